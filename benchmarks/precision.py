@@ -45,7 +45,7 @@ def forward(architecture: str, features: int, windows: int, hidden: int) -> Case
 
 
 def raec(slides: int) -> Case:
-    model = recurrent_autoencoder.build("raec", recurrent_autoencoder.Shape(19, 20))
+    model = recurrent_autoencoder.RecurrentAutoencoder(recurrent_autoencoder.Shape(19, 20))
     frames, classes = torch.randn(400, slides, 19), torch.randint(0, 20, (slides,))
 
     def loss() -> Tensor:

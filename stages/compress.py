@@ -113,7 +113,9 @@ def pca(params: Params, recording: Recording, codec: Fitted) -> pa.Table:
 
     Example: tacpipe compress pca data/segments --split data/split -o data/latents
     """
-    return _encoded(recording, codec)
+    from tacpipe.codecs import latents
+
+    return latents.added(recording, codec)
 
 
 @stage(version=1, fit=fit_autoencoder)
@@ -126,7 +128,9 @@ def autoencoder(params: AutoencoderParams, recording: Recording, codec: Fitted) 
 
     Example: tacpipe compress autoencoder data/segments --split data/split -o data/latents
     """
-    return _encoded(recording, codec)
+    from tacpipe.codecs import latents
+
+    return latents.added(recording, codec)
 
 
 def _kept(components: int, channels: int) -> tuple[int, list[str]]:
@@ -136,25 +140,3 @@ def _kept(components: int, channels: int) -> tuple[int, list[str]]:
     return channels, [
         f"components is {components} and there are {channels} tactile channels, so as many latents are kept."
     ]
-
-
-def _encoded(recording: Recording, codec: Fitted) -> pa.Table:
-    """Return the recording's table with its latents."""
-    import pyarrow as pa
-
-    from tacpipe.codecs import codec as codecs
-    from tacpipe.codecs import frame_stacking, stored, tactile
-    from tacpipe.errors import TacpipeError
-
-    fitted, table = stored.load(codec), recording.table()
-    channels = tactile.columns(table.schema, "tactile")
-    try:
-        codecs.check_channels(fitted.channels, channels)
-        begins = frame_stacking.breaks(tactile.times(table))
-        latents = fitted.encode(tactile.above_rest(table, channels), channels, begins)  # (time, latent)
-    except TacpipeError as error:
-        raise TacpipeError(f"{recording.name}: {error}") from error
-    for index, name in enumerate(fitted.latents):
-        field = pa.field(name, pa.float32(), metadata={"quantity": "latent", "unit": "1"})
-        table = table.append_column(field, pa.array(latents[:, index]))
-    return table

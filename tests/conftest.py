@@ -21,7 +21,7 @@ from hypothesis import settings
 
 from tacpipe.cli import main
 from tacpipe.datasets.manifest import Manifest, parse
-from tacpipe.plugins import registry
+from tacpipe.plugins import architectures, registry
 from tacpipe.store.store import Store
 
 ENTRY_POINTS = """
@@ -208,8 +208,10 @@ def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path],
 
 def forget() -> None:
     """Make the registry look again for what is installed."""
+    registry.installed.cache_clear()
     registry.entry_points.cache_clear()
     registry.stages.cache_clear()
+    architectures.kinds.cache_clear()
 
 
 def tacpipe(folder: Path, command: str, **environment: str) -> subprocess.CompletedProcess[str]:

@@ -17,7 +17,6 @@ from tacpipe.clouds.normalisation import NORMALISATIONS
 from tacpipe.codecs.autoencoder_fit import FRAMES, MOST
 from tacpipe.datasets.splits import SCHEMES
 from tacpipe.errors import UsageError
-from tacpipe.models.forecasts import ARCHITECTURES
 from tacpipe.models.patches import BACKBONES
 from tacpipe.models.pointnet import HEADS
 from tacpipe.models.recurrent_autoencoder import DECODERS
@@ -32,7 +31,7 @@ from tacpipe.tasks.material.pairs import EVERY, PAIRINGS
 from tacpipe.tasks.touch.inputs import MODES, WRISTS
 from tacpipe.tasks.touch.losses import LOSSES
 from tacpipe.training.scaling import KINDS
-from tests.conftest import Ran
+from tests.conftest import Ran, forget
 
 Call = Callable[[str], Ran]
 STAGES = [name for name in registry.stages() if registry.load(name).function.__module__.startswith("tacpipe")]
@@ -220,7 +219,7 @@ def test_every_param_has_a_help_text(name: str) -> None:
 @pytest.mark.parametrize(
     ("name", "field", "known"),
     [
-        ("train.forward", "architecture", {"auto", *ARCHITECTURES}),
+        ("train.forward", "architecture", {"auto", *registry.architectures("forward")}),
         ("train.forward", "actions", ACTIONS),
         ("train.material", "decoder", DECODERS),
         ("train.material", "pairing", PAIRINGS),
@@ -469,11 +468,9 @@ def bending(tmp_path: Path, call: Call, monkeypatch: pytest.MonkeyPatch) -> Iter
     (tmp_path / "lab").mkdir()
     monkeypatch.chdir(tmp_path / "lab")
     monkeypatch.delenv("TACPIPE_STORE", raising=False)
-    for cached in (registry.entry_points, registry.stages):
-        cached.cache_clear()
+    forget()
     yield call
-    for cached in (registry.entry_points, registry.stages):
-        cached.cache_clear()
+    forget()
 
 
 def test_a_plug_ins_stage_has_choices_ranges_and_kinds_like_a_built_in_one(bending: Call) -> None:

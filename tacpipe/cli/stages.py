@@ -199,8 +199,8 @@ def _report(outcome: Outcome, headline: str | None, *, as_json: bool, quiet: boo
         from tacpipe.cli import headline_table
 
         found = headline_table.of_output(outcome.output, headline)
-        extra["headline"] = [one.to_json() for one in found]
-        if not quiet:
+        extra["headline"] = [one.to_json() for one in found or ()]
+        if not quiet and found is not None:  # a task of another package may state none
             headline_table.show(found)
     if as_json:
         terminal.result_json({"schema_version": 1, **outcome.to_json(), **extra})

@@ -24,7 +24,7 @@ class Codec(Protocol):
 
     @property
     def kind(self) -> str:
-        """The word that `load` knows it by."""
+        """The name of its entry point."""
 
     @property
     def representation(self) -> str:
@@ -52,6 +52,25 @@ class Codec(Protocol):
 
     def decode(self, latents: Floats) -> Floats:
         """Return decoded counts, (…, latent) to (…, channel): levels or increments, whichever ``representation`` is."""
+
+
+class FittedCodec(Codec, Protocol):
+    """A codec that was fitted: a class that an entry point of the group ``tacpipe.codecs`` names by its kind.
+
+    A stage fits it, stores what `tacpipe.codecs.stored.to_files` returns of it, and adds its latents to each recording
+    (`tacpipe.codecs.latents`). Models of the task ``forward`` keep a copy of its files and decode what they predict.
+    """
+
+    def to_files(self) -> Mapping[str, bytes]:
+        """Return ``codec.json`` and ``codec.safetensors``: what `from_files` needs, and no pickle.
+
+        `codec.json` is a mapping (`description`) with at least ``kind``, ``of`` (the representation), ``channels`` and
+        ``layout`` (a mapping of texts each); the same codec gives the same bytes.
+        """
+
+    @classmethod
+    def from_files(cls, files: Mapping[str, bytes]) -> FittedCodec:
+        """Return the codec that `to_files` wrote; the files may be untrusted (`tacpipe.datasets.model_files` reads them)."""
 
 
 @dataclass(frozen=True)

@@ -3,43 +3,77 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tacpipe.codecs.autoencoder import Autoencoder
-from tacpipe.codecs.codec import DESCRIPTION, TENSORS, Codec
+from tacpipe.codecs.codec import DESCRIPTION, TENSORS, Codec, FittedCodec, description
 from tacpipe.codecs.frame_stacking import INCREMENTS, LEVELS
-from tacpipe.codecs.pca import PCA
 from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError
-from tacpipe.printable import excerpt
+from tacpipe.plugins import registry
+from tacpipe.printable import excerpt, plain
 
-KINDS = ("autoencoder", "pca")
+if TYPE_CHECKING:
+    from tacpipe.codecs.codec import Floats
+
 NEEDED = {"of": str, "channels": list, "layout": list}
+PLUGIN = "plugin"  # in `codec.json`: the package and version of a codec that is not tacpipe's own
 
 
-def load(files: Mapping[str, bytes]) -> Codec:
+def load(files: Mapping[str, bytes]) -> FittedCodec:
     """Return the codec that `codec.json` and `codec.safetensors` among ``files`` hold.
 
-    Raises `TacpipeError` where a file is missing or the kind is unknown.
+    Its kind is an entry point of the group ``tacpipe.codecs``. Raises `TacpipeError` where a file is missing, where the
+    kind is not installed, and where its parts do not fit one another.
     """
     missing = [name for name in (DESCRIPTION, TENSORS) if name not in files]
     if missing:
         raise TacpipeError(f"There is no {' and no '.join(missing)} here. Give the output of `tacpipe compress`.")
-    kind = model_files.tree(files, DESCRIPTION, {"kind": str})["kind"]
-    if kind in KINDS:
-        model_files.tree(files, DESCRIPTION, NEEDED)
-    if kind == "pca":
-        return _tried(lambda: PCA.from_files(files))
-    if kind == "autoencoder":
-        return _tried(lambda: Autoencoder.from_files(files))
-    raise TacpipeError(
-        f"A codec of kind {excerpt(kind)} is unknown here; {' and '.join(KINDS)} are known. "
-        f"Install the plug-in that made it."
-    )
+    content = model_files.tree(files, DESCRIPTION, {"kind": str})
+    kind = content["kind"]
+    if kind not in registry.codecs():
+        known = f"{', '.join(registry.codecs())} are installed"
+        if PLUGIN in content:
+            package = plain(str(content[PLUGIN]), 100)
+            raise TacpipeError(
+                f"The codec {excerpt(kind)} comes from the package {package}, which is not installed; {known}. Install it."
+            )
+        raise TacpipeError(f"A codec of kind {excerpt(kind)} is not installed here; {known}.")
+    model_files.tree(files, DESCRIPTION, NEEDED)
+    made = registry.load_codec(kind)
+    return _tried(lambda: made.from_files(files))
 
 
-def _tried(read: Callable[[], Codec]) -> Codec:
+def to_files(codec: FittedCodec) -> dict[str, bytes]:
+    """Return the files of a fitted codec, with the package that brings it, once they were read back.
+
+    Raises `TacpipeError` where its kind is not that of an entry point, or its parts do not fit one another.
+    """
+    files = dict(codec.to_files())
+    read = load(files)
+    if type(read) is not type(codec):
+        raise TacpipeError(
+            f"{type(codec).__name__} is of kind {codec.kind}, and the entry point of that name in {registry.CODECS} is "
+            f"{type(read).__name__}."
+        )
+    package = registry.brought_by(registry.CODECS, codec.kind)
+    if package is not None:
+        content = {**model_files.tree(files, DESCRIPTION), PLUGIN: str(package)}
+        files[DESCRIPTION] = description(content)
+    return files
+
+
+def check_latents(codec: Codec, latents: Floats, rows: int) -> None:
+    """Raise `TacpipeError` unless ``latents`` are as many as the codec names, of each of so many ``rows``."""
+    wanted = (rows, len(codec.latents))
+    if latents.shape != wanted:
+        raise TacpipeError(
+            f"The codec {codec.kind} returns latents {latents.shape}; they must be (time, latent), {wanted}."
+        )
+
+
+def _tried(read: Callable[[], FittedCodec]) -> FittedCodec:
     """Return a codec whose parts fit one another, tried on a row. Raises `TacpipeError` where they do not."""
     with model_files.validated("the codec"), np.errstate(all="ignore"):
         codec = read()

@@ -12,9 +12,8 @@ import torch
 from torch import Tensor, nn
 
 from tacpipe.models.batch import Dropout, Rows
-from tacpipe.models.windows import Windows, held, motion
+from tacpipe.models.windows import MOTION, Shape, Windows, held, motion
 
-MOTION, UP = 15, 3
 CELLS = ("gru", "lstm", "tcn")
 CLIPPED = 8.0  # standard deviations to which inputs are clipped: a jump of a sensor must not dominate a window
 
@@ -72,9 +71,37 @@ class ChangeForecast(nn.Module):
         steps, up = driven(windows)
         return ((steps - self.motion_mean) / self.motion_scale).clamp(-CLIPPED, CLIPPED), up
 
+    def inputs(self, windows: Windows) -> tuple[Tensor, Tensor]:
+        """Return past (context, window, `Shape.past`) and plan (horizon, window, `Shape.plan`), scaled."""
+        steps, up = self.arm(windows)
+        arm = torch.cat([steps, up.expand(len(steps), -1, -1)], -1)
+        past, plan = arm[: windows.context], arm[windows.context :]
+        apart = torch.asinh((windows.touch - windows.touch[-1]) / self.change_scale)
+        level = ((windows.touch - self.touch_mean) / self.touch_scale).clamp(-CLIPPED, CLIPPED)
+        return torch.cat([apart, level, held(windows.touch)[..., None], closing(windows)[..., None], past], -1), plan
+
     def touched(self, change: Tensor, windows: Windows) -> Tensor:
         """Return touch (horizon, window, feature) from scaled change."""
         return change * self.change_scale + (0.0 if self.increments else windows.touch[-1])
+
+
+class PlainForecast(ChangeForecast):
+    """A network of past and plan between scales: it returns scaled change or, with ``change_only = False``, levels."""
+
+    def __init__(self, network: nn.Module, shape: Shape, *, loss: str) -> None:
+        """Take the network, and what it reads and predicts."""
+        sizes = {"context": shape.context, "horizon": shape.horizon}
+        super().__init__(shape.features, dropout=0.0, loss=loss, increments=shape.increments, **sizes)
+        self.network = network
+        self.change_only = bool(getattr(network, "change_only", True))
+
+    def forward(self, windows: Windows) -> Tensor:
+        """Return the features to come (horizon, window, feature), in their own unit."""
+        past, plan = self.inputs(windows)
+        found: Tensor = self.network(past, plan)
+        if self.change_only:
+            return self.touched(found, windows)
+        return found * self.touch_scale + self.touch_mean
 
 
 class SequenceForecast(ChangeForecast):
@@ -90,8 +117,8 @@ class SequenceForecast(ChangeForecast):
     def __init__(self, features: int, *, cell: str, hidden: int, **shared: object) -> None:
         """Make a model of random weights that begins at persistence."""
         super().__init__(features, **shared)  # type: ignore[arg-type]
-        arm = MOTION + UP
-        past = 2 * features + 2 + arm  # change against now, level, held, finger, arm
+        shape = Shape(features, self.context, self.horizon)
+        past, arm = shape.past, shape.plan
         self.cell = cell
         if cell == "tcn":
             self.inward = nn.Linear(past + 1, hidden)
@@ -105,12 +132,7 @@ class SequenceForecast(ChangeForecast):
 
     def forward(self, windows: Windows) -> Tensor:
         """Return the features to come (horizon, window, feature), in their own unit."""
-        steps, up = self.arm(windows)
-        arm = torch.cat([steps, up.expand(len(steps), -1, -1)], -1)
-        past, plan = arm[: windows.context], arm[windows.context :]
-        apart = torch.asinh((windows.touch - windows.touch[-1]) / self.change_scale)
-        level = ((windows.touch - self.touch_mean) / self.touch_scale).clamp(-CLIPPED, CLIPPED)
-        read = torch.cat([apart, level, held(windows.touch)[..., None], closing(windows)[..., None], past], -1)
+        read, plan = self.inputs(windows)
         if self.cell == "tcn":
             states = self._convolved(read, plan)
         else:

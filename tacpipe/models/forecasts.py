@@ -14,9 +14,8 @@ from tacpipe.models.recurrent_forward import RecurrentForward
 from tacpipe.models.taxelwise import TaxelwiseForecast, grid
 from tacpipe.models.windows import POSE, Windows
 
-AUTO, TAXELWISE, RECURRENT = "auto", "taxelwise", "recurrent"
+AUTO, TAXELWISE = "auto", "taxelwise"
 ELSE = "gru"  # what auto is where the taxelwise model cannot read what there is
-ARCHITECTURES = (TAXELWISE, *CELLS, RECURRENT)
 Layout = Sequence[Mapping[str, str]]
 Loss = Literal["absolute", "huber", "squared"]
 AnyLoss = Literal["auto", "absolute", "huber", "squared"]
@@ -130,4 +129,4 @@ def resolved(architecture: str, layout: Layout) -> str:
     return TAXELWISE
 
 
-__all__ = ["ARCHITECTURES", "AUTO", "ChangeForecast", "RecurrentForecast", "build", "resolved", "resolved_loss"]
+__all__ = ["AUTO", "ChangeForecast", "RecurrentForecast", "build", "resolved", "resolved_loss"]

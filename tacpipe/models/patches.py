@@ -10,6 +10,8 @@ them. Moving object, hand and wrist together changes nothing of what is read. Tw
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor, nn
 
@@ -18,6 +20,15 @@ from tacpipe.models.batch import Dropout, Rows
 BACKBONES = ("points", "edges")
 NEIGHBOURS = 12
 WIDTHS = (64, 128, 256)
+
+
+@dataclass(frozen=True)
+class Shape:
+    """What a network of touch reads and predicts, as numbers."""
+
+    channels: int  # of a point
+    numbers: int  # of the grasp
+    values: int  # of touch, those of all targets side by side
 
 
 class PatchNetwork(nn.Module):

@@ -112,15 +112,6 @@ class RecurrentClassifier(nn.Module):
         return scores
 
 
-def build(architecture: str, shape: Shape) -> RecurrentAutoencoder | RecurrentClassifier:
-    """Return a network: ``raec`` or ``x-lstm``. Raises `TacpipeError` for another name."""
-    if architecture == "raec":
-        return RecurrentAutoencoder(shape)
-    if architecture == "x-lstm":
-        return RecurrentClassifier(shape)
-    raise TacpipeError(f"There is no network {architecture!r}; there are raec and x-lstm.")
-
-
 def parameters(network: nn.Module) -> int:
     """Return how many weights a network has."""
     return sum(weight.numel() for weight in network.parameters())

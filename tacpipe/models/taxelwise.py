@@ -16,8 +16,8 @@ import torch
 from torch import Tensor, nn
 
 from tacpipe.errors import TacpipeError
-from tacpipe.models.change import CLIPPED, MOTION, UP, ChangeForecast, closing, spread
-from tacpipe.models.windows import Windows, held
+from tacpipe.models.change import CLIPPED, ChangeForecast, closing, spread
+from tacpipe.models.windows import MOTION, UP, Windows, held
 
 TRAITS = 16  # numbers that identify a place on the sensors
 RANK = 32

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+MOTION, UP = 15, 3  # columns of the motion and of the direction up, as a plain network reads them
 POSE = 7  # columns of ``arm`` that hold position and quaternion; velocity follows
 ARM = 13
 
@@ -27,6 +30,27 @@ class Windows(NamedTuple):
     def horizon(self) -> int:
         """How many rows the plan has."""
         return len(self.arm) - len(self.touch)
+
+
+@dataclass(frozen=True)
+class Shape:
+    """What a forecaster reads and predicts: sizes, and where each channel lies."""
+
+    features: int  # channels of touch, or latents
+    context: int  # rows of the past
+    horizon: int  # rows of the plan, and steps that are predicted
+    layout: Sequence[Mapping[str, str]] = ()  # stream, taxel and axis of each channel; empty for latents
+    increments: bool = False  # features are what a row adds to the one before
+
+    @property
+    def past(self) -> int:
+        """The numbers of a row of the past that a plain network reads: change, level, repetition, gripper and motion."""
+        return 2 * self.features + 2 + self.plan
+
+    @property
+    def plan(self) -> int:
+        """The numbers of a row of the plan that a plain network reads: motion and up."""
+        return MOTION + UP
 
 
 def held(touch: Tensor) -> Tensor:

@@ -54,6 +54,12 @@ def bare(wanted: Any) -> Any:
     return bare(kinds[0]) if len(kinds) == 1 else wanted
 
 
+def choices(kind: type[Any], name: str) -> tuple[Any, ...]:
+    """Return the choices of the field ``name`` of a dataclass; empty where it is not a Literal."""
+    wanted = bare(hints(kind).get(name))
+    return get_args(wanted) if get_origin(wanted) is Literal else ()
+
+
 def constraints(wanted: Any) -> list[Constraint]:
     """Return the constraints of an annotation, also of one that None is the only alternative to."""
     return [one for one in metadata(wanted) if isinstance(one, Constraint)]

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import regular, yaml_text
+from tacpipe.plugins import architectures
 from tacpipe.plugins import fields as fields_of
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins.constraints import TomlFile
@@ -82,6 +83,7 @@ def _named(stage: AnyStage, given: Sequence[_Given]) -> Kind:
     name, found = params_of.tag(stage), params_of.kinds(stage)[0]
     for one in given:
         if one.key == name:
+            architectures.require(stage.params, one.value)
             value = fields_of.check(one.value, params_of.fields(stage)[name], one.name, one.place)
             found = next(kind for kind in params_of.kinds(stage) if value in params_of.choices(kind, str(name)))
     return found

@@ -2,7 +2,8 @@
 
 A stage has one dataclass of params, or several: a tagged union, ``Params = Small | Large``, whose classes each have the
 same first field, say ``architecture``, with choices (``Literal``) of their own. That field chooses the class, the first
-one by default; a field that the chosen class does not have is refused, and is not part of a key. A method ``check`` may
+one by default; a field that the chosen class does not have is refused, and is not part of a key. The classes of a
+task's architectures are found like plug-ins (`tacpipe.plugins.architectures`). A method ``check`` may
 refuse values that do not go together; stored params are read back without it. ``PRESETS`` holds named sets of values,
 ``PANELS`` the names of the fields that each panel of the help shows.
 """
@@ -19,8 +20,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Literal, get_args, get_origin
 
 from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.plugins import architectures
 from tacpipe.plugins import fields as fields_of
 from tacpipe.plugins.constraints import StoredAs
+from tacpipe.plugins.fields import choices as choices
 from tacpipe.plugins.fields import filled as filled
 from tacpipe.plugins.stage import AnyStage
 from tacpipe.printable import excerpt
@@ -34,6 +37,8 @@ def kinds(stage: AnyStage) -> tuple[Kind, ...]:
 
 
 def _members(union: Any) -> tuple[Kind, ...]:
+    if architectures.task(union) is not None:
+        return architectures.kinds(union)
     return get_args(union) if get_origin(union) in (typing.Union, types.UnionType) else (union,)
 
 
@@ -54,12 +59,6 @@ def tag(stage: AnyStage) -> str | None:
 
 def _tag_name(several: Sequence[Kind]) -> str:
     return dataclasses.fields(several[0])[0].name
-
-
-def choices(kind: Kind, name: str) -> tuple[Any, ...]:
-    """Return the choices of the tag ``name`` that a kind has; empty where its field is not a Literal."""
-    wanted = fields_of.bare(fields_of.hints(kind).get(name))
-    return get_args(wanted) if get_origin(wanted) is Literal else ()
 
 
 def fields(stage: AnyStage) -> dict[str, Any]:
@@ -89,13 +88,18 @@ def presets(stage: AnyStage) -> list[str]:
 
 
 def panels(stage: AnyStage) -> dict[str, str]:
-    """Return the panel of the help that shows each param, as ``PANELS`` of its dataclasses declare; no panel for others."""
+    """Return the panel of the help that shows each param, as ``PANELS`` of its dataclasses declare; no panel for others.
+
+    A param of an architecture that declares none is in the panel of the architecture.
+    """
     found: dict[str, str] = {}
     for kind in kinds(stage):
         for owner in kind.__mro__:
             declared: Mapping[str, Sequence[str]] = vars(owner).get("PANELS", {})
             for panel, names in declared.items():
                 found |= {name: panel for name in names if name not in found}
+    if architectures.task(stage.params) is not None and architectures.TAG in found:
+        found = {**dict.fromkeys(fields(stage), found[architectures.TAG]), **found}
     return found
 
 
@@ -108,16 +112,21 @@ def added(default: Any) -> Any:
 
 
 def to_json(params: Any) -> dict[str, Any]:
-    """Return the params as keys, manifests and models hold them: `StoredAs` names, `added` ones only if not the default."""
+    """Return the params as keys, manifests and models hold them: `StoredAs` names, `added` ones only if not the default.
+
+    Of an architecture of another package they hold its name and version too.
+    """
     silent = {
         field.name
         for field in dataclasses.fields(params)
         if field.metadata.get("added") and getattr(params, field.name) == field.default
     }
     values = {name: value for name, value in dataclasses.asdict(params).items() if name not in silent}
-    return _stored(
+    found = _stored(
         type(params), {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
     )
+    package = architectures.plugin(type(params))
+    return found if package is None else {**found, architectures.PLUGIN: package}
 
 
 def to_input(params: Any) -> dict[str, Any]:
@@ -130,11 +139,13 @@ def from_json(stage: AnyStage, values: Mapping[str, Any]) -> Any:
     """Return the params that `to_json` gave, now or in an older version; values are taken as they are.
 
     A field that only other kinds have is left out, and so is any that is gone where the stage reads whole datasets.
-    Raises `TacpipeError` where a stage that works recording by recording has no such field: its result would be
-    stored under a name that is not its own.
+    Raises `TacpipeError` where a stage that works recording by recording has no such field, and where another version of
+    an architecture's package is installed: its result would be stored under a name that is not its own.
     """
     kind, current = _current(kinds(stage), values)
+    architectures.check_installed(stage.params, values, kind)
     kind = kind or kinds(stage)[0]
+    architectures.check_version(values, kind)
     known = fields_of.hints(kind)
     gone = sorted(set(current) - set(fields(stage)))
     if gone and stage.mapped:
@@ -174,11 +185,13 @@ def read(union: Any, values: Mapping[str, Any], where: str) -> Any:
     """
     several = _members(union)
     kind, current = _current(several, values)
+    architectures.check_installed(union, values, kind)
     if kind is None:
         name = _tag_name(several)
         allowed = [str(choice) for one in several for choice in choices(one, name)]
         found = excerpt(values.get(_stored_name(several[0], name)))
         raise TacpipeError(f"{where}: {name} is {found}; it must be one of {', '.join(allowed)}.")
+    architectures.warn_of_version(values, kind)
     known = fields_of.hints(kind)
     fitted = {name: _of_type(value, known[name], name, where) for name, value in current.items() if name in known}
     return kind(**fitted)
@@ -258,7 +271,7 @@ def comments(stage: AnyStage) -> dict[str, str]:
         for owner in reversed(kind.__mro__):
             own |= _comments(owner) if dataclasses.is_dataclass(owner) else {}
         for name, text in own.items():
-            if text not in found.setdefault(name, []):
+            if text not in found.setdefault(name, []) and text:
                 found[name].append(text)
     return {name: "; ".join(texts) for name, texts in found.items()}
 

@@ -10,7 +10,7 @@ import importlib.util
 import sys
 from configparser import ConfigParser
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import memory
@@ -27,18 +27,36 @@ DEMOS = "tacpipe.demos"  # by the name of a task: what `tacpipe demo` runs of it
 COMMANDS = "tacpipe.commands"  # by the name of a package: the order of its commands, and the lines of its groups
 OWN = "tacpipe"  # the name of its own entry point there
 TRACKERS = "tacpipe.trackers"
-GROUPS = (STAGES, FORMATS, EXPORTS, TASKS, REPORTS, DEMOS, COMMANDS, SENSORS, EXECUTORS, TRACKERS)
+MODELS = "tacpipe.models"  # TASK.NAME: params of an architecture of a task (`tacpipe.plugins.architectures`)
+CODECS = "tacpipe.codecs"  # by the kind of a codec: its class (`tacpipe.codecs.codec.Codec`)
+GROUPS = (STAGES, FORMATS, EXPORTS, TASKS, REPORTS, DEMOS, COMMANDS, SENSORS, EXECUTORS, TRACKERS, MODELS, CODECS)
 FIT, PART = ".fit", ".part"  # end the names of what belongs to a stage and has a key of its own
+
+
+class Package(NamedTuple):
+    """An installed package."""
+
+    name: str
+    version: str
+
+    def __str__(self) -> str:
+        return f"{self.name} {self.version}".strip()
 
 
 @functools.cache
 def entry_points() -> dict[str, dict[str, str]]:
-    """Return group, name and target of every entry point of tacpipe's groups.
+    """Return group, name and target of every entry point of tacpipe's groups."""
+    return {group: {name: target for name, (target, _) in found.items()} for group, found in installed().items()}
+
+
+@functools.cache
+def installed() -> dict[str, dict[str, tuple[str, Path]]]:
+    """Return group and name of every entry point of tacpipe's groups, with its target and the file that declares it.
 
     Reads the ``entry_points.txt`` of what is installed itself: ``importlib.metadata`` builds an object of each of them and
     takes as long as the rest of ``tacpipe --help``. The first one on the path wins, as there.
     """
-    found: dict[str, dict[str, str]] = {group: {} for group in GROUPS}
+    found: dict[str, dict[str, tuple[str, Path]]] = {group: {} for group in GROUPS}
     for folder in dict.fromkeys(sys.path):
         for file in _entry_point_files(folder):
             try:
@@ -53,8 +71,25 @@ def entry_points() -> dict[str, dict[str, str]]:
             for group, targets in found.items():
                 if parser.has_section(group):
                     for name, target in parser.items(group):
-                        targets.setdefault(name, target)
+                        targets.setdefault(name, (target, file))
     return found
+
+
+def brought_by(group: str, name: str) -> Package | None:
+    """Return the package that brings an entry point, as its metadata has it; None for tacpipe's own.
+
+    Metadata are read as text, so that a hit that needs them loads nothing.
+    """
+    target, file = installed()[group][name]
+    if target.partition(".")[0].partition(":")[0] in extras.OWN:
+        return None
+    about = {"Name": file.parent.stem, "Version": ""}
+    for metadata in (file.with_name("METADATA"), file.with_name("PKG-INFO")):
+        with contextlib.suppress(OSError):
+            head, _, _ = metadata.read_text(encoding="utf-8", errors="replace").partition("\n\n")
+            about |= {key: value.strip() for key, _, value in (line.partition(":") for line in head.splitlines())}
+            break
+    return Package(plain(about["Name"]), plain(about["Version"]))
 
 
 def _entry_point_files(folder: str) -> list[Path]:
@@ -174,6 +209,33 @@ def load_tracker(name: str) -> Any:
     Raises `UsageError` if there is none, `TacpipeError` if it cannot be imported.
     """
     return _named(TRACKERS, "tracker", name)
+
+
+def architectures(task: str) -> list[str]:
+    """Return the names of the architectures of a task: tacpipe's own first, then those of plug-ins."""
+    found = [name.partition(".")[2] for name in installed()[MODELS] if name.partition(".")[0] == task]
+    return sorted(found, key=lambda name: (brought_by(MODELS, f"{task}.{name}") is not None, name))
+
+
+def load_architecture(task: str, name: str) -> Any:
+    """Return the params of an architecture of a task; `tacpipe.plugins.architectures` validates them.
+
+    Raises `UsageError` if there is none, `TacpipeError` if it cannot be imported.
+    """
+    return _named(MODELS, f"architecture of {task}", f"{task}.{name}")
+
+
+def codecs() -> list[str]:
+    """Return the kinds of all codecs."""
+    return sorted(entry_points()[CODECS])
+
+
+def load_codec(kind: str) -> Any:
+    """Return the class of the codecs of this kind, a `tacpipe.codecs.codec.Codec`.
+
+    Raises `UsageError` if there is none, `TacpipeError` if it cannot be imported.
+    """
+    return _named(CODECS, "codec of kind", kind)
 
 
 def _named(group: str, what: str, name: Any) -> Any:

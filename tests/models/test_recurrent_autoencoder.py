@@ -12,7 +12,6 @@ from tacpipe.models.recurrent_autoencoder import (
     RecurrentAutoencoder,
     RecurrentClassifier,
     Shape,
-    build,
     parameters,
 )
 
@@ -122,12 +121,10 @@ def test_dropout_leaves_out_latents_in_training_only() -> None:
 
 def test_what_cannot_be_built_is_refused_with_what_can() -> None:
     with pytest.raises(TacpipeError, match="no decoder 'D3'; there are D1 and D2"):
-        build("raec", Shape(19, 20, decoder="D3"))
-    with pytest.raises(TacpipeError, match="no network 'rnn'"):
-        build("rnn", BIOTAC)
+        RecurrentAutoencoder(Shape(19, 20, decoder="D3"))
     with pytest.raises(TacpipeError, match="a grid of 6 x 10 channels and this sensor has 19"):
-        build("raec", Shape(19, 20, header="cnn"))
+        RecurrentAutoencoder(Shape(19, 20, header="cnn"))
     with pytest.raises(TacpipeError, match="no header 'fft'"):
-        build("raec", Shape(19, 20, header="fft"))
+        RecurrentAutoencoder(Shape(19, 20, header="fft"))
     with pytest.raises(TacpipeError, match="the sensor digit; the recordings have biotac"):
         headers.chosen("digit=mlp", {"biotac": 19})

@@ -10,7 +10,7 @@ from typing import Any
 from safetensors.torch import load
 from torch import Tensor
 
-from tacpipe.models.forecasts import ARCHITECTURES
+from tacpipe.plugins import registry
 from tests.tasks.forward import trials
 from tests.tasks.material import textures
 from tests.tasks.touch import handmade
@@ -20,7 +20,10 @@ RAEC: dict[str, Any] = {"architecture": "raec", "epochs": 3, "align_from": 1, "l
 PATCHES: dict[str, Any] = {"architecture": "patches", "inputs": "xyz"}
 POINTNET: dict[str, Any] = dict(handmade.POINTNET)
 NETWORKS: dict[str, Trains] = {
-    **{f"forward {name}": partial(trials.trained, architecture=name, epochs=3) for name in ARCHITECTURES},
+    **{
+        f"forward {name}": partial(trials.trained, architecture=name, epochs=3)
+        for name in registry.architectures("forward")
+    },
     "forward shuffled": partial(trials.trained, architecture="gru", epochs=3, actions="shuffled"),
     "material raec": partial(textures.trained, **RAEC, dropout=0.3),
     "material contrast": partial(textures.trained, **RAEC, alignment_loss="contrast"),

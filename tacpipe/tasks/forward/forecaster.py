@@ -18,15 +18,14 @@ from tacpipe.codecs import stored
 from tacpipe.codecs.frame_stacking import INCREMENTS
 from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError
-from tacpipe.models import forecasts
 from tacpipe.models.linear import Baselines
 from tacpipe.models.windows import ARM, POSE, Windows, motion
 from tacpipe.plugins import params as params_of
 from tacpipe.printable import plain
 from tacpipe.signals import kinematics
 from tacpipe.signals.rotations import continuous
-from tacpipe.tasks.forward import tracks
-from tacpipe.tasks.forward.params import Change, Params
+from tacpipe.tasks.forward import networks, tracks
+from tacpipe.tasks.forward.params import Params
 from tacpipe.tasks.forward.rows import acted
 from tacpipe.tasks.opened import Chain
 
@@ -159,7 +158,7 @@ class Forecaster:
         inputs = config["inputs"]
         raw = codecs.Raw(tuple(inputs["tactile"]), tuple(inputs["layout"]))
         codec: codecs.Codec = raw if config["codec"]["kind"] == "raw" else stored.load(files)
-        model = model_files.filled(lambda: network(params, codec), model_files.tensors(files[WEIGHTS], WEIGHTS))
+        model = model_files.filled(lambda: networks.build(params, codec), model_files.tensors(files[WEIGHTS], WEIGHTS))
         with model_files.validated("the model"):
             found = model_files.arrays(files[BASELINES], BASELINES) if BASELINES in files else None
             codec_files = (
@@ -298,23 +297,6 @@ def _posed(rows: AnyFloats, columns: int) -> AnyFloats:
     rest = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (len(rows), 1))
     rest[:, :columns] = rows[:, :columns]
     return np.hstack([rest, rows[:, columns:]])
-
-
-def network(params: Params, codec: codecs.Codec) -> nn.Module:
-    """Return the network that ``params`` ask for, of random weights, for the codec's features."""
-    if not isinstance(params, Change):
-        return forecasts.RecurrentForecast(len(codec.latents), params.hidden)
-    return forecasts.build(
-        params.architecture,
-        len(codec.latents),
-        layout(codec),
-        hidden=params.hidden,
-        context=params.context,
-        horizon=params.horizon,
-        dropout=params.dropout,
-        loss=params.loss,
-        changes=codec.representation == INCREMENTS,
-    )
 
 
 def layout(codec: codecs.Codec) -> Sequence[Mapping[str, str]]:

@@ -1,14 +1,23 @@
-"""How a model of the task ``forward`` is built and trained: the params of `tacpipe train forward`, one class a family."""
+"""How a model of the task ``forward`` is built and trained: the params of `tacpipe train forward`, one class a family.
+
+Classes of other packages extend `Forward`, whose `build` states what a network reads and returns.
+"""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from tacpipe.plugins.constraints import PositiveFloat, PositiveInt, Range, Seed
 from tacpipe.plugins.params import added
 from tacpipe.training.devices import Precision
+
+if TYPE_CHECKING:
+    from torch import nn
+
+    from tacpipe.models.windows import Shape
 
 Presets = Mapping[str, Mapping[str, object]]
 Panels = Mapping[str, Sequence[str]]
@@ -16,10 +25,14 @@ Dropout = Annotated[float, Range(0, below=1)]
 
 
 @dataclass(frozen=True)
-class Forward:
-    """Size of a model of the task ``forward`` and of its windows, and how it is trained."""
+class Forward(ABC):
+    """Size of a model of the task ``forward`` and of its windows, and how it is trained.
 
-    architecture: str
+    Each architecture extends it, adds params of its own, and builds its network.
+    """
+
+    ARCHITECTURES: ClassVar[str] = "forward"  # the task, as entry points name it
+    architecture: str = "auto"
     # what the model reads of the planned motion: planned, none, or shuffled (another window's, a negative control)
     actions: Literal["planned", "none", "shuffled"] = "planned"
     hidden: PositiveInt = 128  # units per layer
@@ -47,6 +60,34 @@ class Forward:
         "Data": ("windows", "stride", "arm"),
     }
 
+    @abstractmethod
+    def build(self, shape: Shape) -> nn.Module:
+        """Return the network, of random weights, for what it reads and predicts (`tacpipe.models.windows.Shape`).
+
+        **A plain network** is called as ``network(past, plan)`` and returns (horizon, window, feature), float32.
+
+        - ``past`` (context, window, ``shape.past``) describes each row that was measured, the last one now: of each feature
+          the difference from now (in units of the usual change, compressed by asinh) and the level (mean 0, deviation 1,
+          within 8 deviations); whether the row repeats the one before; the width of the gripper against now; motion.
+        - ``plan`` (horizon, window, ``shape.plan``) is the motion to come: position, rotation, velocity, angular velocity
+          and acceleration of the hand as it sees them now, scaled, and the direction up. Without an arm it is constant.
+        - It returns the change from now, in units of the usual change, or, where the network has ``change_only = False``,
+          levels as ``past`` has them. Zeros are persistence, so a last layer of zeros begins there.
+
+        **A network that scales itself** has the methods ``calibrate(windows, ahead)``, which fits its scales on training
+        windows, and ``loss(windows, ahead)``, which returns a scalar, and the attribute ``change_only``. It is called as
+        ``network(windows)`` with `tacpipe.models.windows.Windows` in the units of the recordings, and returns the
+        features to come in theirs. `tacpipe.models.change.ChangeForecast` has all but ``forward``.
+
+        Of either kind, a prediction depends on its own window alone (so no normalisation over the batch), and each step on
+        the plan up to it, or evaluation of shuffled and missing plans means nothing. With ``ROWS = Rows(1, (1,))``
+        (`tacpipe.models.batch`) a network that scales itself can be trained on several devices; plain ones can always.
+
+        The task makes the windows, fits scales on training recordings, trains (Adam, early stopping, checkpoints that
+        resume, ranks and devices, bfloat16), stores weights as safetensors, fits the baselines, and evaluates. A plain
+        network learns the absolute error, of latents of increments Huber's. Raise `TacpipeError` for what cannot be read.
+        """
+
 
 @dataclass(frozen=True)
 class Change(Forward):
@@ -58,6 +99,22 @@ class Change(Forward):
     # error that training minimises; auto: absolute, and huber for latents of increments, whose median is often 0
     loss: Literal["auto", "absolute", "huber", "squared"] = "auto"
     PRESETS: ClassVar[Presets] = {"quick": {"hidden": 32, "epochs": 3}}
+
+    def build(self, shape: Shape) -> nn.Module:
+        """Return the network; ``auto`` and the loss are resolved before."""
+        from tacpipe.models import forecasts
+
+        return forecasts.build(
+            self.architecture,
+            shape.features,
+            shape.layout,
+            hidden=self.hidden,
+            context=self.context,
+            horizon=self.horizon,
+            dropout=self.dropout,
+            loss=self.loss,
+            changes=shape.increments,
+        )
 
 
 @dataclass(frozen=True)
@@ -80,5 +137,11 @@ class Recurrent(Forward):
         "quick": {"hidden": 32, "epochs": 3},
     }
 
+    def build(self, shape: Shape) -> nn.Module:
+        """Return the paper's network between its scalings."""
+        from tacpipe.models.forecasts import RecurrentForecast
 
-Params = Change | Recurrent
+        return RecurrentForecast(shape.features, self.hidden)
+
+
+Params = Forward  # of any architecture

@@ -22,7 +22,7 @@ from tacpipe.models import forecasts
 from tacpipe.models.linear import Baselines
 from tacpipe.models.windows import motion
 from tacpipe.plugins import params as params_of
-from tacpipe.tasks.forward import tracks, units
+from tacpipe.tasks.forward import networks, tracks, units
 from tacpipe.tasks.forward.alarms import Loads
 from tacpipe.tasks.forward.forecaster import (
     BASELINES,
@@ -33,7 +33,6 @@ from tacpipe.tasks.forward.forecaster import (
     Forecaster,
     largest_level,
     layout,
-    network,
 )
 from tacpipe.tasks.forward.params import Change, Params
 from tacpipe.tasks.forward.predictors import predicted
@@ -90,11 +89,14 @@ def train(
     _check_channels(codec, parts[0])
 
     def build() -> nn.Module:
-        model = network(params, codec).to(device)
+        model = networks.build(params, codec).to(device)
+        if len(known.starts):
+            some = known.pick(known.some(CALIBRATED))
+            networks.check(model, params, some[0], len(codec.latents))
+            if not start:
+                model.calibrate(*some)  # type: ignore[operator]
         if start:
-            model.load_state_dict(start.model.state_dict())
-        elif len(known.starts):
-            model.calibrate(*known.pick(known.some(CALIBRATED)))  # type: ignore[operator]
+            _take_over(model, start)
         return model
 
     schedule = loop.Schedule(
@@ -267,6 +269,18 @@ def _check_start(
         )
     check_codec(init, recordings)
     codecs.check_channels(start.codec.channels, codec.channels)
+
+
+def _take_over(model: nn.Module, start: Forecaster) -> None:
+    """Give a network the weights of the model to begin with. Raises `TacpipeError` where they are of other shapes."""
+    own, known = ({name: tuple(one.shape) for name, one in of.state_dict().items()} for of in (model, start.model))
+    for name in sorted({*own, *known}):
+        if own.get(name) != known.get(name):
+            raise TacpipeError(
+                f"The weights {name} of the model of --init are {known.get(name, 'not there')} and should be "
+                f"{own.get(name, 'not there')}. Train with the params that it was trained with, or begin without --init."
+            )
+    model.load_state_dict(start.model.state_dict())
 
 
 def notes(params: Params, files: Mapping[str, bytes]) -> list[str]:

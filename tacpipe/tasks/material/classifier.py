@@ -14,7 +14,6 @@ from tacpipe.arrays import Float32s, Floats, Int64s
 from tacpipe.datasets import model_files
 from tacpipe.datasets.dataset import Dataset
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.models import recurrent_autoencoder
 from tacpipe.models.level import Level
 from tacpipe.models.minirocket_classifier import MinirocketClassifier
 from tacpipe.models.recurrent_autoencoder import Shape
@@ -23,10 +22,12 @@ from tacpipe.models.tensors import under
 from tacpipe.models.transfer import Transfer
 from tacpipe.plugins import params as params_of
 from tacpipe.printable import plain
+from tacpipe.tasks.material import estimators, networks
 from tacpipe.tasks.material import slides as slides_of
+from tacpipe.tasks.material.estimators import Fitted
 from tacpipe.tasks.material.losses import CHUNK, Network
 from tacpipe.tasks.material.naming import Naming
-from tacpipe.tasks.material.params import Params
+from tacpipe.tasks.material.params import Estimator, Params
 from tacpipe.tasks.material.slides import Layout, Slides, difference
 from tacpipe.tasks.opened import Chain
 from tacpipe.training.scaling import Affine
@@ -40,6 +41,7 @@ NEEDED = {
     "architecture": str,
 }
 CONFIG, WEIGHTS, LAST, BASELINES = "config.json", "model.safetensors", "last.safetensors", "baselines.safetensors"
+ESTIMATORS, SHUFFLED_ESTIMATORS = "model.skops", "baselines.skops"
 ROCKET, SPECTRA = "minirocket", "spectra"
 MEAN_LEVEL, PERMUTED_LABELS = "mean_level", "permuted_labels"
 
@@ -115,7 +117,20 @@ class SpectraReader:
         return spread(self.transfer.expected.scores(latents), self.transfer.classes, self.classes)
 
 
-Reader = NetworkReader | RocketReader | SpectraReader
+@dataclass(frozen=True)
+class EstimatorReader:
+    """An estimator of one sensor."""
+
+    fitted: Fitted
+    classes: tuple[int, ...]
+
+    def read(self, frames: Float32s) -> ReaderOutput:
+        """Return the estimator's scores of slides (slide, time, channel) in device counts."""
+        return ReaderOutput(spread(self.fitted.scores(frames), self.fitted.classes, self.classes), None)
+
+
+Reader = NetworkReader | RocketReader | SpectraReader | EstimatorReader
+Baseline = Level | MinirocketClassifier | Fitted
 
 
 class Classifier:
@@ -131,9 +146,13 @@ class Classifier:
         self.naming = Naming.from_json(config)
         self.quantities = tuple(config["quantities"])
         self.layouts = {name: Layout.from_json(name, layout) for name, layout in config["sensors"].items()}
-        self.readers: dict[str, Reader] = self._readers(files[WEIGHTS], WEIGHTS)
+        if isinstance(self.params, Estimator):
+            fitted = self._estimators(files[ESTIMATORS], ESTIMATORS, self.params)
+            self.readers: dict[str, Reader] = {name: EstimatorReader(one, self.classes) for name, one in fitted.items()}
+        else:
+            self.readers = self._readers(files[WEIGHTS], WEIGHTS)
         self.last = self._readers(files[LAST], LAST) if LAST in files else {}
-        self.baselines = self._baselines(files[BASELINES]) if BASELINES in files else {}
+        self.baselines = self._baselines(files) if BASELINES in files else {}
 
     @classmethod
     def load(cls, files: Mapping[str, bytes], chain: Chain | None = None) -> Self:
@@ -278,21 +297,30 @@ class Classifier:
         for name in self.layouts:
             shape = Shape(**self.config["shapes"][name])
             weights = under(f"{name}.", tensors)
-            network = model_files.filled(
-                functools.partial(recurrent_autoencoder.build, self.architecture, shape), weights
-            )
+            network = model_files.filled(functools.partial(networks.build, self.params, shape), weights)
             scaling = {key: np.array(value) for key, value in self.config["scaling"][name].items()}
             readers[name] = NetworkReader(cast(Network, network), Affine.from_tensors(scaling))
         return readers
 
-    def _baselines(self, content: bytes) -> dict[str, dict[str, Level | MinirocketClassifier]]:
+    def _estimators(self, content: bytes, file: str, params: Estimator) -> dict[str, Fitted]:
+        found = estimators.unpacked(content, file, params)
+        return {name: found[name] for name in self.layouts}
+
+    def _baselines(self, files: Mapping[str, bytes]) -> dict[str, dict[str, Baseline]]:
         """Return the baselines by name and sensor."""
-        arrays = model_files.arrays(content, BASELINES, but=CHOSEN)
+        arrays = model_files.arrays(files[BASELINES], BASELINES, but=CHOSEN)
+        found: dict[str, dict[str, Baseline]] = {
+            MEAN_LEVEL: {name: Level.from_tensors(under(f"{MEAN_LEVEL}.{name}.", arrays)) for name in self.layouts}
+        }
+        if isinstance(self.params, Estimator):
+            shuffled = self._estimators(files[SHUFFLED_ESTIMATORS], SHUFFLED_ESTIMATORS, self.params)
+            return {**found, PERMUTED_LABELS: {**shuffled}}
         permuted = MinirocketClassifier if self.architecture == ROCKET else Level
-        kinds: dict[str, type[Level] | type[MinirocketClassifier]] = {MEAN_LEVEL: Level, PERMUTED_LABELS: permuted}
         return {
-            kind: {name: cls.from_tensors(under(f"{kind}.{name}.", arrays)) for name in self.layouts}
-            for kind, cls in kinds.items()
+            **found,
+            PERMUTED_LABELS: {
+                name: permuted.from_tensors(under(f"{PERMUTED_LABELS}.{name}.", arrays)) for name in self.layouts
+            },
         }
 
 

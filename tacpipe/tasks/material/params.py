@@ -1,10 +1,14 @@
-"""How a classifier of materials is built and trained: the params of `tacpipe train material`, one class an architecture."""
+"""How a classifier of materials is built and trained: the params of `tacpipe train material`, one class an architecture.
+
+Classes of other packages extend `Estimator` or `Network`, whose methods state what a classifier reads and returns.
+"""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from tacpipe.errors import UsageError
 from tacpipe.plugins.constraints import (
@@ -22,6 +26,12 @@ from tacpipe.plugins.constraints import (
 from tacpipe.plugins.params import added
 from tacpipe.training.devices import Precision
 
+if TYPE_CHECKING:
+    from torch import nn
+
+    from tacpipe.arrays import Float32s
+    from tacpipe.models.recurrent_autoencoder import Shape
+
 KEY = "material"  # the label that names classes, unless params name another
 Presets = Mapping[str, Mapping[str, object]]
 Panels = Mapping[str, Sequence[str]]
@@ -33,7 +43,8 @@ HeldOut = Annotated[str, Assignments(Annotated[str, CommaList(least=1)], between
 class Material:
     """What every classifier of materials reads and learns."""
 
-    architecture: str
+    ARCHITECTURES: ClassVar[str] = "material"  # the task, as entry points name it
+    architecture: str = "minirocket"
     sensors: Names = ""  # sensors to learn for; empty for all
     # quantities to read; empty: tactile, and for minirocket also vibration (22 readings a frame)
     quantities: Names = ""
@@ -86,8 +97,38 @@ class Spectra(Material):
 
 
 @dataclass(frozen=True)
-class Network(Material):
-    """What recurrent classifiers have in common."""
+class Estimator(Material, ABC):
+    """An estimator of scikit-learn over features of a slide, of each sensor alone; an architecture extends it."""
+
+    use_validation: bool = True  # learn from validation slides too: nothing is chosen by them
+    # types that skops does not validate and a stored estimator may hold nevertheless, as sklearn.tree._tree.Tree
+    TRUSTED: ClassVar[Sequence[str]] = ()
+
+    def features(self, frames: Float32s) -> Float32s:
+        """Return what the estimator reads of slides (slide, time, channel) in device counts: (slide, feature), finite.
+
+        Without a method of its own an architecture reads every frame: (slide, time · channel).
+        """
+        flat: Float32s = frames.reshape(len(frames), -1)
+        return flat
+
+    @abstractmethod
+    def build(self, seed: int) -> Any:
+        """Return the estimator, not fitted: a classifier of scikit-learn, or a pipeline that ends with one.
+
+        It has ``fit(features, classes)`` with features (slide, feature), float32, and classes (slide,), int64, numbers of
+        materials; and ``predict_proba`` or ``decision_function``, which gives a score of each class (slide, class), the
+        highest for the class that is named. ``seed`` is for its ``random_state``.
+
+        The task reads slides, splits them by the split's roles, fits one estimator a sensor on training slides alone (and
+        those of validation, if ``use_validation`` is set), fits the baselines and permuted labels, stores it without
+        pickle (skops: what that validates, types of the architecture's own package, and `TRUSTED`), and evaluates.
+        """
+
+
+@dataclass(frozen=True)
+class Network(Material, ABC):
+    """What networks that classify slides have in common; an architecture extends it."""
 
     hold_out: HeldOut = ""  # materials whose labels a sensor does not learn, as roboskin=17,18,19,20
     # sensor that learns from a part of the batches alone; needs --no-shuffle
@@ -111,6 +152,23 @@ class Network(Material):
     select: Literal["best", "last"] = "best"
     # of products in training; bfloat16 takes half the memory and rounds to 3 digits, weights stay in float32
     precision: Precision = added("float32")
+
+    @abstractmethod
+    def build(self, shape: Shape) -> nn.Module:
+        """Return a sensor's network, of random weights (`tacpipe.models.recurrent_autoencoder.Shape`).
+
+        **A plain network** is called with slides (time, slide, ``shape.channels``), float32, scaled as ``scaling`` states,
+        and returns scores (slide, ``shape.classes``), which the negative log-likelihood of their softmax is lowered of.
+
+        **A network with a method ``classify``** returns a `tacpipe.models.recurrent_autoencoder.NetworkOutput` (latents,
+        scores and reconstructed frames or None), takes ``decode=False``, and has ``classify(latents)``, which returns
+        scores: sensors can then be compared in their latents.
+
+        Of either kind, what is returned for a slide depends on that slide alone.
+
+        The task reads and scales slides, trains (Adam, epochs chosen by validation accuracy, checkpoints that resume,
+        ranks and devices, bfloat16), stores weights as safetensors, fits the baselines and permuted labels, and evaluates.
+        """
 
     def check(self) -> None:
         """Refuse a subsampled sensor whose batches are shuffled, and a percentage without a sensor."""
@@ -162,6 +220,12 @@ class Raec(Network):
         "quick": {"epochs": 30},
     }
 
+    def build(self, shape: Shape) -> nn.Module:
+        """Return the paper's autoencoder with a classifier."""
+        from tacpipe.models.recurrent_autoencoder import RecurrentAutoencoder
+
+        return RecurrentAutoencoder(shape)
+
     def check(self) -> None:
         """Refuse options of joint learning without it."""
         super().check()
@@ -184,5 +248,11 @@ class XLSTM(Network):
     architecture: Literal["x-lstm"] = "x-lstm"
     PRESETS: ClassVar[Presets] = {"paper": {"epochs": 2000}, "quick": {"epochs": 30}}
 
+    def build(self, shape: Shape) -> nn.Module:
+        """Return the paper's recurrent classifier."""
+        from tacpipe.models.recurrent_autoencoder import RecurrentClassifier
 
-Params = Minirocket | Raec | XLSTM | Spectra
+        return RecurrentClassifier(shape)
+
+
+Params = Material  # of any architecture

@@ -1,4 +1,4 @@
-"""What is fitted in closed form: convolutional features or spectra, and a readout of them."""
+"""What is fitted at once, without epochs: convolutional features or spectra and a readout of them, and estimators."""
 
 from __future__ import annotations
 
@@ -15,9 +15,20 @@ from tacpipe.models.minirocket_classifier import MinirocketClassifier
 from tacpipe.models.spatial_spectrum import Bands, Sampling
 from tacpipe.models.transfer import Transfer
 from tacpipe.plugins.constraints import Assignments
-from tacpipe.tasks.material.classifier import BASELINES, CONFIG, MEAN_LEVEL, PERMUTED_LABELS, WEIGHTS, Config
+from tacpipe.tasks.material.classifier import (
+    BASELINES,
+    CONFIG,
+    ESTIMATORS,
+    MEAN_LEVEL,
+    PERMUTED_LABELS,
+    SHUFFLED_ESTIMATORS,
+    WEIGHTS,
+    Config,
+)
+from tacpipe.tasks.material.estimators import Fitted
+from tacpipe.tasks.material.estimators import packed as packed_estimators
 from tacpipe.tasks.material.naming import Naming
-from tacpipe.tasks.material.params import Minirocket, Params, Spectra
+from tacpipe.tasks.material.params import Estimator, Minirocket, Params, Spectra
 from tacpipe.tasks.material.slides import Slides
 
 BySensor = Mapping[str, Slides]
@@ -37,6 +48,24 @@ def rockets(params: Minirocket, config: Config, known: BySensor, watched: BySens
             baselines |= stored(MEAN_LEVEL, name, Level.fit(frames, materials))
             baselines |= stored(PERMUTED_LABELS, name, strong.relabelled(frames, shuffled))
     return _files(config, tensors, baselines)
+
+
+def estimators(params: Estimator, config: Config, known: BySensor, watched: BySensor) -> dict[str, bytes]:
+    """Return the files of estimators of scikit-learn, of each sensor alone."""
+    fitted: dict[str, Fitted] = {}
+    shuffled: dict[str, Fitted] = {}
+    levels: Arrays = {}
+    for place, (name, some) in enumerate(known.items()):
+        frames, materials = _labelled(params, some, watched.get(name), place)
+        fitted[name] = Fitted.fit(params, frames, materials)
+        if params.baselines:
+            permutation = np.random.default_rng([params.seed, 3, place]).permutation(materials)
+            levels |= stored(MEAN_LEVEL, name, Level.fit(frames, materials))
+            shuffled[name] = Fitted.fit(params, frames, permutation)
+    files = {CONFIG: config_file(config), ESTIMATORS: packed_estimators(fitted, params)}
+    if params.baselines:
+        files |= {BASELINES: packed(levels), SHUFFLED_ESTIMATORS: packed_estimators(shuffled, params)}
+    return files
 
 
 def spectra(
@@ -111,7 +140,7 @@ def _samplings(speeds: str, known: BySensor) -> dict[str, Sampling]:
 
 
 def _labelled(
-    params: Minirocket | Spectra, some: Slides, watched: Slides | None, place: int
+    params: Minirocket | Spectra | Estimator, some: Slides, watched: Slides | None, place: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the frames and materials to learn from: those of validation too, where params ask for it."""
     frames, materials = some.frames, permuted(params, some.materials, place)

@@ -6,7 +6,7 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import torch
@@ -14,13 +14,13 @@ from safetensors.torch import save as save_tensors
 from torch import nn
 
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.models import headers, recurrent_autoencoder
+from tacpipe.models import headers
 from tacpipe.models.level import Level
 from tacpipe.models.recurrent_autoencoder import Shape
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins.constraints import Assignments, CommaList
 from tacpipe.printable import listed
-from tacpipe.tasks.material import readouts
+from tacpipe.tasks.material import networks, readouts
 from tacpipe.tasks.material import slides as slides_of
 from tacpipe.tasks.material.classifier import (
     BASELINES,
@@ -38,7 +38,8 @@ from tacpipe.tasks.material.classifier import (
 from tacpipe.tasks.material.losses import JointWork, ScaledSlides, Weights
 from tacpipe.tasks.material.naming import NUMBERS, UNKNOWN, Naming
 from tacpipe.tasks.material.pairs import NONE, Pairs, permuted_classes
-from tacpipe.tasks.material.params import XLSTM, Minirocket, Params, Raec, Spectra
+from tacpipe.tasks.material.params import Estimator, Minirocket, Params, Raec, Spectra
+from tacpipe.tasks.material.params import Network as NetworkParams
 from tacpipe.tasks.material.slides import Slides
 from tacpipe.tasks.seen import seen
 from tacpipe.training import devices, loop
@@ -52,7 +53,6 @@ RAEC = "raec"
 QUANTITIES = {ROCKET: (slides_of.TACTILE, "vibration")}  # that are read where params name none
 MAPPED_RECONSTRUCTION = 0.05  # weight of a network that is aligned to a frozen one: that of the published script
 
-NetworkParams = Raec | XLSTM
 BySensor = Mapping[str, Slides]
 
 
@@ -110,7 +110,14 @@ def train(
         return readouts.rockets(params, config, known, watched)
     if isinstance(params, Spectra):
         return readouts.spectra(params, config, known, watched, held_out(params.hold_out, classes, known, naming))
-    return _networks(params, config, known, watched, workspace, init)
+    if isinstance(params, Estimator):
+        return readouts.estimators(params, config, known, watched)
+    if isinstance(params, NetworkParams):
+        return _networks(params, config, known, watched, workspace, init)
+    raise TacpipeError(
+        f"The params of the architecture {params.architecture} extend neither Estimator nor Network of "
+        f"tacpipe.tasks.material.params, so the task cannot train it."
+    )
 
 
 def _naming(key: str, *parts: Dataset | None) -> Naming:
@@ -195,7 +202,10 @@ def _networks(
     work = JointWork(scaled_slides[0], scaled_slides[1], pairs, _weights(params, joint), mapped_to, params.drop_last)
 
     def build() -> nn.Module:
-        return _built(params.architecture, shapes, start, mapped_to).to(device)
+        made = _built(params, shapes, start, mapped_to).to(device)
+        for name, network in made.items():
+            networks.check(network, params, scaled_slides[0][name].frames, shapes[name].classes)
+        return made
 
     trained = loop.train(build, work, _schedule(params), workspace)
     best, last = (trained.weights, trained.last) if params.select == "best" else (trained.last, trained.weights)
@@ -338,9 +348,9 @@ def _weights(params: NetworkParams, joint: bool) -> Weights:
     )
 
 
-def _built(architecture: str, shapes: Mapping[str, Shape], start: Classifier | None, frozen: str) -> nn.ModuleDict:
+def _built(params: NetworkParams, shapes: Mapping[str, Shape], start: Classifier | None, frozen: str) -> nn.ModuleDict:
     """Return the networks by sensor; that of ``frozen`` is taken over and frozen, with its classifier in all others."""
-    built = nn.ModuleDict({name: recurrent_autoencoder.build(architecture, one) for name, one in shapes.items()})
+    built = nn.ModuleDict({name: cast(nn.Module, networks.build(params, one)) for name, one in shapes.items()})
     if start:
         known = _reader(start, frozen).network
         for name, network in built.items():

@@ -91,6 +91,11 @@ class TouchWork:
         return {"": (float(line["val_loss"]),)}
 
     def _loss(self, found: Tensor, values: Tensor) -> Tensor:
+        if found.shape != values.shape:
+            raise TacpipeError(
+                f"The network returns {tuple(found.shape)} for {len(values)} grasps; it must return (cloud, value), here "
+                f"{tuple(values.shape)}."
+            )
         squared = (found - values) ** 2
         if self.loss_name == "rmse":
             return torch.sqrt(squared.mean() + SMALLEST)

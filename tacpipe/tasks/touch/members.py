@@ -14,8 +14,7 @@ from tacpipe.channels import biotac_sp
 from tacpipe.clouds import geometry
 from tacpipe.errors import TacpipeError
 from tacpipe.models.forest import Forest
-from tacpipe.models.patches import PatchNetwork
-from tacpipe.models.pointnet import HEADS, PointNet
+from tacpipe.models.patches import Shape
 from tacpipe.tasks.touch import params as params_of
 from tacpipe.tasks.touch.grasps import Grasps
 from tacpipe.tasks.touch.inputs import Inputs, Sources
@@ -71,6 +70,8 @@ class NetworkMember:
     def predict(self, grasps: Grasps) -> Floats:
         """Return the values of its targets (grasp, value), device counts, averaged over the params' ``draws``."""
         found = predictions(self.network, sources(self.params, grasps), len(grasps), self.params.draws)
+        if found.shape != (wanted := (len(grasps), len(self.scale.offset))):
+            raise TacpipeError(f"The network returns {found.shape}; it must return (cloud, value), here {wanted}.")
         return np.asarray(self.scale.restore(found), np.float64)
 
 
@@ -98,20 +99,15 @@ def units(values: Floats, targets: Sequence[str]) -> Floats:
 
 
 def network(params: NetworkParams, targets: Sequence[str]) -> nn.Module:
-    """Return an untrained network for params and targets."""
-    outputs = sum(biotac_sp.width(target) for target in targets)
-    if isinstance(params, params_of.Pointnet):
-        read = inputs(params)
-        return PointNet(read.channels, read.grasp_numbers, outputs, head=HEADS[params.head], transform=params.transform)
-    near = patches(params)
-    return PatchNetwork(
-        near.channels,
-        near.grasp_numbers,
-        outputs,
-        backbone=params.backbone,
-        hidden=params.hidden,
-        dropout=params.dropout,
-    )
+    """Return an untrained network for params and targets. Raises `TacpipeError` where params build something else."""
+    values = sum(biotac_sp.width(target) for target in targets)
+    read = inputs(params) if isinstance(params, params_of.Pointnet) else patches(params)
+    made = params.build(Shape(read.channels, read.grasp_numbers, values))
+    if not isinstance(made, nn.Module):
+        raise TacpipeError(
+            f"The architecture {params.architecture} built {type(made).__name__}; it must build a torch.nn.Module."
+        )
+    return made
 
 
 def checked(params: NetworkParams) -> None:
@@ -131,7 +127,7 @@ def patches(params: params_of.Patches) -> Patches:
     return Patches(params.points, params.radius_mm / 1000, coloured(params), params.place)
 
 
-def coloured(params: params_of.Params) -> bool:
+def coloured(params: params_of.Trees | NetworkParams) -> bool:
     """Return whether colours are read."""
     return params.inputs.startswith("rgb")
 

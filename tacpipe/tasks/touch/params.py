@@ -1,10 +1,14 @@
-"""How a model of touch is built and trained: the params of `tacpipe train touch`, one class an architecture."""
+"""How a model of touch is built and trained: the params of `tacpipe train touch`, one class an architecture.
+
+Classes of other packages extend `Patches` or `Pointnet`, which choose what is read of a cloud, and build another network.
+"""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from tacpipe.plugins.constraints import (
     CommaList,
@@ -20,6 +24,11 @@ from tacpipe.plugins.constraints import (
 from tacpipe.plugins.params import added
 from tacpipe.training.devices import Precision
 
+if TYPE_CHECKING:
+    from torch import nn
+
+    from tacpipe.models.patches import Shape
+
 Presets = Mapping[str, Mapping[str, object]]
 Panels = Mapping[str, Sequence[str]]
 Dropout = Annotated[float, Range(0, below=1)]
@@ -31,7 +40,8 @@ Targets = Annotated[str, CommaList(Literal["pdc_th", "pdc_mf", "e_th", "e_mf"], 
 class Touch:
     """What every model of the task ``touch`` predicts and learns from."""
 
-    architecture: str
+    ARCHITECTURES: ClassVar[str] = "touch"  # the task, as entry points name it
+    architecture: str = "tree-ensemble"
     targets: Targets = "pdc_th,pdc_mf,e_th,e_mf"  # pressure and electrodes of thumb and middle finger
     # label of this run in a report, next to others of the same method, as blocked
     run_label: Annotated[str, StoredAs("setting")] = ""
@@ -67,7 +77,7 @@ class Trees(Touch):
 
 
 @dataclass(frozen=True)
-class PointNetwork(Touch):
+class PointNetwork(Touch, ABC):
     """What networks that read points have in common."""
 
     # one network for all targets; else one each, as in the paper
@@ -88,6 +98,25 @@ class PointNetwork(Touch):
     # of products in training; bfloat16 takes half the memory and rounds to 3 digits, weights stay in float32
     precision: Precision = added("float32")
 
+    @abstractmethod
+    def build(self, shape: Shape) -> nn.Module:
+        """Return the network, of random weights, for what it reads and predicts (`tacpipe.models.patches.Shape`).
+
+        It is called as ``network(points, numbers)`` and returns scaled values (cloud, ``shape.values``), those of the
+        targets side by side.
+
+        - Of an architecture that extends `Patches`, ``points`` are (cloud, 3, point, ``shape.channels``): those about the
+          two contacts, in the axes of the grasp, and the whole cloud; place in metres comes first, then colour.
+        - Of one that extends `Pointnet`, they are the whole cloud, (cloud, point, ``shape.channels``), as ``inputs`` and
+          ``normalisation`` state.
+        - ``numbers`` (cloud, ``shape.numbers``) describe the grasp.
+
+        The task draws points anew at each visit, scales the readings, trains (Adam, the loss and epoch that params choose,
+        checkpoints that resume, bfloat16; several devices for networks with ``ROWS = Rows(0, (0,))`` of
+        `tacpipe.models.batch`), averages over ``networks`` and ``draws``, stores weights as safetensors, and evaluates next
+        to the baselines.
+        """
+
 
 @dataclass(frozen=True)
 class Patches(PointNetwork):
@@ -102,6 +131,19 @@ class Patches(PointNetwork):
     hidden: Annotated[int, Range(2)] = 256  # units of the first layer behind the points
     dropout: Dropout = 0.3  # fraction of these left out of each training step
     PRESETS: ClassVar[Presets] = {"quick": {"networks": 1, "epochs": 10, "points": 64}}
+
+    def build(self, shape: Shape) -> nn.Module:
+        """Return the network of patches."""
+        from tacpipe.models.patches import PatchNetwork
+
+        return PatchNetwork(
+            shape.channels,
+            shape.numbers,
+            shape.values,
+            backbone=self.backbone,
+            hidden=self.hidden,
+            dropout=self.dropout,
+        )
 
 
 @dataclass(frozen=True)
@@ -137,5 +179,11 @@ class Pointnet(PointNetwork):
         "quick": {"networks": 1, "epochs": 10, "points": 64},
     }
 
+    def build(self, shape: Shape) -> nn.Module:
+        """Return the paper's network."""
+        from tacpipe.models.pointnet import HEADS, PointNet
 
-Params = Trees | Patches | Pointnet
+        return PointNet(shape.channels, shape.numbers, shape.values, head=HEADS[self.head], transform=self.transform)
+
+
+Params = Touch  # of any architecture

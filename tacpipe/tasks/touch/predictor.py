@@ -22,7 +22,7 @@ from tacpipe.tasks.opened import Chain
 from tacpipe.tasks.touch import members
 from tacpipe.tasks.touch.baselines import Baselines
 from tacpipe.tasks.touch.grasps import Grasps, check
-from tacpipe.tasks.touch.params import Params, Trees
+from tacpipe.tasks.touch.params import Params
 from tacpipe.training import devices
 from tacpipe.training.scaling import Affine
 
@@ -136,7 +136,7 @@ def _member(params: Params, about: Mapping[str, Any], tensors: dict[str, Any], d
     scale = Affine.from_tensors({name: value.numpy() for name, value in under("scale.", tensors).items()})
     if scale.offset.shape != (width,) or scale.scale.shape != (width,):
         raise ValueError(f"a scale of {scale.offset.shape} does not fit {width} values")
-    if isinstance(params, Trees):
+    if not isinstance(params, members.NetworkParams):
         raise ValueError(f"the architecture {params.architecture} has a network")
     network = model_files.filled(lambda: members.network(params, targets), under("network.", tensors))
     members.checked(params)

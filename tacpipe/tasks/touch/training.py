@@ -66,8 +66,13 @@ def train(
     history: list[loop.Line] = []
     if isinstance(params, Trees):
         _grow(params, config, tensors, known, targets)
-    else:
+    elif isinstance(params, NetworkParams):
         _learn(params, config, tensors, history, (known, watched), targets, workspace)
+    else:
+        raise TacpipeError(
+            f"The params of the architecture {params.architecture} extend neither Patches nor Pointnet of "
+            f"tacpipe.tasks.touch.params, so the task cannot train it."
+        )
     files = {WEIGHTS: save_tensors(tensors)}
     if history:
         files[HISTORY] = "".join(json.dumps(line) + "\n" for line in history).encode()
@@ -97,7 +102,7 @@ def _config(params: Params, targets: Sequence[str], known: Grasps, watched: Gras
 
 def _chooses(params: Params) -> bool:
     """Return whether something is chosen by validation grasps: a network's epoch, or when its training ends."""
-    return not isinstance(params, Trees) and bool(params.select == "best" or params.patience)
+    return isinstance(params, NetworkParams) and bool(params.select == "best" or params.patience)
 
 
 def _grow(params: Trees, config: Config, tensors: dict[str, Tensor], known: Grasps, targets: Sequence[str]) -> None:

@@ -13,7 +13,7 @@ import pytest
 from safetensors.numpy import load
 
 from tacpipe.errors import TacpipeError
-from tacpipe.models.forecasts import ARCHITECTURES
+from tacpipe.plugins import registry
 from tacpipe.plugins.params import to_json
 from tacpipe.tasks.forward import task as forward
 from tacpipe.training import checkpoint
@@ -49,7 +49,7 @@ def test_a_tiny_deterministic_set_is_learned_by_heart(tmp_path: Path) -> None:
     assert min(found) < 0.001 < found[0]
 
 
-@pytest.mark.parametrize("architecture", ARCHITECTURES)
+@pytest.mark.parametrize("architecture", registry.architectures("forward"))
 def test_every_model_is_tensors_and_json_alone(architecture: str, tmp_path: Path) -> None:
     files = trained(tmp_path, dataset(*TRAIN[:1]), architecture=architecture, epochs=1)
     assert set(files) == FILES

@@ -9,7 +9,7 @@ from sklearn.metrics import log_loss
 from torch import Tensor, nn
 
 from tacpipe.errors import TacpipeError
-from tacpipe.models.recurrent_autoencoder import Shape, build
+from tacpipe.models.recurrent_autoencoder import RecurrentAutoencoder, RecurrentClassifier, Shape
 from tacpipe.tasks.material.losses import JointWork, ScaledSlides, Weights
 from tacpipe.tasks.material.pairs import NONE, Pairs
 
@@ -24,7 +24,8 @@ def touched(sensor: str, classes: Tensor = CLASSES) -> ScaledSlides:
 
 def networks(architecture: str = "raec") -> nn.ModuleDict:
     torch.manual_seed(5)
-    return nn.ModuleDict({name: build(architecture, shape) for name, shape in SHAPES.items()})
+    made = {"raec": RecurrentAutoencoder, "x-lstm": RecurrentClassifier}[architecture]
+    return nn.ModuleDict({name: made(shape) for name, shape in SHAPES.items()})
 
 
 def work(weights: Weights, frozen: str = "", **classes: Tensor) -> JointWork:

@@ -254,13 +254,13 @@ def test_slides_that_cannot_be_learned_from_are_refused(
 @pytest.mark.parametrize(
     "changed, sentence",
     [
-        ({"architecture": "cnn"}, "architecture is 'cnn'; it must be one of minirocket, raec, x-lstm, spectra"),
+        ({"architecture": "cnn"}, "architecture is 'cnn'; it must be one of minirocket, raec, spectra, x-lstm"),
         ({"labels": "none"}, "labels is 'none'"),
         ({**RAEC, "select": "first"}, "select is 'first'"),
         ({**RAEC, "frozen_sensor": "biotac"}, "needs both --frozen-sensor"),
         ({**RAEC, "hold_out": "roboskin=9"}, "hold_out names roboskin=9"),
         ({**RAEC, "hold_out": "roboskin=x"}, "hold_out names roboskin=x"),
-        ({"hold_out": "roboskin=3"}, "hold-out belongs to the architecture raec, x-lstm or spectra"),
+        ({"hold_out": "roboskin=3"}, "hold-out belongs to the architecture raec, spectra or x-lstm"),
         ({"sensors": "digit"}, "No recording is of the sensor digit"),
         ({**RAEC, "scaling": "cube"}, "scaling is 'cube'; it must be one of none, standard, spread, log"),
     ],

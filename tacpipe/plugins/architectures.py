@@ -1,0 +1,141 @@
+"""Architectures of a task: classes of params, each of which builds a model; entry points of ``tacpipe.models``.
+
+A task has a dataclass that all of its architectures extend, with the name of the task as ``ARCHITECTURES`` and the default
+architecture as the default of its first field, ``architecture``. An entry point ``TASK.NAME = "module:Class"`` names a
+dataclass that extends it: its ``architecture`` is a ``Literal`` with ``NAME`` among the choices, and ``build(shape)``
+returns what the task trains. Built-in architectures and those of other packages are found in the same way, and their
+classes are the kinds of params of the task's stage (`tacpipe.plugins.params`).
+
+- The module is imported whenever the options of the stage are needed, so it imports torch and the like inside ``build``.
+- The name and version of another package are part of the params as they are stored (``plugin``), and so of every key: a
+  model is trained again with another version. tacpipe's own architectures change with the version of the stage.
+- One that cannot be loaded is left out of the choices; who asks for it gets the reason.
+- What ``build`` gets and what its result must do is described by the task: `tacpipe.tasks.forward.params.Forward`,
+  `tacpipe.tasks.material.params.Estimator` and `Network`, `tacpipe.tasks.touch.params.Patches` and `Pointnet`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+import inspect
+import warnings
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from tacpipe.errors import ResultWarning, TacpipeError
+from tacpipe.plugins import fields as fields_of
+from tacpipe.plugins import registry
+from tacpipe.printable import excerpt, plain
+
+PLUGIN = "plugin"  # name of the package and its version, among stored params of an architecture of another package
+TAG = "architecture"
+Kind = type[Any]
+
+
+def task(kind: Any) -> str | None:
+    """Return the task whose architectures extend the class ``kind`` itself; None for other params."""
+    found: str | None = vars(kind).get("ARCHITECTURES") if isinstance(kind, type) else None
+    return found
+
+
+@functools.cache
+def kinds(base: Kind) -> tuple[Kind, ...]:
+    """Return the classes of the architectures that extend ``base``: the default one, tacpipe's own, those of plug-ins."""
+    found: list[Kind] = []
+    for name in registry.architectures(str(task(base))):
+        with contextlib.suppress(TacpipeError):  # one that cannot be loaded spoils itself alone
+            kind = load(base, name)
+            if kind not in found and not _taken(kind, found):
+                found.append(kind)
+    default = base.__dataclass_fields__[TAG].default
+    return tuple(sorted(found, key=lambda kind: default not in fields_of.choices(kind, TAG)))
+
+
+def load(base: Kind, name: str) -> Kind:
+    """Return the class of the architecture ``name``. Raises `TacpipeError` for one that does not fit ``base``."""
+    of = task(base)
+    found = registry.load_architecture(str(of), name)
+    target = registry.entry_points()[registry.MODELS][f"{of}.{name}"]
+    misfits = {
+        f"a dataclass that extends {base.__module__}.{base.__name__}": isinstance(found, type)
+        and issubclass(found, base)
+        and dataclasses.is_dataclass(found),
+    }
+    if all(misfits.values()):
+        misfits[f"a dataclass whose {TAG} is a Literal with {name}"] = name in fields_of.choices(found, TAG)
+        builds = callable(getattr(found, "build", None)) or registry.brought_by(registry.MODELS, f"{of}.{name}") is None
+        misfits["a class with a method build(shape)"] = builds and not inspect.isabstract(found)
+    for wanted, fits in misfits.items():
+        if not fits:
+            raise TacpipeError(f"{target}, registered as the architecture {name} of {of}, must be {wanted}.")
+    kind: Kind = found
+    return kind
+
+
+def require(base: Any, value: Any) -> None:
+    """Raise the reason why an architecture that is installed as ``value`` is not among the choices, if it is not."""
+    of = task(base)
+    if of is None or not isinstance(value, str) or value not in registry.architectures(of):
+        return
+    kind = load(base, value)
+    if kind not in (known := kinds(base)):
+        choices = ", ".join(map(str, _taken(kind, known)))
+        raise TacpipeError(
+            f"The architecture {value} of the package {plugin(kind)} has the choice {choices}, which another has too. "
+            f"Rename it there."
+        )
+
+
+def plugin(kind: Kind) -> str | None:
+    """Return name and version of the package that the architecture of a class comes from; None for tacpipe's own."""
+    for base in kind.__mro__[1:]:
+        if (of := task(base)) is not None:
+            for name in fields_of.choices(kind, TAG):
+                if name in registry.architectures(of) and (
+                    found := registry.brought_by(registry.MODELS, f"{of}.{name}")
+                ):
+                    return str(found)
+    return None
+
+
+def check_installed(base: Any, values: Mapping[str, Any], kind: Kind | None) -> None:
+    """Raise `TacpipeError` where stored params are of an architecture whose package is not installed, or cannot be loaded.
+
+    ``kind`` is the class that they name, if there is one.
+    """
+    if kind is None and task(base) is not None:
+        require(base, values.get(TAG))
+        if PLUGIN in values:
+            raise TacpipeError(
+                f"The architecture {excerpt(values.get(TAG))} comes from the package {plain(str(values[PLUGIN]), 100)}, "
+                f"which is not installed here. Install it to use the model."
+            )
+
+
+def warn_of_version(values: Mapping[str, Any], kind: Kind) -> None:
+    """Warn where a model was trained with another version of its architecture's package than is installed."""
+    before, now = values.get(PLUGIN), plugin(kind)
+    if before != now:
+        trained = f"{excerpt(values.get(TAG))} of {plain(str(before), 100)}"
+        sentence = (
+            f"This model was trained with the architecture {trained}, and {now} is installed: predictions may differ."
+        )
+        warnings.warn(sentence, ResultWarning, stacklevel=2)
+
+
+def check_version(values: Mapping[str, Any], kind: Kind) -> None:
+    """Raise `TacpipeError` where stored params were computed with another version of the package than is installed."""
+    before, now = values.get(PLUGIN), plugin(kind)
+    if before != now:
+        raise TacpipeError(
+            f"This was computed with the architecture {excerpt(values.get(TAG))} of {plain(str(before), 100)}, and {now} is "
+            f"installed. Install that version, or train again."
+        )
+
+
+def _taken(kind: Kind, found: Iterable[Kind]) -> list[Any]:
+    """Return the choices of a class that one of those found has too."""
+    taken = {choice for other in found if other is not kind for choice in fields_of.choices(other, TAG)}
+    return [choice for choice in fields_of.choices(kind, TAG) if choice in taken]

@@ -1,0 +1,174 @@
+"""Fitted estimators of scikit-learn as bytes, without pickle: skops, and types of known packages alone.
+
+A file of skops is a zip of a description, JSON, and of arrays. It is written so that the same estimator has the same bytes,
+and read only where each type in it is one that skops validates (most of scikit-learn, numpy and scipy), or of the package
+of the architecture, which is installed code, or named by it.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+
+from tacpipe.arrays import Float32s, Floats, Int64s
+from tacpipe.errors import TacpipeError
+from tacpipe.plugins import extras
+from tacpipe.printable import listed, plain
+from tacpipe.tasks.material.params import Estimator
+
+SCHEMA = "schema.json"
+WRITTEN = (1980, 1, 1, 0, 0, 0)  # what a zip states of each member
+TRIED = 2  # slides
+SMALLEST = 1e-12  # probability
+LARGEST = 2**31  # bytes that a file may unpack to
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A fitted estimator and what it reads of a slide."""
+
+    estimator: Any
+    features: Callable[[Float32s], Float32s]
+
+    @classmethod
+    def fit(cls, params: Estimator, frames: Float32s, materials: Int64s) -> Self:
+        """Return the estimator that ``params`` build, fitted on slides (slide, time, channel) and their classes (slide,).
+
+        Raises `TacpipeError` where features or scores are not what `Estimator` states.
+        """
+        made = cls(params.build(params.seed), params.features)
+        made.estimator.fit(made._features(frames), materials)
+        made.scores(frames[:TRIED])
+        return made
+
+    @property
+    def classes(self) -> tuple[int, ...]:
+        """The classes that it scores, in order."""
+        return tuple(int(one) for one in self.estimator.classes_)
+
+    def scores(self, frames: Float32s) -> Float32s:
+        """Return the score of each class for slides (slide, time, channel), (slide, class).
+
+        Probabilities become their logarithms, whose softmax they are. Raises `TacpipeError` for another shape.
+        """
+        read = self._features(frames)
+        if hasattr(self.estimator, "predict_proba"):
+            found: Floats = np.log(np.clip(self.estimator.predict_proba(read), SMALLEST, None))
+        else:
+            found = np.asarray(self.estimator.decision_function(read))
+            found = np.stack([-found, found], axis=1) / 2 if found.ndim == 1 else found  # of two classes
+        if found.shape != (len(frames), len(self.classes)):
+            raise TacpipeError(
+                f"{type(self.estimator).__name__} returns scores {found.shape} for {len(frames)} slides and "
+                f"{len(self.classes)} classes; they must be (slide, class)."
+            )
+        return found.astype(np.float32)
+
+    def _features(self, frames: Float32s) -> Float32s:
+        found: Float32s = np.asarray(self.features(frames), np.float32)
+        if found.ndim != 2 or len(found) != len(frames) or not np.isfinite(found).all():
+            state = "are not all finite" if found.ndim == 2 and len(found) == len(frames) else f"are {found.shape}"
+            raise TacpipeError(
+                f"The features of {len(frames)} slides {state}; features(frames) must return (slide, feature), all finite."
+            )
+        return found
+
+
+def packed(fitted: Mapping[str, Fitted], params: Estimator) -> bytes:
+    """Return fitted estimators by sensor as the bytes of a file. Raises `TacpipeError` for what cannot be read back."""
+    with extras.named(f"The architecture {params.architecture}"):
+        from skops.io import dumps, get_untrusted_types
+        from skops.io.exceptions import UnsupportedTypeException
+    try:
+        content = dumps({sensor: one.estimator for sensor, one in fitted.items()})
+    except UnsupportedTypeException as error:
+        raise TacpipeError(
+            f"The estimator of {params.architecture} cannot be stored without pickle ({plain(str(error), 200)}). Build it "
+            f"of estimators of scikit-learn, with functions of a module and not lambda."
+        ) from error
+    if others := _refused(get_untrusted_types(data=content), params):
+        raise TacpipeError(
+            f"The estimator of {params.architecture} holds {others}, which skops does not validate when it is read. Name "
+            f"what you trust in TRUSTED of {type(params).__name__}, or build another estimator."
+        )
+    return _canonical(content)
+
+
+def unpacked(content: bytes, name: str, params: Estimator) -> dict[str, Fitted]:
+    """Return the estimators by sensor in the file ``name``.
+
+    Raises `TacpipeError` where it is not such a file, and where it has types that the architecture does not trust.
+    """
+    with extras.named(f"The architecture {params.architecture}"):
+        from skops.io import get_untrusted_types, loads
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as file:
+            if sum(member.file_size for member in file.infolist()) > LARGEST:
+                raise TacpipeError(f"{name} unpacks to more than {LARGEST >> 30} GiB, so it is not read.")
+        own = get_untrusted_types(data=content)
+        if others := _refused(own, params):
+            raise TacpipeError(
+                f"{name} holds {others}, which the architecture {params.architecture} does not trust. Train the model again."
+            )
+        found = loads(content, trusted=own)
+        return {sensor: Fitted(estimator, params.features) for sensor, estimator in found.items()}
+    except TacpipeError:
+        raise
+    except Exception as error:  # what a damaged file raises on its way is of many types
+        raise TacpipeError(
+            f"{name} is not a file of skops that can be read ({plain(' '.join(str(error).split()), 200)}). Copy it again "
+            f"from whoever made it."
+        ) from error
+
+
+def _refused(types: Iterable[str], params: Estimator) -> str:
+    """Return those of the types that neither the architecture's package has nor the architecture trusts, as text."""
+    package = type(params).__module__.partition(".")[0]
+    others = [one for one in types if one.partition(".")[0] != package and one not in params.TRUSTED]
+    return listed([plain(one, 100) for one in others]) if others else ""
+
+
+def _canonical(content: bytes) -> bytes:
+    """Return a file of skops with numbers in place of addresses of memory and without times, so that it repeats."""
+    with zipfile.ZipFile(io.BytesIO(content)) as file:
+        members = {member: file.read(member) for member in file.namelist()}
+    numbers: dict[Any, int] = {}
+    described = _renumbered(json.loads(members[SCHEMA]), numbers)
+    renamed = {SCHEMA: json.dumps(described, indent=1, sort_keys=True).encode()}
+    renamed |= {_member(member, numbers): own for member, own in members.items() if member != SCHEMA}
+    written = io.BytesIO()
+    with zipfile.ZipFile(written, "w", zipfile.ZIP_DEFLATED) as file:
+        for member, own in sorted(renamed.items()):
+            about = zipfile.ZipInfo(member, WRITTEN)
+            about.compress_type = zipfile.ZIP_DEFLATED
+            file.writestr(about, own)
+    return written.getvalue()
+
+
+def _renumbered(node: Any, numbers: dict[Any, int]) -> Any:
+    """Return a description whose ``__id__`` are counted from 1 in the order in which they come, and files named by them."""
+    if isinstance(node, list):
+        return [_renumbered(one, numbers) for one in node]
+    if not isinstance(node, Mapping):
+        return node
+    found: dict[str, Any] = {}
+    for name, value in node.items():
+        if name == "__id__":
+            found[name] = numbers.setdefault(value, len(numbers) + 1)
+        elif name == "file":
+            found[name] = _member(value, numbers)
+        else:
+            found[name] = _renumbered(value, numbers)
+    return found
+
+
+def _member(name: str, numbers: dict[Any, int]) -> str:
+    """Return the name of a member, which skops makes of an address."""
+    stem, dot, ending = name.partition(".")
+    return f"{numbers.setdefault(int(stem), len(numbers) + 1)}{dot}{ending}" if stem.isdigit() else name

@@ -1,0 +1,45 @@
+"""The network that an architecture of the task ``material`` builds, validated: built in or of another package."""
+
+from __future__ import annotations
+
+from typing import cast
+
+import torch
+from torch import Tensor, nn
+
+from tacpipe.errors import TacpipeError
+from tacpipe.models.plain_classifier import PlainClassifier
+from tacpipe.models.recurrent_autoencoder import Shape
+from tacpipe.tasks.material.losses import Network
+from tacpipe.tasks.material.params import Material
+from tacpipe.tasks.material.params import Network as NetworkParams
+
+TRIED = 2  # slides
+
+
+def build(params: Material, shape: Shape) -> Network:
+    """Return the network that ``params`` build for a sensor, of random weights; a plain one wrapped, to be called as others.
+
+    Raises `TacpipeError` where they build something else.
+    """
+    made = params.build(shape) if isinstance(params, NetworkParams) else None
+    if not isinstance(made, nn.Module):
+        raise TacpipeError(
+            f"The architecture {params.architecture} built {type(made).__name__}; it must build a torch.nn.Module."
+        )
+    return cast(Network, made if hasattr(made, "classify") else PlainClassifier(made))
+
+
+@torch.no_grad()
+def check(network: nn.Module, params: NetworkParams, slides: Tensor, classes: int) -> None:
+    """Raise `TacpipeError` where a network returns something else than scores for ``slides`` (slide, time, channel)."""
+    training = network.training
+    found = network.eval()(slides[:TRIED].transpose(0, 1).contiguous(), decode=False)
+    network.train(training)
+    scores, wanted = getattr(found, "scores", None), (len(slides[:TRIED]), classes)
+    if not isinstance(scores, Tensor) or tuple(scores.shape) != wanted:
+        returned = str(tuple(scores.shape)) if isinstance(scores, Tensor) else type(scores).__name__
+        raise TacpipeError(
+            f"The network of the architecture {params.architecture} returns {returned} for {wanted[0]} slides; it must "
+            f"return scores (slide, class), here {wanted}."
+        )

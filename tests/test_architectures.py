@@ -1,0 +1,390 @@
+"""Architectures of other packages: choices like built-in ones, their version in keys, and why one does not fit."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+import subprocess
+import sys
+import zipfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tacpipe.errors import ResultWarning, TacpipeError
+from tacpipe.plugins import architectures, given_params, registry
+from tacpipe.plugins import params as params_of
+from tests.conftest import Ran, forget
+
+MODULE = '''
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from tacpipe.plugins.constraints import PositiveInt
+from tacpipe.tasks.forward.params import Forward
+from tacpipe.tasks.material.params import Estimator, Network
+from tacpipe.tasks.touch.params import Patches
+
+
+@dataclass(frozen=True)
+class Plain(Forward):
+    """A linear map of the last row."""
+
+    architecture: Literal["plain"] = "plain"  # plain: a linear map
+    width: PositiveInt = 3  # of nothing
+    returned: Literal["right", "wrong"] = "right"
+
+    def build(self, shape):
+        """Return the network."""
+        from torch import nn
+
+        class Last(nn.Module):
+            def __init__(self, wrong):
+                super().__init__()
+                self.layer, self.wrong = nn.Linear(shape.past + shape.plan, shape.features), wrong
+
+            def forward(self, past, plan):
+                import torch
+
+                found = self.layer(torch.cat([past[-1].expand(len(plan), -1, -1), plan], -1))
+                return found[1:] if self.wrong else found
+
+        return Last(self.returned == "wrong")
+
+
+@dataclass(frozen=True)
+class Scores(Network):
+    """The mean of each channel, weighed."""
+
+    architecture: Literal["scores"] = "scores"
+
+    def build(self, shape):
+        """Return the network."""
+        from torch import nn
+
+        class Mean(nn.Module):
+            def __init__(self):
+                super().__init__()
+                self.layer = nn.Linear(shape.channels, shape.classes)
+
+            def forward(self, frames):
+                return self.layer(frames.mean(dim=0))
+
+        return Mean()
+
+
+@dataclass(frozen=True)
+class Nearest(Estimator):
+    """The nearest mean."""
+
+    architecture: Literal["nearest"] = "nearest"
+
+    def features(self, frames):
+        """Return the mean of each channel."""
+        return frames.mean(axis=1)
+
+    def build(self, seed):
+        """Return the estimator."""
+        from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
+
+        return LinearDiscriminantAnalysis(solver="lsqr", shrinkage=0.5)
+
+
+@dataclass(frozen=True)
+class Forest(Nearest):
+    """A forest, whose trees skops does not validate."""
+
+    architecture: Literal["forest"] = "forest"
+
+    def build(self, seed):
+        """Return the estimator."""
+        from sklearn.ensemble import RandomForestClassifier
+
+        return RandomForestClassifier(3, random_state=seed)
+
+
+@dataclass(frozen=True)
+class Trusting(Forest):
+    """A forest that is trusted."""
+
+    TRUSTED = ("sklearn.tree._tree.Tree",)
+    architecture: Literal["trusting"] = "trusting"
+
+
+@dataclass(frozen=True)
+class Flat(Patches):
+    """The middle of a patch."""
+
+    architecture: Literal["flat"] = "flat"
+
+    def build(self, shape):
+        """Return the network."""
+        from torch import nn
+
+        class Middle(nn.Module):
+            def __init__(self):
+                super().__init__()
+                self.layer = nn.Linear(shape.channels + shape.numbers, shape.values)
+
+            def forward(self, points, numbers):
+                import torch
+
+                return self.layer(torch.cat([points.mean(dim=(1, 2)), numbers], dim=1))
+
+        return Middle()
+
+
+@dataclass(frozen=True)
+class Double(Forward):
+    """A name that the library has."""
+
+    architecture: Literal["double", "gru"] = "double"
+
+    def build(self, shape):
+        """Return nothing."""
+
+
+class Odd:
+    """Not params of the task."""
+'''
+ENTRIES = """[tacpipe.models]
+forward.plain = lab_architectures:Plain
+forward.double = lab_architectures:Double
+forward.odd = lab_architectures:Odd
+forward.lost = nowhere_at_all:Lost
+material.scores = lab_architectures:Scores
+material.nearest = lab_architectures:Nearest
+material.forest = lab_architectures:Forest
+material.trusting = lab_architectures:Trusting
+touch.flat = lab_architectures:Flat
+"""
+
+
+def declare(folder: Path, version: str) -> None:
+    """Write the metadata of the package."""
+    about = folder / "lab_architectures.egg-info"
+    about.mkdir(exist_ok=True)
+    (about / "entry_points.txt").write_text(ENTRIES)
+    (about / "PKG-INFO").write_text(f"Metadata-Version: 2.1\nName: lab-architectures\nVersion: {version}\n\nText: no\n")
+    forget()
+
+
+@pytest.fixture
+def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    folder = tmp_path / "package"
+    folder.mkdir()
+    (folder / "lab_architectures.py").write_text(MODULE)
+    monkeypatch.syspath_prepend(folder)
+    declare(folder, "1.0")
+    yield folder
+    sys.modules.pop("lab_architectures", None)
+    forget()
+
+
+def built(task: str, **options: Any) -> Any:
+    """Return the params of `tacpipe train TASK` for some options."""
+    name = f"train.{task}"
+    return given_params.build(name, registry.load(name), options=options)
+
+
+def test_every_choice_of_a_built_in_architecture_but_the_automatic_one_is_an_entry_point() -> None:
+    for task in registry.tasks():
+        stage = registry.load(f"train.{task}")
+        choices = [choice for kind in params_of.kinds(stage) for choice in params_of.choices(kind, "architecture")]
+        assert sorted({*choices} - {"auto"}) == registry.architectures(task)
+        assert params_of.kinds(stage)[0]().architecture == stage.params.__dataclass_fields__["architecture"].default
+
+
+def test_an_architecture_of_another_package_is_a_choice_and_its_params_are_options(package: Path) -> None:
+    assert built("forward", architecture="plain", width=5).width == 5
+    with pytest.raises(TacpipeError, match="--width belongs to the architecture plain"):
+        built("forward", architecture="gru", width=5)
+    with pytest.raises(TacpipeError, match="--dropout belongs to"):
+        built("forward", architecture="plain", dropout=0.1)
+    stage = registry.load("train.forward")
+    assert set(params_of.panels(stage)) == set(params_of.fields(stage))
+    assert params_of.panels(stage)["width"] == "Model"
+
+
+def test_the_help_shows_it_in_a_panel_and_imports_nothing_heavy(
+    package: Path, call: Callable[[str], Ran], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = call("train forward --help").out
+    model = text.split("Model:")[1].split("Training:")[0]
+    assert "|plain]" in model and "--width" in model
+    probe = (
+        "import sys; from tacpipe.cli import main; sys.argv = ['tacpipe', 'train', 'forward', '--help']\n"
+        "try:\n    main.main()\nexcept SystemExit:\n    pass\n"
+        "assert 'lab_architectures' in sys.modules\n"
+        "assert not {'torch', 'sklearn', 'pyarrow', 'pandas', 'numpy'} & set(sys.modules)\n"
+    )
+    monkeypatch.setenv("PYTHONPATH", str(package))
+    subprocess.run([sys.executable, "-c", probe], check=True, capture_output=True)
+
+
+def test_name_and_version_of_the_package_are_in_keys_and_those_of_built_in_ones_are_as_before(package: Path) -> None:
+    params = built("forward", architecture="plain")
+    assert params_of.to_json(params)["plugin"] == "lab-architectures 1.0"
+    assert "plugin" not in params_of.to_json(built("forward", architecture="gru"))
+    before = params_of.to_json(params)
+    declare(package, "1.1")
+    assert params_of.to_json(params)["plugin"] == "lab-architectures 1.1"
+    stage = registry.load("train.forward")
+    with pytest.raises(TacpipeError, match=r"lab-architectures 1\.0, and lab-architectures 1\.1"):
+        params_of.from_json(stage, before)  # a worker, or a result that is computed again
+    assert params_of.from_json(stage, params_of.to_json(params)) == params
+    with pytest.warns(ResultWarning, match=r"lab-architectures 1\.0, and lab-architectures 1\.1 is installed"):
+        assert params_of.read(stage.params, before, "config.json") == params  # a model opens where its weights fit
+
+
+def test_a_model_without_its_package_names_architecture_package_and_version(package: Path) -> None:
+    stored = params_of.to_json(built("forward", architecture="plain"))
+    (package / "lab_architectures.egg-info" / "entry_points.txt").write_text("")
+    forget()
+    stage = registry.load("train.forward")
+    for read, of in ((params_of.read, stage.params), (params_of.from_json, stage)):
+        where = ("config.json",) if read is params_of.read else ()
+        with pytest.raises(TacpipeError, match=r"'plain' comes from the package lab-architectures 1\.0"):
+            read(of, stored, *where)
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [("lost", "nowhere_at_all"), ("odd", "must be a dataclass that extends"), ("double", "has the choice gru")],
+)
+def test_one_that_does_not_fit_spoils_itself_alone_and_says_why(package: Path, name: str, reason: str) -> None:
+    assert built("forward", architecture="gru").architecture == "gru"
+    assert name not in params_of.fields(registry.load("train.forward"))["architecture"].__args__
+    with pytest.raises(TacpipeError, match=reason):
+        built("forward", architecture=name)
+
+
+@pytest.mark.long
+def test_a_forward_network_is_trained_stored_and_read_back_and_another_shape_is_refused(
+    package: Path, tmp_path: Path
+) -> None:
+    from tests.tasks.forward import trials
+
+    made = trials.trained(tmp_path, architecture="plain", epochs=1, baselines=False)
+    assert "network.layer.weight" in str(made["model.safetensors"][:2000])
+    assert json.loads(made["config.json"])["params"]["plugin"] == "lab-architectures 1.0"
+    with pytest.raises(TacpipeError, match=r"architecture plain returns \(\d+, 2, \d+\).*\(horizon, window, feature\)"):
+        trials.trained(tmp_path / "wrong", architecture="plain", returned="wrong", epochs=1)
+
+
+def slides(seed: int) -> tuple[Any, Any]:
+    """Return slides (slide, time, channel) of three materials that differ in level."""
+    rng = np.random.default_rng(seed)
+    materials = np.arange(30) % 3
+    return (rng.normal(size=(30, 8, 4)) + materials[:, None, None]).astype(np.float32), materials.astype(np.int64)
+
+
+def test_an_estimator_is_stored_without_pickle_and_the_same_one_has_the_same_bytes(package: Path) -> None:
+    from tacpipe.tasks.material import estimators
+
+    params = built("material", architecture="nearest")
+    frames, materials = slides(0)
+    one, other = (estimators.Fitted.fit(params, frames, materials) for _ in range(2))
+    content = estimators.packed({"biotac": one}, params)
+    assert content == estimators.packed({"biotac": other}, params)
+    assert b"pickle" not in content
+    read = estimators.unpacked(content, "model.skops", params)["biotac"]
+    assert np.array_equal(read.scores(slides(1)[0]), one.scores(slides(1)[0]))
+    assert read.classes == (0, 1, 2)
+    assert (one.scores(frames).argmax(axis=1) == materials).mean() > 0.8
+    with pytest.raises(TacpipeError, match=r"model\.skops is not a file of skops"):
+        estimators.unpacked(content[:-30], "model.skops", params)
+
+
+def test_a_changed_file_of_an_estimator_is_refused_or_read_and_names_of_other_packages_run_nothing(
+    package: Path,
+) -> None:
+    from tacpipe.tasks.material import estimators
+
+    params = built("material", architecture="nearest")
+    frames, materials = slides(0)
+    content = estimators.packed({"biotac": estimators.Fitted.fit(params, frames, materials)}, params)
+    rng = np.random.default_rng(0)
+    for _ in range(40):
+        changed = bytearray(content)
+        changed[rng.integers(len(changed))] ^= int(rng.integers(1, 256))
+        try:
+            estimators.unpacked(bytes(changed), "model.skops", params)
+        except TacpipeError as error:
+            assert "model.skops" in str(error)
+    with zipfile.ZipFile(io.BytesIO(content)) as file:
+        members = {name: file.read(name) for name in file.namelist()}
+    call = {
+        "__class__": "system",
+        "__module__": "os",
+        "__loader__": "FunctionNode",
+        "__id__": 1,
+        "content": "os.system",
+    }
+    written, described = io.BytesIO(), json.loads(members["schema.json"])
+    with zipfile.ZipFile(written, "w") as file:
+        for name, own in {**members, "schema.json": json.dumps({**described, **call}).encode()}.items():
+            file.writestr(name, own)
+    with pytest.raises(TacpipeError, match="system"):
+        estimators.unpacked(written.getvalue(), "model.skops", params)
+
+
+def test_types_that_are_not_validated_are_refused_unless_the_architecture_trusts_them(package: Path) -> None:
+    from tacpipe.tasks.material import estimators
+
+    frames, materials = slides(0)
+    forest, trusting = (built("material", architecture=name) for name in ("forest", "trusting"))
+    fitted = {"biotac": estimators.Fitted.fit(forest, frames, materials)}
+    with pytest.raises(TacpipeError, match=r"sklearn\.tree\._tree\.Tree"):
+        estimators.packed(fitted, forest)
+    content = estimators.packed(fitted, trusting)
+    assert np.array_equal(
+        estimators.unpacked(content, "model.skops", trusting)["biotac"].scores(frames), fitted["biotac"].scores(frames)
+    )
+    with pytest.raises(TacpipeError, match=r"holds sklearn\.tree\._tree\.Tree"):
+        estimators.unpacked(content, "model.skops", forest)
+
+
+def test_features_and_scores_of_another_shape_are_refused(package: Path) -> None:
+    from tacpipe.tasks.material import estimators
+
+    params = built("material", architecture="nearest")
+    frames, materials = slides(0)
+    fitted = estimators.Fitted.fit(params, frames, materials)
+    with pytest.raises(TacpipeError, match=r"30 slides are \(8, 4\)"):
+        dataclasses.replace(fitted, features=lambda given: given.mean(axis=0)).scores(frames)
+    with pytest.raises(TacpipeError, match="not all finite"):
+        dataclasses.replace(fitted, features=lambda given: given.mean(axis=1) * np.nan).scores(frames)
+
+
+def test_plain_networks_of_material_and_touch_are_called_as_they_promise(package: Path) -> None:
+    import torch
+
+    from tacpipe.models.recurrent_autoencoder import Shape
+    from tacpipe.tasks.material import networks
+    from tacpipe.tasks.touch import members
+
+    scores = built("material", architecture="scores")
+    made = networks.build(scores, Shape(channels=4, classes=3))
+    networks.check(made, scores, torch.zeros(5, 8, 4), 3)
+    with pytest.raises(TacpipeError, match=r"returns \(2, 3\) for 2 slides.*\(2, 4\)"):
+        networks.check(made, scores, torch.zeros(5, 8, 4), 4)
+    flat = built("touch", architecture="flat")
+    network = members.network(flat, ["pdc_th"])
+    read = members.patches(flat)
+    found = network(torch.zeros(2, 3, 7, read.channels), torch.zeros(2, read.grasp_numbers))
+    assert found.shape == (2, 1)
+
+
+def test_a_codec_that_is_not_installed_is_named_with_its_package() -> None:
+    from tacpipe.codecs import stored
+
+    files = {"codec.json": b'{"kind": "wavelet", "plugin": "lab-codecs 2.0"}', "codec.safetensors": b""}
+    with pytest.raises(TacpipeError, match=r"'wavelet' comes from the package lab-codecs 2\.0.*autoencoder, pca"):
+        stored.load(files)
+    assert registry.codecs() == ["autoencoder", "pca"]
+    assert architectures.task(dict) is None

@@ -1,0 +1,92 @@
+"""The packages that the pages of docs/extending print are installed into a fresh environment, and used there as printed."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import subprocess
+import sys
+import sysconfig
+import venv
+from pathlib import Path
+
+import pytest
+
+from tests import test_docs as docs
+
+TITLED = (".py", ".toml")
+
+
+def packages(folder: Path) -> list[Path]:
+    """Write the package of each page below ``folder``, and return their folders."""
+    made = []
+    for page in docs.EXTENDING:
+        place = folder / page.stem
+        place.mkdir(parents=True)
+        for block in docs.fenced(page.read_text()):
+            if block.title:
+                (place / block.title).write_text(block.text)
+        assert (place / "pyproject.toml").exists(), page
+        made.append(place)
+    return made
+
+
+def environment(folder: Path) -> Path:
+    """Return the folder of programs of a fresh environment, which has what this one has and nothing of its own."""
+    venv.create(folder, with_pip=False, symlinks=True)
+    (own,) = folder.glob("lib/python*/site-packages")
+    (own / "known.pth").write_text(f"import site; site.addsitedir({sysconfig.get_paths()['purelib']!r})\n")
+    program = folder / "bin" / "tacpipe"
+    program.write_text(
+        f"#!{folder}/bin/python\nfrom tacpipe.cli.main import main\n\nif __name__ == '__main__':\n    main()\n"
+    )
+    program.chmod(0o755)
+    return folder / "bin"
+
+
+@pytest.mark.long
+@pytest.mark.timeout(3600)
+def test_the_package_of_every_page_installs_and_does_what_the_page_prints(tmp_path: Path) -> None:
+    """One project serves all pages: what one computed is reused on the next."""
+    programs = environment(tmp_path / "environment")
+    project = tmp_path / "project"
+    project.mkdir()
+    clean = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "TACPIPE_STORE")}
+    around = {**clean, "PATH": f"{programs}{os.pathsep}{os.environ['PATH']}", "OMP_NUM_THREADS": "1"}
+
+    def done(words: list[str], what: str) -> list[str]:
+        ran = subprocess.run(words, cwd=project, env=around, capture_output=True, text=True, check=False)
+        assert ran.returncode == 0, f"{what}: {ran.stderr}"
+        return [line for line in (ran.stderr + ran.stdout).splitlines() if line]
+
+    quiet = ["--quiet", "--no-deps", "--no-build-isolation", "--no-index", "--disable-pip-version-check"]
+    pip = [sys.executable, "-m", "pip", "--python", str(programs / "python"), "install", *quiet]
+    done([*pip, *map(str, packages(tmp_path / "packages"))], "pip install")
+
+    before: set[str] = set()
+    for page in docs.EXTENDING:
+        here = set()
+        for block in docs.fenced(page.read_text()):
+            if block.language == "python" and not block.title:
+                done([str(programs / "python"), "-c", block.text], page.name)
+            elif block.language == "console":
+                for command, lines in docs.printed(block.text):
+                    shown = done([str(programs / "tacpipe"), *shlex.split(command)[1:]], f"{page.name}: {command}")
+                    docs.compare(f"{page.name}: {command}", lines, shown, again=command in before)
+                    here.add(command)
+        before |= here
+
+
+def test_every_group_of_plug_ins_has_a_page() -> None:
+    from tacpipe.plugins import registry
+
+    text = (docs.ROOT / "docs" / "extending" / "index.md").read_text()
+    apart = {
+        registry.EXPORTS,
+        registry.DEMOS,
+        registry.COMMANDS,
+    }  # exports are stages; the others are parts of tasks and packages
+    assert {group for group in registry.GROUPS if f"`{group}`" not in text} == apart
+    assert {page.name for page in docs.EXTENDING} == {
+        page.name for page in (docs.ROOT / "docs" / "extending").glob("*.md") if page.name != "index.md"
+    }
