@@ -19,6 +19,7 @@ from tacpipe.models.level import Level
 from tacpipe.models.minirocket_classifier import MinirocketClassifier
 from tacpipe.models.recurrent_autoencoder import Shape
 from tacpipe.models.spatial_spectrum import Bands
+from tacpipe.models.statistics_classifier import StatisticsClassifier, View
 from tacpipe.models.tensors import under
 from tacpipe.models.transfer import Transfer
 from tacpipe.plugins import params as params_of
@@ -40,10 +41,14 @@ NEEDED = {
     "architecture": str,
 }
 CONFIG, WEIGHTS, LAST, BASELINES = "config.json", "model.safetensors", "last.safetensors", "baselines.safetensors"
-ROCKET, SPECTRA = "minirocket", "spectra"
+ROCKET, STATISTICS, SPECTRA = "minirocket", "statistics", "spectra"
 MEAN_LEVEL, PERMUTED_LABELS = "mean_level", "permuted_labels"
+LEVEL_VIEWS: dict[str, View] = {"level_only": "level", "level_removed": "level_removed"}  # of statistics
 
 Config = dict[str, Any]
+ReadoutModel = MinirocketClassifier | StatisticsClassifier
+Baseline = Level | ReadoutModel
+READOUTS: dict[str, type[ReadoutModel]] = {ROCKET: MinirocketClassifier, STATISTICS: StatisticsClassifier}
 
 
 @dataclass(frozen=True)
@@ -84,15 +89,15 @@ class NetworkReader:
 
 
 @dataclass(frozen=True)
-class RocketReader:
-    """Convolutional features and a linear readout of one sensor."""
+class ReadoutReader:
+    """Features and a linear readout of one sensor."""
 
-    strong: MinirocketClassifier
+    fitted: ReadoutModel
     classes: tuple[int, ...]
 
     def read(self, frames: Float32s) -> ReaderOutput:
         """Return the readout's scores of slides (slide, time, channel) in device counts."""
-        return ReaderOutput(spread(self.strong.scores(frames), self.strong.classes, self.classes), None)
+        return ReaderOutput(spread(self.fitted.scores(frames), self.fitted.classes, self.classes), None)
 
 
 @dataclass(frozen=True)
@@ -115,7 +120,7 @@ class SpectraReader:
         return spread(self.transfer.expected.scores(latents), self.transfer.classes, self.classes)
 
 
-Reader = NetworkReader | RocketReader | SpectraReader
+Reader = NetworkReader | ReadoutReader | SpectraReader
 
 
 class Classifier:
@@ -176,7 +181,7 @@ class Classifier:
         """Return a probability of each class (slide, class), in the order of ``classes``: the softmax of `scores`.
 
         Networks are trained so that it is the probability that they give each class; of ``spectra`` it is that of each
-        material if all are as likely. Scores of ``minirocket`` are distances to class means of no fixed scale: there it only
+        material if all are as likely. Scores of ``minirocket`` and ``statistics`` are distances to class means of no fixed scale: there it only
         orders the classes. See `predict` for the arguments.
         """
         scores = self.scores(slides, sensor).astype(np.float64)
@@ -254,11 +259,10 @@ class Classifier:
         return partner
 
     def _readers(self, content: bytes, file: str) -> dict[str, Reader]:
-        if self.architecture == ROCKET:
-            arrays = model_files.arrays(content, file, but=CHOSEN)
+        if self.architecture in READOUTS:
+            arrays, kind = model_files.arrays(content, file, but=CHOSEN), READOUTS[self.architecture]
             return {
-                name: RocketReader(MinirocketClassifier.from_tensors(under(f"{name}.", arrays)), self.classes)
-                for name in self.layouts
+                name: ReadoutReader(kind.from_tensors(under(f"{name}.", arrays)), self.classes) for name in self.layouts
             }
         if self.architecture == SPECTRA:
             arrays, stored = model_files.arrays(content, file), self.config["spectra"]
@@ -285,11 +289,12 @@ class Classifier:
             readers[name] = NetworkReader(cast(Network, network), Affine.from_tensors(scaling))
         return readers
 
-    def _baselines(self, content: bytes) -> dict[str, dict[str, Level | MinirocketClassifier]]:
+    def _baselines(self, content: bytes) -> dict[str, dict[str, Baseline]]:
         """Return the baselines by name and sensor."""
         arrays = model_files.arrays(content, BASELINES, but=CHOSEN)
-        permuted = MinirocketClassifier if self.architecture == ROCKET else Level
-        kinds: dict[str, type[Level] | type[MinirocketClassifier]] = {MEAN_LEVEL: Level, PERMUTED_LABELS: permuted}
+        kinds: dict[str, type[Baseline]] = {MEAN_LEVEL: Level, PERMUTED_LABELS: READOUTS.get(self.architecture, Level)}
+        if self.architecture == STATISTICS:
+            kinds |= dict.fromkeys(LEVEL_VIEWS, StatisticsClassifier)
         return {
             kind: {name: cls.from_tensors(under(f"{kind}.{name}.", arrays)) for name in self.layouts}
             for kind, cls in kinds.items()
