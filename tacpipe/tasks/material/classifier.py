@@ -181,8 +181,8 @@ class Classifier:
         """Return a probability of each class (slide, class), in the order of ``classes``: the softmax of `scores`.
 
         Networks are trained so that it is the probability that they give each class; of ``spectra`` it is that of each
-        material if all are as likely. Scores of ``minirocket`` and ``statistics`` are distances to class means of no fixed scale: there it only
-        orders the classes. See `predict` for the arguments.
+        material if all are as likely. Scores of ``minirocket`` and ``statistics`` are distances to class means of no fixed
+        scale: there it only orders the classes. See `predict` for the arguments.
         """
         scores = self.scores(slides, sensor).astype(np.float64)
         weights = np.exp(scores - scores.max(axis=1, keepdims=True))
