@@ -92,7 +92,8 @@ def statistics(x: AnyFloats) -> Float32s:
     In this order, each of all channels and of the six across them (mean, standard deviation, quantiles of `ACROSS`), of
     the root of each value, its sign kept: the mean over time; the standard deviation; the mean absolute step; the quantiles
     of `OVER`; the lowest and the highest value; the roughness, which is the mean absolute change of the step as a ratio to
-    the mean absolute step, 0 without steps; the fraction of frames in which the value is 0; the mean of each third of the slide.
+    the mean absolute step, 0 without steps; the fraction of frames in which the value is 0; the mean of each third of the
+    slide.
     Raises `TacpipeError` for slides of fewer than three frames, without channels, or with values that are not finite.
     """
     _check(x)
