@@ -110,7 +110,7 @@ def _grow(params: Trees, config: Config, tensors: dict[str, Tensor], known: Gras
         require_colours(known.names, known.clouds)
     rows, names = geometry.table(known.clouds, known.grasps, coloured=coloured, placed=params.place)
     readings = {target: known.readings[target] for target in targets}
-    groups = [(target,) for target in targets]
+    groups: list[tuple[str, ...]] = [(target,) for target in targets]
     if params.architecture == "tree-ensemble" and len(targets) > 1:
         groups.append(tuple(targets))
     forests, leaves = _forests(params, rows, readings, groups)
