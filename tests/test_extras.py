@@ -92,6 +92,7 @@ LACK = {  # and for each that does need one, with that extra
     "ingest hdf5 arrays --guess": "hdf5",
     "ingest zarr stores --layout rate.toml -o {o}": "zarr",
     "ingest zarr stores --layout rate.toml --dry-run": "zarr",
+    "limits data/grasps": "learn",
     "candidates bottle.ply": "clouds",
     "candidates bottle.ply --picture {o}.png": "clouds",
     "ingest mcap bags -o {o}": "ros",

@@ -25,6 +25,7 @@ SUMMARIES = {
     "sensors": "List, probe and emulate sensors.",
     "store": "Manage what keeps the bytes: verify, repair, push, pull.",
     "candidates": "List grasps on an object, with the predicted touch of each.",
+    "limits": "Measure what limits the prediction of touch.",
     "demo": "Run a whole pipeline on simulated recordings.",
     "version": "Show the versions of tacpipe, Python and libraries.",
 }
@@ -202,6 +203,12 @@ def _candidates(program: typer.Typer) -> None:
     candidates.add(program, SUMMARIES["candidates"])
 
 
+def _limits(program: typer.Typer) -> None:
+    from tacpipe.cli import limits
+
+    limits.add(program, SUMMARIES["limits"])
+
+
 def _view(program: typer.Typer) -> None:
     from tacpipe.cli import view
 
@@ -237,6 +244,7 @@ NAMES: dict[str, Callable[[typer.Typer], None]] = {
     "sensors": _sensors,
     "store": _store,
     "candidates": _candidates,
+    "limits": _limits,
     "demo": _demo,
     "version": _version,
 }

@@ -99,7 +99,7 @@ def _show(store: Store, wanted: Change, directory: Path) -> None:
             adoption.adopt(store, directory, before)
         deliver(store, directory, manifest, lasting=lasting)
         store.roots.set(directory, manifest.content_digest, durable=True, lasting=lasting)
-        store.fetch(objects[path] for path in stale)
+        store.fetch(stale.values())
         sweep(directory, shards=bool(stale), deep=manifest.exported)
         for path in stale:
             with contextlib.suppress(*([MissingError] if path in wanted.may_lack else [])):

@@ -38,7 +38,17 @@ Files = dict[str, bytes]
 SMALL = GIB  # memory that refusing a model may take
 ALL = {"targets": "pdc_th,pdc_mf,e_th,e_mf"}
 TASKS: Mapping[str, Any] = {"forward": forward, "material": material, "touch": touch}
-KINDS = ("forward recurrent", "touch strong", "forward gru", "material minirocket", "material raec", "touch pointnet")
+KINDS = (
+    *(
+        "forward recurrent",
+        "touch strong",
+        "forward gru",
+        "material minirocket",
+        "material statistics",
+        "material raec",
+    ),
+    "touch pointnet",
+)
 
 
 @functools.cache
@@ -60,7 +70,7 @@ def made(kind: str) -> Files:
     if task == "forward":
         return dict(trials.trained(folder, architecture=architecture, epochs=1))
     if task == "material":
-        short = {} if architecture == "minirocket" else {"epochs": 1}
+        short = {} if architecture in ("minirocket", "statistics") else {"epochs": 1}
         return dict(textures.trained(folder, architecture=architecture, **short))
     changed = {**handmade.POINTNET, **ALL, "epochs": 1} if architecture == "pointnet" else {}
     return dict(handmade.trained(folder, **changed))

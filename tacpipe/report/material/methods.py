@@ -15,7 +15,13 @@ from tacpipe.report.material.predictions import Predictions
 
 SENSORS = {"biotac": "BioTac", "roboskin": "RoboSkin"}
 USUAL = (("elsewhere", False), ("elsewhere", True), ("layout", "time"))  # settings that no name states
-_ARCHITECTURES = {"minirocket": "MiniRocket", "x-lstm": "X-LSTM", "raec": "RAEC", "spectra": "spatial spectra"}
+_ARCHITECTURES = {
+    "minirocket": "MiniRocket",
+    "statistics": "statistics",
+    "x-lstm": "X-LSTM",
+    "raec": "RAEC",
+    "spectra": "spatial spectra",
+}
 _PLAIN = {
     "pairing": ("random", "fixed"),
     "labels": ("true",),
@@ -28,6 +34,7 @@ _PLAIN = {
 _NO_METHOD = ("seed", "fold", "sensors", "baselines", "patience", "run_label", "quantities")
 _CLOSED = {  # all that has an effect on what is fitted in closed form
     "minirocket": ("features", "use_validation", "labels"),
+    "statistics": ("use_validation", "labels"),
     "spectra": ("speeds", "use_validation", "labels", "hold_out"),
 }
 _RAECS = ("decoder", "unpool", "reconstruction_weight", "latents")  # of no effect on X-LSTM
@@ -67,7 +74,11 @@ class Result(contents.Result):
     def learned(self) -> Mapping[str, int]:
         """The number of slides that the model learned from, by sensor: a readout also learns from those of validation."""
         params = self.params
-        if self.architecture == "minirocket" and params.get("use_validation") and params.get("labels") != "permuted":
+        if (
+            self.architecture in ("minirocket", "statistics")
+            and params.get("use_validation")
+            and params.get("labels") != "permuted"
+        ):
             watched = self.config["counts"].get("val", {})
             return {sensor: count + watched.get(sensor, 0) for sensor, count in self.trained.items()}
         batch, percent = int(params.get("batch", 32)), int(params.get("subsample_percent", 100))
@@ -221,7 +232,7 @@ def _settings(run: Result) -> dict[str, Any]:
         "labels": str(params.get("labels", "true")),
         "subsample_sensor": str(params.get("subsample_sensor", "")) if ratio < 100 else "",
         "subsample_percent": ratio if params.get("subsample_sensor") else 100,
-        "hold_out": "" if architecture == "minirocket" else str(params.get("hold_out", "")),
+        "hold_out": "" if architecture in ("minirocket", "statistics") else str(params.get("hold_out", "")),
         "vibration": "vibration" in config.get("quantities", str(params.get("quantities", "")).split(","))
         and "vibration" not in config.get("absent", ()),
         "layout": layout,

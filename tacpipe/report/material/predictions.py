@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 
 MODEL, LEVEL, SWAPPED, LAST = "model", "mean_level", "swapped", "last_epoch"
 SHUFFLED = "permuted_labels"
-PREDICTORS = (MODEL, LEVEL, SHUFFLED, SWAPPED, LAST)
+LEVEL_ONLY, LEVEL_REMOVED = "level_only", "level_removed"  # of the architecture statistics
+PREDICTORS = (MODEL, LEVEL, LEVEL_ONLY, LEVEL_REMOVED, SHUFFLED, SWAPPED, LAST)
 NOTHING = -1  # stands where a predictor stated nothing of a slide
 
 

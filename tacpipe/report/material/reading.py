@@ -11,7 +11,16 @@ from tacpipe.comparison.runs import Errors, Question, Run
 from tacpipe.comparison.specification import Kind
 from tacpipe.report.material import methods
 from tacpipe.report.material.methods import Result
-from tacpipe.report.material.predictions import LAST, LEVEL, MODEL, NOTHING, SHUFFLED, SWAPPED
+from tacpipe.report.material.predictions import (
+    LAST,
+    LEVEL,
+    LEVEL_ONLY,
+    LEVEL_REMOVED,
+    MODEL,
+    NOTHING,
+    SHUFFLED,
+    SWAPPED,
+)
 from tacpipe.tasks.material import headline
 
 if TYPE_CHECKING:
@@ -20,11 +29,20 @@ if TYPE_CHECKING:
 
 CALLED = {
     LEVEL: headline.BASELINES[LEVEL],
+    LEVEL_ONLY: headline.BASELINES[LEVEL_ONLY],
+    LEVEL_REMOVED: "same readout, level removed",
     SHUFFLED: "trained on shuffled labels",
     SWAPPED: "classifiers exchanged",
     LAST: "last epoch",
 }
-KINDS: dict[str, Kind] = {MODEL: "model", LEVEL: "baseline", headline.CHANCE: "baseline", SHUFFLED: "control"}
+KINDS: dict[str, Kind] = {
+    MODEL: "model",
+    LEVEL: "baseline",
+    LEVEL_ONLY: "baseline",
+    headline.CHANCE: "baseline",
+    SHUFFLED: "control",
+    LEVEL_REMOVED: "control",
+}
 
 
 def read(results: Sequence[Dataset]) -> list[Run]:

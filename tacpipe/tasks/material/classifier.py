@@ -18,6 +18,7 @@ from tacpipe.models.level import Level
 from tacpipe.models.minirocket_classifier import MinirocketClassifier
 from tacpipe.models.recurrent_autoencoder import Shape
 from tacpipe.models.spatial_spectrum import Bands
+from tacpipe.models.statistics_classifier import StatisticsClassifier, View
 from tacpipe.models.tensors import under
 from tacpipe.models.transfer import Transfer
 from tacpipe.plugins import params as params_of
@@ -42,10 +43,14 @@ NEEDED = {
 }
 CONFIG, WEIGHTS, LAST, BASELINES = "config.json", "model.safetensors", "last.safetensors", "baselines.safetensors"
 ESTIMATORS, SHUFFLED_ESTIMATORS = "model.skops", "baselines.skops"
-ROCKET, SPECTRA = "minirocket", "spectra"
+ROCKET, STATISTICS, SPECTRA = "minirocket", "statistics", "spectra"
 MEAN_LEVEL, PERMUTED_LABELS = "mean_level", "permuted_labels"
+LEVEL_VIEWS: dict[str, View] = {"level_only": "level", "level_removed": "level_removed"}  # of statistics
 
 Config = dict[str, Any]
+ReadoutModel = MinirocketClassifier | StatisticsClassifier
+Baseline = Level | ReadoutModel | Fitted
+READOUTS: dict[str, type[ReadoutModel]] = {ROCKET: MinirocketClassifier, STATISTICS: StatisticsClassifier}
 
 
 @dataclass(frozen=True)
@@ -86,15 +91,15 @@ class NetworkReader:
 
 
 @dataclass(frozen=True)
-class RocketReader:
-    """Convolutional features and a linear readout of one sensor."""
+class ReadoutReader:
+    """Features and a linear readout of one sensor."""
 
-    strong: MinirocketClassifier
+    fitted: ReadoutModel
     classes: tuple[int, ...]
 
     def read(self, frames: Float32s) -> ReaderOutput:
         """Return the readout's scores of slides (slide, time, channel) in device counts."""
-        return ReaderOutput(spread(self.strong.scores(frames), self.strong.classes, self.classes), None)
+        return ReaderOutput(spread(self.fitted.scores(frames), self.fitted.classes, self.classes), None)
 
 
 @dataclass(frozen=True)
@@ -129,8 +134,7 @@ class EstimatorReader:
         return ReaderOutput(spread(self.fitted.scores(frames), self.fitted.classes, self.classes), None)
 
 
-Reader = NetworkReader | RocketReader | SpectraReader | EstimatorReader
-Baseline = Level | MinirocketClassifier | Fitted
+Reader = NetworkReader | ReadoutReader | SpectraReader | EstimatorReader
 
 
 class Classifier:
@@ -195,8 +199,8 @@ class Classifier:
         """Return a probability of each class (slide, class), in the order of ``classes``: the softmax of `scores`.
 
         Networks are trained so that it is the probability that they give each class; of ``spectra`` it is that of each
-        material if all are as likely. Scores of ``minirocket`` are distances to class means of no fixed scale: there it only
-        orders the classes. See `predict` for the arguments.
+        material if all are as likely. Scores of ``minirocket`` and ``statistics`` are distances to class means of no fixed
+        scale: there it only orders the classes. See `predict` for the arguments.
         """
         scores = self.scores(slides, sensor).astype(np.float64)
         weights = np.exp(scores - scores.max(axis=1, keepdims=True))
@@ -273,11 +277,10 @@ class Classifier:
         return partner
 
     def _readers(self, content: bytes, file: str) -> dict[str, Reader]:
-        if self.architecture == ROCKET:
-            arrays = model_files.arrays(content, file, but=CHOSEN)
+        if self.architecture in READOUTS:
+            arrays, kind = model_files.arrays(content, file, but=CHOSEN), READOUTS[self.architecture]
             return {
-                name: RocketReader(MinirocketClassifier.from_tensors(under(f"{name}.", arrays)), self.classes)
-                for name in self.layouts
+                name: ReadoutReader(kind.from_tensors(under(f"{name}.", arrays)), self.classes) for name in self.layouts
             }
         if self.architecture == SPECTRA:
             arrays, stored = model_files.arrays(content, file), self.config["spectra"]
@@ -309,19 +312,19 @@ class Classifier:
     def _baselines(self, files: Mapping[str, bytes]) -> dict[str, dict[str, Baseline]]:
         """Return the baselines by name and sensor."""
         arrays = model_files.arrays(files[BASELINES], BASELINES, but=CHOSEN)
-        found: dict[str, dict[str, Baseline]] = {
-            MEAN_LEVEL: {name: Level.from_tensors(under(f"{MEAN_LEVEL}.{name}.", arrays)) for name in self.layouts}
-        }
+        kinds: dict[str, type[Level | ReadoutModel]] = {MEAN_LEVEL: Level}
+        shuffled: dict[str, Fitted] = {}
         if isinstance(self.params, Estimator):
             shuffled = self._estimators(files[SHUFFLED_ESTIMATORS], SHUFFLED_ESTIMATORS, self.params)
-            return {**found, PERMUTED_LABELS: {**shuffled}}
-        permuted = MinirocketClassifier if self.architecture == ROCKET else Level
-        return {
-            **found,
-            PERMUTED_LABELS: {
-                name: permuted.from_tensors(under(f"{PERMUTED_LABELS}.{name}.", arrays)) for name in self.layouts
-            },
+        else:
+            kinds[PERMUTED_LABELS] = READOUTS.get(self.architecture, Level)
+        if self.architecture == STATISTICS:
+            kinds |= dict.fromkeys(LEVEL_VIEWS, StatisticsClassifier)
+        found: dict[str, dict[str, Baseline]] = {
+            kind: {name: cls.from_tensors(under(f"{kind}.{name}.", arrays)) for name in self.layouts}
+            for kind, cls in kinds.items()
         }
+        return {**found, PERMUTED_LABELS: {**shuffled}} if shuffled else found
 
 
 def spread(scores: Float32s, known: Any, classes: tuple[int, ...]) -> Float32s:

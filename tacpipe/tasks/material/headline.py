@@ -14,7 +14,8 @@ from tacpipe.metrics.pairing import Measure, Sums
 
 TASK = "material"
 CHANCE = "chance"
-BASELINES = {"mean_level": "mean level alone"}  # predictors that are baselines; others are controls or the model's own
+# predictors that are baselines; others are controls or the model's own
+BASELINES = {"mean_level": "mean level alone", "level_only": "same readout of the level alone"}
 
 
 def headline(

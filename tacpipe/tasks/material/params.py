@@ -46,7 +46,7 @@ class Material:
     ARCHITECTURES: ClassVar[str] = "material"  # the task, as entry points name it
     architecture: str = "minirocket"
     sensors: Names = ""  # sensors to learn for; empty for all
-    # quantities to read; empty: tactile, and for minirocket also vibration (22 readings a frame)
+    # quantities to read; empty: tactile, and for minirocket and statistics also vibration (22 readings a frame)
     quantities: Names = ""
     # label of this run in a report, next to others of the same method, as blocked
     run_label: Annotated[str, StoredAs("setting")] = ""
@@ -82,6 +82,15 @@ class Minirocket(Material):
     features: Annotated[int, Range(84)] = 10_000  # of each sensor
     use_validation: bool = True  # learn from validation slides too: nothing is chosen by them
     PRESETS: ClassVar[Presets] = {"quick": {"features": 1_000}}
+
+
+@dataclass(frozen=True)
+class Statistics(Material):
+    """Statistics of each channel and a linear readout, of each sensor alone: for sensors with few slides."""
+
+    # statistics: statistics of each channel and a linear readout, for few slides
+    architecture: Literal["statistics"] = "statistics"
+    use_validation: bool = True  # learn from validation slides too: nothing is chosen by them
 
 
 @dataclass(frozen=True)

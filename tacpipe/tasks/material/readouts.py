@@ -13,22 +13,25 @@ from tacpipe.models import transfer
 from tacpipe.models.level import Level
 from tacpipe.models.minirocket_classifier import MinirocketClassifier
 from tacpipe.models.spatial_spectrum import Bands, Sampling
+from tacpipe.models.statistics_classifier import StatisticsClassifier
 from tacpipe.models.transfer import Transfer
 from tacpipe.plugins.constraints import Assignments
 from tacpipe.tasks.material.classifier import (
     BASELINES,
     CONFIG,
     ESTIMATORS,
+    LEVEL_VIEWS,
     MEAN_LEVEL,
     PERMUTED_LABELS,
     SHUFFLED_ESTIMATORS,
     WEIGHTS,
+    Baseline,
     Config,
 )
 from tacpipe.tasks.material.estimators import Fitted
 from tacpipe.tasks.material.estimators import packed as packed_estimators
 from tacpipe.tasks.material.naming import Naming
-from tacpipe.tasks.material.params import Estimator, Minirocket, Params, Spectra
+from tacpipe.tasks.material.params import Estimator, Minirocket, Params, Spectra, Statistics
 from tacpipe.tasks.material.slides import Slides
 
 BySensor = Mapping[str, Slides]
@@ -66,6 +69,26 @@ def estimators(params: Estimator, config: Config, known: BySensor, watched: BySe
     if params.baselines:
         files |= {BASELINES: packed(levels), SHUFFLED_ESTIMATORS: packed_estimators(shuffled, params)}
     return files
+
+
+def statistics(params: Statistics, config: Config, known: BySensor, watched: BySensor) -> dict[str, bytes]:
+    """Return the files of a model of statistics and a readout, of each sensor alone.
+
+    Its baselines are those of all models and the same readout of the level alone and of slides without their level.
+    """
+    tensors: Arrays = {}
+    baselines: Arrays = {}
+    for place, (name, some) in enumerate(known.items()):
+        frames, materials = _labelled(params, some, watched.get(name), place)
+        fitted = StatisticsClassifier.fit(frames, materials)
+        tensors |= {f"{name}.{key}": value for key, value in fitted.to_tensors().items()}
+        if params.baselines:
+            shuffled = np.random.default_rng([params.seed, 3, place]).permutation(materials)
+            baselines |= stored(MEAN_LEVEL, name, Level.fit(frames, materials))
+            baselines |= stored(PERMUTED_LABELS, name, StatisticsClassifier.fit(frames, shuffled))
+            for kind, view in LEVEL_VIEWS.items():
+                baselines |= stored(kind, name, StatisticsClassifier.fit(frames, materials, view=view))
+    return _files(config, tensors, baselines)
 
 
 def spectra(
@@ -140,7 +163,7 @@ def _samplings(speeds: str, known: BySensor) -> dict[str, Sampling]:
 
 
 def _labelled(
-    params: Minirocket | Spectra | Estimator, some: Slides, watched: Slides | None, place: int
+    params: Minirocket | Statistics | Spectra | Estimator, some: Slides, watched: Slides | None, place: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the frames and materials to learn from: those of validation too, where params ask for it."""
     frames, materials = some.frames, permuted(params, some.materials, place)
@@ -157,7 +180,7 @@ def permuted(params: Params, materials: np.ndarray, place: int) -> np.ndarray:
     return np.random.default_rng([params.seed, 2, place]).permutation(materials)
 
 
-def stored(kind: str, sensor: str, fitted: Level | MinirocketClassifier) -> Arrays:
+def stored(kind: str, sensor: str, fitted: Baseline) -> Arrays:
     """Return the tensors of a baseline, under names that no other has."""
     return {f"{kind}.{sensor}.{key}": value for key, value in fitted.to_tensors().items()}
 

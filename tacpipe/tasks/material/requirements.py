@@ -19,7 +19,7 @@ REQUIREMENTS = Requirements(
         Channels(
             "vibration",
             (),
-            "any number of columns of the same stream, which minirocket reads too",
+            "any number of columns of the same stream, which minirocket and statistics read too",
             "tactile channels alone are read",
         ),
         Channels(

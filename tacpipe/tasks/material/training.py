@@ -29,6 +29,7 @@ from tacpipe.tasks.material.classifier import (
     MEAN_LEVEL,
     PERMUTED_LABELS,
     ROCKET,
+    STATISTICS,
     TASK,
     WEIGHTS,
     Classifier,
@@ -38,7 +39,7 @@ from tacpipe.tasks.material.classifier import (
 from tacpipe.tasks.material.losses import JointWork, ScaledSlides, Weights
 from tacpipe.tasks.material.naming import NUMBERS, UNKNOWN, Naming
 from tacpipe.tasks.material.pairs import NONE, Pairs, permuted_classes
-from tacpipe.tasks.material.params import Estimator, Minirocket, Params, Raec, Spectra
+from tacpipe.tasks.material.params import Estimator, Minirocket, Params, Raec, Spectra, Statistics
 from tacpipe.tasks.material.params import Network as NetworkParams
 from tacpipe.tasks.material.slides import Slides
 from tacpipe.tasks.seen import seen
@@ -50,7 +51,9 @@ if TYPE_CHECKING:
 
 HISTORY = "history.jsonl"
 RAEC = "raec"
-QUANTITIES = {ROCKET: (slides_of.TACTILE, "vibration")}  # that are read where params name none
+QUANTITIES = dict.fromkeys(
+    (ROCKET, STATISTICS), (slides_of.TACTILE, "vibration")
+)  # that are read where params name none
 MAPPED_RECONSTRUCTION = 0.05  # weight of a network that is aligned to a frozen one: that of the published script
 
 BySensor = Mapping[str, Slides]
@@ -108,6 +111,8 @@ def train(
     }
     if isinstance(params, Minirocket):
         return readouts.rockets(params, config, known, watched)
+    if isinstance(params, Statistics):
+        return readouts.statistics(params, config, known, watched)
     if isinstance(params, Spectra):
         return readouts.spectra(params, config, known, watched, held_out(params.hold_out, classes, known, naming))
     if isinstance(params, Estimator):

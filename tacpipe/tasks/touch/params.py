@@ -50,7 +50,18 @@ class Touch:
     use_validation: bool = True  # learn from validation grasps too where nothing is chosen by them
     PANELS: ClassVar[Panels] = {
         "Model": (
-            *("architecture", "inputs", "place", "trees", "leaf", "multi_target", "networks", "points", "draws"),
+            *(
+                "architecture",
+                "inputs",
+                "place",
+                "trees",
+                "leaf",
+                "shrink_novel",
+                "multi_target",
+                "networks",
+                "points",
+                "draws",
+            ),
             *("backbone", "radius_mm", "hidden", "dropout", "normalisation", "wrist", "head", "transform"),
         ),
         "Training": (
@@ -73,6 +84,8 @@ class Trees(Touch):
     place: bool = False  # read where the grasp is before the camera too, not its shape alone
     trees: PositiveInt = 300  # of each target's forest
     leaf: NonNegativeInt = 0  # fewest training grasps of a leaf; 0: chosen of 2, 4 and 8 by out-of-bag error
+    # shrink predictions for objects not trained on towards the constant, as far as errs least on training objects left out
+    shrink_novel: bool = added(False)
     PRESETS: ClassVar[Presets] = {"quick": {"trees": 100}}
 
 

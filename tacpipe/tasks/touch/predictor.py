@@ -23,6 +23,7 @@ from tacpipe.tasks.touch import members
 from tacpipe.tasks.touch.baselines import Baselines
 from tacpipe.tasks.touch.grasps import Grasps, check
 from tacpipe.tasks.touch.params import Params
+from tacpipe.tasks.touch.shrinkage import Shrinkage
 from tacpipe.training import devices
 from tacpipe.training.scaling import Affine
 
@@ -31,6 +32,7 @@ Config = dict[str, Any]
 TASK = "touch"
 CONFIG, WEIGHTS, HISTORY, BASELINES = "config.json", "model.safetensors", "history.jsonl", "baselines.safetensors"
 FOREST, NETWORK = "forest", "network"
+SHRINKAGE = "shrinkage."  # begins the names of its tensors
 NEEDED = {
     **dict.fromkeys(("members", "targets", "objects"), list),
     "params": dict,
@@ -61,6 +63,7 @@ class Predictor:
     members: Sequence[members.Member]
     baselines: Baselines | None
     chain: Chain | None = None  # the stages that it was trained behind; None: unknown
+    shrinkage: Shrinkage | None = None  # of predictions for objects that it was not trained on
 
     @classmethod
     def load(cls, files: Mapping[str, bytes], chain: Chain | None = None) -> Self:
@@ -85,7 +88,9 @@ class Predictor:
                 baselines.check()
             if not config["targets"] or {*config["targets"]} != {target for one in found for target in one.targets}:
                 raise ValueError(f"its members do not predict {excerpt(config['targets'])}")
-        return cls(params, config, found, baselines, chain)
+            shrunk = {name: value.numpy() for name, value in under(SHRINKAGE, tensors).items()}
+            shrinkage = Shrinkage.from_tensors(shrunk, config["targets"]) if shrunk else None
+        return cls(params, config, found, baselines, chain, shrinkage)
 
     @cached_property
     def targets(self) -> tuple[str, ...]:
@@ -95,10 +100,17 @@ class Predictor:
     def predict_grasps(self, grasps: Grasps) -> dict[str, Floats]:
         """Return the predicted reading by target (grasp, value), device counts: the mean of the members.
 
+        With a shrinkage, those of grasps without an object that the model was trained on are shrunk.
+
         Raises `TacpipeError` where a grasp lacks what the model reads: colours, points, the wrist.
         """
         found = members.averaged((member.targets, member.predict(grasps)) for member in self.members)
-        return {target: found[target] for target in self.targets}
+        predicted = {target: found[target] for target in self.targets}
+        if self.shrinkage is None:
+            return predicted
+        return self.shrinkage.apply(
+            predicted, np.array([name not in self.config["objects"] for name in grasps.objects])
+        )
 
     def predict_all(self, cloud: Cloud, grasps: Sequence[Grasp]) -> list[Touch]:
         """Return the touch of several grasps on one cloud, in one pass; `model.TouchModel.predict` describes both."""

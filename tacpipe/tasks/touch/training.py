@@ -15,7 +15,7 @@ from safetensors.numpy import save as save_arrays
 from safetensors.torch import save as save_tensors
 from torch import Tensor, nn
 
-from tacpipe.arrays import Floats
+from tacpipe.arrays import Bools, Floats
 from tacpipe.channels import biotac_sp
 from tacpipe.clouds import geometry
 from tacpipe.errors import TacpipeError
@@ -23,14 +23,14 @@ from tacpipe.models.forest import Forest
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins.constraints import CommaList
 from tacpipe.tasks.touch import grasps as grasps_of
-from tacpipe.tasks.touch import members
+from tacpipe.tasks.touch import members, shrinkage
 from tacpipe.tasks.touch.baselines import Baselines
 from tacpipe.tasks.touch.grasps import Grasps
 from tacpipe.tasks.touch.losses import Drawn, ScaledGrasps, TouchWork
 from tacpipe.tasks.touch.members import NetworkParams
 from tacpipe.tasks.touch.params import Params, Trees
 from tacpipe.tasks.touch.patches import require_colours
-from tacpipe.tasks.touch.predictor import BASELINES, CONFIG, FOREST, HISTORY, NETWORK, TASK, WEIGHTS
+from tacpipe.tasks.touch.predictor import BASELINES, CONFIG, FOREST, HISTORY, NETWORK, SHRINKAGE, TASK, WEIGHTS
 from tacpipe.training import devices, loop
 from tacpipe.training.scaling import Affine
 
@@ -114,20 +114,42 @@ def _grow(params: Trees, config: Config, tensors: dict[str, Tensor], known: Gras
     if coloured:
         require_colours(known.names, known.clouds)
     rows, names = geometry.table(known.clouds, known.grasps, coloured=coloured, placed=params.place)
-    groups = [[target] for target in targets]
+    readings = {target: known.readings[target] for target in targets}
+    groups: list[tuple[str, ...]] = [(target,) for target in targets]
     if params.architecture == "tree-ensemble" and len(targets) > 1:
-        groups.append(list(targets))
-    about: dict[str, Any] = {"kind": FOREST, "targets": list(targets), "groups": groups, "features": list(names)}
-    about |= {"coloured": coloured, "placed": params.place, "leaves": []}
+        groups.append(tuple(targets))
+    forests, leaves = _forests(params, rows, readings, groups)
+    about: dict[str, Any] = {"kind": FOREST, "targets": list(targets), "groups": [*map(list, groups)]}
+    about |= {"features": list(names), "coloured": coloured, "placed": params.place, "leaves": leaves}
     kept: dict[str, Tensor] = {}
-    for number, group in enumerate(groups):
-        values = _side_by_side(known, group)
+    for number, (_, forest) in enumerate(forests):
+        kept |= {f"{number}.{name}": tensor for name, tensor in forest.tensors().items()}
+    _add(config, tensors, about, kept)
+    if params.shrink_novel:
+
+        def predict(among: Bools) -> dict[str, Floats]:
+            own = {target: values[among] for target, values in readings.items()}
+            found, _ = _forests(params, rows[among], own, groups)
+            return members.averaged((group, forest.predict(rows[~among])) for group, forest in found)
+
+        shrunk = shrinkage.fit(readings, known.objects, predict)
+        config["kept_of_novel"] = dict(shrunk.kept)
+        tensors.update({f"{SHRINKAGE}{name}": torch.from_numpy(one) for name, one in shrunk.tensors().items()})
+
+
+def _forests(
+    params: Trees, rows: Floats, readings: Mapping[str, Floats], groups: Sequence[tuple[str, ...]]
+) -> tuple[list[tuple[tuple[str, ...], Forest]], list[int]]:
+    """Return the forest of each group of targets, which predicts their values side by side, and the sizes of leaves."""
+    found, leaves = [], []
+    for group in groups:
+        values = np.concatenate([readings[target] for target in group], axis=1)
         unit = members.units(values, group)
         leaf = params.leaf or _leaf(rows, values / unit, params)
         forest = Forest.fitted(rows, values / unit, trees=params.trees, leaf=leaf, seed=params.seed)
-        about["leaves"].append(leaf)
-        kept |= {f"{number}.{name}": tensor for name, tensor in forest.times(unit).tensors().items()}
-    _add(config, tensors, about, kept)
+        found.append((group, forest.times(unit)))
+        leaves.append(leaf)
+    return found, leaves
 
 
 def _leaf(rows: Floats, values: Floats, params: Trees) -> int:

@@ -14,9 +14,13 @@ import torch
 from safetensors.torch import load as load_tensors
 
 from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.metrics import headline
 from tacpipe.metrics.proportions import wilson
+from tacpipe.models.statistics_classifier import StatisticsClassifier, View
 from tacpipe.plugins import given_params, registry
+from tacpipe.tasks.material import headline as headlines
 from tacpipe.tasks.material import losses
+from tacpipe.tasks.material import slides as slides_of
 from tacpipe.tasks.material import task as material
 from tacpipe.tasks.material.classifier import BASELINES, CONFIG, LAST, WEIGHTS
 from tacpipe.training import loop
@@ -30,7 +34,9 @@ def predictions(result: Any) -> dict[str, list[Any]]:
     return found
 
 
-@pytest.mark.parametrize("changed", [{}, RAEC, {"architecture": "x-lstm"}, {**RAEC, "joint": False}])
+@pytest.mark.parametrize(
+    "changed", [{}, {"architecture": "statistics"}, RAEC, {"architecture": "x-lstm"}, {**RAEC, "joint": False}]
+)
 def test_every_unseen_slide_of_every_sensor_is_counted(tmp_path: Path, changed: dict[str, Any]) -> None:
     metrics, result = evaluated(trained(tmp_path, **changed), slides(8, 3))
     rows = predictions(result)
@@ -55,6 +61,18 @@ def test_the_strong_classifier_names_textures_that_it_can_tell_apart(tmp_path: P
     metrics, _ = evaluated(trained(tmp_path), slides(8, 3))
     assert metrics["model"]["accuracy"] == {"biotac": 1.0, "roboskin": 1.0}
     assert metrics["permuted_labels"]["accuracy"]["biotac"] < 0.7
+
+
+def test_statistics_are_compared_with_the_same_readout_of_the_level_alone_and_without_it(tmp_path: Path) -> None:
+    metrics, result = evaluated(trained(tmp_path, architecture="statistics"), slides(8, 3))
+    learned, unseen = (slides_of.read(slides(*some), labelled=True) for some in ((0, 8), (8, 3)))
+    kinds: dict[str, View] = {"model": "all", "level_only": "level", "level_removed": "level_removed"}
+    for sensor, some in unseen.items():
+        for name, view in kinds.items():
+            own = StatisticsClassifier.fit(learned[sensor].frames, learned[sensor].materials, view=view)
+            assert metrics[name]["correct"][sensor] == int((own.predict(some.frames) == some.materials).sum())
+    for one in headline.read(result.files[headline.FILE]):
+        assert headlines.BASELINES["level_only"] in {baseline.name for baseline in one.baselines}
 
 
 @pytest.mark.long

@@ -1,0 +1,137 @@
+"""The command ``tacpipe limits``: what limits the prediction of touch on some grasps, and what more of them are worth."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from tacpipe.datasets import replacing
+from tacpipe.errors import UsageError
+from tacpipe.io import terminal
+
+if TYPE_CHECKING:
+    from tacpipe.metrics.regression import Interval
+    from tacpipe.tasks.touch.limits import Limits
+
+ABOUT = (
+    "\n\nRepeatability: how alike the readings of pairs of grasps of one object are, by the distance of the grasps, and "
+    "which skill that allows. Learning curve: skill on known objects by the number of training grasps of each. Other "
+    "finger: skill if the reading of the other finger were given. Skill is 1 - RMSE / RMSE of the constant. Takes minutes."
+)
+EXAMPLE = "\n\nExample: tacpipe limits data/grasps -o results/limits.json"
+HEADER = '{"schema_version": 1, "limits"'  # how the file begins
+TARGETS = ("pdc_th", "pdc_mf", "e_th", "e_mf")
+
+
+def add(program: typer.Typer, summary: str) -> None:
+    """Add the command ``limits`` to ``program``."""
+    program.command("limits", help=summary + ABOUT + EXAMPLE)(limits)
+
+
+def limits(
+    grasps: Annotated[Path, typer.Argument(help="Dataset of grasps with readings.")],
+    sizes: Annotated[
+        str, typer.Option("--sizes", help="Training grasps of each object, with commas between.")
+    ] = "2,4,8,16,32",
+    draws: Annotated[int, typer.Option("--draws", min=1, help="Draws of folds and training grasps.")] = 2,
+    trees: Annotated[int, typer.Option("--trees", min=1, help="Trees of each forest.")] = 100,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Random seed of draws and trees.")] = 0,
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="Write JSON to this file too.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Print what limits the prediction of touch on grasps."""
+    asked = _sizes(sizes)
+    if output is not None:
+        replacing.refuse_foreign(output, HEADER.encode())
+    from tacpipe.engine import pipeline
+    from tacpipe.io import progress
+    from tacpipe.tasks.touch import grasps as grasps_of
+    from tacpipe.tasks.touch import limits as limits_of
+
+    dataset = pipeline.open_dataset(grasps)
+    with progress.bar("limits", limits_of.steps(asked, draws)) as advance:
+        found = limits_of.limits(
+            grasps_of.read(dataset), sizes=asked, draws=draws, trees=trees, seed=seed, advance=advance
+        )
+    value = {"schema_version": 1, "limits": found.to_json()}
+    if output is not None:
+        _write(output, json.dumps(value) + "\n")
+    terminal.result_json(value) if as_json else terminal.result(text(found))
+
+
+def text(found: Limits) -> str:
+    """Return what was found as three tables of text."""
+    grasps = sum(found.counts.values())
+    lines = [f"{grasps} grasps of {len(found.counts)} objects", "", "repeatability: skill that pairs of grasps imply"]
+    rows = [
+        [_bounds(low, high), str(max(one.pairs for one in by.values())), *(_cell(by[name].ceiling) for name in TARGETS)]
+        for low, high, by in found.near
+    ]
+    lines += _table(["distance (mm)", "pairs", *TARGETS], rows)
+    lines += ["", "repeatability: likeness of readings within an object"]
+    rows = [
+        [
+            _bounds(low, high),
+            str(max(one.pairs for one in by.values())),
+            *(_cell(by[name].likeness) for name in TARGETS),
+        ]
+        for low, high, by in found.near
+    ]
+    lines += _table(["distance (mm)", "pairs", *TARGETS], rows)
+    lines += ["", "learning curve: skill on known objects"]
+    rows = [
+        [str(one.grasps), f"{one.trained:.0f}", *(_cell(one.skill[name]) for name in TARGETS)] for one in found.curve
+    ]
+    rows.append(["other finger given", "", *(_cell(found.other_finger[name]) for name in TARGETS)])
+    lines += _table(["grasps an object", "trained on", *TARGETS], rows)
+    lines += [
+        "",
+        "Skill: 1 - RMSE / RMSE of the constant. Likeness: 1 where readings are equal and 0 where they differ as any two",
+        f"of the object. In brackets: 95 % interval over resampled grasps. {found.draws} draws of 5 folds.",
+    ]
+    return "\n".join(lines)
+
+
+def _write(path: Path, content: str) -> None:
+    from tacpipe.io.files import readable_errors, write_whole
+
+    with readable_errors(path.parent):
+        write_whole(str(path), content.encode(), f"{path}.draft")
+
+
+def _sizes(given: str) -> list[int]:
+    try:
+        found = [int(one) for one in given.split(",")]
+    except ValueError:
+        found = []
+    if not found or min(found) < 1:
+        raise UsageError(f"--sizes is {given!r}; it must be whole numbers from 1, with commas between, as 2,4,8.")
+    return sorted(set(found))
+
+
+def _bounds(low: float, high: float) -> str:
+    return f"{low:g} or more" if math.isinf(high) else f"{low:g} to {high:g}"
+
+
+def _cell(one: Interval) -> str:
+    if math.isnan(one.mean):
+        return "-"
+    bounds = "" if math.isnan(one.low) else f" ({_fixed(one.low)} to {_fixed(one.high)})"
+    return _fixed(one.mean) + bounds
+
+
+def _fixed(value: float) -> str:
+    return f"{value:.2f}"
+
+
+def _table(heads: Sequence[str], rows: Sequence[Sequence[Any]]) -> list[str]:
+    widths = [max(len(str(row[at])) for row in [heads, *rows]) for at in range(len(heads))]
+    return [
+        "  ".join(str(cell).ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+        for row in [heads, *rows]
+    ]

@@ -1,0 +1,192 @@
+"""What limits the prediction of touch on some grasps: their repeatability, their number, and what the grasp does not state.
+
+The forests here are those of the architecture ``trees``, with leaves of a fixed size; they are trained and tested by
+cross-validation within known objects, and their skill is 1 - RMSE / RMSE of the constant of all training grasps.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from tacpipe.arrays import Floats, Indices, Int64s
+from tacpipe.clouds import geometry
+from tacpipe.errors import TacpipeError
+from tacpipe.metrics import regression
+from tacpipe.metrics.regression import Interval
+from tacpipe.models.forest import Forest
+from tacpipe.tasks.touch import repeatability
+from tacpipe.tasks.touch.grasps import Grasps
+
+FOLDS = 5
+LEAF = 4
+SIZES = (2, 4, 8, 16, 32)  # training grasps of each object
+OTHER = {
+    "pdc_th": ("pdc_mf", "e_mf"),
+    "e_th": ("pdc_mf", "e_mf"),
+    "pdc_mf": ("pdc_th", "e_th"),
+    "e_mf": ("pdc_th", "e_th"),
+}
+Tree = dict[str, Any]
+Skills = dict[str, Interval]  # by target
+
+
+@dataclass(frozen=True)
+class Point:
+    """A point of a learning curve."""
+
+    grasps: int  # of each object that were trained on, at most
+    trained: float  # grasps trained on, mean over folds
+    skill: Skills
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What was measured on grasps."""
+
+    counts: Mapping[str, int]  # grasps by object
+    near: Sequence[tuple[float, float, Mapping[str, repeatability.Repeatability]]]  # bounds in mm
+    curve: Sequence[Point]
+    other_finger: Skills  # of forests that also read what the other finger measured
+    draws: int
+    trees: int
+
+    def to_json(self) -> Tree:
+        """Return all of it for JSON; NaN is null, and so is the upper bound of the last class of distance."""
+        return {
+            "grasps": dict(self.counts),
+            "draws": self.draws,
+            "folds": FOLDS,
+            "trees": self.trees,
+            "repeatability": [
+                {
+                    "low_mm": low,
+                    "high_mm": None if math.isinf(high) else high,
+                    "pairs": max((one.pairs for one in by.values()), default=0),
+                    "likeness": {name: _numbers(one.likeness) for name, one in by.items()},
+                    "ceiling": {name: _numbers(one.ceiling) for name, one in by.items()},
+                }
+                for low, high, by in self.near
+            ],
+            "learning_curve": [
+                {"grasps": one.grasps, "trained": one.trained, "skill": _by_target(one.skill)} for one in self.curve
+            ],
+            "other_finger": _by_target(self.other_finger),
+        }
+
+
+def limits(
+    grasps: Grasps,
+    *,
+    sizes: Sequence[int] = SIZES,
+    draws: int = 2,
+    trees: int = 100,
+    seed: int = 0,
+    advance: Callable[..., None] | None = None,
+) -> Limits:
+    """Return what limits the prediction of touch on grasps with readings.
+
+    ``draws`` is how often folds and training grasps are drawn anew; ``advance`` is called `steps` times. Raises
+    `TacpipeError` where an object has fewer than five grasps, one for each fold, or where grasps have no object.
+    """
+    counts = {name: grasps.objects.count(name) for name in sorted(set(grasps.objects))}
+    few = min(counts, key=lambda name: counts[name], default="")
+    if not counts or "" in counts or counts[few] < FOLDS:
+        found = f"{counts[few]} of {few or 'no named object'}" if counts else "none"
+        raise TacpipeError(
+            f"There are too few grasps: {found}. Limits need {FOLDS} or more of each object, one for each fold; label "
+            f"objects with `tacpipe label RECORDINGS NAME --set object=…`, or leave some out with --exclude."
+        )
+    coloured = all(one.colours is not None for one in grasps.clouds)
+    rows, _ = geometry.table(grasps.clouds, grasps.grasps, coloured=coloured)
+    contacts_m = np.array([[one.g1_m, one.g2_m] for one in grasps.grasps])  # (grasp, finger, axis)
+    trial = _Trial(grasps, rows, draws, trees, seed, advance or (lambda *_, **__: None))
+    most = max(counts.values()) * (FOLDS - 1) // FOLDS
+    curve = [trial.point(size) for size in sorted({min(size, most) for size in sizes})]
+    near = repeatability.table(grasps.readings, contacts_m, grasps.objects)
+    return Limits(counts, near, curve, trial.other_finger(), draws, trees)
+
+
+def steps(sizes: Iterable[int], draws: int) -> int:
+    """Return how often `limits` calls ``advance`` at most."""
+    return (len(set(sizes)) + 1) * draws * FOLDS
+
+
+@dataclass(frozen=True)
+class _Trial:
+    """Cross-validation of forests on some grasps."""
+
+    grasps: Grasps
+    rows: Floats  # (grasp, feature)
+    draws: int
+    trees: int
+    seed: int
+    advance: Callable[..., None]
+
+    def point(self, size: int) -> Point:
+        """Return the skill where ``size`` grasps of each object are trained on."""
+        skill, trained = self._skills(size, dict.fromkeys(self.grasps.readings, self.rows), f"{size} grasps an object")
+        return Point(size, trained, skill)
+
+    def other_finger(self) -> Skills:
+        """Return the skill of forests that also read what the other finger measured, on all training grasps."""
+        readings = self.grasps.readings
+        rows = {
+            name: np.concatenate([self.rows, *(readings[one] for one in OTHER[name] if one in readings)], axis=1)
+            for name in readings
+        }
+        return self._skills(len(self.grasps), rows, "other finger")[0]
+
+    def _skills(self, size: int, rows: Mapping[str, Floats], note: str) -> tuple[Skills, float]:
+        readings = self.grasps.readings
+        squared = {name: np.zeros((2, len(self.grasps))) for name in readings}  # (model or constant, grasp)
+        trained = []
+        for draw in range(self.draws):
+            rng = np.random.default_rng([self.seed, draw])
+            folds = stratified(self.grasps.objects, rng)
+            for fold in range(FOLDS):
+                among, tested = np.flatnonzero(folds != fold), np.flatnonzero(folds == fold)
+                chosen = drawn(among, self.grasps.objects, size, rng)
+                trained.append(len(chosen))
+                for name, values in readings.items():
+                    leaf = max(1, min(LEAF, len(chosen) // 4))
+                    forest = Forest.fitted(
+                        rows[name][chosen], values[chosen], trees=self.trees, leaf=leaf, seed=self.seed + draw
+                    )
+                    constant = np.tile(values[among].mean(axis=0), (len(tested), 1))
+                    for at, predicted in enumerate((forest.predict(rows[name][tested]), constant)):
+                        squared[name][at, tested] += regression.squared_sums(values[tested], predicted)
+                self.advance(note=note)
+        clusters = np.arange(len(self.grasps))
+        found = {
+            name: regression.skill_interval(model, constant, clusters) for name, (model, constant) in squared.items()
+        }
+        return found, float(np.mean(trained))
+
+
+def stratified(objects: Sequence[str], rng: np.random.Generator) -> Int64s:
+    """Return the fold of each grasp (grasp,), 0 to 4, the grasps of each object spread evenly over all."""
+    names = np.asarray(objects)
+    folds = np.zeros(len(names), np.int64)
+    for name in sorted(set(objects)):
+        own = rng.permutation(np.flatnonzero(names == name))
+        folds[own] = np.arange(len(own)) % FOLDS
+    return folds
+
+
+def drawn(among: Indices, objects: Sequence[str], size: int, rng: np.random.Generator) -> Indices:
+    """Return those of the grasps ``among`` (grasp,) that train: ``size`` of each object, or all that it has."""
+    names = np.asarray(objects)[among]
+    return np.concatenate([rng.permutation(among[names == name])[:size] for name in sorted(set(names))])
+
+
+def _by_target(skills: Skills) -> Tree:
+    return {name: _numbers(one) for name, one in skills.items()}
+
+
+def _numbers(one: Interval) -> Tree:
+    return {name: None if math.isnan(value) else value for name, value in one._asdict().items()}
