@@ -71,8 +71,8 @@ class Chainlike(Protocol):
     def push(self, stream: str, batch: Any) -> None:
         """Take samples."""
 
-    def advance(self, t_ns: int) -> list[Forecast]:
-        """Return the forecasts up to a time."""
+    def advance(self, t_ns: int, *, newest_only: bool = False) -> list[Forecast]:
+        """Return the forecasts up to a time, on request of the newest grid point alone."""
 
 
 Opened = Callable[[Mapping[str, "pa.Schema"]], Chainlike]
@@ -154,12 +154,12 @@ class Engine:
         for name, decoder in self._decoders.items():
             for batch in decoder.batches():
                 self.chain.push(name, table(batch, self.sensors[name], self._offset_ns))
-        found = self.chain.advance(now_ns + self._offset_ns - self.settle_ns)
+        found = self.chain.advance(now_ns + self._offset_ns - self.settle_ns, newest_only=True)
         if not found:
             return self._silence(now_ns)
         self._why = ""
         self._point_ns, self._last_ns = found[-1].t_ns, now_ns
-        self.skipped += len(found) - 1
+        self.skipped += sum(Cause.SKIPPED in one.cause for one in found)
         message = self._message(found[-1], now_ns)
         message.late, message.compute_ms = self.late, (time.perf_counter() - began_s) * 1e3
         return [message]

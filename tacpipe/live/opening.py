@@ -33,7 +33,7 @@ def engine(options: Options) -> Engine:
         raise UsageError(f"{options.model} is not a model; give what `tacpipe train forward` wrote.")
     rig = rigs.parse(options.rig)
     sensors = {name: rig.streams[name].sensor for name in options.streams}
-    opened = functools.partial(chain, model)
+    opened = functools.partial(chain, model, rig.master)
     first: list[Alarms] = []
 
     def levels(made: Chainlike) -> Alarms:
@@ -47,9 +47,9 @@ def engine(options: Options) -> Engine:
     return found
 
 
-def chain(model: Dataset, layouts: Mapping[str, pa.Schema]) -> Chain:
+def chain(model: Dataset, master: str, layouts: Mapping[str, pa.Schema]) -> Chain:
     """Return the chain of a model for streams of these layouts; raises as `Chain.of`."""
-    return Chain.of(model.files, model.source.chain, layouts)
+    return Chain.of(model.files, model.source.chain, layouts, master)
 
 
 def _alarms(options: Options, model: Dataset, made: Chainlike) -> Alarms:

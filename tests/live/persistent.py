@@ -10,6 +10,7 @@ import os
 import sys
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -63,13 +64,15 @@ class Persistence:
         if self._next_ns is None and len(t_ns):
             self._next_ns = int(t_ns[0])
 
-    def advance(self, t_ns: int) -> list[Forecast]:
-        """Return a forecast for each grid point."""
+    def advance(self, t_ns: int, *, newest_only: bool = False) -> list[Forecast]:
+        """Return a forecast for each grid point, on request for the newest alone."""
         found = []
         self._passed_ns = max(self._passed_ns, t_ns)
         while self._next_ns is not None and self._next_ns <= t_ns:
             found.append(self._at(self._next_ns))
             self._next_ns += PERIOD_NS
+        if newest_only:
+            found[:-1] = [replace(one, count=None, cause=one.cause | Cause.SKIPPED) for one in found[:-1]]
         return found
 
     def _at(self, point_ns: int) -> Forecast:
