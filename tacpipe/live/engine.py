@@ -17,7 +17,7 @@ import numpy as np
 from tacpipe.live import wire
 from tacpipe.live.alarms import NOTHING_KNOWN, Alarms
 from tacpipe.live.chain import PLAN, Cause, Forecast
-from tacpipe.live.decoding import Decoder, batch_schema, likely_schema, table
+from tacpipe.live.decoding import Decoder, batch_schema, likely_schema
 from tacpipe.live.messages import Message
 from tacpipe.recording.spool_blocks import Note
 from tacpipe.recording.station import BEGAN
@@ -126,6 +126,8 @@ class Engine:
             assert isinstance(block, Note)
             if block.what == wire.BEGIN:
                 self._begin(int(block.detail))
+            elif block.what == wire.END:
+                self._offset_ns = None
             elif block.what == wire.OVERFLOW and self.running:
                 self.overflows += 1
                 self._restart("blocks were thrown away under overload")
@@ -136,7 +138,7 @@ class Engine:
             return
         if stream in self.chain.streams or stream == PLAN or stream not in self._first:
             self._decoders[stream].take(block)
-        if not self.running:
+        if not self.running and stream not in self._first:
             self._look(stream)
 
     def due_ns(self, now_ns: int) -> int:
@@ -153,7 +155,8 @@ class Engine:
         began_s = time.perf_counter()
         for name, decoder in self._decoders.items():
             for batch in decoder.batches():
-                self.chain.push(name, table(batch, self.sensors[name], self._offset_ns))
+                columns = decoder.columns(batch, self._offset_ns)
+                self.chain.push(name, columns.table() if name == PLAN else columns)
         found = self.chain.advance(now_ns + self._offset_ns - self.settle_ns, newest_only=True)
         if not found:
             return self._silence(now_ns)

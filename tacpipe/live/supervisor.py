@@ -73,6 +73,11 @@ class Supervisor:
         self._offset_ns = clock["utc_ns"] - clock["monotonic_ns"]
         self.tap.note(Note(clock["monotonic_ns"], "", wire.BEGIN, str(self._offset_ns)))
 
+    def end(self) -> None:
+        """End the recording: what comes until the next one begins is not predicted."""
+        self._offset_ns = None
+        self.tap.note(Note(clock.now_ns(), "", wire.END))
+
     def look(self) -> list[Note]:
         """Take what the process reports, start it anew where it ended; return notes on that. Never raises, never waits."""
         self.tap.flush()

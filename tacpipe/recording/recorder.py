@@ -37,6 +37,9 @@ class Companion(Protocol):
     def begin(self, clock: Mapping[str, int]) -> None:
         """Take note that a recording begins, with one reading of the monotonic clock and of UTC."""
 
+    def end(self) -> None:
+        """Take note that the recording ends."""
+
     def look(self) -> Iterable[Note]:
         """Do what is due, after each look at what came; return notes for the recording."""
 
@@ -151,6 +154,8 @@ class Recorder:
             yield
         finally:
             self._spool = None
+            if self._companion is not None:
+                self._companion.end()
             self._look()
             if clock.now_ns() - self._awake_ns < DRAIN_S * 1e9:
                 self._drain()

@@ -153,6 +153,8 @@ class Station:
         except BaseException:
             link.close()
             raise
+        if self.listener is not None:
+            link.hasten()
         self._overruns, self._foreign = link.overruns, link.foreign
         self._notes.append(Note(time.monotonic_ns() if not early else early[0][0], self.stream.name, OPENED))
         self._link, self.error = link, None

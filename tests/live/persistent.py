@@ -57,8 +57,8 @@ class Persistence:
         """Keep samples."""
         if stream != "skin":
             return
-        t_ns = batch.column("t_ns").to_numpy()
-        values = np.column_stack([batch.column(name.removeprefix("skin_")).to_numpy() for name in CHANNELS])
+        t_ns = batch.column("t_ns")
+        values = np.column_stack([batch.column(name.removeprefix("skin_")) for name in CHANNELS])
         self.late["skin"] += int((t_ns <= self._passed_ns).sum())
         self._samples += list(zip(t_ns.tolist(), values.astype(np.float32), strict=True))
         if self._next_ns is None and len(t_ns):

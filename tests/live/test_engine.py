@@ -171,3 +171,14 @@ def test_bytes_that_are_no_frame_cost_no_forecast(session: Session) -> None:
     session.send(2, 3)
     (message,) = session.at(2)
     assert message.values is not None and (message.values == session.values[2]).all()
+
+
+def test_after_the_recording_nothing_is_predicted_until_the_next_one_begins(session: Session) -> None:
+    session.send(0, 1)
+    assert len(session.at(0)) == 1
+    session.engine.take("", Note(START_NS + PERIOD_NS, "", wire.END))
+    session.send(1, 3)
+    assert session.at(3) == []
+    session.begin()
+    session.send(4, 5)
+    assert len(session.at(4)) == 1
