@@ -87,7 +87,7 @@ def model(folder: Path, codec: str = "raw", representation: str = "levels", **va
         steps.append(step("compress.pca", components=3, representation=representation))
     trained = {name: value for name, value in values.items() if name not in names}
     params = fitting("train.forward", {**SMALL, **trained})
-    return forward.train(params, *parts, folder), steps
+    return forward.train(params, parts[0], parts[1], folder), steps
 
 
 def chain(made: Made, given: FakeRecording) -> Chain:
@@ -113,3 +113,19 @@ def pieces(given: FakeRecording, cuts_ns: Sequence[int], order: Sequence[str]) -
             first, stop = np.searchsorted(t_ns, [before, cut], side="right").tolist()
             yield name, given.tables[name].slice(first, stop - first), cut
         before = cut
+
+
+def until(table: pa.Table, t_ns: int) -> pa.Array:
+    """Which rows of a stream had arrived by a time."""
+    return pa.array(table["t_ns"].to_numpy() <= t_ns)
+
+
+def more(found: pa.Schema) -> pa.Schema:
+    """The schema of a uSkin with another taxel."""
+    return found.append(schema.uskin_fields(3)[6])
+
+
+def unit(found: pa.Schema, wanted: str) -> pa.Schema:
+    """The schema of a stream whose first channel is in another unit."""
+    field = found.field(1)
+    return found.set(1, field.with_metadata({**field.metadata, b"unit": wanted.encode()}))
