@@ -2,9 +2,8 @@
 
     python benchmarks/live.py MODEL [--seconds 10] [--profile]
 
-The emulated rig's bytes (2 uSkin at 50 Hz, proximity at 400 Hz, an arm at 1 kHz) are decoded, brought onto the model's rows
-and predicted, a grid point at a time. Printed is the processor's time for each: decoding, rows and forecast together, and the
-encoding of what is published.
+The emulated rig's bytes (2 uSkin at 50 Hz, proximity at 400 Hz, an arm at 1 kHz) are decoded, brought onto the rows of the
+model and predicted, a grid point at a time. Printed is the processor's time of each.
 """
 
 from __future__ import annotations

@@ -8,7 +8,8 @@ from tacpipe.errors import UsageError
 from tacpipe.live.session import Described
 from tacpipe.printable import plain
 
-TASK, CONFIG = "forward", "config.json"
+CONFIG = "config.json"
+READ = ("horizon", "inputs")  # of its description
 
 
 def described(model: Path) -> tuple[Described, str]:
@@ -18,10 +19,10 @@ def described(model: Path) -> tuple[Described, str]:
 
     found = tacpipe.open(model)
     if CONFIG not in found.files:
-        raise UsageError(f"{model} is not a model; give what `tacpipe train forward` wrote.")
+        raise UsageError(f"{model} is not a model; give a trained one that predicts future tactile signals.")
     config = model_files.tree(found.files, CONFIG, {"task": str})
-    if config["task"] != TASK:
-        raise UsageError(f"{model} was trained for {plain(config['task'])}; only models of {TASK} run live.")
+    if not all(key in config for key in READ):
+        raise UsageError(f"{model} was trained for {plain(config['task'])}; only models of future signals run live.")
     config = model_files.tree(found.files, CONFIG, {"horizon": int, "inputs.tactile": list})
     inputs = config["inputs"]
     return Described(tuple(inputs["tactile"]), config["horizon"], str(inputs.get("unit", "count"))), found.digest

@@ -30,7 +30,7 @@ def engine(options: Options) -> Engine:
 
     model = tacpipe.open(options.model)
     if not model.source.chain and not model.files:
-        raise UsageError(f"{options.model} is not a model; give what `tacpipe train forward` wrote.")
+        raise UsageError(f"{options.model} is not a model; give a trained one.")
     rig = rigs.parse(options.rig)
     sensors = {name: rig.streams[name].sensor for name in options.streams}
     opened = functools.partial(chain, model, rig.master)
