@@ -52,9 +52,6 @@ class Link(Protocol):
     def write(self, data: bytes) -> None:
         """Send ``data``. Raises `LinkLostError` when the device is gone."""
 
-    def hasten(self) -> None:
-        """Read what comes at once from now on, even where fetching several together would cost less."""
-
     def close(self) -> None:
         """Close the link; once more does nothing."""
 

@@ -16,9 +16,10 @@ import numpy as np
 
 from tacpipe.live import wire
 from tacpipe.live.alarms import NOTHING_KNOWN, Alarms
-from tacpipe.live.chain import PLAN, Cause, Forecast
+from tacpipe.live.chain import Cause, Forecast
 from tacpipe.live.decoding import Decoder, batch_schema, likely_schema
 from tacpipe.live.messages import Message
+from tacpipe.live.sources import PLAN
 from tacpipe.recording.spool_blocks import Note
 from tacpipe.recording.station import BEGAN
 from tacpipe.sensors.framing import Chunks

@@ -13,6 +13,7 @@ from tacpipe.errors import DeviceError, TacpipeError
 from tacpipe.links import dialogue, opening
 from tacpipe.links.dialogue import NoReplyError
 from tacpipe.links.link import Link, LinkLostError
+from tacpipe.links.opened import Opened
 from tacpipe.recording import clock, silence_diagnosis
 from tacpipe.recording.pace import WAITED_NS, Pace
 from tacpipe.recording.rig import Stream
@@ -153,7 +154,7 @@ class Station:
         except BaseException:
             link.close()
             raise
-        if self.listener is not None:
+        if self.listener is not None and isinstance(link, Opened):
             link.hasten()
         self._overruns, self._foreign = link.overruns, link.foreign
         self._notes.append(Note(time.monotonic_ns() if not early else early[0][0], self.stream.name, OPENED))

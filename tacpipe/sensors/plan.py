@@ -14,7 +14,7 @@ from __future__ import annotations
 import itertools
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -74,7 +74,7 @@ class Plan(Sensor):
         return [packet([target], [pose]) for target, pose in zip(targets[:, 0].tolist(), poses.tolist(), strict=True)]
 
 
-def packet(t_ns: Sequence[int], poses: Any) -> bytes:
+def packet(t_ns: Iterable[int], poses: Any) -> bytes:
     """Return the packet of a plan: times in UTC ns (point,), and poses (point, 7)."""
     points = [[int(at_ns), *(float(one) for one in pose)] for at_ns, pose in zip(t_ns, poses, strict=True)]
     return json.dumps({"version": VERSION, "points": points}).encode()
