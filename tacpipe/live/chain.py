@@ -60,6 +60,13 @@ class Forecast:
     gaps: tuple[str, ...] = ()  # streams whose newest sample is too old
 
 
+class Beginning(NamedTuple):
+    """What a chain learned when its session began: enough for another chain to continue the session."""
+
+    origin_ns: int  # first point of the grid
+    rest: tuple[float, ...]  # level at rest of each channel
+
+
 class _Row(NamedTuple):
     """One row of the grid, before the level at rest is taken off."""
 
@@ -79,16 +86,24 @@ class Chain:
     stream's samples come in their order.
     """
 
-    def __init__(self, forecaster: Forecaster, steps: Sequence[Mapping[str, Any]], layout: Layout) -> None:
+    def __init__(
+        self,
+        forecaster: Forecaster,
+        steps: Sequence[Mapping[str, Any]],
+        layout: Layout,
+        beginning: Beginning | None = None,
+    ) -> None:
         """Make a chain of parts that fit; `of` checks that they do."""
         stages = causal_stages(steps)
         self._forecaster, self._stages, self._layout = forecaster, stages, layout
         sync = stages.synchronize
         gap_ns = round(sync.gap_ms * 1e6)
-        self._grid = Grid(layout.readings, layout.master, sync.grid, sync.rate_hz, gap_ns)
-        self._rolling, self._arm = Rolling(forecaster), Arm(forecaster.orientation)
-        self._resting: list[_Row] | None = []
-        self._rest: Floats | None = None
+        origin_ns = None if beginning is None else beginning.origin_ns
+        self._grid = Grid(layout.readings, layout.master, sync.grid, sync.rate_hz, gap_ns, origin_ns)
+        self._rolling = Rolling(forecaster, continues=beginning is not None)
+        self._arm = Arm(forecaster.orientation)
+        self._resting: list[_Row] | None = [] if beginning is None else None  # until the level at rest is known
+        self._rest: Floats | None = None if beginning is None else np.array(beginning.rest)
         self._last_ns: int | None = None  # time of the row before
         self._plans: deque[tuple[int, list[Floats]]] = deque()  # arrival, and rows of time and pose
         self._late_plans = 0
@@ -105,6 +120,7 @@ class Chain:
         steps: Sequence[Mapping[str, Any]],
         layouts: Mapping[str, pa.Schema],
         master: str = "",
+        beginning: Beginning | None = None,
     ) -> Chain:
         """Return the chain of a model: its files, the stages it was trained behind, and the schema of each recorded stream.
 
@@ -113,6 +129,10 @@ class Chain:
         rig file's, used where the model's stages name none. Raises `TacpipeError` where the model is not of a task that
         runs live, was trained behind a stage that looks ahead and has no causal rule, or needs a stream or channel that
         ``layouts`` lacks or has otherwise.
+
+        ``beginning`` is that of another chain of the session, which ended: grid and level at rest are continued, so that
+        this one predicts the same once it has read a few rows more than the model's context. What the other one had
+        counted of wrap-arounds is not known.
         """
         forecaster = Forecaster.load(model)
         if forecaster.actions == "shuffled":
@@ -121,7 +141,7 @@ class Chain:
                 "--actions planned or none."
             )
         stages = causal_stages(steps)
-        return cls(forecaster, steps, Layout.of(forecaster, stages.synchronize, layouts, master))
+        return cls(forecaster, steps, Layout.of(forecaster, stages.synchronize, layouts, master), beginning)
 
     @property
     def streams(self) -> tuple[str, ...]:
@@ -183,6 +203,12 @@ class Chain:
     def rest(self) -> Floats | None:
         """Level at rest (channel,), None as long as it is not known."""
         return self._rest
+
+    @property
+    def beginning(self) -> Beginning | None:
+        """Grid and level at rest, for a chain that continues the session; None as long as they are not known."""
+        origin_ns = self._grid.origin_ns
+        return None if self._rest is None or origin_ns is None else Beginning(origin_ns, tuple(self._rest.tolist()))
 
     @property
     def late(self) -> Mapping[str, int]:

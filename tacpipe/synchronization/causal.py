@@ -44,8 +44,20 @@ class Rows(NamedTuple):
 class Grid:
     """Rows of several streams on the grid of one of them, as `synchronize --causal` defines them."""
 
-    def __init__(self, streams: Mapping[str, Reading], master: str, kind: str, rate_hz: float, gap_ns: int) -> None:
-        """Make a grid of ``kind`` uniform, logged or fresh; ``master`` is one of ``streams``."""
+    def __init__(
+        self,
+        streams: Mapping[str, Reading],
+        master: str,
+        kind: str,
+        rate_hz: float,
+        gap_ns: int,
+        origin_ns: int | None = None,
+    ) -> None:
+        """Make a grid of ``kind`` uniform, logged or fresh; ``master`` is one of ``streams``.
+
+        ``origin_ns`` is the first point of a uniform grid that is continued; None: the master's first sample is.
+        """
+        self._origin_ns = origin_ns
         self._sources = {name: _Source(reading) for name, reading in streams.items()}
         self._master, self._kind, self._rate_hz, self._gap_ns = master, kind, rate_hz, gap_ns
         self._points = 0  # of a uniform grid that were made
@@ -56,6 +68,11 @@ class Grid:
     def waiting(self) -> tuple[str, ...]:
         """The streams of which no sample has come."""
         return tuple(name for name, source in self._sources.items() if source.first_ns is None)
+
+    @property
+    def origin_ns(self) -> int | None:
+        """The first point of the grid; None before the master's first sample."""
+        return self._sources[self._master].first_ns if self._origin_ns is None else self._origin_ns
 
     def push(self, stream: str, t_ns: Times, values: AnyFloats) -> None:
         """Take samples of a stream, (time,) and (time, column), in the order in which they arrived.
@@ -100,10 +117,14 @@ class Grid:
         if master.first_ns is None:
             return np.zeros(0, np.int64)
         if self._kind == "uniform":
-            most = int((until_ns - master.first_ns) * self._rate_hz / 1e9) + 2
-            found = master.first_ns + uniform_offsets(self._points, max(0, most - self._points), self._rate_hz)
+            origin_ns = master.first_ns if self._origin_ns is None else self._origin_ns
+            if not self._points:  # those before the first sample are the grid's that is continued
+                self._points = max(0, int((master.first_ns - origin_ns) * self._rate_hz / 1e9) - 1)
+            most = int((until_ns - origin_ns) * self._rate_hz / 1e9) + 2
+            found = origin_ns + uniform_offsets(self._points, max(0, most - self._points), self._rate_hz)
             found = found[found <= until_ns]
             self._points += len(found)
+            found = found[found >= master.first_ns]
             return found if after_ns is None else found[found > after_ns]
         t_ns, repeated = master.stamps()
         wanted = t_ns <= until_ns

@@ -24,8 +24,8 @@ SMALL = {"architecture": "gru", "hidden": 8, "epochs": 1, "batch": 64, "context"
 Made = tuple[Mapping[str, bytes], Sequence[Mapping[str, Any]]]
 
 
-def recording(seed: int, seconds: float = 3.0, gap_ms: float = 0.0) -> FakeRecording:
-    """Two uSkins at about 45 Hz and an arm at about 100 Hz, each with stamps of its own; counts wrap around.
+def recording(seed: int, seconds: float = 3.0, gap_ms: float = 0.0, *, wraps: bool = True) -> FakeRecording:
+    """Two uSkins at about 45 Hz and an arm at about 100 Hz, each with stamps of its own; counts wrap around, or not.
 
     For ``gap_ms`` in the middle the second uSkin is silent.
     """
@@ -40,7 +40,7 @@ def recording(seed: int, seconds: float = 3.0, gap_ms: float = 0.0) -> FakeRecor
         t_ns = T0 + (t_ms * MS).astype(np.int64)
         x = 0.1 * np.sin(t_ms / 300)
         if number < 2:
-            touch = 65_400 + 4000 * x[:, None] * np.linspace(0.2, 1.0, 6) * (t_ms > 600)[:, None]
+            touch = (65_400 if wraps else 30_000) + 4000 * x[:, None] * np.linspace(0.2, 1.0, 6) * (t_ms > 600)[:, None]
             values = np.round(touch + rng.normal(0, 2, (len(t_ms), 6))) % 65_536
             streams[f"xela{number + 1}"] = schema.stream(t_ns, values.T, fields)
         else:

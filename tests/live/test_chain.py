@@ -218,3 +218,24 @@ def test_a_model_behind_stages_that_look_ahead_is_refused_by_their_name(
 ) -> None:
     with pytest.raises(TacpipeError, match=named):
         Chain.of(models["raw"][0], steps, {name: table.schema for name, table in GIVEN.tables.items()})
+
+
+@pytest.mark.parametrize("kind", ["raw", "latents", "logged"])
+def test_a_chain_that_continues_a_session_predicts_the_same_once_it_has_its_context(
+    kind: str, models: dict[str, Made]
+) -> None:
+    calm = rigs.recording(21, wraps=False)
+    wanted = {one.t_ns: one for one in rigs.whole(models[kind], calm)}
+    first = rigs.chain(models[kind], calm)
+    half_ns = T0 + 1400 * MS
+    for name, table in calm.tables.items():
+        first.push(name, table.filter(rigs.until(table, half_ns)))
+    assert first.beginning is None
+    first.advance(half_ns)
+    schemas = {name: table.schema for name, table in calm.tables.items()}
+    second = Chain.of(*models[kind], schemas, beginning=first.beginning)
+    for name, table in calm.tables.items():
+        second.push(name, table.slice(table.filter(rigs.until(table, half_ns)).num_rows))
+    found = [one for one in second.advance(T0 + 2900 * MS) if one.count is not None]
+    assert len(found) > 40 and found[0].t_ns < half_ns + 250 * MS
+    assert same(found, [wanted[one.t_ns] for one in found])

@@ -94,8 +94,12 @@ class Arm:
 class Rolling:
     """The last rows that a forecaster reads, and its prediction from them."""
 
-    def __init__(self, forecaster: Forecaster) -> None:
-        """Make one without rows."""
+    def __init__(self, forecaster: Forecaster, *, continues: bool = False) -> None:
+        """Make one without rows.
+
+        Where it ``continues`` a session, the first rows depend on rows that it does not know, by velocities and
+        latents, and are not read.
+        """
         codec, context = forecaster.codec, forecaster.context
         self._forecaster = forecaster
         self._latent = np.zeros((context, len(codec.latents)), np.float32)
@@ -105,6 +109,7 @@ class Rolling:
         self._levels = np.zeros((frames, len(codec.channels)))
         self._begins: Bools = np.zeros(frames, bool)
         self._rows = self._run = 0
+        self._unknown = max(1, frames - 1) if continues else 0
 
     @property
     def now(self) -> Floats:
@@ -142,7 +147,8 @@ class Rolling:
             kept_rows[-1] = newest
         finite = bool(np.isfinite(level).all() and np.isfinite(latent).all() and np.isfinite(arm).all())
         finite = finite and bool(np.isfinite(finger))
-        self._run = (self._run + 1 if follows else 1) if usable and finite else 0
+        known = self._rows > self._unknown
+        self._run = (self._run + 1 if follows else 1) if usable and finite and known else 0
         return finite
 
     def predict(self, plan: AnyFloats) -> Float32s:

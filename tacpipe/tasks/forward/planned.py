@@ -25,7 +25,7 @@ def rows(plan: Plan, t_ns: int, ahead_ns: Times, now: AnyFloats) -> Float32s:
 
     ``now`` (13,) is the arm at ``t_ns``. A plan that begins later is reached from there in a straight line; after its end
     the hand stays. Velocities are differences of the planned rows, as those of a recording are, and the sign of the
-    quaternions goes on from ``now``.
+    quaternions continues that of ``now``.
     """
     points_ns, poses = plan
     if not np.isfinite(poses[:, 3:]).all():
