@@ -7,6 +7,7 @@ and how long before a slip they came: printed, and drawn.
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 import threading
@@ -35,6 +36,7 @@ PER_HOUR = 60.0  # false alarms: one a minute, as `tacpipe evaluate` allows
 SEED = 7
 AHEAD_S, EVERY_S, POINT_S = 0.5, 0.1, 0.02  # of the plan: reach, from one to the next, between points
 SWITCH_S = 0.0005
+GAP_PERIODS = 5.0  # without a forecast, in the picture
 
 
 def run(output: Path, rig_file: Path, seconds: float = LIVE_S) -> Path:
@@ -110,9 +112,9 @@ def _shown(output: Path, world: World, epoch_ns: int) -> Path:
     truth_ns = np.arange(int(t_ns[0]), int(t_ns[-1]), 1_000_000, dtype=np.int64)
     slips = world.contact(truth_ns - epoch_ns, lambda scene: scene.contact.slip.astype(np.float64)) > 0.5
     events = onsets(truth_ns, slips)
-    period_ns = int(np.median(np.diff(t_ns)))
-    steps = [int(name.rpartition("_t")[2]) for name in recording.table("forecast").column_names if "_t" in name[-4:]]
-    horizon_ns = max(steps, default=10) * period_ns
+    config = json.loads(tacpipe.open(output / "model").files["config.json"])
+    period_ns = round(1e9 / config["rate_hz"])
+    horizon_ns = config["horizon"] * period_ns
     found = {
         name: leads(t_ns, alarm[f"{name}_state"].to_numpy(), events, horizon_ns, period_ns) for name in ("slip", "load")
     }
@@ -124,7 +126,7 @@ def _shown(output: Path, world: World, epoch_ns: int) -> Path:
         terminal.note(
             f"latency: median {known.median():.1f} ms, 99 % {known.quantile(0.99):.1f} ms, {len(known)} forecasts"
         )
-    return _drawn(output / "live.png", recording, truth_ns, slips, events)
+    return _drawn(output / "live.png", recording, truth_ns, slips, events, period_ns / 1e9)
 
 
 def described(name: str, found: Leads) -> str:
@@ -138,7 +140,7 @@ def described(name: str, found: Leads) -> str:
     return f"{name} alarm: {len(found.leads_ms)} of {found.events} slips led{median}; {false}"
 
 
-def _drawn(path: Path, recording: Any, truth_ns: Times, slips: Any, events: Times) -> Path:
+def _drawn(path: Path, recording: Any, truth_ns: Times, slips: Any, events: Times, period_s: float) -> Path:
     """Draw a load, its forecast, the alarms and the slips over time."""
     import matplotlib as mpl
 
@@ -152,7 +154,8 @@ def _drawn(path: Path, recording: Any, truth_ns: Times, slips: Any, events: Time
     last = max((int(name.rpartition("_t")[2]) for name in columns), default=1)
     now, ahead = (table[[name for name in columns if name.endswith(f"_t{step}")]].mean(axis=1) for step in (1, last))
     at_s = (table["t_device_ns"].to_numpy() - start_ns) / 1e9
-    period_s = float(np.median(np.diff(at_s))) if len(at_s) > 1 else 0.02
+    gaps = np.flatnonzero(np.diff(at_s) > GAP_PERIODS * period_s) + 1  # where no forecast was made the line is broken
+    at_s, now, ahead = (np.insert(np.asarray(one, dtype=float), gaps, np.nan) for one in (at_s, now, ahead))
     figure, (upper, lower) = pyplot.subplots(2, 1, figsize=(10, 5), sharex=True, height_ratios=(2, 1))
     upper.plot(at_s + period_s, now, color="#444444", linewidth=1, label="one row ahead")
     upper.plot(at_s + last * period_s, ahead, color="#d95f02", linewidth=1, label=f"{last} rows ahead")
