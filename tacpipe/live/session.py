@@ -22,7 +22,7 @@ from tacpipe.recording.recorder import Recorder
 from tacpipe.recording.rig import Rig, Stream
 
 PLAN = "plan"
-MEASURED = "measured"  # in the place of an address: the recorded motion is taken to go on
+MEASURED = "measured"  # in the place of an address: the recorded motion is taken to continue
 SWITCH_S = 0.0005  # that one thread may hold up another: the threads that read must not wait 5 ms for the view
 
 
