@@ -41,7 +41,7 @@ def add(program: typer.Typer, summary: str) -> None:
             str,
             typer.Option(
                 "--plan",
-                help="Source of planned motion: measured (the hand is taken to continue its motion), udp::PORT, ws:HOST:PORT.",
+                help="Source of plans: measured (the motion is taken to continue), udp::PORT, ws:HOST:PORT.",
             ),
         ] = "measured",
         output: Annotated[Path | None, typer.Option("-o", "--output", help="Dataset to append recordings to.")] = None,
