@@ -54,7 +54,7 @@ fi; \
 mkdir -p $(dir $(COUNTS)); : > $(COUNTS)
 endef
 
-.PHONY: help demo rig-demo wheel docs pictures result-pages test test-long test-rig test-ci test-loaded test-faults test-exports test-trackers test-viewer viewer-pictures test-install test-power test-slurm test-exits fuzz test-kernel check lint types bless bench clean
+.PHONY: help demo rig-demo live-demo wheel docs pictures result-pages test test-long test-rig test-ci test-loaded test-faults test-exports test-trackers test-viewer viewer-pictures test-install test-power test-slurm test-exits fuzz test-kernel check lint types bless bench clean
 
 help: ## show the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -77,6 +77,9 @@ result-pages: $(VENV)/.dev ## compute the three result pages of a release from t
 
 rig-demo: $(VENV)/.dev ## emulate the first paper's rig, record it live for 30 s, then the chain to a forecast
 	@$(BIN)/tacpipe demo --rig rigs/first-paper.toml -o rig-demo
+
+live-demo: $(VENV)/.dev ## emulate the first paper's rig with slips and forecast them live for 30 s; a summary and live-demo/live.png
+	@$(BIN)/python -m tacpipe.live.demo live-demo rigs/first-paper.toml
 
 test: $(VENV)/.dev ## run the tests that need neither real time nor minutes: some 5 minutes on 2 cores
 	@$(PYTEST) -m "not faults and not long and not rig"
@@ -172,7 +175,7 @@ bench: $(VENV)/.dev ## measure, beside what a user would do instead; writes benc
 	@$(BIN)/python benchmarks/run.py
 
 clean: ## remove .venv, demo and caches; .tacpipe stays, because recordings lie there
-	@rm -rf $(VENV) .cache demo rig-demo build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	@rm -rf $(VENV) .cache demo rig-demo live-demo build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	@find . -name __pycache__ -not -path './.tacpipe/*' -prune -exec rm -rf {} +
 
 # A stamp in .venv says what is installed there, so a second call installs nothing.

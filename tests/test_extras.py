@@ -108,6 +108,7 @@ LACK = {  # and for each that does need one, with that extra
     "split data/segments --scheme random --seed 7 -o {o} --executor slurm": "slurm",
     "show data/synced trial-000 --plot {o}.png": "learn",
     "view data/synced --save {o}.rrd": "view",
+    "live ws.toml --model models/forward --publish ws:127.0.0.1:1 --duration 1": "learn",
     "demo -o {o}": "learn",
     "demo -o {o} --rig serial.toml": "learn",
     "acquire serial.toml -o {o}": "devices",

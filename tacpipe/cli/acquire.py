@@ -96,7 +96,7 @@ def add(program: typer.Typer, summary: str) -> None:
             raise typer.Exit(FAILED if left else DONE)
         plan = trials_of.Plan(
             output,
-            name or time.strftime("%Y%m%d-%H%M%S", time.gmtime()),
+            checked_name(name),
             duration,
             trials,
             start,
@@ -104,7 +104,7 @@ def add(program: typer.Typer, summary: str) -> None:
             contact_count,
             trials > 1 if tare is None else tare,
             keep_spool,
-            _attributes(label or [], note),
+            attributes(label or [], note),
         )
         recorded, lost = _record(found, store, plan, quiet=quiet)
         failed = DeviceError("\n".join(["What came is recorded and kept, but streams were lost on the way.", *lost]))
@@ -119,15 +119,14 @@ def add(program: typer.Typer, summary: str) -> None:
 def _record(rig: Rig, store: Store, plan: Any, *, quiet: bool) -> tuple[list[Recorded], list[str]]:
     from tacpipe.datasets import directory
     from tacpipe.io.termination import Ended
-    from tacpipe.recording import appending, completing, header, trials, triggers
+    from tacpipe.recording import appending, completing, trials, triggers
     from tacpipe.recording.recorder import Recorder
     from tacpipe.recording.view import View
 
     for value, what, known in ((plan.start, "--start", triggers.STARTS), (plan.stop, "--stop", triggers.STOPS)):
         if value not in known:
             raise UsageError(f"There is no {what} {value}; it must be one of {', '.join(known)}.")
-    if not NAME.fullmatch(plan.name) or not header.is_name(plan.name):
-        raise UsageError(f"--name {plan.name!r} names no file; take letters, digits, _, - and dots, no dot in front.")
+    checked_name(plan.name)
     if plan.trials < 1 or (plan.duration_s is not None and plan.duration_s <= 0):
         raise UsageError("--trials and --duration must be above 0.")
     if plan.trials > 1 and plan.stop == "duration" and plan.duration_s is None:
@@ -211,14 +210,25 @@ def _dry_run(rig: Rig, *, as_json: bool) -> str:
     return "\n".join(lines)
 
 
-def _attributes(labels: list[str], note: str | None) -> dict[str, Attribute]:
+def checked_name(name: str | None) -> str:
+    """Return the name of a recording, the time now without one. Raises `UsageError` for one that names no file."""
+    from tacpipe.recording import header
+
+    found = name or time.strftime("%Y%m%d-%H%M%S", time.gmtime())
+    if not NAME.fullmatch(found) or not header.is_name(found):
+        raise UsageError(f"--name {found!r} names no file; take letters, digits, _, - and dots, no dot in front.")
+    return found
+
+
+def attributes(labels: list[str], note: str | None) -> dict[str, Attribute]:
+    """Return the attributes of a recording that labels and a note give. Raises `UsageError` for labels that are none."""
     from tacpipe.datasets import labels as labels_of
 
     try:
-        attributes = labels_of.parse(labels, None, include=False) if labels else {}
+        found = labels_of.parse(labels, None, include=False) if labels else {}
     except UsageError as error:
         raise UsageError(str(error).replace("--set", "--label")) from error
-    return {**attributes, **({"note": note} if note else {})}
+    return {**found, **({"note": note} if note else {})}
 
 
 def _report(

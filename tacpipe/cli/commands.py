@@ -15,6 +15,7 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 Datasets = Annotated[list[Path], typer.Argument(help="Datasets.")]
 SUMMARIES = {
     "acquire": "Record every stream of a rig.",
+    "live": "Forecast while a rig is recorded, with alarms.",
     "label": "Change the labels of recordings, or exclude recordings.",
     "show": "Show what is in a dataset, split, model or result.",
     "compare": "Compare results: the best first, columns for what differs.",
@@ -227,6 +228,12 @@ def _acquire(program: typer.Typer) -> None:
     acquire.add(program, SUMMARIES["acquire"])
 
 
+def _live(program: typer.Typer) -> None:
+    from tacpipe.cli import live
+
+    live.add(program, SUMMARIES["live"])
+
+
 def _print(value: Any, to_text: Callable[..., str], *, as_json: bool, **options: Any) -> None:
     signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `tacpipe show DATASET | head` ends as it does for any Unix tool
     terminal.result_json(value) if as_json else terminal.result(to_text(value, **options))
@@ -234,6 +241,7 @@ def _print(value: Any, to_text: Callable[..., str], *, as_json: bool, **options:
 
 NAMES: dict[str, Callable[[typer.Typer], None]] = {
     "acquire": _acquire,
+    "live": _live,
     "label": _label,
     "show": _show,
     "compare": _compare,

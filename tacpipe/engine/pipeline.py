@@ -289,7 +289,8 @@ class _Run:
             chosen = inputs.in_role(inputs.merged, name, may_lack=self.stage.optional(name))
             return keys.of_dataset(inputs.merged, reads, chosen)
         given = inputs.merged
-        if "model" in inputs.named:
+        as_given = self.stage.as_given
+        if "model" in inputs.named and not (as_given is not None and as_given(self.request.params)):
             where = str(self.request.datasets[0])
             given = self._by_recording.replay(given, inputs.model, inputs.beside, where)
         if "split" in inputs.named:

@@ -43,6 +43,9 @@ class Opened:
             self._refuse_closed()
             self._send(data)
 
+    def hasten(self) -> None:
+        """Read what comes at once, as it is read anyway."""
+
     def close(self) -> None:
         """Close the link, when the reader has returned; once more does nothing."""
         with self._ending:

@@ -132,6 +132,8 @@ class Stage(Generic[P, R]):
     preview: Callable[[Any, Path], str] | None = None  # of a source: describes what would be read (--dry-run)
     guess: Callable[[Path], str] | None = None  # of a source: a first layout file (--guess)
     requirements: Requirements | None = None  # of recordings to train a task on (--requirements)
+    # whether recordings are read as they were given, rather than behind the stages that the model was trained behind
+    as_given: Callable[[Any], bool] | None = None
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
         """Return what the function returns: no store is involved."""
@@ -221,6 +223,7 @@ def stage(
     preview: Callable[[Any, Path], str] | None = None,
     guess: Callable[[Path], str] | None = None,
     requirements: Requirements | None = None,
+    as_given: Callable[[Any], bool] | None = None,
 ) -> Callable[[Callable[P, R]], Stage[P, R]]:
     """Declare the decorated function a stage, whose signature it keeps. Raise ``version`` whenever its result changes.
 
@@ -228,8 +231,21 @@ def stage(
     ``part`` is keyed recording by recording, with the same params; its files become files of the result, and an argument
     ``Parts`` holds its tables. ``first`` names stages that the recordings go through before, with params of their own.
     ``preview`` returns what ``discover`` and the stage would read of a source, in words; ``guess`` a first layout of one.
-    ``requirements`` describe what recordings must hold.
+    ``requirements`` describe what recordings must hold. ``as_given`` states by the params whether recordings are not taken
+    through the stages of a ``Model`` first.
     """
     return lambda function: Stage(
-        function, version, reads, fit, part, first, originals, discover, headline, preview, guess, requirements
+        function,
+        version,
+        reads,
+        fit,
+        part,
+        first,
+        originals,
+        discover,
+        headline,
+        preview,
+        guess,
+        requirements,
+        as_given,
     )

@@ -6,10 +6,12 @@ import contextlib
 import functools
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Protocol
 
 from tacpipe.errors import DeviceError
 from tacpipe.recording import clock, silence_diagnosis
+from tacpipe.recording import spool as spool_of
 from tacpipe.recording.pace import STALL_NS
 from tacpipe.recording.rig import Rig
 from tacpipe.recording.spool import Spool
@@ -26,6 +28,22 @@ DRAIN_S = 2.0  # after this program was held up, in which links are read until n
 PREROLL_S = 0.5  # before a trigger, that are recorded too
 
 
+class Companion(Protocol):
+    """What follows a rig while it is recorded, as a model in a process of its own; nothing of it may wait or raise."""
+
+    def put(self, stream: str, content: Chunks | Note) -> None:
+        """Take what came of a stream; called by the threads that read."""
+
+    def begin(self, clock: Mapping[str, int]) -> None:
+        """Take note that a recording begins, with one reading of the monotonic clock and of UTC."""
+
+    def end(self) -> None:
+        """Take note that the recording ends."""
+
+    def look(self) -> Iterable[Note]:
+        """Do what is due, after each look at what came; return notes for the recording."""
+
+
 class Recorder:
     """The open rig. `tick` moves what came from the links to watches and spool; somebody calls it all the time."""
 
@@ -34,6 +52,7 @@ class Recorder:
         self.stations = {name: Station(stream) for name, stream in rig.streams.items()}
         self.watches = {name: Watch(stream) for name, stream in rig.streams.items()}
         self._spool: Spool | None = None
+        self._companion: Companion | None = None
         self._looked_ns: int | None = None  # when what came was last looked for
         self._awake_ns = (
             0  # since when that happens all the time: a silence that began before may be this program's own
@@ -70,6 +89,9 @@ class Recorder:
             self._spool.write()
         for name, blocks in came.items():
             self._watched(name, blocks)
+        for note in () if self._companion is None else self._companion.look():
+            if self._spool is not None:
+                self._spool.note(note)
 
     def run(self, until: Callable[[], bool], each: Callable[[], None] = lambda: None) -> None:
         """Tick until ``until()``; ``each`` is called after every tick."""
@@ -96,12 +118,27 @@ class Recorder:
         if late and not stopped():
             raise DeviceError("\n".join(self._silent(name) for name in sorted(late)))
 
+    def accompany(self, companion: Companion, streams: Iterable[str]) -> None:
+        """Have a companion follow these streams: it gets what comes before it is spooled, from the threads that read."""
+        self._companion = companion
+        for name in streams:
+            self.stations[name].listener = functools.partial(companion.put, name)
+
+    def follow(self) -> None:
+        """Have the companion begin without a recording: what comes from now on is followed and not kept."""
+        if self._companion is not None:
+            self._companion.begin(spool_of.now())
+        for name, station in self.stations.items():
+            self._watched(name, station.begin(lambda chunks, size, last_ns: None, None))
+
     @contextlib.contextmanager
     def recording(self, spool: Spool, *, preroll: bool = False) -> Iterator[None]:
         """Spool what comes while in the block, and with ``preroll`` what came right before; then finish the spool."""
         ended = threading.Event()
         syncing = threading.Thread(target=_sync, args=(spool, ended), daemon=True)
         since_ns = clock.now_ns() - round(PREROLL_S * 1e9)
+        if self._companion is not None:
+            self._companion.begin(spool.clock)
         for name, station in self.stations.items():
             self._watched(name, station.take())
             early = _since(self._before[name], since_ns) if preroll else None
@@ -117,6 +154,8 @@ class Recorder:
             yield
         finally:
             self._spool = None
+            if self._companion is not None:
+                self._companion.end()
             self._look()
             if clock.now_ns() - self._awake_ns < DRAIN_S * 1e9:
                 self._drain()

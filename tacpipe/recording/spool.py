@@ -53,11 +53,12 @@ class Spool:
     def __init__(self, store: Path, header: Mapping[str, Any], streams: Sequence[str]) -> None:
         self.folder = store / FOLDER / uuid.uuid4().hex
         self.streams = {name: number for number, name in enumerate(streams)}
+        self.clock = now()
         refuse_link(store)
         with readable_errors(store):
             self.folder.parent.mkdir(parents=True, exist_ok=True)
             self.folder.mkdir(mode=0o700)
-            entry = {**header, "streams": list(streams), "clock": now()}
+            entry = {**header, "streams": list(streams), "clock": self.clock}
             self._file = os.open(self.folder / "bytes", os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o644)
             fcntl.flock(self._file, fcntl.LOCK_EX)  # until the process ends: nobody recovers what is being written
             self._tally = _tally(self.folder, len(streams))

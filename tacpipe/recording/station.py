@@ -13,6 +13,7 @@ from tacpipe.errors import DeviceError, TacpipeError
 from tacpipe.links import dialogue, opening
 from tacpipe.links.dialogue import NoReplyError
 from tacpipe.links.link import Link, LinkLostError
+from tacpipe.links.opened import Opened
 from tacpipe.recording import clock, silence_diagnosis
 from tacpipe.recording.pace import WAITED_NS, Pace
 from tacpipe.recording.rig import Stream
@@ -22,6 +23,7 @@ from tacpipe.sensors.sensor import Sensor
 
 TALKING = ("udp", "tcp+udp")
 OPENED, LOST, OVERRUN = "opened", "lost", "overrun"
+BEGAN = "began"  # for listeners: what follows is part of the recording
 FOREIGN = "foreign"  # packets of other senders than the one that counts
 FOREIGN_S = 1.0  # between two notes of such
 STALLED, CAUGHT_UP = (
@@ -36,6 +38,7 @@ STOP_S = 2.0  # in which a thread must have ended
 REPLY_S = 0.5  # after which a device that is asked for each frame is asked once more
 
 Tally = Callable[[int, int, int], None]  # chunks, bytes, last arrival
+Listener = Callable[["Chunks | Note"], None]  # is given what came as it comes; it must neither wait nor raise
 
 
 class Station:
@@ -47,6 +50,7 @@ class Station:
     def __init__(self, stream: Stream) -> None:
         self.stream = stream
         self.error: TacpipeError | None = None  # why the link is lost, while it is
+        self.listener: Listener | None = None  # called by the thread that reads
         self._tally: Tally | None = None
         self._link: Link | None = None
         self._came: deque[tuple[int, bytes]] = deque()
@@ -77,7 +81,8 @@ class Station:
     def begin(self, tally: Tally, early: list[Chunks | Note] | None) -> list[Chunks | Note]:
         """Return what came since the last call, and state ``tally`` from now on how much came after that.
 
-        ``early`` is what came before and is recorded too: it counts, and with it what this returns. None: neither.
+        ``early`` is what came before and is recorded too: it counts, and with it what this returns. None: neither. The
+        listener gets the note `BEGAN`, and behind it all that counts.
         """
         with self._keeping:
             found = self._taken()
@@ -88,6 +93,8 @@ class Station:
             self._foreign = (
                 self._link.foreign if self._link is not None else 0
             )  # what came before is not of this recording
+            for block in (Note(clock.now_ns(), self.stream.name, BEGAN), *(() if early is None else (*early, *found))):
+                self._inform(block)
             return found
 
     def end(self) -> list[Chunks | Note]:
@@ -147,6 +154,8 @@ class Station:
         except BaseException:
             link.close()
             raise
+        if self.listener is not None and isinstance(link, Opened):
+            link.hasten()
         self._overruns, self._foreign = link.overruns, link.foreign
         self._notes.append(Note(time.monotonic_ns() if not early else early[0][0], self.stream.name, OPENED))
         self._link, self.error = link, None
@@ -167,7 +176,10 @@ class Station:
         link, self._link = self._link, None
         self.error = error
         if link is not None:
-            self._notes.append(Note(time.monotonic_ns(), self.stream.name, LOST, str(error)))
+            note = Note(time.monotonic_ns(), self.stream.name, LOST, str(error))
+            self._notes.append(note)
+            with self._keeping:
+                self._inform(note)
             self._wait_s = AGAIN_S[0]
             with contextlib.suppress(Exception):  # of a device that is gone; nothing may end this thread
                 link.close()
@@ -269,6 +281,12 @@ class Station:
                 self._chunks += len(came)
                 self._bytes += sum(len(data) for _, data in came)
                 self._tally(self._chunks, self._bytes, came[-1][0])
+            if self.listener is not None:
+                self._inform(Chunks.of(came))
+
+    def _inform(self, block: Chunks | Note) -> None:
+        if self.listener is not None:
+            self.listener(block)
 
     def _taken(self) -> list[Chunks | Note]:
         found: list[Chunks | Note] = []

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -23,8 +23,11 @@ COLUMNS = 16  # of the heat map, at most
 class View:
     """Shows the watches of a rig; `show` may be called as often as one likes."""
 
-    def __init__(self, watches: Mapping[str, Watch], *, quiet: bool = False) -> None:
+    def __init__(
+        self, watches: Mapping[str, Watch], *, quiet: bool = False, more: Callable[[], Sequence[str]] = lambda: ()
+    ) -> None:
         self._watches, self._quiet = watches, quiet
+        self._more = more  # returns further lines, below the streams
         self._live: Any = None
         self._shown_s = clock.now_s()
         self._tactile = {
@@ -57,6 +60,8 @@ class View:
         else:
             described = "; ".join(line(name, found) for name, found in figures.items())
             terminal.note(f"{state}: {described}")
+            for one in self._more():
+                terminal.note(one)
 
     def _picture(self, state: str, figures: Mapping[str, Figures]) -> Any:
         from rich.console import Group
@@ -71,7 +76,7 @@ class View:
             row = (f"{found.rate_hz:.1f}", f"{found.jitter_ms:.2f}", latency, str(found.samples))
             table.add_row(name, *row, str(found.lost), str(found.bytes_lost), style="red" if found.lost else None)
         maps = [Text.assemble(name + "\n", *self._heat(name)) for name in figures if self._tactile[name]]
-        return Group(table, *maps)
+        return Group(table, *(Text(printable.shown(one)) for one in self._more()), *maps)
 
     def _heat(self, name: str) -> list[Any]:
         """Return the tactile channels of a stream as coloured cells, by how far each is from rest."""

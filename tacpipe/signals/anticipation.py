@@ -76,9 +76,16 @@ def changes(truth: AnyFloats, groups: AnyArray, *, horizon: int, sd: AnyFloats) 
 
 
 def calibrate(
-    truth: AnyFloats, ahead: AnyFloats, groups: AnyArray, *, horizon: int, sd: AnyFloats, rate_hz: float
+    truth: AnyFloats,
+    ahead: AnyFloats,
+    groups: AnyArray,
+    *,
+    horizon: int,
+    sd: AnyFloats,
+    rate_hz: float,
+    per_minute: float = FALSE_ALARMS_PER_MINUTE,
 ) -> AnyFloats:
-    """Return theta (feature,): the least that gives no more than one false alarm a minute in this data.
+    """Return theta (feature,): the least that gives no more than ``per_minute`` false alarms a minute in this data.
 
     ``rate_hz`` is the rate of rows. Infinite for a feature without a row that is free of events: no alarm is known to be
     rare enough there.
@@ -92,7 +99,7 @@ def calibrate(
         free = _free(deviation, those, stretches, horizon)
         if not free.any():
             continue
-        allowed = FALSE_ALARMS_PER_MINUTE * _minutes(free, rate_hz)
+        allowed = per_minute * _minutes(free, rate_hz)
         levels = np.unique(deviation[free])
         low, high = 0, len(levels) - 1  # the highest level is never passed, and what passes a lower one passes it too
         while low < high:

@@ -121,6 +121,40 @@ def nearest_distance_ns(t_ns: Times, grid_ns: Times) -> Times:
     return distance_ns
 
 
+def newest_rows(t_ns: Times, grid_ns: Times) -> Indices:
+    """Return for each grid point the row of the newest sample that is not after it (grid,); of equal stamps the last.
+
+    -1 where there is none yet.
+
+    >>> newest_rows(np.array([10, 20, 20]), np.array([5, 10, 30])).tolist()
+    [-1, 0, 2]
+    """
+    return np.searchsorted(t_ns, grid_ns, side="right") - 1
+
+
+def is_overdue(newest_ns: Times, grid_ns: Times, gap_ns: int) -> Bools:
+    """Return where the newest sample, of ``newest_ns``, is older than ``gap_ns`` at a grid point (grid,).
+
+    That is what `in_gap` can state of a gap before the sample that ends it has come.
+    """
+    found: Bools = grid_ns - newest_ns > gap_ns
+    return found
+
+
+def median_before(t_ns: Times, values: AnyArray, grid_ns: Times, span_ns: int) -> Floats:
+    """Return the median of the samples at most ``span_ns`` before each grid point, float64 (grid, channel).
+
+    ``values`` are (time, channel). Where none is that near, the value is the newest sample's. Each grid point needs one
+    sample that is not after it.
+    """
+    newest = newest_rows(t_ns, grid_ns)
+    found: Floats = values[newest].astype(np.float64)
+    first = np.searchsorted(t_ns, grid_ns - span_ns, side="left")
+    for point in np.flatnonzero(newest > first):
+        found[point] = np.median(values[first[point] : newest[point] + 1].astype(np.float64), axis=0)
+    return found
+
+
 def in_gap(t_ns: Times, grid_ns: Times, gap_ns: int) -> Bools:
     """Return where a grid point has no trustworthy value (grid,).
 

@@ -51,6 +51,7 @@ EXTRAS: dict[str, tuple[str, ...]] = {  # to commands that work with it and not 
     "devices": DEVICES,
     "frames": (),
     "hdf5": HDF5,
+    "live": (),
     "lsl": (),
     "mlflow": (),
     "view": VIEW,

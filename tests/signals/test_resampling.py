@@ -144,3 +144,23 @@ def test_the_median_around_a_point_is_that_of_all_samples_so_near(t_ns: np.ndarr
         near = np.abs(t_ns - point) <= half_ns
         wanted = np.median(values[near], axis=0) if near.any() else line
         np.testing.assert_array_equal(row, wanted)
+
+
+@given(stamps, st.lists(st.integers(0, 10**9), min_size=1, max_size=20))
+def test_the_newest_row_is_the_last_that_is_not_after_the_point(t_ns: np.ndarray, points: list[int]) -> None:
+    t_ns, grid_ns = EPOCH_NS + np.repeat(t_ns, 2), EPOCH_NS + np.array(points)
+    for point, row in zip(grid_ns, resampling.newest_rows(t_ns, grid_ns), strict=True):
+        wanted = [i for i, stamp in enumerate(t_ns) if stamp <= point]
+        assert row == (wanted[-1] if wanted else -1)
+
+
+def test_a_median_of_the_past_has_the_samples_of_its_span_or_the_newest() -> None:
+    t_ns = EPOCH_NS + np.array([0, 10, 20, 30, 100])
+    values = np.array([[5.0], [1.0], [9.0], [2.0], [4.0]])
+    found = resampling.median_before(t_ns, values, EPOCH_NS + np.array([0, 20, 35, 99, 100]), 20)
+    assert found[:, 0].tolist() == [5.0, 5.0, 5.5, 2.0, 4.0]
+
+
+def test_a_stream_is_overdue_once_its_newest_sample_is_older_than_the_gap() -> None:
+    newest_ns, grid_ns = EPOCH_NS + np.array([0, 0, 0]), EPOCH_NS + np.array([49, 50, 51])
+    assert resampling.is_overdue(newest_ns, grid_ns, 50).tolist() == [False, False, True]

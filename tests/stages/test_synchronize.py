@@ -13,7 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 from tacpipe.channels import schema
-from tacpipe.errors import TacpipeError
+from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.plugins.registry import load
 from tacpipe.plugins.stage import RecordingOutput
 
@@ -321,3 +321,60 @@ def test_images_text_and_single_rows_neither_bound_the_grid_nor_stand_on_it(shar
     assert table.column_names == ["t_ns", "skin_a", "skin_held", "skin_gap", "skin_dt_ns"]
     assert table.num_rows == 100
     assert attributes["not_synchronized"] == "camera, note, still"
+
+
+def test_causal_rows_hold_the_newest_sample_that_had_come_and_its_age(shard: Recording) -> None:
+    t_ms = np.cumsum(np.random.default_rng(3).integers(5, 40, 40))
+    tactile, arm = uskin(t_ms), robot(np.arange(3, 700, 7))
+    table, attributes = run(shard({"xela1": tactile, "robot": arm}), causal=True)
+    grid_ms = (table.column("t_ns").to_numpy() - T0) / MS
+    assert grid_ms[-1] > min(t_ms[-1], 696) - 20 and attributes["grid"] == "uniform"
+    for stream, given, name in (("xela1", tactile, "taxel05_y"), ("robot", arm, "orientation_z")):
+        stamps = (given.column("t_ns").to_numpy() - T0) / MS
+        rows = [int(np.flatnonzero(stamps <= point)[-1]) for point in grid_ms]
+        column = table.column(f"{stream}_{name}")
+        assert column.to_numpy().tolist() == given.column(name).to_numpy()[rows].tolist()
+        assert (column.type, table.schema.field(f"{stream}_{name}").metadata[b"interpolation"]) == (
+            given.schema.field(name).type,
+            b"hold",
+        )
+        age_ms = grid_ms - stamps[rows]
+        assert (table.column(f"{stream}_dt_ns").to_numpy() / MS).tolist() == age_ms.tolist()
+        assert table.column(f"{stream}_gap").to_pylist() == (age_ms > 50).tolist()
+
+
+@pytest.mark.parametrize("grid", ["uniform", "logged", "fresh"])
+def test_causal_rows_do_not_depend_on_what_comes_later(shard: Recording, grid: str) -> None:
+    rng = np.random.default_rng(4)
+    t_ms = np.cumsum(rng.integers(5, 40, 60))
+    near = schema.stream(
+        T0 + np.arange(0, 1500, 2) * MS, [rng.normal(size=750)], [schema.float_field("near_m", "m", "proximity")]
+    )
+    streams = {
+        "xela1": uskin(t_ms, rng.integers(0, 65_536, (60, 48))),
+        "robot": robot(np.arange(3, 1500, 7)),
+        "n": near,
+    }
+    whole, _ = run(shard(streams), causal=True, grid=grid)
+    until_ns = T0 + 700 * MS
+    cut = {name: one.filter(pa.array(one.column("t_ns").to_numpy() <= until_ns)) for name, one in streams.items()}
+    part, _ = run(shard(cut), causal=True, grid=grid)
+    assert part.num_rows > 10
+    for name in part.column_names:
+        assert part.column(name).to_pylist() == whole.column(name).to_pylist()[: part.num_rows], name
+
+
+def test_causal_rows_have_the_clock_of_arrival_and_refuse_that_of_the_device() -> None:
+    with pytest.raises(UsageError, match="arrival"):
+        params(causal=True, clock="device").check()
+
+
+def test_what_a_live_session_records_of_itself_is_no_signal(shard: Recording) -> None:
+    t_ms = np.arange(0, 500, 20)
+    streams = {"xela1": uskin(t_ms)}
+    for quantity in ("plan", "prediction", "latency", "alarm"):
+        field = schema.float_field("value", "1", quantity)
+        streams[quantity] = schema.stream(T0 + t_ms[:9] * MS, [np.zeros(9)], [field])
+    table, attributes = run(shard(streams))
+    assert attributes["not_synchronized"] == "alarm, latency, plan, prediction"
+    assert table.num_rows == len(t_ms)

@@ -53,7 +53,7 @@ def tables(forecaster: Forecaster, recordings: Dataset, steps: Sequence[int]) ->
             begins = ends
             del some  # before the next one is made
         t_ns = track.t_ns[starts + forecaster.context - 1]
-        found[name] = _table(forecaster, t_ns, counts, steps)
+        found[name] = prediction_table(forecaster, t_ns, counts, steps)
     return found
 
 
@@ -74,7 +74,7 @@ def inputs(forecaster: Forecaster, recordings: Dataset) -> WindowArrays:
     return WindowArrays(window, arm[ahead], track.t_ns[past[:, -1]])
 
 
-def _table(forecaster: Forecaster, t_ns: Times, counts: Float32s, steps: Sequence[int]) -> pa.Table:
+def prediction_table(forecaster: Forecaster, t_ns: Times, counts: Float32s, steps: Sequence[int]) -> pa.Table:
     """Return the table of predicted ``counts`` (step, channel, window), which become its columns without a copy."""
     fields = [pa.field("t_ns", pa.int64(), metadata={"quantity": "time", "unit": "ns"})]
     columns: list[Any] = [pa.array(t_ns)]

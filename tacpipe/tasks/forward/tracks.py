@@ -207,17 +207,23 @@ def _orientation(table: pa.Table | Columns, pose: Pose) -> AnyFloats:
 
 def _opening(table: pa.Table | Columns) -> AnyFloats:
     """Return the width between the fingers (time,), m; 0 where none is recorded, or several."""
-    found = (FINGER,) if FINGER in table.column_names else tactile.columns(table.schema, poses.WIDTH)
-    if len(found) != 1:
+    found = opening(table.schema)
+    if not found:
         return np.zeros(table.num_rows)
-    scale = poses.metres(table.schema.field(found[0]))
-    width = inputs(table, found)[:, 0]
+    scale = poses.metres(table.schema.field(found))
+    width = inputs(table, [found])[:, 0]
     return width if scale == 1.0 else width * scale
+
+
+def opening(schema: pa.Schema) -> str:
+    """Return the column of the width between the fingers; the empty text where there is none, or several."""
+    found = (FINGER,) if FINGER in schema.names else tactile.columns(schema, poses.WIDTH)
+    return found[0] if len(found) == 1 else ""
 
 
 def _velocity(table: pa.Table | Columns, pose: Pose, t_ns: Times, placed: AnyFloats) -> AnyFloats:
     """Return the hand's linear and angular velocity (time, 6): from the joints where they are those of a known arm."""
-    names, speeds = _joints(table.schema, pose)
+    names, speeds = joints(table.schema, pose)
     if len(names) == len(speeds) == JOINTS:
         angles = inputs(table, names)
         if kinematics.carries(kinematics.PANDA, angles, placed[:, :3]):
@@ -225,7 +231,7 @@ def _velocity(table: pa.Table | Columns, pose: Pose, t_ns: Times, placed: AnyFlo
     return kinematics.differences(t_ns, placed[:, :3], placed[:, 3:])
 
 
-def _joints(schema: pa.Schema, pose: Pose) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def joints(schema: pa.Schema, pose: Pose) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the columns of the angles and speeds of the arm's joints, empty where it has none."""
     if pose == poses.NAMED:
         each = range(1, JOINTS + 1)
@@ -258,10 +264,18 @@ def aligned(arm: AnyFloats, reference: AnyFloats) -> AnyFloats:
     A quaternion and its negative are the same rotation. Within a recording the sign is continuous already; between
     recordings it is a matter of chance, and a model would take it for another pose.
     """
+    return negated(arm) if is_opposite(arm, reference) else arm
+
+
+def is_opposite(arm: AnyFloats, reference: AnyFloats) -> bool:
+    """Return whether the first finite one of the arm's rows (time, 13) has a quaternion nearer to minus ``reference``."""
     finite = arm[np.isfinite(arm).all(axis=1), TURNED]
-    if len(finite) and finite[0] @ reference < 0:
-        return np.hstack([arm[:, : TURNED.start], -arm[:, TURNED], arm[:, TURNED.stop :]])
-    return arm
+    return bool(len(finite) and finite[0] @ reference < 0)
+
+
+def negated(arm: AnyFloats) -> AnyFloats:
+    """Return the arm's rows (time, 13) with the quaternions' other sign."""
+    return np.hstack([arm[:, : TURNED.start], -arm[:, TURNED], arm[:, TURNED.stop :]])
 
 
 def rate_hz(tracks: Sequence[Track]) -> float:

@@ -1,0 +1,333 @@
+"""A model's chain of stages, fed samples as they arrive: rows on the model's grid, latents, windows and forecasts.
+
+Nothing here reads a clock, a file or a link: what comes out depends on the samples, their stamps and the plan alone, and
+not on how they were cut into batches. `tacpipe predict --causal` feeds a recording to the same `Chain`, and so gives bit
+for bit what a live session published. docs/explanation/causal.md states the rules.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from enum import Flag, auto
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from tacpipe.arrays import AnyFloats, Float32s, Floats, Times
+from tacpipe.errors import TacpipeError
+from tacpipe.live.sources import PLAN, PLANNED, Layout, plan_table
+from tacpipe.live.stages import causal_stages
+from tacpipe.models.windows import ARM
+from tacpipe.synchronization.causal import Grid, Rows
+from tacpipe.tasks.forward import planned, units
+from tacpipe.tasks.forward.causal import Arm, Rolling, one_thread
+from tacpipe.tasks.forward.forecaster import Forecaster
+from tacpipe.tasks.forward.planned import Plan
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+CODEC_GAP = 1.5  # periods between two rows above which a codec begins anew, as `frame_stacking.breaks` has it
+
+
+class Cause(Flag):
+    """Why there is no forecast at a grid point, or what one was made without; several may hold."""
+
+    NONE = 0
+    START = auto()  # a stream has not begun, or the level at rest is not yet known: no forecast
+    CONTEXT = auto()  # fewer usable rows in a row than the model's context: no forecast
+    GAP = auto()  # the newest sample of a stream is older than the chain's gap: no forecast
+    VALUE = auto()  # a value of the row is not finite: no forecast
+    SKIPPED = auto()  # a later grid point was predicted instead, on request: no forecast
+    NO_PLAN = auto()  # no planned motion: the hand was assumed to move on as it did
+    PLAN_ENDED = auto()  # the plan ends before the horizon: the hand was assumed to stay at its end
+
+
+BLOCKING = Cause.START | Cause.CONTEXT | Cause.GAP | Cause.VALUE | Cause.SKIPPED
+
+
+@dataclass(frozen=True, slots=True)
+class Forecast:
+    """What was predicted at one grid point; one is returned for each grid point, also where nothing can be predicted."""
+
+    t_ns: int  # of the grid point; step k is the time t_ns + k * period, on a uniform grid
+    made_from_t_ns: int  # stamp of the newest sample that was read, never above t_ns; 0 before the streams have begun
+    count: Float32s | None  # (horizon, channel), above rest; None where `cause` has a flag of `BLOCKING`
+    now: Float32s | None  # (channel,), above rest at t_ns; None before the level at rest is known
+    cause: Cause
+    gaps: tuple[str, ...] = ()  # streams whose newest sample is too old
+
+
+class Beginning(NamedTuple):
+    """What a chain learned when its session began: enough for another chain to continue the session."""
+
+    origin_ns: int  # first point of the grid
+    rest: tuple[float, ...]  # level at rest of each channel
+
+
+class _Row(NamedTuple):
+    """One row of the grid, before the level at rest is taken off."""
+
+    t_ns: int
+    newest_ns: int
+    tactile: Floats  # (channel,)
+    arm: Float32s  # (13,)
+    finger_m: float
+    gaps: tuple[str, ...]
+
+
+class Chain:
+    """The stages that a model was trained behind and the model, causally; one a live session, for one thread.
+
+    Feed every decoded sample with `push`, and state with `advance` up to when all has come: rows and forecasts of the grid
+    points up to then are made. The order of pushes between two calls of `advance` is without effect, as long as each
+    stream's samples come in their order.
+    """
+
+    def __init__(
+        self,
+        forecaster: Forecaster,
+        steps: Sequence[Mapping[str, Any]],
+        layout: Layout,
+        beginning: Beginning | None = None,
+    ) -> None:
+        """Make a chain of parts that fit; `of` checks that they do."""
+        stages = causal_stages(steps)
+        self._forecaster, self._stages, self._layout = forecaster, stages, layout
+        sync = stages.synchronize
+        gap_ns = round(sync.gap_ms * 1e6)
+        origin_ns = None if beginning is None else beginning.origin_ns
+        self._grid = Grid(layout.readings, layout.master, sync.grid, sync.rate_hz, gap_ns, origin_ns)
+        self._rolling = Rolling(forecaster, continues=beginning is not None)
+        self._arm = Arm(forecaster.orientation)
+        self._resting: list[_Row] | None = [] if beginning is None else None  # until the level at rest is known
+        self._rest: Floats | None = None if beginning is None else np.array(beginning.rest)
+        self._last_ns: int | None = None  # time of the row before
+        self._plans: deque[tuple[int, list[Floats]]] = deque()  # arrival, and rows of time and pose
+        self._late_plans = 0
+        self._until_ns: int | None = None
+        period_ns = 1e9 / self.rate_hz
+        self._apart_ns = stages.apart * period_ns
+        self._codec_ns = CODEC_GAP * period_ns
+        self._ahead_ns = np.rint(np.arange(1, forecaster.horizon + 1) * period_ns).astype(np.int64)  # (horizon,)
+
+    @classmethod
+    def of(
+        cls,
+        model: Mapping[str, bytes],
+        steps: Sequence[Mapping[str, Any]],
+        layouts: Mapping[str, pa.Schema],
+        master: str = "",
+        beginning: Beginning | None = None,
+    ) -> Chain:
+        """Return the chain of a model: its files, the stages it was trained behind, and the schema of each recorded stream.
+
+        ``model`` and ``steps`` are ``files`` and ``source.chain`` of the dataset that `tacpipe.open` gives for a model.
+        ``layouts`` holds the schemas (with field metadata) of the rig's streams, as they are recorded; ``master`` is the
+        rig file's, used where the model's stages name none. Raises `TacpipeError` where the model is not of a task that
+        runs live, was trained behind a stage that looks ahead and has no causal rule, or needs a stream or channel that
+        ``layouts`` lacks or has otherwise.
+
+        ``beginning`` is that of another chain of the session, which ended: grid and level at rest are continued, so that
+        this one predicts the same once it has read a few rows more than the model's context. What the other one had
+        counted of wrap-arounds is not known.
+        """
+        forecaster = Forecaster.load(model)
+        if forecaster.actions == "shuffled":
+            raise TacpipeError(
+                "This model was trained on shuffled plans, a control that needs many recordings at once; train one with "
+                "--actions planned or none."
+            )
+        stages = causal_stages(steps)
+        return cls(forecaster, steps, Layout.of(forecaster, stages.synchronize, layouts, master), beginning)
+
+    @property
+    def streams(self) -> tuple[str, ...]:
+        """Names of the streams that are read; others may be pushed and are ignored."""
+        return tuple(self._layout.readings)
+
+    @property
+    def waiting(self) -> tuple[str, ...]:
+        """Those of `streams` of which no sample has come; without the master's there are no grid points either."""
+        return self._grid.waiting
+
+    @property
+    def master(self) -> str:
+        """The stream whose samples start the grid."""
+        return self._layout.master
+
+    @property
+    def rate_hz(self) -> float:
+        """Grid points a second; of a grid ``logged`` or ``fresh``, the median of training."""
+        sync = self._stages.synchronize
+        return float(sync.rate_hz if sync.grid == "uniform" else self._forecaster.config["rate_hz"])
+
+    @property
+    def horizon(self) -> int:
+        """How many steps ahead are predicted: steps 1 to `horizon`."""
+        return self._forecaster.horizon
+
+    @property
+    def context(self) -> int:
+        """How many rows are read."""
+        return self._forecaster.context
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Names of the predicted channels, such as ``xela1_taxel01_z``."""
+        return tuple(self._forecaster.codec.channels)
+
+    @property
+    def layout(self) -> tuple[Mapping[str, str], ...]:
+        """Stream, taxel and axis of each channel."""
+        return tuple(self._forecaster.codec.layout)
+
+    @property
+    def unit(self) -> str:
+        """Unit of the predicted channels, as ``count``."""
+        return str(self._forecaster.config["inputs"].get("unit", units.COUNT))
+
+    @property
+    def forecaster(self) -> Forecaster:
+        """The model."""
+        return self._forecaster
+
+    @property
+    def reads_plan(self) -> bool:
+        """Whether the model reads planned motion."""
+        return self._forecaster.actions == "planned" and bool(self._forecaster.pose.position)
+
+    @property
+    def rest(self) -> Floats | None:
+        """Level at rest (channel,), None as long as it is not known."""
+        return self._rest
+
+    @property
+    def beginning(self) -> Beginning | None:
+        """Grid and level at rest, for a chain that continues the session; None as long as they are not known."""
+        origin_ns = self._grid.origin_ns
+        return None if self._rest is None or origin_ns is None else Beginning(origin_ns, tuple(self._rest.tolist()))
+
+    @property
+    def late(self) -> Mapping[str, int]:
+        """How many samples of each stream came after a sample of a later stamp, or after `advance` had passed them.
+
+        What was predicted meanwhile lacks them, and so differs from what `tacpipe predict --causal` gives.
+        """
+        return {**self._grid.late, **({PLAN: self._late_plans} if self.reads_plan else {})}
+
+    def push(self, stream: str, batch: pa.RecordBatch | pa.Table) -> None:
+        """Take samples of a stream in the order of their arrival, with ``t_ns`` and the columns of its layout."""
+        if stream == PLAN:
+            self._push_plans(batch)
+        elif stream in self._layout.readings and batch.num_rows:
+            self._grid.push(stream, *self._layout.samples(stream, batch))
+
+    def plan(self, arrived_ns: int, t_ns: Times, poses: AnyFloats) -> None:
+        """Take planned motion that arrived at ``arrived_ns``; it replaces the plan before it.
+
+        ``t_ns`` (point,) are the times, ascending, on the clock of the samples, at which the hand is to be at ``poses``
+        (point, 3 or 7): position in m and quaternion x, y, z, w in the frame of the recorded pose. Between points the
+        position is interpolated linearly and the orientation along the shorter arc. The same as pushing the rows of
+        `tacpipe.live.sources.plan_table`, which is what a session records. Raises `TacpipeError` for other shapes.
+        """
+        self._push_plans(plan_table(arrived_ns, t_ns, poses))
+
+    def advance(self, t_ns: int, *, newest_only: bool = False) -> list[Forecast]:
+        """Return the forecasts of the grid points up to ``t_ns``: the caller states that all samples up to it were pushed.
+
+        A sample or plan with a stamp up to ``t_ns`` that comes later is counted in `late`. With ``newest_only``, for whom
+        has fallen behind, the newest grid point alone is predicted; the others have the cause SKIPPED.
+        """
+        self._until_ns = t_ns if self._until_ns is None else max(t_ns, self._until_ns)
+        rows = self._grid.rows(t_ns)
+        found: list[Forecast] = []
+        with one_thread():
+            for index, at_ns in enumerate(rows.t_ns.tolist()):
+                if not rows.begun[index]:
+                    found.append(Forecast(at_ns, 0, None, None, Cause.START))
+                    continue
+                row = self._row(rows, index, at_ns)
+                skipped = newest_only and index < len(rows.t_ns) - 1
+                found.append(self._forecast(row, skipped=skipped))
+        return found
+
+    def _row(self, rows: Rows, index: int, t_ns: int) -> _Row:
+        """Return a row of the grid as the model reads it."""
+        gaps = tuple(name for name, gap in rows.gap.items() if gap[index])
+        newest_ns = max(int(stamps[index]) for stamps in rows.newest_ns.values())
+        values = {name: found[index] for name, found in rows.values.items()}
+        layout = self._layout
+        arm = self._arm.row(t_ns, *layout.placed(values))
+        return _Row(t_ns, newest_ns, layout.tactile(values), arm, layout.finger_m(values), gaps)
+
+    def _forecast(self, row: _Row, *, skipped: bool) -> Forecast:
+        """Return the forecast of a row, once the rows of the rest are known."""
+        if self._resting is not None:
+            first = self._resting[0] if self._resting else row
+            if row.t_ns <= first.t_ns + round(self._stages.contacts.rest_s * 1e9) or not self._resting:
+                self._resting.append(row)
+                return Forecast(row.t_ns, row.newest_ns, None, None, Cause.START, row.gaps)
+            self._rest = self._layout.rest(self._stages.contacts, [one.tactile for one in self._resting])
+            for one in self._resting:
+                self._take(one)
+            self._resting = None
+        finite = self._take(row)
+        cause = Cause.GAP if row.gaps else Cause.NONE
+        cause |= Cause.NONE if finite else Cause.VALUE
+        cause |= Cause.NONE if cause or self._rolling.is_ready else Cause.CONTEXT
+        cause |= Cause.SKIPPED if skipped and not cause else Cause.NONE
+        now = self._rolling.now.astype(np.float32)
+        if cause:
+            return Forecast(row.t_ns, row.newest_ns, None, now, cause, row.gaps)
+        ahead, lacking = self._ahead(row.t_ns)
+        return Forecast(row.t_ns, row.newest_ns, self._rolling.predict(ahead), now, lacking)
+
+    def _take(self, row: _Row) -> bool:
+        """Give a row to the model's window; return whether its values are finite."""
+        since_ns = None if self._last_ns is None else row.t_ns - self._last_ns
+        self._last_ns = row.t_ns
+        assert self._rest is not None
+        return self._rolling.add(
+            row.tactile - self._rest,
+            row.arm,
+            row.finger_m,
+            follows=since_ns is not None and since_ns <= self._apart_ns,
+            encodes=since_ns is not None and since_ns <= self._codec_ns,
+            usable=not row.gaps,
+        )
+
+    def _ahead(self, t_ns: int) -> tuple[AnyFloats, Cause]:
+        """Return the arm's rows to come (horizon, 13), and what they were made without."""
+        now, ahead_ns = self._rolling.arm, t_ns + self._ahead_ns
+        if not self.reads_plan:  # a model without plans puts the newest row there itself
+            return np.broadcast_to(now, (self.horizon, ARM)), Cause.NONE
+        while len(self._plans) > 1 and self._plans[1][0] <= t_ns:
+            self._plans.popleft()
+        if not self._plans or self._plans[0][0] > t_ns:
+            return planned.without(t_ns, ahead_ns, now), Cause.NO_PLAN
+        rows = np.concatenate(self._plans[0][1])
+        plan = Plan(rows[:, 0].view(np.int64), rows[:, 1:])
+        cause = Cause.PLAN_ENDED if plan.t_ns[-1] < ahead_ns[-1] else Cause.NONE
+        return planned.rows(plan, t_ns, ahead_ns, now), cause
+
+    def _push_plans(self, batch: pa.RecordBatch | pa.Table) -> None:
+        """Take rows of plans; rows of the same arrival are one plan, also where they come in several batches."""
+        if not self.reads_plan or not batch.num_rows:
+            return
+        names = batch.schema.names
+        arrived = batch.column(names.index("t_ns")).to_numpy()
+        # times as bits of a float, so that a plan's rows are one array
+        target = np.ascontiguousarray(batch.column(names.index("t_target_ns")).to_numpy()).view(np.float64)
+        poses: Floats = np.column_stack([batch.column(names.index(name)).to_numpy() for name in PLANNED])
+        rows = np.column_stack([target, poses])
+        for arrived_ns in np.unique(arrived).tolist():
+            some = rows[arrived == arrived_ns]
+            if self._until_ns is not None and arrived_ns <= self._until_ns:
+                self._late_plans += 1
+            if self._plans and self._plans[-1][0] == arrived_ns:
+                self._plans[-1][1].append(some)
+            else:
+                self._plans.append((arrived_ns, [some]))

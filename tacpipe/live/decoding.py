@@ -1,0 +1,122 @@
+"""One stream of a live session from the bytes of its link to batches, as they will stand in the recording."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tacpipe.arrays import AnyArray
+from tacpipe.recording.reading import Batch, Reading
+from tacpipe.recording.spool_blocks import Note
+from tacpipe.recording.station import LOST
+from tacpipe.sensors.framing import Chunks
+from tacpipe.sensors.sensor import Sensor
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+
+class Decoder:
+    """Decodes what came of a stream when it is asked for: many small chunks cost less together than one by one."""
+
+    def __init__(self, sensor: Sensor) -> None:
+        self.sensor = sensor
+        self.heard_ns: int | None = None  # arrival of the newest chunk
+        self.failures = 0
+        self._reading = Reading(sensor)
+        self._waiting: list[Chunks | Note] = []
+        self._schema: pa.Schema | None = None  # of all that it gives
+
+    def columns(self, batch: Batch, offset_ns: int) -> Columns:
+        """Return a batch of this stream as it is recorded; ``offset_ns`` is added to the monotonic clock to have UTC."""
+        if self._schema is None:
+            self._schema = batch_schema(batch, self.sensor)
+        return Columns(batch, self._schema, offset_ns)
+
+    def take(self, block: Chunks | Note) -> None:
+        """Take what came."""
+        if isinstance(block, Chunks):
+            self.heard_ns = int(block.t_ns[-1])
+        if isinstance(block, Chunks) or block.what == LOST:
+            self._waiting.append(block)
+
+    def batches(self) -> list[Batch]:
+        """Return what is complete now, as `tacpipe.recording.sealing` will decode it."""
+        waiting, self._waiting = self._waiting, []
+        found: list[Batch] = []
+        chunks: list[Chunks] = []
+        for block in [*waiting, None]:
+            if isinstance(block, Chunks):
+                chunks.append(block)
+                continue
+            if chunks:
+                found += self._fed(Chunks.joined(chunks))
+                chunks = []
+            if block is not None:
+                found.append(self._reading.broken())
+        return [batch for batch in found if len(batch)]
+
+    def _fed(self, chunks: Chunks) -> list[Batch]:
+        try:
+            return [self._reading.feed(chunks)]
+        except Exception:  # of a driver: what comes next is tried again, as it is when the recording is sealed
+            self.failures += 1
+            self._reading = Reading(self.sensor)
+            return []
+
+
+class Columns:
+    """A batch as the recording will hold it, without a copy: what `tacpipe.live.chain.Chain.push` reads of a table.
+
+    A table of pyarrow costs 10 us a column, and an arm has fifty of which a model reads ten.
+    """
+
+    def __init__(self, batch: Batch, schema: pa.Schema, offset_ns: int) -> None:
+        self.schema, self.num_rows = schema, len(batch)
+        self._first = [batch.t_ns + offset_ns]
+        self._first += [one for one in (batch.t_device_ns, batch.seq, batch.device_seq) if one is not None]
+        self._blocks = batch.values
+        self._ends = np.cumsum([block.shape[1] for block in batch.values])
+
+    def column(self, place: int | str) -> AnyArray:
+        """Return a column (sample,) by its number or name."""
+        number = self.schema.get_field_index(place) if isinstance(place, str) else place
+        if number < len(self._first):
+            return self._first[number]
+        number -= len(self._first)
+        block = int(np.searchsorted(self._ends, number, side="right"))
+        found: AnyArray = self._blocks[block][:, number - int(self._ends[block])]
+        return found
+
+    def table(self) -> pa.Table:
+        """Return the same as a table."""
+        import pyarrow as pa
+
+        arrays = [pa.array(self.column(number), field.type) for number, field in enumerate(self.schema)]
+        return pa.Table.from_arrays(arrays, schema=self.schema)
+
+
+def schema(sensor: Sensor, *, device: bool, counters: list[str]) -> pa.Schema:
+    """Return the schema of a stream as it is recorded, with the columns of a device's clock and counters if it has them."""
+    import pyarrow as pa
+
+    from tacpipe.channels import schema as schemas
+
+    time = {"unit": "ns", "quantity": "time"}
+    fields = [schemas.time_field()]
+    fields += [pa.field("t_device_ns", pa.int64(), metadata=time)] if device else []
+    fields += [pa.field(name, pa.int64(), metadata={"unit": "1", "quantity": "sequence"}) for name in counters]
+    return pa.schema([*fields, *sensor.fields()])
+
+
+def likely_schema(sensor: Sensor) -> pa.Schema:
+    """Return the schema of a stream that has given nothing yet: its channels are certain, its clock is not."""
+    counters = ["seq"] * (sensor.counter is not None) + ["device_seq"] * (sensor.device_counter is not None)
+    return schema(sensor, device=False, counters=counters)
+
+
+def batch_schema(batch: Batch, sensor: Sensor) -> pa.Schema:
+    """Return the schema of a stream that gave this batch."""
+    counters = [name for name in ("seq", "device_seq") if getattr(batch, name) is not None]
+    return schema(sensor, device=batch.t_device_ns is not None, counters=counters)

@@ -1,0 +1,260 @@
+"""A live session's logic: blocks of bytes in, messages out. It reads no clock and does no input or output.
+
+The chain is `tacpipe.live.chain.Chain`, or anything that behaves so. `take` keeps what came, `due_ns` states when the next
+grid point can be predicted, and `step` makes what is due. Where several grid points are due, this process fell behind: the
+newest alone is published, the others are counted as skipped.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from tacpipe.live import wire
+from tacpipe.live.alarms import NOTHING_KNOWN, Alarms
+from tacpipe.live.chain import Cause, Forecast
+from tacpipe.live.decoding import Decoder, batch_schema, likely_schema
+from tacpipe.live.messages import Message
+from tacpipe.live.sources import PLAN
+from tacpipe.recording.spool_blocks import Note
+from tacpipe.recording.station import BEGAN
+from tacpipe.sensors.framing import Chunks
+from tacpipe.sensors.sensor import Sensor
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+SETTLE_NS = 2_000_000  # after a grid point, in which the samples that belong to it are awaited from the other threads
+PERIODS = 2.0  # without a forecast, after which a message states why there is none
+SLACK_NS = 5_000_000  # of the same, for jitter
+STARTING_S = 0.005  # between two tries while the grid is not known
+
+
+class Chainlike(Protocol):
+    """What is used of a `tacpipe.live.chain.Chain`."""
+
+    @property
+    def streams(self) -> tuple[str, ...]:
+        """Names of the streams that are read."""
+
+    @property
+    def master(self) -> str:
+        """The stream whose samples start the grid."""
+
+    @property
+    def rate_hz(self) -> float:
+        """Grid points a second."""
+
+    @property
+    def horizon(self) -> int:
+        """How many steps ahead are predicted."""
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Names of the predicted channels."""
+
+    @property
+    def layout(self) -> tuple[Mapping[str, str], ...]:
+        """Stream, taxel and axis of each channel."""
+
+    @property
+    def unit(self) -> str:
+        """Unit of the predicted channels."""
+
+    @property
+    def late(self) -> Mapping[str, int]:
+        """Samples that came too late, by stream."""
+
+    def push(self, stream: str, batch: Any) -> None:
+        """Take samples."""
+
+    def advance(self, t_ns: int, *, newest_only: bool = False) -> list[Forecast]:
+        """Return the forecasts up to a time, on request of the newest grid point alone."""
+
+
+Opened = Callable[[Mapping[str, "pa.Schema"]], Chainlike]
+
+
+class Engine:
+    """One live session: a chain for each recording of it, and for each stretch after blocks were thrown away."""
+
+    def __init__(
+        self,
+        sensors: Mapping[str, Sensor],
+        opened: Opened,
+        alarms: Callable[[Chainlike], Alarms],
+        steps: Sequence[int] | None = None,
+        *,
+        settle_ns: int = SETTLE_NS,
+    ) -> None:
+        self.sensors = dict(sensors)
+        self._opened, self._alarms_of = opened, alarms
+        self.settle_ns = settle_ns
+        self.chain = opened({name: likely_schema(one) for name, one in self.sensors.items()})
+        self.alarms = alarms(self.chain)
+        self.steps = tuple(steps) if steps else tuple(range(1, self.chain.horizon + 1))
+        self.skipped = self.overflows = self._seq = self._late = 0
+        self._first: dict[str, pa.Schema] = {}  # schema of what each stream gave first
+        self._offset_ns: int | None = None  # None: no recording has begun
+        self._begun: set[str] = set()
+        self._decoders = self._new_decoders()
+        self._last_ns: int | None = None  # monotonic, of the last message
+        self._point_ns: int | None = None  # of the last grid point
+        self._why = ""  # there is a chain and yet no grid: why
+
+    @property
+    def period_ns(self) -> int:
+        """Time between grid points."""
+        return round(1e9 / self.chain.rate_hz)
+
+    @property
+    def late(self) -> int:
+        """Samples so far that came after the row that they belong to was made."""
+        return self._late + sum(self.chain.late.values())
+
+    @property
+    def running(self) -> bool:
+        """Whether a recording has begun."""
+        return self._offset_ns is not None
+
+    def take(self, stream: str, block: Chunks | Note) -> None:
+        """Take a block of a stream, or a note on all (``stream`` is empty)."""
+        if not stream:
+            assert isinstance(block, Note)
+            if block.what == wire.BEGIN:
+                self._begin(int(block.detail))
+            elif block.what == wire.END:
+                self._offset_ns = None
+            elif block.what == wire.OVERFLOW and self.running:
+                self.overflows += 1
+                self._restart("blocks were thrown away under overload")
+            return
+        if isinstance(block, Note) and block.what == BEGAN:
+            self._begun.add(stream)
+            self._decoders[stream] = Decoder(self.sensors[stream])
+            return
+        if stream in self.chain.streams or stream == PLAN or stream not in self._first:
+            self._decoders[stream].take(block)
+        if not self.running and stream not in self._first:
+            self._look(stream)
+
+    def due_ns(self, now_ns: int) -> int:
+        """Return when `step` is to be called next, on the monotonic clock."""
+        if self._point_ns is None or self._offset_ns is None:
+            return now_ns + round(STARTING_S * 1e9)
+        due_ns = self._point_ns + self.period_ns - self._offset_ns + self.settle_ns
+        return due_ns if due_ns > now_ns else now_ns + round(STARTING_S * 1e9) // 5
+
+    def step(self, now_ns: int) -> list[Message]:
+        """Return the message that is due: the newest forecast, or that there has been none for `PERIODS`."""
+        if self._offset_ns is None or len(self._begun) < len(self.sensors):
+            return []
+        began_s = time.perf_counter()
+        for name, decoder in self._decoders.items():
+            for batch in decoder.batches():
+                columns = decoder.columns(batch, self._offset_ns)
+                self.chain.push(name, columns.table() if name == PLAN else columns)
+        found = self.chain.advance(now_ns + self._offset_ns - self.settle_ns, newest_only=True)
+        if not found:
+            return self._silence(now_ns)
+        self._why = ""
+        self._point_ns, self._last_ns = found[-1].t_ns, now_ns
+        self.skipped += sum(Cause.SKIPPED in one.cause for one in found)
+        message = self._message(found[-1], now_ns)
+        message.late, message.compute_ms = self.late, (time.perf_counter() - began_s) * 1e3
+        return [message]
+
+    def published(self, message: Message, now_ns: int) -> None:
+        """Write into a message how long it took, when it is about to go out."""
+        if self._offset_ns is None or message.values is None:
+            return
+        message.latency_ms = (now_ns + self._offset_ns - message.made_from_t_ns) / 1e6
+        heard_ns = self._decoders[self.chain.master].heard_ns if self.chain.master in self._decoders else None
+        message.age_ms = math.nan if heard_ns is None else (now_ns - heard_ns) / 1e6
+
+    def _message(self, forecast: Forecast, now_ns: int) -> Message:
+        self._seq += 1
+        values, states = None, dict(NOTHING_KNOWN)
+        if forecast.count is not None and forecast.now is not None:
+            values = np.ascontiguousarray(forecast.count[[step - 1 for step in self.steps]], dtype=np.float32)
+            states = self.alarms.states(forecast.count, forecast.now, self.chain.layout)
+        return Message(
+            self._seq,
+            forecast.t_ns,
+            values,
+            words(forecast),
+            forecast.cause.value,
+            states,
+            forecast.made_from_t_ns,
+            skipped=self.skipped,
+        )
+
+    def _silence(self, now_ns: int) -> list[Message]:
+        """Return a message without a forecast where there was none for too long."""
+        assert self._offset_ns is not None
+        if self._last_ns is None:
+            self._last_ns = now_ns
+        if now_ns - self._last_ns < PERIODS * self.period_ns + SLACK_NS:
+            return []
+        self._last_ns = now_ns
+        self._seq += 1
+        limit_ns = PERIODS * self.period_ns + SLACK_NS
+        silent = [
+            name
+            for name in self.chain.streams
+            if name in self._decoders and now_ns - (self._decoders[name].heard_ns or 0) > limit_ns
+        ]
+        reasons = [self._why] if self._why else []
+        reasons += [f"nothing comes from {', '.join(silent)}"] if silent else []
+        why = "; ".join(reasons) or "no row is complete"
+        return [Message(self._seq, now_ns + self._offset_ns, None, why, skipped=self.skipped, late=self.late)]
+
+    def _begin(self, offset_ns: int) -> None:
+        """Begin a recording: from here on `offset_ns` is added to the monotonic clock."""
+        self._offset_ns = offset_ns
+        self._begun = set()
+        self._decoders = self._new_decoders()
+        self._restart("the recording begins")
+
+    def _restart(self, why: str) -> None:
+        self._late += sum(self.chain.late.values())
+        layouts = {name: self._first.get(name) or likely_schema(one) for name, one in self.sensors.items()}
+        self.chain = self._opened(layouts)
+        self._point_ns = self._last_ns = None
+        self._why = why
+
+    def _look(self, stream: str) -> None:
+        """Take note of the schema of what a stream gives, before a recording begins."""
+        for batch in self._decoders[stream].batches():
+            self._first.setdefault(stream, batch_schema(batch, self.sensors[stream]))
+
+    def _new_decoders(self) -> dict[str, Decoder]:
+        return {name: Decoder(sensor) for name, sensor in self.sensors.items()}
+
+
+def words(forecast: Forecast) -> str:
+    """Return the cause of a forecast in words.
+
+    >>> words(Forecast(0, 0, None, None, Cause.GAP | Cause.CONTEXT, ("xela2",)))
+    'nothing new comes from xela2'
+    """
+    cause = forecast.cause
+    if Cause.GAP in cause:
+        return f"nothing new comes from {', '.join(forecast.gaps) or 'a stream'}"
+    for flag, sentence in SENTENCES.items():
+        if flag in cause:
+            return sentence
+    return ""
+
+
+SENTENCES = {
+    Cause.START: "the session begins: the level at rest is not known yet",
+    Cause.VALUE: "a value is not finite",
+    Cause.CONTEXT: "the model's context is being filled",
+    Cause.PLAN_ENDED: "the plan has ended: the hand is taken to stay",
+    Cause.NO_PLAN: "there is no plan: the hand is taken to move on",
+}

@@ -1,0 +1,36 @@
+"""What a live session is asked for, as the recording process hands it to the model's process."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from typing import Any, Self
+
+OWN = ("forecast", "alarm", "latency")  # streams that a session adds to the rig
+
+
+@dataclass(frozen=True)
+class Options:
+    """A live session."""
+
+    model: str  # path of the model
+    rig: str  # text of the rig file, with the session's own streams
+    streams: tuple[str, ...]  # of the rig that are handed on, in the order of their numbers
+    steps: tuple[int, ...] = ()  # that are published; empty: every step of the horizon
+    publish: tuple[str, ...] = ()  # addresses
+    alarms_per_hour: float = 0.0  # 0: no alarms
+    alarms_on: str = ""  # recordings that their levels are set on
+    split: str = ""  # whose validation recordings are meant; empty: all
+    settle_ms: float = 2.0
+    nice: int = 1  # by how much the model's process stands back behind the recording
+
+    def to_json(self) -> str:
+        """Return the options as one line."""
+        return json.dumps(asdict(self)) + "\n"
+
+    @classmethod
+    def from_json(cls, text: str) -> Self:
+        """Return the options of such a line."""
+        found: Any = json.loads(text)
+        fields: Any = {name: tuple(value) if isinstance(value, list) else value for name, value in found.items()}
+        return cls(**fields)

@@ -1,0 +1,1 @@
+"""Subscribers of a live session, one kind a file; none of them is ever waited for."""

@@ -1,0 +1,115 @@
+"""Recordings given to a `Chain` as they were recorded: what `tacpipe predict --causal` writes."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.io import progress
+from tacpipe.live.chain import BLOCKING, Cause, Chain, Forecast
+from tacpipe.live.sources import PLAN
+from tacpipe.plugins.stage import RecordingOutput, Result
+from tacpipe.tasks.forward.prediction import prediction_table
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from tacpipe.datasets.dataset import Dataset, Model, Recording
+
+PIECE_NS = 1_000_000_000  # of a recording that is given at once
+
+
+def predict(model: Model, recordings: Dataset, steps: Sequence[int]) -> Result:
+    """Return a table a recording, as `tasks.forward.prediction.predict` does, of forecasts that look at no later sample.
+
+    Attributes count the grid points without a forecast, by cause. Raises `TacpipeError` for a step that the model does not
+    reach, and where a recording's streams are not what it reads.
+    """
+    found: dict[str, RecordingOutput] = {}
+    without, unplanned, every = [], 0, 0
+    with progress.bar("predict", len(recordings.recordings)) as advance:
+        for name, recording in sorted(recordings.recordings.items()):
+            try:
+                found[name], causes = _predicted(model, recording, steps)
+            except TacpipeError as error:
+                raise type(error)(f"{name}: {error}") from error
+            if not found[name].streams[""].num_rows:
+                without.append(f"{name}: no forecast could be made at any grid point ({_described(causes)}).")
+            unplanned += causes[Cause.NO_PLAN]
+            every += found[name].streams[""].num_rows
+            advance(note=name)
+    if unplanned:
+        without.append(
+            f"{unplanned} of {every} forecasts are without a plan (there is no stream {PLAN!r} in the recording by then): "
+            f"the hand was assumed to move on as it did."
+        )
+    return Result(found, notes=without)
+
+
+def _predicted(model: Model, recording: Recording, steps: Sequence[int]) -> tuple[RecordingOutput, Counter[Cause]]:
+    """Return the predictions of a recording, and how many grid points each cause had."""
+    tables = recorded(recording)
+    master = str(recording.attributes.get("master", ""))
+    schemas = {name: table.schema for name, table in tables.items()}
+    chain = Chain.of(model.files, model.source.chain, schemas, master)
+    for step in steps:
+        if not 1 <= step <= chain.horizon:
+            raise TacpipeError(
+                f"The model predicts 1 to {chain.horizon} steps ahead, not {step}. Give --steps of these."
+            )
+    t_ns, counts, causes = [], [], Counter[Cause]()
+    wanted = [step - 1 for step in steps]
+    for one in replayed(chain, tables):
+        causes.update(one.cause)
+        if one.count is not None:
+            t_ns.append(one.t_ns)
+            counts.append(one.count[wanted])
+    stacked = np.stack(counts) if counts else np.zeros((0, len(wanted), len(chain.channels)), np.float32)
+    table = prediction_table(chain.forecaster, np.array(t_ns, np.int64), stacked.transpose(1, 2, 0).copy(), steps)
+    described = {
+        f"forecast_{_name(cause)}": count for cause, count in sorted(causes.items(), key=lambda one: one[0].value)
+    }
+    return RecordingOutput(table, {"causal": True, **described}), causes
+
+
+def recorded(recording: Recording) -> dict[str, pa.Table]:
+    """Return the streams of a recording. Raises `UsageError` for one that went through `synchronize` already."""
+    if set(recording.streams) == {""}:
+        raise UsageError(
+            "this recording went through a stage already, and what had arrived when cannot be seen from it. Give the "
+            "recordings themselves; the model's own stages are run on them."
+        )
+    return {name: recording.table(name) for name in recording.streams}
+
+
+def replayed(chain: Chain, tables: Mapping[str, pa.Table]) -> Iterator[Forecast]:
+    """Yield the forecasts of a recording's streams, which are given to ``chain`` as they arrived, some at a time."""
+    stamps = {
+        name: tables[name].column("t_ns").to_numpy()
+        for name in (*chain.streams, PLAN)
+        if name in tables and tables[name].num_rows
+    }
+    if not stamps:
+        return
+    begins, last = (int(pick(some[end] for some in stamps.values())) for pick, end in ((min, 0), (max, -1)))
+    rows = dict.fromkeys(stamps, 0)
+    for until_ns in (*range(begins, last, PIECE_NS), last):
+        for name, t_ns in stamps.items():
+            stop = int(np.searchsorted(t_ns, until_ns, side="right"))
+            chain.push(name, tables[name].slice(rows[name], stop - rows[name]))
+            rows[name] = stop
+        yield from chain.advance(until_ns)
+
+
+def _described(causes: Mapping[Cause, int]) -> str:
+    """Return the causes why there is no forecast, and how often each was."""
+    named = [f"{count} {_name(cause)}" for cause, count in causes.items() if cause & BLOCKING]
+    return ", ".join(named) or "there is none"
+
+
+def _name(cause: Cause) -> str:
+    return str(cause.name).lower()

@@ -1,0 +1,276 @@
+"""Which columns of which streams a forecaster reads, and the stream of planned motion."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tacpipe.arrays import AnyArray, AnyFloats, Floats, Indices, Times
+from tacpipe.channels import pose as poses
+from tacpipe.channels.streams import axes_of
+from tacpipe.codecs import tactile
+from tacpipe.errors import TacpipeError
+from tacpipe.printable import listed
+from tacpipe.signals.contact import rest_level, tared
+from tacpipe.synchronization import grids, methods
+from tacpipe.synchronization.causal import Reading
+from tacpipe.synchronization.streams import holds_signal
+from tacpipe.tasks.forward import tracks, units
+from tacpipe.tasks.forward.forecaster import Forecaster
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+PLAN = "plan"  # name of the stream of planned motion
+EVENTS = "events"  # the stream of what went wrong while recording
+PLANNED = (*(f"position_{axis}_m" for axis in "xyz"), *(f"orientation_{part}" for part in "xyzw"))
+Place = tuple[str, Indices]  # a stream, and columns of its samples
+
+
+def plan_schema() -> pa.Schema:
+    """Return the columns of the stream of plans: arrival, time at which the hand is to be at the pose, and the pose.
+
+    Rows that arrived at the same time are one plan.
+    """
+    import pyarrow as pa
+
+    def planned(name: str) -> pa.Field:
+        metadata = {"unit": "m" if name.endswith("_m") else "1", "quantity": "plan"}
+        return pa.field(name, pa.float64(), metadata=metadata)
+
+    time = pa.field("t_ns", pa.int64(), metadata={"unit": "ns", "quantity": "time"})
+    target = pa.field("t_target_ns", pa.int64(), metadata={"unit": "ns", "quantity": "time"})
+    return pa.schema([time, target, *map(planned, PLANNED)])
+
+
+def plan_table(arrived_ns: int, t_ns: Times, poses: AnyFloats) -> pa.Table:
+    """Return a plan as rows of `plan_schema`: ``poses`` (point, 3 or 7) at times ``t_ns`` (point,), which ascend.
+
+    Without a quaternion the orientation is NaN: the hand keeps the one it has. Raises `TacpipeError` for other shapes, for
+    a position that is not finite and for times that do not ascend.
+    """
+    import pyarrow as pa
+
+    t_ns, poses = np.asarray(t_ns, np.int64), np.asarray(poses, np.float64)
+    if poses.ndim != 2 or poses.shape[1] not in (3, 7) or len(poses) != len(t_ns) or not len(t_ns):
+        raise TacpipeError(
+            f"A plan has {len(t_ns)} times and poses of shape {poses.shape}; it needs one pose a time, one at least, of 3 "
+            f"numbers (position in m) or of 7 (and a quaternion x, y, z, w)."
+        )
+    if (np.diff(t_ns) <= 0).any() or not np.isfinite(poses).all():
+        raise TacpipeError("The times of a plan must ascend, and all its numbers be finite.")
+    whole = np.full((len(poses), len(PLANNED)), np.nan)
+    whole[:, : poses.shape[1]] = poses
+    arrays = [pa.array(np.full(len(t_ns), arrived_ns, np.int64)), pa.array(t_ns), *map(pa.array, whole.T)]
+    return pa.Table.from_arrays(arrays, schema=plan_schema())
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where a forecaster's inputs are among the samples of a rig's streams."""
+
+    master: str
+    columns: Mapping[str, Sequence[str]]  # that are read of each stream
+    readings: Mapping[str, Reading]
+    tactile_of: Mapping[str, tuple[Indices, Indices]]  # by stream: columns, and the channels that they are
+    axes: Mapping[str, int]  # of the taxels of each of these streams
+    kinds: Mapping[str, np.dtype[Any]]  # in which levels at rest are computed, by stream
+    position: Place | None
+    orientation: Place | None
+    joints: tuple[Place, Place] | None  # angles and speeds
+    finger: Place | None
+    position_m: Floats  # (3,), how many metres the unit of each coordinate is
+    finger_scale_m: float
+    _places: dict[str, tuple[Any, Sequence[int]]] = field(default_factory=dict)  # of columns in batches of a schema
+
+    @classmethod
+    def of(cls, forecaster: Forecaster, synchronize: Any, layouts: Mapping[str, pa.Schema], master: str = "") -> Layout:
+        """Return where inputs are in streams of these schemas, by the params of the model's `synchronize`.
+
+        Raises `TacpipeError` where a stream or a channel is absent, or is another than the model's.
+        """
+        import pyarrow as pa
+
+        signals = {name: layouts[name] for name in sorted(layouts) if name != EVENTS and holds_signal(layouts[name])}
+        origin = {
+            methods.grid_name(stream, name): (stream, name)
+            for stream, schema in signals.items()
+            for name in methods.channel_names(schema)
+        }
+        grid = pa.schema(
+            [
+                methods.grid_field(stream, signals[stream].field(name), "hold").with_name(whole)
+                for whole, (stream, name) in origin.items()
+            ]
+        )
+        _check(forecaster, signals, grid)
+        leader = grids.master("of this rig", synchronize.master or master, signals)
+        columns: dict[str, list[str]] = {leader: []}
+
+        def placed(names: Sequence[str]) -> Place | None:
+            if not names:
+                return None
+            stream = origin[names[0]][0]
+            own = columns.setdefault(stream, [])
+            for whole in names:
+                if origin[whole][1] not in own:
+                    own.append(origin[whole][1])
+            return stream, np.array([own.index(origin[whole][1]) for whole in names], np.intp)
+
+        by_stream: dict[str, list[int]] = {}
+        for index, name in enumerate(forecaster.codec.channels):
+            by_stream.setdefault(origin[name][0], []).append(index)
+        tactile_of: dict[str, tuple[Indices, Indices]] = {}
+        axes: dict[str, int] = {}
+        kinds: dict[str, np.dtype[Any]] = {}
+        for stream, indices in by_stream.items():
+            names = [forecaster.codec.channels[index] for index in indices]
+            place = placed(names)
+            assert place is not None
+            tactile_of[stream] = (place[1], np.array(indices, np.intp))
+            axes[stream] = axes_of(grid, names)
+            kind = np.result_type(*(grid.field(name).type.to_pandas_dtype() for name in names))
+            kinds[stream] = kind if kind.kind == "f" else np.dtype(np.float64)
+        pose = forecaster.pose
+        position, orientation = placed(pose.position), placed(pose.orientation)
+        angles, speeds = tracks.joints(grid, pose)
+        known = len(angles) == len(speeds) == tracks.JOINTS
+        opening = tracks.opening(grid)
+        joints = (placed(angles), placed(speeds)) if known else (None, None)
+        finger = placed([opening] if opening else [])
+        readings = {
+            stream: _reading(signals[stream], names, synchronize, is_master=stream == leader)
+            for stream, names in columns.items()
+        }
+        return cls(
+            leader,
+            columns,
+            readings,
+            tactile_of,
+            axes,
+            kinds,
+            position,
+            orientation,
+            None if joints[0] is None or joints[1] is None else (joints[0], joints[1]),
+            finger,
+            np.array([poses.metres(grid.field(name)) for name in pose.position]),
+            poses.metres(grid.field(opening)) if opening else 1.0,
+        )
+
+    def samples(self, stream: str, batch: pa.RecordBatch | pa.Table) -> tuple[Times, Floats]:
+        """Return stamps (time,) and the columns that are read (time, column) of a batch of a stream.
+
+        Raises `TacpipeError` where a column is absent.
+        """
+        known = self._places.get(stream)
+        if known is None or known[0] is not batch.schema:
+            names = batch.schema.names
+            absent = [name for name in ("t_ns", *self.columns[stream]) if name not in names]
+            if absent:
+                raise TacpipeError(f"Samples of stream {stream} have no column {absent[0]}, which the model reads.")
+            known = (batch.schema, [names.index(name) for name in ("t_ns", *self.columns[stream])])
+            self._places[stream] = known
+        first, *others = (_array(batch.column(index)) for index in known[1])
+        values = np.empty((batch.num_rows, len(others)))
+        for index, column in enumerate(others):
+            values[:, index] = column
+        return first.astype(np.int64, copy=False), values
+
+    def tactile(self, values: Mapping[str, Floats]) -> Floats:
+        """Return the tactile channels (channel,) of a row: ``values`` (column,) by stream."""
+        found = np.empty(sum(len(channels) for _, channels in self.tactile_of.values()))
+        for stream, (columns, channels) in self.tactile_of.items():
+            found[channels] = values[stream][columns]
+        return found
+
+    def placed(self, values: Mapping[str, Floats]) -> tuple[Floats, Floats, Floats | None, Floats | None]:
+        """Return position (3,) in m, quaternion (4,), and joint angles and speeds (7,) or None, of a row."""
+        position, quaternion = np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])
+        if self.position is not None:
+            stream, columns = self.position
+            position = values[stream][columns] * self.position_m
+        if self.orientation is not None:
+            stream, columns = self.orientation
+            quaternion = values[stream][columns]
+        if self.joints is None:
+            return position, quaternion, None, None
+        angles, speeds = (values[stream][columns] for stream, columns in self.joints)
+        return position, quaternion, angles, speeds
+
+    def finger_m(self, values: Mapping[str, Floats]) -> float:
+        """Return the width between the fingers in m of a row; 0 where it is not recorded."""
+        if self.finger is None:
+            return 0.0
+        stream, columns = self.finger
+        return float(np.float32(values[stream][columns[0]] * self.finger_scale_m))
+
+    def rest(self, contacts: Any, rows: Sequence[Floats]) -> Floats:
+        """Return each channel's level at rest (channel,) by the params of `segment contacts` from the rows of the rest."""
+        together = np.stack(rows)  # (row, channel)
+        found = np.empty(together.shape[1])
+        t_ns = np.zeros(len(rows), np.int64)  # all of them count
+        for stream, (_, channels) in self.tactile_of.items():
+            values = together[:, channels].astype(self.kinds[stream])
+            found[channels] = tared(contacts.tare, values, rest_level(values, t_ns, 0.0), self.axes[stream])
+        return found
+
+
+def _reading(schema: pa.Schema, names: list[str], synchronize: Any, *, is_master: bool) -> Reading:
+    """Return what is read of a stream; where its repeated samples matter, all its channels are added to ``names``."""
+    import pyarrow as pa
+
+    compared: list[int] = []
+    if is_master and synchronize.grid == "fresh":
+        every = [name for name in methods.channel_names(schema) if methods.method(schema, name) != "nearest"]
+        names += [name for name in every if name not in names]
+        compared = [names.index(name) for name in every]
+    wraps = [
+        index
+        for index, name in enumerate(names)
+        if synchronize.unwrap
+        and (schema.field(name).metadata or {}).get(b"quantity") == b"tactile"
+        and pa.types.is_integer(schema.field(name).type)
+        and schema.field(name).type.bit_width == 16
+    ]
+    medians = [index for index, name in enumerate(names) if methods.method(schema, name) == "median"]
+    return Reading(len(names), wraps, medians, compared)
+
+
+def _check(forecaster: Forecaster, signals: Mapping[str, pa.Schema], grid: pa.Schema) -> None:
+    """Refuse streams that are not those of the model's recordings."""
+    codec, pose = forecaster.codec, forecaster.pose
+    for name in (*codec.channels, *pose.columns):
+        if name not in grid.names:
+            stream = next((one for one in signals if name.startswith(f"{one}_")), None)
+            where = f"its stream {stream} has no such channel" if stream else f"it records {listed(signals)}"
+            raise TacpipeError(f"The model reads {name}, and this rig does not record it: {where}.")
+    owners = {tactile.metadata(grid.field(name)).get("stream", "") for name in codec.channels}
+    found = [
+        name
+        for name in tactile.columns(grid, "tactile")
+        if tactile.metadata(grid.field(name)).get("stream", "") in owners
+    ]
+    if sorted(found) != sorted(codec.channels):
+        extra = next((name for name in found if name not in codec.channels), None)
+        differs = f"{extra} is one that it was not trained on" if extra else "some are not declared tactile"
+        raise TacpipeError(
+            f"The tactile channels of this rig are {len(found)} and those of the model {len(codec.channels)}: {differs}. "
+            f"Take the rig that the model was trained on, or train one on recordings of this rig."
+        )
+    for name, wanted, has in zip(codec.channels, codec.layout, tactile.layout(grid, codec.channels), strict=True):
+        if dict(wanted) != has:
+            raise TacpipeError(
+                f"Channel {name} of this rig is at {has}, and of the model's recordings at {dict(wanted)}."
+            )
+    unit = units.of_channels(grid, codec.channels)
+    trained = str(forecaster.config["inputs"].get("unit", units.COUNT))
+    if unit != trained:
+        raise TacpipeError(f"The tactile channels of this rig are in {unit}, and those of the model in {trained}.")
+
+
+def _array(column: Any) -> AnyArray:
+    """Return a column of a batch or of a table (time,)."""
+    return np.asarray(column)

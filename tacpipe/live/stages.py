@@ -1,0 +1,58 @@
+"""The stages that a model was trained behind, as far as they have a rule that does not look ahead."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+from tacpipe.channels.masks import GRID, apart
+from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.plugins import params, registry
+
+SYNCHRONIZE, CONTACTS, COMPRESS = "synchronize", "segment.contacts", "compress."
+
+
+class CausalStages(NamedTuple):
+    """The params of the stages that a model's rows went through; its codec is among its files."""
+
+    synchronize: Any
+    contacts: Any
+
+    @property
+    def apart(self) -> float:
+        """How many periods two rows may be apart with none missing between."""
+        return apart({GRID: self.synchronize.grid})
+
+
+def causal_stages(steps: Sequence[Mapping[str, Any]]) -> CausalStages:
+    """Return the params of the stages of a chain, as manifests list them.
+
+    Raises `UsageError` where a stage has another version now, `TacpipeError` where one has no causal rule or is absent.
+    """
+    found: dict[str, Any] = {}
+    for step in steps:
+        name = step["stage"]
+        if name not in (SYNCHRONIZE, CONTACTS) and not name.startswith(COMPRESS):
+            raise TacpipeError(
+                f"The model was trained behind `tacpipe {name.replace('.', ' ')}`, which has no rule for samples as they "
+                f"arrive. Train one behind synchronize, segment contacts and, if you like, compress."
+            )
+        stage = registry.load(name)
+        if stage.version != step["version"]:
+            raise UsageError(
+                f"The model was trained behind version {step['version']} of {name}; this tacpipe has version "
+                f"{stage.version}. Train it again."
+            )
+        found[name] = params.from_json(stage, step["params"])
+    missing = [name for name in (SYNCHRONIZE, CONTACTS) if name not in found]
+    if missing:
+        raise TacpipeError(
+            f"The model was not trained behind `tacpipe {missing[0].replace('.', ' ')}`, so it is unknown how samples "
+            f"become its rows. Train it on recordings that went through that stage."
+        )
+    if found[CONTACTS].rest != "start":
+        raise TacpipeError(
+            f"The model was trained with `segment contacts --rest {found[CONTACTS].rest}`, which looks for the rest in "
+            f"the whole recording; samples as they arrive have the rest at their start. Train it with --rest start."
+        )
+    return CausalStages(found[SYNCHRONIZE], found[CONTACTS])

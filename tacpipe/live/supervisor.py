@@ -1,0 +1,169 @@
+"""The model's process as the recording process sees it: started, listened to, and started anew when it ends by itself."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from tacpipe.errors import DamagedError, DeviceError, TacpipeError, UsageError
+from tacpipe.live import wire
+from tacpipe.live.options import Options
+from tacpipe.live.tap import Tap
+from tacpipe.recording import clock
+from tacpipe.recording.spool_blocks import Note
+from tacpipe.sensors.framing import Chunks
+
+MODULE = "tacpipe.live.process"  # that runs as the model's process
+AGAIN_S = (0.5, 10.0)  # from its end to the next start: first, and at most
+STOP_S = 5.0  # that it has to end, which closes what it publishes
+LOOK_S = 0.05
+NOTED = "forecast"  # stream that notes of the process are on
+DIED, RESTARTED = "model_died", "model_restarted"  # notes in the recording
+
+
+class Supervisor:
+    """Keeps the model's process of a session running: a `tacpipe.recording.recorder.Companion`."""
+
+    def __init__(self, options: Options, tap: Tap) -> None:
+        self.options, self.tap = options, tap
+        self.report: dict[str, Any] = {}  # the last one of the process that runs
+        self.alarms: dict[str, Any] = {}  # their levels
+        self.deaths = 0
+        self.ready = False
+        self._totals = {"forecasts": 0, "skipped": 0, "late": 0, "dropped": 0}  # of processes that ended
+        self._process: subprocess.Popen[bytes] | None = None
+        self._socket: socket.socket | None = None
+        self._lines = wire.Lines()
+        self._offset_ns: int | None = None  # of the recording that runs
+        self._again_s = AGAIN_S[0]
+        self._due_s = 0.0
+        self._refusal: tuple[str, int] | None = None
+
+    def start(self, ended: Callable[[], bool]) -> None:
+        """Start the process and wait until it is ready. Raises what it refuses the session with, as its exit code states."""
+        self._spawn()
+        while not ended() and not self._is_ready():
+            clock.sleep(LOOK_S)
+
+    def _is_ready(self) -> bool:
+        """Return whether the process waits for the rig. Raises what it refuses the session with, or that it ended."""
+        code = None if self._process is None else self._process.poll()
+        self._read()
+        if self._refusal is not None:
+            sentence, number = self._refusal
+            self.stop()
+            kinds = {kind.exit_code: kind for kind in (TacpipeError, UsageError, DeviceError, DamagedError)}
+            raise kinds.get(number, TacpipeError)(sentence)
+        if code is not None:
+            self.stop()
+            raise TacpipeError(f"The model's process ended with {code} before it was ready; see above.")
+        return self.ready
+
+    def put(self, stream: str, content: Chunks | Note) -> None:
+        """Hand on what came of a stream."""
+        self.tap.put(stream, content)
+
+    def begin(self, clock: Mapping[str, int]) -> None:
+        """Begin a recording, whose UTC is the monotonic clock and a constant."""
+        self._offset_ns = clock["utc_ns"] - clock["monotonic_ns"]
+        self.tap.note(Note(clock["monotonic_ns"], "", wire.BEGIN, str(self._offset_ns)))
+
+    def end(self) -> None:
+        """End the recording: what comes until the next one begins is not predicted."""
+        self._offset_ns = None
+        self.tap.note(Note(clock.now_ns(), "", wire.END))
+
+    def look(self) -> list[Note]:
+        """Take what the process reports, start it anew where it ended; return notes on that. Never raises, never waits."""
+        self.tap.flush()
+        self._read()
+        notes = []
+        if self._process is not None and self._process.poll() is not None:
+            code = self._process.returncode
+            self.deaths += 1
+            self._forget()
+            self._due_s = clock.now_s() + self._again_s
+            self._again_s = min(2 * self._again_s, AGAIN_S[1])
+            notes.append(Note(clock.now_ns(), NOTED, DIED, f"exit code {code}; it is started anew"))
+        if self._process is None and clock.now_s() >= self._due_s:
+            with contextlib.suppress(OSError):  # of a computer without memory for it: tried again
+                self._spawn()
+                notes.append(Note(clock.now_ns(), NOTED, RESTARTED, f"restart {self.deaths} of this session"))
+        return notes
+
+    def stop(self) -> None:
+        """End the process in good order; one that does not end is killed."""
+        process = self._process
+        if process is None:
+            return
+        self.tap.note(Note(clock.now_ns(), "", wire.STOP))
+        until_s = clock.now_s() + STOP_S
+        while process.poll() is None and clock.now_s() < until_s:
+            self.tap.flush()
+            self._read()
+            clock.sleep(LOOK_S / 5)
+        self._read()
+        if process.poll() is None:
+            process.kill()
+        process.wait()
+        self.tap.connect(None)
+        if self._socket is not None:
+            self._socket.close()
+        self._process = self._socket = None
+
+    def figures(self) -> dict[str, Any]:
+        """Return what the session did so far, over all its processes."""
+        totals = {name: count + int(self.report.get(name, 0)) for name, count in self._totals.items()}
+        return {**self.report, **totals, "restarts": self.deaths, "overflows": self.tap.overflows}
+
+    def _spawn(self) -> None:
+        ours, theirs = socket.socketpair()
+        threads = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}  # more would only take the recorder's processor
+        environment = {**os.environ, **threads}
+        words = [sys.executable, "-m", MODULE, str(theirs.fileno())]
+        try:
+            self._process = subprocess.Popen(
+                words, pass_fds=[theirs.fileno()], env=environment, stdin=subprocess.DEVNULL, start_new_session=True
+            )
+        finally:
+            theirs.close()
+        self._socket, self._lines, self.ready = ours, wire.Lines(), False
+        ours.sendall(self.options.to_json().encode())
+        ours.setblocking(False)
+        first = [] if self._offset_ns is None else [Note(clock.now_ns(), "", wire.BEGIN, str(self._offset_ns))]
+        self.tap.connect(ours, *first)
+        if first:
+            self.tap.begun()
+
+    def _forget(self) -> None:
+        self.tap.connect(None)
+        if self._socket is not None:
+            self._socket.close()
+        self._process = self._socket = None
+        for name in self._totals:
+            self._totals[name] += int(self.report.get(name, 0))
+        self.report = {"cause": "the model's process is started anew", "latency": self.report.get("latency", {})}
+
+    def _read(self) -> None:
+        if self._socket is None:
+            return
+        while True:
+            try:
+                data = self._socket.recv(1 << 16)
+            except OSError:
+                return
+            if not data:
+                return
+            for content in self._lines.feed(data):
+                if "ready" in content:
+                    self.ready, self.alarms = True, content["ready"]["alarms"]
+                elif "refused" in content:
+                    self._refusal = content["refused"], content["exit_code"]
+                elif "report" in content:
+                    self.report = content["report"]
+                    self._again_s = AGAIN_S[0]

@@ -1,0 +1,102 @@
+"""Planned motion: where a controller is about to move the hand, sent as JSON to a live session, which records it.
+
+A packet is one plan, which replaces the plan before::
+
+    {"version": 1, "points": [[T_NS, X, Y, Z, QX, QY, QZ, QW], …]}
+
+Each point is a time in UTC nanoseconds (``time.time_ns()`` of the computer that records), a position in m and a quaternion,
+in the frame of the recorded pose; times ascend. A plan reaches as far ahead as the model's horizon, and is sent again
+before it ends.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+
+from tacpipe.sensors.framing import Framer
+from tacpipe.sensors.sensor import Samples, Sensor
+from tacpipe.sensors.text_framer import TextFramer
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+VERSION = 1
+MOST_POINTS = 1000  # of a plan
+LARGEST = 1 << 62
+NUMBERS = 7  # of a pose
+
+
+@dataclass(frozen=True)
+class Plan(Sensor):
+    """Plans of a controller; a sample is one point of a plan, those of one plan have the same arrival."""
+
+    summary: ClassVar[str] = "Planned motion of a controller, for `tacpipe live`."
+    links: ClassVar[tuple[str, ...]] = ("udp", "ws")
+    listens: ClassVar[bool] = True
+    steady: ClassVar[bool] = False
+
+    rate_hz: float = 0.0  # plans a second; 0: they come when they come
+
+    def fields(self) -> list[pa.Field]:
+        """Return the time that a point is planned for, in UTC ns, and its pose."""
+        import pyarrow as pa
+
+        def number(name: str, unit: str) -> pa.Field:
+            return pa.field(name, pa.float64(), metadata={"unit": unit, "quantity": "plan"})
+
+        target = pa.field("t_target_ns", pa.int64(), metadata={"unit": "ns", "quantity": "plan"})
+        position = [number(f"position_{axis}_m", "m") for axis in "xyz"]
+        return [target, *position, *(number(f"orientation_{part}", "1") for part in "xyzw")]
+
+    def framer(self) -> Framer:
+        """Return a framer that takes packets that are plans."""
+        return TextFramer(is_plan)
+
+    def decode(self, frames: Sequence[bytes]) -> Samples:
+        """Return a sample for each point of each plan."""
+        plans = [json.loads(frame)["points"] for frame in frames]
+        points = [point for plan in plans for point in plan]
+        targets = np.array([point[0] for point in points], dtype=np.int64).reshape(-1, 1)
+        poses = np.array([point[1:] for point in points], dtype=np.float64).reshape(-1, NUMBERS)
+        rows = np.repeat(np.arange(len(plans)), [len(plan) for plan in plans])
+        return Samples((targets, poses), rows=rows.astype(np.int64))
+
+    def encode(self, samples: Samples) -> list[bytes]:
+        """Return a plan of one point for each sample."""
+        targets, poses = samples.values
+        return [packet([target], [pose]) for target, pose in zip(targets[:, 0].tolist(), poses.tolist(), strict=True)]
+
+
+def packet(t_ns: Iterable[int], poses: Any) -> bytes:
+    """Return the packet of a plan: times in UTC ns (point,), and poses (point, 7)."""
+    points = [[int(at_ns), *(float(one) for one in pose)] for at_ns, pose in zip(t_ns, poses, strict=True)]
+    return json.dumps({"version": VERSION, "points": points}).encode()
+
+
+def is_plan(text: bytes) -> bool:
+    """Return whether a packet is a plan: its version, 1 to 1000 points of finite numbers, times that ascend."""
+    try:
+        record = json.loads(text.decode())
+        points = record["points"]
+        if record["version"] != VERSION or not 0 < len(points) <= MOST_POINTS:
+            return False
+        times = [point[0] for point in points]
+        if not all(type(t_ns) is int and abs(t_ns) < LARGEST for t_ns in times):
+            return False
+        if any(after <= before for before, after in itertools.pairwise(times)):
+            return False
+        return all(
+            len(point) == 1 + NUMBERS
+            and all(type(one) in (int, float) and math.isfinite(one) for one in point[1:])
+            and any(point[4:])
+            for point in points
+        )
+    except (ValueError, TypeError, KeyError, RecursionError, OverflowError):
+        return False

@@ -1,0 +1,136 @@
+"""The channels of a stream on a grid, and the masks that state how far they can be trusted."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from tacpipe.synchronization import methods
+from tacpipe.synchronization.streams import Stream
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from tacpipe.arrays import Bools, Floats, Indices, Int64s, Times
+
+MEDIAN_NS = (
+    10_000_000  # on both sides of a grid point: of a proximity sensor at 400 Hz eight readings, whose noise falls
+)
+PAST_NS = 2 * MEDIAN_NS  # before a causal grid point: as many readings, 10 ms late
+BLOCK_BYTES = 1 << 24  # about as much of a stream's channels is interpolated at once
+
+
+def channels(stream: Stream, grid_ns: Times, exact: Int64s | None) -> list[tuple[pa.Field, Any]]:
+    """Return field and values of each channel on the grid, in the order of the stream."""
+    import pyarrow as pa
+
+    from tacpipe.signals.resampling import bracketing_rows, nearest_rows
+
+    if exact is not None:
+        return _at_rows(stream, exact, "none")
+    groups: dict[str, list[str]] = {}
+    for name in stream.channels:
+        groups.setdefault(methods.method(stream.columns.schema, name), []).append(name)
+    found: dict[str, tuple[pa.Field, Any]] = {}
+    if "nearest" in groups:
+        rows = pa.array(nearest_rows(stream.t_ns, grid_ns))
+        for name in groups.pop("nearest"):
+            found[name] = (methods.grid_field(stream.name, stream.field(name), "nearest"), stream.at(name, rows))
+    used = bracketing_rows(stream.t_ns, grid_ns)
+    for method, members in groups.items():
+        how = method.partition(" ")[0]
+        rows = slice(None) if how == "median" else used
+        for some in _blocks(stream, members, how, len(grid_ns)):
+            for name, column in zip(some, _between_samples(stream, some, how, grid_ns, rows).T, strict=True):
+                kind = methods.between_type(stream.columns.schema.field(name).type)
+                found[name] = _as_stored(methods.grid_field(stream.name, stream.field(name), how, kind), column)
+    return [found[name] for name in stream.channels]
+
+
+def causal_channels(stream: Stream, grid_ns: Times) -> list[tuple[pa.Field, Any]]:
+    """Return field and values of each channel on the grid, from samples that had come by each point alone.
+
+    A channel keeps its newest sample, and its type; a proximity sensor has the median of the last `PAST_NS`. Each point
+    needs a sample before it.
+    """
+    from tacpipe.signals.resampling import median_before, newest_rows
+
+    found = {
+        field.name: (field, values) for field, values in _at_rows(stream, newest_rows(stream.t_ns, grid_ns), "hold")
+    }
+    for name in stream.channels:
+        if methods.method(stream.columns.schema, name) == "median":
+            kind = methods.between_type(stream.columns.schema.field(name).type)
+            field = methods.grid_field(stream.name, stream.field(name), "median", kind)
+            values = median_before(stream.t_ns, stream.values(name)[:, None], grid_ns, PAST_NS)
+            found[field.name] = _as_stored(field, values[:, 0])
+    return list(found.values())
+
+
+def _at_rows(stream: Stream, rows: Indices, how: str) -> list[tuple[pa.Field, Any]]:
+    """Return field and values of each channel at some rows, its type kept; ``how`` names what that is."""
+    import pyarrow as pa
+
+    at = pa.array(rows)
+    return [(methods.grid_field(stream.name, stream.field(name), how), stream.at(name, at)) for name in stream.channels]
+
+
+def _blocks(stream: Stream, members: list[str], how: str, points: int) -> list[list[str]]:
+    """Return the channels that are interpolated at once: the four of a quaternion, else as many as fit a block."""
+    if how == "slerp":
+        parts = [stream.columns.schema.field(name) for name in members]
+        return [[members[i] for i in methods.quaternion_order(stream.name, parts)]]
+    rows = len(stream.t_ns) if how == "median" else points
+    size = max(1, BLOCK_BYTES // (8 * max(1, rows)))
+    return [members[first : first + size] for first in range(0, len(members), size)]
+
+
+def _between_samples(stream: Stream, names: list[str], how: str, grid_ns: Times, used: Any) -> Floats:
+    """Return channels between their samples (grid, channel), from the rows ``used`` alone."""
+    import numpy as np
+
+    from tacpipe.signals.resampling import linear, median_around, slerp
+
+    t_ns = stream.t_ns[used]
+    values = np.stack([stream.values(name)[used] for name in names], axis=1)  # (time, channel)
+    if how == "slerp":
+        return slerp(t_ns, values.astype(np.float64), grid_ns)
+    if how == "median":
+        return median_around(t_ns, values, grid_ns, MEDIAN_NS)
+    return linear(t_ns, values, grid_ns)
+
+
+def _as_stored(kind: pa.Field, column: Floats) -> tuple[pa.Field, Any]:
+    import numpy as np
+
+    return kind, np.ascontiguousarray(column, dtype=kind.type.to_pandas_dtype())
+
+
+def masks(stream: Stream, grid_ns: Times, exact: Int64s | None, gap_ns: int) -> list[tuple[pa.Field, Any]]:
+    """Return where the nearest sample was held, where there is a gap, and how far the nearest sample is."""
+    import numpy as np
+
+    from tacpipe.signals.resampling import in_gap, nearest_rows
+
+    rows = nearest_rows(stream.t_ns, grid_ns) if exact is None else exact
+    gap = in_gap(stream.t_ns, grid_ns, gap_ns)
+    return _masks(stream.name, stream.held[rows], gap, np.abs(stream.t_ns[rows] - grid_ns))
+
+
+def causal_masks(stream: Stream, grid_ns: Times, gap_ns: int) -> list[tuple[pa.Field, Any]]:
+    """Return where the newest sample was held, where it is older than ``gap_ns``, and how old it is."""
+    from tacpipe.signals.resampling import is_overdue, newest_rows
+
+    rows = newest_rows(stream.t_ns, grid_ns)
+    newest_ns = stream.t_ns[rows]
+    return _masks(stream.name, stream.held[rows], is_overdue(newest_ns, grid_ns, gap_ns), grid_ns - newest_ns)
+
+
+def _masks(name: str, held: Bools, gap: Bools, dt_ns: Times) -> list[tuple[pa.Field, Any]]:
+    import pyarrow as pa
+
+    mask = {"unit": "1", "quantity": "mask", "stream": name}
+    return [
+        (pa.field(f"{name}_held", pa.bool_(), metadata=mask), held),
+        (pa.field(f"{name}_gap", pa.bool_(), metadata=mask), gap),
+        (pa.field(f"{name}_dt_ns", pa.int64(), metadata={**mask, "unit": "ns"}), dt_ns),
+    ]

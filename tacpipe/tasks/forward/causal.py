@@ -1,0 +1,173 @@
+"""A forecaster fed row by row: what `tracks` and `predictors` make of a whole recording, without looking ahead.
+
+Rows are encoded and predicted one by one, never several at once: products of matrices of one row and of many round
+differently, and a forecast must not depend on how many rows came together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import torch
+
+from tacpipe.arrays import AnyFloats, Bools, Float32s, Floats
+from tacpipe.codecs.frame_stacking import INCREMENTS
+from tacpipe.models.windows import ARM, Windows
+from tacpipe.signals import kinematics
+from tacpipe.tasks.forward import tracks
+from tacpipe.tasks.forward.forecaster import Forecaster
+
+JOINED = 2 * 3 * kinematics.TOOL_SPREAD_M  # by which a hand on the last link may leave its first place on it
+
+
+class Arm:
+    """The arm's rows: place, orientation of continuous sign, and velocities from joints or from the row before."""
+
+    def __init__(self, orientation: AnyFloats) -> None:
+        """Make an arm at its first row; ``orientation`` (4,) is the quaternion whose sign recordings are given."""
+        self._reference = orientation
+        self._sign, self._opposite = 1.0, None if orientation is None else False
+        self._decided = False
+        self._unit: Floats | None = None  # (1, 4), the quaternion before, as it came
+        self._before: tuple[int, Floats] | None = None  # time and place (7,) of the row before
+        self._tool_m: Floats | None = None  # (3,), where the hand was on the last link at first
+        self._carried = True
+
+    def row(
+        self,
+        t_ns: int,
+        position_m: Floats,
+        quaternion: Floats,
+        angles: Floats | None = None,
+        speeds: Floats | None = None,
+    ) -> Float32s:
+        """Return the arm (13,) at a row: position (3,), quaternion (4,), joint angles and speeds (7,) where there are any.
+
+        Velocities come from the joints of a known arm as long as the hand has stayed where it was on the last link; then,
+        and without joints, they are differences from the row before.
+        """
+        placed = np.concatenate([position_m, self._continuous(quaternion)])
+        moved = None if angles is None or speeds is None else self._by_joints(angles, speeds, position_m)
+        if moved is None:
+            moved = self._by_differences(t_ns, placed)
+        self._before = (t_ns, placed)
+        row = np.concatenate([placed, moved]).astype(np.float32)[None]
+        if not self._decided and np.isfinite(row).all():
+            self._opposite, self._decided = tracks.is_opposite(row, self._reference), True
+        found: Float32s = (tracks.negated(row) if self._opposite else row)[0]
+        return found
+
+    def _continuous(self, quaternion: Floats) -> Floats:
+        """Return the quaternion (4,) as `rotations.continuous` has it in the whole series."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            unit = quaternion[None] / np.linalg.norm(quaternion[None], axis=1, keepdims=True)
+        if self._unit is not None and (unit * self._unit).sum(axis=1)[0] < 0:
+            self._sign = -self._sign
+        self._unit = unit
+        found: Floats = unit[0] * self._sign + 0.0
+        return found
+
+    def _by_differences(self, t_ns: int, placed: Floats) -> Floats:
+        if self._before is None:
+            return np.zeros(6)
+        before_ns, before = self._before
+        both = np.stack([before, placed])
+        found: Floats = kinematics.differences(np.array([before_ns, t_ns]), both[:, :3], both[:, 3:])[1]
+        return found
+
+    def _by_joints(self, angles: Floats, speeds: Floats, hand_m: Floats) -> Floats | None:
+        if not self._carried:
+            return None
+        if np.isfinite(angles).all() and np.isfinite(hand_m).all():
+            last = kinematics.joint_frames(kinematics.PANDA, angles[None])[0, -1]
+            tool_m = last[:3, :3].T @ (hand_m - last[:3, 3])
+            self._tool_m = tool_m if self._tool_m is None else self._tool_m
+            self._carried = bool((np.abs(tool_m - self._tool_m) < JOINED).all())
+            if not self._carried:
+                return None
+        found: Floats = kinematics.hand_velocity(kinematics.PANDA, angles[None], speeds[None], hand_m[None])[0]
+        return found
+
+
+class Rolling:
+    """The last rows that a forecaster reads, and its prediction from them."""
+
+    def __init__(self, forecaster: Forecaster, *, continues: bool = False) -> None:
+        """Make one without rows.
+
+        Where it ``continues`` a session, the first rows depend on rows that it does not know, by velocities and
+        latents, and are not read.
+        """
+        codec, context = forecaster.codec, forecaster.context
+        self._forecaster = forecaster
+        self._latent = np.zeros((context, len(codec.latents)), np.float32)
+        self._arm, self._finger = np.zeros((context, ARM), np.float32), np.zeros(context, np.float32)
+        # rows that the newest row's latents depend on
+        frames = int(getattr(codec, "frames", 1)) + (codec.representation == INCREMENTS)
+        self._levels = np.zeros((frames, len(codec.channels)))
+        self._begins: Bools = np.zeros(frames, bool)
+        self._rows = self._run = 0
+        self._unknown = max(1, frames - 1) if continues else 0
+
+    @property
+    def now(self) -> Floats:
+        """The levels above rest (channel,) of the newest row."""
+        found: Floats = self._levels[-1]
+        return found
+
+    @property
+    def arm(self) -> Float32s:
+        """The arm (13,) in the newest row."""
+        found: Float32s = self._arm[-1]
+        return found
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether there are as many usable rows in a row as the model reads."""
+        return self._run >= self._forecaster.context
+
+    def add(self, level: Floats, arm: Float32s, finger: float, *, follows: bool, encodes: bool, usable: bool) -> bool:
+        """Take a row: levels above rest (channel,), the arm (13,), the width between the fingers in m.
+
+        ``follows``: it follows the row before without one missing between, for the window; ``encodes``, for the codec.
+        ``usable``: no stream had a gap. Returns whether all values of the row are finite.
+        """
+        self._levels[:-1], self._begins[:-1] = self._levels[1:], self._begins[1:]
+        self._levels[-1], self._begins[-1] = level, not encodes
+        kept = min(self._rows + 1, len(self._levels))
+        self._rows += 1
+        codec = self._forecaster.codec
+        begins = self._begins[-kept:].copy()
+        begins[0] = True
+        latent = codec.encode(self._levels[-kept:], codec.channels, begins)[-1]
+        for kept_rows, newest in ((self._latent, latent), (self._arm, arm), (self._finger, finger)):
+            kept_rows[:-1] = kept_rows[1:]
+            kept_rows[-1] = newest
+        finite = bool(np.isfinite(level).all() and np.isfinite(latent).all() and np.isfinite(arm).all())
+        finite = finite and bool(np.isfinite(finger))
+        known = self._rows > self._unknown
+        self._run = (self._run + 1 if follows else 1) if usable and finite and known else 0
+        return finite
+
+    def predict(self, plan: AnyFloats) -> Float32s:
+        """Return the levels above rest (horizon, channel) that are predicted with the arm's planned rows (horizon, 13)."""
+        arm = np.concatenate([self._arm, plan.astype(np.float32)])
+        read = (self._latent, arm, self._finger)
+        windows = Windows(*(torch.from_numpy(np.ascontiguousarray(one[:, None])) for one in read))
+        features = self._forecaster.features(windows)
+        levels = self._forecaster.decoded(features, self._levels[None, -1], self._latent[None, -1])
+        found: Float32s = levels[0].astype(np.float32)
+        return found
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Have torch work in one thread: a row is too little to share, and sums in several threads round otherwise."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

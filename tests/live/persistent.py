@@ -1,0 +1,130 @@
+"""A chain that predicts that nothing changes, in the place of a trained model: what is tried is how a session runs.
+
+Run in the place of ``tacpipe``, it has the model's process predict so as well; ``BEHAVIOUR`` of the environment has that
+process be slow (``slow:SECONDS`` a grid point) or end by itself (``die:FORECASTS``).
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tacpipe.errors import UsageError
+from tacpipe.live import process, supervisor
+from tacpipe.live.alarms import Alarms, axes
+from tacpipe.live.chain import Cause, Forecast
+from tacpipe.live.engine import Engine
+from tacpipe.live.options import Options
+from tacpipe.live.session import Described
+from tacpipe.recording import rig as rigs
+
+HORIZON = 3
+PERIOD_NS = 20_000_000
+GAP_NS = 50_000_000
+CHANNELS = tuple(f"skin_taxel{number:02d}_{axis}" for number in range(1, 17) for axis in "xyz")
+
+
+class Persistence:
+    """Predicts the last value of each channel of one skin, on a grid of 50 Hz from its first sample on."""
+
+    streams = ("skin",)
+    master = "skin"
+    rate_hz = 50.0
+    horizon = HORIZON
+    channels = CHANNELS
+    layout = tuple({"stream": "skin", "axis": name[-1], "taxel": name[10:12]} for name in CHANNELS)
+    unit = "count"
+
+    def __init__(self, layouts: Mapping[str, Any]) -> None:
+        if "skin" not in layouts:
+            raise UsageError(f"The model reads the stream skin, and the rig has {', '.join(layouts)}.")
+        names = set(layouts["skin"].names)
+        if not {name.removeprefix("skin_") for name in CHANNELS} <= names:
+            raise UsageError("The model reads 16 taxels of the stream skin, and the rig's skin has another layout.")
+        self.late = {"skin": 0}
+        self._samples: list[tuple[int, Any]] = []
+        self._next_ns: int | None = None
+        self._passed_ns = 0
+
+    def push(self, stream: str, batch: Any) -> None:
+        """Keep samples."""
+        if stream != "skin":
+            return
+        t_ns = batch.column("t_ns")
+        values = np.column_stack([batch.column(name.removeprefix("skin_")) for name in CHANNELS])
+        self.late["skin"] += int((t_ns <= self._passed_ns).sum())
+        self._samples += list(zip(t_ns.tolist(), values.astype(np.float32), strict=True))
+        if self._next_ns is None and len(t_ns):
+            self._next_ns = int(t_ns[0])
+
+    def advance(self, t_ns: int, *, newest_only: bool = False) -> list[Forecast]:
+        """Return a forecast for each grid point, on request for the newest alone."""
+        found = []
+        self._passed_ns = max(self._passed_ns, t_ns)
+        while self._next_ns is not None and self._next_ns <= t_ns:
+            found.append(self._at(self._next_ns))
+            self._next_ns += PERIOD_NS
+        if newest_only:
+            found[:-1] = [replace(one, count=None, cause=one.cause | Cause.SKIPPED) for one in found[:-1]]
+        return found
+
+    def _at(self, point_ns: int) -> Forecast:
+        while len(self._samples) > 1 and self._samples[1][0] <= point_ns:
+            self._samples.pop(0)
+        at_ns, now = self._samples[0]
+        if point_ns - at_ns > GAP_NS:
+            return Forecast(point_ns, at_ns, None, now, Cause.GAP, ("skin",))
+        return Forecast(point_ns, at_ns, np.repeat(now[None], HORIZON, axis=0), now, Cause.NONE)
+
+
+def engine(options: Options) -> Engine:
+    """Return an engine of this chain, with alarms that are never on."""
+    rig = rigs.parse(options.rig)
+    layout = axes(Persistence.layout)
+    levels = {name: tuple(1e9 for _ in layout) for name in ("load", "slip")}
+    sensors = {name: rig.streams[name].sensor for name in options.streams}
+    found = Engine(sensors, Persistence, lambda _: Alarms(layout, levels, 1.0), options.steps or None)
+    behaviour, _, value = os.environ.get("BEHAVIOUR", "").partition(":")
+    if behaviour:
+        _behave(found, behaviour, value)
+    return found
+
+
+def _behave(found: Engine, behaviour: str, value: str) -> None:
+    step, made = found.step, [0]
+
+    def other(now_ns: int) -> Any:
+        messages = step(now_ns)
+        made[0] += len(messages)
+        if behaviour == "slow" and messages:
+            time.sleep(float(value))
+        if behaviour == "die" and made[0] >= int(value):
+            os._exit(9)
+        return messages
+
+    found.step = other  # type: ignore[method-assign]
+
+
+def main() -> None:
+    """Be ``tacpipe`` with this model, or its model's process."""
+    if sys.argv[1:2] and sys.argv[1].isdecimal():
+        sys.exit(process.main(sys.argv[1:], engine))
+    patch = pytest.MonkeyPatch()
+    patch.setattr(supervisor, "MODULE", "tests.live.persistent")
+    patch.setattr("tacpipe.live.description.described", lambda model: (Described(CHANNELS, HORIZON, "count"), "0" * 64))
+    from tacpipe.cli import main as cli
+    from tests.recording import patient
+
+    patient.relax(patch)
+    cli.main()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,131 @@
+"""A small rig of two sensors and an arm, as it is recorded, and models behind the chain of stages."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from tacpipe.channels import schema
+from tacpipe.live.chain import Chain, Forecast
+from tacpipe.plugins import params as params_of
+from tacpipe.plugins import registry
+from tacpipe.plugins.stage import RecordingOutput
+from tacpipe.tasks.forward import task as forward
+from tests.asked import fitting
+from tests.fake_recordings import FakeRecording, FakeShard, dataset
+
+T0 = 1_700_000_000_000_000_000
+MS = 1_000_000
+SMALL = {"architecture": "gru", "hidden": 8, "epochs": 1, "batch": 64, "context": 4, "horizon": 3}
+Made = tuple[Mapping[str, bytes], Sequence[Mapping[str, Any]]]
+
+
+def recording(seed: int, seconds: float = 3.0, gap_ms: float = 0.0, *, wraps: bool = True) -> FakeRecording:
+    """Two uSkins at about 45 Hz and an arm at about 100 Hz, each with stamps of its own; counts wrap around, or not.
+
+    For ``gap_ms`` in the middle the second uSkin is silent.
+    """
+    rng = np.random.default_rng(seed)
+    streams = {}
+    for number, (period_ms, fields) in enumerate(
+        [(22.0, schema.uskin_fields(2)), (22.0, schema.uskin_fields(2)), (10.0, schema.pose_fields())]
+    ):
+        t_ms = np.cumsum(rng.gamma(20.0, period_ms / 20.0, int(seconds * 1e3 / period_ms)))
+        if number == 1 and gap_ms:
+            t_ms = t_ms[(t_ms < 500 * seconds) | (t_ms > 500 * seconds + gap_ms)]
+        t_ns = T0 + (t_ms * MS).astype(np.int64)
+        x = 0.1 * np.sin(t_ms / 300)
+        if number < 2:
+            touch = (65_400 if wraps else 30_000) + 4000 * x[:, None] * np.linspace(0.2, 1.0, 6) * (t_ms > 600)[:, None]
+            values = np.round(touch + rng.normal(0, 2, (len(t_ms), 6))) % 65_536
+            streams[f"xela{number + 1}"] = schema.stream(t_ns, values.T, fields)
+        else:
+            half = 0.3 * np.sin(t_ms / 500)
+            zero = np.zeros_like(x)
+            pose = [0.5 + x, zero, 0.3 + x / 2, zero, zero, np.sin(half), np.cos(half)]
+            streams["robot"] = schema.stream(t_ns, np.array(pose) * np.sign(half + 10)[None], fields)
+    return FakeRecording(streams, f"trial-{seed:03d}")
+
+
+def stage(name: str, given: Any, **values: Any) -> FakeShard:
+    """A recording after a map stage."""
+    made = registry.load(name)(registry.load(name).params(**values), given)
+    assert isinstance(made, RecordingOutput)
+    return FakeShard(given.name, made.streams[""], {**given.attributes, **made.attributes})
+
+
+def segmented(given: FakeRecording, **values: Any) -> FakeShard:
+    """A recording after `synchronize` and `segment contacts`."""
+    return stage("segment.contacts", stage("synchronize", given, **values))
+
+
+def step(name: str, **values: Any) -> Mapping[str, Any]:
+    """A link of a chain as manifests have it."""
+    found = registry.load(name)
+    params = params_of.to_json(found.params(**values))
+    return {"stage": name, "version": found.version, "params": params, "fitted": None}
+
+
+def model(folder: Path, codec: str = "raw", representation: str = "levels", **values: Any) -> Made:
+    """The files of a small model, and the chain that it was trained behind; ``values`` are params of both."""
+    names = {"grid", "rate_hz", "gap_ms", "unwrap", "causal", "master"}
+    sync = {name: value for name, value in values.items() if name in names}
+    shards = [segmented(recording(seed), **sync) for seed in range(3)]
+    steps = [step("synchronize", **sync), step("segment.contacts")]
+    parts = [dataset(*shards[:2]), dataset(shards[2])]
+    if codec == "pca":
+        compress = registry.load("compress.pca")
+        asked = compress.params(components=3, representation=representation)
+        assert compress.fit is not None
+        files = dict(compress.fit(asked, parts[0]).files)
+        made = [FakeShard(one.name, compress(asked, one, files), one.attributes) for one in shards]
+        parts = [dataset(*made[:2], files=files), dataset(made[2], files=files)]
+        steps.append(step("compress.pca", components=3, representation=representation))
+    trained = {name: value for name, value in values.items() if name not in names}
+    params = fitting("train.forward", {**SMALL, **trained})
+    return forward.train(params, parts[0], parts[1], folder), steps
+
+
+def chain(made: Made, given: FakeRecording) -> Chain:
+    """The chain of a model, for the streams of a recording."""
+    return Chain.of(*made, {name: table.schema for name, table in given.tables.items()})
+
+
+def whole(made: Made, given: FakeRecording) -> list[Forecast]:
+    """The forecasts of a recording that is given whole."""
+    fed = chain(made, given)
+    for name, table in given.tables.items():
+        fed.push(name, table)
+    return fed.advance(max(int(table["t_ns"][-1].as_py()) for table in given.tables.values()))
+
+
+def pieces(given: FakeRecording, cuts_ns: Sequence[int], order: Sequence[str]) -> Iterator[tuple[str, pa.Table, int]]:
+    """Yield stream, table and end of the pieces between times, those of one time in an ``order`` of streams."""
+    last = max(int(table["t_ns"][-1].as_py()) for table in given.tables.values())
+    before = 0
+    for cut in [*sorted({cut for cut in cuts_ns if cut < last}), last]:
+        for name in order:
+            t_ns = given.tables[name]["t_ns"].to_numpy()
+            first, stop = np.searchsorted(t_ns, [before, cut], side="right").tolist()
+            yield name, given.tables[name].slice(first, stop - first), cut
+        before = cut
+
+
+def until(table: pa.Table, t_ns: int) -> pa.Array:
+    """Which rows of a stream had arrived by a time."""
+    return pa.array(table["t_ns"].to_numpy() <= t_ns)
+
+
+def more(found: pa.Schema) -> pa.Schema:
+    """The schema of a uSkin with another taxel."""
+    return found.append(schema.uskin_fields(3)[6])
+
+
+def unit(found: pa.Schema, wanted: str) -> pa.Schema:
+    """The schema of a stream whose first channel is in another unit."""
+    field = found.field(1)
+    return found.set(1, field.with_metadata({**field.metadata, b"unit": wanted.encode()}))

@@ -1,0 +1,48 @@
+"""The client of the page on live sessions does what the page states."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tacpipe.live.alarms import State
+from tacpipe.live.messages import Description, Message
+from tacpipe.live.publishers.websocket import WebsocketPublisher
+from tests.live.test_publishers import free_port
+from tests.recording.live import ROOT, awaited
+
+PAGE = ROOT / "docs" / "howto" / "live.md"
+
+
+def client() -> str:
+    """Return the program that the page prints."""
+    _, _, rest = PAGE.read_text().partition('```python title="client.py"\n')
+    return rest.partition("```")[0]
+
+
+def test_the_client_is_short() -> None:
+    assert 20 < len(client().splitlines()) <= 35
+
+
+@pytest.mark.rig
+def test_the_client_reports_a_slip_that_is_predicted(tmp_path: Path) -> None:
+    (tmp_path / "client.py").write_text(client().replace("SILENT_S = 0.04", "SILENT_S = 60"))
+    port = free_port()
+    publisher = WebsocketPublisher(f"127.0.0.1:{port}", Description(("a", "b"), (1, 2, 3), "count", 50.0, "model"))
+    words = [sys.executable, "client.py", f"ws://127.0.0.1:{port}", "4"]
+    with subprocess.Popen(words, cwd=tmp_path, stdout=subprocess.PIPE, text=True) as process:
+        awaited(lambda: publisher.subscribers == 1)
+        for seq, (state, cause) in enumerate([(0, ""), (1, ""), (1, ""), (-1, "nothing new comes from xela1")]):
+            publisher.publish(Message(seq, seq, None, cause, alarms={"slip": State(state, 0.5)}))
+        out, _ = process.communicate(timeout=600)
+    publisher.close()
+    first, *changes = out.splitlines()
+    assert first == "2 channels, steps 1 to 3"
+    assert [line.split(" ", 1)[1].strip() for line in changes] == [
+        "slip: off",
+        "slip: on",
+        "slip: unknown nothing new comes from xela1",
+    ]

@@ -1,0 +1,184 @@
+"""The logic of a live session, over bytes that a test wrote and a clock that it turns."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tacpipe.live import wire
+from tacpipe.live.alarms import Alarms
+from tacpipe.live.chain import Cause
+from tacpipe.live.engine import Engine
+from tacpipe.live.messages import Message
+from tacpipe.recording import rig as rigs
+from tacpipe.recording.spool_blocks import Note
+from tacpipe.recording.station import BEGAN, LOST
+from tacpipe.sensors.framing import Chunks
+from tacpipe.sensors.sensor import Sensor
+from tests.live.persistent import CHANNELS, HORIZON, PERIOD_NS, Persistence
+from tests.sensors import made
+
+START_NS = 10**12
+OFFSET_NS = 5 * 10**17
+LEVEL = 10.0
+SETTLE_NS = 2_000_000
+
+
+class Session:
+    """An engine with one skin, and the frames that it sends."""
+
+    def __init__(self, count: int = 200) -> None:
+        self.sensor: Sensor = rigs.make("xela", {"rate_hz": 50}, "skin")
+        axes = tuple(dict.fromkeys(("skin", name[-1]) for name in CHANNELS))
+        levels = {name: tuple(LEVEL for _ in axes) for name in ("load", "slip")}
+        self.engine = Engine({"skin": self.sensor}, Persistence, lambda _: Alarms(axes, levels), settle_ns=SETTLE_NS)
+        samples = made.samples("xela", self.sensor, count, 1)
+        self.values = np.hstack(samples.values).astype(np.float32)
+        self.packets = made.pieces(self.sensor, self.sensor.encode(samples))
+
+    def begin(self) -> None:
+        """Begin a recording."""
+        self.engine.take("", Note(START_NS, "", wire.BEGIN, str(OFFSET_NS)))
+        self.engine.take("skin", Note(START_NS, "skin", BEGAN))
+
+    def send(self, first: int, last: int) -> None:
+        """Have frames arrive, one each period after the start."""
+        self.engine.take("skin", Chunks.of([(START_NS + n * PERIOD_NS, self.packets[n]) for n in range(first, last)]))
+
+    def at(self, periods: float) -> list[Message]:
+        """Return what is published so long after the start, once what belongs to it has settled."""
+        return self.engine.step(START_NS + round(periods * PERIOD_NS) + SETTLE_NS)
+
+
+@pytest.fixture
+def session() -> Session:
+    made = Session()
+    made.begin()
+    return made
+
+
+def test_each_row_is_predicted_from_the_newest_sample_at_every_step(session: Session) -> None:
+    for row in range(20):
+        session.send(row, row + 1)
+        (message,) = session.at(row)
+        assert message.t_ns == START_NS + OFFSET_NS + row * PERIOD_NS
+        assert message.values is not None and message.values.shape == (HORIZON, len(CHANNELS))
+        assert (message.values == session.values[row]).all() and message.values.dtype == np.float32
+        assert message.seq == row + 1 and message.skipped == 0
+
+
+def test_nothing_is_published_before_what_belongs_to_a_row_has_settled(session: Session) -> None:
+    session.send(0, 2)
+    assert len(session.engine.step(START_NS + SETTLE_NS)) == 1
+    assert session.engine.step(START_NS + PERIOD_NS + SETTLE_NS - 1) == []
+    assert session.engine.due_ns(START_NS + SETTLE_NS) == START_NS + PERIOD_NS + SETTLE_NS
+
+
+def test_a_session_that_fell_behind_publishes_the_newest_row_and_counts_the_others(session: Session) -> None:
+    session.send(0, 8)
+    (message,) = session.at(7)
+    assert message.values is not None and (message.values == session.values[7]).all()
+    assert message.skipped == session.engine.skipped == 7
+
+
+@pytest.mark.parametrize("cut", [1, 3, 7, 50])
+def test_how_the_bytes_were_cut_changes_no_forecast(cut: int) -> None:
+    one, other = Session(), Session()
+    published: list[list[Message]] = []
+    for each, size in ((one, 1), (other, cut)):
+        each.begin()
+        found = []
+        for row in range(0, 100 // size * size, size):
+            each.send(row, row + size)
+            found += each.at(row + size - 1)
+        published.append(found)
+    by_time = {message.t_ns: message.values for message in published[0]}
+    assert published[1] and all(np.array_equal(by_time[one.t_ns], one.values) for one in published[1])  # type: ignore[arg-type]
+
+
+def test_what_came_before_the_recording_is_not_part_of_it() -> None:
+    session = Session()
+    session.send(0, 5)
+    assert session.at(5) == []
+    session.begin()
+    session.send(9, 10)
+    (message,) = session.at(9)
+    assert message.t_ns == START_NS + OFFSET_NS + 9 * PERIOD_NS  # the grid begins with the recording's first sample
+
+
+def test_a_stream_that_stalls_makes_alarms_unknown_with_its_name_within_two_periods(session: Session) -> None:
+    session.send(0, 10)
+    session.at(9)
+    found = [message for tenths in range(91, 131) for message in session.at(tenths / 10)]
+    unknown = next(message for message in found if message.values is None)
+    due = START_NS + OFFSET_NS + 10 * PERIOD_NS  # when the sample that is missing should have come
+    assert unknown.t_ns - due <= 2 * PERIOD_NS
+    assert "skin" in unknown.cause and Cause.GAP in Cause(unknown.flags)
+    assert all(alarm.word == "unknown" for alarm in unknown.alarms.values())
+    session.send(14, 15)
+    (message,) = session.at(14)
+    assert message.values is not None and not message.cause
+
+
+def test_where_no_row_can_be_made_at_all_that_is_reported_with_the_silent_stream(session: Session) -> None:
+    assert session.at(0) == []
+    found = [message for periods in range(1, 10) for message in session.at(periods)]
+    assert found and all(message.values is None and "skin" in message.cause for message in found)
+    assert found[0].t_ns - (START_NS + OFFSET_NS) <= 4 * PERIOD_NS
+
+
+def test_a_link_that_is_lost_and_back_goes_on_without_a_new_session(session: Session) -> None:
+    session.send(0, 5)
+    session.at(4)
+    session.engine.take("skin", Note(START_NS + 5 * PERIOD_NS, "skin", LOST, "unplugged"))
+    session.at(12)
+    session.send(20, 21)
+    (message,) = session.at(20)
+    assert message.values is not None and (message.values == session.values[20]).all()
+
+
+def test_after_blocks_were_thrown_away_a_new_chain_begins_and_the_cause_is_reported(session: Session) -> None:
+    session.send(0, 5)
+    session.at(4)
+    before = session.engine.chain
+    session.engine.take("", Note(START_NS, "", wire.OVERFLOW))
+    assert session.engine.chain is not before and session.engine.overflows == 1
+    found = [message for periods in range(5, 10) for message in session.at(periods)]
+    assert found and "overload" in found[0].cause and found[0].values is None
+    session.send(10, 11)
+    assert session.at(10)[0].values is not None
+
+
+def test_a_sample_that_comes_after_its_row_is_counted(session: Session) -> None:
+    session.send(0, 2)
+    session.at(5)
+    assert session.engine.late == 0
+    session.send(3, 4)
+    session.at(6)
+    assert session.engine.late == 1
+
+
+def test_the_latency_is_from_the_arrival_of_the_newest_sample(session: Session) -> None:
+    session.send(0, 1)
+    (message,) = session.at(0.5)
+    session.engine.published(message, START_NS + 13_000_000)
+    assert (message.latency_ms, message.age_ms) == (13.0, 13.0)
+
+
+def test_bytes_that_are_no_frame_cost_no_forecast(session: Session) -> None:
+    session.send(0, 1)
+    session.engine.take("skin", Chunks.of([(START_NS + PERIOD_NS, b"\xff not a frame")]))
+    session.send(2, 3)
+    (message,) = session.at(2)
+    assert message.values is not None and (message.values == session.values[2]).all()
+
+
+def test_after_the_recording_nothing_is_predicted_until_the_next_one_begins(session: Session) -> None:
+    session.send(0, 1)
+    assert len(session.at(0)) == 1
+    session.engine.take("", Note(START_NS + PERIOD_NS, "", wire.END))
+    session.send(1, 3)
+    assert session.at(3) == []
+    session.begin()
+    session.send(4, 5)
+    assert len(session.at(4)) == 1

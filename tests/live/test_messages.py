@@ -1,0 +1,103 @@
+"""What is published is what was predicted, in every format."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from tacpipe.arrays import Float32s
+from tacpipe.errors import UsageError
+from tacpipe.live import messages
+from tacpipe.live.alarms import State
+from tacpipe.live.messages import Message
+from tacpipe.sensors.framing import Chunks
+from tacpipe.sensors.live import LATENCY, Live
+from tacpipe.sensors.plan import Plan, is_plan, packet
+
+VALUES = np.random.default_rng(0).normal(0, 1000, (3, 5)).astype(np.float32)
+CHANNELS = tuple(f"c{number}" for number in range(5))
+
+
+def message(values: Float32s | None = VALUES) -> Message:
+    states = {"load": State(1, 2.5), "slip": State(-1, math.nan)}
+    return Message(7, 10**18, values, "why", 4, states, latency_ms=3.25, age_ms=4.5, compute_ms=1.0, skipped=2, late=1)
+
+
+def test_json_holds_each_value_to_the_bit_and_null_where_nothing_is_known() -> None:
+    found = json.loads(messages.to_json(message().to_dict()))
+    assert np.array_equal(np.array(found["values"], dtype=np.float32), VALUES)
+    assert found["alarms"] == {"load": {"state": "on", "score": 2.5}, "slip": {"state": "unknown", "score": None}}
+    assert (found["version"], found["seq"], found["t_ns"], found["cause"]) == (1, 7, 10**18, "why")
+    assert json.loads(messages.to_json(message(None).to_dict()))["values"] is None
+
+
+def decoded(sensor: Live, sent: bytes) -> tuple[list[list[float]], int, int]:
+    runs, losses = sensor.framer().feed(Chunks.of([(0, sent)]))
+    assert not losses
+    samples = sensor.decode(runs[0].frames)
+    assert samples.seq is not None and samples.t_device_ns is not None
+    return [block[0].tolist() for block in samples.values], int(samples.seq[0]), int(samples.t_device_ns[0])
+
+
+def test_packets_hold_each_value_to_the_bit_with_number_and_time() -> None:
+    sensor = Live(output="forecast", channels=CHANNELS, steps=(1, 2, 3))
+    sent = messages.packet(message(), sensor, 41)
+    assert sent is not None
+    assert decoded(sensor, sent) == ([VALUES.ravel().tolist()], 41, 10**18)
+    names = [field.name for field in sensor.fields()]
+    assert names[:6] == ["c0_t1", "c1_t1", "c2_t1", "c3_t1", "c4_t1", "c0_t2"]
+
+
+def test_alarms_and_latencies_have_packets_too_and_a_missing_forecast_has_none() -> None:
+    alarm = messages.packet(message(), Live(output="alarm", alarms=("load", "slip")), 3)
+    assert alarm is not None
+    states, scores = decoded(Live(output="alarm", alarms=("load", "slip")), alarm)[0]
+    assert states == [1, -1] and scores[0] == 2.5 and math.isnan(scores[1])
+    latency = messages.packet(message(None), Live(), 3)
+    assert latency is not None
+    assert dict(zip(LATENCY, decoded(Live(), latency)[0][0], strict=True)) == {
+        **{"latency_ms": 3.25, "age_ms": 4.5, "compute_ms": 1.0, "cause": 4.0, "skipped": 2.0, "late": 1.0}
+    }
+    assert messages.packet(message(None), Live(output="forecast", channels=CHANNELS, steps=(1, 2, 3)), 3) is None
+
+
+def test_packets_of_another_output_or_version_are_refused() -> None:
+    sent = messages.packet(message(), Live(output="alarm", alarms=("load", "slip")), 3)
+    assert sent is not None
+    other = sent[:4] + b"\x02" + sent[5:]
+    for wrong in (other, sent[:-1], b"x" + sent[1:]):
+        assert Live(output="alarm", alarms=("load", "slip")).framer().feed(Chunks.of([(0, wrong)]))[0] == []
+
+
+def test_a_forecast_that_is_too_large_for_a_packet_is_refused_with_what_to_do() -> None:
+    with pytest.raises(UsageError, match="--steps"):
+        Live(output="forecast", channels=tuple(f"c{n}" for n in range(1000)), steps=tuple(range(1, 20)))
+
+
+def test_a_plan_is_a_sample_a_point_with_the_arrival_of_its_packet() -> None:
+    poses = [[0.1, 0.2, 0.3, 0, 0, 0, 1], [0.2, 0.2, 0.3, 0, 0, 0, 1.0]]
+    samples = Plan().decode([packet([100, 200], poses), packet([300], poses[:1])])
+    assert samples.rows is not None and samples.rows.tolist() == [0, 0, 1]
+    assert samples.values[0][:, 0].tolist() == [100, 200, 300] and samples.values[1][1].tolist() == poses[1]
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        b"",
+        b"[]",
+        b'{"version": 2, "points": [[1, 0, 0, 0, 0, 0, 0, 1]]}',
+        b'{"version": 1, "points": []}',
+        b'{"version": 1, "points": [[1, 0, 0, 0, 0, 0, 0]]}',
+        b'{"version": 1, "points": [[1, 0, 0, 0, 0, 0, 0, 0]]}',
+        b'{"version": 1, "points": [[1, 0, 0, NaN, 0, 0, 0, 1]]}',
+        b'{"version": 1, "points": [[1.5, 0, 0, 0, 0, 0, 0, 1]]}',
+        b'{"version": 1, "points": [[2, 0, 0, 0, 0, 0, 0, 1], [1, 0, 0, 0, 0, 0, 0, 1]]}',
+        b'{"version": 1, "points": [[4611686018427387905, 0, 0, 0, 0, 0, 0, 1]]}',
+    ],
+)
+def test_what_is_no_plan_is_refused(wrong: bytes) -> None:
+    assert not is_plan(wrong)

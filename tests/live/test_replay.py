@@ -1,0 +1,73 @@
+"""`tacpipe predict --causal` gives what a live session published, and reads nothing that had not arrived."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+import tacpipe
+from tacpipe.live.chain import Chain
+from tacpipe.live.sources import plan_table
+from tests.conftest import Lab
+
+MS = 1_000_000
+TRAINED = (
+    "simulate forward --trials 3 --duration-s 4 --robot-rate-hz 200 -o data/r",
+    "synchronize data/r -o data/synced",
+    "segment contacts data/synced -o data/c",
+    "split data/c -o data/split --scheme random --val 0.34 --test 0",
+    "train forward data/c --split data/split -o models/f --architecture gru --hidden 4 --epochs 1 --context 3 --horizon 2",
+)
+
+
+@pytest.mark.long
+def test_what_a_session_published_is_what_predict_causal_writes_to_the_last_bit(lab: Lab) -> None:
+    for command in TRAINED:
+        lab.run(command)
+    ran = lab.run("predict models/f data/r -o data/p --steps 1,2 --causal")
+    assert "plan" in ran.err
+    predictions = tacpipe.open("data/p")
+    for recording in tacpipe.open("data/r"):
+        published = session({name: recording.table(name) for name in recording.streams})
+        table = predictions[recording.name].table()
+        assert table["t_ns"].to_pylist() == [one.t_ns for one in published] != []
+        for step in (1, 2):
+            for index, name in enumerate(table.schema.names[1::2]):
+                wanted = np.array([one.count[step - 1, index] for one in published])
+                column = table[f"{name.removesuffix('_t1')}_t{step}"].to_numpy()
+                assert column.tobytes() == wanted.tobytes()
+        assert predictions[recording.name].attributes["forecast_no_plan"] == len(published)
+    ran = lab.call("predict models/f data/c -o data/after --causal")
+    assert ran.code == 2 and "trial-000" in ran.err  # what had arrived when cannot be seen after a stage
+
+
+def session(tables: dict[str, pa.Table]) -> list[Any]:
+    """The forecasts of a session in which each sample came alone, two milliseconds late."""
+    model = tacpipe.open("models/f")
+    chain = Chain.of(model.files, model.source.chain, {name: table.schema for name, table in tables.items()})
+    arrivals = sorted(
+        (t_ns, name, row)
+        for name, table in tables.items()
+        if name in chain.streams
+        for row, t_ns in enumerate(table["t_ns"].to_pylist())
+    )
+    found = []
+    for t_ns, name, row in arrivals:
+        found += chain.advance(t_ns - 2 * MS)
+        chain.push(name, tables[name].slice(row, 1).to_batches()[0])
+    found += chain.advance(arrivals[-1][0])
+    return [one for one in found if one.count is not None]
+
+
+def test_a_plan_of_another_shape_or_order_is_refused_by_what_is_wrong() -> None:
+    for t_ns, poses, named in (
+        ([1, 2], np.zeros((2, 4)), r"\(2, 4\)"),
+        ([1], np.zeros((2, 3)), "1 times"),
+        ([2, 2], np.zeros((2, 3)), "ascend"),
+        ([1, 2], np.full((2, 3), np.nan), "finite"),
+    ):
+        with pytest.raises(tacpipe.TacpipeError, match=named):
+            plan_table(0, np.array(t_ns), poses)

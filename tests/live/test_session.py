@@ -1,0 +1,163 @@
+"""Live sessions with real processes and emulated devices: what fails costs forecasts, and never a sample."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tacpipe.live.supervisor import DIED, RESTARTED
+from tests.conftest import Lab
+from tests.live.persistent import CHANNELS, HORIZON
+from tests.recording import live, patient
+
+pytestmark = pytest.mark.rig
+SKIN = live.stream("skin", "xela", "ws:127.0.0.1:5000", "{ rate_hz = 50 }")
+
+
+@pytest.fixture(autouse=True)
+def patience(monkeypatch: pytest.MonkeyPatch) -> None:
+    patient.relax(monkeypatch)
+
+
+def started(lab: Lab, options: str, behaviour: str = "") -> subprocess.Popen[str]:
+    """Return ``tacpipe live`` with a model that predicts no change, running in a process of its own."""
+    words = [sys.executable, "-m", "tests.live.persistent", "live", "rig.toml", "--model", "none", *options.split()]
+    path = os.pathsep.join([str(live.ROOT), os.environ.get("PYTHONPATH", "")])
+    environment = {**os.environ, "PYTHONPATH": path, "BEHAVIOUR": behaviour}
+    return subprocess.Popen(
+        words, cwd=lab.folder, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+
+
+def ended(process: subprocess.Popen[str], *, interrupt: bool = False) -> dict[str, Any]:
+    """Return what a session printed as JSON, once it is over."""
+    if interrupt:
+        process.send_signal(signal.SIGINT)
+    out, err = process.communicate()
+    assert process.returncode == 0, err
+    found: dict[str, Any] = json.loads(out)
+    return found
+
+
+@contextmanager
+def subscriber() -> Iterator[tuple[int, list[dict[str, Any]]]]:
+    """Yield the port of a subscriber, and the messages that it got so far."""
+    found: list[dict[str, Any]] = []
+    over = threading.Event()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as port:
+        port.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 8 << 20)
+        port.bind(("127.0.0.1", 0))
+        port.settimeout(0.1)
+
+        def listen() -> None:
+            while not over.is_set():
+                try:
+                    found.append(json.loads(port.recv(1 << 16)))
+                except TimeoutError:
+                    continue
+
+        listening = threading.Thread(target=listen)
+        listening.start()
+        try:
+            yield port.getsockname()[1], found
+        finally:
+            over.set()
+            listening.join()
+
+
+def forecasts(messages: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    return [one for one in messages if one["kind"] == "forecast" and one["values"] is not None]
+
+
+def whole(shard: Any, name: str) -> bool:
+    """Return whether no sample of a stream was lost on its way into the recording."""
+    counts = shard.table(name).column("seq").to_numpy()
+    return bool((np.diff(counts) == 1).all()) and shard.attributes[f"{name}_lost"] == 0
+
+
+def test_what_is_published_is_recorded_to_the_bit_and_predicted_from_what_was_recorded(lab: Lab) -> None:
+    with live.served(lab.folder, SKIN, live.WRENCH), subscriber() as (port, messages):
+        printed = ended(started(lab, f"-o rec --duration 2 --json --publish udp:127.0.0.1:{port}"))
+    shard = live.only(lab.folder)
+    table = shard.table("forecast")
+    published = {one["t_ns"]: np.array(one["values"], dtype=np.float32) for one in forecasts(messages)}
+    names = [f"{channel}_t{step}" for step in range(1, HORIZON + 1) for channel in CHANNELS]
+    recorded = np.column_stack([table.column(name).to_numpy() for name in names]).reshape(-1, HORIZON, len(CHANNELS))
+    points = table.column("t_device_ns").to_numpy()
+    assert len(points) > 10 and set(points.tolist()) <= set(published)
+    assert all((published[t_ns] == values).all() for t_ns, values in zip(points.tolist(), recorded, strict=True))
+
+    skin = shard.table("skin")
+    arrivals = skin.column("t_ns").to_numpy()
+    values = np.column_stack([skin.column(name.removeprefix("skin_")).to_numpy() for name in CHANNELS])
+    newest = values[np.searchsorted(arrivals, points, side="right") - 1].astype(np.float32)
+    late = printed["live"]["late"]
+    assert int((recorded[:, 0] != newest).any(axis=1).sum()) <= late  # but for rows whose sample came too late
+    assert set(shard.streams) >= {"alarm", "latency"} and "live_model" in shard.attributes
+    assert (shard.table("latency").column("latency_ms").drop_null().to_numpy() != 0).all()
+    assert whole(shard, "skin") and whole(shard, "wrench")
+
+
+def test_a_model_process_that_dies_is_started_anew_and_no_sample_is_lost(lab: Lab) -> None:
+    with live.served(lab.folder, SKIN, live.WRENCH), subscriber() as (port, messages):
+        process = started(lab, f"-o rec --json --publish udp:127.0.0.1:{port}", "die:40")
+        live.awaited(lambda: len({one["seq"] for one in forecasts(messages)}) < len(forecasts(messages)) - 5)
+        printed = ended(process, interrupt=True)
+    shard = live.only(lab.folder)
+    causes = [cause for cause, _ in live.events(shard, "forecast")]
+    assert DIED in causes and RESTARTED in causes and printed["live"]["restarts"] >= 1
+    assert whole(shard, "skin") and whole(shard, "wrench")
+
+
+def test_a_model_that_is_too_slow_costs_forecasts_which_are_counted_and_no_sample(lab: Lab) -> None:
+    with live.served(lab.folder, SKIN, live.WRENCH):
+        printed = ended(started(lab, "-o rec --duration 3 --json", "slow:0.2"))
+    shard = live.only(lab.folder)
+    assert printed["live"]["skipped"] > printed["live"]["forecasts"] > 0
+    assert whole(shard, "skin") and whole(shard, "wrench")
+
+
+def test_a_stream_that_goes_away_makes_alarms_unknown_until_it_is_back(lab: Lab) -> None:
+    with live.served(lab.folder, SKIN, live.WRENCH) as rig, subscriber() as (port, messages):
+        process = started(lab, f"-o rec --json --publish udp:127.0.0.1:{port}")
+        live.awaited(lambda: len(forecasts(messages)) > 20)
+        rig.unplug("skin")
+        live.awaited(lambda: "skin" in messages[-1].get("cause", "") and messages[-1]["values"] is None)
+        assert {alarm["state"] for alarm in messages[-1]["alarms"].values()} == {"unknown"}
+        rig.replug("skin")
+        count = len(messages)
+        live.awaited(lambda: len(forecasts(messages[count:])) > 20)
+        ended(process, interrupt=True)
+    shard = live.only(lab.folder)
+    assert -1 in shard.table("alarm").column("slip_state").to_pylist()
+    assert whole(shard, "wrench") and "lost" in [cause for cause, _ in live.events(shard, "skin")]
+
+
+@pytest.mark.parametrize("stream", [live.WRENCH, live.stream("skin", "tfmini", "serial:/dev/ttyUSB3")])
+def test_a_rig_without_what_the_model_reads_is_refused_in_one_sentence(lab: Lab, stream: str) -> None:
+    Path(lab.folder / "rig.toml").write_text(f"{live.RANGE}{stream}")
+    process = started(lab, "-o rec --duration 1")
+    _, err = process.communicate()
+    assert process.returncode == 2 and "skin" in err and len(err.strip().splitlines()) == 1
+    assert not (lab.folder / "rec").exists()
+
+
+def test_without_an_output_nothing_is_kept_and_figures_are_printed(lab: Lab) -> None:
+    with live.served(lab.folder, SKIN), subscriber() as (port, messages):
+        process = started(lab, f"--json --publish udp:127.0.0.1:{port}")
+        live.awaited(lambda: len(forecasts(messages)) > 20)
+        printed = ended(process, interrupt=True)
+    assert printed["live"]["forecasts"] > 20 and printed["recordings"] == [] and printed["output"] is None
+    assert not (lab.folder / "rec").exists()

@@ -1,0 +1,108 @@
+"""What the links gave reaches the model's process in order, or is thrown away and counted; nobody waits for it."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Iterator
+
+import pytest
+
+from tacpipe.live import wire
+from tacpipe.live.tap import Tap
+from tacpipe.recording.spool_blocks import Note
+from tacpipe.sensors.framing import Chunks
+
+Pair = tuple[socket.socket, socket.socket]
+
+
+@pytest.fixture
+def pair() -> Iterator[Pair]:
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        yield ours, theirs
+
+
+def chunk(number: int, size: int = 10) -> Chunks:
+    return Chunks.of([(number, bytes([number % 256]) * size)])
+
+
+def received(theirs: socket.socket, blocks: wire.Blocks) -> list[tuple[str, Chunks | Note]]:
+    theirs.setblocking(False)
+    found: list[tuple[str, Chunks | Note]] = []
+    while True:
+        try:
+            found += blocks.feed(theirs.recv(777))
+        except BlockingIOError:
+            return found
+
+
+def numbers(found: list[tuple[str, Chunks | Note]]) -> list[int]:
+    return [int(block.t_ns[0]) for _, block in found if isinstance(block, Chunks)]
+
+
+def test_what_is_put_arrives_in_order_with_its_stream_stamps_and_bytes(pair: Pair) -> None:
+    tap = Tap(["a", "b"])
+    tap.connect(pair[0], Note(1, "", wire.BEGIN, "5"))
+    tap.put("b", chunk(7))
+    tap.put("a", Note(8, "a", "lost", "unplugged"))
+
+    begin, first, second = received(pair[1], wire.Blocks(["a", "b"]))
+    assert begin == ("", Note(1, "", wire.BEGIN, "5"))
+    assert first[0] == "b" and isinstance(first[1], Chunks)
+    assert (first[1].t_ns.tolist(), first[1].data) == ([7], bytes([7]) * 10)
+    assert second == ("a", Note(8, "a", "lost", "unplugged"))
+
+
+def test_what_the_socket_does_not_take_waits_and_loses_no_byte(pair: Pair) -> None:
+    tap, blocks = Tap(["a"]), wire.Blocks(["a"])
+    tap.connect(pair[0])
+    for number in range(400):  # several times what a socket holds
+        tap.put("a", chunk(number, 5000))
+    found = received(pair[1], blocks)
+    assert 0 < len(numbers(found)) < 400
+    while len(numbers(found)) < 400:
+        tap.flush()
+        found += received(pair[1], blocks)
+    assert numbers(found) == list(range(400)) and tap.overflows == 0
+
+
+def test_a_queue_that_is_full_is_thrown_away_counted_and_reported_to_the_model(pair: Pair) -> None:
+    tap, blocks = Tap(["a"], most_bytes=200_000), wire.Blocks(["a"])
+    tap.connect(pair[0])
+    for number in range(400):
+        tap.put("a", chunk(number, 5000))
+    assert tap.overflows > 0 and tap.bytes_lost > 0
+    found = received(pair[1], blocks)
+    for _ in range(100):
+        tap.flush()
+        found += received(pair[1], blocks)
+    kept = numbers(found)
+    assert kept == sorted(kept) and kept[-1] == 399 and len(kept) < 400
+    overflows = [place for place, (_, block) in enumerate(found) if isinstance(block, Note)]
+    assert {found[place][1].what for place in overflows} == {wire.OVERFLOW}  # type: ignore[union-attr]
+    gaps = [place for place in range(1, len(kept)) if kept[place] != kept[place - 1] + 1]
+    assert len(gaps) == len(overflows)  # each gap is reported where it is
+
+
+@pytest.mark.parametrize("gone", ["never there", "closed", "taken away"])
+def test_without_a_process_nothing_is_raised(pair: Pair, gone: str) -> None:
+    tap = Tap(["a"])
+    if gone != "never there":
+        tap.connect(pair[0])
+        pair[1].close() if gone == "closed" else tap.connect(None)
+    for number in range(100):
+        tap.put("a", chunk(number, 5000))
+    tap.flush()
+    tap.note(Note(1, "", wire.STOP))
+    assert tap.overflows == 0
+
+
+def test_a_process_that_is_started_in_the_middle_gets_the_beginning_of_each_stream(pair: Pair) -> None:
+    tap = Tap(["a", "b"])
+    tap.connect(pair[0], Note(1, "", wire.BEGIN, "5"))
+    tap.begun()
+    assert [(name, block.what) for name, block in received(pair[1], wire.Blocks(["a", "b"]))] == [  # type: ignore[union-attr]
+        ("", wire.BEGIN),
+        ("a", "began"),
+        ("b", "began"),
+    ]
