@@ -71,7 +71,7 @@ def name_signals() -> None:
         os.kill(os.getpid(), number)
 
     for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGALRM, signal.SIGIO, signal.SIGUSR1, signal.SIGUSR2):
-        if signal.getsignal(number) is signal.SIG_DFL:
+        if signal.getsignal(number) in (signal.SIG_DFL, signal.SIG_IGN):  # `nohup` has SIGHUP ignored: tests send it
             signal.signal(number, name)
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import os
 import pty
+import queue
+import select
 import threading
 import time
 import tty
@@ -36,22 +38,31 @@ def device() -> Iterator[tuple[Link, Talk]]:
     master, slave = pty.openpty()
     tty.setraw(slave)
     link = made(f"serial:{os.ttyname(slave)}", Quiet())
-    threads: list[threading.Thread] = []
+    exchanges: queue.Queue[tuple[bytes, list[bytes]]] = queue.Queue()
+    ended = threading.Event()
+
+    def hears(after: bytes) -> bool:
+        heard = b""
+        while not heard.endswith(after) and not ended.is_set():
+            if select.select([master], [], [], 0.05)[0]:
+                heard += os.read(master, 100)
+        return not ended.is_set()
+
+    def run() -> None:  # one thread, for two would take what the other awaits
+        while not ended.is_set():
+            with contextlib.suppress(queue.Empty):
+                after, replies = exchanges.get(timeout=0.05)
+                for reply in replies if hears(after) else []:
+                    os.write(master, reply)
 
     def talk(after: bytes, replies: list[bytes]) -> None:
-        def run() -> None:
-            heard = b""
-            while not heard.endswith(after):
-                heard += os.read(master, 100)
-            for reply in replies:
-                os.write(master, reply)
+        exchanges.put((after, replies))
 
-        threads.append(threading.Thread(target=run))
-        threads[-1].start()
-
+    thread = threading.Thread(target=run)
+    thread.start()
     yield link, talk
-    for thread in threads:
-        thread.join()
+    ended.set()
+    thread.join()
     link.close()
     os.close(slave)
     os.close(master)
