@@ -94,7 +94,8 @@ def test_no_module_outside_of_a_task_s_own_packages_names_a_task() -> None:
 def test_no_module_outside_of_tasks_reports_formats_and_simulation_names_a_stage() -> None:
     data = {"split", "train", "report", "export"}  # words of data too: a role, kinds of dataset, a message of HID
     known = {*registry.stages(), *registry.commands()} - data
-    needed = {"exports/frames.py"}  # an export of frames runs synchronize before it
+    # an export of frames runs synchronize before it; a live session carries out what these stages do, sample by sample
+    needed = {"exports/frames.py", "live/stages.py", "live/replay.py", "live/demo.py"}
 
     assert _modules_with(re.compile("|".join(map(re.escape, known)))) == needed
 

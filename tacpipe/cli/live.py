@@ -120,9 +120,9 @@ def _run(
     from tacpipe.recording import appending, trials
     from tacpipe.recording.recorder import Recorder
     from tacpipe.recording.view import View
-    from tacpipe.store import store as stores
+    from tacpipe.store import location
 
-    store = stores.locate()
+    store = location.locate()
     plan: trials_of.Plan | None = None
     if output is not None:
         kept = {**acquire.attributes(labels, None), **attributes}

@@ -25,8 +25,8 @@ from tacpipe.tasks.material.classifier import (
     PERMUTED_LABELS,
     SHUFFLED_ESTIMATORS,
     WEIGHTS,
-    Baseline,
     Config,
+    ReadoutModel,
 )
 from tacpipe.tasks.material.estimators import Fitted
 from tacpipe.tasks.material.estimators import packed as packed_estimators
@@ -180,7 +180,7 @@ def permuted(params: Params, materials: np.ndarray, place: int) -> np.ndarray:
     return np.random.default_rng([params.seed, 2, place]).permutation(materials)
 
 
-def stored(kind: str, sensor: str, fitted: Baseline) -> Arrays:
+def stored(kind: str, sensor: str, fitted: Level | ReadoutModel) -> Arrays:
     """Return the tensors of a baseline, under names that no other has."""
     return {f"{kind}.{sensor}.{key}": value for key, value in fitted.to_tensors().items()}
 
