@@ -73,7 +73,7 @@ class Tacpipe:
     def words(self, lab: Lab, step: str, factor: int = 2) -> list[str]:
         common = ["-o", f"data/{step}", "--jobs", "2"]
         if step == "load":
-            return ["tacpipe", "ingest", "numbers", "raw", *common]
+            return ["tacpipe", "ingest", "numbers", "raw", "--replace", *common]  # else a file written anew is refused
         if step == "scale":
             return ["tacpipe", "scale", "data/load", "--factor", str(factor), *common]
         return ["tacpipe", "total", "data/scale", *common]
