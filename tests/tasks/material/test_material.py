@@ -272,7 +272,10 @@ def test_slides_that_cannot_be_learned_from_are_refused(
 @pytest.mark.parametrize(
     "changed, sentence",
     [
-        ({"architecture": "cnn"}, "architecture is 'cnn'; it must be one of minirocket, raec, spectra, x-lstm"),
+        (
+            {"architecture": "cnn"},
+            "architecture is 'cnn'; it must be one of minirocket, raec, spectra, statistics, x-lstm",
+        ),
         ({"labels": "none"}, "labels is 'none'"),
         ({**RAEC, "select": "first"}, "select is 'first'"),
         ({**RAEC, "frozen_sensor": "biotac"}, "needs both --frozen-sensor"),
