@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
+import subprocess
+import sys
 
 from tests.conftest import Lab
 
@@ -38,3 +42,22 @@ def test_link_removes_the_drafts_in_every_folder_of_an_export(lab: Lab) -> None:
     draft.write_bytes(b"half")
     lab.run("store link out")
     assert deep.exists() and not draft.exists()
+
+
+def test_a_lost_connection_after_show_raises_an_error_and_ends_no_process(lab: Lab) -> None:
+    lab.run("simulate toy -o data/r")
+    before = signal.getsignal(signal.SIGPIPE)
+    lab.run("show data/r")
+
+    assert signal.getsignal(signal.SIGPIPE) == before == signal.SIG_IGN
+
+
+def test_show_ends_when_nobody_reads_what_it_prints(lab: Lab) -> None:
+    lab.run("simulate toy --trials 40 -o data/r")
+    readable, writable = os.pipe()
+    os.close(readable)
+    command = [sys.executable, "-m", "tacpipe", "show", "data/r", "--full"]
+    done = subprocess.run(command, cwd=lab.folder, stdout=writable, stderr=subprocess.PIPE, check=False)
+    os.close(writable)
+
+    assert (done.returncode, done.stderr) == (-signal.SIGPIPE, b"")

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import signal
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -128,16 +130,16 @@ def _compare(program: typer.Typer) -> None:
 
         if as_csv and as_json:
             raise typer.BadParameter("give --csv or --json, not both", param_hint="--csv")
-        signal.signal(signal.SIGPIPE, signal.SIG_DFL)
         found = comparing.run(results, pool=not each)
-        if as_json:
-            terminal.result_json(found.to_json())
-        elif as_csv:
-            terminal.result(found.to_csv())
-        else:
-            for number, table in enumerate(found.tables()):
-                terminal.result("") if number else None
-                tables.show(table, result=True)
+        with _ends_with_its_reader():
+            if as_json:
+                terminal.result_json(found.to_json())
+            elif as_csv:
+                terminal.result(found.to_csv())
+            else:
+                for number, table in enumerate(found.tables()):
+                    terminal.result("") if number else None
+                    tables.show(table, result=True)
 
 
 def _track(program: typer.Typer) -> None:
@@ -235,8 +237,22 @@ def _live(program: typer.Typer) -> None:
 
 
 def _print(value: Any, to_text: Callable[..., str], *, as_json: bool, **options: Any) -> None:
-    signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `tacpipe show DATASET | head` ends as it does for any Unix tool
-    terminal.result_json(value) if as_json else terminal.result(to_text(value, **options))
+    with _ends_with_its_reader():
+        terminal.result_json(value) if as_json else terminal.result(to_text(value, **options))
+
+
+@contextlib.contextmanager
+def _ends_with_its_reader() -> Iterator[None]:
+    """While a result is printed, end this process when nobody reads it, as Unix tools do: `tacpipe show DATASET | head`.
+
+    Before and after, a connection that is lost raises an error instead.
+    """
+    before = signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+    try:
+        yield
+        sys.stdout.flush()
+    finally:
+        signal.signal(signal.SIGPIPE, before)
 
 
 NAMES: dict[str, Callable[[typer.Typer], None]] = {
