@@ -12,6 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+from tacpipe.channels.streams import EVENTS
 from tacpipe.errors import UsageError
 from tacpipe.plugins.constraints import PositiveFloat, Rate, Unit
 from tacpipe.plugins.params import added
@@ -23,8 +24,6 @@ if TYPE_CHECKING:
     from tacpipe.arrays import Int64s, Times
     from tacpipe.datasets.dataset import Recording
     from tacpipe.synchronization.streams import Stream
-
-EVENTS = "events"  # the stream of what went wrong while recording; no signal
 
 
 @dataclass(frozen=True)

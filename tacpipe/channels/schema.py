@@ -32,6 +32,15 @@ def time_field(made: str | None = None) -> pa.Field:
     return pa.field("t_ns", pa.int64(), metadata=metadata)
 
 
+def device_fields(*, clock: bool, counters: Iterable[str]) -> list[pa.Field]:
+    """Return the int64 fields of a device's own clock, ``t_device_ns``, if it has one, and of its counters of samples."""
+    import pyarrow as pa
+
+    time = pa.field("t_device_ns", pa.int64(), metadata={"unit": "ns", "quantity": "time"})
+    counted = [pa.field(name, pa.int64(), metadata={"unit": "1", "quantity": "sequence"}) for name in counters]
+    return [time, *counted] if clock else counted
+
+
 def uskin_fields(taxels: int = TAXELS) -> list[pa.Field]:
     """Return the fields ``taxel01_x`` to ``taxel16_z`` of a XELA uSkin, uint16 device counts, taxel by taxel."""
     import pyarrow as pa

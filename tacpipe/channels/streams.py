@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from tacpipe.arrays import AnyArray, Indices, Int64s
 
 COUNT = "count"  # the unit of readings as a sensor gives them
+EVENTS = "events"  # the stream of what went wrong while recording; no signal
 TRUTH = "gt_"  # how columns with ground truth begin
 _GAP_FACTOR = 3.0  # a step this many times the median step is a gap
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from tacpipe.channels.streams import TRUTH
+from tacpipe.channels.streams import EVENTS, TRUTH
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
     from tacpipe.datasets.dataset import Recording
 
-NO_SIGNALS = ("events", "truth")  # streams of what went wrong, and of what a simulation knows
+NO_SIGNALS = (EVENTS, "truth")  # streams of what went wrong, and of what a simulation knows
 
 
 def streams_of(recording: Recording) -> dict[str, pa.Table]:

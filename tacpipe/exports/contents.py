@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset, Recording
 
 TABLE = "data"  # how the only table of a recording is named where a name is needed
-EVENTS = "events"
 TIME = "t_ns"
 COLUMNS, STREAMS, LOSSES = "columns", "streams", "losses"  # tables of a part
 

@@ -17,8 +17,9 @@ from typing import Any, Self
 
 import numpy as np
 
-from tacpipe.arrays import AnyFloats, Floats, Int64s
+from tacpipe.arrays import AnyFloats, Int64s
 from tacpipe.sensors.live import OFF, ON, UNKNOWN
+from tacpipe.signals.loads import axes, loads
 
 LOAD, SLIP = "load", "slip"
 NAMES = (LOAD, SLIP)
@@ -60,7 +61,8 @@ class Alarms:
         """Return the state of each alarm, of counts predicted (step, channel) and the last ones (channel,)."""
         if not self.levels:
             return dict(NOTHING_KNOWN)
-        moved = np.abs(loads(ahead[-1:], layout)[0] - loads(now[None], layout)[0])
+        last, present = (loads(np.asarray(one, np.float64), layout)[0] for one in (ahead[-1:], now[None]))
+        moved = np.abs(last - present)
         found = {}
         for name in NAMES:
             levels = np.array(self.levels[name])
@@ -74,24 +76,6 @@ class Alarms:
         """Return the levels as JSON can hold them: null where there is none."""
         levels = {name: [one if math.isfinite(one) else None for one in values] for name, values in self.levels.items()}
         return {"axes": [list(one) for one in self.axes], "levels": levels, "per_hour": self.per_hour}
-
-
-def axes(layout: Sequence[Mapping[str, str]]) -> tuple[tuple[str, str], ...]:
-    """Return stream and axis of each load of channels that lie so."""
-    return tuple(dict.fromkeys((one.get("stream", ""), one.get("axis", "")) for one in layout))
-
-
-def loads(counts: AnyFloats, layout: Sequence[Mapping[str, str]]) -> Floats:
-    """Return the mean count of each sensor's axes (time, load) of ``counts`` (time, channel)."""
-    places = [(one.get("stream", ""), one.get("axis", "")) for one in layout]
-    found: Floats = np.stack(
-        [
-            counts[:, [index for index, place in enumerate(places) if place == wanted]].mean(axis=1, dtype=np.float64)
-            for wanted in axes(layout)
-        ],
-        axis=1,
-    )
-    return found
 
 
 def set_on(

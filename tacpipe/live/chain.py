@@ -17,9 +17,11 @@ import numpy as np
 
 from tacpipe.arrays import AnyFloats, Float32s, Floats, Times
 from tacpipe.errors import TacpipeError
-from tacpipe.live.sources import PLAN, PLANNED, Layout, plan_table
+from tacpipe.live.sources import Layout, plan_table
 from tacpipe.live.stages import causal_stages
 from tacpipe.models.windows import ARM
+from tacpipe.sensors.plan import NAME as PLAN
+from tacpipe.sensors.plan import POSE
 from tacpipe.synchronization.causal import Grid, Rows
 from tacpipe.tasks.forward import planned, units
 from tacpipe.tasks.forward.causal import Arm, Rolling, one_thread
@@ -321,7 +323,7 @@ class Chain:
         arrived = batch.column(names.index("t_ns")).to_numpy()
         # times as bits of a float, so that a plan's rows are one array
         target = np.ascontiguousarray(batch.column(names.index("t_target_ns")).to_numpy()).view(np.float64)
-        poses: Floats = np.column_stack([batch.column(names.index(name)).to_numpy() for name in PLANNED])
+        poses: Floats = np.column_stack([batch.column(names.index(name)).to_numpy() for name in POSE])
         rows = np.column_stack([target, poses])
         for arrived_ns in np.unique(arrived).tolist():
             some = rows[arrived == arrived_ns]

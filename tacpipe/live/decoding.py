@@ -103,11 +103,7 @@ def schema(sensor: Sensor, *, device: bool, counters: list[str]) -> pa.Schema:
 
     from tacpipe.channels import schema as schemas
 
-    time = {"unit": "ns", "quantity": "time"}
-    fields = [schemas.time_field()]
-    fields += [pa.field("t_device_ns", pa.int64(), metadata=time)] if device else []
-    fields += [pa.field(name, pa.int64(), metadata={"unit": "1", "quantity": "sequence"}) for name in counters]
-    return pa.schema([*fields, *sensor.fields()])
+    return pa.schema([schemas.time_field(), *schemas.device_fields(clock=device, counters=counters), *sensor.fields()])
 
 
 def likely_schema(sensor: Sensor) -> pa.Schema:
@@ -118,5 +114,4 @@ def likely_schema(sensor: Sensor) -> pa.Schema:
 
 def batch_schema(batch: Batch, sensor: Sensor) -> pa.Schema:
     """Return the schema of a stream that gave this batch."""
-    counters = [name for name in ("seq", "device_seq") if getattr(batch, name) is not None]
-    return schema(sensor, device=batch.t_device_ns is not None, counters=counters)
+    return schema(sensor, device=batch.t_device_ns is not None, counters=batch.counters)

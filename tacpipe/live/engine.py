@@ -19,10 +19,10 @@ from tacpipe.live.alarms import NOTHING_KNOWN, Alarms
 from tacpipe.live.chain import Cause, Forecast
 from tacpipe.live.decoding import Decoder, batch_schema, likely_schema
 from tacpipe.live.messages import Message
-from tacpipe.live.sources import PLAN
 from tacpipe.recording.spool_blocks import Note
 from tacpipe.recording.station import BEGAN
 from tacpipe.sensors.framing import Chunks
+from tacpipe.sensors.plan import NAME as PLAN
 from tacpipe.sensors.sensor import Sensor
 
 if TYPE_CHECKING:

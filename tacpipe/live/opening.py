@@ -66,40 +66,32 @@ def _alarms(options: Options, model: Dataset, made: Chainlike) -> Alarms:
 def on_recordings(model: Dataset, recordings: Dataset, per_hour: float) -> Alarms:
     """Return alarms of a model with levels for ``per_hour`` false alarms each on recordings, each row's forecast made."""
     from tacpipe.tasks.forward import tracks
+    from tacpipe.tasks.forward.alarms import Loads
     from tacpipe.tasks.forward.forecaster import Forecaster
-    from tacpipe.tasks.forward.predictors import forecasts
+    from tacpipe.tasks.forward.predictors import MODEL, Prediction, forecasts
     from tacpipe.tasks.opened import Chain as Stages
     from tacpipe.tasks.opened import opened
 
     forecaster = Forecaster.load(model.files)
-    layout, horizon = forecaster.codec.layout, forecaster.horizon
-    truths: list[Any] = []
-    aheads: list[Any] = []
-    groups: list[Any] = []
+    loads = Loads(forecaster.codec.layout, forecaster.horizon)
     slips: list[Any] = []
-    steps_s: list[float] = []
     for shard in opened(recordings, Stages(model)).recordings.values():
         track = tracks.track(shard, forecaster.codec, forecaster.pose)
-        truth = alarms_of.loads(np.asarray(track.tactile[np.arange(len(track.t_ns))]), layout)
-        ahead = np.full_like(truth, np.nan)
-        for some in forecasts(forecaster, track, track.starts(forecaster.context, horizon)):
-            ahead[some.now] = alarms_of.loads(some.count[:, -1], layout)
-        truths.append(np.where(track.usable[:, None], truth, np.nan))
-        aheads.append(ahead)
-        groups.append(track.groups + (int(groups[-1][-1]) + 1 if groups else 0))
+        loads.begin(track)
+        for some in forecasts(forecaster, track, track.starts(forecaster.context, forecaster.horizon)):
+            loads.add_one(MODEL, some.now, Prediction(some.features, some.count))
         slips.append(_slips(shard))
-        steps_s.append(float(np.median(np.diff(track.t_ns))) / 1e9)
-    if not truths:
+    if not slips:
         raise UsageError("There is no validation recording that alarms could be set on; give --alarms-on others.")
     known = None if any(one is None for one in slips) else np.concatenate(slips)
     return alarms_of.set_on(
-        np.concatenate(truths),
-        np.concatenate(aheads),
-        np.concatenate(groups),
+        np.concatenate(loads.truth),
+        np.concatenate(loads.ahead[MODEL]),
+        np.concatenate(loads.groups),
         known,
-        layout,
-        horizon=horizon,
-        rate_hz=1 / float(np.median(steps_s)),
+        loads.layout,
+        horizon=loads.horizon,
+        rate_hz=loads.rate_hz,
         per_hour=per_hour,
     )
 

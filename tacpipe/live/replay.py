@@ -11,8 +11,8 @@ import numpy as np
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import progress
 from tacpipe.live.chain import BLOCKING, Cause, Chain, Forecast
-from tacpipe.live.sources import PLAN
 from tacpipe.plugins.stage import RecordingOutput, Result
+from tacpipe.sensors.plan import NAME as PLAN
 from tacpipe.tasks.forward.prediction import prediction_table
 
 if TYPE_CHECKING:

@@ -20,8 +20,8 @@ from tacpipe.recording import rig as rigs
 from tacpipe.recording import rig_text
 from tacpipe.recording.recorder import Recorder
 from tacpipe.recording.rig import Rig, Stream
+from tacpipe.sensors.plan import NAME as PLAN
 
-PLAN = "plan"
 MEASURED = "measured"  # in the place of an address: the recorded motion is taken to continue
 SWITCH_S = 0.0005  # that one thread may hold up another: the threads that read must not wait 5 ms for the view
 

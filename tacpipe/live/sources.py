@@ -10,10 +10,12 @@ import numpy as np
 
 from tacpipe.arrays import AnyArray, AnyFloats, Floats, Indices, Times
 from tacpipe.channels import pose as poses
-from tacpipe.channels.streams import axes_of
+from tacpipe.channels.schema import time_field
+from tacpipe.channels.streams import EVENTS, axes_of
 from tacpipe.codecs import tactile
 from tacpipe.errors import TacpipeError
 from tacpipe.printable import listed
+from tacpipe.sensors import plan
 from tacpipe.signals.contact import rest_level, tared
 from tacpipe.synchronization import grids, methods
 from tacpipe.synchronization.causal import Reading
@@ -24,9 +26,6 @@ from tacpipe.tasks.forward.forecaster import Forecaster
 if TYPE_CHECKING:
     import pyarrow as pa
 
-PLAN = "plan"  # name of the stream of planned motion
-EVENTS = "events"  # the stream of what went wrong while recording
-PLANNED = (*(f"position_{axis}_m" for axis in "xyz"), *(f"orientation_{part}" for part in "xyzw"))
 Place = tuple[str, Indices]  # a stream, and columns of its samples
 
 
@@ -37,13 +36,7 @@ def plan_schema() -> pa.Schema:
     """
     import pyarrow as pa
 
-    def planned(name: str) -> pa.Field:
-        metadata = {"unit": "m" if name.endswith("_m") else "1", "quantity": "plan"}
-        return pa.field(name, pa.float64(), metadata=metadata)
-
-    time = pa.field("t_ns", pa.int64(), metadata={"unit": "ns", "quantity": "time"})
-    target = pa.field("t_target_ns", pa.int64(), metadata={"unit": "ns", "quantity": "time"})
-    return pa.schema([time, target, *map(planned, PLANNED)])
+    return pa.schema([time_field(), *plan.Plan().fields()])
 
 
 def plan_table(arrived_ns: int, t_ns: Times, poses: AnyFloats) -> pa.Table:
@@ -62,7 +55,7 @@ def plan_table(arrived_ns: int, t_ns: Times, poses: AnyFloats) -> pa.Table:
         )
     if (np.diff(t_ns) <= 0).any() or not np.isfinite(poses).all():
         raise TacpipeError("The times of a plan must ascend, and all its numbers be finite.")
-    whole = np.full((len(poses), len(PLANNED)), np.nan)
+    whole = np.full((len(poses), plan.NUMBERS), np.nan)
     whole[:, : poses.shape[1]] = poses
     arrays = [pa.array(np.full(len(t_ns), arrived_ns, np.int64)), pa.array(t_ns), *map(pa.array, whole.T)]
     return pa.Table.from_arrays(arrays, schema=plan_schema())

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 
+from tacpipe.channels.streams import EVENTS
 from tacpipe.datasets import directory, recording_names
 from tacpipe.datasets import manifest as manifest_of
 from tacpipe.datasets.manifest import ACQUIRE, Entry, Manifest
@@ -48,7 +49,7 @@ def append(store: Store, output: Path, spooled: Spooled, rig: Rig, sealed: Mappi
         _refuse(spooled, sealed)
     events = events_table(sealed, spooled)
     if events.num_rows:
-        tables["events"] = events
+        tables[EVENTS] = events
     shards = {name: _shard(store, name, table) for name, table in sorted(tables.items())}
     text = vars(store.put(rig.text.encode(), durable=True))
     entry: Entry = {"attributes": _attributes(spooled, rig, sealed), "shards": shards}

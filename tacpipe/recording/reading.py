@@ -46,6 +46,11 @@ class Batch:
     def __len__(self) -> int:
         return len(self.t_ns)
 
+    @property
+    def counters(self) -> list[str]:
+        """Names of the counters of samples that are there."""
+        return [name for name in ("seq", "device_seq") if getattr(self, name) is not None]
+
 
 class Reading:
     """Turns what a link gave into samples; the same bytes give the same samples, however they are cut."""

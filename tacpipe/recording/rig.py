@@ -22,6 +22,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from tacpipe.channels.streams import EVENTS
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import regular
 from tacpipe.links import link
@@ -31,7 +32,7 @@ from tacpipe.printable import excerpt, plain
 from tacpipe.sensors.sensor import Sensor
 
 NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")
-TAKEN = ("events", "truth")  # streams that a recording has next to those of its sensors
+TAKEN = (EVENTS, "truth")  # streams that a recording has next to those of its sensors
 KEYS = ("name", "sensor", "transport", "options", "emulate")
 
 

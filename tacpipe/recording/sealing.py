@@ -233,14 +233,10 @@ def _table(parts: _Parts, t_ns: Times, uncertain_ns: Times) -> pa.Table:
         kind = pa.field(UNCERTAIN, pa.int64(), metadata={"unit": "ns", "quantity": "time"})
         columns.append((kind, uncertain_ns))
     batches = parts.batches
-    first = batches[0] if batches else None
-    if first is not None and first.t_device_ns is not None:
-        kind = pa.field("t_device_ns", pa.int64(), metadata={"unit": "ns", "quantity": "time"})
-        columns.append((kind, _joined([batch.t_device_ns for batch in batches], np.int64)))
-    for name in ("seq", "device_seq"):
-        if first is not None and getattr(first, name) is not None:
-            kind = pa.field(name, pa.int64(), metadata={"unit": "1", "quantity": "sequence"})
-            columns.append((kind, _joined([getattr(batch, name) for batch in batches], np.int64)))
+    if batches:
+        first = batches[0]
+        kinds = schema.device_fields(clock=first.t_device_ns is not None, counters=first.counters)
+        columns += [(kind, _joined([getattr(batch, kind.name) for batch in batches], np.int64)) for kind in kinds]
     arrays = [*(pa.array(values, kind.type) for kind, values in columns), *parts.channels()]
     return pa.Table.from_arrays(arrays, schema=pa.schema([*(kind for kind, _ in columns), *parts.fields]))
 

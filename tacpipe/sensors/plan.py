@@ -30,7 +30,9 @@ if TYPE_CHECKING:
 VERSION = 1
 MOST_POINTS = 1000  # of a plan
 LARGEST = 1 << 62
-NUMBERS = 7  # of a pose
+NAME = "plan"  # of the stream of a rig
+POSE = (*(f"position_{axis}_m" for axis in "xyz"), *(f"orientation_{part}" for part in "xyzw"))  # columns
+NUMBERS = len(POSE)  # of a pose
 
 
 @dataclass(frozen=True)
@@ -48,12 +50,12 @@ class Plan(Sensor):
         """Return the time that a point is planned for, in UTC ns, and its pose."""
         import pyarrow as pa
 
-        def number(name: str, unit: str) -> pa.Field:
-            return pa.field(name, pa.float64(), metadata={"unit": unit, "quantity": "plan"})
+        def number(name: str) -> pa.Field:
+            metadata = {"unit": "m" if name.endswith("_m") else "1", "quantity": "plan"}
+            return pa.field(name, pa.float64(), metadata=metadata)
 
         target = pa.field("t_target_ns", pa.int64(), metadata={"unit": "ns", "quantity": "plan"})
-        position = [number(f"position_{axis}_m", "m") for axis in "xyz"]
-        return [target, *position, *(number(f"orientation_{part}", "1") for part in "xyzw")]
+        return [target, *map(number, POSE)]
 
     def framer(self) -> Framer:
         """Return a framer that takes packets that are plans."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tacpipe.arrays import Bytes, Float32s, Times
-from tacpipe.channels.streams import TRUTH, rate_hz
+from tacpipe.channels.streams import EVENTS, TRUTH, rate_hz
 from tacpipe.clouds.cloud import COLOUR, POSITION
 from tacpipe.datasets.streams import streams_of
 from tacpipe.formats.arrays.frames import encoding
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Recording
     from tacpipe.plugins.stage import Attribute
 
-EVENTS = "events"
 # quantities, in the order in which they are looked for
 FIRST = ("force", "static_pressure", "joint_position", "finger_width", "position", "speed", "velocity")
 

@@ -18,12 +18,13 @@ import pytest
 
 from tacpipe.errors import UsageError
 from tacpipe.live import process, supervisor
-from tacpipe.live.alarms import Alarms, axes
+from tacpipe.live.alarms import Alarms
 from tacpipe.live.chain import Cause, Forecast
 from tacpipe.live.engine import Engine
 from tacpipe.live.options import Options
 from tacpipe.live.session import Described
 from tacpipe.recording import rig as rigs
+from tacpipe.signals.loads import axes
 
 HORIZON = 3
 PERIOD_NS = 20_000_000

@@ -12,6 +12,7 @@ from tacpipe.arrays import Floats
 from tacpipe.live import alarms
 from tacpipe.live.alarms import LOAD, NAMES, SLIP, Alarms
 from tacpipe.sensors.live import OFF, ON, UNKNOWN
+from tacpipe.signals.loads import axes
 
 LAYOUT = [{"stream": "skin", "axis": axis, "taxel": str(taxel)} for taxel in (1, 2) for axis in "xyz"]
 HORIZON, RATE_HZ = 10, 50.0
@@ -22,7 +23,7 @@ def states(levels: Mapping[str, tuple[float, ...]], change: list[float]) -> dict
     now = np.arange(6.0)
     ahead = np.repeat(now[None], HORIZON, axis=0)
     ahead[-1] += np.tile(change, 2)
-    found = Alarms(alarms.axes(LAYOUT), levels).states(ahead, now, LAYOUT)
+    found = Alarms(axes(LAYOUT), levels).states(ahead, now, LAYOUT)
     return {name: state.state for name, state in found.items()}
 
 

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import os
 import re
-import shutil
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from tests.power.machine import blank
+from tests.power import machine
 
 TOOLS = {  # and of which package
     "linux.uml": "user-mode-linux",
@@ -22,8 +20,6 @@ TOOLS = {  # and of which package
     "mkfs.ext4": "e2fsprogs",
 }
 ROUNDS = 3
-LIMIT_S = 1200
-PATH = f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin"
 WORK = """
 mkdir -p /mnt/a/lab/a /mnt/a/lab/b
 on() {  # client, command
@@ -41,21 +37,15 @@ for client in a b; do on $client "store verify"; echo "CODE $?"; done
 """
 
 
-def lacking() -> str:
-    """Return which Debian packages are missing, nothing if all is there."""
-    return " ".join(sorted({package for tool, package in TOOLS.items() if shutil.which(tool, path=PATH) is None}))
-
-
 @pytest.mark.skipif("TACPIPE_TEST_NFS" not in os.environ, reason="it takes minutes: TACPIPE_TEST_NFS=1 runs it")
-@pytest.mark.skipif(bool(lacking()), reason=f"{lacking()} is not installed")
+@pytest.mark.skipif(bool(machine.lacking(TOOLS)), reason=f"{machine.lacking(TOOLS)} is not installed")
 def test_two_clients_of_one_export_that_do_the_same_beside_collections_end_with_the_same_bytes(
     plugin: Path, tmp_path: Path
 ) -> None:
-    disk = blank(tmp_path / "disk", 512)
-    subprocess.run(["mkfs.ext4", "-q", "-F", str(disk)], check=True, env={**os.environ, "PATH": PATH})
+    disk = machine.formatted(tmp_path / "disk", "ext4", size_mb=512)
     (tmp_path / "work").write_text(WORK.replace("ROUNDS", str(ROUNDS)))
     variables = {
-        "PATH": PATH,
+        "PATH": machine.PATH,
         "LD_LIBRARY_PATH": os.environ.get("LD_LIBRARY_PATH", ""),
         "SCRATCH": str(tmp_path),
         "PYTHON": sys.executable,
@@ -63,23 +53,7 @@ def test_two_clients_of_one_export_that_do_the_same_beside_collections_end_with_
         "OMP_NUM_THREADS": "1",
         "HOME": "/run",
     }
-    exports = "".join(f"export {name}='{value}'\n" for name, value in variables.items())
-    first = tmp_path / "init"
-    first.write_text(f"#!/bin/bash\n{exports}exec bash {Path(__file__).with_name('guest.sh')}\n")
-    first.chmod(0o755)
-    ran = subprocess.run(
-        [
-            *("linux.uml", "mem=768M", "root=/dev/root", "rootfstype=hostfs", "rootflags=/", "ro", f"init={first}"),
-            *("con=null", "con0=fd:0,fd:1", "quiet", f"ubda={disk}"),
-        ],
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        errors="replace",
-        timeout=LIMIT_S,
-        check=False,
-        env={**os.environ, "TMPDIR": "/dev/shm", "PATH": PATH},
-    )
+    ran = machine.boot([disk], f"exec bash {Path(__file__).with_name('guest.sh')}\n", tmp_path, variables)
     printed = ran.stdout
     assert "CLIENTS 2" in printed, printed[-3000:] + ran.stderr[-1000:]
     assert re.findall(r"CODE (\d+)", printed) == ["0"] * (3 * ROUNDS + 2), printed[-3000:]

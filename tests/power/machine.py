@@ -17,19 +17,19 @@ MEMORY = "768M"
 LIMIT_S = 1200
 MAKE = {"ext4": ["mkfs.ext4", "-q", "-F"], "xfs": ["mkfs.xfs", "-q"], "btrfs": ["mkfs.btrfs", "-q"]}
 SIZE_MB = {"ext4": 64, "xfs": 320, "btrfs": 128}  # hardly more than each needs
+PATH = f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin"
+TOOLS = {  # and the Debian packages that have them
+    "linux.uml": "user-mode-linux",
+    "dmsetup": "dmsetup",
+    "mkfs.ext4": "e2fsprogs",
+    "mkfs.xfs": "xfsprogs",
+    "mkfs.btrfs": "btrfs-progs",
+}
 
 
-def lacking() -> str:
-    """Return which Debian packages are missing to run one, nothing if all is there."""
-    tools = {
-        "linux.uml": "user-mode-linux",
-        "dmsetup": "dmsetup",
-        "mkfs.ext4": "e2fsprogs",
-        "mkfs.xfs": "xfsprogs",
-        "mkfs.btrfs": "btrfs-progs",
-    }
-    path = f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin"
-    return " ".join(package for tool, package in tools.items() if shutil.which(tool, path=path) is None)
+def lacking(tools: Mapping[str, str] = TOOLS) -> str:
+    """Return which Debian packages are missing for these tools, nothing if all are there."""
+    return " ".join(sorted({package for tool, package in tools.items() if shutil.which(tool, path=PATH) is None}))
 
 
 def modules() -> Path:
@@ -45,11 +45,10 @@ def blank(path: Path, size_mb: int) -> Path:
     return path
 
 
-def formatted(path: Path, kind: str) -> Path:
-    """Return a disk with an empty file system."""
-    blank(path, SIZE_MB[kind])
-    environment = {**os.environ, "PATH": f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin"}
-    subprocess.run([*MAKE[kind], str(path)], check=True, capture_output=True, env=environment)
+def formatted(path: Path, kind: str, size_mb: int | None = None) -> Path:
+    """Return a disk with an empty file system, of the least size without ``size_mb``."""
+    blank(path, size_mb or SIZE_MB[kind])
+    subprocess.run([*MAKE[kind], str(path)], check=True, capture_output=True, env={**os.environ, "PATH": PATH})
     return path
 
 
@@ -57,24 +56,27 @@ def run(
     disks: Sequence[Path], task: Mapping[str, Any], scratch: Path, environment: Mapping[str, str]
 ) -> list[dict[str, Any]]:
     """Boot with these disks, do the ``task`` of `guest`, and return its answers."""
-    told, first = scratch / "task.json", scratch / "init"
+    told = scratch / "task.json"
     told.write_text(json.dumps(task))
-    exports = "".join(f"export {name}='{value}'\n" for name, value in environment.items())
     command = f"cd {ROOT}\nexec {sys.executable} -B -m tests.power.guest {told}\n"
+    ran = boot(disks, command, scratch, environment)
+    answers = [line.partition("RESULT ")[2] for line in ran.stdout.splitlines() if "RESULT {" in line]
+    assert answers, ran.stdout[-3000:] + ran.stderr[-1000:]
+    return [json.loads(answer) for answer in answers]
+
+
+def boot(
+    disks: Sequence[Path], command: str, scratch: Path, environment: Mapping[str, str]
+) -> subprocess.CompletedProcess[str]:
+    """Boot with these disks, run lines of a shell as the first process, and return what was printed."""
+    first = scratch / "init"
+    exports = "".join(f"export {name}='{value}'\n" for name, value in environment.items())
     first.write_text(f"#!/bin/sh\n{exports}{command}")
     first.chmod(0o755)
-    ran = subprocess.run(
+    root = ("root=/dev/root", "rootfstype=hostfs", "rootflags=/", "ro", f"init={first}")
+    return subprocess.run(
         [
-            *(
-                "linux.uml",
-                f"mem={MEMORY}",
-                "root=/dev/root",
-                "rootfstype=hostfs",
-                "rootflags=/",
-                "ro",
-                f"init={first}",
-            ),
-            *("con=null", "con0=fd:0,fd:1", "quiet"),
+            *("linux.uml", f"mem={MEMORY}", *root, "con=null", "con0=fd:0,fd:1", "quiet"),
             *(f"ubd{chr(ord('a') + number)}={disk}" for number, disk in enumerate(disks)),
         ],
         stdin=subprocess.DEVNULL,
@@ -83,8 +85,5 @@ def run(
         errors="replace",
         timeout=LIMIT_S,
         check=False,
-        env={**os.environ, "TMPDIR": "/dev/shm", "PATH": f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin"},
+        env={**os.environ, "TMPDIR": "/dev/shm", "PATH": PATH},
     )
-    answers = [line.partition("RESULT ")[2] for line in ran.stdout.splitlines() if "RESULT {" in line]
-    assert answers, ran.stdout[-3000:] + ran.stderr[-1000:]
-    return [json.loads(answer) for answer in answers]

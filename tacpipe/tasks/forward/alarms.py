@@ -11,7 +11,7 @@ import numpy as np
 
 from tacpipe.arrays import AnyFloats, Int64s
 from tacpipe.signals import anticipation, holds
-from tacpipe.tasks.forward.levels import Levels
+from tacpipe.signals.loads import loads
 from tacpipe.tasks.forward.predictors import BASELINE, MODEL, Predicted, Prediction
 from tacpipe.tasks.forward.tracks import Track
 
@@ -33,7 +33,7 @@ class Loads:
 
     def begin(self, track: Track) -> None:
         """Add the rows of a recording, without predictions yet."""
-        truth = self._loads(track.tactile)
+        truth = loads(track.tactile, self.layout)
         offset = max((int(one[-1]) + 1 for one in self.groups if len(one)), default=0)
         self.truth.append(np.where(track.usable[:, None], truth, np.nan))
         self.groups.append(track.groups + offset)
@@ -50,7 +50,7 @@ class Loads:
     def add_one(self, name: str, now: Int64s, prediction: Prediction) -> None:
         """Add the predictions of one predictor for windows whose last rows are ``now``, as `add` does."""
         if name in WATCHED:
-            self.ahead[name][-1][now] = self._loads(prediction.count[:, -1])
+            self.ahead[name][-1][now] = loads(prediction.count[:, -1], self.layout)
 
     def calibrated(self) -> dict[str, Any]:
         """Return each load's usual change and, by predictor, the alarm levels that give a false alarm a minute."""
@@ -60,7 +60,7 @@ class Loads:
         sd = anticipation.difference_sd(truth, groups, horizon=self.horizon)
         theta = {
             name: anticipation.calibrate(
-                truth, ahead, groups, horizon=self.horizon, sd=sd, rate_hz=self._rate_hz()
+                truth, ahead, groups, horizon=self.horizon, sd=sd, rate_hz=self.rate_hz
             ).tolist()
             for name, ahead in self._said()
         }
@@ -85,7 +85,7 @@ class Loads:
                 horizon=self.horizon,
                 sd=sd,
                 theta=theta,
-                rate_hz=self._rate_hz(),
+                rate_hz=self.rate_hz,
                 held=holds.held(truth),
             )
             found[name] = {key: _number(value) for key, value in asdict(score).items()}
@@ -95,19 +95,10 @@ class Loads:
         joined = {name: np.concatenate(parts) for name, parts in self.ahead.items()}
         return [(name, values) for name, values in joined.items() if np.isfinite(values).any()]
 
-    def _rate_hz(self) -> float:
+    @property
+    def rate_hz(self) -> float:
+        """Rows a second; 1 where no recording has two."""
         return 1 / float(np.median(self.steps_s)) if self.steps_s else 1.0
-
-    def _loads(self, counts: AnyFloats | Levels) -> AnyFloats:
-        """Return the mean of each sensor's axes (time, feature) of ``counts`` (time, channel)."""
-        places = [(one.get("stream", ""), one.get("axis", "")) for one in self.layout]
-        return np.stack(
-            [
-                counts[:, [index for index, place in enumerate(places) if place == wanted]].mean(axis=1)
-                for wanted in dict.fromkeys(places)
-            ],
-            axis=1,
-        )
 
 
 def _number(value: float | int) -> float | int | None:
