@@ -119,14 +119,15 @@ def _shown(output: Path, world: World, epoch_ns: int) -> Path:
         name: leads(t_ns, alarm[f"{name}_state"].to_numpy(), events, horizon_ns, period_ns) for name in ("slip", "load")
     }
     terminal.note(f"\n{len(events)} slips of the simulation; horizon {horizon_ns / 1e6:.0f} ms; {len(t_ns)} rows")
-    for name, one in found.items():
-        terminal.note(described(name, one))
+    worth = [described(name, one) for name, one in found.items()]
+    for line in worth:
+        terminal.note(line)
     known = latency["latency_ms"].dropna()
     if len(known):
         terminal.note(
             f"latency: median {known.median():.1f} ms, 99 % {known.quantile(0.99):.1f} ms, {len(known)} forecasts"
         )
-    return _drawn(output / "live.png", recording, truth_ns, slips, events, period_ns / 1e9)
+    return _drawn(output / "live.png", recording, truth_ns, slips, events, period_ns / 1e9, worth[0])
 
 
 def described(name: str, found: Leads) -> str:
@@ -140,8 +141,10 @@ def described(name: str, found: Leads) -> str:
     return f"{name} alarm: {len(found.leads_ms)} of {found.events} slips led{median}; {false}"
 
 
-def _drawn(path: Path, recording: Any, truth_ns: Times, slips: Any, events: Times, period_s: float) -> Path:
-    """Draw a load, its forecast, the alarms and the slips over time."""
+def _drawn(
+    path: Path, recording: Any, truth_ns: Times, slips: Any, events: Times, period_s: float, headline: str
+) -> Path:
+    """Draw a load, its forecast, the alarms and the slips over time, below the headline."""
     import matplotlib as mpl
 
     mpl.use("Agg")
@@ -159,6 +162,7 @@ def _drawn(path: Path, recording: Any, truth_ns: Times, slips: Any, events: Time
     figure, (upper, lower) = pyplot.subplots(2, 1, figsize=(10, 5), sharex=True, height_ratios=(2, 1))
     upper.plot(at_s + period_s, now, color="#444444", linewidth=1, label="one row ahead")
     upper.plot(at_s + last * period_s, ahead, color="#d95f02", linewidth=1, label=f"{last} rows ahead")
+    upper.set_title(headline, loc="left")
     upper.set_ylabel("xela1, mean of x, count")
     upper.legend(loc="upper right", frameon=False)
     alarm_s = (alarm["t_device_ns"].to_numpy() - start_ns) / 1e9
@@ -169,9 +173,9 @@ def _drawn(path: Path, recording: Any, truth_ns: Times, slips: Any, events: Time
                 alarm_s[state == value], np.full((state == value).sum(), place), "|", color=colour, markersize=12
             )
     lower.plot((truth_ns[slips] - start_ns) / 1e9, np.full(int(slips.sum()), 2), "|", color="#1b6ca8", markersize=12)
-    lower.set_yticks([0, 1, 2], ["load alarm", "slip alarm", "slip (truth)"])
+    lower.set_yticks([0, 1, 2], ["load alarm (on: orange)", "slip alarm (on: orange)", "slip (truth)"])
     lower.set_ylim(-0.6, 2.6)
-    lower.set_xlabel("s")
+    lower.set_xlabel("time, s")
     for one in (upper, lower):
         for event_ns in events.tolist():
             one.axvline((event_ns - start_ns) / 1e9, color="#1b6ca8", linewidth=0.6, alpha=0.6)
