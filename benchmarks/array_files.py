@@ -10,10 +10,11 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pandas as pd
+import pyarrow as pa
 import timing
 import zarr
 
-from tacpipe.io.parquet import to_parquet
+from tacpipe.io import parquet
 from tacpipe.plugins import registry
 
 DEMOS, ROWS, TAXELS = 20, 1000, 48
@@ -50,8 +51,12 @@ def _ours(kind: str, place: Path, *, write: bool = False) -> None:
     params = stage.params()
     for one in stage.discover(params, place).values():
         made = stage(params, files=one.files, values=one.values)  # type: ignore[union-attr]
-        for table in made.streams.values() if write else ():
-            to_parquet(table)
+        for table in made.streams.values():
+            if write:
+                parquet.write(table, io.BytesIO())
+            elif isinstance(table, pa.RecordBatchReader):  # batches are read when they are asked for
+                for _ in table:
+                    pass
 
 
 def _h5py(path: Path, *, write: bool = False) -> None:
