@@ -6,7 +6,7 @@ import contextlib
 import json
 import shutil
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -82,7 +82,7 @@ def compute(task: Task) -> Done:
             return _computed(task, store, key, crew)
     except TacpipeError as error:
         with contextlib.suppress(OSError):  # a workspace in which nothing was saved; one with a checkpoint stays
-            (store.root / "checkpoints" / key).rmdir()
+            _workspace(store, key).rmdir()
         at_fault = error.exit_code == FAILED and not isinstance(error, (StorageError, MissingModuleError))
         return Done(task.recording, None, str(error), error.exit_code, at_fault=at_fault)
     finally:
@@ -108,7 +108,7 @@ def _computed(task: Task, store: Store, key: str, crew: Crew | None) -> Done:
         if stage.source:  # the record alone would mark this as a recording, until a dataset's manifest does
             store.put(_manifest_of(task, stage, result).content, durable=True)
         record = store.commit(task.identity, result, made, replace=replace, durable=stage.source)
-        shutil.rmtree(store.root / "checkpoints" / key, ignore_errors=True)
+        shutil.rmtree(_workspace(store, key), ignore_errors=True)
         return Done(task.recording, record)
 
 
@@ -332,15 +332,20 @@ def _arguments(stage: AnyStage, task: Task, store: Store) -> Iterator[dict[str, 
         elif kind == "Roles":
             found[name] = roles.read(read(inputs[name], roles.FILE)) if inputs[name] else {}
         else:
-            found[name] = _workspace(store, task.identity)
+            found[name] = _begun_workspace(store, digest(task.identity))
     yield found
     for file, path in (task.files or {}).items():
         if remembered_file_digest(path) != inputs[stage.argument("Files")][file]:
             raise StorageError(f"{path} changed while it was read. Run the same command again.")
 
 
-def _workspace(store: Store, identity: Mapping[str, Any]) -> Path:
-    folder = store.root / "checkpoints" / digest(identity)
+def _workspace(store: Store, key: str) -> Path:
+    """Return the folder in which a key's training keeps what it resumes from."""
+    return store.root / "checkpoints" / key
+
+
+def _begun_workspace(store: Store, key: str) -> Path:
+    folder = _workspace(store, key)
     if folder.is_symlink():
         raise StorageError(f"{folder} is a symbolic link, and none is followed within a store. Remove it.")
     folder.mkdir(parents=True, exist_ok=True)
@@ -356,6 +361,18 @@ def _followed(name: str, stage: AnyStage, arguments: Mapping[str, Any]) -> Itera
         return
     with display.on_stderr(registry.whole(name), workspace) as shown, following.in_workspace(workspace, *shown):
         yield
+
+
+@contextmanager
+def watching(task: Task) -> Iterator[Sequence[following.Follower]]:
+    """Yield whoever looks, here, at what a task trains in another process: nobody where its stage trains nothing."""
+    if stage_of(task.name).argument("Workspace") is None:
+        yield ()
+        return
+    store = opened(task.store)
+    here = None if store.distant else _workspace(store, digest(task.identity))  # else it is in the worker's own folder
+    with display.on_stderr(registry.whole(task.name), here) as shown:
+        yield (*following.trackers(), *shown)
 
 
 def _named(value: Mapping[str, Any]) -> Iterator[str]:

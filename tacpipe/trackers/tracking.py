@@ -99,14 +99,14 @@ class Tracking:
     def finish(self, path: Path, files: Mapping[str, bytes]) -> None:
         """End the run of a dataset at ``path``, some of whose files are given.
 
-        If none of its epochs was added as it was trained, those of its history are.
+        Epochs of its history that were not added as it was trained are: all of a stored model, and those whose messages
+        did not come from another computer.
         """
         config = _tree(files.get(CONFIG, b"{}"))
         if not self._started:  # nothing was trained: a stored model, or a result, whose params are its model's
             self.params = {**tracker.params(config.get("params", {})), **self.params}
         self.start()
-        if not self._lines:
-            self.replay(files.get(HISTORY, b""), config.get("params", {}))
+        self.replay(files.get(HISTORY, b""), config.get("params", {}))
         found = tracker.figures(config.get("validation") or {}, "best/")
         if headline.FILE in files:  # a result: those of an older version have no summary
             stored = _tree(files.get(summary.FILE, b"{}"))
@@ -115,10 +115,10 @@ class Tracking:
             self._call(wanted, functools.partial(one.end, path, found))
 
     def replay(self, history: bytes, params: Mapping[str, Any]) -> None:
-        """Add the epochs of a stored history; ``params`` are the model's, for the learning rate."""
+        """Add the epochs of a stored history that were not added yet; ``params`` are the model's, for the learning rate."""
         lines = [json.loads(line) for line in history.splitlines() if line.strip()]
         self._labelled = tracker.several(lines)
-        for line in lines:
+        for line in lines[self._lines :]:
             self._add(line, _rate(params, line["epoch"]))
 
     def abandon(self) -> None:

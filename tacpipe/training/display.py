@@ -16,8 +16,10 @@ _SHOWN = 8  # of these, enough for a shell to complete
 
 
 @contextlib.contextmanager
-def on_stderr(stage: str, workspace: Path) -> Iterator[list[Follower]]:
+def on_stderr(stage: str, workspace: Path | None) -> Iterator[list[Follower]]:
     """Yield what shows trainings of a stage in ``workspace`` to whoever looks: nobody if quiet was asked for.
+
+    Without a workspace none is named: it is on another computer.
 
     On a terminal a bar moves from here to the end of the block, also before the first epoch and after the last.
     """
@@ -47,7 +49,7 @@ def duration(seconds: float) -> str:
 class _Shown:
     """What both have in common: which epochs are done, and what is reported at the beginning and the end."""
 
-    def __init__(self, workspace: Path) -> None:
+    def __init__(self, workspace: Path | None) -> None:
         self._workspace = workspace
         self._announced = False
         self.network = Network(1)
@@ -59,7 +61,7 @@ class _Shown:
         """Report which file grows, once, and from which epoch a training resumes."""
         self.network, self.history, self._resumed = network, list(history), len(history)
         self._begun_s = time.monotonic()
-        if not self._announced:
+        if not self._announced and self._workspace is not None:
             terminal.note(f"each epoch is appended to {_shown(self._workspace / HISTORY)}")
             self._announced = True
         if history:
@@ -126,7 +128,7 @@ class Lines(_Shown):
 class Bar(_Shown):
     """A bar that is drawn over itself; it pulses while no network is trained."""
 
-    def __init__(self, stage: str, workspace: Path) -> None:
+    def __init__(self, stage: str, workspace: Path | None) -> None:
         from rich.console import Console
         from rich.progress import BarColumn, Progress, TextColumn
 

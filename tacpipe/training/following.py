@@ -94,6 +94,11 @@ def in_workspace(workspace: Path, *shown: Follower) -> Iterator[None]:
         file.close()
 
 
+def trackers() -> tuple[Follower, ...]:
+    """Return the trackers of the block."""
+    return _trackers.get()
+
+
 @contextlib.contextmanager
 def network(found: Network, history: Sequence[Line]) -> Iterator[Followers]:
     """Yield the followers of a network that is trained in the block."""

@@ -63,13 +63,25 @@ def history(lines: list[dict[str, Any]]) -> bytes:
 def test_a_tracker_gets_params_then_every_epoch_then_the_figures_and_the_path(tmp_path: Path) -> None:
     kept = Kept()
     trained, tracked = training(tmp_path, kept)
-    tracked.finish(Path("models/m"), {"config.json": json.dumps(CONFIG).encode(), "history.jsonl": b"not read again"})
+    files = {"config.json": json.dumps(CONFIG).encode(), "history.jsonl": history(trained.history)}
+    tracked.finish(Path("models/m"), files)  # no epoch of the history is given again
 
     assert kept.calls[0] == ("start", "m-1", {"a": 1})
     for call, line in zip(kept.calls[1:-1], trained.history, strict=True):
         losses = {name: line[name] for name in ("train_loss", "val_loss")}
         assert call == ("line", line["epoch"], {**losses, "learning_rate": SCHEDULE.learning_rate})
     assert kept.calls[-1] == ("end", Path("models/m"), {"best/loss": 0.25, "best/epoch": 2.0})
+
+
+def test_epochs_whose_messages_did_not_come_are_given_at_the_end() -> None:
+    kept = Kept()
+    tracked, line = Tracking({"kept": kept}, "m-1", {}), {"train_loss": 0.5, "val_loss": 0.25}
+    tracked.begin(following.Network(3), [])
+    tracked.line({"epoch": 1, **line}, 0.5)
+    lines = [{"epoch": epoch, **line} for epoch in (1, 2, 3)]
+    tracked.finish(Path("models/m"), {"config.json": json.dumps(CONFIG).encode(), "history.jsonl": history(lines)})
+
+    assert [call[1] for call in kept.calls if call[0] == "line"] == [1, 2, 3]
 
 
 @pytest.mark.parametrize("where", ["start", "line", "end"])

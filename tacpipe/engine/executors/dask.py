@@ -11,17 +11,19 @@ its tasks to another one; what it had finished is in the store and is found ther
 from __future__ import annotations
 
 import contextlib
+import functools
 import ipaddress
 import logging
 import os
 import threading
+import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from queue import Queue
 from typing import TYPE_CHECKING, Any
 
-from tacpipe.engine import provenance
+from tacpipe.engine import execution, provenance
 from tacpipe.engine.execution import Done, Task
 from tacpipe.engine.executors import agreement, chunks
 from tacpipe.engine.processor import usable_cores
@@ -32,6 +34,7 @@ from tacpipe.plugins import extras
 from tacpipe.store import records
 from tacpipe.store.location import opened
 from tacpipe.store.store import Store
+from tacpipe.training import following, relay
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -91,9 +94,12 @@ class Dask:
         wanted = agreement.here(tasks[0].name)
         workers = max(len(self._workers()), self._expected)
         given = [[_absolute(task) for task in chunk] for chunk in chunks.of(tasks, workers, _MOST)]
-        futures = [self.client.submit(_work, wanted, compute, chunk, pure=False) for chunk in given]
         what = f"{len(tasks)} tasks were given to {workers} workers"
-        with termination.reporting(f"tacpipe: interrupted; {what}: those that wait are cancelled, those at work end."):
+        with (
+            self._followed(tasks) as topic,
+            termination.reporting(f"tacpipe: interrupted; {what}: those that wait are cancelled, those at work end."),
+        ):
+            futures = [self.client.submit(_work, wanted, compute, chunk, topic, pure=False) for chunk in given]
             store = opened(tasks[0].store, tasks[0].run)
             try:
                 for done in self._results(futures, tasks[0].name):
@@ -104,6 +110,30 @@ class Dask:
                 store.close()
                 with contextlib.suppress(Exception):  # the scheduler forgets them in any case when the client goes
                     self.client.cancel(futures)  # type: ignore[no-untyped-call]
+
+    @contextlib.contextmanager
+    def _followed(self, tasks: Sequence[Task]) -> Iterator[str]:
+        """Have what a task trains in a worker followed here; yield the topic of its messages, empty where nobody looks.
+
+        Followers are called in a thread of their own: the client's own thread must not wait for a tracker's server.
+        """
+        with contextlib.ExitStack() as stack:
+            followers = stack.enter_context(execution.watching(tasks[0])) if len(tasks) == 1 else ()
+            if not followers:
+                yield ""
+                return
+            topic = f"tacpipe-{uuid.uuid4().hex}"
+            came: Queue[relay.Message | None] = Queue()
+            thread = threading.Thread(target=_passed_on, args=(came, followers), daemon=True)
+            thread.start()
+            self.client.subscribe_topic(topic, lambda event: came.put(event[1]))  # type: ignore[no-untyped-call]
+            try:
+                yield topic
+            finally:
+                with contextlib.suppress(Exception):  # the scheduler may be gone
+                    self.client.unsubscribe_topic(topic)  # type: ignore[no-untyped-call]
+                came.put(None)
+                thread.join()
 
     def _workers(self) -> Mapping[str, Any]:
         found: Mapping[str, Any] = self.client.scheduler_info(n_workers=-1)["workers"]
@@ -227,18 +257,30 @@ def _absolute(task: Task) -> Task:
     return replace(task, files={name: str(Path(path).absolute()) for name, path in task.files.items()})
 
 
+def _passed_on(came: Queue[relay.Message | None], followers: Sequence[following.Follower]) -> None:
+    """Call followers with what comes, until None does."""
+    receiver = relay.Receiver(followers)
+    while (message := came.get()) is not None:
+        receiver.take(message)
+    receiver.close()
+
+
 # ---- in a worker
 
 _alone = threading.Lock()  # tasks are computed one at a time in a process, whatever number of threads it was given
 _leases: dict[str, str] = {}  # of this worker, by the lease of the run that they are for
 
 
-def _work(wanted: Mapping[str, Any], compute: Callable[[Task], Done], tasks: Sequence[Task]) -> list[Done] | Exception:
-    """Return ``compute`` of each task, or what kept this worker from it."""
+def _work(
+    wanted: Mapping[str, Any], compute: Callable[[Task], Done], tasks: Sequence[Task], topic: str
+) -> list[Done] | Exception:
+    """Return ``compute`` of each task, or what kept this worker from it; what it trains is followed by a topic's readers."""
     from distributed import get_worker
 
-    name = str(get_worker().name)
-    with _alone, progress.shown(False), provenance.worker(name):
+    worker = get_worker()
+    name = str(worker.name)
+    senders = [relay.Sender(functools.partial(worker.log_event, topic))] if topic else []
+    with _alone, progress.shown(False), provenance.worker(name), following.tracked(senders):
         try:
             _check(name, wanted, tasks[0])
             lease = _lease(tasks[0])

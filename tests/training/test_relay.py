@@ -1,0 +1,90 @@
+"""A training in another process: what its followers here are called with, and what they are not called with twice."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from tacpipe.training import relay
+from tacpipe.training.following import Network
+from tests.training.test_following import Seen, followed
+
+NETWORK = Network(4, number=2, count=3, labels={"member": 1})
+
+
+def line(epoch: int) -> relay.Message:
+    return {"line": {"epoch": epoch, "val_loss": 0.5}, "learning_rate": 0.25}
+
+
+def begin(*epochs: int, network: Network = NETWORK) -> relay.Message:
+    found: list[relay.Message] = []
+    relay.Sender(found.append).begin(network, [{"epoch": epoch} for epoch in epochs])
+    return json.loads(json.dumps(found[0]))  # type: ignore[no-any-return]
+
+
+def test_followers_elsewhere_see_what_followers_in_the_process_see(tmp_path: Path) -> None:
+    here, there = Seen(), Seen()
+    receiver = relay.Receiver([there])
+    followed(tmp_path, here, relay.Sender(lambda message: receiver.take(json.loads(json.dumps(message)))))
+
+    assert there.networks == here.networks
+    assert there.lines == here.lines
+    assert there.ends == here.ends == [True]
+    assert set(there.passed) <= set(here.passed)
+
+
+def test_messages_about_batches_are_at_least_half_a_second_apart() -> None:
+    sent: list[relay.Message] = []
+    sender = relay.Sender(sent.append)
+    for number in range(1000):
+        sender.batch(number / 1000, lambda: 1.0)
+    assert len(sent) <= 1
+
+    sender._sent_s -= relay.BATCH_S
+    sender.batch(0.5, lambda: 0.125)
+    assert sent[-1] == {"batch": 0.5, "loss": 0.125}
+
+
+def test_epochs_that_another_worker_repeats_or_takes_over_are_given_once() -> None:
+    seen = Seen()
+    receiver = relay.Receiver([seen])
+    for message in (begin(), line(1), line(2), {"end": False}):
+        receiver.take(message)
+    for message in (begin(1, 2, 3), line(4), {"end": True}):  # one epoch's message was lost with the worker
+        receiver.take(message)
+
+    assert seen.networks == [(NETWORK, [])]
+    assert [one["epoch"] for one, _ in seen.lines] == [1, 2, 3, 4]
+    assert seen.ends == [True]
+
+
+def test_a_network_that_is_trained_from_its_beginning_by_another_worker_gives_no_epoch_twice() -> None:
+    seen = Seen()
+    receiver = relay.Receiver([seen])
+    for message in (begin(), line(1), line(2), begin(), line(1), line(2), line(3)):
+        receiver.take(message)
+
+    assert [one["epoch"] for one, _ in seen.lines] == [1, 2, 3]
+
+
+def test_a_network_whose_worker_never_came_back_ends_untrained() -> None:
+    seen = Seen()
+    receiver = relay.Receiver([seen])
+    receiver.take(begin())
+    receiver.take(line(1))
+    receiver.close()
+    receiver.close()
+
+    assert seen.ends == [False]
+
+
+def test_the_next_network_is_begun_once_the_one_before_has_ended() -> None:
+    seen = Seen()
+    receiver = relay.Receiver([seen])
+    other = Network(4, number=3, count=3, labels={"member": 2})
+    for message in (begin(), line(1), {"end": True}, begin(network=other), line(1), {"end": True}):
+        receiver.take(message)
+
+    assert [network for network, _ in seen.networks] == [NETWORK, other]
+    assert len(seen.lines) == 2
+    assert seen.ends == [True, True]
