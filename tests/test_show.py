@@ -8,6 +8,11 @@ import signal
 import subprocess
 import sys
 
+import pyarrow as pa
+
+from tacpipe.cli import show
+from tacpipe.datasets.dataset import Recording
+from tacpipe.io.parquet import to_parquet
 from tests.conftest import Lab
 
 MANY = 12
@@ -61,3 +66,25 @@ def test_show_ends_when_nobody_reads_what_it_prints(lab: Lab) -> None:
     os.close(writable)
 
     assert (done.returncode, done.stderr) == (-signal.SIGPIPE, b"")
+
+
+def test_the_numbers_of_a_stream_are_those_of_its_samples() -> None:
+    tactile = {b"quantity": b"tactile"}
+    rows = {
+        pa.field("t_ns", pa.int64()): [0, 10**7, 2 * 10**7, 3 * 10**7, 9 * 10**7],
+        pa.field("one", pa.uint16(), metadata=tactile): [0, 0, 65535, 7, 7],
+        pa.field("other", pa.int8(), metadata=tactile): [5, 5, 5, None, 127],
+        pa.field("force", pa.float32(), metadata=tactile): [0.0] * 5,
+    }
+    content = to_parquet(pa.table(list(rows.values()), schema=pa.schema(list(rows))))
+    shard = Recording("a", {"attributes": {}, "shards": {"skin": {"digest": "d"}}}, lambda digest, path: content)
+
+    assert show._stream(shard, "skin") == {
+        "rows": 5,
+        "columns": 4,
+        "duration_s": 0.09,
+        "rate_hz": 100.0,
+        "gaps": 1,
+        "held_share": 0.25,  # of four steps one has both channels as before; where there is no value nothing is held
+        "saturated": 4,  # 65535, 127 and twice the 0 of an unsigned channel
+    }

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from tacpipe import printable
 from tacpipe.channels import streams
@@ -21,6 +21,9 @@ from tacpipe.plugins import params as params_of
 from tacpipe.plugins.stage import ROLES
 from tacpipe.recording import ending
 from tacpipe.store.location import locate
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 SHOWN = 20  # recordings listed before the rest is counted
 _TRUTH = "gt_"  # begins the labels that a simulator gives: what no lab knows of its recordings
@@ -98,27 +101,32 @@ def _recording(shard: Recording) -> dict[str, Any]:
 
 
 def _stream(shard: Recording, stream: str) -> dict[str, Any]:
+    """Return the numbers of a stream; only its clocks and what an integer sensor measured are decoded, some at a time."""
     import numpy as np
     import pyarrow as pa
 
-    table = shard.table(stream)
-    found: dict[str, Any] = {"rows": table.num_rows, "columns": table.num_columns}
-    if "t_ns" in table.column_names and table.num_rows > 1:
-        step_ns = np.diff(table["t_ns"].to_numpy())  # (time - 1,)
-        found["duration_s"] = round(float(step_ns.sum()) / 1e9, 3)
-        found["rate_hz"] = streams.rate_hz(table)
-        found["gaps"] = len(streams.gaps_before(table))
-    integers = [
-        table[field.name].to_numpy()
-        for field in table.schema
-        if pa.types.is_integer(field.type) and (field.metadata or {}).get(b"quantity") == b"tactile"
-    ]
-    if integers and table.num_rows > 1:
-        values = np.column_stack(integers)  # (time, channel)
-        limits = np.iinfo(values.dtype)
-        found["held_share"] = round(float((values[1:] == values[:-1]).all(axis=1).mean()), 4)
-        found["saturated"] = int(((values == limits.max) | (values == limits.min)).sum())
+    opened = shard.columns(stream)
+    rows = opened.num_rows
+    found: dict[str, Any] = {"rows": rows, "columns": len(opened.column_names)}
+    if "t_ns" in opened.column_names and rows > 1:
+        clocks = pa.table({name: opened.column(name) for name in ("t_ns", "seq") if name in opened.column_names})
+        found["duration_s"] = round(float(np.diff(clocks["t_ns"].to_numpy()).sum()) / 1e9, 3)
+        found["rate_hz"] = streams.rate_hz(clocks)
+        found["gaps"] = len(streams.gaps_before(clocks))
+    integers = [one for one in _measured(opened.schema) if pa.types.is_integer(one.type)]
+    if integers and rows > 1:
+        held, saturated = np.ones(rows - 1, dtype=bool), 0  # (time - 1,)
+        for field in integers:
+            values = opened.column(field.name).to_numpy()  # (time,), NaN where there is none
+            limits = np.iinfo(field.type.to_pandas_dtype())
+            held &= values[1:] == values[:-1]
+            saturated += int(((values == limits.max) | (values == limits.min)).sum())
+        found["held_share"], found["saturated"] = round(float(held.mean()), 4), saturated
     return found
+
+
+def _measured(schema: pa.Schema) -> list[pa.Field]:
+    return [field for field in schema if (field.metadata or {}).get(b"quantity") == b"tactile"]
 
 
 def to_text(value: dict[str, Any], *, full: bool = False) -> str:
