@@ -68,6 +68,15 @@ class Beginning(NamedTuple):
     origin_ns: int  # first point of the grid
     rest: tuple[float, ...]  # level at rest of each channel
 
+    def to_json(self) -> dict[str, Any]:
+        """Return what `from_json` reads."""
+        return self._asdict()
+
+    @classmethod
+    def from_json(cls, stored: Mapping[str, Any]) -> Beginning:
+        """Return the beginning that `to_json` wrote."""
+        return cls(int(stored["origin_ns"]), tuple(map(float, stored["rest"])))
+
 
 class _Row(NamedTuple):
     """One row of the grid, before the level at rest is taken off."""
@@ -102,6 +111,9 @@ class Chain:
         gap_ns = round(sync.gap_ms * 1e6)
         origin_ns = None if beginning is None else beginning.origin_ns
         self._grid = Grid(layout.readings, layout.master, sync.grid, sync.rate_hz, gap_ns, origin_ns)
+        if beginning is not None:
+            for stream, levels in layout.levels(beginning.rest).items():
+                self._grid.continue_from(stream, levels)
         self._rolling = Rolling(forecaster, continues=beginning is not None)
         self._arm = Arm(forecaster.orientation)
         self._resting: list[_Row] | None = [] if beginning is None else None  # until the level at rest is known
@@ -133,8 +145,8 @@ class Chain:
         ``layouts`` lacks or has otherwise.
 
         ``beginning`` is that of another chain of the session, which ended: grid and level at rest are continued, so that
-        this one predicts the same once it has read a few rows more than the model's context. What the other one had
-        counted of wrap-arounds is not known.
+        this one predicts the same once it has read a few rows more than the model's context. Counts that had wrapped
+        around are taken as near to the level at rest as they can be.
         """
         forecaster = Forecaster.load(model)
         if forecaster.actions == "shuffled":

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tacpipe.errors import UsageError
+from tacpipe.errors import FAILED, TacpipeError, UsageError
 from tacpipe.live import alarms as alarms_of
 from tacpipe.live.alarms import Alarms
-from tacpipe.live.chain import Chain
+from tacpipe.live.chain import Beginning, Chain
 from tacpipe.live.engine import Chainlike, Engine
 from tacpipe.live.options import Options
 from tacpipe.recording import rig as rigs
@@ -41,15 +41,20 @@ def engine(options: Options) -> Engine:
             first.append(_alarms(options, model, made))
         return first[0]
 
-    found = Engine(sensors, opened, levels, options.steps or None, settle_ns=round(options.settle_ms * 1e6))
+    try:
+        found = Engine(sensors, opened, levels, options.steps or None, settle_ns=round(options.settle_ms * 1e6))
+    except TacpipeError as error:
+        if error.exit_code != FAILED:
+            raise
+        raise UsageError(str(error)) from error  # the session was asked for with a rig that the model cannot read
     if options.steps and max(options.steps) > found.chain.horizon:
         raise UsageError(f"The model predicts 1 to {found.chain.horizon} steps ahead; give --steps of these.")
     return found
 
 
-def chain(model: Dataset, master: str, layouts: Mapping[str, pa.Schema]) -> Chain:
-    """Return the chain of a model for streams of these layouts; raises as `Chain.of`."""
-    return Chain.of(model.files, model.source.chain, layouts, master)
+def chain(model: Dataset, master: str, layouts: Mapping[str, pa.Schema], beginning: Beginning | None = None) -> Chain:
+    """Return the chain of a model for streams of these layouts, which continues another's session; raises as `Chain.of`."""
+    return Chain.of(model.files, model.source.chain, layouts, master, beginning)
 
 
 def _alarms(options: Options, model: Dataset, made: Chainlike) -> Alarms:

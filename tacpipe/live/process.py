@@ -39,6 +39,7 @@ class Loop:
         self.forecasts = 0
         self.cause = ""
         self._reported_ns = 0
+        self._beginning: Any = None  # that was reported
         self._ended = False
 
     def run(self) -> None:
@@ -83,6 +84,10 @@ class Loop:
             "above_20_ms": self.latencies.above(20.0),
         }
         send(self.connection, {"report": figures})
+        beginning = self.engine.chain.beginning if self.engine.running else None
+        if beginning is not None and beginning != self._beginning:
+            send(self.connection, {"beginning": beginning.to_json(), "offset_ns": self.engine.offset_ns})
+        self._beginning = beginning
 
     def _fetch(self) -> None:
         while True:

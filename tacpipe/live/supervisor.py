@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import socket
 import subprocess
@@ -40,6 +41,7 @@ class Supervisor:
         self._socket: socket.socket | None = None
         self._lines = wire.Lines()
         self._offset_ns: int | None = None  # of the recording that runs
+        self._beginning: dict[str, Any] | None = None  # of its chain, for a process that continues it
         self._again_s = AGAIN_S[0]
         self._due_s = 0.0
         self._refusal: tuple[str, int] | None = None
@@ -71,6 +73,7 @@ class Supervisor:
     def begin(self, clock: Mapping[str, int]) -> None:
         """Begin a recording, whose UTC is the monotonic clock and a constant."""
         self._offset_ns = clock["utc_ns"] - clock["monotonic_ns"]
+        self._beginning = None
         self.tap.note(Note(clock["monotonic_ns"], "", wire.BEGIN, str(self._offset_ns)))
 
     def end(self) -> None:
@@ -136,6 +139,8 @@ class Supervisor:
         ours.sendall(self.options.to_json().encode())
         ours.setblocking(False)
         first = [] if self._offset_ns is None else [Note(clock.now_ns(), "", wire.BEGIN, str(self._offset_ns))]
+        if first and self._beginning is not None:
+            first.insert(0, Note(clock.now_ns(), "", wire.CONTINUE, json.dumps(self._beginning)))
         self.tap.connect(ours, *first)
         if first:
             self.tap.begun()
@@ -164,6 +169,9 @@ class Supervisor:
                     self.ready, self.alarms = True, content["ready"]["alarms"]
                 elif "refused" in content:
                     self._refusal = content["refused"], content["exit_code"]
+                elif "beginning" in content:
+                    if content["offset_ns"] == self._offset_ns:  # else it is that of the recording before
+                        self._beginning = content["beginning"]
                 elif "report" in content:
                     self.report = content["report"]
                     self._again_s = AGAIN_S[0]
