@@ -19,7 +19,7 @@ from tacpipe.live import wire
 from tacpipe.live.alarms import NOTHING_KNOWN, Alarms
 from tacpipe.live.chain import Beginning, Cause, Forecast
 from tacpipe.live.decoding import Decoder, batch_schema, likely_schema
-from tacpipe.live.messages import Message
+from tacpipe.live.messages import Description, Message
 from tacpipe.recording.spool_blocks import Note
 from tacpipe.recording.station import BEGAN
 from tacpipe.sensors.framing import Chunks
@@ -126,6 +126,24 @@ class Engine:
     def offset_ns(self) -> int | None:
         """What is added to the monotonic clock to have the recording's UTC; None where none runs."""
         return self._offset_ns
+
+    @property
+    def beginning(self) -> Beginning | None:
+        """What another process needs to continue this recording."""
+        return self.chain.beginning
+
+    def about(self, model: str) -> Description:
+        """Return what the values of messages are."""
+        chain = self.chain
+        return Description(chain.channels, self.steps, chain.unit, chain.rate_hz, model)
+
+    def ready(self) -> dict[str, Any]:
+        """Return how many channels are predicted, and the levels of the alarms."""
+        return {"channels": len(self.chain.channels), "alarms": self.alarms.to_json()}
+
+    def finish(self) -> list[Message]:
+        """Return the messages that are left when the session is over: none."""
+        return []
 
     @property
     def running(self) -> bool:

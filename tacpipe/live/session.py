@@ -7,7 +7,7 @@ import socket
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 from tacpipe.errors import UsageError
 from tacpipe.links.link import Address
@@ -33,6 +33,28 @@ class Described:
     channels: tuple[str, ...]
     horizon: int
     unit: str
+    task: ClassVar[str] = "forward"
+
+    def own(self, steps: Sequence[int]) -> dict[str, Mapping[str, Any]]:
+        """Return the session's own streams, with the options of the sensor ``live``."""
+        forecast = {"output": "forecast", "channels": list(self.channels), "steps": list(steps), "unit": self.unit}
+        return {
+            "forecast": forecast,
+            "alarm": {"output": "alarm", "alarms": list(NAMES)},
+            "latency": {"output": "latency"},
+        }
+
+
+@dataclass(frozen=True)
+class Surfaces:
+    """The materials that the model names."""
+
+    names: tuple[str, ...]
+    task: ClassVar[str] = "material"
+
+    def own(self, steps: Sequence[int]) -> dict[str, Mapping[str, Any]]:
+        """Return the session's own streams, with the options of the sensor ``live``."""
+        return {"material": {"output": "material", "channels": list(self.names)}, "latency": {"output": "latency"}}
 
 
 def with_plan(rig: Rig, plan: str) -> Rig:
@@ -53,24 +75,15 @@ def with_plan(rig: Rig, plan: str) -> Rig:
     return replace(rig, streams={**rig.streams, PLAN: stream})
 
 
-def with_own(rig: Rig, about: Described, steps: Sequence[int]) -> Rig:
-    """Return a rig with the streams ``forecast``, ``alarm`` and ``latency``, at ports of this computer that are free.
+def with_own(rig: Rig, about: Described | Surfaces, steps: Sequence[int]) -> Rig:
+    """Return a rig with the session's own streams, as ``forecast`` and ``latency``, at free ports of this computer.
 
     Raises `UsageError` where it has streams of these names, and for forecasts too large for a packet.
     """
     taken = [name for name in OWN if name in rig.streams]
     if taken:
         raise UsageError(f"The rig file has a stream {taken[0]}, as a live session adds itself; give it another name.")
-    options: dict[str, Mapping[str, Any]] = {
-        "forecast": {
-            "output": "forecast",
-            "channels": list(about.channels),
-            "steps": list(steps),
-            "unit": about.unit,
-        },
-        "alarm": {"output": "alarm", "alarms": list(NAMES)},
-        "latency": {"output": "latency"},
-    }
+    options = about.own(steps)
     added = {
         name: Stream(name, "live", rigs.make("live", found, "live"), Address("udp", f"127.0.0.1:{port}"), found)
         for (name, found), port in zip(options.items(), free_ports(len(options)), strict=True)
@@ -108,9 +121,9 @@ def running(recorder: Recorder, options: Options, ended: Callable[[], bool]) -> 
 def lines(figures: Mapping[str, Any]) -> list[str]:
     """Return what a session did so far in words.
 
-    >>> lines({"forecasts": 9, "skipped": 1, "restarts": 0, "alarms": {"load": "off", "slip": "unknown"},
+    >>> lines({"forecasts": 9, "skipped": 1, "restarts": 0, "states": {"load": "off", "slip": "unknown"},
     ...     "cause": "", "latency": {"count": 9, "p50_ms": 4.2, "p99_ms": 6.0, "max_ms": 6.5}})
-    ['forecasts 9, skipped 1; latency median 4.2 ms, 99 % 6.0 ms, largest 6.5 ms; alarms: load off, slip unknown']
+    ['forecasts 9, skipped 1; latency median 4.2 ms, 99 % 6.0 ms, largest 6.5 ms; load off, slip unknown']
     """
     latency = figures.get("latency") or {}
     parts = [f"forecasts {figures.get('forecasts', 0)}, skipped {figures.get('skipped', 0)}"]
@@ -119,8 +132,8 @@ def lines(figures: Mapping[str, Any]) -> list[str]:
             f"latency median {latency['p50_ms']:.1f} ms, 99 % {latency['p99_ms']:.1f} ms, "
             f"largest {latency['max_ms']:.1f} ms"
         )
-    alarms = ", ".join(f"{name} {state}" for name, state in figures.get("alarms", {}).items())
-    parts += [f"alarms: {alarms}"] if alarms else []
+    states = ", ".join(f"{name} {state}" for name, state in figures.get("states", {}).items())
+    parts += [states] if states else []
     for name, what in (
         ("late", "samples late"),
         ("dropped", "messages not taken by subscribers"),
