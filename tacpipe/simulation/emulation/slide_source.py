@@ -1,4 +1,4 @@
-"""What an emulated BioTac sends while it is drawn over one material after another: the trials of `tacpipe simulate material`.
+"""What an emulated BioTac sends that is drawn over one material after another: the trials of `tacpipe simulate material`.
 
 Trials follow one another, those of each material in turn, as the simulated rig makes them.
 """
