@@ -48,7 +48,7 @@ def add(program: typer.Typer, summary: str) -> None:
             str,
             typer.Option(
                 "--plan",
-                help="Source of plans: measured (the motion is taken to continue), udp::PORT, ws:HOST:PORT.",
+                help="Source of plans: measured (motion continues), udp::PORT, ws:HOST:PORT, rig:STREAM (its set-points).",
             ),
         ] = "measured",
         output: Annotated[Path | None, typer.Option("-o", "--output", help="Dataset to append recordings to.")] = None,
@@ -117,6 +117,7 @@ def add(program: typer.Typer, summary: str) -> None:
             "" if alarms_on is None else str(alarms_on.absolute()),
             "" if split is None else str(split.absolute()),
             settle_ms,
+            session.targets_of(asked, plan),
             about.task,
             sensor,
             every_ms,

@@ -52,7 +52,7 @@ def materials(options: Options, model: Dataset, rig: Rig, sensors: Mapping[str, 
 
 def forecasts(options: Options, model: Dataset, rig: Rig, sensors: Mapping[str, Sensor]) -> Engine:
     """Return the engine of a session with a model of future signals. Raises as `engine`."""
-    opened = functools.partial(chain, model, rig.master)
+    opened = functools.partial(chain, model, rig, options.plan_from)
     first: list[Alarms] = []
 
     def levels(made: Chainlike) -> Alarms:
@@ -66,9 +66,15 @@ def forecasts(options: Options, model: Dataset, rig: Rig, sensors: Mapping[str, 
     return found
 
 
-def chain(model: Dataset, master: str, layouts: Mapping[str, pa.Schema], beginning: Beginning | None = None) -> Chain:
+def chain(
+    model: Dataset,
+    rig: Rig,
+    plan_from: str,
+    layouts: Mapping[str, pa.Schema],
+    beginning: Beginning | None = None,
+) -> Chain:
     """Return the chain of a model for streams of these layouts, which continues another's session; raises as `Chain.of`."""
-    return Chain.of(model.files, model.source.chain, layouts, master, beginning)
+    return Chain.of(model.files, model.source.chain, layouts, rig.master, beginning, plan_from)
 
 
 def _alarms(options: Options, model: Dataset, made: Chainlike) -> Alarms:

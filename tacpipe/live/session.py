@@ -15,13 +15,14 @@ from tacpipe.live.alarms import NAMES
 from tacpipe.live.options import OWN, Options
 from tacpipe.live.supervisor import Supervisor
 from tacpipe.live.tap import Tap
-from tacpipe.printable import excerpt
+from tacpipe.printable import excerpt, listed
 from tacpipe.recording import rig as rigs
 from tacpipe.recording import rig_text
 from tacpipe.recording.recorder import Recorder
 from tacpipe.recording.rig import Rig, Stream
 from tacpipe.sensors.plan import NAME as PLAN
 
+RIG = "rig"  # scheme of a plan from one of the rig's own streams
 MEASURED = "measured"  # in the place of an address: the recorded motion is taken to continue
 SWITCH_S = 0.0005  # that one thread may hold up another: the threads that read must not wait 5 ms for the view
 
@@ -58,21 +59,33 @@ class Surfaces:
 
 
 def with_plan(rig: Rig, plan: str) -> Rig:
-    """Return a rig with a stream of plans that come from an address; with ``measured``, or its own, as it is.
+    """Return a rig with a stream of plans that come from an address; with ``measured``, or one of the rig's own, as it is.
 
-    Raises `UsageError` for what is no address, and where the rig has a stream of that name.
+    Raises `UsageError` for what is no address, and where the rig has a stream of that name, or lacks that which is named.
     """
-    if plan == MEASURED:
+    if plan == MEASURED or targets_of(rig, plan):
         return rig
     if PLAN in rig.streams:
         raise UsageError(f"The rig file has a stream {PLAN} already; leave --plan out, and its plans are read.")
     scheme, colon, place = plan.partition(":")
     if scheme not in ("udp", "ws") or not colon or not place:
         raise UsageError(
-            f"--plan {excerpt(plan)} is not a source of plans; give {MEASURED}, udp::PORT or ws:HOST:PORT."
+            f"--plan {excerpt(plan)} is not a source of plans; give {MEASURED}, udp::PORT, ws:HOST:PORT or rig:STREAM."
         )
     stream = Stream(PLAN, "plan", rigs.make("plan", {}, "--plan"), Address(scheme, place))
     return replace(rig, streams={**rig.streams, PLAN: stream})
+
+
+def targets_of(rig: Rig, plan: str) -> str:
+    """Return the stream that ``rig:STREAM`` names, empty for any other source. Raises `UsageError` where there is none."""
+    scheme, _, stream = plan.partition(":")
+    if scheme != RIG:
+        return ""
+    if stream not in rig.streams:
+        raise UsageError(
+            f"--plan {excerpt(plan)}: the rig has no stream {excerpt(stream)}; it has {listed(rig.streams)}."
+        )
+    return stream
 
 
 def with_own(rig: Rig, about: Described | Surfaces, steps: Sequence[int]) -> Rig:
