@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from tacpipe.links import lsl
 from tacpipe.live.messages import About, Published
 from tacpipe.plugins import extras
 
@@ -14,7 +15,7 @@ class LslPublisher:
     def __init__(self, place: str, about: About) -> None:
         with extras.named("--publish lsl"):
             import pylsl
-
+        lsl.quiet(pylsl)
         columns = about.columns()
         info = pylsl.StreamInfo(
             place, about.kind.capitalize(), len(columns), about.rate_hz, pylsl.cf_float32, f"tacpipe-{place}"
