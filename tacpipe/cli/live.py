@@ -28,7 +28,7 @@ recording. The recording has priority: where the computer does not keep up, fore
 Example: tacpipe live rig.toml --model models/forward -o data/live --publish ws:127.0.0.1:8765
 
 A model of materials names the surface while a slide goes on, with a probability of each, and at the end of the recording
-what `tacpipe predict` gives.
+what `tacpipe predict` gives. One of touch ranks candidate grasps on a cloud, which come to a stream of the sensor grasps.
 
 Example: tacpipe live finger.toml --model models/material -o data/live --publish udp:127.0.0.1:9000
 
@@ -42,7 +42,7 @@ def add(program: typer.Typer, summary: str) -> None:
     def live(
         rig: Annotated[Path, typer.Argument(help="Rig file, as of `tacpipe acquire`.")],
         model: Annotated[
-            Path, typer.Option("--model", help="Trained model, as of `tacpipe train forward` or `train material`.")
+            Path, typer.Option("--model", help="Trained model, as of `tacpipe train forward`, `material` or `touch`.")
         ],
         plan: Annotated[
             str,
@@ -83,6 +83,9 @@ def add(program: typer.Typer, summary: str) -> None:
         least: Annotated[
             float, typer.Option("--least", help="Fraction of a slide before which its material is unknown, 0 to 1.")
         ] = 0.25,
+        rank: Annotated[
+            str, typer.Option("--rank", help="Criterion for a model of touch: contact, balance, level:0.4.")
+        ] = "contact",
         settle_ms: Annotated[
             float, typer.Option("--settle-ms", help="Time after a row in which its samples are awaited, ms.")
         ] = 2.0,
@@ -102,7 +105,7 @@ def add(program: typer.Typer, summary: str) -> None:
         if isinstance(about, session.Described):
             wanted = _steps(steps, about.horizon)
         elif steps or plan != session.MEASURED or alarms_per_hour:
-            raise UsageError(f"{model} names materials; --steps, --plan and --alarms-per-hour are for forecasts.")
+            raise UsageError(f"{model} is of {about.task}; --steps, --plan and --alarms-per-hour are for forecasts.")
         else:
             wanted = ()
         asked = session.with_plan(rigs.read(rig), plan)
@@ -122,6 +125,7 @@ def add(program: typer.Typer, summary: str) -> None:
             sensor,
             every_ms,
             least,
+            rank,
         )
         attributes = {"live_model": digest, "live_plan": plan, "live_alarms_per_hour": alarms_per_hour}
         _run(found, options, output, name, duration, label or [], attributes, quiet=quiet, as_json=as_json)

@@ -172,12 +172,14 @@ def to_json(content: Mapping[str, Any]) -> bytes:
     return json.dumps(content, separators=(",", ":"), allow_nan=False).encode()
 
 
-def packet(message: Published, sensor: Live, seq: int) -> bytes | None:
-    """Return the packet of a message for one output, numbered ``seq``; None: of a forecast where there is none."""
+def packets(message: Published, sensor: Live, seq: int) -> list[bytes]:
+    """Return the packets of a message for one output, numbered from ``seq`` on; none of a forecast where there is none."""
     values = message.outputs(sensor.output)
     if values is None:
-        return None
-    return sensor.encode(Samples(values, np.array([seq]), np.array([message.t_ns]))).tobytes()
+        return []
+    count = len(values[0])
+    seqs = (seq + np.arange(count)) % (1 << 32)
+    return [row.tobytes() for row in sensor.encode(Samples(values, seqs, np.full(count, message.t_ns)))]
 
 
 def properties(*integers: str, **types: str) -> dict[str, Any]:

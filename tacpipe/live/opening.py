@@ -34,7 +34,7 @@ def engine(options: Options) -> Working:
     model = tacpipe.open(options.model)
     rig = rigs.parse(options.rig)
     sensors = {name: rig.streams[name].sensor for name in options.streams}
-    made = {"forward": forecasts, "material": materials}[options.task]
+    made = {"forward": forecasts, "material": materials, "touch": touches}[options.task]
     try:
         return made(options, model, rig, sensors)
     except TacpipeError as error:
@@ -48,6 +48,15 @@ def materials(options: Options, model: Dataset, rig: Rig, sensors: Mapping[str, 
     from tacpipe.live import material_opening
 
     return material_opening.engine(options, model, sensors)
+
+
+def touches(options: Options, model: Dataset, rig: Rig, sensors: Mapping[str, Sensor]) -> Working:
+    """Return the engine of a session with a model of touch. Raises as `engine`."""
+    from tacpipe.live import touch_ranking
+    from tacpipe.live.touch_engine import TouchEngine
+    from tacpipe.tasks.touch.predictor import Predictor
+
+    return TouchEngine(sensors, Predictor.load(model.files), touch_ranking.criterion(options.rank))
 
 
 def forecasts(options: Options, model: Dataset, rig: Rig, sensors: Mapping[str, Sensor]) -> Engine:

@@ -56,14 +56,12 @@ class Own:
     def publish(self, message: Published) -> None:
         """Send the packets of a message."""
         for output, sensor in self._sensors.items():
-            packet = messages.packet(message, sensor, self._sent[output])
-            if packet is None:
-                continue
-            self._sent[output] = (self._sent[output] + 1) % (1 << 32)
-            try:
-                self._socket.sendto(packet, self._places[output])
-            except OSError:
-                self.dropped += 1
+            for packet in messages.packets(message, sensor, self._sent[output]):
+                self._sent[output] = (self._sent[output] + 1) % (1 << 32)
+                try:
+                    self._socket.sendto(packet, self._places[output])
+                except OSError:
+                    self.dropped += 1
 
     def close(self) -> None:
         """Close the socket."""

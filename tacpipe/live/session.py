@@ -76,6 +76,18 @@ def with_plan(rig: Rig, plan: str) -> Rig:
     return replace(rig, streams={**rig.streams, PLAN: stream})
 
 
+@dataclass(frozen=True)
+class Grasped:
+    """What the model predicts of a grasp."""
+
+    columns: tuple[str, ...]
+    task: ClassVar[str] = "touch"
+
+    def own(self, steps: Sequence[int]) -> dict[str, Mapping[str, Any]]:
+        """Return the session's own streams, with the options of the sensor ``live``."""
+        return {"touch": {"output": "touch", "channels": list(self.columns)}, "latency": {"output": "latency"}}
+
+
 def targets_of(rig: Rig, plan: str) -> str:
     """Return the stream that ``rig:STREAM`` names, empty for any other source. Raises `UsageError` where there is none."""
     scheme, _, stream = plan.partition(":")
@@ -88,7 +100,7 @@ def targets_of(rig: Rig, plan: str) -> str:
     return stream
 
 
-def with_own(rig: Rig, about: Described | Surfaces, steps: Sequence[int]) -> Rig:
+def with_own(rig: Rig, about: Described | Surfaces | Grasped, steps: Sequence[int]) -> Rig:
     """Return a rig with the session's own streams, as ``forecast`` and ``latency``, at free ports of this computer.
 
     Raises `UsageError` where it has streams of these names, and for forecasts too large for a packet.

@@ -12,7 +12,7 @@ from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.live import material_opening, wire
 from tacpipe.live.material_engine import RESTARTED, THROWN, MaterialEngine
 from tacpipe.live.material_messages import FINAL, SLIDING, WAITING, MaterialMessage
-from tacpipe.live.messages import packet
+from tacpipe.live.messages import packets
 from tacpipe.live.options import Options
 from tacpipe.plugins import registry
 from tacpipe.recording import rig as rigs_of
@@ -198,8 +198,7 @@ def test_rows_of_the_sessions_stream_hold_what_was_published() -> None:
     assert [field.name for field in sensor.fields()] == [*SLIDE, "probability_cork", "probability_felt"]
     for probabilities in (None, np.array([0.25, 0.75], np.float32)):
         message = MaterialMessage(1, 5, ("cork", "felt"), probabilities, SLIDING, 60, 0.5)
-        sent = packet(message, sensor, 7)
-        assert sent is not None
+        (sent,) = packets(message, sensor, 7)
         found = sensor.decode(np.frombuffer(sent, np.uint8)[None])
         assert found.seq is not None and found.t_device_ns is not None
         assert (found.seq[0], found.t_device_ns[0]) == (7, 5)

@@ -157,6 +157,7 @@ def test_the_rig_of_all_sensors_has_them_all() -> None:
         "lsl",
         "live",
         "plan",
+        "grasps",
     }  # outlets that pylsl makes; what a live session records itself
     assert {stream.kind for stream in ALL_SENSORS.streams.values()} == served
 
