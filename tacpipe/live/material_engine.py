@@ -59,7 +59,12 @@ class MaterialEngine:
         self._finger, self._slide, self._description = finger, slide, description
         self._lacks = ""  # why this recording gives no answer any more
         self._continues = False
-        self._begin(None)
+        self.offset_ns: int | None = None  # that is added to the monotonic clock; None: no recording runs
+        self._decoders: dict[str, Decoder] = {}
+        self._tables: dict[str, pa.Table] = {}
+        self._over: set[str] = set()  # streams of which nothing more is of the recording
+        self._due_ns: int | None = None
+        self._read_ns = 0  # up to which samples were read
 
     @property
     def running(self) -> bool:
@@ -128,13 +133,9 @@ class MaterialEngine:
         if self.offset_ns is not None and message.made_from_t_ns:
             message.latency_ms = (now_ns + self.offset_ns - message.made_from_t_ns) / 1e6
 
-    def _begin(self, offset_ns: int | None) -> None:
-        self.offset_ns = offset_ns  # that is added to the monotonic clock
-        self._decoders: dict[str, Decoder] = {}
-        self._tables: dict[str, pa.Table] = {}
-        self._over: set[str] = set()
-        self._due_ns: int | None = None
-        self._read_ns = 0  # up to which samples were read
+    def _begin(self, offset_ns: int) -> None:
+        self.offset_ns, self._due_ns, self._read_ns = offset_ns, None, 0
+        self._decoders, self._tables, self._over = {}, {}, set()
 
     def _answered(self, until_ns: int, *, final: bool) -> MaterialMessage:
         """Return the answer from all samples up to a moment; the final one is from all there are."""

@@ -29,6 +29,18 @@ def started(lab: Lab, options: str, behaviour: str = "") -> subprocess.Popen[str
     )
 
 
+def commanded(lab: Lab, command: str) -> subprocess.Popen[str]:
+    """Return ``tacpipe`` with a command in a lab, in a process of its own whose limits suit a busy computer."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "tests.recording.patient", *command.split()],
+        cwd=lab.folder,
+        env={**os.environ, "PYTHONPATH": str(live.ROOT)},
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
+
+
 def ended(process: subprocess.Popen[str], *, interrupt: bool = False) -> dict[str, Any]:
     """Return what a session printed as JSON, once it is over."""
     if interrupt:

@@ -38,7 +38,7 @@ SETTLE_NS = 2_000_000
 OFFSET_NS = 10**18
 RIG = Rig(materials=3, pac=False, arm_every=0)
 TRAINED, UNSEEN = range(3), 3
-KINDS = {
+KINDS: dict[str, dict[str, Any]] = {
     "statistics": {"architecture": "statistics"},
     "x-lstm": {"architecture": "x-lstm", "hidden": 6, "epochs": 1, "batch": 4},
     "minirocket": {"architecture": "minirocket", "features": 200},
@@ -59,7 +59,7 @@ def models(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Opened]:
     found = {}
     for kind, params in KINDS.items():
         asked = fitting("train.material", params)
-        found[kind] = Opened(material.train(asked, *parts, tmp_path_factory.mktemp(kind), None))
+        found[kind] = Opened(material.train(asked, parts[0], parts[1], tmp_path_factory.mktemp(kind), None))
     return found
 
 
@@ -227,7 +227,9 @@ def test_a_rig_that_the_model_cannot_read_is_refused_by_what_is_missing(models: 
 def test_a_model_of_several_sensors_needs_the_name_of_the_rigs(tmp_path: Path) -> None:
     rig = Rig(materials=2, pac=False, arm_every=0)
     parts = [slides(rig, indices(rig, ["biotac", "roboskin"], some), frames=FRAMES) for some in (range(2), [2])]
-    model: Any = Opened(material.train(fitting("train.material", KINDS["statistics"]), *parts, tmp_path, None))
+    model: Any = Opened(
+        material.train(fitting("train.material", KINDS["statistics"]), parts[0], parts[1], tmp_path, None)
+    )
     sensors = {"finger": rigs_of.make("biotac", {}, "finger")}
     with pytest.raises(UsageError, match="--sensor"):
         material_opening.engine(options(), model, sensors)

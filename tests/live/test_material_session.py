@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 
@@ -15,7 +11,7 @@ from tacpipe.recording import rig_text
 from tacpipe.simulation.emulation.emulator import Emulator
 from tacpipe.tasks.material.classifier import softmax
 from tests.conftest import Lab
-from tests.live.sessions import ended, subscriber
+from tests.live.sessions import commanded, ended, subscriber
 from tests.recording import live
 
 pytestmark = [pytest.mark.rig, pytest.mark.long]
@@ -37,15 +33,7 @@ def test_the_last_answer_of_a_session_is_what_predict_gives_its_recording(lab: L
     ):
         (lab.folder / "rig.toml").write_text(rig_text.of(emulator.rig))
         words = f"live rig.toml --model models/m -o rec --json --publish udp:127.0.0.1:{port}"
-        environment = {**os.environ, "PYTHONPATH": str(live.ROOT)}
-        process = subprocess.Popen(
-            [sys.executable, "-m", "tests.recording.patient", *words.split()],
-            cwd=lab.folder,
-            env=environment,
-            text=True,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-        )
+        process = commanded(lab, words)
         live.awaited(lambda: sum(one.get("seen") == 1.0 for one in messages) > 5 or process.poll() is not None)
         printed = ended(process, interrupt=True)
         live.awaited(lambda: messages[-1].get("state") == "final")

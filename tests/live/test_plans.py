@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import socket
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -19,7 +17,7 @@ import tacpipe
 from tacpipe.live.session import free_ports
 from tacpipe.sensors import plan as plans
 from tests.conftest import Lab
-from tests.live.sessions import ended, forecasts, subscriber, whole
+from tests.live.sessions import commanded, ended, forecasts, subscriber, whole
 from tests.recording import live
 
 pytestmark = [pytest.mark.rig, pytest.mark.long]
@@ -46,14 +44,7 @@ def trained(lab: Lab) -> Lab:
 
 def started(lab: Lab, options: str) -> subprocess.Popen[str]:
     """Return ``tacpipe live`` with the model, running in a process of its own."""
-    words = ["live", "rig.toml", "--model", "models/f", "-o", "rec", "--json", *options.split()]
-    environment = {**os.environ, "PYTHONPATH": str(live.ROOT)}
-    return subprocess.Popen(
-        [sys.executable, "-m", "tests.recording.patient", *words],
-        **{"cwd": lab.folder, "env": environment, "text": True},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-    )
+    return commanded(lab, f"live rig.toml --model models/f -o rec --json {options}")
 
 
 def packet() -> bytes:
@@ -111,7 +102,7 @@ def awaited(messages: list[dict[str, Any]], process: subprocess.Popen[str], caus
     def there() -> bool:
         assert process.poll() is None, process.communicate()[1]
         found = [one["cause"] for one in forecasts(messages[first:])]
-        return sum(one.startswith(cause) if cause else not one for one in found) >= count
+        return len([one for one in found if (one.startswith(cause) if cause else not one)]) >= count
 
     live.awaited(there)
 

@@ -118,7 +118,12 @@ def test_a_forecast_reads_set_points_as_its_plan_however_they_came(model: Made) 
 def test_the_plan_is_what_the_set_point_did_last_taken_to_go_on(model: Made, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[Any] = []
     used = planned.without
-    monkeypatch.setattr(planned, "without", lambda *given: seen.append(given) or used(*given))
+
+    def without(*given: Any) -> Any:
+        seen.append(given)
+        return used(*given)
+
+    monkeypatch.setattr(planned, "without", without)
     given = aimed(6)
     fed(model, given, [])
     robot = given.tables["robot"]

@@ -27,7 +27,8 @@ class SlideSource:
         """Take a BioTac; raises `UsageError` for any other sensor."""
         if not isinstance(sensor, BioTac):
             raise UsageError("emulate: slides is for the sensor biotac; leave it out for others.")
-        self.sensor, self.timing = sensor, timing
+        self.sensor: Sensor = sensor
+        self.timing, self._fingers = timing, sensor.fingers
         self.rows = max(1, round(timing.rate_hz * BLOCK_S))
         self._seed, self._rig = seed, rig or Rig(arm_every=0)
         self._fields = [field.name for field in BioTac().fields()]
@@ -45,7 +46,7 @@ class SlideSource:
             self._ends.append(self._ends[-1] + len(self._trial(len(self._ends) - 1)))
         trials = np.searchsorted(self._ends, numbers, side="right") - 1
         rows = [self._trial(int(trial))[row - self._ends[trial]] for trial, row in zip(trials, numbers, strict=True)]
-        readings = np.tile(np.stack(rows), self.sensor.fingers)
+        readings = np.tile(np.stack(rows), self._fingers)
         device_ns = faults.device_stamps(self.timing.taken_ns(numbers), self.timing.clock)
         return Samples((readings,), numbers % (self.sensor.counter or 1), device_ns)
 
