@@ -40,7 +40,7 @@ def engine(options: Options, model: Dataset, sensors: Mapping[str, Sensor]) -> M
             f"{len(layout.channels)}{f', among them {odd[0]}' if odd else ', in another order'}. Take the rig that the "
             f"model was trained on, or train one on recordings of this rig."
         )
-    slide = SlideSoFar(classifier, params, sensor, options.least)
+    slide = SlideSoFar(classifier, params, sensor, options.least, sensors[finger].rate_hz)
     stated = isinstance(classifier.readers[sensor], NetworkReader | SpectraReader)
     about = MaterialDescription(
         classifier.names,

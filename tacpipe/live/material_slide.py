@@ -59,9 +59,16 @@ class Answer:
 class SlideSoFar:
     """Names the material of the slide in what has come of a recording."""
 
-    def __init__(self, classifier: Classifier, params: Any, sensor: str, least: float) -> None:
-        """Take the params of `segment slides`, and which fraction of a slide is enough. Raises for an unknown sensor."""
+    def __init__(
+        self, classifier: Classifier, params: Any, sensor: str, least: float, rate_hz: float | None = None
+    ) -> None:
+        """Take the params of `segment slides`, and which fraction of a slide is enough. Raises for an unknown sensor.
+
+        ``rate_hz`` is the rig's, as the label of a recording; None: that of the stamps, which are arrivals, and so come in
+        bursts where the computer is busy.
+        """
         self._classifier, self._params, self._sensor = classifier, params, sensor
+        self._attributes = {"sensor": sensor} | ({"rate_hz": rate_hz} if rate_hz else {})
         self._layout, self._reader = classifier.layout(sensor), classifier.readers[sensor]
         self._stage = registry.load(SLIDES)
         self._least = least
@@ -78,7 +85,7 @@ class SlideSoFar:
 
     def answer(self, streams: Mapping[str, pa.Table]) -> Answer:
         """Return what a recording of these streams would give if it ended now."""
-        held = Held(streams, {"sensor": self._sensor})
+        held = Held(streams, self._attributes)
         try:
             whole = self._stage(replace(self._params, crop="none"), held)
         except TacpipeError:

@@ -123,6 +123,7 @@ class Loop:
     def report(self) -> None:
         """Send the recording process what the session did so far; where it does not read, the report is left out."""
         figures = {
+            "kind": self.publishers.kind,
             "forecasts": self.forecasts,
             "skipped": self.engine.skipped,
             "late": self.engine.late,

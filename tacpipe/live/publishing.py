@@ -71,7 +71,8 @@ class Own:
 class Publishers:
     """All publishers of a session; the session's own streams come last, so that the latency they carry covers the others."""
 
-    def __init__(self, several: list[Publisher], own: Own | None) -> None:
+    def __init__(self, several: list[Publisher], own: Own | None, kind: str = "forecast") -> None:
+        self.kind = kind  # of the messages
         self._subscribed = several
         self._own = own
         self.states: Mapping[str, str] = {}  # what was published last, in words
@@ -123,7 +124,7 @@ def opened(options: Options, engine: Predicts) -> Publishers:
         for one in several:
             one.close()
         raise
-    return Publishers(several, Own(places, sensors) if own else None)
+    return Publishers(several, Own(places, sensors) if own else None, about.kind)
 
 
 def check(address: str) -> tuple[str, str]:

@@ -22,6 +22,7 @@ from tacpipe.recording.recorder import Recorder
 from tacpipe.recording.rig import Rig, Stream
 from tacpipe.sensors.plan import NAME as PLAN
 
+ANSWERS = {"forecast": "forecasts", "material": "materials named", "touch": "rankings"}  # by kind of message
 RIG = "rig"  # scheme of a plan from one of the rig's own streams
 MEASURED = "measured"  # in the place of an address: the recorded motion is taken to continue
 SWITCH_S = 0.0005  # that one thread may hold up another: the threads that read must not wait 5 ms for the view
@@ -151,7 +152,8 @@ def lines(figures: Mapping[str, Any]) -> list[str]:
     ['forecasts 9, skipped 1; latency median 4.2 ms, 99 % 6.0 ms, largest 6.5 ms; load off, slip unknown']
     """
     latency = figures.get("latency") or {}
-    parts = [f"forecasts {figures.get('forecasts', 0)}, skipped {figures.get('skipped', 0)}"]
+    kind = figures.get("kind", "forecast")
+    parts = [f"{ANSWERS.get(kind, kind)} {figures.get('forecasts', 0)}, skipped {figures.get('skipped', 0)}"]
     if latency.get("count"):
         parts.append(
             f"latency median {latency['p50_ms']:.1f} ms, 99 % {latency['p99_ms']:.1f} ms, "
@@ -167,4 +169,4 @@ def lines(figures: Mapping[str, Any]) -> list[str]:
     ):
         parts += [f"{figures[name]} {what}"] if figures.get(name) else []
     found = ["; ".join(parts)]
-    return [*found, f"forecast: {figures['cause']}"] if figures.get("cause") else found
+    return [*found, f"{kind}: {figures['cause']}"] if figures.get("cause") else found

@@ -23,7 +23,7 @@ MODULE = "tacpipe.live.process"  # that runs as the model's process
 AGAIN_S = (0.5, 10.0)  # from its end to the next start: first, and at most
 STOP_S = 5.0  # that it has to end, which closes what it publishes
 LOOK_S = 0.05
-NOTED = "forecast"  # stream that notes of the process are on
+NOTED = {"forward": "forecast"}  # task to the stream that notes of the process are on; of others that of their name
 DIED, RESTARTED = "model_died", "model_restarted"  # notes in the recording
 
 
@@ -32,6 +32,7 @@ class Supervisor:
 
     def __init__(self, options: Options, tap: Tap) -> None:
         self.options, self.tap = options, tap
+        self._noted = NOTED.get(options.task, options.task)
         self.report: dict[str, Any] = {}  # the last one of the process that runs
         self.alarms: dict[str, Any] = {}  # their levels
         self.deaths = 0
@@ -92,11 +93,11 @@ class Supervisor:
             self._forget()
             self._due_s = clock.now_s() + self._again_s
             self._again_s = min(2 * self._again_s, AGAIN_S[1])
-            notes.append(Note(clock.now_ns(), NOTED, DIED, f"exit code {code}; it is started anew"))
+            notes.append(Note(clock.now_ns(), self._noted, DIED, f"exit code {code}; it is started anew"))
         if self._process is None and clock.now_s() >= self._due_s:
             with contextlib.suppress(OSError):  # of a computer without memory for it: tried again
                 self._spawn()
-                notes.append(Note(clock.now_ns(), NOTED, RESTARTED, f"restart {self.deaths} of this session"))
+                notes.append(Note(clock.now_ns(), self._noted, RESTARTED, f"restart {self.deaths} of this session"))
         return notes
 
     def stop(self) -> None:

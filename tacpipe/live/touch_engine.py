@@ -70,6 +70,7 @@ class TouchEngine:
                 self.offset_ns, self._begun = int(block.detail), set()
             elif block.what == wire.END:
                 self.offset_ns = None
+                self._waiting.clear()
             elif block.what == wire.OVERFLOW:
                 self.overflows += 1
             elif block.what == BEGAN:

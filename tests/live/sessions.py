@@ -11,12 +11,15 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from tests.conftest import Lab
 from tests.recording import live
+
+MODULES = (b"tacpipe.live.process", b"tests.live.persistent")  # that a model's process runs
 
 
 def started(lab: Lab, options: str, behaviour: str = "") -> subprocess.Popen[str]:
@@ -39,6 +42,19 @@ def commanded(lab: Lab, command: str) -> subprocess.Popen[str]:
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
     )
+
+
+def model_process(session: subprocess.Popen[str]) -> int:
+    """Return the number of a session's process that runs the model."""
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            parent = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
+            words = (folder / "cmdline").read_bytes()
+        except (OSError, ValueError):
+            continue
+        if parent == session.pid and any(one in words for one in MODULES):
+            return int(folder.name)
+    raise AssertionError("the session has no process of a model")
 
 
 def ended(process: subprocess.Popen[str], *, interrupt: bool = False) -> dict[str, Any]:

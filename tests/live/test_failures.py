@@ -9,9 +9,7 @@ import json
 import os
 import signal
 import socket
-import subprocess
 import threading
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,7 +20,7 @@ from tacpipe.live.supervisor import DIED, RESTARTED
 from tacpipe.simulation.emulation.byte_faults import Faults
 from tests.conftest import Lab
 from tests.live.persistent import GAP_NS, PERIOD_NS
-from tests.live.sessions import ended, forecasts, started, subscriber, whole
+from tests.live.sessions import ended, forecasts, model_process, started, subscriber, whole
 from tests.recording import live, patient
 
 pytestmark = pytest.mark.rig
@@ -37,18 +35,6 @@ def patience(monkeypatch: pytest.MonkeyPatch) -> None:
 def without(messages: list[dict[str, Any]], stream: str) -> list[dict[str, Any]]:
     """Return the messages without a forecast whose cause names a stream."""
     return [one for one in messages if one["kind"] == "forecast" and one["values"] is None and stream in one["cause"]]
-
-
-def model_process(session: subprocess.Popen[str]) -> int:
-    """Return the number of a session's process that runs the model."""
-    for folder in Path("/proc").glob("[0-9]*"):
-        try:
-            parent = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
-        except (OSError, ValueError):
-            continue
-        if parent == session.pid and b"tests.live.persistent" in (folder / "cmdline").read_bytes():
-            return int(folder.name)
-    raise AssertionError("the session has no process of a model")
 
 
 def test_a_stream_that_stalls_costs_the_forecasts_of_that_time_and_alarms_are_unknown(lab: Lab) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 import socket
 from typing import Any
 
@@ -14,9 +16,10 @@ from tacpipe.clouds import ply
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
 from tacpipe.live.session import free_ports
+from tacpipe.live.supervisor import DIED, RESTARTED
 from tacpipe.live.touch_messages import COLUMNS
 from tests.conftest import Lab
-from tests.live.sessions import commanded, ended, subscriber
+from tests.live.sessions import commanded, ended, model_process, subscriber
 from tests.recording import live
 
 pytestmark = [pytest.mark.rig, pytest.mark.long]
@@ -60,6 +63,9 @@ def test_a_request_is_answered_with_what_predict_gives_and_both_are_recorded(lab
             return any(one["kind"] == "touch" for one in messages)
 
         live.awaited(answered)
+        os.kill(model_process(process), signal.SIGKILL)
+        count = len(messages)
+        live.awaited(lambda: answered() and any(one["kind"] == "touch" for one in messages[count:]))
         ended(process, interrupt=True)
     answer = next(one for one in messages if one["kind"] == "touch")
     assert answer["cause"] == "" and answer["criterion"] == "balance"
@@ -71,6 +77,7 @@ def test_a_request_is_answered_with_what_predict_gives_and_both_are_recorded(lab
     found = np.array([answer["candidates"][0]["touch"][one] for one in COLUMNS], np.float32)
     assert found.tobytes() == wanted.tobytes()
     shard = live.only(lab.folder)
+    assert [cause for cause, _ in live.events(shard, "touch")][:2] == [DIED, RESTARTED]
     rows = shard.table("touch").to_pylist()
     assert rows and {one["request"] for one in rows} == {7} and sorted({one["grasp"] for one in rows}) == [0, 1]
     assert next(one for one in rows if one["rank"] == 1)["grasp"] == answer["best"]
