@@ -133,6 +133,15 @@ def pose_fields() -> list[pa.Field]:
     return position + [float_field(f"orientation_{part}", "1", "orientation", part) for part in COMPONENTS]
 
 
+def target_pose_fields() -> list[pa.Field]:
+    """Return those of the pose that an arm's controller aims at: ``target_position_x_m``, … ``target_orientation_w``."""
+    return [
+        float_field(f"target_{field.name}", field.metadata[b"unit"].decode(), f"target_{kind}", part)
+        for field in pose_fields()
+        for kind, part in [(field.name.split("_")[0], field.name.split("_")[1])]
+    ]
+
+
 def float_field(name: str, unit: str, quantity: str, component: str | None = None) -> pa.Field:
     """Return a float64 field with its unit and quantity."""
     import pyarrow as pa

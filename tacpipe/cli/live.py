@@ -27,6 +27,11 @@ recording. The recording has priority: where the computer does not keep up, fore
 
 Example: tacpipe live rig.toml --model models/forward -o data/live --publish ws:127.0.0.1:8765
 
+A model of materials names the surface while a slide goes on, with a probability of each, and at the end of the recording
+what `tacpipe predict` gives. One of touch ranks candidate grasps on a cloud, which come to a stream of the sensor grasps.
+
+Example: tacpipe live finger.toml --model models/material -o data/live --publish udp:127.0.0.1:9000
+
 Example: tacpipe live rig.toml --model models/forward --alarms-per-hour 6 --alarms-on data/segments --split data/split"""
 
 
@@ -36,12 +41,14 @@ def add(program: typer.Typer, summary: str) -> None:
     @program.command("live", help=summary + HELP)
     def live(
         rig: Annotated[Path, typer.Argument(help="Rig file, as of `tacpipe acquire`.")],
-        model: Annotated[Path, typer.Option("--model", help="Trained model, as of `tacpipe train forward`.")],
+        model: Annotated[
+            Path, typer.Option("--model", help="Trained model, as of `tacpipe train forward`, `material` or `touch`.")
+        ],
         plan: Annotated[
             str,
             typer.Option(
                 "--plan",
-                help="Source of plans: measured (the motion is taken to continue), udp::PORT, ws:HOST:PORT.",
+                help="Source of plans: measured (motion continues), udp::PORT, ws:HOST:PORT, rig:STREAM (its set-points).",
             ),
         ] = "measured",
         output: Annotated[Path | None, typer.Option("-o", "--output", help="Dataset to append recordings to.")] = None,
@@ -67,6 +74,18 @@ def add(program: typer.Typer, summary: str) -> None:
         name: Annotated[
             str | None, typer.Option(help="Name of the recording; the time of its start by default.")
         ] = None,
+        sensor: Annotated[
+            str, typer.Option("--sensor", help="Sensor of the rig, of those that a model of materials knows.")
+        ] = "",
+        every_ms: Annotated[
+            float, typer.Option("--every-ms", help="Time between two answers of a model of materials, ms.")
+        ] = 100.0,
+        least: Annotated[
+            float, typer.Option("--least", help="Fraction of a slide before which its material is unknown, 0 to 1.")
+        ] = 0.25,
+        rank: Annotated[
+            str, typer.Option("--rank", help="Criterion for a model of touch: contact, balance, level:0.4.")
+        ] = "contact",
         settle_ms: Annotated[
             float, typer.Option("--settle-ms", help="Time after a row in which its samples are awaited, ms.")
         ] = 2.0,
@@ -79,10 +98,16 @@ def add(program: typer.Typer, summary: str) -> None:
         from tacpipe.recording import rig as rigs
 
         _check(duration, alarms_per_hour, alarms_on, split, settle_ms)
+        _check_slides(every_ms, least)
         for address in publish or []:
             publishing.check(address)
         about, digest = description.described(model)
-        wanted = _steps(steps, about.horizon)
+        if isinstance(about, session.Described):
+            wanted = _steps(steps, about.horizon)
+        elif steps or plan != session.MEASURED or alarms_per_hour:
+            raise UsageError(f"{model} is of {about.task}; --steps, --plan and --alarms-per-hour are for forecasts.")
+        else:
+            wanted = ()
         asked = session.with_plan(rigs.read(rig), plan)
         found = session.with_own(completing.completed(asked), about, wanted)
         options = Options(
@@ -95,6 +120,12 @@ def add(program: typer.Typer, summary: str) -> None:
             "" if alarms_on is None else str(alarms_on.absolute()),
             "" if split is None else str(split.absolute()),
             settle_ms,
+            session.targets_of(asked, plan),
+            about.task,
+            sensor,
+            every_ms,
+            least,
+            rank,
         )
         attributes = {"live_model": digest, "live_plan": plan, "live_alarms_per_hour": alarms_per_hour}
         _run(found, options, output, name, duration, label or [], attributes, quiet=quiet, as_json=as_json)
@@ -214,6 +245,13 @@ def _check(
         raise UsageError("--split has no effect without --alarms-on.")
     if not 0 <= settle_ms <= 1000:
         raise UsageError(f"--settle-ms is {settle_ms:g}; it must be between 0 and 1000.")
+
+
+def _check_slides(every_ms: float, least: float) -> None:
+    if not 10 <= every_ms <= 10_000:
+        raise UsageError(f"--every-ms is {every_ms:g}; it must be between 10 and 10,000.")
+    if not 0 < least <= 1:
+        raise UsageError(f"--least is {least:g}; it must be above 0 and at most 1.")
 
 
 def _steps(text: str, horizon: int) -> tuple[int, ...]:

@@ -46,7 +46,7 @@ def open_lsl(place: str, sensor: Sensor, name: str) -> LslLink:
     wanted = _wanted(place)
     with extras.named(name):
         import pylsl
-    _quiet(pylsl)
+    quiet(pylsl)
     found = _resolved(pylsl, wanted)
     if len(found) != 1:
         raise DeviceError(f"{name}: {_other(pylsl, found)}")
@@ -62,7 +62,7 @@ def open_lsl(place: str, sensor: Sensor, name: str) -> LslLink:
     return LslLink(name, inlet, _checked(text, sensor, name), pylsl)
 
 
-def _quiet(pylsl: Any) -> None:
+def quiet(pylsl: Any) -> None:
     """Keep liblsl's messages off the terminal, unless a file of the user's configures it."""
     if not os.environ.get("LSLAPICFG") and not any(path.expanduser().is_file() for path in CONFIGURED):
         pylsl.util.set_config_content(SILENT)  # does nothing where LSL was used before in this process

@@ -16,10 +16,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from tacpipe.arrays import AnyFloats, Float32s, Floats, Times
-from tacpipe.errors import TacpipeError
+from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.live.sources import Layout, plan_table
 from tacpipe.live.stages import causal_stages
+from tacpipe.live.targets import Targets, facing
 from tacpipe.models.windows import ARM
+from tacpipe.printable import listed
 from tacpipe.sensors.plan import NAME as PLAN
 from tacpipe.sensors.plan import POSE
 from tacpipe.synchronization.causal import Grid, Rows
@@ -68,6 +70,15 @@ class Beginning(NamedTuple):
     origin_ns: int  # first point of the grid
     rest: tuple[float, ...]  # level at rest of each channel
 
+    def to_json(self) -> dict[str, Any]:
+        """Return what `from_json` reads."""
+        return self._asdict()
+
+    @classmethod
+    def from_json(cls, stored: Mapping[str, Any]) -> Beginning:
+        """Return the beginning that `to_json` wrote."""
+        return cls(int(stored["origin_ns"]), tuple(map(float, stored["rest"])))
+
 
 class _Row(NamedTuple):
     """One row of the grid, before the level at rest is taken off."""
@@ -94,14 +105,19 @@ class Chain:
         steps: Sequence[Mapping[str, Any]],
         layout: Layout,
         beginning: Beginning | None = None,
+        targets: Targets | None = None,
     ) -> None:
         """Make a chain of parts that fit; `of` checks that they do."""
+        self._targets = targets
         stages = causal_stages(steps)
         self._forecaster, self._stages, self._layout = forecaster, stages, layout
         sync = stages.synchronize
         gap_ns = round(sync.gap_ms * 1e6)
         origin_ns = None if beginning is None else beginning.origin_ns
         self._grid = Grid(layout.readings, layout.master, sync.grid, sync.rate_hz, gap_ns, origin_ns)
+        if beginning is not None:
+            for stream, levels in layout.levels(beginning.rest).items():
+                self._grid.continue_from(stream, levels)
         self._rolling = Rolling(forecaster, continues=beginning is not None)
         self._arm = Arm(forecaster.orientation)
         self._resting: list[_Row] | None = [] if beginning is None else None  # until the level at rest is known
@@ -123,6 +139,7 @@ class Chain:
         layouts: Mapping[str, pa.Schema],
         master: str = "",
         beginning: Beginning | None = None,
+        plan_from: str = "",
     ) -> Chain:
         """Return the chain of a model: its files, the stages it was trained behind, and the schema of each recorded stream.
 
@@ -133,8 +150,11 @@ class Chain:
         ``layouts`` lacks or has otherwise.
 
         ``beginning`` is that of another chain of the session, which ended: grid and level at rest are continued, so that
-        this one predicts the same once it has read a few rows more than the model's context. What the other one had
-        counted of wrap-arounds is not known.
+        this one predicts the same once it has read a few rows more than the model's context. Counts that had wrapped
+        around are taken as near to the level at rest as they can be.
+
+        ``plan_from`` names the stream of an arm whose set-points are the planned motion (`tacpipe.live.targets`), in the
+        place of the stream ``plan``. Raises `UsageError` where it has none.
         """
         forecaster = Forecaster.load(model)
         if forecaster.actions == "shuffled":
@@ -143,12 +163,18 @@ class Chain:
                 "--actions planned or none."
             )
         stages = causal_stages(steps)
-        return cls(forecaster, steps, Layout.of(forecaster, stages.synchronize, layouts, master), beginning)
+        if plan_from and plan_from not in layouts:
+            raise UsageError(f"There is no stream {plan_from} that plans could come from; there are {listed(layouts)}.")
+        targets = Targets(plan_from, layouts[plan_from]) if plan_from else None
+        return cls(forecaster, steps, Layout.of(forecaster, stages.synchronize, layouts, master), beginning, targets)
 
     @property
     def streams(self) -> tuple[str, ...]:
         """Names of the streams that are read; others may be pushed and are ignored."""
-        return tuple(self._layout.readings)
+        several = (
+            self._layout.readings if self._targets is None else {**self._layout.readings, self._targets.stream: None}
+        )
+        return tuple(several)
 
     @property
     def waiting(self) -> tuple[str, ...]:
@@ -222,6 +248,8 @@ class Chain:
 
     def push(self, stream: str, batch: pa.RecordBatch | pa.Table) -> None:
         """Take samples of a stream in the order of their arrival, with ``t_ns`` and the columns of its layout."""
+        if self._targets is not None and stream == self._targets.stream and batch.num_rows:
+            self._targets.push(batch)
         if stream == PLAN:
             self._push_plans(batch)
         elif stream in self._layout.readings and batch.num_rows:
@@ -306,6 +334,10 @@ class Chain:
         now, ahead_ns = self._rolling.arm, t_ns + self._ahead_ns
         if not self.reads_plan:  # a model without plans puts the newest row there itself
             return np.broadcast_to(now, (self.horizon, ARM)), Cause.NONE
+        if self._targets is not None:
+            aimed = self._targets.state(t_ns)
+            cause = Cause.NO_PLAN if aimed is None else Cause.NONE
+            return planned.without(t_ns, ahead_ns, now if aimed is None else facing(aimed, now)), cause
         while len(self._plans) > 1 and self._plans[1][0] <= t_ns:
             self._plans.popleft()
         if not self._plans or self._plans[0][0] > t_ns:

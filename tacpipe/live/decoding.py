@@ -57,6 +57,11 @@ class Decoder:
                 found.append(self._reading.broken())
         return [batch for batch in found if len(batch)]
 
+    def last(self) -> list[Batch]:
+        """Return what is complete now that nothing more comes, as `batches`."""
+        found = [*self.batches(), self._reading.finish()]
+        return [batch for batch in found if len(batch)]
+
     def _fed(self, chunks: Chunks) -> list[Batch]:
         try:
             return [self._reading.feed(chunks)]

@@ -7,6 +7,7 @@ newest alone is published, the others are counted as skipped.
 
 from __future__ import annotations
 
+import json
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -16,9 +17,9 @@ import numpy as np
 
 from tacpipe.live import wire
 from tacpipe.live.alarms import NOTHING_KNOWN, Alarms
-from tacpipe.live.chain import Cause, Forecast
+from tacpipe.live.chain import Beginning, Cause, Forecast
 from tacpipe.live.decoding import Decoder, batch_schema, likely_schema
-from tacpipe.live.messages import Message
+from tacpipe.live.messages import Description, Message
 from tacpipe.recording.spool_blocks import Note
 from tacpipe.recording.station import BEGAN
 from tacpipe.sensors.framing import Chunks
@@ -69,6 +70,10 @@ class Chainlike(Protocol):
     def late(self) -> Mapping[str, int]:
         """Samples that came too late, by stream."""
 
+    @property
+    def beginning(self) -> Beginning | None:
+        """What a chain needs to continue this one's session; None as long as it is not known."""
+
     def push(self, stream: str, batch: Any) -> None:
         """Take samples."""
 
@@ -76,7 +81,7 @@ class Chainlike(Protocol):
         """Return the forecasts up to a time, on request of the newest grid point alone."""
 
 
-Opened = Callable[[Mapping[str, "pa.Schema"]], Chainlike]
+Opened = Callable[[Mapping[str, "pa.Schema"], "Beginning | None"], Chainlike]
 
 
 class Engine:
@@ -94,7 +99,7 @@ class Engine:
         self.sensors = dict(sensors)
         self._opened, self._alarms_of = opened, alarms
         self.settle_ns = settle_ns
-        self.chain = opened({name: likely_schema(one) for name, one in self.sensors.items()})
+        self.chain = opened({name: likely_schema(one) for name, one in self.sensors.items()}, None)
         self.alarms = alarms(self.chain)
         self.steps = tuple(steps) if steps else tuple(range(1, self.chain.horizon + 1))
         self.skipped = self.overflows = self._seq = self._late = 0
@@ -105,6 +110,7 @@ class Engine:
         self._last_ns: int | None = None  # monotonic, of the last message
         self._point_ns: int | None = None  # of the last grid point
         self._why = ""  # there is a chain and yet no grid: why
+        self._continues: Beginning | None = None  # of a process that ended, which the next recording continues
 
     @property
     def period_ns(self) -> int:
@@ -117,6 +123,29 @@ class Engine:
         return self._late + sum(self.chain.late.values())
 
     @property
+    def offset_ns(self) -> int | None:
+        """What is added to the monotonic clock to have the recording's UTC; None where none runs."""
+        return self._offset_ns
+
+    @property
+    def beginning(self) -> Beginning | None:
+        """What another process needs to continue this recording."""
+        return self.chain.beginning
+
+    def about(self, model: str) -> Description:
+        """Return what the values of messages are."""
+        chain = self.chain
+        return Description(chain.channels, self.steps, chain.unit, chain.rate_hz, model)
+
+    def ready(self) -> dict[str, Any]:
+        """Return how many channels are predicted, and the levels of the alarms."""
+        return {"channels": len(self.chain.channels), "alarms": self.alarms.to_json()}
+
+    def finish(self) -> list[Message]:
+        """Return the messages that are left when the session is over: none."""
+        return []
+
+    @property
     def running(self) -> bool:
         """Whether a recording has begun."""
         return self._offset_ns is not None
@@ -125,13 +154,15 @@ class Engine:
         """Take a block of a stream, or a note on all (``stream`` is empty)."""
         if not stream:
             assert isinstance(block, Note)
-            if block.what == wire.BEGIN:
+            if block.what == wire.CONTINUE:
+                self._continues = Beginning.from_json(json.loads(block.detail))
+            elif block.what == wire.BEGIN:
                 self._begin(int(block.detail))
             elif block.what == wire.END:
                 self._offset_ns = None
             elif block.what == wire.OVERFLOW and self.running:
                 self.overflows += 1
-                self._restart("blocks were thrown away under overload")
+                self._restart("blocks were thrown away under overload", self.chain.beginning)
             return
         if isinstance(block, Note) and block.what == BEGAN:
             self._begun.add(stream)
@@ -218,12 +249,15 @@ class Engine:
         self._offset_ns = offset_ns
         self._begun = set()
         self._decoders = self._new_decoders()
-        self._restart("the recording begins")
+        continues, self._continues = self._continues, None
+        self._restart(
+            "the recording begins" if continues is None else "the model's process was started anew", continues
+        )
 
-    def _restart(self, why: str) -> None:
+    def _restart(self, why: str, beginning: Beginning | None) -> None:
         self._late += sum(self.chain.late.values())
         layouts = {name: self._first.get(name) or likely_schema(one) for name, one in self.sensors.items()}
-        self.chain = self._opened(layouts)
+        self.chain = self._opened(layouts, beginning)
         self._point_ns = self._last_ns = None
         self._why = why
 

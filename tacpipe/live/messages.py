@@ -10,17 +10,63 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
 from tacpipe.arrays import Float32s
-from tacpipe.live.alarms import NOTHING_KNOWN, State
+from tacpipe.live.alarms import NAMES, NOTHING_KNOWN, State
 from tacpipe.sensors.live import Live
 from tacpipe.sensors.sensor import Samples
 
 VERSION = 1
 Times = Mapping[str, float]
+
+
+class Published(Protocol):
+    """A message of any kind: what publishers and the session's own streams read of it."""
+
+    t_ns: int
+    cause: str
+    latency_ms: float
+
+    @property
+    def answers(self) -> bool:
+        """Whether there is an answer of the model in it, rather than why there is none."""
+
+    @property
+    def states(self) -> Mapping[str, str]:
+        """What it states, in words, for the view of the session."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the message as JSON and msgpack hold it."""
+
+    def columns(self) -> Float32s:
+        """Return the message as numbers (column,), those that `About.columns` names."""
+
+    def outputs(self, output: str) -> tuple[Any, ...] | None:
+        """Return the blocks of numbers that the session's stream of an output holds; None: nothing now."""
+
+
+class About(Protocol):
+    """What the numbers of messages of one kind are: sent once to each subscriber, before the first message."""
+
+    @property
+    def kind(self) -> str:
+        """The kind of the messages, as forecast."""
+
+    @property
+    def rate_hz(self) -> float:
+        """Messages a second."""
+
+    def columns(self) -> list[tuple[str, str]]:
+        """Return name and unit of each of `Published.columns`."""
+
+    def schema(self) -> dict[str, Any]:
+        """Return the properties of `Published.to_dict`, as JSON schema has them."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the description as JSON and msgpack hold it."""
 
 
 @dataclass
@@ -49,11 +95,39 @@ class Message:
             "t_ns": self.t_ns,
             "values": None if self.values is None else self.values.tolist(),
             "cause": self.cause,
-            "alarms": {name: {"state": one.word, "score": _known(one.score)} for name, one in self.alarms.items()},
-            "latency_ms": _known(self.latency_ms),
-            "age_ms": _known(self.age_ms),
+            "alarms": {name: {"state": one.word, "score": known(one.score)} for name, one in self.alarms.items()},
+            "latency_ms": known(self.latency_ms),
+            "age_ms": known(self.age_ms),
             "skipped": self.skipped,
         }
+
+    @property
+    def answers(self) -> bool:
+        """Whether there is a forecast."""
+        return self.values is not None
+
+    @property
+    def states(self) -> Mapping[str, str]:
+        """The state of each alarm."""
+        return {name: one.word for name, one in self.alarms.items()}
+
+    def columns(self) -> Float32s:
+        """Return the values (step x channel,), empty without a forecast, and the state of each alarm."""
+        values = np.zeros(0) if self.values is None else self.values.ravel()
+        return np.concatenate([values, [self.alarms[name].state for name in NAMES]]).astype(np.float32)
+
+    def outputs(self, output: str) -> tuple[Any, ...] | None:
+        """Return the numbers of the session's stream ``forecast``, ``alarm`` or ``latency``."""
+        if output == "forecast":
+            return None if self.values is None else (self.values.reshape(1, -1),)
+        if output == "alarm":
+            states = list(self.alarms.values())
+            return (
+                np.array([[one.state for one in states]], dtype=np.int8),
+                np.array([[one.score for one in states]], dtype=np.float32),
+            )
+        numbers = (self.latency_ms, self.age_ms, self.compute_ms, self.flags, self.skipped, self.late)
+        return (np.array([numbers], dtype=np.float32),)
 
 
 @dataclass(frozen=True)
@@ -65,6 +139,20 @@ class Description:
     unit: str
     rate_hz: float
     model: str
+    kind: ClassVar[str] = "forecast"
+
+    def columns(self) -> list[tuple[str, str]]:
+        """Return each channel at each step with its unit, and the state of each alarm."""
+        names = [(f"{channel}_t{step}", self.unit) for step in self.steps for channel in self.channels]
+        return names + [(f"{alarm}_state", "1") for alarm in NAMES]
+
+    def schema(self) -> dict[str, Any]:
+        """Return the properties of a message, as JSON schema has them."""
+        return {
+            **properties("version", "seq", "t_ns", "skipped", kind="string", cause="string"),
+            "values": {"type": "array", "items": {"type": "array", "items": {"type": "number"}}},
+            **properties(alarms="object", latency_ms="number", age_ms="number"),
+        }
 
     def to_dict(self) -> dict[str, Any]:
         """Return the description as JSON and msgpack hold it."""
@@ -84,26 +172,21 @@ def to_json(content: Mapping[str, Any]) -> bytes:
     return json.dumps(content, separators=(",", ":"), allow_nan=False).encode()
 
 
-def packet(message: Message, sensor: Live, seq: int) -> bytes | None:
-    """Return the packet of a message for one output, numbered ``seq``; None: of a forecast where there is none."""
-    values = _values(message, sensor.output)
+def packets(message: Published, sensor: Live, seq: int) -> list[bytes]:
+    """Return the packets of a message for one output, numbered from ``seq`` on; none of a forecast where there is none."""
+    values = message.outputs(sensor.output)
     if values is None:
-        return None
-    return sensor.encode(Samples(values, np.array([seq]), np.array([message.t_ns]))).tobytes()
+        return []
+    count = len(values[0])
+    seqs = (seq + np.arange(count)) % (1 << 32)
+    return [row.tobytes() for row in sensor.encode(Samples(values, seqs, np.full(count, message.t_ns)))]
 
 
-def _values(message: Message, output: str) -> tuple[Any, ...] | None:
-    if output == "forecast":
-        return None if message.values is None else (message.values.reshape(1, -1),)
-    if output == "alarm":
-        states = list(message.alarms.values())
-        return (
-            np.array([[one.state for one in states]], dtype=np.int8),
-            np.array([[one.score for one in states]], dtype=np.float32),
-        )
-    numbers = (message.latency_ms, message.age_ms, message.compute_ms, message.flags, message.skipped, message.late)
-    return (np.array([numbers], dtype=np.float32),)
+def properties(*integers: str, **types: str) -> dict[str, Any]:
+    """Return properties of JSON schema by their types; those named alone are integers."""
+    return {name: {"type": kind} for name, kind in {**dict.fromkeys(integers, "integer"), **types}.items()}
 
 
-def _known(value: float) -> float | None:
+def known(value: float) -> float | None:
+    """Return a number to four digits, None for one that is not finite."""
     return round(value, 4) if math.isfinite(value) else None

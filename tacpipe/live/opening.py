@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tacpipe.errors import UsageError
+from tacpipe.errors import FAILED, TacpipeError, UsageError
 from tacpipe.live import alarms as alarms_of
 from tacpipe.live.alarms import Alarms
-from tacpipe.live.chain import Chain
+from tacpipe.live.chain import Beginning, Chain
 from tacpipe.live.engine import Chainlike, Engine
 from tacpipe.live.options import Options
 from tacpipe.recording import rig as rigs
@@ -20,20 +20,48 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from tacpipe.datasets.dataset import Dataset
+    from tacpipe.live.process import Engine as Working
+    from tacpipe.recording.rig import Rig
+    from tacpipe.sensors.sensor import Sensor
 
 SLIP_COLUMN = "slip"  # where `tacpipe segment slips` states that the object slips
 
 
-def engine(options: Options) -> Engine:
-    """Return the engine of a session. Raises `TacpipeError` where model, rig and recordings do not belong together."""
+def engine(options: Options) -> Working:
+    """Return the engine of a session. Raises `UsageError` where model, rig and recordings do not belong together."""
     import tacpipe
 
     model = tacpipe.open(options.model)
-    if not model.source.chain and not model.files:
-        raise UsageError(f"{options.model} is not a model; give a trained one.")
     rig = rigs.parse(options.rig)
     sensors = {name: rig.streams[name].sensor for name in options.streams}
-    opened = functools.partial(chain, model, rig.master)
+    made = {"forward": forecasts, "material": materials, "touch": touches}[options.task]
+    try:
+        return made(options, model, rig, sensors)
+    except TacpipeError as error:
+        if error.exit_code != FAILED:
+            raise
+        raise UsageError(str(error)) from error  # the session was asked for with a rig that the model cannot read
+
+
+def materials(options: Options, model: Dataset, rig: Rig, sensors: Mapping[str, Sensor]) -> Working:
+    """Return the engine of a session with a model of materials. Raises as `engine`."""
+    from tacpipe.live import material_opening
+
+    return material_opening.engine(options, model, sensors)
+
+
+def touches(options: Options, model: Dataset, rig: Rig, sensors: Mapping[str, Sensor]) -> Working:
+    """Return the engine of a session with a model of touch. Raises as `engine`."""
+    from tacpipe.live import touch_ranking
+    from tacpipe.live.touch_engine import TouchEngine
+    from tacpipe.tasks.touch.predictor import Predictor
+
+    return TouchEngine(sensors, Predictor.load(model.files), touch_ranking.criterion(options.rank))
+
+
+def forecasts(options: Options, model: Dataset, rig: Rig, sensors: Mapping[str, Sensor]) -> Engine:
+    """Return the engine of a session with a model of future signals. Raises as `engine`."""
+    opened = functools.partial(chain, model, rig, options.plan_from)
     first: list[Alarms] = []
 
     def levels(made: Chainlike) -> Alarms:
@@ -47,9 +75,15 @@ def engine(options: Options) -> Engine:
     return found
 
 
-def chain(model: Dataset, master: str, layouts: Mapping[str, pa.Schema]) -> Chain:
-    """Return the chain of a model for streams of these layouts; raises as `Chain.of`."""
-    return Chain.of(model.files, model.source.chain, layouts, master)
+def chain(
+    model: Dataset,
+    rig: Rig,
+    plan_from: str,
+    layouts: Mapping[str, pa.Schema],
+    beginning: Beginning | None = None,
+) -> Chain:
+    """Return the chain of a model for streams of these layouts, which continues another's session; raises as `Chain.of`."""
+    return Chain.of(model.files, model.source.chain, layouts, rig.master, beginning, plan_from)
 
 
 def _alarms(options: Options, model: Dataset, made: Chainlike) -> Alarms:
@@ -65,10 +99,9 @@ def _alarms(options: Options, model: Dataset, made: Chainlike) -> Alarms:
 
 def on_recordings(model: Dataset, recordings: Dataset, per_hour: float) -> Alarms:
     """Return alarms of a model with levels for ``per_hour`` false alarms each on recordings, each row's forecast made."""
-    from tacpipe.tasks.forward import tracks
+    from tacpipe.tasks.forward import predictors, tracks
     from tacpipe.tasks.forward.alarms import Loads
     from tacpipe.tasks.forward.forecaster import Forecaster
-    from tacpipe.tasks.forward.predictors import MODEL, Prediction, forecasts
     from tacpipe.tasks.opened import Chain as Stages
     from tacpipe.tasks.opened import opened
 
@@ -78,15 +111,15 @@ def on_recordings(model: Dataset, recordings: Dataset, per_hour: float) -> Alarm
     for shard in opened(recordings, Stages(model)).recordings.values():
         track = tracks.track(shard, forecaster.codec, forecaster.pose)
         loads.begin(track)
-        for some in forecasts(forecaster, track, track.starts(forecaster.context, forecaster.horizon)):
-            loads.add_one(MODEL, some.now, Prediction(some.features, some.count))
+        for some in predictors.forecasts(forecaster, track, track.starts(forecaster.context, forecaster.horizon)):
+            loads.add_one(predictors.MODEL, some.now, predictors.Prediction(some.features, some.count))
         slips.append(_slips(shard))
     if not slips:
         raise UsageError("There is no validation recording that alarms could be set on; give --alarms-on others.")
     known = None if any(one is None for one in slips) else np.concatenate(slips)
     return alarms_of.set_on(
         np.concatenate(loads.truth),
-        np.concatenate(loads.ahead[MODEL]),
+        np.concatenate(loads.ahead[predictors.MODEL]),
         np.concatenate(loads.groups),
         known,
         loads.layout,

@@ -6,7 +6,7 @@ import json
 from dataclasses import asdict, dataclass
 from typing import Any, Self
 
-OWN = ("forecast", "alarm", "latency")  # streams that a session adds to the rig
+OWN = ("forecast", "alarm", "latency", "material", "touch")  # streams that a session adds to the rig, those of its task
 
 
 @dataclass(frozen=True)
@@ -22,6 +22,12 @@ class Options:
     alarms_on: str = ""  # recordings that their levels are set on
     split: str = ""  # whose validation recordings are meant; empty: all
     settle_ms: float = 2.0
+    plan_from: str = ""  # stream of an arm whose set-points are the planned motion; empty: none
+    task: str = "forward"  # of the model
+    sensor: str = ""  # of a model of materials: which of those that it knows; empty: the only one
+    every_ms: float = 100.0  # of a model of materials: from one answer to the next
+    least: float = 0.25  # of a model of materials: fraction of the slide that it reads before it names one
+    rank: str = "contact"  # of a model of touch: what candidates are ranked by
     nice: int = 1  # by how much the model's process stands back behind the recording
 
     def to_json(self) -> str:

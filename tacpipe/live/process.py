@@ -13,13 +13,12 @@ import socket
 import sys
 import time
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Protocol
 
 from tacpipe.errors import TacpipeError
 from tacpipe.live import publishing, wire
-from tacpipe.live.engine import Engine
 from tacpipe.live.latency import Latencies
-from tacpipe.live.messages import Message
+from tacpipe.live.messages import About, Published
 from tacpipe.live.options import Options
 from tacpipe.live.publishing import Publishers
 from tacpipe.recording.spool_blocks import Note
@@ -28,6 +27,57 @@ REPORT_NS = 250_000_000  # between two reports to the recording process
 FETCH_BYTES = 1 << 18
 LONGEST_S = 0.02  # that a wait lasts at most
 REFUSED = 2  # exit code: the session cannot begin with this model and rig
+
+
+class Continued(Protocol):
+    """What a process that is started anew needs to continue a recording."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return it as the note `wire.CONTINUE` holds it."""
+
+
+class Engine(Protocol):
+    """What makes messages of blocks: of forecasts, `tacpipe.live.engine.Engine`; those of other tasks are alike."""
+
+    skipped: int  # messages so far that were left out under overload
+    overflows: int  # times that blocks were thrown away
+
+    @property
+    def late(self) -> int:
+        """Samples so far that came too late to be read."""
+
+    @property
+    def running(self) -> bool:
+        """Whether a recording has begun."""
+
+    @property
+    def offset_ns(self) -> int | None:
+        """What is added to the monotonic clock to have the recording's UTC."""
+
+    @property
+    def beginning(self) -> Continued | None:
+        """What another process needs to continue the recording; None as long as it is not known."""
+
+    def about(self, model: str) -> About:
+        """Return what its messages are."""
+
+    def ready(self) -> dict[str, Any]:
+        """Return what the recording process is to know before the session begins."""
+
+    def take(self, stream: str, block: Any) -> None:
+        """Take a block of a stream, or a note on all."""
+
+    def due_ns(self, now_ns: int) -> int:
+        """Return when `step` is to be called next, on the monotonic clock."""
+
+    def step(self, now_ns: int) -> Sequence[Any]:
+        """Return the messages that are due."""
+
+    def published(self, message: Any, now_ns: int) -> None:
+        """Write into a message how long it took, when it is about to go out."""
+
+    def finish(self) -> Sequence[Any]:
+        """Return the messages that are left when the session is over."""
 
 
 class Loop:
@@ -39,6 +89,7 @@ class Loop:
         self.forecasts = 0
         self.cause = ""
         self._reported_ns = 0
+        self._beginning: Any = None  # that was reported
         self._ended = False
 
     def run(self) -> None:
@@ -57,32 +108,39 @@ class Loop:
             wait_s = (self.engine.due_ns(time.monotonic_ns()) - time.monotonic_ns()) / 1e9
             if wait_s > 0:
                 time.sleep(min(wait_s, LONGEST_S))
+        for message in self.engine.finish():
+            self.publish(message)
         self.report()
 
-    def publish(self, message: Message) -> None:
+    def publish(self, message: Published) -> None:
         """Send a message to all subscribers, and count how long it took."""
         self.publishers.publish(message, lambda one: self.engine.published(one, time.monotonic_ns()))
         self.cause = message.cause
-        if message.values is not None:
+        if message.answers:
             self.forecasts += 1
             self.latencies.add(message.latency_ms)
 
     def report(self) -> None:
         """Send the recording process what the session did so far; where it does not read, the report is left out."""
         figures = {
+            "kind": self.publishers.kind,
             "forecasts": self.forecasts,
             "skipped": self.engine.skipped,
             "late": self.engine.late,
             "overflows": self.engine.overflows,
             "dropped": self.publishers.dropped,
             "cause": self.cause,
-            "alarms": self.publishers.alarms,
+            "states": dict(self.publishers.states),
             "cpu_s": round(time.process_time(), 3),
             "latency": self.latencies.figures(),
             "above_10_ms": self.latencies.above(10.0),
             "above_20_ms": self.latencies.above(20.0),
         }
         send(self.connection, {"report": figures})
+        beginning = self.engine.beginning if self.engine.running else None
+        if beginning is not None and beginning != self._beginning:
+            send(self.connection, {"beginning": beginning.to_json(), "offset_ns": self.engine.offset_ns})
+        self._beginning = beginning
 
     def _fetch(self) -> None:
         while True:
@@ -131,7 +189,7 @@ def main(arguments: Sequence[str], made: Callable[[Options], Engine] = engine_of
     gc.freeze()
     gc.disable()
     os.nice(options.nice)
-    send(connection, {"ready": {"channels": len(engine.chain.channels), "alarms": engine.alarms.to_json()}})
+    send(connection, {"ready": engine.ready()})
     with publishers:
         Loop(connection, engine, publishers, wire.Blocks(options.streams)).run()
     return 0

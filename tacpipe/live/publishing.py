@@ -10,8 +10,7 @@ from typing import Any, Protocol, Self
 
 from tacpipe.errors import UsageError
 from tacpipe.live import messages
-from tacpipe.live.engine import Engine
-from tacpipe.live.messages import Description, Message
+from tacpipe.live.messages import About, Published
 from tacpipe.live.options import OWN, Options
 from tacpipe.printable import excerpt
 from tacpipe.recording import rig as rigs
@@ -30,11 +29,18 @@ class Publisher(Protocol):
 
     dropped: int  # messages that did not go out, over all subscribers
 
-    def publish(self, message: Message) -> None:
+    def publish(self, message: Published) -> None:
         """Send a message, or drop it."""
 
     def close(self) -> None:
         """Send what still waits and close."""
+
+
+class Predicts(Protocol):
+    """What is used of an engine."""
+
+    def about(self, model: str) -> About:
+        """Return what its messages are, made by a model of a path."""
 
 
 class Own:
@@ -47,17 +53,15 @@ class Own:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
 
-    def publish(self, message: Message) -> None:
+    def publish(self, message: Published) -> None:
         """Send the packets of a message."""
         for output, sensor in self._sensors.items():
-            packet = messages.packet(message, sensor, self._sent[output])
-            if packet is None:
-                continue
-            self._sent[output] = (self._sent[output] + 1) % (1 << 32)
-            try:
-                self._socket.sendto(packet, self._places[output])
-            except OSError:
-                self.dropped += 1
+            for packet in messages.packets(message, sensor, self._sent[output]):
+                self._sent[output] = (self._sent[output] + 1) % (1 << 32)
+                try:
+                    self._socket.sendto(packet, self._places[output])
+                except OSError:
+                    self.dropped += 1
 
     def close(self) -> None:
         """Close the socket."""
@@ -67,10 +71,11 @@ class Own:
 class Publishers:
     """All publishers of a session; the session's own streams come last, so that the latency they carry covers the others."""
 
-    def __init__(self, several: list[Publisher], own: Own | None) -> None:
+    def __init__(self, several: list[Publisher], own: Own | None, kind: str = "forecast") -> None:
+        self.kind = kind  # of the messages
         self._subscribed = several
         self._own = own
-        self.alarms: dict[str, str] = {}  # the state of each, as it was published last
+        self.states: Mapping[str, str] = {}  # what was published last, in words
 
     @property
     def _several(self) -> list[Publisher]:
@@ -81,7 +86,7 @@ class Publishers:
         """How many messages did not go out."""
         return sum(one.dropped for one in self._several)
 
-    def publish(self, message: Message, stamped: Callable[[Message], None]) -> None:
+    def publish(self, message: Published, stamped: Callable[[Any], None]) -> None:
         """Send a message to all; ``stamped`` writes into it how long it took so far."""
         stamped(message)
         for one in self._subscribed:
@@ -89,7 +94,7 @@ class Publishers:
         stamped(message)
         if self._own is not None:
             self._own.publish(message)
-        self.alarms = {name: state.word for name, state in message.alarms.items()}
+        self.states = message.states
 
     def __enter__(self) -> Self:
         return self
@@ -102,17 +107,16 @@ class Publishers:
                 one.close()
 
 
-def opened(options: Options, engine: Engine) -> Publishers:
+def opened(options: Options, engine: Predicts) -> Publishers:
     """Return the publishers of a session. Raises `UsageError` for an address that is none, `DeviceError` for one in use."""
     rig = rigs.parse(options.rig)
-    own = {name: rig.streams[name] for name in OWN if name in rig.streams}
+    own = {name: rig.streams[name] for name in rig.streams if name in OWN}
     places: dict[str, tuple[str, int]] = {}
     for name, stream in own.items():
         host, _, port = stream.address.place.partition("?")[0].rpartition(":")
         places[name] = (host or "127.0.0.1", int(port))
     sensors = {name: stream.sensor for name, stream in own.items() if isinstance(stream.sensor, Live)}
-    chain = engine.chain
-    about = Description(chain.channels, engine.steps, chain.unit, chain.rate_hz, options.model)
+    about = engine.about(options.model)
     several: list[Publisher] = []
     try:
         several.extend(publisher(address, about) for address in options.publish)
@@ -120,7 +124,7 @@ def opened(options: Options, engine: Engine) -> Publishers:
         for one in several:
             one.close()
         raise
-    return Publishers(several, Own(places, sensors) if own else None)
+    return Publishers(several, Own(places, sensors) if own else None, about.kind)
 
 
 def check(address: str) -> tuple[str, str]:
@@ -134,10 +138,10 @@ def check(address: str) -> tuple[str, str]:
     return scheme, place
 
 
-def publisher(address: str, about: Description) -> Publisher:
+def publisher(address: str, about: About) -> Publisher:
     """Return the publisher of an address. Raises `UsageError` and `DeviceError`, as `opened`."""
     scheme, place = check(address)
-    made: dict[str, Callable[[str, Description], Any]] = {
+    made: dict[str, Callable[[str, About], Any]] = {
         "ws": _websocket,
         "udp": _udp,
         "lsl": _lsl,
@@ -147,25 +151,25 @@ def publisher(address: str, about: Description) -> Publisher:
     return found
 
 
-def _websocket(place: str, about: Description) -> Publisher:
+def _websocket(place: str, about: About) -> Publisher:
     from tacpipe.live.publishers.websocket import WebsocketPublisher
 
     return WebsocketPublisher(place, about)
 
 
-def _udp(place: str, about: Description) -> Publisher:
+def _udp(place: str, about: About) -> Publisher:
     from tacpipe.live.publishers.udp import UdpPublisher
 
     return UdpPublisher(place, about)
 
 
-def _lsl(place: str, about: Description) -> Publisher:
+def _lsl(place: str, about: About) -> Publisher:
     from tacpipe.live.publishers.lsl import LslPublisher
 
     return LslPublisher(place, about)
 
 
-def _mcap(place: str, about: Description) -> Publisher:
+def _mcap(place: str, about: About) -> Publisher:
     from tacpipe.live.publishers.mcap import McapPublisher
 
     return McapPublisher(place, about)

@@ -55,7 +55,9 @@ def _predicted(model: Model, recording: Recording, steps: Sequence[int]) -> tupl
     tables = recorded(recording)
     master = str(recording.attributes.get("master", ""))
     schemas = {name: table.schema for name, table in tables.items()}
-    chain = Chain.of(model.files, model.source.chain, schemas, master)
+    plan = str(recording.attributes.get("live_plan", ""))
+    source = plan.removeprefix("rig:") if plan.startswith("rig:") else ""
+    chain = Chain.of(model.files, model.source.chain, schemas, master, plan_from=source if source in schemas else "")
     for step in steps:
         if not 1 <= step <= chain.horizon:
             raise TacpipeError(

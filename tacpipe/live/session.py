@@ -7,7 +7,7 @@ import socket
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 from tacpipe.errors import UsageError
 from tacpipe.links.link import Address
@@ -15,13 +15,15 @@ from tacpipe.live.alarms import NAMES
 from tacpipe.live.options import OWN, Options
 from tacpipe.live.supervisor import Supervisor
 from tacpipe.live.tap import Tap
-from tacpipe.printable import excerpt
+from tacpipe.printable import excerpt, listed
 from tacpipe.recording import rig as rigs
 from tacpipe.recording import rig_text
 from tacpipe.recording.recorder import Recorder
 from tacpipe.recording.rig import Rig, Stream
 from tacpipe.sensors.plan import NAME as PLAN
 
+ANSWERS = {"forecast": "forecasts", "material": "materials named", "touch": "rankings"}  # by kind of message
+RIG = "rig"  # scheme of a plan from one of the rig's own streams
 MEASURED = "measured"  # in the place of an address: the recorded motion is taken to continue
 SWITCH_S = 0.0005  # that one thread may hold up another: the threads that read must not wait 5 ms for the view
 
@@ -33,44 +35,81 @@ class Described:
     channels: tuple[str, ...]
     horizon: int
     unit: str
+    task: ClassVar[str] = "forward"
+
+    def own(self, steps: Sequence[int]) -> dict[str, Mapping[str, Any]]:
+        """Return the session's own streams, with the options of the sensor ``live``."""
+        forecast = {"output": "forecast", "channels": list(self.channels), "steps": list(steps), "unit": self.unit}
+        return {
+            "forecast": forecast,
+            "alarm": {"output": "alarm", "alarms": list(NAMES)},
+            "latency": {"output": "latency"},
+        }
+
+
+@dataclass(frozen=True)
+class Surfaces:
+    """The materials that the model names."""
+
+    names: tuple[str, ...]
+    task: ClassVar[str] = "material"
+
+    def own(self, steps: Sequence[int]) -> dict[str, Mapping[str, Any]]:
+        """Return the session's own streams, with the options of the sensor ``live``."""
+        return {"material": {"output": "material", "channels": list(self.names)}, "latency": {"output": "latency"}}
 
 
 def with_plan(rig: Rig, plan: str) -> Rig:
-    """Return a rig with a stream of plans that come from an address; with ``measured``, or its own, as it is.
+    """Return a rig with a stream of plans that come from an address; with ``measured``, or one of the rig's own, as it is.
 
-    Raises `UsageError` for what is no address, and where the rig has a stream of that name.
+    Raises `UsageError` for what is no address, and where the rig has a stream of that name, or lacks that which is named.
     """
-    if plan == MEASURED:
+    if plan == MEASURED or targets_of(rig, plan):
         return rig
     if PLAN in rig.streams:
         raise UsageError(f"The rig file has a stream {PLAN} already; leave --plan out, and its plans are read.")
     scheme, colon, place = plan.partition(":")
     if scheme not in ("udp", "ws") or not colon or not place:
         raise UsageError(
-            f"--plan {excerpt(plan)} is not a source of plans; give {MEASURED}, udp::PORT or ws:HOST:PORT."
+            f"--plan {excerpt(plan)} is not a source of plans; give {MEASURED}, udp::PORT, ws:HOST:PORT or rig:STREAM."
         )
     stream = Stream(PLAN, "plan", rigs.make("plan", {}, "--plan"), Address(scheme, place))
     return replace(rig, streams={**rig.streams, PLAN: stream})
 
 
-def with_own(rig: Rig, about: Described, steps: Sequence[int]) -> Rig:
-    """Return a rig with the streams ``forecast``, ``alarm`` and ``latency``, at ports of this computer that are free.
+@dataclass(frozen=True)
+class Grasped:
+    """What the model predicts of a grasp."""
+
+    columns: tuple[str, ...]
+    task: ClassVar[str] = "touch"
+
+    def own(self, steps: Sequence[int]) -> dict[str, Mapping[str, Any]]:
+        """Return the session's own streams, with the options of the sensor ``live``."""
+        return {"touch": {"output": "touch", "channels": list(self.columns)}, "latency": {"output": "latency"}}
+
+
+def targets_of(rig: Rig, plan: str) -> str:
+    """Return the stream that ``rig:STREAM`` names, empty for any other source. Raises `UsageError` where there is none."""
+    scheme, _, stream = plan.partition(":")
+    if scheme != RIG:
+        return ""
+    if stream not in rig.streams:
+        raise UsageError(
+            f"--plan {excerpt(plan)}: the rig has no stream {excerpt(stream)}; it has {listed(rig.streams)}."
+        )
+    return stream
+
+
+def with_own(rig: Rig, about: Described | Surfaces | Grasped, steps: Sequence[int]) -> Rig:
+    """Return a rig with the session's own streams, as ``forecast`` and ``latency``, at free ports of this computer.
 
     Raises `UsageError` where it has streams of these names, and for forecasts too large for a packet.
     """
     taken = [name for name in OWN if name in rig.streams]
     if taken:
         raise UsageError(f"The rig file has a stream {taken[0]}, as a live session adds itself; give it another name.")
-    options: dict[str, Mapping[str, Any]] = {
-        "forecast": {
-            "output": "forecast",
-            "channels": list(about.channels),
-            "steps": list(steps),
-            "unit": about.unit,
-        },
-        "alarm": {"output": "alarm", "alarms": list(NAMES)},
-        "latency": {"output": "latency"},
-    }
+    options = about.own(steps)
     added = {
         name: Stream(name, "live", rigs.make("live", found, "live"), Address("udp", f"127.0.0.1:{port}"), found)
         for (name, found), port in zip(options.items(), free_ports(len(options)), strict=True)
@@ -108,19 +147,20 @@ def running(recorder: Recorder, options: Options, ended: Callable[[], bool]) -> 
 def lines(figures: Mapping[str, Any]) -> list[str]:
     """Return what a session did so far in words.
 
-    >>> lines({"forecasts": 9, "skipped": 1, "restarts": 0, "alarms": {"load": "off", "slip": "unknown"},
+    >>> lines({"forecasts": 9, "skipped": 1, "restarts": 0, "states": {"load": "off", "slip": "unknown"},
     ...     "cause": "", "latency": {"count": 9, "p50_ms": 4.2, "p99_ms": 6.0, "max_ms": 6.5}})
-    ['forecasts 9, skipped 1; latency median 4.2 ms, 99 % 6.0 ms, largest 6.5 ms; alarms: load off, slip unknown']
+    ['forecasts 9, skipped 1; latency median 4.2 ms, 99 % 6.0 ms, largest 6.5 ms; load off, slip unknown']
     """
     latency = figures.get("latency") or {}
-    parts = [f"forecasts {figures.get('forecasts', 0)}, skipped {figures.get('skipped', 0)}"]
+    kind = figures.get("kind", "forecast")
+    parts = [f"{ANSWERS.get(kind, kind)} {figures.get('forecasts', 0)}, skipped {figures.get('skipped', 0)}"]
     if latency.get("count"):
         parts.append(
             f"latency median {latency['p50_ms']:.1f} ms, 99 % {latency['p99_ms']:.1f} ms, "
             f"largest {latency['max_ms']:.1f} ms"
         )
-    alarms = ", ".join(f"{name} {state}" for name, state in figures.get("alarms", {}).items())
-    parts += [f"alarms: {alarms}"] if alarms else []
+    states = ", ".join(f"{name} {state}" for name, state in figures.get("states", {}).items())
+    parts += [states] if states else []
     for name, what in (
         ("late", "samples late"),
         ("dropped", "messages not taken by subscribers"),
@@ -129,4 +169,4 @@ def lines(figures: Mapping[str, Any]) -> list[str]:
     ):
         parts += [f"{figures[name]} {what}"] if figures.get(name) else []
     found = ["; ".join(parts)]
-    return [*found, f"forecast: {figures['cause']}"] if figures.get("cause") else found
+    return [*found, f"{kind}: {figures['cause']}"] if figures.get("cause") else found

@@ -179,6 +179,13 @@ class Layout:
             found[channels] = values[stream][columns]
         return found
 
+    def levels(self, rest: Sequence[float]) -> dict[str, Floats]:
+        """Return levels of channels (channel,) as columns of the streams they are in, (column,), NaN where there is none."""
+        found = {name: np.full(reading.width, np.nan) for name, reading in self.readings.items()}
+        for stream, (columns, channels) in self.tactile_of.items():
+            found[stream][columns] = np.asarray(rest)[channels]
+        return found
+
     def placed(self, values: Mapping[str, Floats]) -> tuple[Floats, Floats, Floats | None, Floats | None]:
         """Return position (3,) in m, quaternion (4,), and joint angles and speeds (7,) or None, of a row."""
         position, quaternion = np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])

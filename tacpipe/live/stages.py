@@ -12,6 +12,42 @@ from tacpipe.plugins import params, registry
 SYNCHRONIZE, CONTACTS, COMPRESS = "synchronize", "segment.contacts", "compress."
 
 
+SLIDES = "segment.slides"
+
+
+def slide_params(steps: Sequence[Mapping[str, Any]]) -> Any:
+    """Return the params of `segment slides` that a model of materials was trained behind.
+
+    Raises `UsageError` where that stage has another version now, `TacpipeError` where the model was trained behind others.
+    """
+    names = [step["stage"] for step in steps]
+    if names != [SLIDES]:
+        found = ", ".join(f"`tacpipe {name.replace('.', ' ')}`" for name in names) or "no stage"
+        raise TacpipeError(
+            f"The model was trained behind {found}; live, a slide is cut out by `tacpipe segment slides` alone. Train it "
+            f"on recordings that went through that stage."
+        )
+    params_found = _params(steps[0])
+    if params_found.trigger == "load" and params_found.rest != "start":
+        raise TacpipeError(
+            f"The model was trained with `segment slides --rest {params_found.rest}`, which looks for the rest in the whole "
+            f"recording; samples as they arrive have the rest at their start. Train it with --rest start."
+        )
+    return params_found
+
+
+def _params(step: Mapping[str, Any]) -> Any:
+    """Return the params of a stage of a chain. Raises `UsageError` where it has another version now."""
+    name = step["stage"]
+    stage = registry.load(name)
+    if stage.version != step["version"]:
+        raise UsageError(
+            f"The model was trained behind version {step['version']} of {name}; this tacpipe has version "
+            f"{stage.version}. Train it again."
+        )
+    return params.from_json(stage, step["params"])
+
+
 class CausalStages(NamedTuple):
     """The params of the stages that a model's rows went through; its codec is among its files."""
 
@@ -37,13 +73,7 @@ def causal_stages(steps: Sequence[Mapping[str, Any]]) -> CausalStages:
                 f"The model was trained behind `tacpipe {name.replace('.', ' ')}`, which has no rule for samples as they "
                 f"arrive. Train one behind synchronize, segment contacts and, if you like, compress."
             )
-        stage = registry.load(name)
-        if stage.version != step["version"]:
-            raise UsageError(
-                f"The model was trained behind version {step['version']} of {name}; this tacpipe has version "
-                f"{stage.version}. Train it again."
-            )
-        found[name] = params.from_json(stage, step["params"])
+        found[name] = _params(step)
     missing = [name for name in (SYNCHRONIZE, CONTACTS) if name not in found]
     if missing:
         raise TacpipeError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import socket
 import subprocess
@@ -22,7 +23,7 @@ MODULE = "tacpipe.live.process"  # that runs as the model's process
 AGAIN_S = (0.5, 10.0)  # from its end to the next start: first, and at most
 STOP_S = 5.0  # that it has to end, which closes what it publishes
 LOOK_S = 0.05
-NOTED = "forecast"  # stream that notes of the process are on
+NOTED = {"forward": "forecast"}  # task to the stream that notes of the process are on; of others that of their name
 DIED, RESTARTED = "model_died", "model_restarted"  # notes in the recording
 
 
@@ -31,6 +32,7 @@ class Supervisor:
 
     def __init__(self, options: Options, tap: Tap) -> None:
         self.options, self.tap = options, tap
+        self._noted = NOTED.get(options.task, options.task)
         self.report: dict[str, Any] = {}  # the last one of the process that runs
         self.alarms: dict[str, Any] = {}  # their levels
         self.deaths = 0
@@ -40,6 +42,7 @@ class Supervisor:
         self._socket: socket.socket | None = None
         self._lines = wire.Lines()
         self._offset_ns: int | None = None  # of the recording that runs
+        self._beginning: dict[str, Any] | None = None  # of its chain, for a process that continues it
         self._again_s = AGAIN_S[0]
         self._due_s = 0.0
         self._refusal: tuple[str, int] | None = None
@@ -71,6 +74,7 @@ class Supervisor:
     def begin(self, clock: Mapping[str, int]) -> None:
         """Begin a recording, whose UTC is the monotonic clock and a constant."""
         self._offset_ns = clock["utc_ns"] - clock["monotonic_ns"]
+        self._beginning = None
         self.tap.note(Note(clock["monotonic_ns"], "", wire.BEGIN, str(self._offset_ns)))
 
     def end(self) -> None:
@@ -89,11 +93,11 @@ class Supervisor:
             self._forget()
             self._due_s = clock.now_s() + self._again_s
             self._again_s = min(2 * self._again_s, AGAIN_S[1])
-            notes.append(Note(clock.now_ns(), NOTED, DIED, f"exit code {code}; it is started anew"))
+            notes.append(Note(clock.now_ns(), self._noted, DIED, f"exit code {code}; it is started anew"))
         if self._process is None and clock.now_s() >= self._due_s:
             with contextlib.suppress(OSError):  # of a computer without memory for it: tried again
                 self._spawn()
-                notes.append(Note(clock.now_ns(), NOTED, RESTARTED, f"restart {self.deaths} of this session"))
+                notes.append(Note(clock.now_ns(), self._noted, RESTARTED, f"restart {self.deaths} of this session"))
         return notes
 
     def stop(self) -> None:
@@ -136,6 +140,8 @@ class Supervisor:
         ours.sendall(self.options.to_json().encode())
         ours.setblocking(False)
         first = [] if self._offset_ns is None else [Note(clock.now_ns(), "", wire.BEGIN, str(self._offset_ns))]
+        if first and self._beginning is not None:
+            first.insert(0, Note(clock.now_ns(), "", wire.CONTINUE, json.dumps(self._beginning)))
         self.tap.connect(ours, *first)
         if first:
             self.tap.begun()
@@ -164,6 +170,9 @@ class Supervisor:
                     self.ready, self.alarms = True, content["ready"]["alarms"]
                 elif "refused" in content:
                     self._refusal = content["refused"], content["exit_code"]
+                elif "beginning" in content:
+                    if content["offset_ns"] == self._offset_ns:  # else it is that of the recording before
+                        self._beginning = content["beginning"]
                 elif "report" in content:
                     self.report = content["report"]
                     self._again_s = AGAIN_S[0]

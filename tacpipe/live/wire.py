@@ -13,6 +13,7 @@ from tacpipe.sensors.framing import Chunks
 
 CLOCK = "clock"  # a note on all streams: what is added to the monotonic clock to have the recording's UTC, ns
 BEGIN = "begin"  # a recording begins: what its streams give follows behind a note of each
+CONTINUE = "continue"  # before the next BEGIN: grid and level at rest of a process that ended, which it continues
 END = "end"  # the recording ends
 OVERFLOW = "overflow"  # blocks were thrown away, because the model's process did not fetch them
 STOP = "stop"  # the session is over

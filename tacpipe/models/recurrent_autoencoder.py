@@ -53,6 +53,7 @@ class RecurrentAutoencoder(nn.Module):
     """Header, LSTM, latents, classifier, and the decoder's LSTM and header."""
 
     ROWS = _ROWS
+    ANY_LENGTH = True  # reads slides of any number of frames
 
     def __init__(self, shape: Shape) -> None:
         super().__init__()
@@ -93,6 +94,7 @@ class RecurrentClassifier(nn.Module):
     """The paper's X-LSTM: header, LSTM, and a linear layer that classifies its last state, which are its latents."""
 
     ROWS = _ROWS
+    ANY_LENGTH = True
 
     def __init__(self, shape: Shape) -> None:
         super().__init__()

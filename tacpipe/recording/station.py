@@ -23,7 +23,7 @@ from tacpipe.sensors.sensor import Sensor
 
 TALKING = ("udp", "tcp+udp")
 OPENED, LOST, OVERRUN = "opened", "lost", "overrun"
-BEGAN = "began"  # for listeners: what follows is part of the recording
+BEGAN, OVER = "began", "over"  # for listeners: what comes between is part of the recording
 FOREIGN = "foreign"  # packets of other senders than the one that counts
 FOREIGN_S = 1.0  # between two notes of such
 STALLED, CAUGHT_UP = (
@@ -98,9 +98,10 @@ class Station:
             return found
 
     def end(self) -> list[Chunks | Note]:
-        """Return what came since the last call, and state no tally any more."""
+        """Return what came since the last call, and state no tally any more. The listener gets the note `OVER`."""
         with self._keeping:
             self._tally = None
+            self._inform(Note(clock.now_ns(), self.stream.name, OVER))
             self._note_foreign(self._link)
             return self._taken()
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from tacpipe.arrays import Bools, Bytes, Float32s
+from tacpipe.arrays import Bools, Bytes, Float32s, Floats
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.sensors.framing import Framer
 from tacpipe.sensors.packet_framer import PacketFramer
@@ -54,7 +54,8 @@ STATE = np.dtype(
     + [("motion_mode", "u1"), ("control_mode", "u1"), ("errors", "u1", FLAGS), ("last_errors", "u1", FLAGS)]
     + [("robot_mode", "u1"), ("success_rate", "<f4")]
 )
-READ = ("O_T_EE", "q", "dq", "tau_J", "tau_ext_hat_filtered", "O_F_ext_hat_K", "success_rate")  # of the floats
+MEASURED, AIMED = "O_T_EE", "O_T_EE_d"  # poses
+READ = (MEASURED, "q", "dq", "tau_J", "tau_ext_hat_filtered", "O_F_ext_hat_K", "success_rate")  # of the floats
 MODES = ("robot_mode", "motion_mode", "control_mode")
 ERRORS = ("errors", "last_errors")
 
@@ -71,6 +72,7 @@ class Franka(Sensor):
         "program that moves it must send its state to a tap itself."
     )
 
+    targets: bool = False  # the pose that the controller aims at (O_T_EE_d) is recorded too
     rate_hz: float = RATE_HZ  # fixed
 
     def __post_init__(self) -> None:
@@ -79,6 +81,8 @@ class Franka(Sensor):
 
     def fields(self) -> list[pa.Field]:
         """Return pose of the end effector, angles, velocities, torques, external torques, external load, modes, errors.
+
+        With ``targets`` the pose that the controller aims at stands behind the load.
 
         Floats are widened to the float64 that arms have elsewhere; the load is that on the stiffness frame, in the frame
         of the base; errors are a bit each, in the order of the interface.
@@ -100,6 +104,7 @@ class Franka(Sensor):
             *schema.joint_torque_fields(JOINTS),
             *external,
             *schema.wrench_fields(),
+            *(schema.target_pose_fields() if self.targets else []),
             pa.field("success_rate", pa.float32(), metadata={"unit": "1", "quantity": "share"}),
             *(pa.field(name, pa.uint8(), metadata=status) for name in MODES),
             *(pa.field(name, pa.uint64(), metadata=status) for name in ERRORS),
@@ -107,17 +112,18 @@ class Franka(Sensor):
 
     def framer(self) -> Framer:
         """Return a framer that takes packets of a state's size whose numbers are finite, and whose pose is one."""
-        return PacketFramer([STATE.itemsize], _is_state)
+        poses = (MEASURED, AIMED) if self.targets else (MEASURED,)
+        return PacketFramer([STATE.itemsize], lambda packets: _are_states(packets, *poses))
 
     def decode(self, frames: Bytes) -> Samples:
         """Return the samples of states, with their count of milliseconds for time and counter."""
         states = np.ascontiguousarray(frames).view(STATE)[:, 0]
-        pose = _matrices(states).astype(np.float64)
         floats = [states[name].astype(np.float64) for name in READ[1:-1]]
+        floats += [_poses(states, AIMED)] if self.targets else []
         count_ms = states["message_id"].astype(np.int64)
         return Samples(
             (
-                np.hstack([pose[:, :3, 3], rotations.quaternions_of(pose[:, :3, :3]), *floats]),
+                np.hstack([_poses(states, MEASURED), *floats]),
                 states["success_rate"][:, None].astype(np.float32),
                 np.column_stack([states[name] for name in MODES]),
                 np.column_stack([_packed(states[name]) for name in ERRORS]),
@@ -132,9 +138,9 @@ class Franka(Sensor):
         assert samples.seq is not None
         states = np.zeros(len(samples), STATE)
         states["message_id"] = samples.seq
-        pose = np.zeros((len(samples), 4, 4))
-        pose[:, :3, :3], pose[:, :3, 3], pose[:, 3, 3] = rotations.matrices_of(floats[:, 3:7]), floats[:, :3], 1
-        states["O_T_EE"] = pose.transpose(0, 2, 1).reshape(-1, POSE)
+        states[MEASURED] = _flat(floats[:, :7])
+        if self.targets:
+            states[AIMED] = _flat(floats[:, -7:])
         place = 7
         for name in READ[1:-1]:
             states[name] = floats[:, place : place + FLOATS[name]]
@@ -203,10 +209,23 @@ def whole(data: bytes) -> int:
     return size if len(data) >= size else 0
 
 
-def _matrices(states: NDArray[np.void]) -> Float32s:
-    """Return the pose of the end effector in the base's frame as matrices (frame, 4, 4)."""
-    poses: Float32s = states["O_T_EE"].reshape(-1, 4, 4).transpose(0, 2, 1)
+def _matrices(states: NDArray[np.void], name: str) -> Float32s:
+    """Return a pose of the end effector in the base's frame as matrices (frame, 4, 4)."""
+    poses: Float32s = states[name].reshape(-1, 4, 4).transpose(0, 2, 1)
     return poses
+
+
+def _poses(states: NDArray[np.void], name: str) -> Floats:
+    """Return a pose of the end effector as position and quaternion (frame, 7)."""
+    pose = _matrices(states, name).astype(np.float64)
+    return np.hstack([pose[:, :3, 3], rotations.quaternions_of(pose[:, :3, :3])])
+
+
+def _flat(poses: Floats) -> Floats:
+    """Return positions with quaternions (frame, 7) as matrices, column after column (frame, 16)."""
+    matrices = np.zeros((len(poses), 4, 4))
+    matrices[:, :3, :3], matrices[:, :3, 3], matrices[:, 3, 3] = rotations.matrices_of(poses[:, 3:]), poses[:, :3], 1
+    return matrices.transpose(0, 2, 1).reshape(-1, POSE)
 
 
 def _packed(flags: NDArray[np.uint8]) -> NDArray[np.uint64]:
@@ -215,10 +234,13 @@ def _packed(flags: NDArray[np.uint8]) -> NDArray[np.uint64]:
     return packed
 
 
-def _is_state(frames: Bytes) -> Bools:
+def _are_states(frames: Bytes, *poses: str) -> Bools:
+    """Return which packets (frame,) hold finite numbers, and poses that are such in these fields."""
     states = np.ascontiguousarray(frames).view(STATE)[:, 0]
     good = np.ones(len(states), dtype=bool)
-    for name in READ:
+    for name in {*READ, *poses}:
         good &= np.isfinite(states[name]).reshape(len(states), -1).all(axis=1)
-    last = np.where(good[:, None], _matrices(states)[:, 3], 0)
-    return good & (np.abs(last - (0, 0, 0, 1)) <= AFFINE).all(axis=1)
+    for name in poses:
+        last = np.where(good[:, None], _matrices(states, name)[:, 3], 0)
+        good &= (np.abs(last - (0, 0, 0, 1)) <= AFFINE).all(axis=1)
+    return good

@@ -196,11 +196,7 @@ def _fields(name: str) -> list[pa.Field]:
     if name == "RIst":
         return schema.pose_fields()
     if name == "RSol":
-        return [
-            schema.float_field(f"target_{field.name}", field.metadata[b"unit"].decode(), f"target_{kind}", part)
-            for field in schema.pose_fields()
-            for kind, part in [(field.name.split("_")[0], field.name.split("_")[1])]
-        ]
+        return schema.target_pose_fields()
     if name == "AIPos":
         return schema.joint_fields(len(AXES))[0]
     if name == "ASPos":

@@ -1,8 +1,10 @@
 """What `tacpipe live` publishes, as a stream of a rig: its forecasts, its alarms, or how long they took.
 
-A packet is ``tacL``, the version, what it holds (0 forecast, 1 alarm, 2 latency), a counter of 32 bits and the time of the
-grid point in UTC ns, and then numbers, all little-endian: of a forecast float32 by step and channel, of alarms a state and a
-score each, of latencies the numbers of `LATENCY`. So a session's forecasts are recorded like any sensor, by any computer.
+A packet is ``tacL``, the version, what it holds (0 forecast, 1 alarm, 2 latency, 3 material, 4 touch), a counter of 32 bits
+and the time of the grid point in UTC ns, and then numbers, all little-endian: of a forecast float32 by step and channel, of
+alarms a state and a score each, of latencies the numbers of `LATENCY`, of materials those of `SLIDE` and a probability each,
+of a grasp's touch `ORDER`, `WORTH` and the predicted values. So what a session publishes is recorded like any sensor, by any
+computer.
 """
 
 from __future__ import annotations
@@ -21,10 +23,10 @@ from tacpipe.sensors.sensor import Samples, Sensor
 if TYPE_CHECKING:
     import pyarrow as pa
 
-Output = Literal["forecast", "alarm", "latency"]
+Output = Literal["forecast", "alarm", "latency", "material", "touch"]
 
 MAGIC, VERSION = b"tacL", 1
-KINDS: dict[str, int] = {"forecast": 0, "alarm": 1, "latency": 2}
+KINDS: dict[str, int] = {"forecast": 0, "alarm": 1, "latency": 2, "material": 3, "touch": 4}
 HEAD = np.dtype([("magic", "S4"), ("version", "u1"), ("kind", "u1"), ("rest", "<u2"), ("seq", "<u4"), ("t_ns", "<i8")])
 UNKNOWN, OFF, ON = -1, 0, 1  # states of an alarm
 MOST = 60_000  # bytes of a packet
@@ -36,20 +38,29 @@ LATENCY = {  # column to unit
     "skipped": "1",  # grid points so far whose forecast was left out under overload
     "late": "1",  # samples so far that came after the row that they belong to
 }
+ORDER = ("request", "grasp", "rank")  # of a touch, 1 for the best of a request
+WORTH = ("score", "level_th", "level_mf")  # of a touch
+SLIDE = {  # column to unit
+    "class": "1",  # number of the material among those of the model, from 0; -1: unknown
+    "rows": "1",  # rows of the slide so far
+    "seen": "1",  # of the rows that the model reads, the fraction that has come
+    "ended": "1",  # whether the slide is over
+}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Live(Sensor):
     """One of the outputs of a live session."""
 
-    summary: ClassVar[str] = "Forecasts, alarms or latencies that `tacpipe live` publishes by UDP."
+    summary: ClassVar[str] = "Forecasts, alarms, materials, rankings or latencies that `tacpipe live` publishes by UDP."
     links: ClassVar[tuple[str, ...]] = ("udp",)
     listens: ClassVar[bool] = True
     steady: ClassVar[bool] = False
     counter: ClassVar[int | None] = 1 << 32
 
-    output: Output = "latency"  # what the packets hold: forecast, alarm or latency
-    channels: tuple[str, ...] = ()  # of a forecast: the predicted channels
+    output: Output = "latency"  # what the packets hold: forecast, alarm, latency, material or touch
+    # of a forecast and of touch: what is predicted; of materials: their names
+    channels: tuple[str, ...] = ()
     steps: tuple[int, ...] = ()  # of a forecast: how many rows ahead
     unit: str = "count"  # of the channels
     alarms: tuple[str, ...] = ()  # of alarms: their names
@@ -60,9 +71,11 @@ class Live(Sensor):
             "forecast": not (self.channels and self.steps),
             "alarm": not self.alarms,
             "latency": False,
+            "material": not self.channels,
+            "touch": not self.channels,
         }
         if missing[self.output]:
-            needed = "channels and steps" if self.output == "forecast" else "alarms"
+            needed = {"forecast": "channels and steps", "alarm": "alarms"}.get(self.output, "channels")
             raise UsageError(f"live: a stream of the output {self.output} needs {needed}.")
         if self.size > MOST:
             raise UsageError(
@@ -81,11 +94,15 @@ class Live(Sensor):
             "forecast": [("values", "<f4", (len(self.channels) * len(self.steps),))],
             "alarm": [("state", "i1", (len(self.alarms),)), ("score", "<f4", (len(self.alarms),))],
             "latency": [("values", "<f4", (len(LATENCY),))],
+            "touch": [("order", "<i8", (len(ORDER),)), ("values", "<f4", (len(WORTH) + len(self.channels),))],
+            "material": [("slide", "<f4", (len(SLIDE),)), ("probability", "<f4", (len(self.channels),))],
         }
         return np.zeros(count, dtype=parts[self.output])
 
     def fields(self) -> list[pa.Field]:
-        """Return a field for each step and channel, for state and score of each alarm, or for each of `LATENCY`."""
+        """Return a field for each step and channel, for state and score of each alarm, for each of `LATENCY`, or for each of
+        `SLIDE` and the probability of each material.
+        """
         import pyarrow as pa
 
         if self.output == "latency":
@@ -97,6 +114,19 @@ class Live(Sensor):
             about = {"unit": "1", "quantity": "alarm"}
             states = [pa.field(f"{name}_state", pa.int8(), metadata=about) for name in self.alarms]
             return states + [pa.field(f"{name}_score", pa.float32(), metadata=about) for name in self.alarms]
+        if self.output == "touch":
+            about = {"unit": "1", "quantity": "prediction"}
+            order = [pa.field(name, pa.int64(), metadata=about) for name in ORDER]
+            worth = [pa.field(name, pa.float32(), metadata=about) for name in WORTH]
+            touch = [pa.field(name, pa.float32(), metadata={**about, "unit": self.unit}) for name in self.channels]
+            return [*order, *worth, *touch]
+        if self.output == "material":
+            about = {"unit": "1", "quantity": "material"}
+            slide = [pa.field(name, pa.float32(), metadata=about) for name in SLIDE]
+            return slide + [
+                pa.field(f"probability_{name}", pa.float32(), metadata={**about, "material": name})
+                for name in self.channels
+            ]
         return [
             pa.field(
                 f"{channel}_t{step}",

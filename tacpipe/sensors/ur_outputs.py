@@ -25,12 +25,13 @@ WIRE = {  # type to numpy's and how many
     "VECTOR6INT32": (">i4", 6),
     "VECTOR6UINT32": (">u4", 6),
 }
-POSE = "actual_TCP_pose"  # x, y, z in metres and a rotation vector in rad
+POSE, TARGET_POSE = "actual_TCP_pose", "target_TCP_pose"  # x, y, z in metres and a rotation vector in rad
+POSES = (POSE, TARGET_POSE)
 TYPES = {
     **dict.fromkeys(("target_q", "target_qd", "target_qdd", "target_current", "target_moment"), "VECTOR6D"),
     **dict.fromkeys(("actual_q", "actual_qd", "actual_current", "actual_current_window"), "VECTOR6D"),
     **dict.fromkeys(("joint_control_output", "joint_temperatures", "actual_joint_voltage"), "VECTOR6D"),
-    **dict.fromkeys((POSE, "actual_TCP_speed", "actual_TCP_force", "target_TCP_pose", "target_TCP_speed"), "VECTOR6D"),
+    **dict.fromkeys((POSE, "actual_TCP_speed", "actual_TCP_force", TARGET_POSE, "target_TCP_speed"), "VECTOR6D"),
     **dict.fromkeys(("ft_raw_wrench", "payload_inertia"), "VECTOR6D"),
     **dict.fromkeys(("actual_tool_accelerometer", "elbow_position", "elbow_velocity", "payload_cog"), "VECTOR3D"),
     **dict.fromkeys(("actual_digital_input_bits", "actual_digital_output_bits"), "UINT64"),
@@ -89,6 +90,8 @@ def fields_of(output: str) -> list[pa.Field]:
 
     if output == POSE:
         return schema.pose_fields()
+    if output == TARGET_POSE:
+        return schema.target_pose_fields()
     if output == "actual_TCP_force":
         return schema.wrench_fields()
     if output == "actual_TCP_speed":

@@ -64,6 +64,13 @@ class Grid:
         self._until_ns: int | None = None  # up to which rows were made
         self.late = dict.fromkeys(streams, 0)  # samples that came after the rows that they would have changed
 
+    def continue_from(self, stream: str, levels: AnyFloats) -> None:
+        """Take the first sample of a stream to have wrapped around as often as is nearest to ``levels`` (column,).
+
+        For a grid that continues a session, in which counts may have run over their end before.
+        """
+        self._sources[stream].levels = levels
+
     @property
     def waiting(self) -> tuple[str, ...]:
         """The streams of which no sample has come."""
@@ -151,6 +158,7 @@ class _Source:
         self._start = self._stop = 0  # of what the buffers hold
         self._before: AnyFloats | None = None  # (column,), the sample before, as it came
         self._turned: Int64s = np.zeros(len(self._wraps), np.int64)
+        self.levels: AnyFloats | None = None  # (column,), that the first sample is nearest to; None: as it comes
 
     def push(self, t_ns: Times, values: AnyFloats) -> None:
         """Take samples whose stamps do not run backwards."""
@@ -159,6 +167,9 @@ class _Source:
         self._reserve(len(t_ns))
         some = slice(self._stop, self._stop + len(t_ns))
         self._t_ns[some], self._values[some] = t_ns, values
+        if self._before is None and self.levels is not None:
+            apart = (self.levels - values[0])[self._wraps]
+            self._turned = np.where(np.isfinite(apart), np.rint(apart / RANGE), 0).astype(np.int64)
         if len(self._wraps):
             turned = self._turned + np.cumsum(turns(both[:, self._wraps]), axis=0)
             self._values[some, self._wraps] += RANGE * turned

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from tacpipe.io.columns import Columns
 
 # quantities of streams that are no signals: times alone, and what a live session records of itself
-OF_SESSIONS = ("time", "plan", "prediction", "latency", "alarm")
+OF_SESSIONS = ("time", "plan", "prediction", "latency", "alarm", "material")
 
 
 @dataclass(frozen=True)

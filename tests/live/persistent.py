@@ -19,7 +19,7 @@ import pytest
 from tacpipe.errors import UsageError
 from tacpipe.live import process, supervisor
 from tacpipe.live.alarms import Alarms
-from tacpipe.live.chain import Cause, Forecast
+from tacpipe.live.chain import Beginning, Cause, Forecast
 from tacpipe.live.engine import Engine
 from tacpipe.live.options import Options
 from tacpipe.live.session import Described
@@ -43,7 +43,7 @@ class Persistence:
     layout = tuple({"stream": "skin", "axis": name[-1], "taxel": name[10:12]} for name in CHANNELS)
     unit = "count"
 
-    def __init__(self, layouts: Mapping[str, Any]) -> None:
+    def __init__(self, layouts: Mapping[str, Any], beginning: Beginning | None = None) -> None:
         if "skin" not in layouts:
             raise UsageError(f"The model reads the stream skin, and the rig has {', '.join(layouts)}.")
         names = set(layouts["skin"].names)
@@ -51,6 +51,7 @@ class Persistence:
             raise UsageError("The model reads 16 taxels of the stream skin, and the rig's skin has another layout.")
         self.late = {"skin": 0}
         self._samples: list[tuple[int, Any]] = []
+        self.beginning = beginning
         self._next_ns: int | None = None
         self._passed_ns = 0
 
@@ -63,7 +64,9 @@ class Persistence:
         self.late["skin"] += int((t_ns <= self._passed_ns).sum())
         self._samples += list(zip(t_ns.tolist(), values.astype(np.float32), strict=True))
         if self._next_ns is None and len(t_ns):
-            self._next_ns = int(t_ns[0])
+            self.beginning = self.beginning or Beginning(int(t_ns[0]), ())
+            since_ns = int(t_ns[0]) - self.beginning.origin_ns
+            self._next_ns = self.beginning.origin_ns + -(-since_ns // PERIOD_NS) * PERIOD_NS
 
     def advance(self, t_ns: int, *, newest_only: bool = False) -> list[Forecast]:
         """Return a forecast for each grid point, on request for the newest alone."""

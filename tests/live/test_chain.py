@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from collections.abc import Sequence
 from typing import Any
 
@@ -15,7 +16,7 @@ from hypothesis import strategies as st
 from tacpipe.codecs import tactile
 from tacpipe.codecs.frame_stacking import breaks
 from tacpipe.errors import TacpipeError
-from tacpipe.live.chain import BLOCKING, Cause, Chain, Forecast
+from tacpipe.live.chain import BLOCKING, Beginning, Cause, Chain, Forecast
 from tacpipe.tasks.forward import tracks
 from tacpipe.tasks.forward.forecaster import Forecaster
 from tacpipe.tasks.forward.predictors import forecasts
@@ -239,3 +240,24 @@ def test_a_chain_that_continues_a_session_predicts_the_same_once_it_has_its_cont
     found = [one for one in second.advance(T0 + 2900 * MS) if one.count is not None]
     assert len(found) > 40 and found[0].t_ns < half_ns + 250 * MS
     assert same(found, [wanted[one.t_ns] for one in found])
+
+
+def test_counts_that_had_run_over_their_end_are_continued_at_the_turn_that_is_nearest_to_the_rest(
+    models: dict[str, Made],
+) -> None:
+    given = rigs.recording(21)  # whose counts run over 65,535 and back
+    wanted = {one.t_ns: one for one in rigs.whole(models["raw"], given)}
+    first = rigs.chain(models["raw"], given)
+    half_ns = T0 + 1400 * MS
+    for name, table in given.tables.items():
+        first.push(name, table.filter(rigs.until(table, half_ns)))
+    first.advance(half_ns)
+    schemas = {name: table.schema for name, table in given.tables.items()}
+    beginning = first.beginning
+    assert beginning is not None
+    assert Beginning.from_json(json.loads(json.dumps(beginning.to_json()))) == beginning
+    second = Chain.of(*models["raw"], schemas, beginning=beginning)
+    for name, table in given.tables.items():
+        second.push(name, table.slice(table.filter(rigs.until(table, half_ns)).num_rows))
+    found = [one for one in second.advance(T0 + 2900 * MS) if one.count is not None]
+    assert len(found) > 40 and same(found, [wanted[one.t_ns] for one in found])

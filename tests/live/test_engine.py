@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 
@@ -182,3 +184,21 @@ def test_after_the_recording_nothing_is_predicted_until_the_next_one_begins(sess
     session.begin()
     session.send(4, 5)
     assert len(session.at(4)) == 1
+
+
+def test_after_blocks_were_thrown_away_and_after_a_process_that_ended_the_grid_is_continued(session: Session) -> None:
+    session.send(0, 5)
+    session.at(4)
+    beginning = session.engine.chain.beginning
+    assert beginning is not None and beginning.origin_ns == START_NS + OFFSET_NS
+    session.engine.take("", Note(START_NS, "", wire.OVERFLOW))
+    assert session.engine.chain.beginning == beginning
+    other = Session()
+    other.engine.take("", Note(START_NS, "", wire.CONTINUE, json.dumps(beginning.to_json())))
+    other.begin()
+    late = START_NS + 7 * PERIOD_NS + PERIOD_NS // 3
+    other.engine.take("skin", Chunks.of([(late, other.packets[7])]))
+    (message,) = other.at(8)
+    assert message.t_ns == START_NS + OFFSET_NS + 8 * PERIOD_NS and message.values is not None
+    other.begin()  # another recording has a grid of its own
+    assert other.engine.chain.beginning is None

@@ -44,7 +44,7 @@ def decoded(sensor: Live, sent: bytes) -> tuple[list[list[float]], int, int]:
 
 def test_packets_hold_each_value_to_the_bit_with_number_and_time() -> None:
     sensor = Live(output="forecast", channels=CHANNELS, steps=(1, 2, 3))
-    sent = messages.packet(message(), sensor, 41)
+    (sent,) = messages.packets(message(), sensor, 41)
     assert sent is not None
     assert decoded(sensor, sent) == ([VALUES.ravel().tolist()], 41, 10**18)
     names = [field.name for field in sensor.fields()]
@@ -52,20 +52,20 @@ def test_packets_hold_each_value_to_the_bit_with_number_and_time() -> None:
 
 
 def test_alarms_and_latencies_have_packets_too_and_a_missing_forecast_has_none() -> None:
-    alarm = messages.packet(message(), Live(output="alarm", alarms=("load", "slip")), 3)
+    (alarm,) = messages.packets(message(), Live(output="alarm", alarms=("load", "slip")), 3)
     assert alarm is not None
     states, scores = decoded(Live(output="alarm", alarms=("load", "slip")), alarm)[0]
     assert states == [1, -1] and scores[0] == 2.5 and math.isnan(scores[1])
-    latency = messages.packet(message(None), Live(), 3)
+    (latency,) = messages.packets(message(None), Live(), 3)
     assert latency is not None
     assert dict(zip(LATENCY, decoded(Live(), latency)[0][0], strict=True)) == {
         **{"latency_ms": 3.25, "age_ms": 4.5, "compute_ms": 1.0, "cause": 4.0, "skipped": 2.0, "late": 1.0}
     }
-    assert messages.packet(message(None), Live(output="forecast", channels=CHANNELS, steps=(1, 2, 3)), 3) is None
+    assert messages.packets(message(None), Live(output="forecast", channels=CHANNELS, steps=(1, 2, 3)), 3) == []
 
 
 def test_packets_of_another_output_or_version_are_refused() -> None:
-    sent = messages.packet(message(), Live(output="alarm", alarms=("load", "slip")), 3)
+    (sent,) = messages.packets(message(), Live(output="alarm", alarms=("load", "slip")), 3)
     assert sent is not None
     other = sent[:4] + b"\x02" + sent[5:]
     for wrong in (other, sent[:-1], b"x" + sent[1:]):

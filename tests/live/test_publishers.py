@@ -14,6 +14,7 @@ import pytest
 
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.live import publishing
+from tacpipe.live.material_messages import SLIDING, MaterialDescription, MaterialMessage
 from tacpipe.live.messages import Description, Message
 from tacpipe.live.publishers.udp import UdpPublisher
 from tacpipe.live.publishers.websocket import BEHIND, QUEUED, WebsocketPublisher
@@ -159,3 +160,22 @@ def test_a_port_that_is_taken_is_refused_with_its_address() -> None:
         port = one.getsockname()[1]
         with pytest.raises(DeviceError, match=str(port)):
             publishing.publisher(f"ws:127.0.0.1:{port}", ABOUT)
+
+
+def test_an_mcap_file_of_materials_has_a_topic_and_a_schema_of_its_own(tmp_path: Path) -> None:
+    from mcap.reader import make_reader
+
+    path = tmp_path / "session.mcap"
+    about = MaterialDescription(("cork", "felt"), "biotac", 100, True, "order", 10.0, "models/material")
+    publisher = publishing.publisher(f"mcap:{path}", about)
+    publisher.publish(MaterialMessage(1, 7, ("cork", "felt"), np.array([0.25, 0.75], np.float32), SLIDING, 50, 0.5))
+    publisher.close()
+    with path.open("rb") as file:
+        found = [
+            (schema, channel.topic, json.loads(one.data)) for schema, channel, one in make_reader(file).iter_messages()
+        ]
+    assert [topic for _, topic, _ in found] == ["/description", "/material"]
+    schema, _, content = found[1]
+    assert schema is not None and schema.name == "tacpipe.Material"
+    assert set(content) == set(json.loads(schema.data)["properties"])
+    assert content["material"] == "felt" and content["probabilities"] == {"cork": 0.25, "felt": 0.75}

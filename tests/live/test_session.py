@@ -2,17 +2,7 @@
 
 from __future__ import annotations
 
-import json
-import os
-import signal
-import socket
-import subprocess
-import sys
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,6 +10,7 @@ import pytest
 from tacpipe.live.supervisor import DIED, RESTARTED
 from tests.conftest import Lab
 from tests.live.persistent import CHANNELS, HORIZON
+from tests.live.sessions import ended, forecasts, started, subscriber, whole
 from tests.recording import live, patient
 
 pytestmark = pytest.mark.rig
@@ -29,62 +20,6 @@ SKIN = live.stream("skin", "xela", "ws:127.0.0.1:5000", "{ rate_hz = 50 }")
 @pytest.fixture(autouse=True)
 def patience(monkeypatch: pytest.MonkeyPatch) -> None:
     patient.relax(monkeypatch)
-
-
-def started(lab: Lab, options: str, behaviour: str = "") -> subprocess.Popen[str]:
-    """Return ``tacpipe live`` with a model that predicts no change, running in a process of its own."""
-    words = [sys.executable, "-m", "tests.live.persistent", "live", "rig.toml", "--model", "none", *options.split()]
-    path = os.pathsep.join([str(live.ROOT), os.environ.get("PYTHONPATH", "")])
-    environment = {**os.environ, "PYTHONPATH": path, "BEHAVIOUR": behaviour}
-    return subprocess.Popen(
-        words, cwd=lab.folder, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    )
-
-
-def ended(process: subprocess.Popen[str], *, interrupt: bool = False) -> dict[str, Any]:
-    """Return what a session printed as JSON, once it is over."""
-    if interrupt:
-        process.send_signal(signal.SIGINT)
-    out, err = process.communicate()
-    assert process.returncode == 0, err
-    found: dict[str, Any] = json.loads(out)
-    return found
-
-
-@contextmanager
-def subscriber() -> Iterator[tuple[int, list[dict[str, Any]]]]:
-    """Yield the port of a subscriber, and the messages that it got so far."""
-    found: list[dict[str, Any]] = []
-    over = threading.Event()
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as port:
-        port.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 8 << 20)
-        port.bind(("127.0.0.1", 0))
-        port.settimeout(0.1)
-
-        def listen() -> None:
-            while not over.is_set():
-                try:
-                    found.append(json.loads(port.recv(1 << 16)))
-                except TimeoutError:
-                    continue
-
-        listening = threading.Thread(target=listen)
-        listening.start()
-        try:
-            yield port.getsockname()[1], found
-        finally:
-            over.set()
-            listening.join()
-
-
-def forecasts(messages: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    return [one for one in messages if one["kind"] == "forecast" and one["values"] is not None]
-
-
-def whole(shard: Any, name: str) -> bool:
-    """Return whether no sample of a stream was lost on its way into the recording."""
-    counts = shard.table(name).column("seq").to_numpy()
-    return bool((np.diff(counts) == 1).all()) and shard.attributes[f"{name}_lost"] == 0
 
 
 def test_what_is_published_is_recorded_to_the_bit_and_predicted_from_what_was_recorded(lab: Lab) -> None:

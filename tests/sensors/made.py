@@ -201,6 +201,7 @@ def _one_part_at_a_time(columns: Columns, sensor: Sensor) -> Columns:
 TEXT = "word"
 LIMITS: dict[str, Limits] = {  # of fields whose names begin so, where a device uses less than their type holds
     "biotac": {"": (0, 4095)},
+    "grasps": {"request": (0, 1 << 61), "grasp": (0, 0)},
     "plan": {"t_target": (0, 1 << 61)},
     "weiss-wts": {"": (0, 4095)},
     "franka": {"errors": (0, (1 << 41) - 1), "last_errors": (0, (1 << 41) - 1)},

@@ -1,4 +1,4 @@
-"""Messages into an MCAP file, as JSON that Foxglove plots: the topics ``/description`` and ``/forecast``.
+"""Messages into an MCAP file, as JSON that Foxglove plots: the topics ``/description`` and, of forecasts, ``/forecast``.
 
 A thread of its own writes: a disk may take its time.
 """
@@ -9,34 +9,18 @@ import json
 import queue
 import threading
 from pathlib import Path
-from typing import Any
 
 from tacpipe.errors import UsageError
-from tacpipe.live.messages import Description, Message, to_json
+from tacpipe.live.messages import About, Published, to_json
 from tacpipe.plugins import extras
 
 QUEUED = 500  # messages that wait for the disk: 10 s at 50 Hz
-SCHEMA: dict[str, Any] = {
-    "type": "object",
-    "properties": {
-        "version": {"type": "integer"},
-        "kind": {"type": "string"},
-        "seq": {"type": "integer"},
-        "t_ns": {"type": "integer"},
-        "values": {"type": "array", "items": {"type": "array", "items": {"type": "number"}}},
-        "cause": {"type": "string"},
-        "alarms": {"type": "object"},
-        "latency_ms": {"type": "number"},
-        "age_ms": {"type": "number"},
-        "skipped": {"type": "integer"},
-    },
-}
 
 
 class McapPublisher:
     """Writes a file that did not exist before."""
 
-    def __init__(self, place: str, about: Description) -> None:
+    def __init__(self, place: str, about: About) -> None:
         with extras.named("--publish mcap"):
             from mcap.writer import Writer
 
@@ -50,16 +34,19 @@ class McapPublisher:
         self.dropped = 0
         self._writer = Writer(self._file)
         self._writer.start(profile="", library="tacpipe")
-        schema = self._writer.register_schema("tacpipe.Forecast", "jsonschema", json.dumps(SCHEMA).encode())
-        self._topics = {
-            name: self._writer.register_channel(f"/{name}", "json", schema) for name in ("description", "forecast")
-        }
+        described = {"type": "object", "properties": about.schema()}
+        schema = self._writer.register_schema(
+            f"tacpipe.{about.kind.capitalize()}", "jsonschema", json.dumps(described).encode()
+        )
+        self._about_topic, self._topic = (
+            self._writer.register_channel(f"/{name}", "json", schema) for name in ("description", about.kind)
+        )
         self._about: bytes | None = to_json(about.to_dict())
-        self._waiting: queue.Queue[tuple[int, Message] | None] = queue.Queue(QUEUED)
+        self._waiting: queue.Queue[tuple[int, Published] | None] = queue.Queue(QUEUED)
         self._thread = threading.Thread(target=self._write, daemon=True)
         self._thread.start()
 
-    def publish(self, message: Message) -> None:
+    def publish(self, message: Published) -> None:
         """Have a message written, if the disk keeps up."""
         try:
             self._waiting.put_nowait((message.t_ns, message))
@@ -77,6 +64,6 @@ class McapPublisher:
         while (entry := self._waiting.get()) is not None:
             t_ns, message = entry
             if self._about is not None:
-                self._writer.add_message(self._topics["description"], t_ns, self._about, t_ns)
+                self._writer.add_message(self._about_topic, t_ns, self._about, t_ns)
                 self._about = None
-            self._writer.add_message(self._topics["forecast"], t_ns, to_json(message.to_dict()), t_ns)
+            self._writer.add_message(self._topic, t_ns, to_json(message.to_dict()), t_ns)

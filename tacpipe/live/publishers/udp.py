@@ -9,7 +9,7 @@ from urllib.parse import parse_qsl
 
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.links import network
-from tacpipe.live.messages import Description, Message, to_json
+from tacpipe.live.messages import About, Published, to_json
 from tacpipe.plugins import extras
 from tacpipe.printable import excerpt
 
@@ -21,7 +21,7 @@ FORMATS = ("json", "msgpack")
 class UdpPublisher:
     """Sends each message to one address."""
 
-    def __init__(self, place: str, about: Description) -> None:
+    def __init__(self, place: str, about: About) -> None:
         place, _, options = place.partition("?")
         found = dict(parse_qsl(options, keep_blank_values=True))
         kind = found.pop("format", "json")
@@ -40,7 +40,7 @@ class UdpPublisher:
         self._about = self._packed(about.to_dict())
         self._until_about = 0
 
-    def publish(self, message: Message) -> None:
+    def publish(self, message: Published) -> None:
         """Send a message; what the network does not take at once is dropped."""
         if not self._until_about:
             self._until_about = EVERY

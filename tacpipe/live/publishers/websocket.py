@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from tacpipe.errors import DeviceError
 from tacpipe.links import network
-from tacpipe.live.messages import Description, Message, to_json
+from tacpipe.live.messages import About, Published, to_json
 from tacpipe.plugins import extras
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ class _Client:
 class WebsocketPublisher:
     """A server of websockets; what a slow client does not take is dropped for it, and then the client is."""
 
-    def __init__(self, place: str, about: Description) -> None:
+    def __init__(self, place: str, about: About) -> None:
         with extras.named("--publish ws"):
             from websockets.sync.server import serve
 
@@ -59,7 +59,7 @@ class WebsocketPublisher:
         """How many clients there are."""
         return len(self._clients)
 
-    def publish(self, message: Message) -> None:
+    def publish(self, message: Published) -> None:
         """Put a message into the queue of each client that has room."""
         with self._keeping:
             clients = list(self._clients)

@@ -144,6 +144,10 @@ class Emulator:
             ClockSteps(self.faults.clock_step, self.faults.clock_step_ms, seed) if self.faults.clock_step else no_steps
         )
         timing = Timing(rate_hz, start_ns, clock(its_pace, seed), steps, self.faults.wrap_s)
+        if its_pace.slides:
+            from tacpipe.simulation.emulation.slide_source import SlideSource
+
+            return SlideSource(sensor, timing, self.seed)
         last = name[-1] if name[-1] in "12" else "1"
         if stream_of_clouds(sensor):
             from tacpipe.simulation.emulation.cloud_source import CloudSource

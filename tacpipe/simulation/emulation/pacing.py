@@ -21,6 +21,7 @@ class Pace:
     burst_ms: float = 0.0  # frames are collected for so long and sent together, as USB bridges do; 0: each alone
     skew_ppm: float | None = None  # by which the device's clock, and with it its rate, is fast; None: any within 50
     offset_ms: float | None = None  # by which its clock is ahead; None: any within 80
+    slides: bool = False  # of a biotac: the slides of `tacpipe simulate material` instead of the rig's grasps
     finger: int | None = None  # of the gripper that the sensor sits on, 1 or 2; None: the last digit of its name, or 1
 
     def __post_init__(self) -> None:

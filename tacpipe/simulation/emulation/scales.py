@@ -39,7 +39,8 @@ FULL = {  # what a device of counts is made for, SI
 }  # fmt: skip
 SHARED = ("tactile", "magnetic_flux_density", "displacement")  # quantities of one taxel among others
 NOISE = 0.002  # standard deviation as a fraction of what a device is made for
-SILENT = ("time", "status", "sequence", "label", "mask", "orientation", "mass", "friction")  # quantities without noise
+AIMED = ("target_position", "target_orientation")  # what a controller states, as it computed it
+SILENT = ("time", "status", "sequence", "label", "mask", "orientation", "mass", "friction", *AIMED)  # without noise
 
 
 def sent(quantity: str, values: Floats, fields: Sequence[pa.Field], rng: np.random.Generator) -> list[AnyArray]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Self, cast
+from typing import Any, ClassVar, Self, cast
 
 import numpy as np
 import torch
@@ -68,6 +68,11 @@ class NetworkReader:
     network: Network
     scaling: Affine
 
+    @property
+    def any_length(self) -> bool:
+        """Whether slides of fewer frames than those of training are read too."""
+        return bool(getattr(self.network, "ANY_LENGTH", False))
+
     def read(self, frames: Float32s) -> ReaderOutput:
         """Return scores and latents of slides (slide, time, channel) in device counts."""
         scores, latents = [], []
@@ -97,6 +102,11 @@ class ReadoutReader:
     fitted: ReadoutModel
     classes: tuple[int, ...]
 
+    @property
+    def any_length(self) -> bool:
+        """Whether slides of fewer frames than those of training are read too: by statistics over time."""
+        return isinstance(self.fitted, StatisticsClassifier)
+
     def read(self, frames: Float32s) -> ReaderOutput:
         """Return the readout's scores of slides (slide, time, channel) in device counts."""
         return ReaderOutput(spread(self.fitted.scores(frames), self.fitted.classes, self.classes), None)
@@ -111,6 +121,7 @@ class SpectraReader:
     speed_m_s: float
     transfer: Transfer
     classes: tuple[int, ...]
+    any_length: ClassVar[bool] = False  # the wave lengths that are told apart depend on the way
 
     def read(self, frames: Float32s) -> ReaderOutput:
         """Return log-likelihoods and, as latents, spectra of slides (slide, time, channel) in device counts."""
@@ -128,6 +139,7 @@ class EstimatorReader:
 
     fitted: Fitted
     classes: tuple[int, ...]
+    any_length: ClassVar[bool] = False  # what it reads is of a fixed size
 
     def read(self, frames: Float32s) -> ReaderOutput:
         """Return the estimator's scores of slides (slide, time, channel) in device counts."""
@@ -202,10 +214,7 @@ class Classifier:
         material if all are as likely. Scores of ``minirocket`` and ``statistics`` are distances to class means of no fixed
         scale: there it only orders the classes. See `predict` for the arguments.
         """
-        scores = self.scores(slides, sensor).astype(np.float64)
-        weights = np.exp(scores - scores.max(axis=1, keepdims=True))
-        found: Float32s = (weights / weights.sum(axis=1, keepdims=True)).astype(np.float32)
-        return found
+        return softmax(self.scores(slides, sensor))
 
     def scores(self, slides: Float32s | Floats, sensor: str = "") -> Float32s:
         """Return the score of each class (slide, class), in the order of ``classes``; see `predict`."""
@@ -335,4 +344,12 @@ def spread(scores: Float32s, known: Any, classes: tuple[int, ...]) -> Float32s:
     """
     found = np.full((len(scores), len(classes)), -np.inf, np.float32)
     found[:, [classes.index(int(one)) for one in known]] = scores
+    return found
+
+
+def softmax(scores: Float32s) -> Float32s:
+    """Return the probability of each class (slide, class) that scores (slide, class) state."""
+    wide = scores.astype(np.float64)
+    weights = np.exp(wide - wide.max(axis=1, keepdims=True))
+    found: Float32s = (weights / weights.sum(axis=1, keepdims=True)).astype(np.float32)
     return found

@@ -108,7 +108,7 @@ def read(
             )
         there.add(sensor)
         if not only or sensor in only:
-            found.setdefault(sensor, []).append((shard, *_frames(shard, sensor, quantities)))
+            found.setdefault(sensor, []).append((shard, *frames(shard, sensor, quantities)))
         if advance is not None:
             advance(note=name)
     missing = sorted(set(only) - set(found))
@@ -128,8 +128,8 @@ def absent_quantities(recordings: Dataset, quantities: Sequence[str]) -> list[st
     return [quantity for quantity in quantities if quantity not in there]
 
 
-def _frames(shard: Recording, sensor: str, quantities: Sequence[str]) -> tuple[Layout, Float32s]:
-    """Return the layout of a slide and its frames (time, channel)."""
+def frames(shard: Recording, sensor: str, quantities: Sequence[str]) -> tuple[Layout, Float32s]:
+    """Return the layout of a slide and its frames (time, channel), device counts; raises as `read`."""
     if STREAM not in shard.streams and "" not in shard.streams:
         raise TacpipeError(
             f"Recording {shard.name} has the streams {', '.join(shard.streams)} and none is a slide. "

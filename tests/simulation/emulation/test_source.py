@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from tacpipe.channels import schema
+from tacpipe.errors import UsageError
 from tacpipe.plugins import registry
 from tacpipe.recording import rig
+from tacpipe.sensors.biotac import BioTac
 from tacpipe.sensors.optoforce import OptoForce
 from tacpipe.sensors.tfmini import TfMini
 from tacpipe.sensors.xela import Xela
@@ -17,8 +19,10 @@ from tacpipe.signals import kinematics
 from tacpipe.simulation import pick_and_move, taxels
 from tacpipe.simulation.emulation import joints, perfect
 from tacpipe.simulation.emulation.scales import unit_scale
+from tacpipe.simulation.emulation.slide_source import SlideSource
 from tacpipe.simulation.emulation.source import Source, Timing
 from tacpipe.simulation.emulation.world import CYCLE_NS, World
+from tacpipe.simulation.slide import Rig, simulate_trial
 from tests.simulation.emulation.rigs import ALL_SENSORS
 
 WORLD = World(3)
@@ -153,6 +157,7 @@ def test_the_rig_of_all_sensors_has_them_all() -> None:
         "lsl",
         "live",
         "plan",
+        "grasps",
     }  # outlets that pylsl makes; what a live session records itself
     assert {stream.kind for stream in ALL_SENSORS.streams.values()} == served
 
@@ -177,3 +182,19 @@ def test_a_board_of_counts_stays_within_its_type() -> None:
 
 def test_columns_keep_the_names_of_published_recordings() -> None:
     assert [field.name for field in Xela().fields()] == [field.name for field in schema.uskin_fields()]
+
+
+def test_a_biotac_that_slides_sends_the_trials_of_the_simulated_rig_one_after_another() -> None:
+    sensor = BioTac()
+    rig_ = Rig(materials=2, arm_every=0)
+    source = SlideSource(sensor, Timing(sensor.rate_hz), 4, rig_)
+    other = SlideSource(sensor, Timing(sensor.rate_hz), 4, rig_)
+    assert np.array_equal(
+        other.block(31).values[0], np.concatenate([source.block(n).values[0] for n in range(32)])[-50:]
+    )
+    whole = np.concatenate([source.block(n).values[0] for n in range(45)])
+    trials = [simulate_trial(4, index, rig_).streams["biotac"] for index in (0, 2)]
+    rows = np.concatenate([np.column_stack([t.column(f.name).to_numpy() for f in sensor.fields()]) for t in trials])
+    assert np.array_equal(whole[: len(rows)], rows[: len(whole)])
+    with pytest.raises(UsageError, match="biotac"):
+        SlideSource(TfMini(), Timing(100), 4)

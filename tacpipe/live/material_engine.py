@@ -1,0 +1,204 @@
+"""A live session's logic for models of materials: blocks of bytes in, answers out; as `tacpipe.live.engine` for forecasts.
+
+A recording holds one slide, as `tacpipe segment slides` has it. Several times a second the slide so far is read, from all
+samples up to a moment; the last answer of a recording, from all that is in it, is its final one.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from tacpipe.live import wire
+from tacpipe.live.decoding import Decoder, likely_schema
+from tacpipe.live.material_messages import ENDED, FINAL, SLIDING, WAITING, MaterialDescription, MaterialMessage
+from tacpipe.live.material_slide import Answer, SlideSoFar
+from tacpipe.recording.spool_blocks import Note
+from tacpipe.recording.station import BEGAN, OVER
+from tacpipe.sensors.framing import Chunks
+from tacpipe.sensors.sensor import Sensor
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+SETTLE_NS = 2_000_000  # after a moment, in which the samples that belong to it are awaited from the other threads
+GAP_NS = 50_000_000  # age of the newest sample of the finger, from which on its stream is silent
+LONGEST_NS = 120_000_000_000  # of a recording, whose rows are kept until it ends
+IDLE_NS = 20_000_000
+RESTARTED = "the model's process was started anew, and lacks what came before"
+THROWN = "blocks were thrown away under overload"
+
+
+@dataclass(frozen=True)
+class Begun:
+    """That a recording has begun, for a process that is started anew in it: what came of it is lost to that one."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return nothing: there is no more to know."""
+        return {}
+
+
+class MaterialEngine:
+    """One live session of a model of materials."""
+
+    def __init__(
+        self,
+        sensors: Mapping[str, Sensor],
+        finger: str,
+        slide: SlideSoFar,
+        description: MaterialDescription,
+        *,
+        every_ns: int,
+        settle_ns: int = SETTLE_NS,
+    ) -> None:
+        self.sensors = dict(sensors)
+        self.settle_ns, self.every_ns = settle_ns, every_ns
+        self.skipped = self.overflows = self.late = self._seq = 0
+        self._finger, self._slide, self._description = finger, slide, description
+        self._lacks = ""  # why this recording gives no answer any more
+        self._continues = False
+        self.offset_ns: int | None = None  # that is added to the monotonic clock; None: no recording runs
+        self._decoders: dict[str, Decoder] = {}
+        self._tables: dict[str, pa.Table] = {}
+        self._over: set[str] = set()  # streams of which nothing more is of the recording
+        self._due_ns: int | None = None
+        self._read_ns = 0  # up to which samples were read
+
+    @property
+    def running(self) -> bool:
+        """Whether a recording has begun, and is not over."""
+        return self.offset_ns is not None
+
+    @property
+    def beginning(self) -> Begun | None:
+        """That a recording has begun."""
+        return Begun() if self.running else None
+
+    def about(self, model: str) -> MaterialDescription:
+        """Return what its messages are."""
+        return self._description
+
+    def ready(self) -> dict[str, Any]:
+        """Return the materials; there are no alarms."""
+        return {"materials": list(self._description.names), "alarms": {}}
+
+    def take(self, stream: str, block: Chunks | Note) -> None:
+        """Take a block of a stream, or a note on all (``stream`` is empty)."""
+        if not stream:
+            assert isinstance(block, Note)
+            if block.what == wire.CONTINUE:
+                self._continues = True
+            elif block.what == wire.BEGIN:
+                self._lacks, self._continues = RESTARTED if self._continues else "", False
+                self._begin(int(block.detail))
+            elif block.what == wire.OVERFLOW:
+                self.overflows += 1
+                self._lacks = THROWN
+        elif isinstance(block, Note) and block.what == BEGAN:
+            self._decoders[stream] = Decoder(self.sensors[stream])
+        elif isinstance(block, Note) and block.what == OVER:
+            self._over.add(stream)
+        elif stream in self._decoders and stream not in self._over:
+            self._decoders[stream].take(block)
+
+    def due_ns(self, now_ns: int) -> int:
+        """Return when `step` is to be called next, on the monotonic clock."""
+        return now_ns + IDLE_NS if self._due_ns is None or self._over else max(self._due_ns, now_ns + IDLE_NS // 20)
+
+    def step(self, now_ns: int) -> list[MaterialMessage]:
+        """Return the answer that is due; where nothing more comes of the recording, its final one."""
+        if self.offset_ns is None:
+            return []
+        if self._over:
+            return self.finish() if self._over >= set(self.sensors) else []
+        if self._due_ns is not None and now_ns < self._due_ns:
+            return []
+        if self._due_ns is not None:
+            self.skipped += (now_ns - self._due_ns) // self.every_ns
+        self._due_ns = now_ns + self.every_ns
+        return [self._answered(now_ns + self.offset_ns - self.settle_ns, final=False)]
+
+    def finish(self) -> list[MaterialMessage]:
+        """Return the final answer of the recording, which is over."""
+        if self.offset_ns is None:
+            return []
+        found = self._answered(0, final=True)
+        self.offset_ns = None
+        return [found]
+
+    def published(self, message: MaterialMessage, now_ns: int) -> None:
+        """Write into a message how long it took, when it is about to go out."""
+        if self.offset_ns is not None and message.made_from_t_ns:
+            message.latency_ms = (now_ns + self.offset_ns - message.made_from_t_ns) / 1e6
+
+    def _begin(self, offset_ns: int) -> None:
+        self.offset_ns, self._due_ns, self._read_ns = offset_ns, None, 0
+        self._decoders, self._tables, self._over = {}, {}, set()
+
+    def _answered(self, until_ns: int, *, final: bool) -> MaterialMessage:
+        """Return the answer from all samples up to a moment; the final one is from all there are."""
+        began_s = time.perf_counter()
+        self._fetch(final=final)
+        stamps = {name: table.column("t_ns").to_numpy() for name, table in self._tables.items()}
+        if final:
+            until_ns = int(max((some[-1] for some in stamps.values()), default=self._read_ns))
+        rows = {name: int(some.searchsorted(until_ns, side="right")) for name, some in stamps.items()}
+        streams = {name: self._tables[name].slice(0, count) for name, count in rows.items() if count}
+        newest_ns = {name: int(stamps[name][rows[name] - 1]) for name in streams}
+        answer = self._answer(streams, 0 if final else until_ns - newest_ns.get(self._finger, until_ns))
+        self._read_ns = max(self._read_ns, until_ns)
+        self._seq += 1
+        found = MaterialMessage(
+            self._seq,
+            until_ns,
+            self._description.names,
+            answer.probabilities,
+            FINAL if final else ENDED if answer.ended else SLIDING if answer.rows else WAITING,
+            answer.rows,
+            answer.seen,
+            answer.cause,
+            max(newest_ns.values(), default=0),
+            skipped=self.skipped,
+            late=self.late,
+        )
+        found.compute_ms = (time.perf_counter() - began_s) * 1e3
+        return found
+
+    def _answer(self, streams: Mapping[str, pa.Table], silent_ns: int) -> Answer:
+        if self._lacks:
+            return Answer(None, cause=self._lacks)
+        if self._finger not in streams:
+            return Answer(None, cause=f"nothing comes from {self._finger}")
+        if silent_ns > GAP_NS:
+            return Answer(None, cause=f"nothing new comes from {self._finger}")
+        t_ns = streams[self._finger].column("t_ns")
+        if t_ns[-1].as_py() - t_ns[0].as_py() > LONGEST_NS:
+            self._lacks = f"the recording is longer than {LONGEST_NS / 1e9:g} s; begin another one for the next slide"
+            return Answer(None, cause=self._lacks)
+        return self._slide.answer(streams)
+
+    def _fetch(self, *, final: bool) -> None:
+        """Put what came behind what is kept, unless nothing can be answered from it."""
+        import pyarrow as pa
+
+        assert self.offset_ns is not None
+        for name, decoder in self._decoders.items():
+            batches = decoder.last() if final else decoder.batches()
+            made = [decoder.columns(batch, self.offset_ns).table() for batch in batches]
+            if not made or self._lacks:
+                continue
+            self.late += sum(int((table.column("t_ns").to_numpy() <= self._read_ns).sum()) for table in made)
+            before = [self._tables[name]] if name in self._tables else []
+            self._tables[name] = pa.concat_tables([*before, *made]).combine_chunks()
+
+
+def finger_of(sensors: Mapping[str, Sensor]) -> str:
+    """Return the stream with tactile channels. Raises `TacpipeError` where there is none, or more than one."""
+    from tacpipe.channels.finger import finger
+
+    schemas = {name: likely_schema(sensor) for name, sensor in sensors.items()}
+    tables: Mapping[str, Any] = {name: schema.empty_table() for name, schema in schemas.items()}
+    found = finger("of this rig", tables)
+    return next(name for name, table in tables.items() if table is found)

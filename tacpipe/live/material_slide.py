@@ -1,0 +1,121 @@
+"""The material of a slide while it goes on: `tacpipe segment slides` and the model, applied to what has come so far.
+
+Whatever is asked at a moment is what a recording that ends there would give, so nothing looks ahead, and at the end of the
+recording the answer is that of `tacpipe predict`. Only a slide that is still shorter than those of training has a rule of
+its own: models that read slides of any length read what there is of it, once there is enough.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+from tacpipe.arrays import Float32s
+from tacpipe.channels.finger import finger
+from tacpipe.errors import TacpipeError
+from tacpipe.live.stages import SLIDES
+from tacpipe.plugins import registry
+from tacpipe.tasks.material import slides as slides_of
+from tacpipe.tasks.material.classifier import Classifier, softmax
+from tacpipe.tasks.material.slides import STREAM, difference
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+ENDED_NS = 200_000_000  # without a row of the slide, after which it counts as over
+
+
+@dataclass(frozen=True)
+class Held:
+    """The streams of a recording so far, as a stage reads a recording."""
+
+    tables: Mapping[str, pa.Table]
+    attributes: Mapping[str, Any]
+    name: str = "so far"
+
+    @property
+    def streams(self) -> tuple[str, ...]:
+        """Names of the streams."""
+        return tuple(self.tables)
+
+    def table(self, stream: str = "", columns: Sequence[str] | None = None) -> pa.Table:
+        """Return a stream."""
+        return self.tables[stream] if columns is None else self.tables[stream].select(list(columns))
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a model gives of a slide so far."""
+
+    scores: Float32s | None  # (class,); None: no material is named, for a cause
+    rows: int = 0  # of the slide so far
+    seen: float = 0.0  # fraction of the rows that the model reads
+    ended: bool = False  # nothing came of the slide for `ENDED_NS`
+    cause: str = ""
+    probabilities: Float32s | None = field(default=None)  # (class,)
+
+
+class SlideSoFar:
+    """Names the material of the slide in what has come of a recording."""
+
+    def __init__(
+        self, classifier: Classifier, params: Any, sensor: str, least: float, rate_hz: float | None = None
+    ) -> None:
+        """Take the params of `segment slides`, and which fraction of a slide is enough. Raises for an unknown sensor.
+
+        ``rate_hz`` is the rig's, as the label of a recording; None: that of the stamps, which are arrivals, and so come in
+        bursts where the computer is busy.
+        """
+        self._classifier, self._params, self._sensor = classifier, params, sensor
+        self._attributes = {"sensor": sensor} | ({"rate_hz": rate_hz} if rate_hz else {})
+        self._layout, self._reader = classifier.layout(sensor), classifier.readers[sensor]
+        self._stage = registry.load(SLIDES)
+        self._least = least
+
+    @property
+    def frames(self) -> int:
+        """Rows of a slide that the model reads."""
+        return self._layout.frames
+
+    @property
+    def any_length(self) -> bool:
+        """Whether it reads fewer."""
+        return self._reader.any_length
+
+    def answer(self, streams: Mapping[str, pa.Table]) -> Answer:
+        """Return what a recording of these streams would give if it ended now."""
+        held = Held(streams, self._attributes)
+        try:
+            whole = self._stage(replace(self._params, crop="none"), held)
+        except TacpipeError:
+            return Answer(None, cause="no slide has begun")
+        table = whole.streams[STREAM]
+        rows = table.num_rows
+        newest_ns = finger("so far", streams).column("t_ns")[-1].as_py()
+        ended = rows > 0 and newest_ns - table.column("t_ns")[-1].as_py() > ENDED_NS
+        try:
+            cut, lacks = self._cut(held, table)
+            layout, frames = slides_of.frames(cut, self._sensor, self._classifier.quantities)
+        except TacpipeError as error:
+            return Answer(None, rows, 0.0, ended, str(error))
+        there = Answer(None, rows, min(1.0, len(frames) / self.frames), ended)
+        if layout.channels != self._layout.channels or len(frames) > self.frames:
+            return replace(there, cause=f"the slide {difference(self._layout, layout)} as the model was trained on")
+        if len(frames) < self.frames and not (self.any_length and there.seen >= self._least):
+            enough = f"{self._least:.0%} of {self.frames}" if self.any_length else str(self.frames)
+            return replace(there, cause=f"{len(frames)} rows of the slide have come, and {enough} are needed")
+        if not lacks and not self._layout.alike(layout):
+            return replace(there, cause=f"the slide {difference(self._layout, layout)} as the model was trained on")
+        scores = self._reader.read(frames[None]).scores
+        return replace(there, scores=scores[0], probabilities=softmax(scores)[0])
+
+    def _cut(self, held: Held, table: pa.Table) -> tuple[Any, bool]:
+        """Return the rows of the slide that count, as the stage cuts them out or as far as they have come, and which."""
+        params = self._params
+        first = params.offset_frames if params.crop == "offset" else 0
+        if params.crop == "none" or table.num_rows - first >= params.frames:
+            cut = self._stage(params, held)
+            return Held(cut.streams, {**held.attributes, **cut.attributes}), False
+        rest = table.slice(min(first, table.num_rows))
+        return Held({STREAM: rest}, held.attributes), rest.num_rows < self.frames

@@ -1,0 +1,103 @@
+"""Live sessions with a process each, what subscribers of them hear, and what was recorded."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tests.conftest import Lab
+from tests.recording import live
+
+MODULES = (b"tacpipe.live.process", b"tests.live.persistent")  # that a model's process runs
+
+
+def started(lab: Lab, options: str, behaviour: str = "") -> subprocess.Popen[str]:
+    """Return ``tacpipe live`` with a model that predicts no change, running in a process of its own."""
+    words = [sys.executable, "-m", "tests.live.persistent", "live", "rig.toml", "--model", "none", *options.split()]
+    path = os.pathsep.join([str(live.ROOT), os.environ.get("PYTHONPATH", "")])
+    environment = {**os.environ, "PYTHONPATH": path, "BEHAVIOUR": behaviour}
+    return subprocess.Popen(
+        words, cwd=lab.folder, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+
+
+def commanded(lab: Lab, command: str) -> subprocess.Popen[str]:
+    """Return ``tacpipe`` with a command in a lab, in a process of its own whose limits suit a busy computer."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "tests.recording.patient", *command.split()],
+        cwd=lab.folder,
+        env={**os.environ, "PYTHONPATH": str(live.ROOT)},
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
+
+
+def model_process(session: subprocess.Popen[str]) -> int:
+    """Return the number of a session's process that runs the model."""
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            parent = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
+            words = (folder / "cmdline").read_bytes()
+        except (OSError, ValueError):
+            continue
+        if parent == session.pid and any(one in words for one in MODULES):
+            return int(folder.name)
+    raise AssertionError("the session has no process of a model")
+
+
+def ended(process: subprocess.Popen[str], *, interrupt: bool = False) -> dict[str, Any]:
+    """Return what a session printed as JSON, once it is over."""
+    if interrupt:
+        process.send_signal(signal.SIGINT)
+    out, err = process.communicate()
+    assert process.returncode == 0, err
+    found: dict[str, Any] = json.loads(out)
+    return found
+
+
+@contextmanager
+def subscriber() -> Iterator[tuple[int, list[dict[str, Any]]]]:
+    """Yield the port of a subscriber, and the messages that it got so far."""
+    found: list[dict[str, Any]] = []
+    over = threading.Event()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as port:
+        port.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 8 << 20)
+        port.bind(("127.0.0.1", 0))
+        port.settimeout(0.1)
+
+        def listen() -> None:
+            while not over.is_set():
+                try:
+                    found.append(json.loads(port.recv(1 << 16)))
+                except TimeoutError:
+                    continue
+
+        listening = threading.Thread(target=listen)
+        listening.start()
+        try:
+            yield port.getsockname()[1], found
+        finally:
+            over.set()
+            listening.join()
+
+
+def forecasts(messages: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    return [one for one in messages if one["kind"] == "forecast" and one["values"] is not None]
+
+
+def whole(shard: Any, name: str) -> bool:
+    """Return whether no sample of a stream was lost on its way into the recording."""
+    counts = shard.table(name).column("seq").to_numpy()
+    return bool((np.diff(counts) == 1).all()) and shard.attributes[f"{name}_lost"] == 0

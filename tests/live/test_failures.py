@@ -1,0 +1,123 @@
+"""What fails in a live session costs forecasts with a stated cause; the recording continues, and so does the session.
+
+Nothing here goes by the clock: a forecast is held against the arrival of what it was made from, in the recording.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import threading
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tacpipe.live.session import free_ports
+from tacpipe.live.supervisor import DIED, RESTARTED
+from tacpipe.simulation.emulation.byte_faults import Faults
+from tests.conftest import Lab
+from tests.live.persistent import GAP_NS, PERIOD_NS
+from tests.live.sessions import ended, forecasts, model_process, started, subscriber, whole
+from tests.recording import live, patient
+
+pytestmark = pytest.mark.rig
+SKIN = live.stream("skin", "xela", "ws:127.0.0.1:5000", "{ rate_hz = 50 }")
+
+
+@pytest.fixture(autouse=True)
+def patience(monkeypatch: pytest.MonkeyPatch) -> None:
+    patient.relax(monkeypatch)
+
+
+def without(messages: list[dict[str, Any]], stream: str) -> list[dict[str, Any]]:
+    """Return the messages without a forecast whose cause names a stream."""
+    return [one for one in messages if one["kind"] == "forecast" and one["values"] is None and stream in one["cause"]]
+
+
+def test_a_stream_that_stalls_costs_the_forecasts_of_that_time_and_alarms_are_unknown(lab: Lab) -> None:
+    faults = Faults(stall=0.7, stall_s=0.6)
+    with live.served(lab.folder, SKIN, live.WRENCH, faults=faults), subscriber() as (port, messages):
+        process = started(lab, f"-o rec --json --publish udp:127.0.0.1:{port}")
+        live.awaited(lambda: without(messages, "skin"))
+        count = messages.index(without(messages, "skin")[0])
+        live.awaited(lambda: len(forecasts(messages[count:])) > 20)
+        printed = ended(process, interrupt=True)
+    silent = without(messages, "skin")
+    assert {alarm["state"] for one in silent for alarm in one["alarms"].values()} == {"unknown"}
+    shard = live.only(lab.folder)
+    arrivals = shard.table("skin").column("t_ns").to_numpy()
+    points = shard.table("forecast").column("t_device_ns").to_numpy()
+    newest = arrivals[np.searchsorted(arrivals, points, side="right") - 1]
+    assert ((points - newest) <= GAP_NS).all()  # and a sample was due a period after the newest
+    assert GAP_NS <= 3 * PERIOD_NS and len(points) == printed["live"]["forecasts"]
+    assert whole(shard, "skin") and whole(shard, "wrench")
+
+
+def test_a_device_whose_clock_is_set_anew_changes_no_forecast(lab: Lab) -> None:
+    faults = Faults(clock_step=1.0, clock_step_ms=5000.0)
+    with live.served(lab.folder, SKIN, faults=faults), subscriber() as (port, messages):
+        process = started(lab, f"-o rec --json --publish udp:127.0.0.1:{port}")
+        live.awaited(lambda: len(forecasts(messages)) > 150)
+        printed = ended(process, interrupt=True)
+    shard = live.only(lab.folder)
+    steps_ns = np.diff(shard.table("skin").column("t_device_ns").to_numpy())
+    assert (np.abs(steps_ns) > 10**9).any()
+    assert {one["cause"] for one in forecasts(messages)} == {""}
+    points = shard.table("forecast").column("t_device_ns").to_numpy()
+    skipped = printed["live"]["skipped"]
+    assert (np.diff(points) > 0).all() and ((points - points[0]) % PERIOD_NS == 0).all()
+    gaps = len([one for one in messages if one["kind"] == "forecast" and one["values"] is None])
+    assert (points[-1] - points[0]) // PERIOD_NS + 1 <= len(points) + skipped + gaps
+
+
+def test_a_model_process_that_is_killed_is_replaced_by_one_that_continues_its_grid(lab: Lab) -> None:
+    with live.served(lab.folder, SKIN, live.WRENCH), subscriber() as (port, messages):
+        process = started(lab, f"-o rec --json --publish udp:127.0.0.1:{port}")
+        live.awaited(lambda: len(forecasts(messages)) > 30)
+        os.kill(model_process(process), signal.SIGKILL)
+        count = len(messages)
+        live.awaited(lambda: any(one["kind"] == "description" for one in messages[count:]))
+        live.awaited(lambda: len(forecasts(messages[count:])) > 30)
+        printed = ended(process, interrupt=True)
+    shard = live.only(lab.folder)
+    assert printed["live"]["restarts"] == 1
+    assert [cause for cause, _ in live.events(shard, "forecast")][:2] == [DIED, RESTARTED]
+    points = np.array([one["t_ns"] for one in forecasts(messages)])
+    assert ((points - points[0]) % PERIOD_NS == 0).all() and (np.diff(points) > 0).all()
+    assert whole(shard, "skin") and whole(shard, "wrench")
+
+
+def test_a_subscriber_that_never_reads_keeps_no_message_from_the_others(lab: Lab) -> None:
+    from websockets.sync.client import connect
+
+    (place,) = free_ports(1)
+    found: list[dict[str, Any]] = []
+    with live.served(lab.folder, SKIN), subscriber() as (port, messages):
+        process = started(lab, f"-o rec --json --publish ws:127.0.0.1:{place} --publish udp:127.0.0.1:{port}")
+        live.awaited(lambda: bool(forecasts(messages)))
+        with socket.socket() as slow, connect(f"ws://127.0.0.1:{place}", max_size=None) as quick:
+            slow.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+            slow.connect(("127.0.0.1", place))
+            key = "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n"
+            slow.sendall(
+                f"GET / HTTP/1.1\r\nHost: x\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n{key}\r\n".encode()
+            )
+
+            def listen() -> None:
+                while len(found) < 200:
+                    found.append(json.loads(quick.recv(600)))
+
+            listening = threading.Thread(target=listen, daemon=True)
+            listening.start()
+            live.awaited(lambda: len(found) == 200)
+            ended(process, interrupt=True)
+            listening.join()
+    assert found[0]["kind"] == "description"
+    for heard in (found[1:], [one for one in messages if one["kind"] == "forecast"]):
+        assert (np.diff([one["seq"] for one in heard]) == 1).all()
+    shard = live.only(lab.folder)
+    assert whole(shard, "skin")
+    assert len(shard.table("forecast")) == len(forecasts(messages))

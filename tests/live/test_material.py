@@ -1,0 +1,236 @@
+"""The material of a slide while it goes on is what the samples so far give, and at its end what `tacpipe predict` gives."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.live import material_opening, wire
+from tacpipe.live.material_engine import RESTARTED, THROWN, MaterialEngine
+from tacpipe.live.material_messages import FINAL, SLIDING, WAITING, MaterialMessage
+from tacpipe.live.messages import packets
+from tacpipe.live.options import Options
+from tacpipe.plugins import registry
+from tacpipe.recording import rig as rigs_of
+from tacpipe.recording.spool_blocks import Note
+from tacpipe.recording.station import BEGAN, OVER
+from tacpipe.sensors.framing import Chunks
+from tacpipe.sensors.live import SLIDE, Live
+from tacpipe.sensors.sensor import Samples
+from tacpipe.simulation.slide import Rig, simulate_trial
+from tacpipe.tasks.material import prediction
+from tacpipe.tasks.material import task as material
+from tacpipe.tasks.material.classifier import Classifier, softmax
+from tests.asked import fitting
+from tests.fake_recordings import FakeDataset
+from tests.live import rigs
+from tests.sensors import made
+from tests.simulation.slide_datasets import SEED, indices, slides
+from tests.tasks.material.textures import Slide
+
+FRAMES = 120
+EVERY_NS = 100_000_000
+SETTLE_NS = 2_000_000
+OFFSET_NS = 10**18
+RIG = Rig(materials=3, pac=False, arm_every=0)
+TRAINED, UNSEEN = range(3), 3
+KINDS: dict[str, dict[str, Any]] = {
+    "statistics": {"architecture": "statistics"},
+    "x-lstm": {"architecture": "x-lstm", "hidden": 6, "epochs": 1, "batch": 4},
+    "minirocket": {"architecture": "minirocket", "features": 200},
+}
+
+
+class Opened:
+    """A model of slides of a BioTac, as `tacpipe.open` gives it."""
+
+    def __init__(self, files: Any, **params: Any) -> None:
+        self.files, self.source = files, self
+        self.chain = [rigs.step("segment.slides", frames=FRAMES, **params)]
+
+
+@pytest.fixture(scope="module")
+def models(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Opened]:
+    parts = [slides(RIG, indices(RIG, ["biotac"], some), frames=FRAMES) for some in (TRAINED, [UNSEEN])]
+    found = {}
+    for kind, params in KINDS.items():
+        asked = fitting("train.material", params)
+        found[kind] = Opened(material.train(asked, parts[0], parts[1], tmp_path_factory.mktemp(kind), None))
+    return found
+
+
+def options(**changed: Any) -> Options:
+    return Options("models/material", "", ("finger",), task="material", **{"least": 0.5, **changed})
+
+
+class Session:
+    """An engine with a BioTac, whose frames arrive as those of a simulated trial."""
+
+    def __init__(self, model: Any, kind: int = 1) -> None:
+        self.sensor = rigs_of.make("biotac", {}, "finger")
+        self.engine: MaterialEngine = material_opening.engine(options(), model, {"finger": self.sensor})
+        trial = simulate_trial(SEED, indices(RIG, ["biotac"], [UNSEEN])[kind], RIG)
+        self.table = trial.streams["biotac"]
+        names = [field.name for field in self.sensor.fields()]
+        values = np.column_stack([self.table.column(name).to_numpy() for name in names]).astype(np.uint16)
+        self.t_ns = self.table.column("t_ns").to_numpy() - OFFSET_NS
+        samples = Samples((values,), seq=np.arange(len(values)))
+        self.packets = made.pieces(self.sensor, self.sensor.encode(samples))
+        self.sent = 0
+
+    def begin(self) -> None:
+        """Begin the recording."""
+        self.engine.take("", Note(0, "", wire.BEGIN, str(OFFSET_NS)))
+        self.engine.take("finger", Note(0, "finger", BEGAN))
+
+    def run(self, until_ns: int, cut: int = 7) -> list[MaterialMessage]:
+        """Have all arrive up to a time, some at once, and return what is published meanwhile."""
+        found = []
+        while self.sent < len(self.t_ns) and self.t_ns[self.sent] <= until_ns:
+            stop = min(self.sent + cut, int(np.searchsorted(self.t_ns, until_ns, side="right")))
+            some = [(int(self.t_ns[row]), self.packets[row]) for row in range(self.sent, stop)]
+            self.engine.take("finger", Chunks.of(some))
+            self.sent = stop
+            found += self.engine.step(int(self.t_ns[stop - 1]) + SETTLE_NS)
+        return found
+
+    def end(self) -> MaterialMessage:
+        """End the recording and return the last message."""
+        self.engine.take("", Note(0, "", wire.END))
+        self.engine.take("finger", Note(0, "finger", OVER))
+        (last,) = self.engine.step(int(self.t_ns[-1]) + 10**9)
+        return last
+
+
+def predicted(model: Any, table: Any) -> Any:
+    """Return the probabilities that `tacpipe predict` gives a recording of this stream, None where it refuses it."""
+    stage = registry.load("segment.slides")
+    given = Slide({"finger": table}, "trial", {"sensor": "biotac"})
+    try:
+        cut = stage(stage.params(frames=FRAMES), given)
+    except TacpipeError:
+        return None
+    shard = Slide(cut.streams, "trial", {**given.attributes, **cut.attributes})
+    scores = prediction.predictions(Classifier.load(model.files), FakeDataset({"trial": shard}, {}))  # type: ignore[arg-type]
+    columns = [name for name in scores.column_names if name.startswith("score_")]
+    return softmax(np.column_stack([scores.column(name).to_numpy() for name in columns]))[0]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_answer_at_the_end_is_that_of_predict_however_the_bytes_were_cut(
+    kind: str, models: dict[str, Opened]
+) -> None:
+    wanted = None
+    for cut in (1, 13):
+        session = Session(models[kind])
+        session.begin()
+        session.run(10**19, cut)
+        last = session.end()
+        wanted = predicted(models[kind], session.table) if wanted is None else wanted
+        assert last.state == FINAL and last.seen == 1.0 and last.probabilities is not None
+        assert last.probabilities.tobytes() == wanted.tobytes()
+        assert not session.engine.running and session.engine.late <= 1  # the first frame, which the next one confirms
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_each_answer_is_that_of_a_recording_which_ends_then(kind: str, models: dict[str, Opened]) -> None:
+    session = Session(models[kind])
+    session.begin()
+    found = session.run(10**19)
+    whole = [one for one in found if one.seen == 1.0]
+    assert len(whole) > 20 and all(one.state == SLIDING for one in whole)
+    for one in whole[:: len(whole) // 4]:
+        rows = int((session.t_ns <= one.t_ns - OFFSET_NS).sum())
+        wanted = predicted(models[kind], session.table.slice(0, rows))
+        assert one.probabilities is not None and one.probabilities.tobytes() == wanted.tobytes()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_material_is_unknown_until_enough_of_the_slide_has_come(kind: str, models: dict[str, Opened]) -> None:
+    session = Session(models[kind])
+    session.begin()
+    found = session.run(10**19)
+    before = [one for one in found if one.state == WAITING]
+    assert before and {one.cause for one in before} == {"no slide has begun"}
+    least = 1.0 if kind == "minirocket" else 0.5
+    for one in found[len(before) :]:
+        assert (one.probabilities is None) == (one.seen < least) == bool(one.cause)
+        content = one.to_dict()
+        assert (content["material"] == "unknown") == (one.probabilities is None)
+        assert one.probabilities is None or abs(sum(content["probabilities"].values()) - 1) < 1e-5
+    seen = [one.seen for one in found]
+    assert seen == sorted(seen) and 0 < seen[len(before)] < 1
+
+
+def test_a_finger_that_falls_silent_is_named_and_the_material_is_unknown_until_it_is_back(
+    models: dict[str, Opened],
+) -> None:
+    session = Session(models["statistics"])
+    session.begin()
+    half = int(session.t_ns[len(session.t_ns) // 2])
+    assert session.run(half)[-1].probabilities is not None
+    (silent,) = session.engine.step(half + EVERY_NS + SETTLE_NS)
+    assert silent.probabilities is None and silent.cause == "nothing new comes from finger"
+    assert session.run(10**19)[-1].probabilities is not None
+
+
+def test_what_was_lost_makes_this_recording_unknown_and_not_the_next(models: dict[str, Opened]) -> None:
+    session = Session(models["statistics"])
+    session.engine.take("", Note(0, "", wire.CONTINUE, "{}"))
+    session.begin()
+    found = session.run(int(session.t_ns[300]))
+    assert found and {one.cause for one in found} == {RESTARTED}
+    session.begin()
+    session.engine.take("", Note(0, "", wire.OVERFLOW))
+    assert {one.cause for one in session.run(int(session.t_ns[400]))} == {THROWN}
+    other = Session(models["statistics"])
+    other.begin()
+    assert other.run(10**19)[-1].cause == ""
+
+
+def test_rows_of_the_sessions_stream_hold_what_was_published() -> None:
+    sensor = rigs_of.make("live", {"output": "material", "channels": ["cork", "felt"]}, "live")
+    assert isinstance(sensor, Live)
+    assert [field.name for field in sensor.fields()] == [*SLIDE, "probability_cork", "probability_felt"]
+    for probabilities in (None, np.array([0.25, 0.75], np.float32)):
+        message = MaterialMessage(1, 5, ("cork", "felt"), probabilities, SLIDING, 60, 0.5)
+        (sent,) = packets(message, sensor, 7)
+        found = sensor.decode(np.frombuffer(sent, np.uint8)[None])
+        assert found.seq is not None and found.t_device_ns is not None
+        assert (found.seq[0], found.t_device_ns[0]) == (7, 5)
+        number = -1 if probabilities is None else 1
+        assert found.values[0][0].tolist() == [number, 60, 0.5, 0]
+        assert np.array_equal(found.values[1][0], message.columns()[4:], equal_nan=True)
+
+
+def test_a_rig_that_the_model_cannot_read_is_refused_by_what_is_missing(models: dict[str, Opened]) -> None:
+    model: Any = models["statistics"]
+    biotac, range_finder = (rigs_of.make(kind, {}, kind) for kind in ("biotac", "tfmini"))
+    two = rigs_of.make("biotac", {"fingers": 2}, "biotac")
+    for sensors, changed, named in (
+        ({"range": range_finder}, {}, "tactile"),
+        ({"a": biotac, "b": biotac}, {}, "2 streams"),
+        ({"finger": two}, {}, "other channels"),
+        ({"finger": biotac}, {"sensor": "roboskin"}, "roboskin"),
+    ):
+        with pytest.raises(TacpipeError, match=named):
+            material_opening.engine(options(**changed), model, sensors)
+    lowest: Any = Opened(model.files, trigger="load", rest="lowest")
+    with pytest.raises(TacpipeError, match="lowest"):
+        material_opening.engine(options(), lowest, {"finger": biotac})
+
+
+def test_a_model_of_several_sensors_needs_the_name_of_the_rigs(tmp_path: Path) -> None:
+    rig = Rig(materials=2, pac=False, arm_every=0)
+    parts = [slides(rig, indices(rig, ["biotac", "roboskin"], some), frames=FRAMES) for some in (range(2), [2])]
+    model: Any = Opened(
+        material.train(fitting("train.material", KINDS["statistics"]), parts[0], parts[1], tmp_path, None)
+    )
+    sensors = {"finger": rigs_of.make("biotac", {}, "finger")}
+    with pytest.raises(UsageError, match="--sensor"):
+        material_opening.engine(options(), model, sensors)
+    assert material_opening.engine(options(sensor="biotac"), model, sensors).about("m").frames == FRAMES

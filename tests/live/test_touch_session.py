@@ -1,0 +1,84 @@
+"""A live session of a model of touch: requests come by UDP, rankings leave, and both are recorded."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+from typing import Any
+
+import numpy as np
+import pytest
+
+import tacpipe
+from tacpipe.clouds import ply
+from tacpipe.clouds.cloud import Cloud
+from tacpipe.clouds.grasp import Grasp
+from tacpipe.live.session import free_ports
+from tacpipe.live.supervisor import DIED, RESTARTED
+from tacpipe.live.touch_messages import COLUMNS
+from tests.conftest import Lab
+from tests.live.sessions import commanded, ended, model_process, subscriber
+from tests.recording import live
+
+pytestmark = [pytest.mark.rig, pytest.mark.long]
+TRAINED = (
+    "simulate touch --trials 12 --objects 1 --families sphere,box -o data/pinched",
+    "segment grasps data/pinched -o data/g",
+    "split data/g -o data/split --scheme random --val 0.2 --test 0",
+    "train touch data/g --split data/split -o models/t --trees 10 --leaf 2",
+)
+
+
+def test_a_request_is_answered_with_what_predict_gives_and_both_are_recorded(lab: Lab) -> None:
+    for command in TRAINED:
+        lab.run(command)
+    recordings = tacpipe.open(lab.folder / "data/g")
+    name = sorted(recordings.recordings)[0]
+    cloud, grasp = Cloud.of(recordings[name].table("cloud")), Grasp.of(recordings[name].table("grasp"))
+    (lab.folder / "clouds").mkdir()
+    (lab.folder / "clouds" / "cup.ply").write_bytes(ply.packed(cloud.points_m, cloud.colours))
+    (port,) = free_ports(1)
+    options = f'{{ folder = "{lab.folder / "clouds"}" }}'
+    (lab.folder / "rig.toml").write_text(live.stream("requests", "grasps", f"udp:127.0.0.1:{port}", options))
+    assert grasp.wrist is not None
+    turned = Grasp(grasp.g2_m, grasp.g1_m, grasp.wrist @ np.diag([1.0, -1.0, -1.0]))
+    asked: dict[str, Any] = {
+        "version": 1,
+        "request": 7,
+        "cloud": "cup.ply",
+        "grasps": [
+            {"g1": one.g1_m.tolist(), "g2": one.g2_m.tolist(), "wrist": np.asarray(one.wrist).tolist()}
+            for one in (grasp, turned)
+        ],
+    }
+    with subscriber() as (heard, messages), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as planner:
+        words = f"live rig.toml --model models/t -o rec --rank balance --json --publish udp:127.0.0.1:{heard}"
+        process = commanded(lab, words)
+
+        def answered() -> bool:
+            assert process.poll() is None, process.communicate()[1]
+            planner.sendto(json.dumps(asked).encode(), ("127.0.0.1", port))
+            return any(one["kind"] == "touch" for one in messages)
+
+        live.awaited(answered)
+        os.kill(model_process(process), signal.SIGKILL)
+        count = len(messages)
+        live.awaited(lambda: answered() and any(one["kind"] == "touch" for one in messages[count:]))
+        ended(process, interrupt=True)
+    answer = next(one for one in messages if one["kind"] == "touch")
+    assert answer["cause"] == "" and answer["criterion"] == "balance"
+    lab.run("predict models/t data/g -o predicted")
+    (predicted,) = tacpipe.open(lab.folder / "predicted")
+    table = predicted.table()
+    row = table.column("recording").to_pylist().index(name)
+    wanted = np.array([table.column(one)[row].as_py() for one in COLUMNS], np.float32)
+    found = np.array([answer["candidates"][0]["touch"][one] for one in COLUMNS], np.float32)
+    assert found.tobytes() == wanted.tobytes()
+    shard = live.only(lab.folder)
+    assert [cause for cause, _ in live.events(shard, "touch")][:2] == [DIED, RESTARTED]
+    rows = shard.table("touch").to_pylist()
+    assert rows and {one["request"] for one in rows} == {7} and sorted({one["grasp"] for one in rows}) == [0, 1]
+    assert next(one for one in rows if one["rank"] == 1)["grasp"] == answer["best"]
+    assert shard.table("requests")["g1_x_m"].to_pylist()[0] == asked["grasps"][0]["g1"][0]
