@@ -133,7 +133,7 @@ class Chain:
         ``layouts`` lacks or has otherwise.
 
         ``beginning`` is that of another chain of the session, which ended: grid and level at rest are continued, so that
-        this one predicts the same once it has read a few rows more than the model's context. What the other one had
+        this one predicts the same once it has read a few rows more than the model reads. What the other one had
         counted of wrap-arounds is not known.
         """
         forecaster = Forecaster.load(model)
