@@ -17,7 +17,7 @@ from tacpipe.models.change import closing
 from tacpipe.models.taxelwise import TaxelwiseForecast
 from tacpipe.models.windows import MOTION, UP, Windows, held
 
-PATTERN = 16  # newest rows of which it is read whether each is new: what tells when the next frame is due
+PATTERN = 16  # newest rows of which it is read whether each is new, from which follows when the next frame is due
 DENSE, SPARSE = 10, 5  # newest rows of the arm that are all read; of older ones each fifth
 
 

@@ -161,7 +161,9 @@ class Mixed(Forward):
     epochs: PositiveInt = 8  # maximum number of passes over the training windows
     dropout: Dropout = 0.2  # fraction of units left out of each training step
     networks: Annotated[int, Range(0)] = 3  # networks that read new frames, next to one taxelwise
-    frames: Annotated[int, Range(2)] = 8  # newest frames that they and the trees read; repeated rows are no frames
+    frames: Annotated[int, Range(2)] = (
+        8  # newest frames that they and the trees read; rows that repeat the one before do not count
+    )
     history: PositiveInt = 50  # past rows that are read where there are as many; the first is repeated where not
     trees: Annotated[int, Range(0)] = 80  # of the gradient boosting; 0: none
     boosted: PositiveInt = 4000  # training windows that trees are fitted on at most
