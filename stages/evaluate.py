@@ -30,7 +30,7 @@ class Params:
     """Nothing to choose: the evaluation of a model does not depend on who trained it."""
 
 
-@stage(version=4, headline=headline.FILE)
+@stage(version=5, headline=headline.FILE)
 def evaluate(params: Params, model: Model, recordings: Dataset) -> Result:
     """Evaluate a model on recordings, by the measures of the task it was trained for."""
     from tacpipe.datasets import model_files

@@ -150,7 +150,7 @@ class Chain:
         ``layouts`` lacks or has otherwise.
 
         ``beginning`` is that of another chain of the session, which ended: grid and level at rest are continued, so that
-        this one predicts the same once it has read a few rows more than the model's context. Counts that had wrapped
+        this one predicts the same once it has read a few rows more than the model reads. Counts that had wrapped
         around are taken as near to the level at rest as they can be.
 
         ``plan_from`` names the stream of an arm whose set-points are the planned motion (`tacpipe.live.targets`), in the

@@ -81,12 +81,16 @@ class TaxelwiseForecast(ChangeForecast):
         hidden = nn.functional.gelu(self.mixing(nn.functional.gelu(hidden) * self._kept(hidden)))
         hidden = hidden * self._kept(hidden)
         factors = self.factors(hidden).view(*hidden.shape[:2], self.axes, RANK)  # (window, taxel, axis, rank)
-        new = 3 - 4 * held(windows.touch).T  # (window, context): new frames are rare, so they weigh more
+        new = self._new(windows)
         plan = self.arm(windows)[0][windows.context :]  # (horizon, window, motion)
         states, _ = self.plan(torch.cat([plan, new.expand(len(plan), -1, -1)], -1), self.start(whole)[None])
         steps = (self.steps(states) + self.step) * torch.sigmoid(self.gate(new)).T[..., None]
         change = torch.einsum("ntar,hnr->hnta", factors, steps)
         return self.touched(change.flatten(2), windows)
+
+    def _new(self, windows: Windows) -> Tensor:
+        """Return which rows are new (window, context): new frames are rare, so they weigh more."""
+        return 3 - 4 * held(windows.touch).T
 
     def _by_taxel(self, touch: Tensor) -> Tensor:
         """Return ``touch`` (…, channel) as (…, taxel, axis)."""

@@ -30,6 +30,7 @@ KINDS: dict[str, dict[str, Any]] = {
     "increments": {"actions": "none", "codec": "pca", "representation": "increments"},
     "logged": {"actions": "none", "grid": "logged"},
     "fresh": {"actions": "none", "grid": "fresh"},
+    "mixed": {"architecture": "mixed", "actions": "none", "networks": 1, "trees": 6, "history": 30, "frames": 4},
 }
 GIVEN = rigs.recording(20, gap_ms=200.0)
 
@@ -71,7 +72,7 @@ def test_any_cut_of_a_recording_gives_the_same_forecasts_to_the_last_bit(
     assert not any(fed.late.values())
 
 
-@pytest.mark.parametrize("kind", ["raw", "latents", "increments", "logged", "fresh"])
+@pytest.mark.parametrize("kind", ["raw", "latents", "increments", "logged", "fresh", "mixed"])
 def test_forecasts_are_those_of_the_stages_of_the_whole_recording(kind: str, models: dict[str, Made]) -> None:
     made = models[kind]
     values = {"causal": True, **{name: KINDS[kind][name] for name in ("grid",) if name in KINDS[kind]}}

@@ -100,10 +100,10 @@ class Rolling:
         Where it ``continues`` a session, the first rows depend on rows that it does not know, by velocities and
         latents, and are not read.
         """
-        codec, context = forecaster.codec, forecaster.context
+        codec, reads = forecaster.codec, forecaster.reads
         self._forecaster = forecaster
-        self._latent = np.zeros((context, len(codec.latents)), np.float32)
-        self._arm, self._finger = np.zeros((context, ARM), np.float32), np.zeros(context, np.float32)
+        self._latent = np.zeros((reads, len(codec.latents)), np.float32)
+        self._arm, self._finger = np.zeros((reads, ARM), np.float32), np.zeros(reads, np.float32)
         # rows that the newest row's latents depend on
         frames = int(getattr(codec, "frames", 1)) + (codec.representation == INCREMENTS)
         self._levels = np.zeros((frames, len(codec.channels)))
@@ -153,8 +153,10 @@ class Rolling:
 
     def predict(self, plan: AnyFloats) -> Float32s:
         """Return the levels above rest (horizon, channel) that are predicted with the arm's planned rows (horizon, 13)."""
-        arm = np.concatenate([self._arm, plan.astype(np.float32)])
-        read = (self._latent, arm, self._finger)
+        reads = self._forecaster.reads
+        past = np.maximum(np.arange(reads), reads - self._run)  # before the first usable row that one is repeated
+        arm = np.concatenate([self._arm[past], plan.astype(np.float32)])
+        read = (self._latent[past], arm, self._finger[past])
         windows = Windows(*(torch.from_numpy(np.ascontiguousarray(one[:, None])) for one in read))
         features = self._forecaster.features(windows)
         levels = self._forecaster.decoded(features, self._levels[None, -1], self._latent[None, -1])

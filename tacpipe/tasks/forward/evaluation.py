@@ -15,11 +15,12 @@ from tacpipe.errors import TacpipeError
 from tacpipe.io import progress
 from tacpipe.metrics import headline
 from tacpipe.plugins.stage import RecordingOutput, Result
-from tacpipe.tasks.forward import metrics, tracks, units
+from tacpipe.tasks.forward import metrics, situations, tracks, units
 from tacpipe.tasks.forward.alarms import Loads
 from tacpipe.tasks.forward.forecaster import CONFIG, Forecaster
 from tacpipe.tasks.forward.metrics import Trial
 from tacpipe.tasks.forward.predictors import predicted
+from tacpipe.tasks.forward.situations import BySituation
 from tacpipe.tasks.forward.tracks import Track
 from tacpipe.tasks.forward.training import HISTORY, check_codec
 
@@ -43,13 +44,14 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
     known, objects = set(forecaster.config["trained_on"].values()), set(forecaster.config["objects"])
     trials, kept = [], {}
     loads = Loads(forecaster.codec.layout, forecaster.horizon)
+    apart = BySituation(forecaster.horizon, len(forecaster.codec.channels))
     with progress.bar("evaluate", len(recordings.recordings)) as advance:
         for name, shard in sorted(recordings.recordings.items()):
             track = tracks.track(shard, forecaster.codec, forecaster.pose)
             check_rate(track, forecaster)
             trial = Trial(name, shard.digest in known, track.object, track.object is None or track.object in objects)
             attributes = {**shard.attributes, "seen": trial.seen}
-            kept[name] = RecordingOutput(_predictions(forecaster, track, trial, loads), attributes)
+            kept[name] = RecordingOutput(_predictions(forecaster, track, trial, loads, apart), attributes)
             trials.append(trial)
             del track
             advance(note=name)
@@ -57,6 +59,8 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
     tree = metrics.summary(trials, groups, forecaster.horizon, forecaster.channel_scale)
     if warned := loads.scored(forecaster.config.get("anticipation", {})):
         tree["anticipation"] = warned
+    if found := apart.summary():
+        tree["situations"] = found
     method = f"{forecaster.config['architecture']} · {forecaster.config['codec']['name']}"
     files = {
         headline.FILE: headline.write(
@@ -71,11 +75,11 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
     return Result(kept, files)
 
 
-def _predictions(forecaster: Forecaster, track: Track, trial: Trial, loads: Loads) -> pa.Table:
+def _predictions(forecaster: Forecaster, track: Track, trial: Trial, loads: Loads, apart: BySituation) -> pa.Table:
     """Return the predictions for all windows of a recording; its errors are added to ``trial``.
 
-    Its loads are added to ``loads`` where the model has not seen it. Some windows are in memory at a time, and of each one
-    of the predictors.
+    Where the model has not seen it, its loads are added to ``loads`` and its errors by situation
+    to ``apart``. Some windows are in memory at a time, and of each one of the predictors.
     """
     starts = track.starts(forecaster.context, forecaster.horizon)
     steps = [step for step in STORED_STEPS if step <= forecaster.horizon]
@@ -85,10 +89,14 @@ def _predictions(forecaster: Forecaster, track: Track, trial: Trial, loads: Load
     begins = 0
     for some in predicted(forecaster, track, starts):
         trial.windows += len(some.now)
+        doing = situations.of_windows(track, some.now, forecaster.horizon)
+        if not trial.seen:
+            apart.count(trial.name, doing)
         for name, prediction in some.predictions.items():
             trial.add_errors(name, prediction, some.truth, forecaster.feature_half)
             if not trial.seen:
                 loads.add_one(name, some.now, prediction)
+                apart.add(trial.name, doing, name, prediction, some.truth)
         ends = begins + len(some.now)
         stored[..., begins:ends] = some.features[:, [step - 1 for step in steps]].transpose(1, 2, 0)
         begins = ends

@@ -21,7 +21,7 @@ def shape(params: Forward, codec: codecs.Codec) -> Shape:
     """Return what a network for the codec's features reads and predicts."""
     where = codec.layout if codec.kind == "raw" else ()
     changes = codec.representation == INCREMENTS
-    return Shape(len(codec.latents), params.context, params.horizon, tuple(where), changes)
+    return Shape(len(codec.latents), params.reads, params.horizon, tuple(where), changes)
 
 
 def build(params: Forward, codec: codecs.Codec) -> nn.Module:

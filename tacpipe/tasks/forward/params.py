@@ -60,6 +60,11 @@ class Forward(ABC):
         "Data": ("windows", "stride", "arm"),
     }
 
+    @property
+    def reads(self) -> int:
+        """How many rows of the past a network is given: those that a window needs, and older ones where there are any."""
+        return self.context
+
     @abstractmethod
     def build(self, shape: Shape) -> nn.Module:
         """Return the network, of random weights, for what it reads and predicts (`tacpipe.models.windows.Shape`).
@@ -142,6 +147,53 @@ class Recurrent(Forward):
         from tacpipe.models.forecasts import RecurrentForecast
 
         return RecurrentForecast(shape.features, self.hidden)
+
+
+@dataclass(frozen=True)
+class Mixed(Forward):
+    """Networks that read the newest frames, a taxelwise one and gradient boosting, blended with persistence.
+
+    Weights of the blend are fitted for each step on the validation recordings.
+    """
+
+    # model: mixed blends networks of new frames, a taxelwise one, boosted trees and persistence
+    architecture: Literal["mixed"] = "mixed"
+    epochs: PositiveInt = 8  # maximum number of passes over the training windows
+    dropout: Dropout = 0.2  # fraction of units left out of each training step
+    networks: Annotated[int, Range(0)] = 3  # networks that read new frames, next to one taxelwise
+    frames: Annotated[int, Range(2)] = (
+        8  # newest frames that they and the trees read; rows that repeat the one before do not count
+    )
+    history: PositiveInt = 50  # past rows that are read where there are as many; the first is repeated where not
+    trees: Annotated[int, Range(0)] = 80  # of the gradient boosting; 0: none
+    boosted: PositiveInt = 4000  # training windows that trees are fitted on at most
+    PANELS: ClassVar[Panels] = {
+        **Forward.PANELS,
+        "Model": (*Forward.PANELS["Model"], "networks", "frames", "history", "trees"),
+        "Training": (*Forward.PANELS["Training"], "boosted"),
+    }
+    PRESETS: ClassVar[Presets] = {"quick": {"hidden": 32, "epochs": 3, "networks": 1, "trees": 20, "boosted": 500}}
+
+    @property
+    def reads(self) -> int:
+        """How many rows of the past the networks are given."""
+        return max(self.history, self.context)
+
+    def build(self, shape: Shape) -> nn.Module:
+        """Return networks of random weights, and trees that predict no change; `MixedForecast.complete` fits these."""
+        from tacpipe.models.mixed import MixedForecast, Size
+
+        size = Size(
+            networks=self.networks,
+            frames=self.frames,
+            trees=self.trees,
+            hidden=self.hidden,
+            context=self.context,
+            history=self.reads,
+            horizon=self.horizon,
+            dropout=self.dropout,
+        )
+        return MixedForecast(shape.layout, size)
 
 
 Params = Forward  # of any architecture

@@ -64,10 +64,8 @@ def inputs(forecaster: Forecaster, recordings: Dataset) -> WindowArrays:
     track = tracks.track(shard, forecaster.codec, forecaster.pose)
     check_rate(track, forecaster)
     starts = track.starts(forecaster.context, forecaster.horizon)
-    past, ahead = (
-        starts[:, None] + np.arange(*ends)
-        for ends in ((0, forecaster.context), (forecaster.context, forecaster.context + forecaster.horizon))
-    )
+    past = track.past(starts, forecaster.context, forecaster.reads)
+    ahead = starts[:, None] + np.arange(forecaster.context, forecaster.context + forecaster.horizon)
     read = [*range(len(forecaster.pose.columns)), *(range(POSE, ARM) if forecaster.derived_columns else ())]
     arm = track.arm[:, read].astype(np.float64)
     window = np.concatenate([track.tactile[past], arm[past], track.finger[past][..., None]], axis=-1)

@@ -31,6 +31,8 @@ class Rows:
     context: int
     horizon: int
     actions: str = "planned"
+    reads: int = 0  # rows of the past that windows have, at least `context`
+    begins: Tensor | None = None  # (time,), the first row that may be read with each; None where `reads` is `context`
 
     @property
     def part(self) -> loop.Part:
@@ -40,11 +42,13 @@ class Rows:
     def pick(self, starts: Tensor) -> tuple[Windows, Tensor]:
         """Return the windows that begin at ``starts`` (window,) and their future tactile signals (horizon, window,
         feature)."""
-        steps = torch.arange(self.context + self.horizon, device=starts.device)
+        reads = max(self.reads, self.context)
+        steps = torch.arange(self.context - reads, self.context + self.horizon, device=starts.device)
         rows = steps[:, None] + starts  # (row, window)
+        if self.begins is not None:
+            rows = torch.maximum(rows, self.begins[starts + self.context - 1])
         touch, arm = (one.index_select(0, rows.flatten()).view(*rows.shape, -1) for one in (self.touch, self.arm))
-        picked = Windows(touch[: self.context], arm, self.finger[rows[: self.context]])
-        return picked, touch[self.context :]
+        return Windows(touch[:reads], arm, self.finger[rows[:reads]]), touch[reads:]
 
     def loss(self, model: nn.Module, indices: Tensor) -> Tensor:
         """Return the mean loss of the windows with these indices."""
@@ -75,8 +79,12 @@ def rows(
     *,
     actions: str = "planned",
     device: str = "cpu",
+    reads: int = 0,
 ) -> Rows:
-    """Return the rows of all tracks and the windows that begin at ``starts``, counted within each track."""
+    """Return the rows of all tracks and the windows that begin at ``starts``, counted within each track.
+
+    A window has ``reads`` rows of the past, or ``context`` if that is more; see `Track.past`.
+    """
     if actions not in ACTIONS:
         raise TacpipeError(f"There are no actions {actions!r}; there are {', '.join(ACTIONS)}.")
     offsets = np.cumsum([0] + [len(one.t_ns) for one in tracks])
@@ -92,7 +100,11 @@ def rows(
         for values in (stacked("latent", features), stacked("arm", (windows_of.ARM,)), stacked("finger", ()))
     )
     first = torch.from_numpy(np.concatenate([np.zeros(0, np.int64), *begins])).to(device)
-    return Rows(touch, arm, finger, tracks, first, context, horizon, actions)
+    if reads <= context:
+        return Rows(touch, arm, finger, tracks, first, context, horizon, actions)
+    own = [one.begins() + offset for one, offset in zip(tracks, offsets, strict=False)]
+    earliest = torch.from_numpy(np.concatenate([np.zeros(0, np.int64), *own])).to(device)
+    return Rows(touch, arm, finger, tracks, first, context, horizon, actions, reads, earliest)
 
 
 def acted(windows: Windows, actions: str) -> Windows:

@@ -22,7 +22,7 @@ from tacpipe.models import forecasts
 from tacpipe.models.linear import Baselines
 from tacpipe.models.windows import motion
 from tacpipe.plugins import params as params_of
-from tacpipe.tasks.forward import networks, tracks, units
+from tacpipe.tasks.forward import completion, networks, tracks, units
 from tacpipe.tasks.forward.alarms import Loads
 from tacpipe.tasks.forward.forecaster import (
     BASELINES,
@@ -110,6 +110,7 @@ def train(
         precision=params.precision,
     )
     trained = loop.train(build, loop.Windows(known.part, watched.part, schedule.batch), schedule, workspace)
+    weights = completion.completed(trained.weights, params, codec, known, watched)
     best = min(trained.history, key=lambda line: line["val_loss"])
     config: Config = {
         "task": TASK,
@@ -142,7 +143,7 @@ def train(
         linear = Baselines.fit(_linear(known), _linear(watched))
         config["baselines"] = linear.chosen
         files[BASELINES] = save_arrays({name: np.ascontiguousarray(one) for name, one in linear.to_tensors().items()})
-    files |= {WEIGHTS: save_tensors(trained.weights), CONFIG: _json(config)}
+    files |= {WEIGHTS: save_tensors(weights), CONFIG: _json(config)}
     if params.baselines:
         config["anticipation"] = _alarms(Forecaster.load(files), parts[1])
     return {**files, CONFIG: _json(config), HISTORY: trained.history_lines}
@@ -177,7 +178,7 @@ def _windows(part: Sequence[Track], params: Params, stride: int, device: str) ->
     """Return the rows of a part and its windows, all or those in contact."""
     context, horizon = params.context, params.horizon
     starts = [(one.starts if params.windows == "all" else one.contact_starts)(context, horizon, stride) for one in part]
-    return rows(part, starts, context, horizon, actions=params.actions, device=device)
+    return rows(part, starts, context, horizon, actions=params.actions, device=device, reads=params.reads)
 
 
 def _linear(part: Rows) -> tuple[AnyFloats, AnyFloats, AnyFloats]:
@@ -185,7 +186,7 @@ def _linear(part: Rows) -> tuple[AnyFloats, AnyFloats, AnyFloats]:
     starts = part.some(LINEAR)
     at = starts.cpu().numpy()[:, None]
     past, ahead = at + np.arange(part.context), at + np.arange(part.context, part.context + part.horizon)
-    moved = motion(part.pick(starts)[0])[0].transpose(0, 1).cpu().numpy()
+    moved = motion(part.pick(starts)[0].latest(part.context))[0].transpose(0, 1).cpu().numpy()
     return part.tactile(past), moved, part.tactile(ahead)
 
 

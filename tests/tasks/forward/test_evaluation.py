@@ -33,6 +33,7 @@ from tests.tasks.forward.trials import (
     trained,
 )
 
+OTHERS = {"known", "unseen", "counts", "skill", "anticipation", "situations", "context_mean"}
 LINEAR = {"train_mean", "damped_trend", "last_value_linear", "ridge", "ridge_actions"}
 
 
@@ -198,7 +199,7 @@ def test_names_of_metrics_are_those_that_readers_rely_on(model: dict[str, bytes]
             assert set(metrics[predictor]["mae_counts"][group]) == {"t1", "t2", "t3", "t4", "mean"}
     assert set(metrics) == {
         *({"model", "persistence", "context_mean"} | LINEAR),
-        *("counts", "skill", "anticipation", "known", "unseen"),
+        *("counts", "skill", "anticipation", "situations", "known", "unseen"),
     }
     assert set(metrics["model"]) == {"mse_counts", "mae_counts", "mse_standard", "mse_latent", "mse_feature"}
     assert set(metrics["ridge"]) == {"mse_counts", "mae_counts", "mse_standard"}
@@ -245,7 +246,7 @@ def test_what_the_codec_alone_loses_stands_beside_the_model(
     of = name.split()[1]
     codec, test = latents[of], compressed(*TEST, files=latents[of].files, representation=of)
     metrics, result = evaluated(latent_models[name], *test.recordings.values(), files=codec.files)
-    assert set(metrics) - LINEAR - {"known", "unseen", "counts", "skill", "anticipation", "context_mean"} == {
+    assert set(metrics) - LINEAR - OTHERS == {
         *("model", "persistence"),
         *rows,
     }

@@ -151,7 +151,7 @@ def test_what_is_told_of_the_plan_decides_whether_it_helps(actions: str, tmp_pat
     assert skill > 0.9 if actions == "planned" else skill < 0.2
 
 
-@pytest.mark.parametrize("architecture", ["recurrent", "taxelwise", "gru"])
+@pytest.mark.parametrize("architecture", ["recurrent", "taxelwise", "gru", "mixed"])
 def test_training_again_gives_the_same_bytes_and_another_seed_does_not(architecture: str, tmp_path: Path) -> None:
     first, again, other = (
         trained(tmp_path / name, architecture=architecture, epochs=1, seed=seed)
@@ -162,7 +162,8 @@ def test_training_again_gives_the_same_bytes_and_another_seed_does_not(architect
 
 
 @pytest.mark.parametrize(
-    ("architecture", "actions"), [("recurrent", "planned"), ("taxelwise", "planned"), ("gru", "shuffled")]
+    ("architecture", "actions"),
+    [("recurrent", "planned"), ("taxelwise", "planned"), ("gru", "shuffled"), ("mixed", "planned")],
 )
 def test_an_interrupted_training_goes_on_where_it_was(
     architecture: str, actions: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

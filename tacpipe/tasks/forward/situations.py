@@ -1,0 +1,152 @@
+"""What the hand does in a window, and the errors of forecasts by that.
+
+A window is named by its last row read and the rows to come, so names describe what was measured; no model reads them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from tacpipe.arrays import AnyFloats, Int64s
+from tacpipe.metrics import forecast
+from tacpipe.tasks.forward.predictors import BASELINE, MODEL, Prediction
+from tacpipe.tasks.forward.tracks import Track
+
+SITUATIONS = ("no contact", "closing", "releasing", "slipping", "holding in motion", "holding still")
+WIDTH_M = 0.0005  # by which the gripper's width changes over the rows to come where it closes or opens
+LOST = 0.05  # fraction of the load that is lost over the rows to come where an object slips
+PACE_M_S, TURNING_RAD_S = 0.02, 0.1  # from which on the hand moves
+Tree = dict[str, Any]
+
+
+class Motion(NamedTuple):
+    """What names a window: of its last row read (now) and its last row to come (then), each (window,)."""
+
+    touched_now: AnyFloats  # whether anything is touched, 0 or 1
+    touched_then: AnyFloats
+    load_now: AnyFloats  # mean of absolute levels over channels
+    load_then: AnyFloats
+    wider_m: AnyFloats  # by how much the gripper is wider then
+    pace_m_s: AnyFloats  # the hand's fastest from now to then
+    turning_rad_s: AnyFloats
+
+
+def named(motion: Motion) -> Int64s:
+    """Return the situation of each window (window,), a place in `SITUATIONS`; the first one that holds.
+
+    - no contact: nothing is touched now or then;
+    - closing: the gripper's width shrinks by more than ``WIDTH_M``, or contact begins;
+    - releasing: it grows by more than that, or contact ends;
+    - slipping: the load falls by more than ``LOST`` of itself with the gripper still;
+    - holding in motion: the hand is faster than ``PACE_M_S`` or ``TURNING_RAD_S``;
+    - holding still: all else.
+
+    >>> one = Motion(*(np.array([value]) for value in (1, 1, 100.0, 99.0, 0.0001, 0.3, 0.0)))
+    >>> SITUATIONS[named(one)[0]], SITUATIONS[named(one._replace(load_then=np.array([90.0])))[0]]
+    ('holding in motion', 'slipping')
+    """
+    now, then = motion.touched_now > 0, motion.touched_then > 0
+    conditions = [
+        ~now & ~then & (np.abs(motion.wider_m) <= WIDTH_M),
+        (motion.wider_m < -WIDTH_M) | (~now & then),
+        (motion.wider_m > WIDTH_M) | (now & ~then),
+        motion.load_then < (1 - LOST) * motion.load_now,
+        (motion.pace_m_s > PACE_M_S) | (motion.turning_rad_s > TURNING_RAD_S),
+    ]
+    return np.select(conditions, range(len(conditions)), len(SITUATIONS) - 1).astype(np.int64)
+
+
+def of_windows(track: Track, now: Int64s, horizon: int) -> Int64s:
+    """Return the situation of the windows of a recording whose last row read is ``now`` (window,)."""
+    if not len(now):
+        return np.zeros(0, np.int64)
+    then, ahead = now + horizon, now[:, None] + np.arange(horizon + 1)
+    speeds = track.arm[ahead][..., 7:].astype(np.float64)  # (window, row, 6)
+    return named(
+        Motion(
+            (track.contact[now] >= 0).astype(np.float64),
+            (track.contact[then] >= 0).astype(np.float64),
+            np.abs(track.tactile[now]).mean(axis=1),
+            np.abs(track.tactile[then]).mean(axis=1),
+            (track.finger[then] - track.finger[now]).astype(np.float64),
+            np.linalg.norm(speeds[..., :3], axis=-1).max(axis=1),
+            np.linalg.norm(speeds[..., 3:], axis=-1).max(axis=1),
+        )
+    )
+
+
+@dataclass
+class BySituation:
+    """Sums of errors by recording, predictor and situation."""
+
+    horizon: int
+    channels: int
+    windows: dict[str, Int64s] = field(default_factory=dict)  # by recording, (situation,)
+    squared: dict[tuple[str, str], AnyFloats] = field(
+        default_factory=dict
+    )  # by recording, predictor: (situation, step)
+    absolute: dict[tuple[str, str], AnyFloats] = field(default_factory=dict)
+
+    def count(self, recording: str, situations: Int64s) -> None:
+        """Count windows of a recording."""
+        found = np.bincount(situations, minlength=len(SITUATIONS))
+        self.windows[recording] = self.windows.get(recording, np.zeros(len(SITUATIONS), np.int64)) + found
+
+    def add(self, recording: str, situations: Int64s, name: str, predicted: Prediction, truth: Prediction) -> None:
+        """Add the errors of one predictor on these windows."""
+        for sums, of in ((self.squared, forecast.squared_sums), (self.absolute, forecast.absolute_sums)):
+            before = sums.setdefault((recording, name), np.zeros((len(SITUATIONS), self.horizon)))
+            for one in np.unique(situations):
+                chosen = situations == one
+                before[one] += of(predicted.count[chosen], truth.count[chosen]).sum(axis=1)
+
+    def summary(self, seed: int = 0) -> Tree:
+        """Return by situation the windows, recordings, mean absolute errors by predictor and step, and the model's skill.
+
+        Skill is 1 - squared error / squared error of persistence, by step and over all, with its interval over recordings.
+        """
+        return {name: self._of(at, seed) for at, name in enumerate(SITUATIONS) if self._recordings(at)}
+
+    def _recordings(self, situation: int) -> list[str]:
+        return [name for name, windows in self.windows.items() if windows[situation]]
+
+    def _of(self, at: int, seed: int) -> Tree:
+        recordings = self._recordings(at)
+        count = sum(int(self.windows[name][at]) for name in recordings)
+        predictors = list(dict.fromkeys(name for _, name in self.absolute))
+        errors = {name: self._sums(self.absolute, recordings, name, at).sum(axis=0) for name in predictors}
+        model, still = (
+            np.hstack([sums, sums.sum(axis=1, keepdims=True)])
+            for sums in (self._sums(self.squared, recordings, name, at) for name in (MODEL, BASELINE))
+        )
+        found = forecast.skill_interval(model, still, seed=seed)
+        skill = {
+            step: {
+                part: _rounded(value)
+                for part in ("mean", "low", "high")
+                if math.isfinite(value := getattr(found, part)[place])
+            }
+            for place, step in enumerate([*(f"t{step}" for step in range(1, self.horizon + 1)), "mean"])
+        }
+        return {
+            "windows": count,
+            "recordings": len(recordings),
+            "mae_counts": {name: _steps(one / (count * self.channels)) for name, one in errors.items()},
+            "skill": {step: one for step, one in skill.items() if one},
+        }
+
+    def _sums(self, sums: dict[tuple[str, str], AnyFloats], recordings: Sequence[str], name: str, at: int) -> AnyFloats:
+        return np.stack([sums[one, name][at] for one in recordings])
+
+
+def _steps(errors: AnyFloats) -> Tree:
+    return {f"t{step}": _rounded(value) for step, value in enumerate(errors, 1)} | {"mean": _rounded(errors.mean())}
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.9g}")

@@ -1,0 +1,109 @@
+"""What the hand does in a window, and that errors by it add up to those of all windows."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tacpipe.tasks.forward import situations, tracks
+from tacpipe.tasks.forward.predictors import Prediction
+from tacpipe.tasks.forward.situations import SITUATIONS, BySituation, Motion
+from tests.stages.learning_fakes import motion
+from tests.tasks.forward.trials import CONTEXT, HORIZON, evaluated, trained
+
+REST = {
+    "touched_now": 1.0,
+    "touched_then": 1.0,
+    "load_now": 100.0,
+    "load_then": 100.0,
+    "wider_m": 0.0,
+    "pace_m_s": 0.0,
+    "turning_rad_s": 0.0,
+}
+
+
+@pytest.mark.parametrize(
+    ("changed", "wanted"),
+    [
+        ({}, "holding still"),
+        ({"pace_m_s": 0.021}, "holding in motion"),
+        ({"turning_rad_s": 0.11, "load_then": 96.0}, "holding in motion"),
+        ({"load_then": 94.0, "pace_m_s": 1.0}, "slipping"),
+        ({"load_then": 94.0, "wider_m": 0.0006}, "releasing"),
+        ({"touched_then": 0.0}, "releasing"),
+        ({"wider_m": -0.0006, "pace_m_s": 1.0}, "closing"),
+        ({"touched_now": 0.0}, "closing"),
+        ({"touched_now": 0.0, "touched_then": 0.0, "wider_m": -0.01}, "closing"),
+        ({"touched_now": 0.0, "touched_then": 0.0, "pace_m_s": 1.0}, "no contact"),
+    ],
+)
+def test_a_window_has_the_first_name_that_fits(changed: dict[str, float], wanted: str) -> None:
+    found = situations.named(Motion(**{name: np.array([value]) for name, value in {**REST, **changed}.items()}))
+    assert SITUATIONS[found[0]] == wanted
+
+
+def test_windows_of_a_recording_are_named_by_their_last_row_and_those_to_come() -> None:
+    one = motion(0)
+    track = tracks.track(one, tracks.codec_of(one.content, {}))  # type: ignore[arg-type]
+    rows = len(track.t_ns)
+    arm = np.zeros((rows, 13), np.float32)
+    arm[40:, 7] = 0.5
+    contact = np.where(np.arange(rows) < 10, -1, 0)
+    finger = np.where(np.arange(rows) < 60, 0.04, 0.05).astype(np.float32)
+    still = np.full(track.tactile.shape, 50.0)
+    still[20:] = 40.0
+    given: Any = dataclasses.replace(track, arm=arm, contact=contact, finger=finger, tactile=still)
+    now = np.array([3, 8, 12, 17, 25, 37, 45, 57])
+    found = [SITUATIONS[at] for at in situations.of_windows(given, now, HORIZON)]
+    assert found == [
+        *("no contact", "closing", "holding still", "slipping"),
+        *("holding still", "holding in motion", "holding in motion", "releasing"),
+    ]
+    assert situations.of_windows(given, now[:0], HORIZON).tolist() == []
+
+
+def test_errors_and_skill_are_those_of_numpy_over_the_windows_of_a_situation() -> None:
+    rng = np.random.default_rng(0)
+    sums, kept = BySituation(HORIZON, 3), {}
+    for recording in ("a", "b", "c"):
+        doing = rng.integers(0, 3, 30)
+        truth = rng.normal(size=(30, HORIZON, 3))
+        model, still = truth + rng.normal(0, 0.5, truth.shape), truth + rng.normal(0, 1, truth.shape)
+        for some in (slice(0, 11), slice(11, 30)):
+            sums.count(recording, doing[some])
+            for name, values in (("model", model), ("persistence", still)):
+                sums.add(recording, doing[some], name, Prediction(None, values[some]), Prediction(None, truth[some]))
+        kept[recording] = (doing, truth, model, still)
+    found = sums.summary()
+    assert set(found) == set(SITUATIONS[:3])
+    at = 1
+    errors = [np.concatenate([(one[2 + which] - one[1])[one[0] == at] for one in kept.values()]) for which in (0, 1)]
+    one = found[SITUATIONS[at]]
+    assert (one["windows"], one["recordings"]) == (len(errors[0]), 3)
+    assert one["mae_counts"]["model"]["t2"] == pytest.approx(np.abs(errors[0][:, 1]).mean(), rel=1e-6)
+    assert one["mae_counts"]["persistence"]["mean"] == pytest.approx(np.abs(errors[1]).mean(), rel=1e-6)
+    squared = [float((part[:, 2] ** 2).sum()) for part in errors]
+    assert one["skill"]["t3"]["mean"] == pytest.approx(1 - squared[0] / squared[1], rel=1e-6)
+    assert one["skill"]["t3"]["low"] < one["skill"]["t3"]["mean"] < one["skill"]["t3"]["high"]
+
+
+def test_evaluate_states_situations_whose_windows_are_all_windows_of_unseen_recordings(tmp_path: Path) -> None:
+    files = trained(tmp_path, epochs=1)
+    metrics, _ = evaluated(files, motion(20), motion(21), motion(0))  # the last one was trained on
+    found = metrics["situations"]
+    assert (
+        sum(one["windows"] for one in found.values())
+        == metrics["counts"]["windows"]
+        == 2 * (80 - CONTEXT - HORIZON + 1)
+    )
+    for name in ("model", "persistence", "ridge"):
+        pooled = sum(one["windows"] * one["mae_counts"][name]["t1"] for one in found.values())
+        assert pooled / metrics["counts"]["windows"] == pytest.approx(
+            metrics[name]["mae_counts"]["both"]["t1"], rel=1e-6
+        )
+    only, _ = evaluated(files, motion(0))
+    assert "situations" not in only
