@@ -17,6 +17,7 @@ from tacpipe.metrics import headline
 from tacpipe.plugins.stage import RecordingOutput, Result
 from tacpipe.tasks.forward import metrics, tracks, units
 from tacpipe.tasks.forward.alarms import Loads
+from tacpipe.tasks.forward.bands import Bands
 from tacpipe.tasks.forward.forecaster import CONFIG, Forecaster
 from tacpipe.tasks.forward.metrics import Trial
 from tacpipe.tasks.forward.predictors import predicted
@@ -42,7 +43,7 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
     check_codec(model, recordings.files)
     known, objects = set(forecaster.config["trained_on"].values()), set(forecaster.config["objects"])
     trials, kept = [], {}
-    loads = Loads(forecaster.codec.layout, forecaster.horizon)
+    loads, bands = Loads(forecaster.codec.layout, forecaster.horizon), Bands(forecaster)
     with progress.bar("evaluate", len(recordings.recordings)) as advance:
         for name, shard in sorted(recordings.recordings.items()):
             track = tracks.track(shard, forecaster.codec, forecaster.pose)
@@ -51,12 +52,15 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
             attributes = {**shard.attributes, "seen": trial.seen}
             kept[name] = RecordingOutput(_predictions(forecaster, track, trial, loads), attributes)
             trials.append(trial)
+            bands.add(track, trial)
             del track
             advance(note=name)
     groups = metrics.channel_groups(forecaster.codec.layout)
     tree = metrics.summary(trials, groups, forecaster.horizon, forecaster.channel_scale)
     if warned := loads.scored(forecaster.config.get("anticipation", {})):
         tree["anticipation"] = warned
+    if stated := bands.summary(trials):
+        tree["quantiles"] = stated
     method = f"{forecaster.config['architecture']} · {forecaster.config['codec']['name']}"
     files = {
         headline.FILE: headline.write(
@@ -66,6 +70,7 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
         "horizons.csv": metrics.horizons_csv(tree, forecaster.config["rate_hz"]),
         "trials.csv": metrics.trials_csv(trials),
         "errors.parquet": metrics.errors_parquet(trials, groups, forecaster.channel_scale),
+        **bands.files(trials),
         **{name: model[name] for name in (CONFIG, HISTORY, codecs.DESCRIPTION) if name in model},
     }
     return Result(kept, files)
