@@ -25,8 +25,8 @@ def signs(past: AnyFloats, ahead: AnyFloats, arm: AnyFloats, finger: AnyFloats, 
     windows, context, channels = past.shape
     level = past / scale
     last = level[:, -1]
-    steps = np.diff(level, axis=1)
-    still: Bools = np.asarray(steps == 0) if context > 1 else np.ones((windows, 1, channels), bool)
+    steps: AnyFloats = np.diff(level, axis=1)
+    still: Bools = (steps == 0) if context > 1 else np.ones((windows, 1, channels), bool)
     own = [
         np.log1p(np.abs(last) * 10),
         np.log1p(level.std(axis=1) * 100),
