@@ -8,6 +8,7 @@ COMMANDS = {  # in the order of `tacpipe --help`; the line of a group, "" for a 
     "split": "",
     "compress": "Compress tactile channels to a few latents.",
     "train": "Train the model of a task.",
+    "calibrate": "",
     "evaluate": "",
     "predict": "",
     "report": "",

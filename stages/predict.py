@@ -1,15 +1,17 @@
 """Predict recordings with a trained model, row by row.
 
 `tacpipe evaluate` reports how good the predictions are. With ``--causal`` each prediction reads what had arrived by then
-and no more, from recordings as they were recorded: what a live session publishes, bit for bit.
+and no more, from recordings as they were recorded: what a live session publishes, bit for bit. ``--quantiles 10,50,90`` adds
+quantiles of a model that `tacpipe calibrate` made.
 
 Example: tacpipe predict models/forward data/segments -o data/predictions
 """
 
 from __future__ import annotations
 
+import inspect
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from tacpipe.plugins.constraints import CommaList, PositiveInt
 from tacpipe.plugins.params import added
@@ -29,6 +31,10 @@ class Params:
     steps: Annotated[str, STEPS] = "1,3,5,10"  # steps ahead
     # read no sample that had not arrived yet, as a live session; give recordings as they were recorded
     causal: bool = added(False)
+    # levels in percent of quantiles to add, of a model that `tacpipe calibrate` made, as 10,50,90; empty: none
+    quantiles: Annotated[str, CommaList(PositiveInt)] = added("")
+    # of material: add calibrated probabilities and the answer, a name or unknown, of a model that `tacpipe calibrate` made
+    probabilities: bool = added(False)
 
 
 def _as_given(params: Params) -> bool:
@@ -41,12 +47,34 @@ def predict(params: Params, model: Model, recordings: Dataset) -> Result:
     from tacpipe.datasets import model_files
 
     steps = sorted(set(STEPS.items(params.steps)))
+    quantiles = sorted(set(CommaList(PositiveInt).items(params.quantiles)))
     if params.causal:
+        _check_causal(quantiles)
         return _causal(model, recordings, steps)
     task = model_files.task(model.files)
     with model_files.validated("the model"):
-        result: Result = task.predict(model.files, recordings, steps)
+        result: Result = task.predict(model.files, recordings, steps, **_asked(task, params, quantiles))
     return result
+
+
+def _asked(task: Any, params: Params, quantiles: list[int]) -> dict[str, Any]:
+    """Return what is asked for beyond the steps, as a task's ``predict`` takes it."""
+    from tacpipe.errors import UsageError
+
+    asked = {"quantiles": quantiles, "probabilities": params.probabilities}
+    given = {name: value for name, value in asked.items() if value}
+    known = inspect.signature(task.predict).parameters
+    for name in given:
+        if name not in known:
+            raise UsageError(f"Models of this task have no {name}; leave out --{name}.")
+    return given
+
+
+def _check_causal(quantiles: list[int]) -> None:
+    from tacpipe.errors import UsageError
+
+    if quantiles:
+        raise UsageError("causal has no quantiles; leave out --quantiles, or --causal.")
 
 
 def _causal(model: Model, recordings: Dataset, steps: list[int]) -> Result:

@@ -248,7 +248,7 @@ def _shared(stage: AnyStage) -> list[inspect.Parameter]:
                 ),
             ),
         ]
-    if stage.reads_model:
+    if stage.reads_model and not stage.needs_split:
         found.append(
             _parameter("role", str | None, typer.Option(None, "--role", help="Role to read: train, val or test."))
         )

@@ -102,7 +102,7 @@ def _refuse_unread(name: str, stage: AnyStage, datasets: Sequence[Given], named:
     }
     given = {**dict.fromkeys(named, True), "fold": how.fold != 0, "role": how.role is not None}
     given |= {"track": bool(how.track), "device": how.device != AUTO, "devices": how.devices != 1}
-    reads |= {"fold": reads["split"], "role": stage.reads_model, "track": stage.tracked}
+    reads |= {"fold": reads["split"], "role": stage.reads_model and not stage.needs_split, "track": stage.tracked}
     reads |= {"device": stage.trains, "devices": stage.trains}
     for key in given:
         if given[key] and not reads[key]:

@@ -285,14 +285,13 @@ class _Run:
             given = self.inputs.merged if name == ORIGINALS else self._given
             chosen = {one: entry for one, entry in given.included.items() if one in self._parts.recordings}
             return keys.of_dataset(given, reads, chosen)
-        if name in ROLES:
-            chosen = inputs.in_role(inputs.merged, name, may_lack=self.stage.optional(name))
-            return keys.of_dataset(inputs.merged, reads, chosen)
         given = inputs.merged
         as_given = self.stage.as_given
         if "model" in inputs.named and not (as_given is not None and as_given(self.request.params)):
             where = str(self.request.datasets[0])
             given = self._by_recording.replay(given, inputs.model, inputs.beside, where)
+        if name in ROLES:
+            return keys.of_dataset(given, reads, inputs.in_role(given, name, may_lack=self.stage.optional(name)))
         if "split" in inputs.named:
             return keys.of_dataset(given, reads, inputs.in_role(given, self.request.role or "test"))
         if self.request.role is not None:

@@ -246,6 +246,7 @@ STAGES = (
         "compress autoencoder data/c --split data/split -o data/z --epochs 1 --components 2 --hidden 4",
         FORWARD[:4],
     ),
+    Case("calibrate", "calibrate models/f data/c --split data/split -o models/g", FORWARD[:5]),
     Case("predict", "predict models/f data/c --split data/split -o data/p --role test --steps 1,2", FORWARD[:5]),
     Case("report", "report results/f -o report.html", FORWARD),
     *_export(("card", "csv", "hdf5", "mcap"), "data/r", 1),

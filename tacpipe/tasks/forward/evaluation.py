@@ -17,6 +17,7 @@ from tacpipe.metrics import headline
 from tacpipe.plugins.stage import RecordingOutput, Result
 from tacpipe.tasks.forward import metrics, situations, tracks, units
 from tacpipe.tasks.forward.alarms import Loads
+from tacpipe.tasks.forward.bands import Bands
 from tacpipe.tasks.forward.forecaster import CONFIG, Forecaster
 from tacpipe.tasks.forward.metrics import Trial
 from tacpipe.tasks.forward.predictors import predicted
@@ -43,7 +44,7 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
     check_codec(model, recordings.files)
     known, objects = set(forecaster.config["trained_on"].values()), set(forecaster.config["objects"])
     trials, kept = [], {}
-    loads = Loads(forecaster.codec.layout, forecaster.horizon)
+    loads, bands = Loads(forecaster.codec.layout, forecaster.horizon), Bands(forecaster)
     apart = BySituation(forecaster.horizon, len(forecaster.codec.channels))
     with progress.bar("evaluate", len(recordings.recordings)) as advance:
         for name, shard in sorted(recordings.recordings.items()):
@@ -53,6 +54,7 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
             attributes = {**shard.attributes, "seen": trial.seen}
             kept[name] = RecordingOutput(_predictions(forecaster, track, trial, loads, apart), attributes)
             trials.append(trial)
+            bands.add(track, trial)
             del track
             advance(note=name)
     groups = metrics.channel_groups(forecaster.codec.layout)
@@ -61,6 +63,8 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
         tree["anticipation"] = warned
     if found := apart.summary():
         tree["situations"] = found
+    if stated := bands.summary(trials):
+        tree["quantiles"] = stated
     method = f"{forecaster.config['architecture']} · {forecaster.config['codec']['name']}"
     files = {
         headline.FILE: headline.write(
@@ -70,6 +74,7 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
         "horizons.csv": metrics.horizons_csv(tree, forecaster.config["rate_hz"]),
         "trials.csv": metrics.trials_csv(trials),
         "errors.parquet": metrics.errors_parquet(trials, groups, forecaster.channel_scale),
+        **bands.files(trials),
         **{name: model[name] for name in (CONFIG, HISTORY, codecs.DESCRIPTION) if name in model},
     }
     return Result(kept, files)

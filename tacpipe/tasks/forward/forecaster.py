@@ -27,6 +27,8 @@ from tacpipe.signals.rotations import continuous
 from tacpipe.tasks.forward import networks, tracks
 from tacpipe.tasks.forward.params import Params
 from tacpipe.tasks.forward.rows import acted
+from tacpipe.tasks.forward.uncertainty import FILE as QUANTILES
+from tacpipe.tasks.forward.uncertainty import Uncertainty, window_signs
 from tacpipe.tasks.opened import Chain
 
 Config = dict[str, Any]
@@ -65,6 +67,7 @@ class Forecaster:
     baselines: Baselines | None
     codec_files: Mapping[str, bytes] = field(default_factory=dict)
     chain: Chain | None = None  # the stages that it was trained behind; None: unknown
+    uncertainty: Uncertainty | None = None  # of a model that `tacpipe calibrate` made
 
     @property
     def context(self) -> int:
@@ -170,7 +173,9 @@ class Forecaster:
                 {} if codec.kind == "raw" else {name: files[name] for name in (codecs.DESCRIPTION, codecs.TENSORS)}
             )
             baselines = None if found is None else Baselines.from_tensors(found)
-            made = cls(model.eval(), params, config, codec, baselines, codec_files, chain)
+            sizes = len(codec.channels), params.horizon
+            uncertainty = Uncertainty.load(files[QUANTILES], *sizes) if QUANTILES in files else None
+            made = cls(model.eval(), params, config, codec, baselines, codec_files, chain, uncertainty)
             made._try()
         return made
 
@@ -204,6 +209,30 @@ class Forecaster:
         self._check_levels(touch)
         predicted = self._of_arrays(touch, arm, finger)
         return predicted[0] if single else predicted
+
+    def quantiles_of(self, percents: Sequence[int]) -> tuple[Uncertainty, list[int]]:
+        """Return what the model knows of its uncertainty, and where the quantiles of these levels, in percent, stand in it.
+
+        Raises `TacpipeError` where the model has none, or not these.
+        """
+        if self.uncertainty is None:
+            raise TacpipeError(
+                "The model has no quantiles. Run `tacpipe calibrate MODEL DATASET --split SPLIT -o CALIBRATED` and give "
+                "that one."
+            )
+        return self.uncertainty, self.uncertainty.chosen(percents)
+
+    def predict_quantiles(self, window: AnyFloats, plan: AnyFloats, percents: Sequence[int]) -> AnyFloats:
+        """Return quantiles of counts above rest of arrays; `model.ForwardModel.predict` describes all three."""
+        uncertainty, at = self.quantiles_of(percents)
+        window = np.asarray(window)
+        single = window.ndim == 2
+        touch, arm, finger = self._parts(*((window[None], plan[None]) if single else (window, plan)))
+        self._check_levels(touch)
+        ahead = self._of_arrays(touch, arm, finger)
+        read = Windows(*(torch.from_numpy(one.swapaxes(0, 1)) for one in (touch, arm, finger)))
+        found = uncertainty.quantiles(window_signs(read, touch, ahead, self.channel_scale), ahead)[..., at]
+        return found[0] if single else found
 
     def _of_arrays(self, touch: AnyFloats, arm: AnyFloats, finger: AnyFloats) -> AnyFloats:
         """Return the future tactile signals (window, horizon, channel) of what `_parts` returns."""

@@ -23,27 +23,36 @@ class ForwardModel(Forecaster):
     """Predicts future tactile signals of recordings, or of arrays."""
 
     @overload
-    def predict(self, recordings: Dataset | Recording, /, *, steps: Sequence[int] = STEPS) -> pa.Table: ...
+    def predict(
+        self, recordings: Dataset | Recording, /, *, steps: Sequence[int] = STEPS, quantiles: Sequence[int] = ()
+    ) -> pa.Table: ...
 
     @overload
-    def predict(self, window: AnyFloats, plan: AnyFloats, /) -> AnyFloats: ...
+    def predict(self, window: AnyFloats, plan: AnyFloats, /, *, quantiles: Sequence[int] = ()) -> AnyFloats: ...
 
     def predict(
-        self, given: Dataset | Recording | AnyFloats, plan: AnyFloats | None = None, /, *, steps: Sequence[int] = STEPS
+        self,
+        given: Dataset | Recording | AnyFloats,
+        plan: AnyFloats | None = None,
+        /,
+        *,
+        steps: Sequence[int] = STEPS,
+        quantiles: Sequence[int] = (),
     ) -> pa.Table | AnyFloats:
         """Return predicted tactile signals: of a dataset or one of its recordings as a table, of arrays as an array.
 
         **Recordings** (``tacpipe.open(PATH)``, or one of its recordings) give the arrow table that `tacpipe predict` writes
         and ``tacpipe.open(OUTPUT).table()`` reads: ``recording``, ``t_ns`` (when it was known) and for each channel and each
         of ``steps`` the counts above rest that many rows later, as ``xela1_taxel01_z_t5``, float32; a row a window.
-        ``.to_pandas()`` makes a frame of it. Raises `UsageError` where the recordings did not go through the stages that
+        ``.to_pandas()`` makes a frame of it. ``quantiles`` (percent, of those of `tacpipe calibrate`) adds columns such as
+        ``xela1_taxel01_z_t5_q90``. Raises `UsageError` where the recordings did not go through the stages that
         the model was trained behind, `TacpipeError` for a step beyond the horizon.
 
         **Arrays**, for controllers: ``window`` (context, column) or (window, context, column), newest row last, has
         `window_columns` or these, `derived_columns` and the width of the gripper; ``plan`` (horizon, column) or (window,
         horizon, column), the rows to come, has `plan_columns`, or these and `derived_columns`. `windows` makes both of a
         recording. Velocities that are left out are differences of the poses. Returns counts above rest, float64 (horizon,
-        channel) or (window, horizon, channel).
+        channel) or (window, horizon, channel); with ``quantiles`` these instead, float32 (…, channel, quantile).
 
         Raises `TacpipeError` for other shapes, for values that are not finite, and for raw counts instead of counts above
         rest: where the median of a window's counts, by absolute value over rows and channels, is more than twice
@@ -53,9 +62,10 @@ class ForwardModel(Forecaster):
         `largest_level` goes unnoticed. A model without `largest_level` skips this check with a warning.
         """
         if plan is not None:
-            return self.predict_windows(cast("AnyFloats", given), plan)
+            window = cast("AnyFloats", given)
+            return self.predict_quantiles(window, plan, quantiles) if quantiles else self.predict_windows(window, plan)
         recordings = opened(cast("Dataset | Recording", given), self.chain)
-        return one_after_another(prediction.tables(self, recordings, sorted(set(steps))))
+        return one_after_another(prediction.tables(self, recordings, sorted(set(steps)), sorted(set(quantiles))))
 
     def windows(self, recording: Recording) -> WindowArrays:
         """Return all windows of a recording as `predict` reads them: ``window``, ``plan`` and ``t_ns``, when each was known.

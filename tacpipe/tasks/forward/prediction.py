@@ -13,32 +13,40 @@ from tacpipe.errors import TacpipeError
 from tacpipe.models.windows import ARM, POSE
 from tacpipe.plugins.stage import RecordingOutput, Result
 from tacpipe.tasks.forward import tracks, units
+from tacpipe.tasks.forward.bands import band
 from tacpipe.tasks.forward.evaluation import check_rate
 from tacpipe.tasks.forward.forecaster import Forecaster, WindowArrays
 from tacpipe.tasks.forward.predictors import forecasts
 from tacpipe.tasks.forward.training import check_codec
+from tacpipe.tasks.forward.uncertainty import CHUNK
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
 
 
-def predict(model: Mapping[str, bytes], recordings: Dataset, steps: Sequence[int]) -> Result:
+def predict(
+    model: Mapping[str, bytes], recordings: Dataset, steps: Sequence[int], quantiles: Sequence[int] = ()
+) -> Result:
     """Return a table a recording: when each prediction was known, and each channel's counts above rest ``steps`` later.
 
-    Columns are named like ``xela1_taxel01_z_t5``. Raises `TacpipeError` for a step that the model does not reach and
-    where the recordings are not what it reads.
+    Columns are named like ``xela1_taxel01_z_t5``, and with ``quantiles`` (percent) like ``xela1_taxel01_z_t5_q90`` too.
+    Raises `TacpipeError` for a step that the model does not reach, for quantiles that it does not have, and where the
+    recordings are not what it reads.
     """
-    found = tables(Forecaster.load(model), recordings, steps)
+    found = tables(Forecaster.load(model), recordings, steps, quantiles)
     return Result({name: RecordingOutput(table) for name, table in found.items()})
 
 
-def tables(forecaster: Forecaster, recordings: Dataset, steps: Sequence[int]) -> dict[str, pa.Table]:
+def tables(
+    forecaster: Forecaster, recordings: Dataset, steps: Sequence[int], quantiles: Sequence[int] = ()
+) -> dict[str, pa.Table]:
     """Return the table of each recording's predictions; steps and errors are those of `predict`."""
     for step in steps:
         if not 1 <= step <= forecaster.horizon:
             raise TacpipeError(
                 f"The model predicts 1 to {forecaster.horizon} steps ahead, not {step}. Give --steps of these."
             )
+    levels = forecaster.quantiles_of(quantiles)[1] if quantiles else []
     check_codec(forecaster.codec_files, recordings.files)
     found = {}
     for name, shard in sorted(recordings.recordings.items()):
@@ -46,14 +54,19 @@ def tables(forecaster: Forecaster, recordings: Dataset, steps: Sequence[int]) ->
         check_rate(track, forecaster)
         starts = track.starts(forecaster.context, forecaster.horizon)
         counts = np.empty((len(steps), len(forecaster.codec.channels), len(starts)), np.float32)
+        bands = np.empty((len(levels), *counts.shape), np.float32)
         wanted, begins = [step - 1 for step in steps], 0
         for some in forecasts(forecaster, track, starts):
             ends = begins + len(some.count)
             counts[..., begins:ends] = some.count[:, wanted].transpose(1, 2, 0)
+            for first in range(0, len(some.count) if levels else 0, CHUNK):
+                part = slice(first, min(first + CHUNK, len(some.count)))
+                own = band(forecaster, track, some, part)[:, wanted][..., levels].transpose(3, 1, 2, 0)
+                bands[..., begins + part.start : begins + part.stop] = own
             begins = ends
             del some  # before the next one is made
         t_ns = track.t_ns[starts + forecaster.context - 1]
-        found[name] = prediction_table(forecaster, t_ns, counts, steps)
+        found[name] = prediction_table(forecaster, t_ns, counts, steps, dict(zip(quantiles, bands, strict=True)))
     return found
 
 
@@ -72,8 +85,17 @@ def inputs(forecaster: Forecaster, recordings: Dataset) -> WindowArrays:
     return WindowArrays(window, arm[ahead], track.t_ns[past[:, -1]])
 
 
-def prediction_table(forecaster: Forecaster, t_ns: Times, counts: Float32s, steps: Sequence[int]) -> pa.Table:
-    """Return the table of predicted ``counts`` (step, channel, window), which become its columns without a copy."""
+def prediction_table(
+    forecaster: Forecaster,
+    t_ns: Times,
+    counts: Float32s,
+    steps: Sequence[int],
+    bands: Mapping[int, Float32s] | None = None,
+) -> pa.Table:
+    """Return the table of predicted ``counts`` (step, channel, window), which become its columns without a copy.
+
+    ``bands`` holds quantiles of the same shape by their level in percent, in columns behind each one's prediction.
+    """
     fields = [pa.field("t_ns", pa.int64(), metadata={"quantity": "time", "unit": "ns"})]
     columns: list[Any] = [pa.array(t_ns)]
     unit = str(forecaster.config["inputs"].get("unit", units.COUNT))
@@ -82,4 +104,8 @@ def prediction_table(forecaster: Forecaster, t_ns: Times, counts: Float32s, step
             about = {"quantity": "prediction", "unit": unit, "step": str(step), **forecaster.codec.layout[channel]}
             fields.append(pa.field(f"{name}_t{step}", pa.float32(), metadata=about))
             columns.append(pa.array(counts[index, channel]))
+            for percent, values in (bands or {}).items():
+                level = {**about, "quantile": f"{percent / 100:g}"}
+                fields.append(pa.field(f"{name}_t{step}_q{percent}", pa.float32(), metadata=level))
+                columns.append(pa.array(values[index, channel]))
     return pa.Table.from_arrays(columns, schema=pa.schema(fields))

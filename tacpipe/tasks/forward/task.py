@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from tacpipe.tasks.forward.calibration import calibrate
 from tacpipe.tasks.forward.evaluation import evaluate
 from tacpipe.tasks.forward.forecaster import TASK
 from tacpipe.tasks.forward.model import ForwardModel
@@ -19,4 +20,4 @@ def load(files: Mapping[str, bytes], chain: Chain | None = None) -> ForwardModel
     return ForwardModel.load(files, chain)
 
 
-__all__ = ["SHORT_NAMES", "TASK", "ForwardModel", "evaluate", "load", "notes", "predict", "train"]
+__all__ = ["SHORT_NAMES", "TASK", "ForwardModel", "calibrate", "evaluate", "load", "notes", "predict", "train"]

@@ -23,7 +23,7 @@ from tacpipe.models.tensors import under
 from tacpipe.models.transfer import Transfer
 from tacpipe.plugins import params as params_of
 from tacpipe.printable import plain
-from tacpipe.tasks.material import estimators, networks
+from tacpipe.tasks.material import estimators, known, networks
 from tacpipe.tasks.material import slides as slides_of
 from tacpipe.tasks.material.estimators import Fitted
 from tacpipe.tasks.material.losses import CHUNK, Network
@@ -44,6 +44,7 @@ NEEDED = {
 CONFIG, WEIGHTS, LAST, BASELINES = "config.json", "model.safetensors", "last.safetensors", "baselines.safetensors"
 ESTIMATORS, SHUFFLED_ESTIMATORS = "model.skops", "baselines.skops"
 ROCKET, STATISTICS, SPECTRA = "minirocket", "statistics", "spectra"
+UNKNOWN_ANSWER = "unknown"
 MEAN_LEVEL, PERMUTED_LABELS = "mean_level", "permuted_labels"
 LEVEL_VIEWS: dict[str, View] = {"level_only": "level", "level_removed": "level_removed"}  # of statistics
 
@@ -169,6 +170,8 @@ class Classifier:
             self.readers = self._readers(files[WEIGHTS], WEIGHTS)
         self.last = self._readers(files[LAST], LAST) if LAST in files else {}
         self.baselines = self._baselines(files) if BASELINES in files else {}
+        # of a model that `tacpipe calibrate` made, by sensor
+        self.known = known.unpacked(files[known.FILE], self.layouts) if known.FILE in files else {}
 
     @classmethod
     def load(cls, files: Mapping[str, bytes], chain: Chain | None = None) -> Self:
@@ -210,19 +213,46 @@ class Classifier:
     def probabilities(self, slides: Float32s | Floats, sensor: str = "") -> Float32s:
         """Return a probability of each class (slide, class), in the order of ``classes``: the softmax of `scores`.
 
+        Of a model that `tacpipe calibrate` made, scores are divided by the temperature first that makes them frequencies.
         Networks are trained so that it is the probability that they give each class; of ``spectra`` it is that of each
         material if all are as likely. Scores of ``minirocket`` and ``statistics`` are distances to class means of no fixed
         scale: there it only orders the classes. See `predict` for the arguments.
         """
-        return softmax(self.scores(slides, sensor))
+        scores = self.scores(slides, sensor)
+        return self.known[self._sensor(sensor)].probabilities(scores.astype(np.float64)) if self.known else softmax(scores)
 
-    def scores(self, slides: Float32s | Floats, sensor: str = "") -> Float32s:
-        """Return the score of each class (slide, class), in the order of ``classes``; see `predict`."""
+    def answers(self, slides: Float32s | Floats, sensor: str = "") -> list[str]:
+        """Return the name of the class of each slide, or ``unknown``, of a model that `tacpipe calibrate` made.
+
+        See `predict` for the arguments. Raises `UsageError` for another model.
+        """
+        frames = np.asarray(slides, np.float32)
+        scores = self.scores(frames, sensor)
+        return self.answered(scores, frames[None] if frames.ndim == 2 else frames, self._sensor(sensor))
+
+    def answered(self, scores: Float32s, frames: Float32s, sensor: str) -> list[str]:
+        """Return the answers for slides (slide, time, channel) of a sensor, whose scores (slide, class) are known."""
+        if not self.known:
+            raise UsageError(
+                "The model has no calibrated probabilities and no answer unknown. Run `tacpipe calibrate MODEL DATASET "
+                "--split SPLIT -o CALIBRATED` and give that one."
+            )
+        found = self.known[sensor]
+        refused = found.score(scores, frames) < found.threshold
+        names = self.naming.named(self.named(scores))
+        return [UNKNOWN_ANSWER if no else str(name) for no, name in zip(refused, names, strict=True)]
+
+    def _sensor(self, sensor: str) -> str:
+        """Return the sensor of slides: the one that is named, or the only one."""
         if not sensor and len(self.layouts) > 1:
             raise UsageError(
                 f"The model knows the sensors {', '.join(self.layouts)}; name the one that recorded the slides."
             )
-        layout = self.layout(sensor or next(iter(self.layouts)))
+        return sensor or next(iter(self.layouts))
+
+    def scores(self, slides: Float32s | Floats, sensor: str = "") -> Float32s:
+        """Return the score of each class (slide, class), in the order of ``classes``; see `predict`."""
+        layout = self.layout(self._sensor(sensor))
         frames = np.asarray(slides, np.float32)
         frames = frames[None] if frames.ndim == 2 else frames
         wanted = (layout.frames, len(layout.channels))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +24,7 @@ from tacpipe.tasks.material.metrics import LAST_EPOCH, MODEL, SWAPPED, Tree
 from tacpipe.tasks.material.params import XLSTM, Raec
 from tacpipe.tasks.material.slides import Slides
 from tacpipe.tasks.material.training import HISTORY
+from tacpipe.tasks.material.unknown import Answers
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
@@ -58,15 +59,19 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
     classifier = Classifier.load(model)
     known = set(classifier.config["trained_on"].values())
     evaluated = {}
+    answers = Answers(classifier)
     with progress.bar("evaluate", 2 * len(recordings.recordings)) as advance:  # each slide is read, then named
-        for sensor, slides in classifier.read(recordings, labelled=True, advance=advance).items():
-            evaluated[sensor] = _evaluated(classifier, slides, known)
+        for sensor, slides in _read(classifier, recordings, advance).items():
+            named = answers.add(slides, np.array([one in known for one in slides.digests], bool))
+            if named.any() or not classifier.known:
+                some = slides.some(named) if classifier.known else slides
+                evaluated[sensor] = _evaluated(classifier, some, known)
             advance(len(slides), sensor)
     if not evaluated:
         raise TacpipeError(
             "There is no slide to evaluate the model on. Give a dataset that `tacpipe segment slides` made."
         )
-    tree = _summary(evaluated, classifier, seen=False)
+    tree = {**_summary(evaluated, classifier, seen=False), **answers.trees()}
     seen = _summary(evaluated, classifier, seen=True)
     if any(seen["counts"]["slides"].values()):
         tree["seen"] = seen
@@ -84,11 +89,19 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
             [classifier.naming.named(one.slides.materials[[at]])[0] for _, one, at in rows],
             [classifier.naming.named(one.predicted[MODEL][[at]])[0] for _, one, at in rows],
         ),
+        **answers.files(),
         **{name: model[name] for name in (CONFIG, HISTORY) if name in model},
     }
     attributes = {name: shard.attributes for name, shard in recordings.recordings.items()}
     table = predictions_table(evaluated, classifier, {name: one.get("session") for name, one in attributes.items()})
     return Result({PREDICTIONS: RecordingOutput(table, origin.together(attributes.values()))}, files)
+
+
+def _read(classifier: Classifier, recordings: Dataset, advance: Callable[..., None]) -> dict[str, Slides]:
+    """Return labelled slides; of a calibrated classifier their classes may be others than those that it knows."""
+    key = classifier.naming.key
+    every = all(shard.attributes.get(key) is not None for shard in recordings.recordings.values())
+    return classifier.read(recordings, labelled=not (classifier.known and every), advance=advance)
 
 
 def _evaluated(classifier: Classifier, slides: Slides, known: set[str]) -> Evaluated:

@@ -21,19 +21,26 @@ class MaterialModel(Classifier):
     """Predicts the material of slides: of recordings, or of arrays."""
 
     @overload
-    def predict(self, recordings: Dataset | Recording, /) -> pa.Table: ...
+    def predict(self, recordings: Dataset | Recording, /, *, probabilities: bool = False) -> pa.Table: ...
 
     @overload
     def predict(self, slides: Float32s | NDArray[np.float64], /, sensor: str = "") -> NDArray[Any]: ...
 
     def predict(
-        self, given: Dataset | Recording | Float32s | NDArray[np.float64], /, sensor: str = ""
+        self,
+        given: Dataset | Recording | Float32s | NDArray[np.float64],
+        /,
+        sensor: str = "",
+        *,
+        probabilities: bool = False,
     ) -> pa.Table | NDArray[Any]:
         """Return the material of slides: of a dataset or one of its recordings as a table, of arrays as an array.
 
         **Recordings** (``tacpipe.open(PATH)``, or one of its recordings) give the arrow table that `tacpipe predict`
         writes: a row a slide with ``recording``, ``sensor``, ``material`` (int32, or text where labels are), a
-        ``score_…`` of each class and, of networks, the latents ``z…``. ``.to_pandas()`` makes a frame of it. Scores of
+        ``score_…`` of each class and, of networks, the latents ``z…``; with ``probabilities``, of a model that `tacpipe
+        calibrate` made, a ``probability_…`` of each class and the ``answer``, a name or unknown.
+        ``.to_pandas()`` makes a frame of it. Scores of
         a dataset are those of the command to the last bit; those of one recording alone may differ in the last digits
         of a float32, because slides are computed together. Raises `UsageError` where the recordings did not go through
         the stages that the model was trained behind.
@@ -44,7 +51,7 @@ class MaterialModel(Classifier):
         that are not finite.
         """
         if isinstance(given, Dataset | Recording):
-            return prediction.predictions(self, opened(given, self.chain))
+            return prediction.predictions(self, opened(given, self.chain), probabilities=probabilities)
         return self.naming.named(self.named(self.scores(given, sensor)))
 
     def frames(self, recording: Recording) -> tuple[Float32s, str]:

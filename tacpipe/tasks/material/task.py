@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from tacpipe.tasks.material.calibration import calibrate
 from tacpipe.tasks.material.classifier import TASK
 from tacpipe.tasks.material.evaluation import evaluate
 from tacpipe.tasks.material.model import MaterialModel
@@ -17,4 +18,4 @@ def load(files: Mapping[str, bytes], chain: Chain | None = None) -> MaterialMode
     return MaterialModel.load(files, chain)
 
 
-__all__ = ["TASK", "MaterialModel", "evaluate", "load", "predict", "train"]
+__all__ = ["TASK", "MaterialModel", "calibrate", "evaluate", "load", "predict", "train"]

@@ -18,9 +18,9 @@ from tacpipe.errors import TacpipeError
 from tacpipe.io import progress
 from tacpipe.metrics import headline, regression
 from tacpipe.plugins.stage import RecordingOutput, Result
+from tacpipe.tasks.touch import bands, metrics
 from tacpipe.tasks.touch import grasps as grasps_of
 from tacpipe.tasks.touch import headline as headlines
-from tacpipe.tasks.touch import metrics
 from tacpipe.tasks.touch.grasps import Grasps
 from tacpipe.tasks.touch.metrics import Readings, Tree
 from tacpipe.tasks.touch.predictor import CONFIG, HISTORY, Predictor
@@ -66,6 +66,8 @@ def _evaluated(
     for name, mask in (("known", known & ~seen), ("novel", ~known & ~seen), ("seen", seen)):
         if mask.any():
             tree[name] = _measures(grasps, predicted, mask, known)
+    if stated := _quantiles(predictor, grasps, predicted, seen, known):
+        tree["quantiles"] = stated
     files = {
         headline.FILE: headline.write(_headlines(predictor, grasps, predicted, seen, known)),
         "metrics.json": (json.dumps(tree, indent=1, sort_keys=True, allow_nan=False) + "\n").encode(),
@@ -75,6 +77,20 @@ def _evaluated(
     streams[GRASPS] = _about(grasps, seen, known)
     attributes = origin.together(shard.attributes for shard in recordings.recordings.values())
     return Result({PREDICTIONS: RecordingOutput(streams, attributes)}, files)
+
+
+def _quantiles(
+    predictor: Predictor, grasps: Grasps, predicted: Mapping[str, Readings], seen: Bools, known: Bools
+) -> Tree:
+    """Return the measures of a calibrated model's quantiles, of known objects and of novel ones; empty for others."""
+    if predictor.uncertainty is None:
+        return {}
+    parts = {"known": known & ~seen, "novel": ~known & ~seen}
+    clusters = {"known": grasps.names, "novel": grasps.objects}
+    trees = {
+        name: bands.tree(predictor.uncertainty, grasps, predicted, mask, clusters[name]) for name, mask in parts.items()
+    }
+    return {**predictor.config["quantiles"], **{name: one for name, one in trees.items() if one}}
 
 
 def _headlines(
@@ -160,11 +176,19 @@ def simulated(recordings: Dataset) -> dict[str, bool]:
     return {"simulated": True} if found else {}
 
 
-def readings_table(predicted: Readings) -> pa.Table:
-    """Return a row a grasp: ``pdc_th``, ``pdc_mf``, ``e_th_01`` … ``e_mf_24`` float32, device counts, where predicted."""
+def readings_table(predicted: Readings, bands: Mapping[int, Readings] | None = None) -> pa.Table:
+    """Return a row a grasp: ``pdc_th``, ``pdc_mf``, ``e_th_01`` … ``e_mf_24`` float32, device counts, where predicted.
+
+    ``bands`` holds quantiles by their level in percent, which follow each value as ``e_th_01_q90``.
+    """
     fields, arrays = [], []
     for target, values in predicted.items():
-        for name, column in zip(biotac_sp.value_columns(target), values.T, strict=True):
-            fields.append(pa.field(name, pa.float32(), metadata={"unit": "count", "quantity": "prediction"}))
+        for at, (name, column) in enumerate(zip(biotac_sp.value_columns(target), values.T, strict=True)):
+            about = {"unit": "count", "quantity": "prediction"}
+            fields.append(pa.field(name, pa.float32(), metadata=about))
             arrays.append(pa.array(column.astype(np.float32)))
+            for percent, band in (bands or {}).items():
+                level = {**about, "quantile": f"{percent / 100:g}"}
+                fields.append(pa.field(f"{name}_q{percent}", pa.float32(), metadata=level))
+                arrays.append(pa.array(band[target][:, at].astype(np.float32)))
     return pa.Table.from_arrays(arrays, schema=pa.schema(fields))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, overload
 
 from tacpipe.clouds.cloud import Cloud
@@ -21,18 +22,21 @@ class TouchModel(Predictor):
     """Predicts the tactile reading of grasps: of recordings, or of a cloud and a grasp."""
 
     @overload
-    def predict(self, recordings: Dataset | Recording, /) -> pa.Table: ...
+    def predict(self, recordings: Dataset | Recording, /, *, quantiles: Sequence[int] = ()) -> pa.Table: ...
 
     @overload
     def predict(self, cloud: Cloud, grasp: Grasp, /) -> Touch: ...
 
-    def predict(self, given: Dataset | Recording | Cloud, grasp: Grasp | None = None, /) -> pa.Table | Touch:
+    def predict(
+        self, given: Dataset | Recording | Cloud, grasp: Grasp | None = None, /, *, quantiles: Sequence[int] = ()
+    ) -> pa.Table | Touch:
         """Return predicted readings: of a dataset or one of its recordings as a table, of one cloud as `Touch`.
 
         **Recordings** (``tacpipe.open(PATH)``, or one of its recordings) give the arrow table that `tacpipe predict` writes:
         a row a grasp with ``recording`` and the predicted values in device counts, as ``pdc_th`` and ``e_mf_07``, float32.
-        ``.to_pandas()`` makes a frame of it. Raises `UsageError` where the recordings did not go through the stages that
-        the model was trained behind.
+        ``quantiles`` (percent, of those of `tacpipe calibrate`) adds columns such as ``e_mf_07_q90``. ``.to_pandas()`` makes
+        a frame of it. Raises `UsageError` where the recordings did not go through the stages that the model was trained
+        behind.
 
         **A cloud and a grasp**, in metres and one frame, give the touch of this grasp. Raises `TacpipeError` where the grasp
         lies far from the cloud, and where either lacks what the model reads.
@@ -43,4 +47,4 @@ class TouchModel(Predictor):
                     "A cloud needs a grasp: the place where the fingers close. Give predict(cloud, grasp)."
                 )
             return self.predict_all(given, [grasp])[0]
-        return prediction.predictions(self, opened(given, self.chain))
+        return prediction.predictions(self, opened(given, self.chain), sorted(set(quantiles)))

@@ -18,19 +18,32 @@ if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
 
 
-def predict(model: Mapping[str, bytes], recordings: Dataset, steps: Sequence[int] = ()) -> Result:
+def predict(
+    model: Mapping[str, bytes], recordings: Dataset, steps: Sequence[int] = (), quantiles: Sequence[int] = ()
+) -> Result:
     """Return one table, ``predictions``: a row a grasp with the recording's name and all predicted values, device counts.
 
     Grasps need no reading; ``steps`` is for tasks that predict over time and has no effect here. Raises `TacpipeError` where
-    there are no recordings or they are not what the model reads.
+    there are no recordings or they are not what the model reads. ``quantiles`` (percent), of a calibrated model, add columns
+    such as ``e_mf_07_q90``.
     """
-    return Result({PREDICTIONS: RecordingOutput(predictions(Predictor.load(model), recordings), simulated(recordings))})
+    found = predictions(Predictor.load(model), recordings, quantiles)
+    return Result({PREDICTIONS: RecordingOutput(found, simulated(recordings))})
 
 
-def predictions(predictor: Predictor, recordings: Dataset) -> pa.Table:
+def predictions(predictor: Predictor, recordings: Dataset, quantiles: Sequence[int] = ()) -> pa.Table:
     """Return the table of `predict`, which raises the same errors."""
+    at = predictor.quantiles_of(quantiles)[1] if quantiles else []
     grasps = grasps_of.read(recordings, with_readings=False)
     if not len(grasps):
         raise TacpipeError("There is no grasp to predict. Give a dataset with recordings of the role asked for.")
-    table = readings_table(predictor.predict_grasps(grasps))
+    predicted = predictor.predict_grasps(grasps)
+    bands = {}
+    if quantiles and predictor.uncertainty is not None:
+        found = predictor.uncertainty.quantiles(predicted)
+        bands = {
+            one: {target: values[..., level] for target, values in found.items()}
+            for one, level in zip(quantiles, at, strict=True)
+        }
+    table = readings_table(predicted, bands)
     return table.add_column(0, pa.field("recording", pa.string()), pa.array(grasps.names, pa.string()))

@@ -14,6 +14,7 @@ from tacpipe.channels import biotac_sp
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
 from tacpipe.datasets import model_files
+from tacpipe.errors import TacpipeError
 from tacpipe.models.forest import Forest
 from tacpipe.models.tensors import under
 from tacpipe.plugins import params as params_of
@@ -24,6 +25,8 @@ from tacpipe.tasks.touch.baselines import Baselines
 from tacpipe.tasks.touch.grasps import Grasps, check
 from tacpipe.tasks.touch.params import Params
 from tacpipe.tasks.touch.shrinkage import Shrinkage
+from tacpipe.tasks.touch.uncertainty import FILE as QUANTILES
+from tacpipe.tasks.touch.uncertainty import Uncertainty
 from tacpipe.training import devices
 from tacpipe.training.scaling import Affine
 
@@ -64,6 +67,7 @@ class Predictor:
     baselines: Baselines | None
     chain: Chain | None = None  # the stages that it was trained behind; None: unknown
     shrinkage: Shrinkage | None = None  # of predictions for objects that it was not trained on
+    uncertainty: Uncertainty | None = None  # of a model that `tacpipe calibrate` made
 
     @classmethod
     def load(cls, files: Mapping[str, bytes], chain: Chain | None = None) -> Self:
@@ -90,7 +94,8 @@ class Predictor:
                 raise ValueError(f"its members do not predict {excerpt(config['targets'])}")
             shrunk = {name: value.numpy() for name, value in under(SHRINKAGE, tensors).items()}
             shrinkage = Shrinkage.from_tensors(shrunk, config["targets"]) if shrunk else None
-        return cls(params, config, found, baselines, chain, shrinkage)
+            uncertainty = Uncertainty.load(files[QUANTILES], config["targets"]) if QUANTILES in files else None
+        return cls(params, config, found, baselines, chain, shrinkage, uncertainty)
 
     @cached_property
     def targets(self) -> tuple[str, ...]:
@@ -111,6 +116,18 @@ class Predictor:
         return self.shrinkage.apply(
             predicted, np.array([name not in self.config["objects"] for name in grasps.objects])
         )
+
+    def quantiles_of(self, percents: Sequence[int]) -> tuple[Uncertainty, list[int]]:
+        """Return what the model knows of its uncertainty, and where the quantiles of these levels, in percent, stand in it.
+
+        Raises `TacpipeError` where the model has none, or not these.
+        """
+        if self.uncertainty is None:
+            raise TacpipeError(
+                "The model has no quantiles. Run `tacpipe calibrate MODEL DATASET --split SPLIT -o CALIBRATED` and give "
+                "that one."
+            )
+        return self.uncertainty, self.uncertainty.chosen(percents)
 
     def predict_all(self, cloud: Cloud, grasps: Sequence[Grasp]) -> list[Touch]:
         """Return the touch of several grasps on one cloud, in one pass; `model.TouchModel.predict` describes both."""

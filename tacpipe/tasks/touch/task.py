@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
 from tacpipe.tasks.opened import Chain
+from tacpipe.tasks.touch.calibration import calibrate
 from tacpipe.tasks.touch.evaluation import evaluate
 from tacpipe.tasks.touch.headline import PARTS, TARGETS
 from tacpipe.tasks.touch.model import TouchModel
@@ -36,4 +37,15 @@ def predict_grasp(model: TouchModel, cloud: Cloud, grasp: Grasp) -> dict[str, fl
     return values
 
 
-__all__ = ["SHORT_NAMES", "TASK", "Touch", "TouchModel", "evaluate", "load", "predict", "predict_grasp", "train"]
+__all__ = [
+    "SHORT_NAMES",
+    "TASK",
+    "Touch",
+    "TouchModel",
+    "calibrate",
+    "evaluate",
+    "load",
+    "predict",
+    "predict_grasp",
+    "train",
+]

@@ -1,0 +1,53 @@
+"""Measure how uncertain a trained model is.
+
+Writes the model with what it needs to state that. Models of the tasks ``forward`` and ``touch`` get quantiles: fitted to
+their errors on training recordings, then corrected on validation recordings, so that a band holds as often as it states.
+Models of the task ``material`` get probabilities that are frequencies, and a threshold for the answer ``unknown``. The
+model's predictions stay as they are.
+
+Example: tacpipe calibrate models/forward data/segments --split data/split -o models/forward-calibrated
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated
+
+from tacpipe.plugins.constraints import CommaList, PositiveInt, Range, Seed
+from tacpipe.plugins.stage import stage
+
+if TYPE_CHECKING:
+    from tacpipe.datasets.dataset import Dataset, Model
+    from tacpipe.plugins.stage import Result
+
+LEVELS = CommaList(PositiveInt, least=1)
+
+
+@dataclass(frozen=True)
+class Params:
+    """How a model is to state its uncertainty."""
+
+    quantiles: Annotated[str, LEVELS] = "10,50,90"  # levels in percent, symmetric about 50, of forward and touch
+    # of forward and touch: widen bands until they hold in a new recording with at least their level; else they do on average
+    promise: bool = False
+    # of material: fraction of slides of known materials that may be answered unknown
+    false_unknown: Annotated[float, Range(above=0, below=1)] = 0.05
+    seed: Seed = 0  # random seed of what is fitted
+
+
+@stage(version=1)
+def calibrate(params: Params, model: Model, train: Dataset, val: Dataset) -> Result:
+    """Return the model's files and what states its uncertainty."""
+    from tacpipe.datasets import model_files
+    from tacpipe.errors import UsageError
+    from tacpipe.plugins.stage import Result
+    from tacpipe.tasks.calibrated import Asked
+
+    task = model_files.task(model.files)
+    if not hasattr(task, "calibrate"):
+        name = model_files.tree(model.files, model_files.CONFIG)["task"]
+        raise UsageError(f"The task {name} has no calibration: its module needs a function calibrate.")
+    asked = Asked(tuple(LEVELS.items(params.quantiles)), params.promise, params.false_unknown, params.seed)
+    files = {name: model.files[name] for name in model.files}
+    with model_files.validated("the model"):
+        return Result(files=task.calibrate(files, asked, train, val))

@@ -1,0 +1,114 @@
+"""How good predicted quantiles are: pinball loss, coverage and width, as sums that add up over recordings.
+
+The pinball loss (Koenker and Bassett, Regression quantiles, 1978) of a quantile ``q`` at a level ``p`` is ``p (y - q)``
+where the true value ``y`` lies above, else ``(1 - p) (q - y)``: least, on average, for the true quantile. Coverage is the
+fraction of true values in the band between the lowest and the highest quantile; a band is only good if it is narrow too.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from tacpipe.arrays import AnyFloats
+from tacpipe.errors import TacpipeError
+from tacpipe.metrics import forecast
+
+
+def check_levels(percents: tuple[int, ...]) -> None:
+    """Raise `TacpipeError` unless levels are whole percentages that lie symmetrically about 50 and include it.
+
+    >>> check_levels((10, 50, 90))
+    """
+    ordered = tuple(sorted(set(percents)))
+    mirrored = tuple(100 - one for one in reversed(ordered))
+    if ordered != percents or ordered != mirrored or 50 not in ordered or len(ordered) < 3 or ordered[0] < 1:
+        given = ",".join(map(str, percents))
+        raise TacpipeError(
+            f"The quantiles {given} are not levels that lie symmetrically about 50. Give percentages from 1 to 99 in "
+            f"ascending order with 50 in the middle, as 10,50,90."
+        )
+
+
+@dataclass(frozen=True)
+class Sums:
+    """Sums over the values of one recording: what adds up."""
+
+    pinball: AnyFloats  # (step, level), counts
+    below: AnyFloats  # (step, level), true values at or below the quantile
+    covered: AnyFloats  # (step,), true values in the band from the lowest to the highest quantile
+    width: AnyFloats  # (step,), of that band, counts
+    values: AnyFloats  # (step,)
+
+    @classmethod
+    def of(cls, truth: AnyFloats, predicted: AnyFloats, levels: AnyFloats) -> Sums:
+        """Return the sums over true values (value, step) of predicted quantiles (value, step, level).
+
+        ``levels`` (level,) are fractions in ascending order.
+        """
+        above = truth[..., None].astype(np.float64) - predicted
+        within = (above[..., 0] >= 0) & (above[..., -1] <= 0)
+        return cls(
+            np.maximum(levels * above, (levels - 1) * above).sum(axis=0),
+            (above <= 0).sum(axis=0).astype(np.float64),
+            within.sum(axis=0).astype(np.float64),
+            (predicted[..., -1].astype(np.float64) - predicted[..., 0]).sum(axis=0),
+            np.full(truth.shape[1], float(len(truth))),
+        )
+
+    def __add__(self, other: Sums) -> Sums:
+        """Return the sums over the values of both."""
+        return Sums(*(getattr(self, name) + getattr(other, name) for name in self.__dataclass_fields__))
+
+
+def tree(recordings: list[Sums], percents: tuple[int, ...], baseline: list[Sums] | None = None) -> dict[str, Any]:
+    """Return the measures over recordings by step, ``t1`` …, and over all steps, ``mean``.
+
+    ``pinball`` is the mean over values and levels; ``coverage`` that of the band, with the 95 % interval of it over
+    resampled recordings as ``coverage_low`` and ``coverage_high``; ``width`` the band's mean; ``below_q10`` … the fraction
+    of true values at or below each quantile. ``pinball_skill`` is 1 - pinball / pinball of ``baseline``, sums of the same
+    recordings.
+    """
+    total = recordings[0]
+    for one in recordings[1:]:
+        total = total + one
+    found: dict[str, Any] = {
+        "pinball": _steps(total.pinball.mean(axis=1), total.values),
+        "coverage": _steps(total.covered, total.values),
+        "width": _steps(total.width, total.values),
+    }
+    for at, percent in enumerate(percents):
+        found[f"below_q{percent}"] = _steps(total.below[:, at], total.values)
+    if len(recordings) > 1:
+        low, high = _interval(recordings)
+        found["coverage_low"], found["coverage_high"] = low, high
+    if baseline is not None:
+        other = np.sum([one.pinball.sum(axis=1) for one in baseline], axis=0)
+        own = total.pinball.sum(axis=1)
+        gains = forecast.skill(np.append(own, own.sum()), np.append(other, other.sum()))
+        found["pinball_skill"] = _named(gains)
+    return found
+
+
+def _steps(sums: AnyFloats, values: AnyFloats) -> dict[str, float]:
+    """Return sums (step,) divided by how many values each is of, by step and over all."""
+    return _named(np.append(sums / values, sums.sum() / values.sum()))
+
+
+def _interval(recordings: list[Sums]) -> tuple[dict[str, float], dict[str, float]]:
+    """Return the ends of the 95 % interval of coverage over resampled recordings, by step and over all."""
+    covered, values = (
+        np.stack([np.append(getattr(one, name), getattr(one, name).sum()) for one in recordings])
+        for name in ("covered", "values")
+    )
+    weights = forecast.draws(len(recordings))
+    low, high = forecast.bounds((weights @ covered) / (weights @ values))
+    return _named(low), _named(high)
+
+
+def _named(values: AnyFloats) -> dict[str, float]:
+    """Return values (step + 1,) by their names, to 9 digits; what is not defined is left out."""
+    names = [*(f"t{step}" for step in range(1, len(values))), "mean"]
+    return {name: float(f"{value:.9g}") for name, value in zip(names, values, strict=True) if np.isfinite(value)}

@@ -1,0 +1,72 @@
+"""How far a slide is from every class that was learned, in a space that does not depend on the classifier.
+
+Slides are described by statistics of each channel (`tacpipe.models.statistics_classifier`), standardised and reduced to
+their principal components. There each class is a mean, all with one covariance, shrunk as by Ledoit and Wolf (2004). The
+score is minus half the squared Mahalanobis distance to the nearest mean (Lee, Lee, Lee and Shin, A simple unified framework
+for detecting out-of-distribution samples, NeurIPS 2018).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from tacpipe.arrays import AnyArray, AnyFloats, Float32s, Floats, Int32s, Ints
+from tacpipe.models.statistics_classifier import statistics
+
+COMPONENTS = 40  # at most, and no more than a third of the slides
+STEADY = 1e-6  # standard deviation below which a feature is constant
+
+
+@dataclass(frozen=True)
+class ClassDistance:
+    """What was fitted on labelled slides."""
+
+    classes: Int32s  # (class,), sorted
+    centre: AnyFloats  # (feature,)
+    projection: AnyFloats  # (feature, component), into a space in which the covariance within classes is the identity
+    means: AnyFloats  # (class, component)
+
+    @classmethod
+    def fit(cls, frames: Float32s, labels: Ints) -> Self:
+        """Return the distance to classes of slides (slide, time, channel) and their ``labels`` (slide,).
+
+        Raises `TacpipeError` for what `statistics` refuses.
+        """
+        from sklearn.covariance import ledoit_wolf
+
+        read = statistics(frames).astype(np.float64)
+        centre, spread = read.mean(axis=0), read.std(axis=0)
+        gain = np.where(spread > STEADY, 1 / np.maximum(spread, STEADY), 0)
+        scaled = (read - centre) * gain
+        count = max(1, min(COMPONENTS, len(scaled) // 3, scaled.shape[1]))
+        basis = np.linalg.svd(scaled, full_matrices=False)[2][:count].T  # (feature, component)
+        placed = scaled @ basis
+        classes, index = np.unique(labels, return_inverse=True)
+        means = np.stack([placed[index == one].mean(axis=0) for one in range(len(classes))])
+        covariance, _ = ledoit_wolf(placed - means[index], assume_centered=True)
+        values, vectors = np.linalg.eigh(covariance)
+        whiten = vectors / np.sqrt(np.maximum(values, STEADY * values.max() or 1.0))
+        return cls(classes.astype(np.int32), centre, gain[:, None] * (basis @ whiten), means @ whiten)
+
+    def scores(self, frames: Float32s) -> Floats:
+        """Return minus half the squared distance of slides (slide, time, channel) to each class (slide, class)."""
+        placed = (statistics(frames).astype(np.float64) - self.centre) @ self.projection
+        found: Floats = -np.square(placed[:, None] - self.means[None]).sum(axis=2) / 2
+        return found
+
+    def to_tensors(self) -> dict[str, AnyArray]:
+        """Return all that `from_tensors` needs."""
+        return {name: getattr(self, name) for name in ("classes", "centre", "projection", "means")}
+
+    @classmethod
+    def from_tensors(cls, tensors: Mapping[str, AnyArray]) -> Self:
+        """Return what `to_tensors` described. Raises `ValueError` where shapes do not fit one another."""
+        made = cls(tensors["classes"], tensors["centre"], tensors["projection"], tensors["means"])
+        sizes = (len(made.centre), made.means.shape[1])
+        if made.projection.shape != sizes or len(made.means) != len(made.classes):
+            raise ValueError(f"the projection of slides is {made.projection.shape}, not {sizes}")
+        return made

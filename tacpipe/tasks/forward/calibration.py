@@ -1,0 +1,86 @@
+"""Give a trained forecaster quantiles: from its errors on recordings to one more file."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tacpipe.errors import TacpipeError
+from tacpipe.io import progress
+from tacpipe.metrics import conformal
+from tacpipe.metrics.quantiles import check_levels
+from tacpipe.tasks.forward import tracks
+from tacpipe.tasks.forward.evaluation import check_rate
+from tacpipe.tasks.forward.forecaster import CONFIG, Forecaster
+from tacpipe.tasks.forward.predictors import forecasts
+from tacpipe.tasks.forward.training import check_codec
+from tacpipe.tasks.forward.uncertainty import FILE, Errors, Uncertainty, fewer, window_signs
+
+if TYPE_CHECKING:
+    from tacpipe.datasets.dataset import Dataset
+    from tacpipe.tasks.calibrated import Asked
+
+FITTED = 5000  # windows that quantiles are fitted on, evenly spread over training recordings
+CORRECTED = 400  # windows of each calibration recording
+
+
+def calibrate(model: Mapping[str, bytes], asked: Asked, training: Dataset, validation: Dataset) -> dict[str, bytes]:
+    """Return the files of a model with quantiles of its error, fitted on training and corrected on validation recordings.
+
+    Raises `TacpipeError` where the recordings are not what the model reads or hold no window, and for too few of them.
+    """
+    check_levels(asked.quantiles)
+    forecaster = Forecaster.load(model)
+    known = errors_of(forecaster, training, max(1, FITTED // max(1, len(training.recordings))))
+    watched = errors_of(forecaster, validation, CORRECTED)
+    levels = np.array(asked.quantiles) / 100
+    made = Uncertainty.fit(levels, known, watched, promised=asked.promise, seed=asked.seed)
+    count = len(np.unique(watched.recordings))
+    config = dict(forecaster.config)
+    config["quantiles"] = {
+        "levels": list(asked.quantiles),
+        "method": "promised" if asked.promise else "pooled",
+        "recordings": {"fitted": len(np.unique(known.recordings)), "corrected": count},
+        "most_promised": conformal.most_promised(count),
+    }
+    config["trained_on"] = _seen(config["trained_on"], training, validation)
+    return {**model, CONFIG: (json.dumps(config, indent=1, sort_keys=True) + "\n").encode(), FILE: made.to_bytes()}
+
+
+def errors_of(forecaster: Forecaster, recordings: Dataset, most: int) -> Errors:
+    """Return the model's errors on at most ``most`` windows of each recording, evenly spread."""
+    check_codec(forecaster.codec_files, recordings.files)
+    parts: list[tuple[Any, ...]] = []
+    with progress.bar("calibrate", len(recordings.recordings)) as advance:
+        for number, (name, shard) in enumerate(sorted(recordings.recordings.items())):
+            track = tracks.track(shard, forecaster.codec, forecaster.pose)
+            check_rate(track, forecaster)
+            starts = fewer(track.starts(forecaster.context, forecaster.horizon), most)
+            for some in forecasts(forecaster, track, starts):
+                past, truth = track.tactile[some.past], track.tactile[some.future]
+                parts.append(
+                    (
+                        window_signs(some.windows, past, some.count, forecaster.channel_scale),
+                        (truth - some.count).transpose(0, 2, 1).astype(np.float32),
+                        (truth - past[:, -1:]).transpose(0, 2, 1).astype(np.float32),
+                        np.full(len(past), number),
+                    )
+                )
+            advance(note=name)
+    if not parts:
+        raise TacpipeError(
+            f"None of the {len(recordings.recordings)} recordings holds a window of {forecaster.context} and "
+            f"{forecaster.horizon} rows without a gap. Give longer recordings."
+        )
+    return Errors(*map(np.concatenate, zip(*parts, strict=True)))
+
+
+def _seen(before: Mapping[str, str], *parts: Dataset) -> dict[str, str]:
+    """Return the digests of all recordings that the model has seen by name, those that it is calibrated on included."""
+    known = set(before.values())
+    new = {shard.name: shard.digest for part in parts for shard in part.recordings.values()}
+    added = {name: digest for name, digest in new.items() if digest not in known}
+    return {**before, **{f"{name} of calibration" if name in before else name: one for name, one in added.items()}}

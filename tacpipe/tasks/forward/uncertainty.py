@@ -1,0 +1,165 @@
+"""How uncertain a forecast is, of a model of any architecture: quantiles around what it predicts, as they are stored."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Self
+
+import numpy as np
+from safetensors.numpy import save
+
+from tacpipe.arrays import AnyArray, AnyFloats, Float32s, Int64s
+from tacpipe.datasets import model_files
+from tacpipe.errors import TacpipeError
+from tacpipe.metrics import conformal
+from tacpipe.models.residual_quantiles import ResidualQuantiles
+from tacpipe.models.tensors import under
+from tacpipe.tasks.forward.signs import signs
+
+if TYPE_CHECKING:
+    from tacpipe.models.windows import Windows
+
+FILE = "quantiles.safetensors"
+ERRORS = "errors."  # begins the names of the tensors of `ResidualQuantiles`
+CHUNK = 256  # windows whose quantiles are computed at once
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """Quantiles of a model's error and, to compare with, constant ones of its error and of persistence's."""
+
+    errors: ResidualQuantiles
+    moved: AnyFloats  # (level, step), outwards, in the units of ``errors``
+    unconditional: AnyFloats  # (level, channel, step), of the model's error on calibration recordings, counts
+    persistence: AnyFloats  # (level, channel, step), of persistence's error on training recordings, counts
+
+    @property
+    def percents(self) -> tuple[int, ...]:
+        """The levels of the quantiles in percent, ascending."""
+        return tuple(round(float(100 * one)) for one in self.errors.levels)
+
+    def chosen(self, percents: Sequence[int]) -> list[int]:
+        """Return where quantiles of these levels, in percent, stand. Raises `TacpipeError` for one that was not fitted."""
+        for one in percents:
+            if one not in self.percents:
+                raise TacpipeError(
+                    f"The model has the quantiles {','.join(map(str, self.percents))}, not {one}. Give --quantiles of "
+                    f"these, or run `tacpipe calibrate` with others."
+                )
+        return [self.percents.index(one) for one in percents]
+
+    def quantiles(self, read: Float32s, ahead: AnyFloats) -> Float32s:
+        """Return quantiles in counts above rest (window, step, channel, level), ascending, of the forecast ``ahead``
+        (window, step, channel) and its ``signs`` (window, channel, feature)."""
+        found = self.errors.predict(read)  # (window, channel, step, level)
+        middle, unit = len(self.percents) // 2, self.errors.unit[None]
+        for at in range(len(self.percents)):
+            if at != middle:
+                outwards = unit * self.moved[at].astype(np.float32)
+                found[..., at] += outwards if at > middle else -outwards
+        np.maximum.accumulate(found[..., middle:], axis=-1, out=found[..., middle:])
+        down = found[..., : middle + 1][..., ::-1]
+        np.minimum.accumulate(down, axis=-1, out=down)
+        return found.transpose(0, 2, 1, 3) + ahead[..., None].astype(np.float32)
+
+    @classmethod
+    def fit(
+        cls,
+        levels: AnyFloats,
+        training: Errors,
+        calibration: Errors,
+        *,
+        promised: bool = False,
+        seed: int = 0,
+    ) -> Self:
+        """Return quantiles fitted on the errors of training recordings and corrected on those of calibration recordings.
+
+        Each quantile is moved until, of the calibration recordings, each weighing the same, as many values lie at or below
+        it as its level states: conformalized quantile regression (Romano, Patterson and Candès, NeurIPS 2019), each
+        side for itself, with the CDFs of recordings pooled (`tacpipe.metrics.conformal`). ``promised``: pairs of
+        quantiles are moved together so far that the band between them holds in a new recording with at least its level;
+        raises `TacpipeError` with too few recordings for that.
+        """
+        errors = ResidualQuantiles.fit(training.signs, training.errors, levels, seed=seed)
+        predicted = errors.predict(calibration.signs)
+        moved = _moved(errors, predicted, calibration, promised)
+        return cls(errors, moved, _empirical(calibration.errors, levels), _empirical(training.changes, levels))
+
+    def to_bytes(self) -> bytes:
+        """Return a file that `load` reads."""
+        tensors: dict[str, AnyArray] = {name: getattr(self, name) for name in ("moved", "unconditional", "persistence")}
+        tensors |= {f"{ERRORS}{name}": value for name, value in self.errors.to_tensors().items()}
+        return save({name: np.ascontiguousarray(value) for name, value in tensors.items()})
+
+    @classmethod
+    def load(cls, content: bytes, channels: int, horizon: int) -> Self:
+        """Return what `to_bytes` wrote. Raises `TacpipeError` for another file, `ValueError` where shapes do not fit."""
+        found = model_files.arrays(content, FILE)
+        made = cls(
+            ResidualQuantiles.from_tensors(under(ERRORS, found)),
+            *(found[name] for name in ("moved", "unconditional", "persistence")),
+        )
+        levels = len(made.percents)
+        shapes = {(levels, channels, horizon)} | {one.shape for one in (made.unconditional, made.persistence)}
+        if len(shapes) > 1 or made.moved.shape != (levels, horizon) or made.errors.unit.shape != (channels, horizon):
+            raise ValueError("the quantiles are of other channels or steps")
+        return made
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Errors of a model on some windows of recordings, and what its forecasts and inputs show."""
+
+    signs: Float32s  # (window, channel, feature)
+    errors: Float32s  # (window, channel, step), true less predicted, counts
+    changes: Float32s  # (window, channel, step), true less the last row, counts
+    recordings: Int64s  # (window,), the number of the recording
+
+
+def window_signs(windows: Windows, past: AnyFloats, ahead: AnyFloats, scale: AnyFloats) -> Float32s:
+    """Return `signs.signs` of windows as a forecaster reads them, their levels (window, context, channel) and forecast."""
+    arm, finger = windows.arm.transpose(0, 1).numpy(), windows.finger.T.numpy()
+    return signs(past, ahead, arm, finger, scale)
+
+
+def _moved(errors: ResidualQuantiles, predicted: Float32s, calibration: Errors, promised: bool) -> AnyFloats:
+    """Return by how many units each quantile is moved outwards (level, step)."""
+    levels, steps = errors.levels, errors.unit.shape[1]
+    middle, channels = len(levels) // 2, errors.unit.shape[0]
+    groups = np.repeat(calibration.recordings, channels)
+    moved = np.zeros((len(levels), steps))
+    for step in range(steps):
+        beyond = (calibration.errors[:, :, step, None] - predicted[:, :, step]) / errors.unit[None, :, step, None]
+        for low in range(middle):
+            high, level = len(levels) - 1 - low, float(levels[-1 - low])
+            sides = {low: -beyond[..., low].ravel(), high: beyond[..., high].ravel()}
+            if promised:
+                both = np.maximum(*sides.values())
+                moved[[low, high], step] = _promise(both, groups, 2 * level - 1)
+            else:
+                for at, scores in sides.items():
+                    moved[at, step] = conformal.quantile(scores, groups, level)
+    return moved
+
+
+def _promise(scores: AnyFloats, groups: Int64s, level: float) -> float:
+    found = conformal.quantile(scores, groups, level, promised=True)
+    if not np.isfinite(found):
+        count = len(np.unique(groups))
+        raise TacpipeError(
+            f"{count} calibration recordings can promise a band that holds {100 * conformal.most_promised(count):.0f} % at "
+            f"most, not {100 * level:.0f} %. Split with more of them (`tacpipe split --val`), give quantiles nearer to 50, "
+            f"or leave out --promise."
+        )
+    return found
+
+
+def _empirical(errors: Float32s, levels: AnyFloats) -> Float32s:
+    """Return the quantiles (level, channel, step) of errors (window, channel, step)."""
+    return np.quantile(errors, levels, axis=0).astype(np.float32)
+
+
+def fewer(starts: Int64s, most: int) -> Int64s:
+    """Return at most ``most`` of a recording's windows, evenly spread."""
+    return starts[:: max(1, -(-len(starts) // most))]

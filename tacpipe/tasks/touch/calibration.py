@@ -1,0 +1,51 @@
+"""Give a trained model of touch quantiles: from its errors on validation grasps to one more file."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.metrics.quantiles import check_levels
+from tacpipe.tasks.touch import grasps as grasps_of
+from tacpipe.tasks.touch.predictor import CONFIG, Predictor
+from tacpipe.tasks.touch.uncertainty import FILE, Uncertainty
+
+if TYPE_CHECKING:
+    from tacpipe.datasets.dataset import Dataset
+    from tacpipe.tasks.calibrated import Asked
+
+
+def calibrate(model: Mapping[str, bytes], asked: Asked, training: Dataset, validation: Dataset) -> dict[str, bytes]:
+    """Return the files of a model with quantiles, which hold on validation grasps as often as their levels state.
+
+    Raises `TacpipeError` where the model learned from these validation grasps, and where there are none.
+    """
+    check_levels(asked.quantiles)
+    predictor = Predictor.load(model)
+    known, watched = grasps_of.read(training), grasps_of.read(validation)
+    if not len(watched):
+        raise TacpipeError(
+            "No grasp has the role val to calibrate on. Make a split with some: `tacpipe split --val 0.2`."
+        )
+    learned = set(predictor.config["trained_on"].values())
+    if predictor.config["counts"]["val"] == 0 and any(digest in learned for digest in watched.digests):
+        raise UsageError(
+            "The model learned from these validation grasps too, so that they state nothing of its errors. Train it with "
+            "--no-use-validation."
+        )
+    levels = np.array(asked.quantiles) / 100
+    predicted = predictor.predict_grasps(watched)
+    made = Uncertainty.fit(levels, known, watched, predicted, promised=asked.promise)
+    trained_on = {**predictor.config["trained_on"]}
+    trained_on |= {name: one for name, one in zip(watched.names, watched.digests, strict=True) if one not in learned}
+    stated = {
+        "levels": list(asked.quantiles),
+        "method": "promised" if asked.promise else "pooled",
+        "grasps": len(watched),
+    }
+    config = {**predictor.config, "quantiles": stated, "trained_on": trained_on}
+    return {**model, CONFIG: (json.dumps(config, indent=1, sort_keys=True) + "\n").encode(), FILE: made.to_bytes()}

@@ -1,0 +1,38 @@
+"""The distance to classes: a slide of another texture is further from all than one of a texture that was learned."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tacpipe.metrics import calibration
+from tacpipe.models.class_distance import ClassDistance
+
+
+def slides(kinds: tuple[int, ...], count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Slides (slide, time, channel) whose spread differs by kind, and their kinds (slide,)."""
+    rng = np.random.default_rng(seed)
+    labels = np.repeat(kinds, count)
+    frames = rng.normal(20, 1, (len(labels), 30, 4)) + labels[:, None, None] * rng.normal(0, 1, (len(labels), 30, 4))
+    return frames.astype(np.float32), labels
+
+
+def test_the_nearest_class_is_the_slides_own_and_other_textures_are_far() -> None:
+    fitted = ClassDistance.fit(*slides((0, 2, 5), 30, 0))
+    frames, labels = slides((0, 2, 5), 20, 1)
+    scores = fitted.scores(frames)
+    assert (fitted.classes[scores.argmax(axis=1)] == labels).mean() > 0.95
+    others, _ = slides((12,), 20, 2)
+    assert calibration.auroc(scores.max(axis=1), fitted.scores(others).max(axis=1)) > 0.95
+
+
+def test_whitened_training_slides_have_about_as_many_dimensions_of_squared_distance() -> None:
+    frames, labels = slides((0, 2, 5), 60, 0)
+    fitted = ClassDistance.fit(frames, labels)
+    own = fitted.scores(frames)[np.arange(len(labels)), np.searchsorted(fitted.classes, labels)]
+    assert 0.5 < -2 * own.mean() / fitted.means.shape[1] < 1.2
+
+
+def test_tensors_give_back_the_distance() -> None:
+    frames, labels = slides((0, 5), 10, 0)
+    fitted = ClassDistance.fit(frames, labels)
+    assert (ClassDistance.from_tensors(fitted.to_tensors()).scores(frames) == fitted.scores(frames)).all()

@@ -1,0 +1,155 @@
+"""Quantiles of a forecaster: calibrated on recordings, predicted in tables and arrays, evaluated next to persistence's."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+import tacpipe
+from tacpipe.errors import TacpipeError
+from tacpipe.plugins import registry
+from tacpipe.tasks.calibrated import Asked
+from tacpipe.tasks.forward import task as forward
+from tests.fake_recordings import dataset
+from tests.stages.learning_fakes import CHANNELS, motion
+from tests.tasks.forward.trials import HORIZON, asked, compressed, evaluated, predicted_windows, trained
+
+TEST = motion(20)
+PERCENTS = (10, 50, 90)
+TRAINING, CALIBRATION = [motion(seed) for seed in range(3)], [motion(seed) for seed in range(10, 14)]
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    return trained(tmp_path_factory.mktemp("model"))
+
+
+def calibrated(files: dict[str, bytes], *, promise: bool = False, count: int = 4) -> dict[str, bytes]:
+    how = Asked(PERCENTS, promise, 0.05, 0)
+    return forward.calibrate(files, how, dataset(*TRAINING), dataset(*CALIBRATION[:count]))
+
+
+@pytest.fixture(scope="module")
+def model(plain: dict[str, bytes]) -> dict[str, bytes]:
+    return calibrated(plain)
+
+
+def test_a_calibrated_model_predicts_the_same_and_adds_its_quantiles(
+    plain: dict[str, bytes], model: dict[str, bytes]
+) -> None:
+    before = forward.predict(plain, dataset(TEST), [1, 4]).recordings[TEST.name].streams[""]
+    after = forward.predict(model, dataset(TEST), [1, 4]).recordings[TEST.name].streams[""]
+    assert before.equals(after)
+    found = forward.predict(model, dataset(TEST), [1, 4], [10, 90]).recordings[TEST.name].streams[""]
+    assert found.select(before.column_names).equals(before)
+    assert found.column_names[1:4] == [f"{CHANNELS[0]}_t1", f"{CHANNELS[0]}_t1_q10", f"{CHANNELS[0]}_t1_q90"]
+    assert found.schema.field(f"{CHANNELS[0]}_t1_q90").metadata[b"quantile"] == b"0.9"
+    low, high = (found[f"{CHANNELS[5]}_t4_q{one}"].to_numpy() for one in (10, 90))
+    assert (low < high).all()
+
+
+def test_the_table_and_arrays_have_the_same_quantiles(model: dict[str, bytes]) -> None:
+    table = forward.predict(model, dataset(TEST), [4], PERCENTS).recordings[TEST.name].streams[""]
+    loaded = forward.load(model)
+    found, starts, _ = predicted_windows(loaded, TEST)
+    arrays = loaded.predict(*asked(found, starts), quantiles=PERCENTS)
+    assert arrays.shape == (len(starts), HORIZON, len(CHANNELS), 3)
+    for at, percent in enumerate(PERCENTS):
+        wanted = table[f"{CHANNELS[3]}_t4_q{percent}"].to_numpy()
+        assert np.allclose(arrays[:, 3, 3, at], wanted, rtol=1e-4, atol=0.05)
+    one = loaded.predict(*(part[0] for part in asked(found, starts)), quantiles=[90])
+    assert np.allclose(one[..., 0], arrays[0, ..., 2], rtol=1e-4, atol=0.05)
+
+
+def test_as_many_values_of_calibration_recordings_lie_below_a_quantile_as_its_level_states(
+    model: dict[str, bytes],
+) -> None:
+    # the law of the correction on the recordings that it is computed on: no fewer, and no more than a few ties beyond
+    tree, _ = evaluated(model, *CALIBRATION)
+    seen = tree["quantiles"]["seen"]["model"]
+    for step in range(1, HORIZON + 1):
+        assert seen["below_q90"][f"t{step}"] == pytest.approx(0.9, abs=0.01)
+        assert seen["below_q10"][f"t{step}"] == pytest.approx(0.1, abs=0.01)
+
+
+def test_evaluation_reports_quantiles_next_to_those_of_persistence(model: dict[str, bytes]) -> None:
+    tree, result = evaluated(model, TEST, motion(21))
+    found = tree["quantiles"]
+    assert found["levels"] == [10, 50, 90]
+    assert found["recordings"] == {"fitted": 3, "corrected": 4}
+    assert found["most_promised"] == 0.8
+    for predictor in ("model", "model_unconditional", "persistence"):
+        assert set(found[predictor]["coverage"]) == {*(f"t{step}" for step in range(1, HORIZON + 1)), "mean"}
+        assert 0 <= found[predictor]["coverage_low"]["t1"] <= found[predictor]["coverage_high"]["t1"] <= 1
+    assert found["persistence"]["pinball_skill"]["mean"] == pytest.approx(0, abs=1e-12)
+    assert 0.6 < found["model"]["coverage"]["mean"] < 0.95
+    table = pq.read_table(io.BytesIO(result.files["coverage.parquet"]))
+    assert table.num_rows == 2 * 3 * HORIZON
+    (drawn, _) = json.loads(result.files["bands.json"])
+    assert drawn["recording"] == TEST.name and len(drawn["t_s"]) == len(drawn["q90"])
+
+
+def test_pinball_in_metrics_is_that_of_the_predicted_table(model: dict[str, bytes]) -> None:
+    tree, _ = evaluated(model, TEST)
+    table = forward.predict(model, dataset(TEST), [2], PERCENTS).recordings[TEST.name].streams[""]
+    _, _, some = predicted_windows(forward.load(model), TEST)
+    lost = []
+    for channel, name in enumerate(CHANNELS):
+        for percent in PERCENTS:
+            above = some.truth.count[:, 1, channel] - table[f"{name}_t2_q{percent}"].to_numpy()
+            lost.append(np.maximum(percent / 100 * above, (percent / 100 - 1) * above).mean())
+    assert tree["quantiles"]["model"]["pinball"]["t2"] == pytest.approx(np.mean(lost), rel=1e-5)
+
+
+def test_a_model_without_quantiles_is_evaluated_as_before_and_has_none_to_give(plain: dict[str, bytes]) -> None:
+    tree, result = evaluated(plain, TEST)
+    assert "quantiles" not in tree and "coverage.parquet" not in result.files
+    with pytest.raises(TacpipeError, match="tacpipe calibrate"):
+        forward.predict(plain, dataset(TEST), [1], [10])
+
+
+def test_a_level_that_was_not_fitted_is_refused(model: dict[str, bytes]) -> None:
+    with pytest.raises(TacpipeError, match="10,50,90, not 25"):
+        forward.predict(model, dataset(TEST), [1], [25])
+
+
+def test_four_recordings_can_promise_the_band_and_three_cannot(
+    plain: dict[str, bytes], model: dict[str, bytes]
+) -> None:
+    promised, _ = evaluated(calibrated(plain, promise=True), TEST)
+    pooled, _ = evaluated(model, TEST)
+    assert promised["quantiles"]["method"] == "promised"
+    assert promised["quantiles"]["model"]["width"]["mean"] > pooled["quantiles"]["model"]["width"]["mean"]
+    with pytest.raises(TacpipeError, match="3 calibration recordings can promise a band that holds 75 %"):
+        calibrated(plain, promise=True, count=3)
+
+
+def test_recordings_of_the_calibration_count_as_seen(model: dict[str, bytes]) -> None:
+    tree, _ = evaluated(model, CALIBRATION[2], TEST)
+    assert tree["counts"]["recordings"] == 1 and tree["seen"]["counts"]["recordings"] == 1
+
+
+def test_a_model_of_latents_has_quantiles_in_counts(tmp_path: Path) -> None:
+    training = compressed(*TRAINING)
+    files = trained(tmp_path, training, compressed(motion(10), files=training.files))
+    how = Asked(PERCENTS, False, 0.05, 0)
+    made = forward.calibrate(files, how, training, compressed(*CALIBRATION, files=training.files))
+    tree, _ = evaluated(made, *compressed(TEST, files=training.files).recordings.values(), files=training.files)
+    assert 0.5 < tree["quantiles"]["model"]["coverage"]["mean"] <= 1
+
+
+def test_quantiles_of_another_model_are_refused(model: dict[str, bytes], tmp_path: Path) -> None:
+    other = trained(tmp_path, horizon=2)
+    with pytest.raises(TacpipeError, match="other channels or steps"):
+        forward.evaluate({**other, "quantiles.safetensors": model["quantiles.safetensors"]}, dataset(TEST))
+
+
+def test_causal_predictions_have_no_quantiles() -> None:
+    stage = registry.load("predict")
+    with pytest.raises(tacpipe.UsageError, match="causal has no quantiles"):
+        stage(stage.params(causal=True, quantiles="10"), dataset(), dataset())

@@ -1,0 +1,133 @@
+"""A calibrated classifier: probabilities, the answer unknown, and how both are measured with a material left out."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tacpipe.errors import TacpipeError
+from tacpipe.tasks.calibrated import Asked
+from tacpipe.tasks.material import task as material
+from tests.tasks.material.textures import MATERIALS, dataset, evaluated, slide, slides, trained
+
+FOREIGN = 9  # a material that no model here learns
+SENSORS = ("biotac", "roboskin")
+ASKED = Asked((10, 50, 90), False, 0.1, 0)
+
+
+def others(**attributes: Any) -> Any:
+    """Slides of a material that the model does not know."""
+    return dataset(*(slide(sensor, FOREIGN, trial, **attributes) for sensor in SENSORS for trial in range(4)))
+
+
+def both(known: Any, unknown: Any) -> Any:
+    return dataset(*known.recordings.values(), *unknown.recordings.values())
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    return trained(tmp_path_factory.mktemp("model"), slides(0, 8), slides(20, 5), use_validation=False)
+
+
+@pytest.fixture(scope="module")
+def model(plain: dict[str, bytes]) -> dict[str, bytes]:
+    return material.calibrate(plain, ASKED, slides(0, 8), slides(20, 5))
+
+
+def test_a_calibrated_model_names_the_same_and_adds_probabilities_and_answers(
+    plain: dict[str, bytes], model: dict[str, bytes]
+) -> None:
+    asked = slides(40, 2)
+    before, after = (material.predict(one, asked).recordings["predictions"].streams[""] for one in (plain, model))
+    assert before.equals(after)
+    found = material.predict(model, asked, probabilities=True).recordings["predictions"].streams[""]
+    assert found.select(before.column_names).equals(before)
+    each = np.column_stack([found[f"probability_{kind:02d}"].to_numpy() for kind in MATERIALS])
+    assert each.sum(axis=1) == pytest.approx(1, abs=1e-5)
+    assert [MATERIALS[at] for at in each.argmax(axis=1)] == found["material"].to_pylist()
+    answered = zip(found["answer"].to_pylist(), found["material"].to_pylist(), strict=True)
+    assert all(answer in ("unknown", str(named)) for answer, named in answered)
+
+
+def test_evaluation_reports_calibration_and_unknown_next_to_the_accuracy_on_known_slides(
+    model: dict[str, bytes],
+) -> None:
+    alone, _ = evaluated(model, slides(40, 5))
+    tree, result = evaluated(model, both(slides(40, 5), others()))
+    assert tree["model"] == alone["model"]  # slides of materials that the model does not know are counted apart
+    for sensor in SENSORS:
+        found = tree["unknown"][sensor]
+        assert (found["false_unknown_n"], found["false_known_n"]) == (20, 4)
+        assert 0 <= found["false_known_low"] <= found["false_known"] <= found["false_known_high"] <= 1
+        assert set(found["auroc"]) == {"probability", "distance"} and found["auroc"][found["rule"]] > 0.8
+        stated = tree["calibration"][sensor]
+        assert stated["n"] == 20
+        assert sum(one["n"] for one in stated["after"]["reliability"]) == 20
+        assert stated["after"]["log_loss"] < stated["before"]["log_loss"]
+    rows = list(csv.DictReader(result.files["answers.csv"].decode().splitlines()))
+    assert len(rows) == 48 and {row["known"] for row in rows} == {"true", "false"}
+    assert all(row["answer"] in ("unknown", row["named"]) for row in rows)
+
+
+def test_at_most_the_asked_fraction_of_calibration_slides_is_unknown(model: dict[str, bytes]) -> None:
+    loaded = material.load(model)
+    for sensor, some in loaded.read(slides(20, 5)).items():
+        assert sum(one == "unknown" for one in loaded.answers(some.frames, sensor)) <= ASKED.false_unknown * len(some)
+
+
+def test_slides_of_unknown_materials_whose_labels_are_text_are_evaluated_too(tmp_path: Path) -> None:
+    def named(shards: Any) -> Any:
+        return dataset(
+            *(
+                slide(one["sensor"], one["material"], one["trial"], object=f"m{one['material']}")
+                for one in (shard.attributes for shard in shards.recordings.values())
+            )
+        )
+
+    files = trained(tmp_path, named(slides(0, 8)), named(slides(20, 5)), use_validation=False, label="object")
+    made = material.calibrate(files, ASKED, named(slides(0, 8)), named(slides(20, 5)))
+    tree, _ = evaluated(made, both(named(slides(40, 2)), named(others())))
+    assert tree["unknown"]["biotac"]["false_known_n"] == 4
+
+
+def test_slides_of_unknown_materials_alone_leave_no_accuracy_to_report(model: dict[str, bytes]) -> None:
+    with pytest.raises(TacpipeError, match="no slide to evaluate"):
+        evaluated(model, others())
+
+
+def test_a_model_that_is_not_calibrated_has_no_answers_and_refuses_other_materials(plain: dict[str, bytes]) -> None:
+    with pytest.raises(TacpipeError, match="tacpipe calibrate"):
+        material.predict(plain, slides(40, 1), probabilities=True)
+    with pytest.raises(TacpipeError, match="not one of those the model names"):
+        evaluated(plain, both(slides(40, 1), others()))
+
+
+def test_validation_slides_that_the_model_learned_from_are_refused(tmp_path: Path) -> None:
+    files = trained(tmp_path, slides(0, 8), slides(20, 5))
+    with pytest.raises(TacpipeError, match="--no-use-validation"):
+        material.calibrate(files, ASKED, slides(0, 8), slides(20, 5))
+
+
+def test_too_few_slides_for_the_asked_fraction_are_refused(plain: dict[str, bytes]) -> None:
+    how = Asked((10, 50, 90), False, 0.01, 0)
+    with pytest.raises(TacpipeError, match=r"20 validation slides cannot set a threshold .* takes 99 or more"):
+        material.calibrate(plain, how, slides(0, 8), slides(20, 5))
+
+
+def test_a_network_is_calibrated_as_any_architecture(tmp_path: Path) -> None:
+    files = trained(tmp_path, slides(0, 8), slides(20, 5), architecture="x-lstm", scaling="standard")
+    tree, _ = evaluated(material.calibrate(files, ASKED, slides(0, 8), slides(20, 5)), both(slides(40, 2), others()))
+    assert set(tree["calibration"]) == set(SENSORS)
+
+
+def test_probabilities_of_arrays_are_those_of_the_table(model: dict[str, bytes]) -> None:
+    loaded = material.load(model)
+    table = material.predict(model, slides(40, 1), probabilities=True).recordings["predictions"].streams[""]
+    ((_, some),) = list(loaded.read(slides(40, 1, ("roboskin",))).items())
+    rows = [at for at, name in enumerate(table["sensor"].to_pylist()) if name == "roboskin"]
+    wanted = np.column_stack([table[f"probability_{kind:02d}"].to_numpy()[rows] for kind in MATERIALS])
+    assert np.allclose(loaded.probabilities(some.frames, "roboskin"), wanted, atol=1e-5)

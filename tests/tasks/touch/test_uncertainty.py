@@ -1,0 +1,95 @@
+"""Quantiles of predicted readings: calibrated on validation grasps, predicted, and evaluated next to the constant's."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tacpipe.errors import TacpipeError
+from tacpipe.tasks.calibrated import Asked
+from tacpipe.tasks.touch import grasps as grasps_of
+from tacpipe.tasks.touch import task as touch
+from tests.tasks.touch.handmade import dataset, evaluated, recording, recordings, trained
+
+PERCENTS = (10, 50, 90)
+FAST = {"architecture": "trees", "inputs": "xyz"}
+ASKED = Asked(PERCENTS, False, 0.05, 0)
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    return trained(tmp_path_factory.mktemp("model"), **FAST)
+
+
+@pytest.fixture(scope="module")
+def watched() -> Any:
+    return recordings(50, 8)
+
+
+@pytest.fixture(scope="module")
+def model(plain: dict[str, bytes], watched: Any) -> dict[str, bytes]:
+    return touch.calibrate(plain, ASKED, recordings(), watched)
+
+
+def test_a_calibrated_model_predicts_the_same_and_adds_its_quantiles(
+    plain: dict[str, bytes], model: dict[str, bytes]
+) -> None:
+    asked = recordings(80, 2)
+    before, after = (touch.predict(one, asked).recordings["predictions"].streams[""] for one in (plain, model))
+    assert before.equals(after)
+    found = touch.predict(model, asked, (), [10, 90]).recordings["predictions"].streams[""]
+    assert found.select(before.column_names).equals(before)
+    assert found.column_names[1:4] == ["pdc_th", "pdc_th_q10", "pdc_th_q90"]
+    assert (found["e_mf_07_q10"].to_numpy() < found["e_mf_07_q90"].to_numpy()).all()
+    assert touch.load(model).uncertainty.percents == PERCENTS  # type: ignore[union-attr]
+
+
+def test_as_many_values_of_calibration_grasps_lie_below_a_quantile_as_its_level_states(
+    model: dict[str, bytes], watched: Any
+) -> None:
+    loaded = touch.load(model)
+    assert loaded.uncertainty is not None
+    grasps = grasps_of.read(watched)
+    for target, bands in loaded.uncertainty.quantiles(loaded.predict_grasps(grasps)).items():
+        below = (grasps.readings[target][..., None] <= bands + 1e-9).mean(axis=(0, 1))
+        assert (below >= np.array(PERCENTS) / 100 - 1e-9).all()
+        assert (below <= np.array(PERCENTS) / 100 + 1.5 / len(grasps)).all()
+
+
+def test_evaluation_reports_quantiles_of_known_and_novel_objects(model: dict[str, bytes]) -> None:
+    shards = [
+        *recordings(80, 3).recordings.values(),
+        *(recording(n, kind) for kind in ("egg", "shoe") for n in (30, 31)),
+    ]
+    tree, _ = evaluated(model, dataset(*shards))
+    found = tree["quantiles"]
+    assert found["levels"] == [10, 50, 90] and set(found["known"]) >= {"model", "constant", "object_mean"}
+    for part in ("known", "novel"):
+        for predictor in ("model", "constant", "object_mean"):
+            one = found[part][predictor]
+            assert set(one["coverage"]) == {"pdc_th", "pdc_mf", "e_th", "e_mf"}
+            assert all(0 <= value <= 1 for value in one["coverage"].values())
+        assert list(found[part]["constant"]["pinball_skill"].values()) == pytest.approx([0] * 4)
+    assert found["novel"]["n"] == 4
+
+
+def test_a_model_without_quantiles_is_evaluated_as_before_and_has_none_to_give(plain: dict[str, bytes]) -> None:
+    tree, _ = evaluated(plain, recordings(80, 2))
+    assert "quantiles" not in tree
+    with pytest.raises(TacpipeError, match="tacpipe calibrate"):
+        touch.predict(plain, recordings(80, 1), (), [10])
+
+
+def test_grasps_that_the_model_learned_from_are_refused(tmp_path: Path, watched: Any) -> None:
+    files = trained(tmp_path, recordings(), watched, **FAST)
+    with pytest.raises(TacpipeError, match="--no-use-validation"):
+        touch.calibrate(files, ASKED, recordings(), watched)
+
+
+def test_too_few_grasps_cannot_promise_the_band(plain: dict[str, bytes]) -> None:
+    how = Asked(PERCENTS, True, 0.05, 0)
+    with pytest.raises(TacpipeError, match="3 calibration grasps can promise a band that holds 75 %"):
+        touch.calibrate(plain, how, recordings(), dataset(*(recording(n) for n in (60, 61, 62))))
