@@ -14,6 +14,7 @@ from tacpipe.live.material_engine import RESTARTED, THROWN, MaterialEngine
 from tacpipe.live.material_messages import FINAL, SLIDING, WAITING, MaterialMessage
 from tacpipe.live.messages import packets
 from tacpipe.live.options import Options
+from tacpipe.metrics import calibration
 from tacpipe.plugins import registry
 from tacpipe.recording import rig as rigs_of
 from tacpipe.recording.spool_blocks import Note
@@ -24,7 +25,7 @@ from tacpipe.sensors.sensor import Samples
 from tacpipe.simulation.slide import Rig, simulate_trial
 from tacpipe.tasks.material import prediction
 from tacpipe.tasks.material import task as material
-from tacpipe.tasks.material.classifier import Classifier, softmax
+from tacpipe.tasks.material.classifier import Classifier
 from tests.asked import fitting
 from tests.fake_recordings import FakeDataset
 from tests.live import rigs
@@ -117,7 +118,9 @@ def predicted(model: Any, table: Any) -> Any:
     shard = Slide(cut.streams, "trial", {**given.attributes, **cut.attributes})
     scores = prediction.predictions(Classifier.load(model.files), FakeDataset({"trial": shard}, {}))  # type: ignore[arg-type]
     columns = [name for name in scores.column_names if name.startswith("score_")]
-    return softmax(np.column_stack([scores.column(name).to_numpy() for name in columns]))[0]
+    return calibration.probabilities(np.column_stack([scores.column(name).to_numpy() for name in columns]))[0].astype(
+        np.float32
+    )
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import tacpipe
+from tacpipe.metrics import calibration
 from tacpipe.recording import rig as rig_of
 from tacpipe.recording import rig_text
 from tacpipe.simulation.emulation.emulator import Emulator
-from tacpipe.tasks.material.classifier import softmax
 from tests.conftest import Lab
 from tests.live.sessions import commanded, ended, subscriber
 from tests.recording import live
@@ -45,7 +45,9 @@ def test_the_last_answer_of_a_session_is_what_predict_gives_its_recording(lab: L
     (predicted,) = tacpipe.open("predicted")
     table = predicted.table()
     names = [name for name in table.column_names if name.startswith("score_")]
-    wanted = softmax(np.column_stack([table.column(name).to_numpy() for name in names]))[0]
+    wanted = calibration.probabilities(np.column_stack([table.column(name).to_numpy() for name in names]))[0].astype(
+        np.float32
+    )
     assert np.array_equal(np.array(list(final["probabilities"].values()), np.float32), wanted)
     assert final["material"] == str(table.column("material")[0].as_py())
     assert printed["live"]["states"]["material"].startswith(final["material"])

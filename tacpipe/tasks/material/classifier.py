@@ -14,6 +14,7 @@ from tacpipe.arrays import Float32s, Floats, Int64s
 from tacpipe.datasets import model_files
 from tacpipe.datasets.dataset import Dataset
 from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.metrics import calibration
 from tacpipe.models.level import Level
 from tacpipe.models.minirocket_classifier import MinirocketClassifier
 from tacpipe.models.recurrent_autoencoder import Shape
@@ -218,8 +219,12 @@ class Classifier:
         material if all are as likely. Scores of ``minirocket`` and ``statistics`` are distances to class means of no fixed
         scale: there it only orders the classes. See `predict` for the arguments.
         """
-        scores = self.scores(slides, sensor)
-        return self.known[self._sensor(sensor)].probabilities(scores.astype(np.float64)) if self.known else softmax(scores)
+        return self.likely(self.scores(slides, sensor), self._sensor(sensor))
+
+    def likely(self, scores: Float32s, sensor: str) -> Float32s:
+        """Return the probabilities (slide, class) of slides of a sensor whose scores (slide, class) are known."""
+        found = self.known[sensor].probabilities(scores) if self.known else calibration.probabilities(scores)
+        return found.astype(np.float32)
 
     def answers(self, slides: Float32s | Floats, sensor: str = "") -> list[str]:
         """Return the name of the class of each slide, or ``unknown``, of a model that `tacpipe calibrate` made.
@@ -374,12 +379,4 @@ def spread(scores: Float32s, known: Any, classes: tuple[int, ...]) -> Float32s:
     """
     found = np.full((len(scores), len(classes)), -np.inf, np.float32)
     found[:, [classes.index(int(one)) for one in known]] = scores
-    return found
-
-
-def softmax(scores: Float32s) -> Float32s:
-    """Return the probability of each class (slide, class) that scores (slide, class) state."""
-    wide = scores.astype(np.float64)
-    weights = np.exp(wide - wide.max(axis=1, keepdims=True))
-    found: Float32s = (weights / weights.sum(axis=1, keepdims=True)).astype(np.float32)
     return found
