@@ -54,7 +54,7 @@ fi; \
 mkdir -p $(dir $(COUNTS)); : > $(COUNTS)
 endef
 
-.PHONY: help demo rig-demo live-demo wheel docs pictures result-pages test test-long test-rig test-ci test-loaded test-faults test-exports test-trackers test-viewer viewer-pictures test-install test-power test-slurm test-exits fuzz test-kernel check lint types bless bench clean
+.PHONY: help demo rig-demo live-demo wheel docs pictures result-pages unknown-materials test test-long test-rig test-ci test-loaded test-faults test-exports test-trackers test-viewer viewer-pictures test-install test-power test-slurm test-exits fuzz test-kernel check lint types bless bench clean
 
 help: ## show the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -74,6 +74,9 @@ pictures: demo ## draw the pictures of the documentation, that of the front page
 
 result-pages: $(VENV)/.dev ## compute the three result pages of a release from the published sets in DATA, in hours; dist/results
 	@$(BIN)/python docs/result_pages.py $(DATA)
+
+unknown-materials: $(VENV)/.dev ## measure the answer unknown with materials left out, on the published slides in DATA; a table
+	@$(BIN)/python docs/unknown_materials.py $(DATA)
 
 rig-demo: $(VENV)/.dev ## emulate the first paper's rig, record it live for 30 s, then the chain to a forecast
 	@$(BIN)/tacpipe demo --rig rigs/first-paper.toml -o rig-demo
