@@ -19,8 +19,8 @@ from tacpipe.report import blocks, charts, learning
 from tacpipe.report.blocks import NONE, Cell, Chart, Charts, Fold, Note, Table, fold, number, table
 from tacpipe.report.charts import Line
 from tacpipe.report.context import Context, median_run
+from tacpipe.report.forward import bands, reading, representations, single_run, situations, traces
 from tacpipe.report.forward import methods as by_method
-from tacpipe.report.forward import reading, representations, single_run, situations, traces
 from tacpipe.report.forward.error_sums import BASELINE
 from tacpipe.tasks.forward import headline, units
 
@@ -45,6 +45,7 @@ def folds(context: Context) -> list[Fold]:
         *_ahead(context),
         *_channels(context),
         *_ablations(context),
+        *bands.folds(context),
         *_anticipation(context),
         *situations.folds(context),
         *representations.folds(context),

@@ -1,0 +1,129 @@
+"""What the page states of quantiles: coverage over the time ahead, what they are worth, and a forecast with its band."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tacpipe.io.parquet import from_parquet
+from tacpipe.metrics import forecast
+from tacpipe.report import blocks, charts
+from tacpipe.report.blocks import Chart, Charts, Fold, fold, number, table
+from tacpipe.report.charts import Line
+from tacpipe.report.context import Context
+from tacpipe.tasks.forward.headline import PARTS
+
+if TYPE_CHECKING:
+    from tacpipe.arrays import AnyFloats
+    from tacpipe.comparison.runs import Run
+
+COVERAGE, EXAMPLES = "coverage.parquet", "bands.json"
+NAMES = {
+    "model": "quantiles of the model",
+    "model_unconditional": "model, one band for all moments",
+    "persistence": "persistence, quantiles of its errors",
+}
+SHOWN = (1, 5, 10)  # steps of the table
+EXPLAINED = (
+    "A band holds as often as it states if its coverage lies on the dashed line; shaded: 95 % over recordings. The "
+    "narrowest band of the right coverage is best, which the pinball loss measures (lower is better)."
+)
+
+
+def folds(context: Context) -> list[Fold]:
+    """Return how good quantiles are, of the results of calibrated models; nothing without any."""
+    runs = [run for run in context.runs if COVERAGE in run.details.dataset.files]
+    if not runs:
+        return []
+    asked = sorted({tuple(run.details.metrics["quantiles"]["levels"]) for run in runs})[0]
+    level = (asked[-1] - asked[0]) / 100
+    methods = sorted({run.method for run in runs})
+    drawn: list[Chart] = []
+    rows: list[Sequence[Any]] = []
+    for method in methods:
+        sums = _sums([run for run in runs if run.method == method])
+        for known in (True, False):
+            own = {name: one[known] for name, one in sums.items() if one.get(known)}
+            if own:
+                title = " · ".join(filter(None, (method if len(methods) > 1 else "", PARTS[known])))
+                drawn.append(_coverage(title, own, level))
+                rows += _rows(title, own)
+    heads = ("", "step", "recordings", "coverage", "width", "pinball loss", "pinball loss below persistence's (%)")
+    title = f"Bands from the {asked[0]} to the {asked[-1]} % quantile"
+    return fold(
+        "Uncertainty",
+        Charts(drawn),
+        blocks.notes(EXPLAINED),
+        table(title, heads, rows),
+        *([Charts(_examples(runs[0]))] if EXAMPLES in runs[0].details.dataset.files else []),
+    )
+
+
+Sums = Mapping[str, dict[str, "AnyFloats"]]  # recording -> covered, width, pinball and values, each (step,)
+
+
+def _sums(runs: Sequence[Run]) -> dict[str, dict[bool, dict[str, dict[str, AnyFloats]]]]:
+    """Return the sums of recordings that were not seen, by predictor, whether the object is known, and recording."""
+    found: dict[str, dict[bool, dict[str, dict[str, AnyFloats]]]] = {}
+    for run in runs:
+        read = from_parquet(run.details.dataset.files[COVERAGE]).to_pandas()
+        for (name, known, recording), one in read[~read.seen].groupby(["predictor", "known", "recording"]):
+            own = one.sort_values("step")
+            added = {key: own[key].to_numpy(float) for key in ("covered", "width", "pinball", "values")}
+            there = found.setdefault(str(name), {}).setdefault(bool(known), {})
+            before = there.get(str(recording))
+            there[str(recording)] = added if before is None else {key: before[key] + added[key] for key in added}
+    return found
+
+
+def _of(sums: Mapping[str, Mapping[str, AnyFloats]], key: str) -> AnyFloats:
+    """Return one kind of sums (recording, step)."""
+    return np.stack([one[key] for one in sums.values()])
+
+
+def _coverage(title: str, sums: Mapping[str, Mapping[str, Mapping[str, AnyFloats]]], level: float) -> Chart:
+    """Return coverage by step of each predictor, with its interval over recordings."""
+    several = []
+    for name in (one for one in NAMES if one in sums):
+        covered, values = _of(sums[name], "covered"), _of(sums[name], "values")
+        mean = covered.sum(axis=0) / values.sum(axis=0)
+        low, high = mean, mean
+        if len(covered) > 1:
+            weights = forecast.draws(len(covered))
+            low, high = forecast.bounds((weights @ covered) / (weights @ values))
+        several.append(Line(NAMES[name], np.arange(1.0, len(mean) + 1), mean, low, high, dashed=name != "model"))
+    spec = charts.lines(several, "rows ahead", "coverage", level=("asked for", level))
+    return Chart(f"Coverage: {title}", spec)
+
+
+def _rows(title: str, sums: Mapping[str, Mapping[str, Mapping[str, AnyFloats]]]) -> list[Sequence[Any]]:
+    """Return the rows of the table: a predictor and step each."""
+    still = _of(sums["persistence"], "pinball").sum(axis=0)
+    rows: list[Sequence[Any]] = []
+    for name in (one for one in NAMES if one in sums):
+        one = {key: _of(sums[name], key).sum(axis=0) for key in ("covered", "width", "pinball", "values")}
+        for step in (each for each in SHOWN if each <= len(still)):
+            at, values = step - 1, one["values"][step - 1]
+            gain = 100 * (1 - one["pinball"][at] / still[at]) if still[at] else float("nan")
+            measured = (one["covered"][at] / values, one["width"][at] / values, one["pinball"][at] / values, gain)
+            rows.append([f"{title}: {NAMES[name]}", f"t+{step}", str(len(sums[name])), *map(number, measured)])
+    return rows
+
+
+def _examples(run: Run) -> list[Chart]:
+    """Return a forecast with its band of each recording that the evaluation kept, next to what was measured."""
+    drawn = []
+    for one in json.loads(run.details.dataset.files[EXAMPLES]):
+        levels = sorted((int(name[1:]), name) for name in one if name.startswith("q"))
+        low, middle, high = (one[levels[at][1]] for at in (0, len(levels) // 2, -1))
+        time_s = np.array(one["t_s"]) - one["t_s"][0]
+        several = [
+            Line("measured", time_s, one["measured"]),
+            Line(f"predicted {one['step']} rows before", time_s, middle, low, high, dashed=True),
+        ]
+        spec = charts.lines(several, "time (s)", "counts above rest", points=False, height=190)
+        drawn.append(Chart(f"{one['recording']}: {one['channel']}", spec, wide=True))
+    return drawn
