@@ -49,8 +49,8 @@ def main(model: str, recordings: str, slides: str, split: str) -> None:
             began_s = time.process_time()
             answer = slide.answer({stream: table for stream, table in came.items() if table.num_rows})
             took_s.append(time.process_time() - began_s)
-            known = answer.probabilities is not None
-            found.append(known and classifier.names[int(np.argmax(answer.probabilities))] == truth)
+            scores = answer.probabilities
+            found.append(scores is not None and classifier.names[int(scores.argmax())] == truth)
     print(f"{len(names)} slides, {len(classifier.classes)} materials")
     for fraction, found in right.items():
         print(f"{fraction * slide.frames:6.0f} rows: {np.mean(found):.2f} right")
