@@ -27,7 +27,7 @@ recording. The recording has priority: where the computer does not keep up, fore
 
 Example: tacpipe live rig.toml --model models/forward -o data/live --publish ws:127.0.0.1:8765
 
-A model of materials names the surface while a slide goes on, with a probability of each, and at the end of the recording
+A model of materials names the surface during a slide, with a probability of each, and at the end of the recording
 what `tacpipe predict` gives. One of touch ranks candidate grasps on a cloud, which come to a stream of the sensor grasps.
 
 Example: tacpipe live finger.toml --model models/material -o data/live --publish udp:127.0.0.1:9000
@@ -105,7 +105,9 @@ def add(program: typer.Typer, summary: str) -> None:
         if isinstance(about, session.Described):
             wanted = _steps(steps, about.horizon)
         elif steps or plan != session.MEASURED or alarms_per_hour:
-            raise UsageError(f"{model} is of {about.task}; --steps, --plan and --alarms-per-hour are for forecasts.")
+            raise UsageError(
+                f"{model} is of the kind {about.kind}; --steps, --plan and --alarms-per-hour are for forecasts."
+            )
         else:
             wanted = ()
         asked = session.with_plan(rigs.read(rig), plan)
@@ -121,7 +123,7 @@ def add(program: typer.Typer, summary: str) -> None:
             "" if split is None else str(split.absolute()),
             settle_ms,
             session.targets_of(asked, plan),
-            about.task,
+            about.kind,
             sensor,
             every_ms,
             least,

@@ -22,11 +22,11 @@ def described(model: Path) -> tuple[Described | Surfaces | Grasped, str]:
     if CONFIG not in found.files:
         raise UsageError(f"{model} is not a model; give one of `tacpipe train`.")
     config = model_files.tree(found.files, CONFIG, {"task": str})
-    if config["task"] == Surfaces.task:
+    if config["task"] == Surfaces.kind:
         config = model_files.tree(found.files, CONFIG, {"classes": list})
         names = config.get("names") or {number: number for number in config["classes"]}
         return Surfaces(tuple(str(names[number]) for number in config["classes"])), found.digest
-    if config["task"] == Grasped.task:
+    if config["task"] == Grasped.kind:
         return Grasped(COLUMNS), found.digest
     if not all(key in config for key in READ):
         raise UsageError(

@@ -1,4 +1,4 @@
-"""What is published of a slide while it goes on: which material it is on, how sure that is, and how much was seen."""
+"""What is published of a slide while it lasts: which material it is on, how sure that is, and how much was seen."""
 
 from __future__ import annotations
 

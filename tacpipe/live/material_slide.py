@@ -1,4 +1,4 @@
-"""The material of a slide while it goes on: `tacpipe segment slides` and the model, applied to what has come so far.
+"""The material of a slide while it lasts: `tacpipe segment slides` and the model, applied to what has come so far.
 
 Whatever is asked at a moment is what a recording that ends there would give, so nothing looks ahead, and at the end of the
 recording the answer is that of `tacpipe predict`. Only a slide that is still shorter than those of training has a rule of

@@ -34,7 +34,7 @@ def engine(options: Options) -> Working:
     model = tacpipe.open(options.model)
     rig = rigs.parse(options.rig)
     sensors = {name: rig.streams[name].sensor for name in options.streams}
-    made = {"forward": forecasts, "material": materials, "touch": touches}[options.task]
+    made = {"forecast": forecasts, "material": materials, "touch": touches}[options.kind]
     try:
         return made(options, model, rig, sensors)
     except TacpipeError as error:

@@ -23,7 +23,7 @@ class Options:
     split: str = ""  # whose validation recordings are meant; empty: all
     settle_ms: float = 2.0
     plan_from: str = ""  # stream of an arm whose set-points are the planned motion; empty: none
-    task: str = "forward"  # of the model
+    kind: str = "forecast"  # of messages that the model makes: forecast, material or touch
     sensor: str = ""  # of a model of materials: which of those that it knows; empty: the only one
     every_ms: float = 100.0  # of a model of materials: from one answer to the next
     least: float = 0.25  # of a model of materials: fraction of the slide that it reads before it names one

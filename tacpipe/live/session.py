@@ -35,7 +35,7 @@ class Described:
     channels: tuple[str, ...]
     horizon: int
     unit: str
-    task: ClassVar[str] = "forward"
+    kind: ClassVar[str] = "forecast"  # of its messages
 
     def own(self, steps: Sequence[int]) -> dict[str, Mapping[str, Any]]:
         """Return the session's own streams, with the options of the sensor ``live``."""
@@ -52,7 +52,7 @@ class Surfaces:
     """The materials that the model names."""
 
     names: tuple[str, ...]
-    task: ClassVar[str] = "material"
+    kind: ClassVar[str] = "material"
 
     def own(self, steps: Sequence[int]) -> dict[str, Mapping[str, Any]]:
         """Return the session's own streams, with the options of the sensor ``live``."""
@@ -82,7 +82,7 @@ class Grasped:
     """What the model predicts of a grasp."""
 
     columns: tuple[str, ...]
-    task: ClassVar[str] = "touch"
+    kind: ClassVar[str] = "touch"
 
     def own(self, steps: Sequence[int]) -> dict[str, Mapping[str, Any]]:
         """Return the session's own streams, with the options of the sensor ``live``."""

@@ -23,7 +23,6 @@ MODULE = "tacpipe.live.process"  # that runs as the model's process
 AGAIN_S = (0.5, 10.0)  # from its end to the next start: first, and at most
 STOP_S = 5.0  # that it has to end, which closes what it publishes
 LOOK_S = 0.05
-NOTED = {"forward": "forecast"}  # task to the stream that notes of the process are on; of others that of their name
 DIED, RESTARTED = "model_died", "model_restarted"  # notes in the recording
 
 
@@ -32,7 +31,7 @@ class Supervisor:
 
     def __init__(self, options: Options, tap: Tap) -> None:
         self.options, self.tap = options, tap
-        self._noted = NOTED.get(options.task, options.task)
+        self._noted = options.kind  # stream that notes of the process are on
         self.report: dict[str, Any] = {}  # the last one of the process that runs
         self.alarms: dict[str, Any] = {}  # their levels
         self.deaths = 0

@@ -1,4 +1,4 @@
-"""A request for a ranking, as clouds and grasps: what the sensor ``grasps`` lets through is text of a stranger still."""
+"""A request for a ranking, as clouds and grasps: what the sensor ``grasps`` lets through is untrusted still."""
 
 from __future__ import annotations
 

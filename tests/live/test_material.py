@@ -1,4 +1,4 @@
-"""The material of a slide while it goes on is what the samples so far give, and at its end what `tacpipe predict` gives."""
+"""The material of a slide while it lasts is what the samples so far give, and at its end what `tacpipe predict` gives."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def models(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Opened]:
 
 
 def options(**changed: Any) -> Options:
-    return Options("models/material", "", ("finger",), task="material", **{"least": 0.5, **changed})
+    return Options("models/material", "", ("finger",), kind="material", **{"least": 0.5, **changed})
 
 
 class Session:

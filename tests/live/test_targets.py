@@ -115,7 +115,9 @@ def test_a_forecast_reads_set_points_as_its_plan_however_they_came(model: Made) 
     assert any((one.count != without[one.t_ns].count).any() for one in ready)
 
 
-def test_the_plan_is_what_the_set_point_did_last_taken_to_go_on(model: Made, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_plan_is_what_the_set_point_did_last_taken_to_continue(
+    model: Made, monkeypatch: pytest.MonkeyPatch
+) -> None:
     seen: list[Any] = []
     used = planned.without
 

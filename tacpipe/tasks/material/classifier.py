@@ -123,7 +123,7 @@ class SpectraReader:
     speed_m_s: float
     transfer: Transfer
     classes: tuple[int, ...]
-    any_length: ClassVar[bool] = False  # the wave lengths that are told apart depend on the way
+    any_length: ClassVar[bool] = False  # which wave lengths it distinguishes depends on the way
 
     def read(self, frames: Float32s) -> ReaderOutput:
         """Return log-likelihoods and, as latents, spectra of slides (slide, time, channel) in device counts."""
