@@ -53,6 +53,11 @@ def shows(store: Store, manifest: Manifest, directory: Path) -> bool:
     return _current(directory, manifest) and next(_stale(store, manifest, directory), None) is None
 
 
+def links(store: Store, manifest: Manifest, directory: Path) -> bool:
+    """Return whether all that ``manifest`` names lies in ``directory`` itself, as links to the objects of the store."""
+    return all("/" not in path and _linked(f"{directory}/{path}", store, name) for path, name in manifest.objects())
+
+
 def change(store: Store, directory: Path, decide: Callable[[], Change]) -> Manifest:
     """Make ``directory`` show what ``decide`` returns, and return its manifest: whatever is changed there goes this way.
 
@@ -286,6 +291,13 @@ def _matches(path: str, store: Store, name: str) -> bool:
         return False
     same = (there.st_dev, there.st_ino) == (stored.st_dev, stored.st_ino)
     return same or (there.st_size == stored.st_size and file_digest(path) == name)
+
+
+def _linked(path: str, store: Store, name: str) -> bool:
+    try:
+        return os.path.samestat(os.lstat(path), os.lstat(store.object_path(name)))
+    except OSError:
+        return False
 
 
 def _current(directory: Path, manifest: Manifest) -> bool:
