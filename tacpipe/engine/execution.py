@@ -53,7 +53,7 @@ class Task:
 
     def to_text(self) -> str:
         """Return what `task_of` reads."""
-        return json.dumps(asdict(self))
+        return json.dumps({**vars(self), "compute": asdict(self.compute)})  # an identity may name all recordings
 
 
 def task_of(text: str) -> Task:
@@ -78,7 +78,8 @@ def compute(task: Task) -> Done:
     """Make the task's key and return its record; a `TacpipeError` becomes a `Done` with its sentence."""
     store, key = opened(task.store, task.run), digest(task.identity)
     try:
-        with devices.given(task.compute), rank_processes.available(task.to_text(), task.compute) as crew:
+        text = task.to_text() if task.compute.devices > 1 else ""
+        with devices.given(task.compute), rank_processes.available(text, task.compute) as crew:
             return _computed(task, store, key, crew)
     except TacpipeError as error:
         with contextlib.suppress(OSError):  # a workspace in which nothing was saved; one with a checkpoint stays

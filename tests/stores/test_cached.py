@@ -510,6 +510,45 @@ def test_credentials_are_in_nothing_that_is_kept_or_printed(linked: Linked) -> N
         assert not [one for one in [*kept, *here] if secret.encode() in one]
 
 
+def test_folders_that_begin_anew_are_one_project_where_the_environment_names_it(
+    computers: Computers, files: Stepping, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TACPIPE_PROJECT", "nightly")
+    for job in ("first", "second", "third"):
+        computers.run(job, SIMULATE, SCALE)
+    roots = RemoteStore(files).roots.all()
+    assert sorted((root["project"]["name"], root["path"]) for root in roots) == [
+        ("nightly", "data/r"),
+        ("nightly", "data/s"),
+    ]
+    monkeypatch.setenv("TACPIPE_PROJECT", "other")
+    computers.run("fourth", SIMULATE)
+    monkeypatch.delenv("TACPIPE_PROJECT")
+    computers.run("fifth", SIMULATE)
+    assert len(RemoteStore(files).roots.all()) == 4
+
+
+def test_a_job_that_begins_anew_pulls_what_an_earlier_one_pushed_under_the_name_of_the_environment(
+    computers: Computers, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TACPIPE_PROJECT", "nightly")
+    computers.run("first", SIMULATE, "store push s3://lab/elsewhere data/r")
+    wanted = content(computers.enter("first"))
+    computers.run("second", "store pull s3://lab/elsewhere data/r")
+    assert content(computers.enter("second")) == wanted
+    refused = computers.lab.call("store push s3://lab/elsewhere data/r --project another")
+    assert refused.code == 2 and refused.err.count("\n") == 1
+
+
+@pytest.mark.parametrize("name", ["a:b", "x" * 61, " lab", "a\tb"])
+def test_a_name_that_no_project_can_have_is_refused(
+    computers: Computers, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    monkeypatch.setenv("TACPIPE_PROJECT", name)
+    refused = computers.lab.call(SIMULATE)
+    assert refused.code == 2 and "TACPIPE_PROJECT" in refused.err and refused.err.count("\n") == 1
+
+
 # ---- several at once
 
 
