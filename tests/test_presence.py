@@ -23,13 +23,13 @@ DAY_NS = 86_400 * 10**9
 def shows(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Path]]:
     """The directories of which each file was looked at; all datasets are large, and all folders changed long ago."""
     asked: list[Path] = []
-    look, clock_ns = directory.shows, presence.Look._clock_ns
+    look, clock_ns = directory.showing, presence.Look._clock_ns
 
-    def looked(*given: object) -> bool:
+    def looked(*given: object) -> str:
         asked.append(Path(str(given[2])))
         return look(*given)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(directory, "shows", looked)
+    monkeypatch.setattr(directory, "showing", looked)
     monkeypatch.setattr(presence.Look, "_clock_ns", lambda self: clock_ns(self) + DAY_NS)
     monkeypatch.setattr(pages, "LARGE", 0)
     monkeypatch.setattr(pages, "MANY", 1)
@@ -243,6 +243,16 @@ def test_copies_are_looked_at_each_time(lab: Lab, shows: list[Path]) -> None:
     shutil.copy(stored, path)
     lab.run(SCALE)
     assert not (lab.folder / ".tacpipe/presence").exists()
+
+
+def test_symbolic_links_are_followed_each_time(lab: Lab, shows: list[Path]) -> None:
+    lab.run("simulate toy --trials 2 --rows 3 -o data/r")
+    lab.run(SCALE)
+    path, stored = first(lab)
+    path.unlink()
+    path.symlink_to(stored)
+    lab.run(SCALE)
+    assert path.is_symlink() and not (lab.folder / ".tacpipe/presence").exists()
 
 
 def test_a_collection_removes_the_notes_on_directories_that_are_gone(noted: Lab) -> None:

@@ -162,13 +162,20 @@ class _Place(ABC):
 class _Directory(_Place):
     """The directory of a dataset."""
 
+    _linked = False  # whether it was found to hold nothing but links to objects
+
     def shows(self, hit: Manifest) -> bool:
         root = self.root
         if root is None:
             return False
         wanted = self.settled(hit)
         known = root["manifest"] == wanted.content_digest and self.store.has(root["manifest"])
-        return known and directory.shows(self.store, wanted, self.path)
+        self._linked = False
+        if not known:
+            return False
+        how = directory.showing(self.store, wanted, self.path)
+        self._linked = how == "links"
+        return bool(how)
 
     def unread(self, work: Work) -> Unread | None:
         request, root = self.request, self.root
@@ -190,7 +197,7 @@ class _Directory(_Place):
         return None
 
     def note(self, look: Look | None, work: Work, hit: Manifest) -> bool:
-        if look is None or hit.copied or not directory.links(self.store, hit, self.path):
+        if look is None or hit.copied or not self._linked:
             return False
         objects = chain([(hit.content_digest, len(hit.content))], hit.sizes())
         return look.note(work.key, hit.content_digest, objects, reused=work.reused, rows=hit.rows)
