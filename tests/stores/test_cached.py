@@ -346,8 +346,8 @@ def test_a_repair_sends_again_what_is_damaged_or_missing_in_the_bucket(
     if kept != "copy":
         shutil.rmtree(computers.store.root / "objects")
     if kept == "nothing":
-        for path in (Path("data/r/trial-001/left.parquet"), Path("data/s/trial-001.parquet")):
-            path.unlink()
+        for file in (Path("data/r/trial-001/left.parquet"), Path("data/s/trial-001.parquet")):
+            file.unlink()
     ran = computers.lab.run("store repair --json")
     assert sorted(json.loads(ran.out)["repaired"]) == sorted([recorded, made, *manifests])
     assert {name: value for name, value in files.content().items() if name.startswith("objects/")} == {
