@@ -1,9 +1,10 @@
 """Stages on a store in a bucket beside the same on a folder: seconds and requests for 1,000 recordings.
 
-    python benchmarks/bucket_stages.py [--trials 1000] [--server localbucket|seaweedfs]
+    python benchmarks/bucket_stages.py [--trials 1000] [--server localbucket|seaweedfs] [--delay-ms 30]
 
-The server runs on this computer, behind the proxy of the tests, which counts requests; needs the extra bucket and what tests
-need. Two computers are two folders in front of one bucket. Each command is a process of its own.
+The server runs on this computer, behind the proxy of the tests, which counts requests and delays each by ``--delay-ms``, as
+a bucket far away does; needs the extra bucket and what tests need. Two computers are two folders in front of one bucket.
+Each command is a process of its own.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ ADD = "tacpipe add data/r -o data/s --quiet"
 
 
 def measure(
-    folder: Path, trials: int, bucket: dict[str, str], faulty: proxy.Proxy
+    folder: Path, trials: int, bucket: dict[str, str], faulty: proxy.Proxy, fault: str | None
 ) -> list[tuple[str, float, float, int]]:
     """Return what was done, its seconds on a folder and on a bucket, and the requests that the latter took."""
     plugin = str(timing.plugin(folder, "small_stages", ENTRY_POINTS))
@@ -39,7 +40,7 @@ def measure(
         project = folder / name / "project"
         project.mkdir(parents=True, exist_ok=True)
         (project / "dvc.yaml").touch()
-        faulty.begin(lambda number: None)
+        faulty.begin(lambda number: fault)
         began_s = time.perf_counter()
         timing.run(command, project, PYTHONPATH=plugin, **computers[name])
         return time.perf_counter() - began_s, faulty.requests
@@ -69,8 +70,10 @@ def main() -> None:
     """Print a table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--trials", type=int, default=1000)
+    parser.add_argument("--delay-ms", type=float, default=0.0, help="Delay of each request.")
     parser.add_argument("--server", default="localbucket", choices=["localbucket", "seaweedfs"])
     given = parser.parse_args()
+    proxy.WAIT_S = given.delay_ms / 1000
     serve = {"localbucket": places.localbucket, "seaweedfs": places.seaweedfs}[given.server]
     with (
         tempfile.TemporaryDirectory() as folder,
@@ -78,7 +81,9 @@ def main() -> None:
         proxy.between(endpoint) as faulty,
     ):
         print("| what | folder, s | bucket, s | requests |\n| --- | ---: | ---: | ---: |", flush=True)
-        measure(Path(folder), given.trials, places.environment(faulty.endpoint), faulty)
+        measure(
+            Path(folder), given.trials, places.environment(faulty.endpoint), faulty, "slow" if given.delay_ms else None
+        )
 
 
 if __name__ == "__main__":

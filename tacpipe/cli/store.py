@@ -128,15 +128,11 @@ def repair(as_json: AsJson = False) -> None:
 
     Example: tacpipe store repair
     """
+    from tacpipe.maintenance import cache
     from tacpipe.maintenance import repair as upkeep
 
     store = locate()
-    if store.distant:
-        raise UsageError(
-            f"{store.place} is a bucket: a stage that needs an object that is damaged there recomputes and replaces it, "
-            f"and `tacpipe store push --verify`, from where it is sound, replaces it too."
-        )
-    found = upkeep.repair(store)
+    found = cache.repair_damaged(cache.distant(store)) if store.distant else upkeep.repair(store)
     _print(asdict(found), as_json=as_json, text=found.to_text())
     if found.lost:
         raise typer.Exit(DAMAGED)

@@ -10,7 +10,7 @@ import uuid
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from tacpipe.datasets import adoption, pages, replacing
 from tacpipe.datasets.delivery import deliver
@@ -50,7 +50,24 @@ def publish(store: Store, manifest: Manifest, directory: Path) -> None:
 
 def shows(store: Store, manifest: Manifest, directory: Path) -> bool:
     """Return whether ``directory`` shows ``manifest`` already, with all that it names."""
-    return _current(directory, manifest) and next(_stale(store, manifest, directory), None) is None
+    return bool(showing(store, manifest, directory))
+
+
+def showing(store: Store, manifest: Manifest, directory: Path) -> Literal["", "files", "links"]:
+    """Return how ``directory`` shows ``manifest``, with all that it names; empty where it does not.
+
+    With ``links`` all lies in the directory itself, as links to the objects of the store; else some is a copy, or within a
+    folder.
+    """
+    if not _current(directory, manifest):
+        return ""
+    linked = True
+    for path, name in manifest.objects():
+        how = _matches(f"{directory}/{path}", store, name)
+        if not how:
+            return ""
+        linked = linked and how == "links" and "/" not in path
+    return "links" if linked else "files"
 
 
 def change(store: Store, directory: Path, decide: Callable[[], Change]) -> Manifest:
@@ -277,15 +294,19 @@ def _link(source: str, target: Path) -> bool:
     return False
 
 
-def _matches(path: str, store: Store, name: str) -> bool:
+def _matches(path: str, store: Store, name: str) -> Literal["", "files", "links"]:
     """Return whether ``path`` holds the object ``name``: known by its inode where it is linked, else by its content."""
     try:
-        there = os.stat(path)  # noqa: PTH116  (once a shard on every hit)
+        there = os.lstat(path)
+        symbolic = stat.S_ISLNK(there.st_mode)
+        if symbolic:  # what it leads through may change, and the directory not
+            there = os.stat(path)  # noqa: PTH116  (once a shard)
         stored = os.lstat(store.object_path(name))
     except (FileNotFoundError, NotADirectoryError):
-        return False
-    same = (there.st_dev, there.st_ino) == (stored.st_dev, stored.st_ino)
-    return same or (there.st_size == stored.st_size and file_digest(path) == name)
+        return ""
+    if (there.st_dev, there.st_ino) == (stored.st_dev, stored.st_ino):
+        return "files" if symbolic else "links"
+    return "files" if there.st_size == stored.st_size and file_digest(path) == name else ""
 
 
 def _current(directory: Path, manifest: Manifest) -> bool:

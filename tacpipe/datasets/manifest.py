@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import os
 import re
 from array import array
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -14,7 +15,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from tacpipe.datasets import pages
-from tacpipe.errors import DamagedError, UsageError
+from tacpipe.errors import DamagedError, StorageError, UsageError
 from tacpipe.io import places, regular
 from tacpipe.io.files import unread
 from tacpipe.io.hashing import DIGEST, bytes_digest, canonical
@@ -356,17 +357,29 @@ def shard_path(recording: str, stream: str) -> str:
     return f"{recording}/{stream}.parquet" if stream else f"{recording}.parquet"
 
 
-@dataclass(frozen=True)
 class Found:
-    """A manifest as it was found: the directory of its dataset, and its bytes."""
+    """A manifest as it was found: the directory of its dataset, and its bytes.
 
-    directory: Path
-    content: bytes
+    Those of a large one are hashed at once, and read when they are asked for.
+    """
+
+    def __init__(self, directory: Path, content: bytes | None = None) -> None:
+        self.directory = directory
+        self.digest = hashed(directory / NAME) if content is None else bytes_digest(content)
+        if content is not None:
+            self.__dict__["content"] = content
 
     @cached_property
-    def digest(self) -> str:
-        """The digest of the manifest file."""
-        return bytes_digest(self.content)
+    def content(self) -> bytes:
+        """The bytes of the manifest file. Raises `StorageError` where they are no longer those that gave its digest."""
+        file = self.directory / NAME
+        try:
+            content = regular.content(file, regular.JSON_BYTES)
+        except OSError as error:
+            raise unread(file, error) from error
+        if bytes_digest(content) != self.digest:
+            raise StorageError(f"{file} was changed by another program meanwhile. Run the same command again.")
+        return content
 
     @cached_property
     def manifest(self) -> Manifest:
@@ -382,7 +395,8 @@ def find(path: Path | str) -> Found:
     given = places.local(path)
     file = given if given.name == NAME else given / NAME
     try:
-        return Found(file.parent, regular.content(file, regular.JSON_BYTES))
+        large = os.stat(file).st_size >= pages.LARGE  # noqa: PTH116  (of a pipe or a device it is 0)
+        return Found(file.parent, None if large else regular.content(file, regular.JSON_BYTES))
     except regular.IrregularError as error:
         raise UsageError(f"{error} There is no dataset.") from None
     except (FileNotFoundError, NotADirectoryError):
@@ -392,6 +406,14 @@ def find(path: Path | str) -> Found:
         ) from None
     except OSError as error:
         raise unread(file, error) from error
+
+
+def hashed(file: Path) -> str:
+    """Return the digest of a manifest file, of which memory holds a block at a time; raises as `regular.content`."""
+    found = hashlib.sha256()
+    for block in regular.blocks(file, regular.JSON_BYTES):
+        found.update(block)
+    return found.hexdigest()
 
 
 def merge(manifests: Sequence[Manifest]) -> Manifest:

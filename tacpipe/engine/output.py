@@ -4,20 +4,44 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from itertools import chain
 from typing import Any, Protocol
 
-from tacpipe.datasets import directory, replacing
+from tacpipe.datasets import directory, pages, replacing
+from tacpipe.datasets import manifest as manifest_of
 from tacpipe.datasets.delivery import deliver
 from tacpipe.datasets.manifest import Manifest
 from tacpipe.engine.request import Request
-from tacpipe.errors import DamagedError, UsageError, WouldChangeError
+from tacpipe.errors import DamagedError, TacpipeError, UsageError, WouldChangeError
 from tacpipe.io.hashing import file_digest
 from tacpipe.plugins.stage import Attribute
+from tacpipe.store import presence
+from tacpipe.store.presence import Look
 from tacpipe.store.store import MissingError, Store
+
+
+@dataclass(frozen=True)
+class Unread:
+    """A result that is shown already, as noted; its manifest is not read."""
+
+    rows: int
 
 
 class Work(Protocol):
     """Where the result of a command comes from."""
+
+    @property
+    def key(self) -> str:
+        """What names the run."""
+
+    @property
+    def reused(self) -> int:
+        """How many results of the store the answer consists of."""
+
+    def recall(self, manifest_digest: str, reused: int) -> bool:
+        """Take over what is known of the run before; return whether it gave the manifest of this digest."""
 
     @property
     def reads(self) -> Sequence[str]:
@@ -33,8 +57,10 @@ class Work(Protocol):
         """Return the result, answered by the store or made and remembered; ``rerun``: made in any case."""
 
 
-def settle(store: Store, request: Request, plan: replacing.Plan, work: Work) -> Manifest:
+def settle(store: Store, request: Request, plan: replacing.Plan, work: Work) -> Manifest | Unread:
     """Return the manifest that the output shows once the request is met; the only way in which a command writes it.
+
+    Where a note states that it shows the answer, and still holds, that is not read.
 
     ===============  ==================================  ==============================================
     output           ``--check``                         otherwise
@@ -49,8 +75,13 @@ def settle(store: Store, request: Request, plan: replacing.Plan, work: Work) -> 
     is recomputed.
     """
     place = _place(store, request)
+    if (unread := place.unread(work)) is not None:
+        return unread
+    look = place.look()
     hit = None if request.compare or request.rerun else work.answer()
     shown = hit is not None and place.shows(hit)
+    if shown and hit is not None:
+        place.note(look, work, hit)
     if not (shown or request.compare):
         place.refuse(plan)
     if shown or request.check or request.compare:
@@ -65,11 +96,17 @@ def settle(store: Store, request: Request, plan: replacing.Plan, work: Work) -> 
             return place.publish(work.result(rerun=False))
 
 
-def shown(store: Store, request: Request, work: Work) -> Manifest | None:
-    """Return the manifest that the output shows where it shows the store's answer already, else None; nothing is changed."""
+def shown(store: Store, request: Request, work: Work) -> Manifest | Unread | None:
+    """Return what `settle` returns where the output shows the store's answer already, else None; nothing is changed."""
     place = _place(store, request)
+    if (unread := place.unread(work)) is not None:
+        return unread
+    look = place.look()
     hit = work.answer()
-    return place.settled(hit) if hit is not None and place.shows(hit) else None
+    if hit is None or not place.shows(hit):
+        return None
+    place.note(look, work, hit)
+    return place.settled(hit)
 
 
 def _place(store: Store, request: Request) -> _Place:
@@ -90,6 +127,18 @@ class _Place(ABC):
     @abstractmethod
     def shows(self, hit: Manifest) -> bool:
         """Return whether it holds the answer already and nothing is to be written; its root too is known."""
+
+    def unread(self, work: Work) -> Unread | None:
+        """Return what is known of the answer where it is noted that all of it is shown, and the note still holds."""
+        return None
+
+    def look(self) -> Look | None:
+        """Return a look at all files that begins now, where what it finds is worth a note."""
+        return None
+
+    def note(self, look: Look | None, work: Work, hit: Manifest) -> bool:
+        """Note that the look found all of the answer shown; return whether that is noted."""
+        return False
 
     @abstractmethod
     def refuse(self, plan: replacing.Plan) -> None:
@@ -113,13 +162,45 @@ class _Place(ABC):
 class _Directory(_Place):
     """The directory of a dataset."""
 
+    _linked = False  # whether it was found to hold nothing but links to objects
+
     def shows(self, hit: Manifest) -> bool:
         root = self.root
         if root is None:
             return False
         wanted = self.settled(hit)
         known = root["manifest"] == wanted.content_digest and self.store.has(root["manifest"])
-        return known and directory.shows(self.store, wanted, self.path)
+        self._linked = False
+        if not known:
+            return False
+        how = directory.showing(self.store, wanted, self.path)
+        self._linked = how == "links"
+        return bool(how)
+
+    def unread(self, work: Work) -> Unread | None:
+        request, root = self.request, self.root
+        if root is None or request.compare or request.rerun or request.track or request.check:
+            return None
+        note = presence.known(self.store, self.path)
+        if note is None or (note.key, note.manifest) != (work.key, root["manifest"]):
+            return None
+        with suppress(OSError, TacpipeError):
+            same = manifest_of.hashed(self.path / manifest_of.NAME) == note.manifest
+            if same and presence.holds(note, self.store, self.path) and work.recall(note.manifest, note.reused):
+                return Unread(note.rows)
+        return None
+
+    def look(self) -> Look | None:
+        with suppress(OSError):
+            if (self.path / manifest_of.NAME).stat().st_size >= pages.LARGE:
+                return Look(self.store, self.path)
+        return None
+
+    def note(self, look: Look | None, work: Work, hit: Manifest) -> bool:
+        if look is None or hit.copied or not self._linked:
+            return False
+        objects = chain([(hit.content_digest, len(hit.content))], hit.sizes())
+        return look.note(work.key, hit.content_digest, objects, reused=work.reused, rows=hit.rows)
 
     def refuse(self, plan: replacing.Plan) -> None:
         directory.check_output(self.store, self.request.output)

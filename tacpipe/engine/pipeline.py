@@ -18,6 +18,7 @@ from tacpipe.engine.by_recording import ByRecording
 from tacpipe.engine.execution import Task
 from tacpipe.engine.executors.executor import Chosen
 from tacpipe.engine.outcome import Outcome
+from tacpipe.engine.output import Unread
 from tacpipe.engine.request import Inputs, Request
 from tacpipe.errors import TacpipeError, UsageError, WouldChangeError
 from tacpipe.io import progress
@@ -59,7 +60,8 @@ def run(request: Request) -> Outcome:
         outcome = work.outcome
         with _tracked(request, trackers, outcome, store) as ended:
             made = output.settle(store, request, inputs.plan(), work)
-            ended(made)
+            if isinstance(made, Manifest):  # else there was nothing to track
+                ended(made)
     return _concluded(outcome, inputs, made, started)
 
 
@@ -80,7 +82,7 @@ def answered(request: Request) -> Outcome | None:
     return None if shown is None else _concluded(work.outcome, inputs, shown, started)
 
 
-def _concluded(outcome: Outcome, inputs: Inputs, made: Manifest, started: float) -> Outcome:
+def _concluded(outcome: Outcome, inputs: Inputs, made: Manifest | Unread, started: float) -> Outcome:
     outcome.notes = [*sorted(set(inputs.notes)), *outcome.describe_results(), *outcome.notes]
     outcome.rows = made.rows
     outcome.seconds = round(time.perf_counter() - started, 3)
@@ -120,6 +122,26 @@ class _Run:
         self.stage = inputs.stage
         self.outcome = Outcome(request.output, digest(identity))
         self.reads = [found.digest for found in inputs.used]
+
+    @property
+    def key(self) -> str:
+        """What names the run."""
+        return self.outcome.key
+
+    @property
+    def reused(self) -> int:
+        """How many results of the store the answer consists of."""
+        return self.outcome.reused
+
+    def recall(self, manifest_digest: str, reused: int) -> bool:
+        """Take over what is known of the run before; return whether it gave the manifest of this digest."""
+        record = self.store.record(self.key)
+        if record is None or record["result"]["files"][manifest.NAME]["digest"] != manifest_digest:
+            return False
+        self.outcome.begin()
+        self.outcome.restore(record["provenance"])
+        self.outcome.reused = reused
+        return True
 
     def answer(self) -> Manifest | None:
         """Return the manifest that this run gave before, if everything it names is still there."""

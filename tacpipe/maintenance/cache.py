@@ -8,7 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from tacpipe import printable
+from tacpipe.datasets import manifest
+from tacpipe.engine import execution
+from tacpipe.errors import StorageError, TacpipeError
 from tacpipe.io.files import readable_errors
+from tacpipe.io.hashing import DIGEST
 from tacpipe.maintenance import garbage, pushed, remote_upkeep, repair
 from tacpipe.maintenance.garbage import Collected
 from tacpipe.maintenance.pushed import AnyStore
@@ -55,6 +59,51 @@ def verify(store: CachedStore) -> Soundness:
     """
     repair.verify(store)
     return remote_upkeep.verify(store.bucket)
+
+
+def repair_damaged(store: CachedStore) -> Soundness:
+    """Return the soundness of the bucket after what is damaged or missing there was sent again.
+
+    A damaged object is moved to quarantine there. It comes from the folder in front, from a dataset's directory, or is
+    recomputed; what this computer cannot have again is lost as far as it is concerned. A damaged record stays, and is
+    replaced by whoever computes its key.
+    """
+    if not store.bucket.check():
+        return Soundness(there=False)
+    with store.at_work():
+        found = verify(store)
+        damaged = [name for name in found.damaged if DIGEST.fullmatch(name) and store.bucket.has(name)]
+        for name in damaged:
+            store.bucket.quarantine(name)
+        paths, directories = _shown(store)
+        read = execution.reader(store, tuple(directories))
+        wanted, tried = {*damaged, *found.missing}, set[str]()
+        while wanted:
+            for name in sorted(wanted):
+                try:
+                    read(name, paths.get(name, name[:12]))
+                    store.send([name])
+                    found.repaired.append(name)
+                except StorageError as error:
+                    found.unread[name] = str(error)
+                except TacpipeError as error:
+                    found.lost[name] = str(error)
+            tried |= wanted
+            wanted = remote_upkeep.missing(store.bucket) - tried  # of manifests that are there again
+        found.missing = []
+    return found
+
+
+def _shown(store: CachedStore) -> tuple[dict[str, str], list[str]]:
+    """Return the paths of all that datasets of this computer name, by digest, and the directories of these."""
+    paths: dict[str, str] = {}
+    directories = []
+    for root in store.roots.all():
+        with contextlib.suppress(TacpipeError):
+            found = manifest.find(Path(root["path"]))
+            paths |= {name: path for path, name in found.manifest.objects()} | {found.digest: manifest.NAME}
+            directories.append(root["path"])
+    return paths, directories
 
 
 def collect(store: CachedStore, *, dry_run: bool, recordings: bool, grace_days: float) -> Collected:

@@ -10,6 +10,7 @@ import contextlib
 import os
 import shutil
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ from tacpipe.io import regular
 from tacpipe.io.files import readable_errors
 from tacpipe.io.hashing import DIGEST, bytes_digest
 from tacpipe.maintenance import unnamed
-from tacpipe.store import layout
+from tacpipe.store import layout, presence
 from tacpipe.store.records import named
 from tacpipe.store.roots import PUSHED
 from tacpipe.store.store import MissingError, Store
@@ -123,27 +124,28 @@ def collect(store: Store, *, dry_run: bool, recordings: bool = False, grace_days
 
 
 def _collect(store: Store, *, dry_run: bool, recordings: bool, grace_days: float) -> Collected:
-    records = list(store.records())  # before what is needed: a damaged one goes to quarantine, and counts there
+    records = [*map(_brief, store.records())]  # before what is needed: a damaged one goes to quarantine, and counts
     needed = live(store, grace_days, dry_run=dry_run, lasting=not recordings)
     collected = Collected()
     kept, unneeded = set(needed.lasting), []
-    for key, record in records:
-        names = set(named(record["result"]))
+    for key, named_text, irreplaceable in records:
+        names = set(named_text.split())
         if names <= needed.objects or names <= kept:
             continue
-        if record["provenance"].get("irreplaceable") and not recordings:
+        if irreplaceable and not recordings:
             kept |= names - needed.objects
             continue
         unneeded.append(key)
-    objects = list(layout.entries(store.root, "objects"))
     kept |= needed.objects
-    named_by = {} if recordings else unnamed.kept((one for one in objects if one.name not in kept), needed.manifests)
+    objects = [path.name for path in layout.entries(store.root, "objects") if path.name not in kept]
+    unknown = (Path(store.object_path(name)) for name in objects)
+    named_by = {} if recordings else unnamed.kept(unknown, needed.manifests)
     kept = kept.union(named_by, *named_by.values())
     collected.records = sum(_remove_record(Path(store.record_path(key)), dry_run=dry_run) for key in unneeded)
     collected.kept_recordings = len(kept - needed.objects - needed.replaced - set(named_by))
     aside = []
-    for path in objects:
-        if path.name in kept or _young(path):
+    for path in (Path(store.object_path(name)) for name in objects if name not in kept):
+        if _young(path):
             continue
         if dry_run:
             _count(collected, path)
@@ -157,6 +159,12 @@ def _collect(store: Store, *, dry_run: bool, recordings: bool, grace_days: float
         _remove(store, aside, live(store, grace_days).objects, collected)
     _sweep(store, needed, collected, grace_days, dry_run=dry_run, doubtful=recordings)
     return collected
+
+
+def _brief(found: tuple[str, Mapping[str, Any]]) -> tuple[str, str, bool]:
+    """Return the key of a record, the digests that it names, and whether it marks a recording: memory holds all records."""
+    key, record = found
+    return key, " ".join(named(record["result"])), bool(record["provenance"].get("irreplaceable"))
 
 
 def _remove(store: Store, aside: list[str], needed: set[str], collected: Collected) -> None:
@@ -313,6 +321,7 @@ def _sweep(
             _drop(path, dry_run=dry_run)
     if not dry_run:
         store.leases.sweep()
+        presence.forget(store, [path.stem for path in layout.entries(store.root, "roots")])
     for folder in layout.entries(store.root, "checkpoints"):
         if store.record(folder.name) is not None:
             collected.checkpoints += 1

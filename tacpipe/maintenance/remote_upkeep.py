@@ -66,12 +66,19 @@ def verify(store: RemoteStore) -> Soundness:
     found.records = len(keys)
     found.damaged += sorted(key for key in keys if key not in sound and store.files.stat(layout.record_name(key)))
     found.damaged += [f"root {name}" for name in store.roots.damaged()]
+    found.missing = sorted(missing(store) - set(found.damaged))
+    return found
+
+
+def missing(store: RemoteStore) -> set[str]:
+    """Return the digests of what the newest pushed manifests name and the place has not, as far as these can be read."""
+    absent: set[str] = set()
     for _ in range(2):  # a second time: a root may have changed meanwhile
         wanted = _wanted(store)
-        found.missing = sorted(wanted - set(store.sizes(wanted)) - set(found.damaged))
-        if not found.missing:
+        absent = wanted - set(store.sizes(wanted))
+        if not absent:
             break
-    return found
+    return absent
 
 
 def _is_object(name: str) -> bool:

@@ -56,6 +56,7 @@ class Settings:
     config: dict[str, Any] = field(default_factory=dict, repr=False)
     provider: Any = field(default=None, repr=False)  # of credentials that change, as those of roles do
     plaintext: bool = False  # the server is reached without TLS
+    url: str = ""  # what the client is given in place of the address
 
 
 def parsed(text: str) -> Address | Path:
@@ -96,6 +97,9 @@ def settings(address: Address, environment: Mapping[str, str] = os.environ) -> S
 
     Raises `UsageError` for a profile that is named and is not there.
     """
+    if address.scheme == "az":  # the client takes the account as a setting
+        account, _, within = address.path.partition("/")
+        return Settings({"account_name": account}, url=f"az://{within}")
     if address.scheme != "s3":
         return Settings()
     found = Settings({"disable_bulk_delete": True})  # which not every server knows, and one at a time is deleted here

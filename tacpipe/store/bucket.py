@@ -279,7 +279,7 @@ def _connected(address: Address) -> Any:
     more: dict[str, Any] = {} if given.provider is None else {"credential_provider": given.provider}
     more |= {"config": given.config, "client_options": options, "retry_config": retries}
     try:
-        return from_url(str(address), **more)
+        return from_url(given.url or str(address), **more)
     except (BaseError, ValueError, TypeError):  # its text may hold a credential
         raise UsageError(
             f"The settings for {address} cannot be used. Look at the variables {_VARIABLES[address.scheme]} and the profile."

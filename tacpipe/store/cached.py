@@ -139,6 +139,16 @@ class CachedStore(Store):
             self._keep_record(record)
             self._asked.update(records.named(record["result"]))
 
+    def seek(self, key: str) -> None:
+        """Bring the record of a key that is not here, or note that there is none."""
+        if key in self._no_record or present(self.record_path(key)):
+            return
+        record = self.bucket.record(key)
+        if record is None:
+            self._no_record.add(key)
+        else:
+            self._keep_record(record)
+
     # ---- objects
 
     def has(self, name: str, size: int | None = None) -> bool:
@@ -222,6 +232,16 @@ class CachedStore(Store):
         made = super().put_written(write, durable=durable)
         self._made.add(made.digest)
         return made
+
+    def send(self, names: Iterable[str]) -> None:
+        """Have the bucket hold objects; those that it lacks are sent. Raises `MissingError` for one that is not here."""
+        sizes = {}
+        for name in names:
+            if not self._lies(name):
+                raise AbsentError(f"Object {name[:12]} is not in {self.root}.")
+            sizes[name] = os.lstat(self.object_path(name)).st_size
+        self._announce(sizes)
+        self._complete(sizes)
 
     def _upload(self, names: Collection[str]) -> None:
         """Have the bucket keep objects that lie here. Raises `MissingError` for one that is damaged."""

@@ -24,6 +24,7 @@ FOLDERS = ("objects", "records", "roots", "leases", "checkpoints", "quarantine",
 SPOOL = "spool"  # made by the first recording
 KEPT = "kept-spools"  # made by the first recording whose raw bytes are kept
 PROJECTS = "projects"  # made by the first push
+PRESENCE = "presence"  # made by the first command that finds a large dataset complete
 ASIDE = "gc-"  # begins the name in ``tmp/`` of an object that a collection has moved out of the way
 SHELF = re.compile(r"[0-9a-f]{2}")  # folders within objects/ and records/: how the names in them begin
 _DIGEST = r"[0-9a-f]{64}"
@@ -39,6 +40,7 @@ _FORMS = {  # of the path within each folder
     SPOOL: re.compile(_RANDOM),
     KEPT: re.compile(_RANDOM),
     PROJECTS: re.compile(rf"{_DIGEST}\.json"),
+    PRESENCE: re.compile(_DIGEST),
 }
 _SHELVED = ("objects", "records")
 _HOLD_FOLDERS = ("checkpoints", SPOOL, KEPT)  # their entries are folders, those of others files

@@ -1,4 +1,7 @@
-"""The identity of a project, under which other stores keep what it pushes: made once, and kept in the project's store."""
+"""The identity of a project, under which other stores keep what it pushes: made once, and kept in the project's store.
+
+Where a folder begins anew each time, as in a job of continuous integration, the environment names the project instead.
+"""
 
 from __future__ import annotations
 
@@ -9,14 +12,16 @@ import uuid
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from tacpipe.errors import DamagedError, StorageError
+from tacpipe.errors import DamagedError, StorageError, UsageError
 from tacpipe.io import regular
 from tacpipe.io.files import may_not_write, readable_errors
 from tacpipe.io.hashing import digest
+from tacpipe.printable import plain
 from tacpipe.store.location import marked
 from tacpipe.store.store import Store
 
 FOLDER = "projects"  # within the store
+VARIABLE = "TACPIPE_PROJECT"
 _FILE_BYTES = 1 << 16  # the largest identity that is read
 _NAME_LETTERS = 60
 
@@ -42,11 +47,34 @@ def place(directory: Path) -> tuple[Path, str]:
     return folder, str(here.relative_to(folder)) if folder in here.parents else here.name or "dataset"
 
 
+def named() -> Project | None:
+    """Return the project that the environment names, the same wherever it does; None where it names none.
+
+    Raises `UsageError` for a name that none can have.
+
+    >>> os.environ["TACPIPE_PROJECT"] = "slip detection"
+    >>> named().name, named() == named()
+    ('slip detection', True)
+    >>> del os.environ["TACPIPE_PROJECT"]
+    """
+    name = os.environ.get(VARIABLE, "")
+    if not name:
+        return None
+    if _shown(name) != name or name != name.strip():
+        raise UsageError(
+            f"{VARIABLE} is {plain(name, 80)!r}; the name of a project has {_NAME_LETTERS} printable letters at most, no "
+            f"colon, and no space at its ends."
+        )
+    return Project(digest(["named project", name])[:32], name)
+
+
 def known(store: Store, folder: Path) -> Project | None:
-    """Return the identity of the project in ``folder``, None where it has pushed nothing yet.
+    """Return the identity of the project in ``folder``, None where it has pushed nothing yet and `named` gives none.
 
     Raises `DamagedError` for one that is damaged: under a new one it would be another project.
     """
+    if (project := named()) is not None:
+        return project
     file = _file(store, folder)
     try:
         with readable_errors(store.root, reading=True):
@@ -91,7 +119,15 @@ def new_id() -> str:
 
 
 def join(store: Store, folder: Path, project: Project) -> None:
-    """Make ``project`` the identity of the project in ``folder``, as on a second computer."""
+    """Make ``project`` the identity of the project in ``folder``, as on a second computer.
+
+    Raises `UsageError` where the environment names another one.
+    """
+    given = named()
+    if given is not None and given != project:
+        raise UsageError(
+            f"{VARIABLE} names the project {given.name}, so --project {project.name} has no effect. Unset one."
+        )
     store.prepare()
     _write(store, folder, project, exclusive=False)
 
@@ -115,5 +151,8 @@ def _name(folder: Path) -> str:
     >>> _name(Path("/lab/slip detection")), _name(Path("/lab/a:b")), _name(Path("/"))
     ('slip detection', 'a-b', 'project')
     """
-    shown = "".join("-" if letter == ":" or not letter.isprintable() else letter for letter in folder.name)
-    return shown[:_NAME_LETTERS] or "project"
+    return _shown(folder.name) or "project"
+
+
+def _shown(name: str) -> str:
+    return "".join("-" if letter == ":" or not letter.isprintable() else letter for letter in name)[:_NAME_LETTERS]

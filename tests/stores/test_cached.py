@@ -1,13 +1,15 @@
 """Stages that work on a store in a bucket, each computer with a folder of its own in front."""
 
+import itertools
 import json
 import os
 import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -15,9 +17,9 @@ import pytest
 
 from tacpipe.engine import execution
 from tacpipe.engine.execution import Done, Task
-from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.errors import StorageError, TacpipeError, UsageError
 from tacpipe.maintenance import remote_upkeep, transfer
-from tacpipe.store import bucket, cached, location
+from tacpipe.store import bucket, cached, location, records
 from tacpipe.store.addresses import Address, parsed
 from tacpipe.store.bucket import Bucket
 from tacpipe.store.cached import CachedStore
@@ -249,7 +251,7 @@ def test_status_list_and_checkout_show_what_the_bucket_holds(computers: Computer
     computers.lab.run(f"store checkout {wanted} -o data/back")
     there = computers.lab.folder / "first/project/data/s/manifest.json"
     assert Path("data/back/manifest.json").read_bytes() == there.read_bytes()
-    assert computers.lab.call("store repair").code == 2
+    assert "all sound" in computers.lab.run("store repair").out
     assert "s3://lab/store" in computers.lab.run("store status").out
 
 
@@ -324,6 +326,46 @@ def test_a_damaged_object_of_the_bucket_is_recomputed_and_replaced(computers: Co
     assert content(second) == content(computers.lab.folder / "first/project")
     assert files.read(path) == sound
     expect_whole(files)
+
+
+@pytest.mark.parametrize("lost", ["bytes", "object"])
+@pytest.mark.parametrize("kept", ["copy", "dataset", "nothing"])
+def test_a_repair_sends_again_what_is_damaged_or_missing_in_the_bucket(
+    computers: Computers, files: Stepping, lost: str, kept: str
+) -> None:
+    computers.run("first", SIMULATE, SCALE)
+    recorded = computers.lab.manifest("first/project/data/r").recordings["trial-001"]["shards"]["left"]["digest"]
+    made = computers.lab.manifest("first/project/data/s").recordings["trial-001"]["shards"][""]["digest"]
+    manifests = [manifest_digest(Path("data/r")), manifest_digest(Path("data/s"))]
+    before = files.content()
+    for name in (recorded, made, *manifests):
+        path = f"objects/{name[:2]}/{name}"
+        files.delete(path)
+        if lost == "bytes":
+            files.create(path, before[path][:-1] + b"x")
+    if kept != "copy":
+        shutil.rmtree(computers.store.root / "objects")
+    if kept == "nothing":
+        for file in (Path("data/r/trial-001/left.parquet"), Path("data/s/trial-001.parquet")):
+            file.unlink()
+    ran = computers.lab.run("store repair --json")
+    assert sorted(json.loads(ran.out)["repaired"]) == sorted([recorded, made, *manifests])
+    assert {name: value for name, value in files.content().items() if name.startswith("objects/")} == {
+        name: value for name, value in before.items() if name.startswith("objects/")
+    }
+    assert len(list(files.list("quarantine"))) == (4 if lost == "bytes" else 0)
+    expect_whole(files)
+
+
+def test_a_repair_states_what_this_computer_cannot_have_again(computers: Computers, files: Stepping) -> None:
+    computers.run("first", SIMULATE, SCALE)
+    name = computers.lab.manifest("first/project/data/r").recordings["trial-001"]["shards"]["left"]["digest"]
+    for entry in [*files.list("records")]:
+        files.delete(entry.name)
+    computers.enter("second")
+    files.delete(f"objects/{name[:2]}/{name}")
+    ran = computers.lab.call("store repair")
+    assert ran.code == 4 and name in ran.out and "cannot be recomputed" in ran.out
 
 
 def test_what_a_collection_took_is_computed_again(computers: Computers, files: Stepping) -> None:
@@ -508,6 +550,111 @@ def test_credentials_are_in_nothing_that_is_kept_or_printed(linked: Linked) -> N
     for secret in (SECRET, KEY):
         assert secret not in printed
         assert not [one for one in [*kept, *here] if secret.encode() in one]
+
+
+def test_folders_that_begin_anew_are_one_project_where_the_environment_names_it(
+    computers: Computers, files: Stepping, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TACPIPE_PROJECT", "nightly")
+    for job in ("first", "second", "third"):
+        computers.run(job, SIMULATE, SCALE)
+    roots = RemoteStore(files).roots.all()
+    assert sorted((root["project"]["name"], root["path"]) for root in roots) == [
+        ("nightly", "data/r"),
+        ("nightly", "data/s"),
+    ]
+    monkeypatch.setenv("TACPIPE_PROJECT", "other")
+    computers.run("fourth", SIMULATE)
+    monkeypatch.delenv("TACPIPE_PROJECT")
+    computers.run("fifth", SIMULATE)
+    assert len(RemoteStore(files).roots.all()) == 4
+
+
+def test_a_job_that_begins_anew_pulls_what_an_earlier_one_pushed_under_the_name_of_the_environment(
+    computers: Computers, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TACPIPE_PROJECT", "nightly")
+    computers.run("first", SIMULATE, "store push s3://lab/elsewhere data/r")
+    wanted = content(computers.enter("first"))
+    computers.run("second", "store pull s3://lab/elsewhere data/r")
+    assert content(computers.enter("second")) == wanted
+    refused = computers.lab.call("store push s3://lab/elsewhere data/r --project another")
+    assert refused.code == 2 and refused.err.count("\n") == 1
+
+
+@pytest.mark.parametrize("name", ["a:b", "x" * 61, " lab", "a\tb"])
+def test_a_name_that_no_project_can_have_is_refused(
+    computers: Computers, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    monkeypatch.setenv("TACPIPE_PROJECT", name)
+    refused = computers.lab.call(SIMULATE)
+    assert refused.code == 2 and "TACPIPE_PROJECT" in refused.err and refused.err.count("\n") == 1
+
+
+def test_results_are_sent_while_others_are_computed_and_objects_still_come_before_their_records(
+    computers: Computers, files: Stepping, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    several, create, lock = threading.Event(), files.create, threading.Lock()
+    under_way = [0, 0]  # now, and at most
+
+    def creating(name: str, content: bytes | Iterable[bytes]) -> bool:
+        if not name.startswith("records/"):
+            return create(name, content)
+        assert isinstance(content, bytes)
+        for wanted in records.named(json.loads(content)["result"]):
+            assert files.stat(f"objects/{wanted[:2]}/{wanted}") is not None, name
+        with lock:
+            under_way[0] += 1
+            under_way[1] = max(under_way)
+            if under_way[0] > 1:
+                several.set()
+        several.wait(60)  # in vain where each waits for the one before
+        kept = create(name, content)
+        with lock:
+            under_way[0] -= 1
+        return kept
+
+    monkeypatch.setattr(files, "create", creating)
+    computers.run("first", SIMULATE.replace("--trials 3", "--trials 12"))
+    assert several.is_set() and 1 < under_way[1] <= execution.AT_ONCE
+    expect_whole(files)
+    assert not [path for path in computers.store.root.glob("leases/*") if not path.name.startswith("run-")]
+    computers.run("second", SIMULATE.replace("--trials 3", "--trials 12"))
+    assert content(computers.lab.folder / "second/project") == content(computers.lab.folder / "first/project")
+
+
+def test_what_another_computer_made_meanwhile_is_not_computed_where_many_are_looked_for_ahead(
+    computers: Computers, files: Stepping
+) -> None:
+    many = SIMULATE.replace("--trials 3", "--trials 12")
+    computers.run("first", many)
+    tasks = {"scale": [], "simulate.toy": []}  # type: ignore[var-annotated]
+    for _, record in computers.store.records():
+        identity = record["identity"]
+        if identity.get("stage") in tasks:
+            tasks[identity["stage"]].append(Task(computers.address, identity["stage"], identity))
+    computers.enter("second")
+    done = list(execution.compute.each(tasks["simulate.toy"]))
+    assert len(done) == 12 and not any(one.made for one in done)
+
+
+def test_a_result_that_cannot_be_sent_ends_the_command_and_the_others_are_kept(
+    computers: Computers, files: Stepping, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    many, create, sent = SIMULATE.replace("--trials 3", "--trials 12"), files.create, itertools.count()
+
+    def failing(name: str, content: bytes | Iterable[bytes]) -> bool:
+        if name.startswith("records/") and next(sent) == 5:
+            raise StorageError("s3://lab/store fails. It answers 503.")
+        return create(name, content)
+
+    with monkeypatch.context() as broken:
+        broken.setattr(files, "create", failing)
+        ran = computers.lab.call(many)
+    assert ran.code == 1 and "503" in ran.err
+    assert not list(computers.store.root.glob("leases/*"))
+    assert counts(computers.lab.run(f"{many} --json").out) == (1, 11)
+    expect_whole(files)
 
 
 # ---- several at once

@@ -101,3 +101,10 @@ def test_a_real_server_refuses_a_wrong_secret_and_the_sentence_shows_neither(
     refused = lab.call("store push s3://lab/store data/r")
     assert refused.code == 1 and "403" in refused.err and refused.err.count("\n") == 1
     assert wrong not in refused.err and KEY not in refused.err and SECRET not in refused.err
+
+
+def test_the_account_of_an_address_of_azure_is_a_setting_and_the_container_is_the_first_folder() -> None:
+    address = addresses.parsed("az://account/container/touch/store")
+    assert isinstance(address, addresses.Address)
+    found = addresses.settings(address, {})
+    assert (found.config["account_name"], found.url) == ("account", "az://container/touch/store")

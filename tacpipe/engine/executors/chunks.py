@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import TypeVar
 
 from tacpipe.io import memory
@@ -23,6 +23,12 @@ def of(tasks: Sequence[Task], workers: int, most: int | None = None) -> list[Seq
     return [tasks[start : start + size] for start in range(0, len(tasks), size)]
 
 
+def each(compute: Callable[[Task], Done], tasks: Sequence[Task]) -> Iterator[Done]:
+    """Yield ``compute(task)`` of each task; ``compute.each(tasks)`` where it has that, which may do several at once."""
+    several: Callable[[Sequence[Task]], Iterator[Done]] | None = getattr(compute, "each", None)
+    return map(compute, tasks) if several is None else several(tasks)
+
+
 def computed(compute: Callable[[Task], Done], chunk: Sequence[Task]) -> list[Done] | Exception:
     """Return ``compute(task)`` of each task; or a mistake in a stage, to be raised where the stage was asked for.
 
@@ -30,7 +36,7 @@ def computed(compute: Callable[[Task], Done], chunk: Sequence[Task]) -> list[Don
     """
     try:
         with memory.raising_shortage():
-            return [compute(task) for task in chunk]
+            return list(each(compute, chunk))
     except Exception as error:
         import pickle
         import traceback

@@ -35,7 +35,7 @@ class Local:
         """
         jobs = min(self.jobs, len(tasks))
         alone = jobs <= 1 or len(tasks) < self._pool_from
-        return map(compute, tasks) if alone else _run(compute, tasks, jobs, preload)
+        return chunks.each(compute, tasks) if alone else _run(compute, tasks, jobs, preload)
 
 
 @contextlib.contextmanager
