@@ -18,7 +18,7 @@ _CPUINFO = Path("/proc/cpuinfo")
 _INSTRUCTIONS = ("avx", "avx2", "fma", "avx512f", "avx512bw", "avx512_bf16", "amx_tile", "asimd", "sve", "sve2")
 # variables that choose kernels by name
 _CHOSEN = ("OPENBLAS_CORETYPE", "ATEN_CPU_CAPABILITY", "ONEDNN_MAX_CPU_ISA", "MKL_CBWR", "NPY_DISABLE_CPU_FEATURES")
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 def here() -> dict[str, Any]:
@@ -32,7 +32,7 @@ def threads() -> int:
     torch = sys.modules.get("torch")
     if torch is not None:
         return int(torch.get_num_threads())
-    given = (os.environ.get(name, "") for name in _THREADS)
+    given = (os.environ.get(name, "") for name in THREADS)
     return next((int(text) for text in given if text.isdecimal() and int(text)), usable_cores())
 
 
