@@ -1,8 +1,8 @@
 """Steps of several recurrent networks at once, their weights stacked, next to the same networks one after another.
 
-``python benchmarks/stacked_training.py``; processor seconds of one thread, in interleaved rounds. Of the networks of a grid only
-the LSTM is stacked here, with the maths of `tacpipe.models.lstm` in one product (member, window, …) a time step: it is where their
-time goes. Both give the same losses and gradients, which is checked first.
+``python benchmarks/stacked_training.py``; processor seconds of one thread, in interleaved rounds. What is stacked is the
+LSTM, where the time of these networks goes, with the maths of `tacpipe.models.lstm` in one product (member, window, …) a
+time step. Both give the same gradients, which is checked first.
 """
 
 from __future__ import annotations
@@ -113,7 +113,8 @@ def _made(
     inputs = torch.randn(MEMBERS, steps, windows, width)
     bound = size**-0.5
     weights = [
-        torch.empty(MEMBERS, 4 * size, *rest).uniform_(-bound, bound).requires_grad_() for rest in ((width,), (size,), ())
+        torch.empty(MEMBERS, 4 * size, *rest).uniform_(-bound, bound).requires_grad_()
+        for rest in ((width,), (size,), ())
     ]
     toward = torch.randn(steps, MEMBERS, windows, size)
 

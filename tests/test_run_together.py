@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from tacpipe.cli import stage_processes
-from tacpipe.engine.processor import THREADS
+from tacpipe.engine import processor
 from tests.conftest import Lab, tacpipe
 from tests.test_run import STAGES, content, one, written
 
@@ -32,10 +32,12 @@ def test_several_stages_at_a_time_give_the_bytes_that_they_give_one_after_anothe
 
 
 def test_stages_that_do_not_depend_on_each_other_run_at_the_same_time(lab: Lab) -> None:
-    written({
-        "first": {"cmd": f"touch first && {WAITS.format('second', 'second')}"},
-        "second": {"cmd": f"touch second && {WAITS.format('first', 'first')}"},
-    })
+    written(
+        {
+            "first": {"cmd": f"touch first && {WAITS.format('second', 'second')}"},
+            "second": {"cmd": f"touch second && {WAITS.format('first', 'first')}"},
+        }
+    )
 
     assert lab.run("run dvc.yaml --jobs 2").err.splitlines()[-1] == "2 ran"
 
@@ -80,17 +82,15 @@ def test_with_nothing_to_do_no_process_is_started(lab: Lab, monkeypatch: pytest.
     assert lab.run("run dvc.yaml --jobs 0").err.splitlines()[-1] == "3 unchanged"
 
 
-def test_each_process_gets_its_part_of_the_cores_unless_the_environment_states_threads(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(stage_processes, "usable_cores", lambda: 8)
-    for name in THREADS:
+def test_each_process_gets_its_part_of_the_cores(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(processor, "usable_cores", lambda: 8)
+    for name in processor.THREADS:
         monkeypatch.delenv(name, raising=False)
-    assert stage_processes.threads(2) == dict.fromkeys(THREADS, "4")
-    assert stage_processes.threads(16) == dict.fromkeys(THREADS, "1")
+    written({str(number): {"cmd": "echo $OMP_NUM_THREADS $OPENBLAS_NUM_THREADS >> threads"} for number in range(2)})
+    lab.run("run dvc.yaml --jobs 2")
 
-    monkeypatch.setenv("OMP_NUM_THREADS", "3")
-    assert stage_processes.threads(2) == {}
+    assert Path("threads").read_text() == "4 4\n4 4\n"
+    assert "OMP_NUM_THREADS" not in os.environ
 
 
 @pytest.mark.long

@@ -53,8 +53,9 @@ def add(program: typer.Typer, summary: str) -> None:
         "run",
         help=f"{summary}\n\nStages run in the order of their deps and outs, from the folder of the file. A stage whose "
         "results are there is passed over; one that fails keeps back only what depends on it. Commands of other programs "
-        "are run by the shell, each time.\n\nWith --jobs stages that do not depend on each other run at the same time, and what a command prints is "
-        "printed when it ends.\n\nExample: tacpipe run dvc.yaml\n\nExample: tacpipe run dvc.yaml train evaluate\n\n"
+        "are run by the shell, each time.\n\nWith --jobs stages that do not depend on each other run at the same time, "
+        "each with its part of the cores, and what a command prints is printed when it ends.\n\n"
+        "Example: tacpipe run dvc.yaml\n\nExample: tacpipe run dvc.yaml train evaluate\n\n"
         "Example: tacpipe run dvc.yaml forward --jobs 2",
     )
     def run(
@@ -172,12 +173,13 @@ class _Together:
 
 def _run_together(chain: Chain, jobs: int, *, quiet: bool) -> int:
     """Run the stages of a chain, ``jobs`` at a time; return the exit code of the first that failed, or 0."""
-    from tacpipe.cli.stage_processes import StageProcesses
+    from tacpipe.cli import stage_processes
 
+    modules = stage_processes.modules(command for stage in chain.stages for command in stage.commands)
     with (
         tempfile.TemporaryDirectory(prefix="tacpipe-run-") as folder,
         termination.reporting(""),
-        StageProcesses(jobs, Path(folder)) as processes,
+        stage_processes.StageProcesses(jobs, Path(folder), modules) as processes,
     ):
         together = _Together(chain, processes, quiet=quiet)
         together.run()

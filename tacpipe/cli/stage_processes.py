@@ -9,15 +9,17 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
+import runpy
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from tacpipe.engine import processor
 from tacpipe.engine.executors import forking
-from tacpipe.engine.processor import THREADS, usable_cores
 from tacpipe.io import termination
 
 if TYPE_CHECKING:
@@ -27,17 +29,27 @@ if TYPE_CHECKING:
 Command = str | Sequence[str]  # a text for the shell, or the words of a command of tacpipe without its name
 MODULES = ("tacpipe.cli.main", "tacpipe.cli.stages", "tacpipe.engine.pipeline", "tacpipe.io.parquet")
 LEARNING = tuple(f"tacpipe.tasks.{name}.task" for name in ("forward", "material", "touch"))  # these import torch
+_LEARNS = re.compile(r"\btacpipe (train|evaluate|predict|compress autoencoder) ")
+
+
+def modules(commands: Iterable[str]) -> tuple[str, ...]:
+    """Return the modules that commands import.
+
+    >>> modules(["tacpipe split data -o split"]) == MODULES
+    True
+    """
+    return (*MODULES, *LEARNING) if any(_LEARNS.search(command) for command in commands) else MODULES
 
 
 class StageProcesses:
-    """At most ``jobs`` commands at the same time, in the block of a ``with``: those that still run at its end are interrupted.
+    """At most ``jobs`` commands at the same time, in the block of a ``with``; what still runs at its end is interrupted.
 
     Each computes with as many threads as there are cores for each, unless the environment states another number.
     """
 
-    def __init__(self, jobs: int, folder: Path, modules: Sequence[str] = (*MODULES, *LEARNING)) -> None:
-        """Take how many, 0 for one a usable core, a folder for what they print, and which modules they need."""
-        self.jobs = jobs or usable_cores()
+    def __init__(self, jobs: int, folder: Path, modules: Sequence[str]) -> None:
+        """Take how many, 0 for one a usable core, a folder for what they print, and the modules that they import."""
+        self.jobs = jobs or processor.usable_cores()
         self._folder, self._modules = folder, modules
         self._running: dict[str, Process] = {}  # by the name of the stage
         self._context: ForkServerContext | None = None
@@ -68,10 +80,10 @@ class StageProcesses:
     def start(self, name: str, command: Command) -> None:
         """Start a command of the stage ``name``, of which none runs."""
         if self._context is None:
-            with _set(threads(self.jobs)):  # the process that forks hands its environment on
+            with processor.shared_by(self.jobs):  # the process that forks hands its environment on
                 self._context = forking.context(self._modules)
         words = command if isinstance(command, str) else list(command)
-        given = words, str(Path.cwd()), *map(str, self._printed(name))
+        given = words, str(Path.cwd()), processor.each_of(self.jobs), *map(str, self._printed(name))
         process = self._context.Process(target=_run, args=given)
         with termination.deferred(), forking.without_main():
             process.start()
@@ -106,26 +118,9 @@ class StageProcesses:
         return place.with_name(f"{place.name}.out"), place.with_name(f"{place.name}.err")
 
 
-def threads(jobs: int) -> dict[str, str]:
-    """Return the variables that give each of ``jobs`` processes its part of the cores, where none of them is set."""
-    if any(name in os.environ for name in THREADS):
-        return {}
-    return dict.fromkeys(THREADS, str(max(1, usable_cores() // jobs)))
-
-
-@contextlib.contextmanager
-def _set(variables: Mapping[str, str]) -> Iterator[None]:
-    """Have the environment hold these variables, which it does not hold, in the block."""
-    os.environ.update(variables)
-    try:
-        yield
-    finally:
-        for name in variables:
-            del os.environ[name]
-
-
-def _run(command: str | list[str], place: str, *printed: str) -> None:
+def _run(command: str | list[str], place: str, variables: dict[str, str], *printed: str) -> None:
     """Run one command in this process, which was forked for it."""
+    os.environ.update(variables)
     for handle, path in enumerate(printed, 1):
         opened = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND, 0o600)
         os.dup2(opened, handle)
@@ -135,6 +130,4 @@ def _run(command: str | list[str], place: str, *printed: str) -> None:
     if isinstance(command, str):
         os.execv("/bin/sh", ["sh", "-c", command])
     sys.argv = ["tacpipe", *command]
-    from tacpipe.cli.main import main
-
-    main()
+    runpy.run_module("tacpipe", run_name="__main__")

@@ -6,10 +6,12 @@ additions, and so how they round.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import os
 import platform
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +36,28 @@ def threads() -> int:
         return int(torch.get_num_threads())
     given = (os.environ.get(name, "") for name in THREADS)
     return next((int(text) for text in given if text.isdecimal() and int(text)), usable_cores())
+
+
+@contextlib.contextmanager
+def shared_by(processes: int) -> Iterator[None]:
+    """Have processes that start in the block compute with `each_of` so many."""
+    variables = each_of(processes)
+    os.environ.update(variables)
+    try:
+        yield
+    finally:
+        for name in variables:
+            os.environ.pop(name, None)
+
+
+def each_of(processes: int) -> dict[str, str]:
+    """Return the variables that give each of so many processes its part of the cores; none where the environment has one.
+
+    Of several processes with as many threads each as there are cores, most threads wait for one another.
+    """
+    if any(name in os.environ for name in THREADS):
+        return {}
+    return dict.fromkeys(THREADS, str(max(1, usable_cores() // max(1, processes))))
 
 
 def usable_cores() -> int:

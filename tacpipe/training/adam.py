@@ -1,4 +1,4 @@
-"""Adam (Kingma and Ba, Adam: A Method for Stochastic Optimization, 2015) by torch's fused kernel, to the bit as `torch.optim.Adam`.
+"""Adam (Kingma and Ba, Adam: A Method for Stochastic Optimization, 2015), to the bit as `torch.optim.Adam` computes it.
 
 The first `torch.optim.Adam` of a process imports torch's compiler, which takes as long as torch itself: 1.2 s of processor
 time, of some 6 s that a short training of one epoch takes. The function that it calls at each step needs none of that.
