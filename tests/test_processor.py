@@ -72,3 +72,20 @@ def test_a_git_that_does_not_answer_leaves_the_commit_out(monkeypatch: pytest.Mo
 
 def test_a_record_that_does_not_say_is_unlike_nothing() -> None:
     assert provenance.unlike({"threads": 2}, provenance.of(0.0)) == []
+
+
+def test_each_of_several_processes_gets_its_part_of_the_cores_unless_the_environment_states_threads(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(processor, "usable_cores", lambda: 8)
+    for name in processor.THREADS:
+        monkeypatch.delenv(name, raising=False)
+    found = [{name: os.environ.get(name)} for name in processor.THREADS]
+    assert processor.each_of(2) == dict.fromkeys(processor.THREADS, "4")
+    assert processor.each_of(16) == dict.fromkeys(processor.THREADS, "1")
+    with processor.shared_by(3):
+        assert [os.environ[name] for name in processor.THREADS] == ["2", "2", "2"]
+    assert [{name: os.environ.get(name)} for name in processor.THREADS] == found
+
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
+    assert processor.each_of(2) == {}

@@ -13,10 +13,11 @@ import shlex
 import signal
 import subprocess
 import sys
-from collections.abc import Sequence
+import tempfile
+from collections.abc import Mapping, Sequence
 from enum import Enum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -26,6 +27,9 @@ from tacpipe.engine.chains.chain import Chain, ChainStage
 from tacpipe.errors import DONE, INTERRUPTED
 from tacpipe.io import progress, terminal, termination
 from tacpipe.plugins import registry
+
+if TYPE_CHECKING:
+    from tacpipe.cli.stage_processes import StageProcesses
 
 PROGRAM = (sys.executable, "-P", "-m", "tacpipe")  # without -P modules would be found in the folder of the chain
 _SHELL = re.compile(r"[|&;<>()$`\\~#!\n]|\{[^}]*(?:,|\.\.)[^}]*\}")  # what a shell does more with than splitting words
@@ -49,7 +53,10 @@ def add(program: typer.Typer, summary: str) -> None:
         "run",
         help=f"{summary}\n\nStages run in the order of their deps and outs, from the folder of the file. A stage whose "
         "results are there is passed over; one that fails keeps back only what depends on it. Commands of other programs "
-        "are run by the shell, each time.\n\nExample: tacpipe run dvc.yaml\n\nExample: tacpipe run dvc.yaml train evaluate",
+        "are run by the shell, each time.\n\nWith --jobs stages that do not depend on each other run at the same time, "
+        "each with its part of the cores, and what a command prints is printed when it ends.\n\n"
+        "Example: tacpipe run dvc.yaml\n\nExample: tacpipe run dvc.yaml train evaluate\n\n"
+        "Example: tacpipe run dvc.yaml forward --jobs 2",
     )
     def run(
         file: Annotated[Path, typer.Argument(help="A file with stages, as DVC's dvc.yaml.")],
@@ -57,11 +64,14 @@ def add(program: typer.Typer, summary: str) -> None:
             list[str] | None,
             typer.Argument(metavar="STAGES", help="Stages to run, with all that they depend on; by default all."),
         ] = None,
+        jobs: Annotated[
+            int, typer.Option("--jobs", min=0, help="Stages at the same time, each in a process; 0: one a core.")
+        ] = 1,
         quiet: Annotated[bool, typer.Option("--quiet", help="No names of stages, no summary.")] = False,
     ) -> None:
         chain = chains.load(file, names or ())
         with contextlib.chdir(file.absolute().parent):
-            code = _run(chain, quiet=quiet)
+            code = _run(chain, quiet=quiet) if jobs == 1 else _run_together(chain, jobs, quiet=quiet)
         if code:
             raise typer.Exit(code)
 
@@ -71,15 +81,9 @@ def _run(chain: Chain, *, quiet: bool) -> int:
     became: dict[str, Became] = {}
     first = DONE
     for stage in chain.stages:
-        missing = sorted(
-            name for name in chain.after[stage.name] if became.get(name) in (Became.FAILED, Became.BLOCKED)
-        )
-        if missing:
-            became[stage.name] = Became.BLOCKED
-            terminal.note(f"tacpipe: {stage.name} was not run: it depends on {missing[0]}.")
-            continue
-        if stage.frozen:
-            became[stage.name] = Became.UNCHANGED
+        found = _without_running(stage, chain, became)
+        if found is not None:
+            became[stage.name] = found
             continue
         if not quiet:
             terminal.note(f"{stage.name}:")
@@ -89,11 +93,98 @@ def _run(chain: Chain, *, quiet: bool) -> int:
         if code:
             terminal.note(f"tacpipe: {stage.name} failed with exit code {code}.")
             first = first or code
+    _summary(became, quiet=quiet)
+    return first
+
+
+def _without_running(stage: ChainStage, chain: Chain, became: Mapping[str, Became]) -> Became | None:
+    """Return what became of a stage that is not to be run: one of which another failed, or a frozen one."""
+    missing = sorted(name for name in chain.after[stage.name] if became.get(name) in (Became.FAILED, Became.BLOCKED))
+    if missing:
+        terminal.note(f"tacpipe: {stage.name} was not run: it depends on {missing[0]}.")
+        return Became.BLOCKED
+    return Became.UNCHANGED if stage.frozen else None
+
+
+def _summary(became: Mapping[str, Became], *, quiet: bool) -> None:
     progress.set_quiet(quiet)
     if not quiet:
         counts = {kind: sum(one is kind for one in became.values()) for kind in Became}
         terminal.note(", ".join(f"{count} {kind.value}" for kind, count in counts.items() if count))
-    return first
+
+
+class _Together:
+    """The stages of a chain, several of them at work: each begins when all that it depends on are done."""
+
+    def __init__(self, chain: Chain, processes: StageProcesses, *, quiet: bool) -> None:
+        self._chain, self._processes, self._quiet = chain, processes, quiet
+        self._waiting = list(chain.stages)
+        self._at_work: dict[str, tuple[ChainStage, list[str]]] = {}  # with the commands that follow
+        self.became: dict[str, Became] = {}
+        self.first = DONE  # exit code that is not 0
+
+    def run(self) -> None:
+        """Run all stages."""
+        while self._waiting or self._processes.busy:
+            while self._processes.free and (stage := self._ready()) is not None:
+                self._waiting.remove(stage)
+                found = _without_running(stage, self._chain, self.became)
+                if found is None:
+                    self._announce(f"{stage.name}:")
+                    self._advance(stage, list(stage.commands), Became.UNCHANGED)
+                else:
+                    self.became[stage.name] = found
+            if self._processes.busy:
+                self._end(*self._processes.next(before=self._announce))
+
+    def _ready(self) -> ChainStage | None:
+        """Return the next stage of which everything that it depends on is done."""
+        done = self.became.keys()
+        return next((stage for stage in self._waiting if self._chain.after[stage.name] <= done), None)
+
+    def _advance(self, stage: ChainStage, commands: list[str], became: Became) -> None:
+        """Go through the commands of a stage up to the first that has something to do, and start that one."""
+        while commands:
+            command = commands.pop(0)
+            words = _words(command)
+            if words is not None and _answered(words[1:]):
+                continue
+            self._announce(f"{stage.name} begins: {command}")
+            self._at_work[stage.name] = stage, commands
+            self._processes.start(stage.name, command if words is None else words[1:])
+            return
+        self.became[stage.name] = became
+
+    def _end(self, name: str, code: int) -> None:
+        stage, commands = self._at_work.pop(name)
+        if code == INTERRUPTED:
+            raise KeyboardInterrupt
+        if not code:
+            self._advance(stage, commands, Became.RAN)
+            return
+        self.became[name] = Became.FAILED
+        self.first = self.first or code
+        terminal.note(f"tacpipe: {name} failed with exit code {code}.")
+
+    def _announce(self, sentence: str) -> None:
+        if not self._quiet:
+            terminal.note(sentence)
+
+
+def _run_together(chain: Chain, jobs: int, *, quiet: bool) -> int:
+    """Run the stages of a chain, ``jobs`` at a time; return the exit code of the first that failed, or 0."""
+    from tacpipe.cli import stage_processes
+
+    modules = stage_processes.modules(command for stage in chain.stages for command in stage.commands)
+    with (
+        tempfile.TemporaryDirectory(prefix="tacpipe-run-") as folder,
+        termination.reporting(""),
+        stage_processes.StageProcesses(jobs, Path(folder), modules) as processes,
+    ):
+        together = _Together(chain, processes, quiet=quiet)
+        together.run()
+    _summary(together.became, quiet=quiet)
+    return together.first
 
 
 def _stage(stage: ChainStage) -> tuple[Became, int]:

@@ -130,7 +130,9 @@ def filled(build: Callable[[], torch.nn.Module], weights: Mapping[str, torch.Ten
                 f"The model's weights do not fit its {CONFIG}: {plain(name)} is {there.get(name, 'not there')} and should "
                 f"be {wanted.get(name, 'not there')}. Copy its files again from whoever made them."
             )
-    network.to_empty(device="cpu").load_state_dict(weights)
+    kinds = {name: value.dtype for name, value in network.state_dict().items()}
+    # `to_empty` imports sympy, which takes as long as a small network's evaluation
+    network.load_state_dict({name: value.to(kinds[name], copy=True) for name, value in weights.items()}, assign=True)
     return network
 
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from tacpipe.engine import pipeline
+from tacpipe.engine import pipeline, processor
 from tacpipe.engine.executors.local import Local
 from tacpipe.engine.outcome import Outcome
 from tacpipe.engine.request import Request
@@ -64,7 +64,8 @@ def run(given: Sequence[Request], jobs: int) -> Iterator[tuple[Request, Outcome 
     """
     tasks = [(position, replace(request, jobs=1)) for position, request in enumerate(given)]
     pool = Local(jobs, pool_from=2)
-    with progress.bar(f"{given[0].name}, folds", len(given)) as advance:
+    at_once = min(pool.jobs, len(tasks))
+    with processor.shared_by(at_once), progress.bar(f"{given[0].name}, folds", len(given)) as advance:
         for position, became in pool.run(_run, tasks, ["tacpipe.engine.pipeline", "tacpipe.io.parquet"]):
             advance(note=str(given[position].output))
             yield given[position], became

@@ -6,10 +6,12 @@ additions, and so how they round.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import os
 import platform
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +20,7 @@ _CPUINFO = Path("/proc/cpuinfo")
 _INSTRUCTIONS = ("avx", "avx2", "fma", "avx512f", "avx512bw", "avx512_bf16", "amx_tile", "asimd", "sve", "sve2")
 # variables that choose kernels by name
 _CHOSEN = ("OPENBLAS_CORETYPE", "ATEN_CPU_CAPABILITY", "ONEDNN_MAX_CPU_ISA", "MKL_CBWR", "NPY_DISABLE_CPU_FEATURES")
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 def here() -> dict[str, Any]:
@@ -32,8 +34,30 @@ def threads() -> int:
     torch = sys.modules.get("torch")
     if torch is not None:
         return int(torch.get_num_threads())
-    given = (os.environ.get(name, "") for name in _THREADS)
+    given = (os.environ.get(name, "") for name in THREADS)
     return next((int(text) for text in given if text.isdecimal() and int(text)), usable_cores())
+
+
+@contextlib.contextmanager
+def shared_by(processes: int) -> Iterator[None]:
+    """Have processes that start in the block compute with `each_of` so many."""
+    variables = each_of(processes)
+    os.environ.update(variables)
+    try:
+        yield
+    finally:
+        for name in variables:
+            os.environ.pop(name, None)
+
+
+def each_of(processes: int) -> dict[str, str]:
+    """Return the variables that give each of so many processes its part of the cores; none where the environment has one.
+
+    Of several processes with as many threads each as there are cores, most threads wait for one another.
+    """
+    if any(name in os.environ for name in THREADS):
+        return {}
+    return dict.fromkeys(THREADS, str(max(1, usable_cores() // max(1, processes))))
 
 
 def usable_cores() -> int:

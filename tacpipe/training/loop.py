@@ -24,6 +24,7 @@ from torch import Tensor, nn
 from tacpipe.errors import TacpipeError
 from tacpipe.models.tensors import under
 from tacpipe.training import checkpoint, following, ranks
+from tacpipe.training.adam import Adam
 from tacpipe.training.following import Followers, Network
 from tacpipe.training.following import Line as Line
 from tacpipe.training.ranks import Alone
@@ -114,7 +115,7 @@ class _Run:
     """What an epoch changes; all of it is in the checkpoint."""
 
     model: nn.Module
-    optimiser: torch.optim.Adam
+    optimiser: Adam
     best: dict[str, Tensor]
     history: list[Line]
     rank: Alone
@@ -122,7 +123,7 @@ class _Run:
     def save(self, folder: Path) -> None:
         if self.rank.rank:
             return
-        slots = self.optimiser.state_dict()["state"]
+        slots = self.optimiser.state()
         tensors = {f"model.{name}": value for name, value in self.model.state_dict().items()}
         tensors |= {f"best.{name}": value for name, value in self.best.items()}
         tensors |= {f"adam.{slot}.{name}": value for slot, held in slots.items() for name, value in held.items()}
@@ -140,7 +141,7 @@ class _Run:
         for name, value in under("adam.", tensors).items():
             slot, held = name.split(".", 1)
             slots.setdefault(int(slot), {})[held] = value
-        self.optimiser.load_state_dict({**self.optimiser.state_dict(), "state": slots})
+        self.optimiser.load(slots)
         torch.set_rng_state(tensors["random"])
         self.history = state["history"]
 
@@ -174,8 +175,7 @@ def train(
         rank = ranks.current()
         model = build()
         learned = [weight for weight in model.parameters() if weight.requires_grad]
-        optimiser = torch.optim.Adam(learned, lr=schedule.learning_rate, weight_decay=weight_decay, fused=True)
-        run = _Run(model, optimiser, {}, [], rank)
+        run = _Run(model, Adam(learned, schedule.learning_rate, weight_decay), {}, [], rank)
         run.resume(workspace)
         model.load_state_dict(rank.agreed(lambda: {name: value.cpu() for name, value in model.state_dict().items()}))
         with rank.sharing(model):
@@ -211,11 +211,10 @@ def _epoch(run: _Run, work: Work, schedule: Schedule, followers: Followers) -> L
     batches = work.batches(epoch)
     reduced = _reduced(run.model, schedule)
     for step, batch in enumerate(batches):
-        for group in run.optimiser.param_groups:
-            group["lr"] = schedule.rate((epoch + step / len(batches)) / schedule.epochs)
+        run.optimiser.learning_rate = schedule.rate((epoch + step / len(batches)) / schedule.epochs)
         with reduced:
             loss, weight = work.loss(run.model, batch, epoch)
-        run.optimiser.zero_grad(set_to_none=True)
+        run.optimiser.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         run.rank.sum_gradients(run.model.parameters())
         if math.isfinite(schedule.gradient_clip):

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import sys
 from collections.abc import Callable, Iterator, Sequence
-from types import ModuleType
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from tacpipe.engine.executors import chunks
+from tacpipe.engine.executors import chunks, forking
 from tacpipe.engine.processor import usable_cores
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.io import memory, processes, termination
+from tacpipe.io import processes, termination
 
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection
@@ -72,48 +70,16 @@ def _run(compute: Callable[[Task], Done], tasks: Sequence[Task], jobs: int, prel
 
 def _start(jobs: int, preload: Sequence[str], workers: dict[Connection, Connection]) -> None:
     """Start ``jobs`` workers; add the connection to each, and the one that keeps it alive, to ``workers``."""
-    import multiprocessing
-
-    memory.require_library("pyarrow")  # which each of them loads
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(list(preload))
-    _start_server()
+    context = forking.context(preload)
     for _ in range(jobs):
         ours, theirs = context.Pipe()
         alive, life = context.Pipe(duplex=False)
         workers[ours] = life
         # a worker that received half of its task would report that
-        with termination.deferred(), _death_told(), _without_main():
+        with termination.deferred(), _death_told(), forking.without_main():
             context.Process(target=_work, args=(theirs, alive)).start()
         theirs.close()
         alive.close()
-
-
-@contextlib.contextmanager
-def _without_main() -> Iterator[None]:
-    """Have a process that starts in the block not import the program's main module, of which workers need nothing.
-
-    A script that calls `tacpipe.run` at its top level would otherwise run once more in each worker.
-    """
-    main = sys.modules["__main__"]
-    sys.modules["__main__"] = ModuleType("__main__")
-    try:
-        yield
-    finally:
-        sys.modules["__main__"] = main
-
-
-def _start_server() -> None:
-    """Start the process that forks workers. It and they never hear of Ctrl-C, which is this process's to answer."""
-    import signal
-    from multiprocessing import forkserver, resource_tracker
-
-    resource_tracker.ensure_running()  # which lets signals through that were held back
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        forkserver.ensure_running()
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _work(tasks: Connection, alive: Connection) -> None:

@@ -1,0 +1,80 @@
+"""Adam against torch's own class."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+import torch
+from torch import nn
+
+from tacpipe.training.adam import Adam
+
+
+def _network() -> nn.Sequential:
+    torch.manual_seed(3)
+    return nn.Sequential(nn.Linear(5, 7), nn.Tanh(), nn.Linear(7, 2), nn.Linear(2, 1))
+
+
+def _gradients(network: nn.Sequential, step: int) -> None:
+    """Compute gradients of a batch; in every third step the last layer is not reached."""
+    rows = torch.randn(11, 5, generator=torch.Generator().manual_seed(step))
+    found = network[:3](rows) if step % 3 == 2 else network(rows)
+    found.square().mean().backward()
+
+
+@pytest.mark.parametrize("weight_decay", [0.0, 0.01])
+def test_each_step_gives_the_bits_of_torch_optim_adam_also_where_some_weights_have_no_gradient(
+    weight_decay: float,
+) -> None:
+    ours, theirs = _network(), _network()
+    own = Adam(ours.parameters(), 0.01, weight_decay)
+    torchs = torch.optim.Adam(theirs.parameters(), lr=0.01, weight_decay=weight_decay, fused=True)
+
+    for step in range(12):
+        own.learning_rate = torchs.param_groups[0]["lr"] = 0.01 / (step + 1)
+        own.zero_grad()
+        torchs.zero_grad(set_to_none=True)
+        _gradients(ours, step)
+        _gradients(theirs, step)
+        own.step()
+        torchs.step()
+
+    for one, other in zip(ours.parameters(), theirs.parameters(), strict=True):
+        assert torch.equal(one, other)
+    for number, known in torchs.state_dict()["state"].items():
+        assert {name: value.tolist() for name, value in known.items()} == {
+            name: value.tolist() for name, value in own.state()[number].items()
+        }
+
+
+def test_an_optimiser_that_takes_over_the_state_of_another_continues_with_the_same_bits() -> None:
+    whole, parts = _network(), _network()
+    one, first = Adam(whole.parameters(), 0.01), Adam(parts.parameters(), 0.01)
+    second = Adam(parts.parameters(), 0.01)
+
+    for step in range(8):
+        if step == 4:
+            second.load({number: {**known} for number, known in first.state().items()})
+        for network, optimiser in ((whole, one), (parts, first if step < 4 else second)):
+            optimiser.zero_grad()
+            _gradients(network, step)
+            optimiser.step()
+
+    assert all(torch.equal(a, b) for a, b in zip(whole.parameters(), parts.parameters(), strict=True))
+
+
+def test_a_training_imports_no_compiler() -> None:
+    program = (
+        "import sys, torch\n"
+        "from tacpipe.training.adam import Adam\n"
+        "weight = torch.ones(3, requires_grad=True)\n"
+        "weight.square().sum().backward()\n"
+        "Adam([weight], 0.1).step()\n"
+        "print([name for name in ('torch._dynamo', 'torch._inductor') if name in sys.modules])\n"
+    )
+
+    found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+
+    assert found.stdout == "[]\n"
