@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -26,6 +28,8 @@ published. With -o the rig is recorded as by `tacpipe acquire`, and forecasts, a
 recording. The recording has priority: where the computer does not keep up, forecasts are left out and counted.
 
 Example: tacpipe live rig.toml --model models/forward -o data/live --publish ws:127.0.0.1:8765
+
+Example: tacpipe live rig.toml --model models/forward --realtime   # on a computer that does other work too
 
 Example: tacpipe live rig.toml --model models/forward --alarms-per-hour 6 --alarms-on data/segments --split data/split"""
 
@@ -70,15 +74,20 @@ def add(program: typer.Typer, summary: str) -> None:
         settle_ms: Annotated[
             float, typer.Option("--settle-ms", help="Time after a row in which its samples are awaited, ms.")
         ] = 2.0,
+        realtime: Annotated[
+            bool, typer.Option("--realtime", help="Real-time scheduling of the session, where the system allows it.")
+        ] = False,
         quiet: Annotated[bool, typer.Option("--quiet", help="Print only errors on stderr.")] = False,
         as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
     ) -> None:
-        from tacpipe.live import description, publishing, session
+        from tacpipe.live import description, publishing, scheduling, session
         from tacpipe.live.options import Options
         from tacpipe.recording import completing
         from tacpipe.recording import rig as rigs
 
         _check(duration, alarms_per_hour, alarms_on, split, settle_ms)
+        if realtime:
+            scheduling.check()
         for address in publish or []:
             publishing.check(address)
         about, digest = description.described(model)
@@ -95,6 +104,7 @@ def add(program: typer.Typer, summary: str) -> None:
             "" if alarms_on is None else str(alarms_on.absolute()),
             "" if split is None else str(split.absolute()),
             settle_ms,
+            realtime=realtime,
         )
         attributes = {"live_model": digest, "live_plan": plan, "live_alarms_per_hour": alarms_per_hour}
         _run(found, options, output, name, duration, label or [], attributes, quiet=quiet, as_json=as_json)
@@ -140,6 +150,9 @@ def _run(
         View(recorder.watches, quiet=quiet, more=lambda: _lines(supervisor)).open() as view,
     ):
         recorder.await_first(ended)
+        if plan is not None and supervisor.alarms.get("levels"):
+            levels = json.dumps(supervisor.alarms, separators=(",", ":"))
+            plan = replace(plan, attributes={**plan.attributes, "live_alarm_levels": levels})
         if plan is None:
             _follow(recorder, duration_s, view, ended)
             lost = recorder.lost()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from tacpipe.live.chain import Chain
 from tacpipe.live.engine import Chainlike, Engine
 from tacpipe.live.options import Options
 from tacpipe.recording import rig as rigs
+from tacpipe.tasks.forward.forecaster import Forecaster
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -33,7 +34,8 @@ def engine(options: Options) -> Engine:
         raise UsageError(f"{options.model} is not a model; give a trained one.")
     rig = rigs.parse(options.rig)
     sensors = {name: rig.streams[name].sensor for name in options.streams}
-    opened = functools.partial(chain, model, rig.master)
+    forecaster = Forecaster.load(model.files)
+    opened = functools.partial(chain, forecaster, model.source.chain, rig.master)
     first: list[Alarms] = []
 
     def levels(made: Chainlike) -> Alarms:
@@ -44,12 +46,15 @@ def engine(options: Options) -> Engine:
     found = Engine(sensors, opened, levels, options.steps or None, settle_ns=round(options.settle_ms * 1e6))
     if options.steps and max(options.steps) > found.chain.horizon:
         raise UsageError(f"The model predicts 1 to {found.chain.horizon} steps ahead; give --steps of these.")
+    forecaster.prepare_single()
     return found
 
 
-def chain(model: Dataset, master: str, layouts: Mapping[str, pa.Schema]) -> Chain:
+def chain(
+    forecaster: Forecaster, steps: Sequence[Mapping[str, Any]], master: str, layouts: Mapping[str, pa.Schema]
+) -> Chain:
     """Return the chain of a model for streams of these layouts; raises as `Chain.of`."""
-    return Chain.of(model.files, model.source.chain, layouts, master)
+    return Chain.of(forecaster, steps, layouts, master)
 
 
 def _alarms(options: Options, model: Dataset, made: Chainlike) -> Alarms:
@@ -67,7 +72,6 @@ def on_recordings(model: Dataset, recordings: Dataset, per_hour: float) -> Alarm
     """Return alarms of a model with levels for ``per_hour`` false alarms each on recordings, each row's forecast made."""
     from tacpipe.tasks.forward import tracks
     from tacpipe.tasks.forward.alarms import Loads
-    from tacpipe.tasks.forward.forecaster import Forecaster
     from tacpipe.tasks.forward.predictors import MODEL, Prediction, forecasts
     from tacpipe.tasks.opened import Chain as Stages
     from tacpipe.tasks.opened import opened
@@ -80,7 +84,7 @@ def on_recordings(model: Dataset, recordings: Dataset, per_hour: float) -> Alarm
         loads.begin(track)
         for some in forecasts(forecaster, track, track.starts(forecaster.context, forecaster.horizon)):
             loads.add_one(MODEL, some.now, Prediction(some.features, some.count))
-        slips.append(_slips(shard))
+        slips.append(slips_of(shard))
     if not slips:
         raise UsageError("There is no validation recording that alarms could be set on; give --alarms-on others.")
     known = None if any(one is None for one in slips) else np.concatenate(slips)
@@ -96,7 +100,7 @@ def on_recordings(model: Dataset, recordings: Dataset, per_hour: float) -> Alarm
     )
 
 
-def _slips(shard: Any) -> Any:
+def slips_of(shard: Any) -> Any:
     """Return where an object slips (time,), by label or the simulator's truth; None where nothing states that."""
     table = shard.columns()
     for name in (SLIP_COLUMN, "gt_slip"):

@@ -23,6 +23,7 @@ class Options:
     split: str = ""  # whose validation recordings are meant; empty: all
     settle_ms: float = 2.0
     nice: int = 1  # by how much the model's process stands back behind the recording
+    realtime: bool = False  # whether both run before all ordinary programs
 
     def to_json(self) -> str:
         """Return the options as one line."""
