@@ -83,7 +83,7 @@ def compiled_ahead(forecaster: Forecaster) -> Run:
 
 def onnx(forecaster: Forecaster) -> Run:
     """`torch.export` to ONNX, and onnxruntime with one thread."""
-    import onnxruntime
+    import onnxruntime  # type: ignore[import-not-found,unused-ignore]
 
     path = Path(tempfile.mkdtemp()) / "network.onnx"
     torch.onnx.export(

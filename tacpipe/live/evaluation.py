@@ -44,7 +44,7 @@ class _Offline(NamedTuple):
     """What the offline model predicts of a recording."""
 
     now: Int64s  # (window,), rows of the track
-    count: AnyFloats  # (window, horizon, channel), above rest
+    ahead: AnyFloats  # (window, horizon, channel), above rest
 
 
 def evaluate(model: Model, recordings: Dataset) -> Result:
@@ -183,7 +183,7 @@ def _errors(
     found = {
         LIVE: truth.sums(values[kept][:, own] + chain.rest, ahead[kept]),
         LIVE_STILL: truth.sums(held, ahead[kept]),
-        OFFLINE: truth.sums(predicted.count[windows][:, [step - 1 for step in steps]] + rest, later),
+        OFFLINE: truth.sums(predicted.ahead[windows][:, [step - 1 for step in steps]] + rest, later),
         STILL: truth.sums(now, later),
     }
     return int(kept.sum()), found
@@ -256,7 +256,7 @@ def _offline_states(
     alarms = Alarms.from_json(json.loads(str(recording.attributes[LEVELS])))
     layout = forecaster.codec.layout
     found = {name: np.empty(len(predicted.now), np.int64) for name in NAMES}
-    for place, (row, ahead) in enumerate(zip(predicted.now.tolist(), predicted.count, strict=True)):
+    for place, (row, ahead) in enumerate(zip(predicted.now.tolist(), predicted.ahead, strict=True)):
         for name, one in alarms.states(ahead, track.tactile[row], layout).items():
             found[name][place] = one.state
     return found

@@ -73,8 +73,8 @@ def targets(rows_ns: Times, row: Times, steps: tuple[int, ...], period_ns: float
         found: Times = row[:, None] + np.rint(np.array(steps) * period_ns).astype(np.int64)
         return found
     places = np.searchsorted(rows_ns, row)[:, None] + np.array(steps)
-    padded = np.append(rows_ns, -1)
-    return padded[np.minimum(places, len(rows_ns))]
+    later: Times = np.append(rows_ns, -1)[np.minimum(places, len(rows_ns))]
+    return later
 
 
 def sums(predicted: AnyFloats, truth: AnyFloats) -> tuple[Floats, Floats]:

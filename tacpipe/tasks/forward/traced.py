@@ -68,7 +68,8 @@ def _recorded(forecaster: Forecaster) -> torch.jit.ScriptModule | None:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of shapes that are constants of the recording, as they are here
-            made = torch.jit.freeze(torch.jit.trace(whole, tuple(several[0]), check_trace=False))
+            traced = torch.jit.trace(whole, tuple(several[0]), check_trace=False)  # type: ignore[no-untyped-call]
+            made: torch.jit.ScriptModule = torch.jit.freeze(traced)
             for _ in range(2):  # once while it is optimized, and as it stays
                 if not all(torch.equal(made(*windows), whole(*windows)) for windows in several):
                     return None

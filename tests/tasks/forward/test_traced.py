@@ -59,7 +59,7 @@ class Unwilling(Moody):
     """Cannot be recorded."""
 
     def forward(self, given: Windows) -> Any:
-        if torch.jit.is_tracing():
+        if torch.jit.is_tracing():  # type: ignore[attr-defined,no-untyped-call]
             raise RuntimeError("not while recorded")
         return self.network(given)
 
