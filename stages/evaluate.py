@@ -4,9 +4,12 @@ Prints how the model compares with the best baseline, with intervals over record
 and to ``summary.json`` in few numbers, for DVC. Writes ``metrics.json``,
 ``horizons.csv`` (errors by step), ``trials.csv`` (errors by recording), ``errors.parquet`` (the sums behind them) and the
 predictions of each recording. Recordings that the model was trained on are reported apart,
-under ``seen``.
+under ``seen``. With ``--live`` recordings of `tacpipe live -o` are evaluated: what was published is compared with the
+offline chain on the same recordings (``live`` of ``metrics.json``, ``live.csv``), and bit for bit with `predict --causal`.
 
 Example: tacpipe evaluate models/forward data/segments --split data/split -o results/forward
+
+Example: tacpipe evaluate models/forward data/live --live -o results/live
 """
 
 from __future__ import annotations
@@ -16,6 +19,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from tacpipe.metrics import headline, summary
+from tacpipe.plugins.params import added
 from tacpipe.plugins.stage import stage
 
 if TYPE_CHECKING:
@@ -27,18 +31,40 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Params:
-    """Nothing to choose: the evaluation of a model does not depend on who trained it."""
+    """How recordings are evaluated; nothing depends on who trained the model."""
+
+    # recordings are those of live sessions, as they were recorded: also evaluate what was published
+    live: bool = added(False)
 
 
-@stage(version=5, headline=headline.FILE)
+def _as_given(params: Params) -> bool:
+    return params.live
+
+
+@stage(version=5, headline=headline.FILE, as_given=_as_given)
 def evaluate(params: Params, model: Model, recordings: Dataset) -> Result:
     """Evaluate a model on recordings, by the measures of the task it was trained for."""
     from tacpipe.datasets import model_files
 
     task = model_files.task(model.files)
-    with model_files.validated("the model"):
-        result: Result = task.evaluate(model.files, recordings)
+    if params.live:
+        result = _live(model, recordings)
+    else:
+        with model_files.validated("the model"):
+            result = task.evaluate(model.files, recordings)
     if headline.FILE not in result.files:  # of a task of another package that has none
         return result
     found = summary.write(headline.read(result.files[headline.FILE]), getattr(task, "SHORT_NAMES", {}))
     return dataclasses.replace(result, files={**result.files, summary.FILE: found})
+
+
+def _live(model: Model, recordings: Dataset) -> Result:
+    from tacpipe.datasets import model_files
+    from tacpipe.errors import UsageError
+    from tacpipe.live import evaluation
+
+    name = model_files.tree(model.files, model_files.CONFIG)["task"]
+    if name != "forward":
+        raise UsageError(f"live is for models of the task forward, and this one is of {name}; leave --live out.")
+    with model_files.validated("the model"):
+        return evaluation.evaluate(model, recordings)

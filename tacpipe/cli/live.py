@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -31,6 +33,8 @@ A model of materials names the surface during a slide, with a probability of eac
 what `tacpipe predict` gives. One of touch ranks candidate grasps on a cloud, which come to a stream of the sensor grasps.
 
 Example: tacpipe live finger.toml --model models/material -o data/live --publish udp:127.0.0.1:9000
+
+Example: tacpipe live rig.toml --model models/forward --realtime   # on a computer that does other work too
 
 Example: tacpipe live rig.toml --model models/forward --alarms-per-hour 6 --alarms-on data/segments --split data/split"""
 
@@ -89,16 +93,21 @@ def add(program: typer.Typer, summary: str) -> None:
         settle_ms: Annotated[
             float, typer.Option("--settle-ms", help="Time after a row in which its samples are awaited, ms.")
         ] = 2.0,
+        realtime: Annotated[
+            bool, typer.Option("--realtime", help="Real-time scheduling of the session, where the system allows it.")
+        ] = False,
         quiet: Annotated[bool, typer.Option("--quiet", help="Print only errors on stderr.")] = False,
         as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
     ) -> None:
-        from tacpipe.live import description, publishing, session
+        from tacpipe.live import description, publishing, scheduling, session
         from tacpipe.live.options import Options
         from tacpipe.recording import completing
         from tacpipe.recording import rig as rigs
 
         _check(duration, alarms_per_hour, alarms_on, split, settle_ms)
         _check_slides(every_ms, least)
+        if realtime:
+            scheduling.check()
         for address in publish or []:
             publishing.check(address)
         about, digest = description.described(model)
@@ -128,6 +137,7 @@ def add(program: typer.Typer, summary: str) -> None:
             every_ms,
             least,
             rank,
+            realtime=realtime,
         )
         attributes = {"live_model": digest, "live_plan": plan, "live_alarms_per_hour": alarms_per_hour}
         _run(found, options, output, name, duration, label or [], attributes, quiet=quiet, as_json=as_json)
@@ -173,6 +183,9 @@ def _run(
         View(recorder.watches, quiet=quiet, more=lambda: _lines(supervisor)).open() as view,
     ):
         recorder.await_first(ended)
+        if plan is not None and supervisor.alarms.get("levels"):
+            levels = json.dumps(supervisor.alarms, separators=(",", ":"))
+            plan = replace(plan, attributes={**plan.attributes, "live_alarm_levels": levels})
         if plan is None:
             _follow(recorder, duration_s, view, ended)
             lost = recorder.lost()

@@ -57,6 +57,15 @@ class Alarms:
         """Return alarms without levels, which are always unknown."""
         return cls(axes(layout), {})
 
+    @classmethod
+    def from_json(cls, content: Mapping[str, Any]) -> Self:
+        """Return what `to_json` gave."""
+        levels = {
+            name: tuple(math.inf if one is None else float(one) for one in values)
+            for name, values in content["levels"].items()
+        }
+        return cls(tuple((stream, axis) for stream, axis in content["axes"]), levels, float(content["per_hour"]))
+
     def states(self, ahead: AnyFloats, now: AnyFloats, layout: Sequence[Mapping[str, str]]) -> dict[str, State]:
         """Return the state of each alarm, of counts predicted (step, channel) and the last ones (channel,)."""
         if not self.levels:

@@ -33,6 +33,8 @@ from tacpipe.tasks.forward.planned import Plan
 if TYPE_CHECKING:
     import pyarrow as pa
 
+    from tacpipe.live.decoding import Columns
+
 CODEC_GAP = 1.5  # periods between two rows above which a codec begins anew, as `frame_stacking.breaks` has it
 
 
@@ -134,7 +136,7 @@ class Chain:
     @classmethod
     def of(
         cls,
-        model: Mapping[str, bytes],
+        model: Mapping[str, bytes] | Forecaster,
         steps: Sequence[Mapping[str, Any]],
         layouts: Mapping[str, pa.Schema],
         master: str = "",
@@ -143,7 +145,8 @@ class Chain:
     ) -> Chain:
         """Return the chain of a model: its files, the stages it was trained behind, and the schema of each recorded stream.
 
-        ``model`` and ``steps`` are ``files`` and ``source.chain`` of the dataset that `tacpipe.open` gives for a model.
+        ``model`` and ``steps`` are ``files`` and ``source.chain`` of the dataset that `tacpipe.open` gives for a model; who
+        makes several chains gives the model loaded, because that and its first forecast take a second.
         ``layouts`` holds the schemas (with field metadata) of the rig's streams, as they are recorded; ``master`` is the
         rig file's, used where the model's stages name none. Raises `TacpipeError` where the model is not of a task that
         runs live, was trained behind a stage that looks ahead and has no causal rule, or needs a stream or channel that
@@ -156,7 +159,7 @@ class Chain:
         ``plan_from`` names the stream of an arm whose set-points are the planned motion (`tacpipe.live.targets`), in the
         place of the stream ``plan``. Raises `UsageError` where it has none.
         """
-        forecaster = Forecaster.load(model)
+        forecaster = model if isinstance(model, Forecaster) else Forecaster.load(model)
         if forecaster.actions == "shuffled":
             raise TacpipeError(
                 "This model was trained on shuffled plans, a control that needs many recordings at once; train one with "
@@ -246,7 +249,7 @@ class Chain:
         """
         return {**self._grid.late, **({PLAN: self._late_plans} if self.reads_plan else {})}
 
-    def push(self, stream: str, batch: pa.RecordBatch | pa.Table) -> None:
+    def push(self, stream: str, batch: pa.RecordBatch | pa.Table | Columns) -> None:
         """Take samples of a stream in the order of their arrival, with ``t_ns`` and the columns of its layout."""
         if self._targets is not None and stream == self._targets.stream and batch.num_rows:
             self._targets.push(batch)
@@ -347,15 +350,15 @@ class Chain:
         cause = Cause.PLAN_ENDED if plan.t_ns[-1] < ahead_ns[-1] else Cause.NONE
         return planned.rows(plan, t_ns, ahead_ns, now), cause
 
-    def _push_plans(self, batch: pa.RecordBatch | pa.Table) -> None:
+    def _push_plans(self, batch: pa.RecordBatch | pa.Table | Columns) -> None:
         """Take rows of plans; rows of the same arrival are one plan, also where they come in several batches."""
         if not self.reads_plan or not batch.num_rows:
             return
         names = batch.schema.names
-        arrived = batch.column(names.index("t_ns")).to_numpy()
+        arrived = np.asarray(batch.column(names.index("t_ns")))
         # times as bits of a float, so that a plan's rows are one array
-        target = np.ascontiguousarray(batch.column(names.index("t_target_ns")).to_numpy()).view(np.float64)
-        poses: Floats = np.column_stack([batch.column(names.index(name)).to_numpy() for name in POSE])
+        target = np.ascontiguousarray(batch.column(names.index("t_target_ns"))).view(np.float64)
+        poses: Floats = np.column_stack([np.asarray(batch.column(names.index(name))) for name in POSE])
         rows = np.column_stack([target, poses])
         for arrived_ns in np.unique(arrived).tolist():
             some = rows[arrived == arrived_ns]

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tacpipe.arrays import AnyArray
+from tacpipe.arrays import AnyArray, Floats, Indices
 from tacpipe.recording.reading import Batch, Reading
 from tacpipe.recording.spool_blocks import Note
 from tacpipe.recording.station import LOST
@@ -27,12 +27,13 @@ class Decoder:
         self._reading = Reading(sensor)
         self._waiting: list[Chunks | Note] = []
         self._schema: pa.Schema | None = None  # of all that it gives
+        self._places: Places = {}
 
     def columns(self, batch: Batch, offset_ns: int) -> Columns:
         """Return a batch of this stream as it is recorded; ``offset_ns`` is added to the monotonic clock to have UTC."""
         if self._schema is None:
             self._schema = batch_schema(batch, self.sensor)
-        return Columns(batch, self._schema, offset_ns)
+        return Columns(batch, self._schema, offset_ns, self._places)
 
     def take(self, block: Chunks | Note) -> None:
         """Take what came."""
@@ -71,28 +72,51 @@ class Decoder:
             return []
 
 
+Place = tuple[int, Indices, Indices]  # number of a block, which columns are in it, and where
+Places = dict[tuple[int, ...], list[Place]]
+
+
 class Columns:
     """A batch as the recording will hold it, without a copy: what `tacpipe.live.chain.Chain.push` reads of a table.
 
     A table of pyarrow costs 10 us a column, and an arm has fifty of which a model reads ten.
     """
 
-    def __init__(self, batch: Batch, schema: pa.Schema, offset_ns: int) -> None:
+    def __init__(self, batch: Batch, schema: pa.Schema, offset_ns: int, places: Places | None = None) -> None:
+        """Take a batch; ``places`` keeps where columns are from one batch of a stream to the next."""
         self.schema, self.num_rows = schema, len(batch)
+        self._places: Places = {} if places is None else places
         self._first = [batch.t_ns + offset_ns]
         self._first += [one for one in (batch.t_device_ns, batch.seq, batch.device_seq) if one is not None]
         self._blocks = batch.values
-        self._ends = np.cumsum([block.shape[1] for block in batch.values])
 
     def column(self, place: int | str) -> AnyArray:
         """Return a column (sample,) by its number or name."""
         number = self.schema.get_field_index(place) if isinstance(place, str) else place
         if number < len(self._first):
             return self._first[number]
-        number -= len(self._first)
-        block = int(np.searchsorted(self._ends, number, side="right"))
-        found: AnyArray = self._blocks[block][:, number - int(self._ends[block])]
+        ((block, _, places),) = self._found((number,))
+        found: AnyArray = self._blocks[block][:, places[0]]
         return found
+
+    def several(self, numbers: tuple[int, ...]) -> Floats:
+        """Return columns of values (sample, column) by their numbers."""
+        found = np.empty((self.num_rows, len(numbers)))
+        for block, columns, places in self._found(numbers):
+            found[:, columns] = self._blocks[block][:, places]
+        return found
+
+    def _found(self, numbers: tuple[int, ...]) -> list[Place]:
+        """Return each block that columns are in, which of ``numbers`` these are, and where they are in it."""
+        if numbers not in self._places:
+            ends = np.cumsum([len(self._first), *(block.shape[1] for block in self._blocks)])
+            blocks = np.searchsorted(ends, numbers, side="right") - 1  # (column,)
+            self._places[numbers] = [
+                (block, columns, np.array(numbers, np.intp)[columns] - ends[block])
+                for block in np.unique(blocks).tolist()
+                for columns in [np.flatnonzero(blocks == block)]
+            ]
+        return self._places[numbers]
 
     def table(self) -> pa.Table:
         """Return the same as a table."""

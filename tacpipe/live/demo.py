@@ -51,7 +51,7 @@ def run(output: Path, rig_file: Path, seconds: float = LIVE_S) -> Path:
     with Emulator(rigs.read(rig_file), SEED, folder=output / "emulated", world=world) as emulator:
         (output / "emulated" / "rig.toml").write_text(rig_text.of(emulator.rig))
         ended = threading.Event()
-        planner = threading.Thread(target=_plan, args=(emulator, port, ended), daemon=True)
+        planner = threading.Thread(target=send_plans, args=(emulator, port, ended), daemon=True)
         planner.start()
         try:
             _tacpipe(
@@ -88,7 +88,7 @@ def _tacpipe(*words: str) -> None:
         raise TacpipeError(f"The demo stopped: `tacpipe {' '.join(words)}` ended with {code}.")
 
 
-def _plan(emulator: Emulator, port: int, ended: threading.Event) -> None:
+def send_plans(emulator: Emulator, port: int, ended: threading.Event) -> None:
     """Send where the emulated hand will be, as a controller would."""
     import socket
 

@@ -32,6 +32,10 @@ if TYPE_CHECKING:
 SETTLE_NS = 2_000_000  # after a grid point, in which the samples that belong to it are awaited from the other threads
 PERIODS = 2.0  # without a forecast, after which a message states why there is none
 SLACK_NS = 5_000_000  # of the same, for jitter
+EARLY_NS = (
+    1_500_000  # before a row is due, at which what came by then is decoded: the row then waits for the rest alone
+)
+LITTLE_NS = 300_000  # a shorter wait until then is not worth waking for
 STARTING_S = 0.005  # between two tries while the grid is not known
 
 
@@ -174,21 +178,23 @@ class Engine:
             self._look(stream)
 
     def due_ns(self, now_ns: int) -> int:
-        """Return when `step` is to be called next, on the monotonic clock."""
+        """Return when `step` is to be called next, on the monotonic clock: early, to decode, then when a row is due."""
         if self._point_ns is None or self._offset_ns is None:
             return now_ns + round(STARTING_S * 1e9)
         due_ns = self._point_ns + self.period_ns - self._offset_ns + self.settle_ns
-        return due_ns if due_ns > now_ns else now_ns + round(STARTING_S * 1e9) // 5
+        if due_ns <= now_ns:
+            return now_ns + round(STARTING_S * 1e9) // 5
+        return max(due_ns - EARLY_NS, now_ns) if due_ns - EARLY_NS - now_ns > LITTLE_NS else due_ns
 
     def step(self, now_ns: int) -> list[Message]:
-        """Return the message that is due: the newest forecast, or that there has been none for `PERIODS`."""
+        """Return the message that is due: the newest forecast, or that there has been none for `PERIODS`.
+
+        Before a row is due what came is decoded, and nothing returned.
+        """
         if self._offset_ns is None or len(self._begun) < len(self.sensors):
             return []
         began_s = time.perf_counter()
-        for name, decoder in self._decoders.items():
-            for batch in decoder.batches():
-                columns = decoder.columns(batch, self._offset_ns)
-                self.chain.push(name, columns.table() if name == PLAN else columns)
+        self._decode(self._offset_ns)
         found = self.chain.advance(now_ns + self._offset_ns - self.settle_ns, newest_only=True)
         if not found:
             return self._silence(now_ns)
@@ -206,6 +212,12 @@ class Engine:
         message.latency_ms = (now_ns + self._offset_ns - message.made_from_t_ns) / 1e6
         heard_ns = self._decoders[self.chain.master].heard_ns if self.chain.master in self._decoders else None
         message.age_ms = math.nan if heard_ns is None else (now_ns - heard_ns) / 1e6
+
+    def _decode(self, offset_ns: int) -> None:
+        """Decode what came and give it to the chain."""
+        for name, decoder in self._decoders.items():
+            for batch in decoder.batches():
+                self.chain.push(name, decoder.columns(batch, offset_ns))
 
     def _message(self, forecast: Forecast, now_ns: int) -> Message:
         self._seq += 1

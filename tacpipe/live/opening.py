@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from tacpipe.live.chain import Beginning, Chain
 from tacpipe.live.engine import Chainlike, Engine
 from tacpipe.live.options import Options
 from tacpipe.recording import rig as rigs
+from tacpipe.tasks.forward.forecaster import Forecaster
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -61,7 +62,8 @@ def touches(options: Options, model: Dataset, rig: Rig, sensors: Mapping[str, Se
 
 def forecasts(options: Options, model: Dataset, rig: Rig, sensors: Mapping[str, Sensor]) -> Engine:
     """Return the engine of a session with a model of future signals. Raises as `engine`."""
-    opened = functools.partial(chain, model, rig, options.plan_from)
+    forecaster = Forecaster.load(model.files)
+    opened = functools.partial(chain, forecaster, model.source.chain, rig.master, options.plan_from)
     first: list[Alarms] = []
 
     def levels(made: Chainlike) -> Alarms:
@@ -72,18 +74,20 @@ def forecasts(options: Options, model: Dataset, rig: Rig, sensors: Mapping[str, 
     found = Engine(sensors, opened, levels, options.steps or None, settle_ns=round(options.settle_ms * 1e6))
     if options.steps and max(options.steps) > found.chain.horizon:
         raise UsageError(f"The model predicts 1 to {found.chain.horizon} steps ahead; give --steps of these.")
+    forecaster.prepare_single()
     return found
 
 
 def chain(
-    model: Dataset,
-    rig: Rig,
+    forecaster: Forecaster,
+    steps: Sequence[Mapping[str, Any]],
+    master: str,
     plan_from: str,
     layouts: Mapping[str, pa.Schema],
     beginning: Beginning | None = None,
 ) -> Chain:
     """Return the chain of a model for streams of these layouts, which continues another's session; raises as `Chain.of`."""
-    return Chain.of(model.files, model.source.chain, layouts, rig.master, beginning, plan_from)
+    return Chain.of(forecaster, steps, layouts, master, beginning, plan_from)
 
 
 def _alarms(options: Options, model: Dataset, made: Chainlike) -> Alarms:
@@ -101,7 +105,6 @@ def on_recordings(model: Dataset, recordings: Dataset, per_hour: float) -> Alarm
     """Return alarms of a model with levels for ``per_hour`` false alarms each on recordings, each row's forecast made."""
     from tacpipe.tasks.forward import predictors, tracks
     from tacpipe.tasks.forward.alarms import Loads
-    from tacpipe.tasks.forward.forecaster import Forecaster
     from tacpipe.tasks.opened import Chain as Stages
     from tacpipe.tasks.opened import opened
 
@@ -113,7 +116,7 @@ def on_recordings(model: Dataset, recordings: Dataset, per_hour: float) -> Alarm
         loads.begin(track)
         for some in predictors.forecasts(forecaster, track, track.starts(forecaster.context, forecaster.horizon)):
             loads.add_one(predictors.MODEL, some.now, predictors.Prediction(some.features, some.count))
-        slips.append(_slips(shard))
+        slips.append(slips_of(shard))
     if not slips:
         raise UsageError("There is no validation recording that alarms could be set on; give --alarms-on others.")
     known = None if any(one is None for one in slips) else np.concatenate(slips)
@@ -129,7 +132,7 @@ def on_recordings(model: Dataset, recordings: Dataset, per_hour: float) -> Alarm
     )
 
 
-def _slips(shard: Any) -> Any:
+def slips_of(shard: Any) -> Any:
     """Return where an object slips (time,), by label or the simulator's truth; None where nothing states that."""
     table = shard.columns()
     for name in (SLIP_COLUMN, "gt_slip"):

@@ -29,6 +29,7 @@ class Options:
     least: float = 0.25  # of a model of materials: fraction of the slide that it reads before it names one
     rank: str = "contact"  # of a model of touch: what candidates are ranked by
     nice: int = 1  # by how much the model's process stands back behind the recording
+    realtime: bool = False  # whether both run before all ordinary programs
 
     def to_json(self) -> str:
         """Return the options as one line."""

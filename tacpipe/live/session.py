@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import socket
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -138,8 +139,11 @@ def running(recorder: Recorder, options: Options, ended: Callable[[], bool]) -> 
     try:
         supervisor.start(ended)
         recorder.accompany(supervisor, options.streams)
+        gc.collect()
+        gc.freeze()  # what is there stays: looking through it all would hold up the threads that read for 20 ms and more
         yield supervisor
     finally:
+        gc.unfreeze()
         supervisor.stop()
         sys.setswitchinterval(before_s)
 

@@ -14,6 +14,7 @@ from tacpipe.channels.schema import time_field
 from tacpipe.channels.streams import EVENTS, axes_of
 from tacpipe.codecs import tactile
 from tacpipe.errors import TacpipeError
+from tacpipe.live.decoding import Columns
 from tacpipe.printable import listed
 from tacpipe.sensors import plan
 from tacpipe.signals.contact import rest_level, tared
@@ -77,7 +78,7 @@ class Layout:
     finger: Place | None
     position_m: Floats  # (3,), how many metres the unit of each coordinate is
     finger_scale_m: float
-    _places: dict[str, tuple[Any, Sequence[int]]] = field(default_factory=dict)  # of columns in batches of a schema
+    _places: dict[str, tuple[Any, tuple[int, ...]]] = field(default_factory=dict)  # of columns in batches of a schema
 
     @classmethod
     def of(cls, forecaster: Forecaster, synchronize: Any, layouts: Mapping[str, pa.Schema], master: str = "") -> Layout:
@@ -153,7 +154,7 @@ class Layout:
             poses.metres(grid.field(opening)) if opening else 1.0,
         )
 
-    def samples(self, stream: str, batch: pa.RecordBatch | pa.Table) -> tuple[Times, Floats]:
+    def samples(self, stream: str, batch: pa.RecordBatch | pa.Table | Columns) -> tuple[Times, Floats]:
         """Return stamps (time,) and the columns that are read (time, column) of a batch of a stream.
 
         Raises `TacpipeError` where a column is absent.
@@ -164,13 +165,16 @@ class Layout:
             absent = [name for name in ("t_ns", *self.columns[stream]) if name not in names]
             if absent:
                 raise TacpipeError(f"Samples of stream {stream} have no column {absent[0]}, which the model reads.")
-            known = (batch.schema, [names.index(name) for name in ("t_ns", *self.columns[stream])])
+            known = (batch.schema, tuple(names.index(name) for name in ("t_ns", *self.columns[stream])))
             self._places[stream] = known
-        first, *others = (_array(batch.column(index)) for index in known[1])
+        first, *others = known[1]
+        t_ns = _array(batch.column(first)).astype(np.int64, copy=False)
+        if isinstance(batch, Columns):
+            return t_ns, batch.several(tuple(others))
         values = np.empty((batch.num_rows, len(others)))
-        for index, column in enumerate(others):
-            values[:, index] = column
-        return first.astype(np.int64, copy=False), values
+        for index, number in enumerate(others):
+            values[:, index] = _array(batch.column(number))
+        return t_ns, values
 
     def tactile(self, values: Mapping[str, Floats]) -> Floats:
         """Return the tactile channels (channel,) of a row: ``values`` (column,) by stream."""

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from tacpipe.errors import DamagedError, DeviceError, TacpipeError, UsageError
-from tacpipe.live import wire
+from tacpipe.live import scheduling, wire
 from tacpipe.live.options import Options
 from tacpipe.live.tap import Tap
 from tacpipe.recording import clock
@@ -75,10 +75,14 @@ class Supervisor:
         self._offset_ns = clock["utc_ns"] - clock["monotonic_ns"]
         self._beginning = None
         self.tap.note(Note(clock["monotonic_ns"], "", wire.BEGIN, str(self._offset_ns)))
+        if self.options.realtime:
+            scheduling.realtime(scheduling.RECORDER)
 
     def end(self) -> None:
         """End the recording: what comes until the next one begins is not predicted."""
         self._offset_ns = None
+        if self.options.realtime:
+            scheduling.ordinary()  # what was recorded is decoded and written now
         self.tap.note(Note(clock.now_ns(), "", wire.END))
 
     def look(self) -> list[Note]:

@@ -10,7 +10,7 @@ import pytest
 from tacpipe.live import wire
 from tacpipe.live.alarms import Alarms
 from tacpipe.live.chain import Cause
-from tacpipe.live.engine import Engine
+from tacpipe.live.engine import EARLY_NS, Engine
 from tacpipe.live.messages import Message
 from tacpipe.recording import rig as rigs
 from tacpipe.recording.spool_blocks import Note
@@ -73,7 +73,10 @@ def test_nothing_is_published_before_what_belongs_to_a_row_has_settled(session: 
     session.send(0, 2)
     assert len(session.engine.step(START_NS + SETTLE_NS)) == 1
     assert session.engine.step(START_NS + PERIOD_NS + SETTLE_NS - 1) == []
-    assert session.engine.due_ns(START_NS + SETTLE_NS) == START_NS + PERIOD_NS + SETTLE_NS
+    due_ns = START_NS + PERIOD_NS + SETTLE_NS
+    assert session.engine.due_ns(START_NS + SETTLE_NS) == due_ns - EARLY_NS  # what came by then is decoded
+    assert session.engine.step(due_ns - EARLY_NS) == []
+    assert session.engine.due_ns(due_ns - EARLY_NS) == due_ns
 
 
 def test_a_session_that_fell_behind_publishes_the_newest_row_and_counts_the_others(session: Session) -> None:

@@ -158,7 +158,7 @@ class Rolling:
         arm = np.concatenate([self._arm[past], plan.astype(np.float32)])
         read = (self._latent[past], arm, self._finger[past])
         windows = Windows(*(torch.from_numpy(np.ascontiguousarray(one[:, None])) for one in read))
-        features = self._forecaster.features(windows)
+        features = self._forecaster.single.features(windows)
         levels = self._forecaster.decoded(features, self._levels[None, -1], self._latent[None, -1])
         found: Float32s = levels[0].astype(np.float32)
         return found

@@ -5,7 +5,8 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, Self
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -30,6 +31,9 @@ from tacpipe.tasks.forward.rows import acted
 from tacpipe.tasks.forward.uncertainty import FILE as QUANTILES
 from tacpipe.tasks.forward.uncertainty import Uncertainty, window_signs
 from tacpipe.tasks.opened import Chain
+
+if TYPE_CHECKING:
+    from tacpipe.tasks.forward.traced import Network
 
 Config = dict[str, Any]
 
@@ -124,6 +128,17 @@ class Forecaster:
         without an arm has no velocities.
         """
         return (*tracks.VELOCITY, *tracks.TURNING) if self.pose.position else ()
+
+    @cached_property
+    def single(self) -> Network:
+        """The network for one window at a time, as live sessions and `tacpipe predict --causal` run it."""
+        from tacpipe.tasks.forward.traced import Network
+
+        return Network(self)
+
+    def prepare_single(self) -> None:
+        """Have `single` ready, which takes a second: before a session begins, not at its first forecast."""
+        _ = self.single
 
     @property
     def predicts_change(self) -> bool:

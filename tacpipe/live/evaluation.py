@@ -1,0 +1,283 @@
+"""Recordings of live sessions evaluated: what was published next to what the offline chain and model give of the same.
+
+`evaluate` returns what `tacpipe evaluate` does of the recordings after the model's own stages, and adds what the session
+recorded: errors of the published forecasts, alarms with their leads, latencies, and whether `tacpipe predict --causal` gives
+the published values again, bit for bit.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from tacpipe.arrays import AnyFloats, Bools, Float32s, Int64s, Times
+from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.live import replay, truth, worth
+from tacpipe.live.alarms import NAMES, Alarms
+from tacpipe.live.chain import Chain, Forecast
+from tacpipe.live.leads import leads, onsets
+from tacpipe.live.opening import slips_of
+from tacpipe.live.unstored import Recordings, continued
+from tacpipe.live.worth import LIVE, LIVE_STILL, OFFLINE, STILL, Session, Sums, summed
+from tacpipe.metrics import headline
+from tacpipe.plugins.stage import Result
+from tacpipe.signals import anticipation
+from tacpipe.signals.loads import loads
+from tacpipe.tasks.forward import evaluation, tracks, units
+from tacpipe.tasks.forward import headline as headlines
+from tacpipe.tasks.forward.forecaster import Forecaster
+from tacpipe.tasks.forward.levels import Levels
+from tacpipe.tasks.forward.predictors import forecasts
+from tacpipe.tasks.forward.tracks import Track
+
+if TYPE_CHECKING:
+    from tacpipe.datasets.dataset import Dataset, Model, Recording
+
+LEVELS = "live_alarm_levels"  # attribute of a recording: the levels of its alarms, as JSON
+
+
+class _Offline(NamedTuple):
+    """What the offline model predicts of a recording."""
+
+    now: Int64s  # (window,), rows of the track
+    ahead: AnyFloats  # (window, horizon, channel), above rest
+
+
+def evaluate(model: Model, recordings: Dataset) -> Result:
+    """Return the evaluation of recordings of live sessions. Raises `UsageError` where one has no stream ``forecast``."""
+    forecaster = Forecaster.load(model.files)
+    steps = headlines.shown(range(1, forecaster.horizon + 1))
+    offline: dict[str, Any] = {}
+    sessions: dict[str, Session] = {}
+    for name, recording in sorted(recordings.recordings.items()):
+        if "forecast" not in recording.streams:
+            raise UsageError(
+                f"{name} is not a recording of a live session: it has no stream forecast. Give what `tacpipe live -o` "
+                f"recorded, or leave --live out."
+            )
+        try:
+            offline[name] = continued(recording, model)
+            sessions[name] = _session(forecaster, model, recording, offline[name], steps)
+        except TacpipeError as error:
+            raise type(error)(f"{name}: {error}") from error
+    given: Any = Recordings(offline, model.files)
+    result = evaluation.evaluate(model.files, given)
+    tree = json.loads(result.files["metrics.json"])
+    channels = len(forecaster.codec.channels)
+    tree["live"] = {
+        **summed(list(sessions.values()), steps, channels),
+        "recordings": {name: summed([one], steps, channels) for name, one in sessions.items()},
+    }
+    found = headline.read(result.files[headline.FILE])
+    added = _headline(forecaster, sessions, steps, channels)
+    files = {
+        **result.files,
+        "metrics.json": (json.dumps(tree, indent=1, sort_keys=True) + "\n").encode(),
+        "live.csv": worth.table(tree["live"], steps),
+        headline.FILE: headline.write([*found, *added]),
+    }
+    return dataclasses.replace(result, files=files, notes=[*result.notes, *worth.sentences(tree["live"])])
+
+
+def _session(
+    forecaster: Forecaster, model: Model, recording: Recording, offline: Any, steps: tuple[int, ...]
+) -> Session:
+    tables = replay.recorded(recording)
+    published_ns, published, published_steps = _published(tables["forecast"], forecaster)
+    schemas = {name: one.schema for name, one in tables.items()}
+    chain = Chain.of(forecaster, model.source.chain, schemas, str(recording.attributes.get("master", "")))
+    every = list(replay.replayed(chain, tables))
+    made = [one for one in every if one.count is not None]
+    made_ns = np.array([one.t_ns for one in made], np.int64)
+    again = (
+        np.stack([one.count[[step - 1 for step in published_steps]] for one in made if one.count is not None])
+        if made
+        else published[:0]
+    )
+    same, equal = truth.equality(published_ns, published, made_ns, again)
+    latency = tables["latency"]
+    track = tracks.track(offline, forecaster.codec, forecaster.pose)
+    predicted = _offline(forecaster, track)
+    rows, sums = _errors(forecaster, chain, every, (published_ns, published, published_steps), track, predicted, steps)
+    late = latency.column("late").to_numpy()
+    grew = _times(latency)[np.flatnonzero(np.diff(late, prepend=0) > 0)]
+    return Session(
+        same,
+        _after(published_ns[~equal & np.isin(published_ns, made_ns)], grew, forecaster),
+        rows,
+        sums,
+        _alarms(forecaster, recording, tables, track, predicted, offline),
+        latency.column("latency_ms").to_numpy().astype(np.float64),
+        int(latency.column("skipped").to_numpy().max(initial=0)),
+        int(late.max(initial=0)),
+    )
+
+
+def _published(forecast: Any, forecaster: Forecaster) -> tuple[Times, Float32s, tuple[int, ...]]:
+    """Return times (row,), values (row, step, channel) and steps of a stream of forecasts."""
+    channels = forecaster.codec.channels
+    steps = tuple(
+        sorted(
+            {int(name.rpartition("_t")[2]) for name in forecast.column_names if name.rpartition("_t")[0] in channels}
+        )
+    )
+    values = np.empty((forecast.num_rows, len(steps), len(channels)), np.float32)
+    for place, step in enumerate(steps):
+        for channel, name in enumerate(channels):
+            values[:, place, channel] = forecast.column(f"{name}_t{step}").to_numpy()
+    return _times(forecast), values, steps
+
+
+def _times(stream: Any) -> Times:
+    """Return the times of the rows that a stream of a session is about (row,)."""
+    found: Times = stream.column("t_device_ns").to_numpy()
+    return found
+
+
+def _offline(forecaster: Forecaster, track: Track) -> _Offline:
+    starts = track.starts(forecaster.context, forecaster.horizon)
+    some = list(forecasts(forecaster, track, starts))
+    if not some:
+        nothing = np.zeros((0, forecaster.horizon, len(forecaster.codec.channels)))
+        return _Offline(np.zeros(0, np.int64), nothing)
+    return _Offline(np.concatenate([one.now for one in some]), np.concatenate([one.count for one in some]))
+
+
+def _errors(
+    forecaster: Forecaster,
+    chain: Chain,
+    every: Sequence[Forecast],
+    published: tuple[Times, Float32s, tuple[int, ...]],
+    track: Track,
+    predicted: _Offline,
+    steps: tuple[int, ...],
+) -> tuple[int, Sums]:
+    """Return how many rows all predictors have, and the sums of their errors over these."""
+    row_ns, values, published_steps = published
+    if not set(steps) <= set(published_steps) or chain.rest is None or not len(predicted.now):
+        return 0, {}
+    uniform = forecaster.config["timeline"] == "uniform"
+    period_ns = 1e9 / float(forecaster.config["rate_hz"])
+    still = {one.t_ns: one.now for one in every if one.now is not None}
+    grid_ns = np.array(sorted(still), np.int64)
+    counts = track.tactile.stored if isinstance(track.tactile, Levels) else np.asarray(track.tactile)
+    wanted = truth.targets(grid_ns, row_ns, steps, period_ns if uniform else None)
+    flat = truth.at(track.t_ns, counts.astype(np.float64), track.groups, track.usable, wanted.ravel())
+    ahead = flat.reshape(len(row_ns), len(steps), -1)  # (row, step, channel)
+    now_ns = track.t_ns[predicted.now]
+    nearest = np.clip(np.searchsorted(now_ns, row_ns - round(period_ns / 2)), 0, len(now_ns) - 1)
+    kept = np.isfinite(ahead).all(axis=(1, 2)) & (np.abs(now_ns[nearest] - row_ns) <= period_ns / 2)
+    kept &= np.isin(row_ns, grid_ns)
+    if not kept.any():
+        return 0, {}
+    rest = counts[0] - track.tactile[0]  # offline
+    own = [published_steps.index(step) for step in steps]
+    held = np.stack([still[at_ns] for at_ns in row_ns[kept].tolist()])[:, None] + chain.rest
+    windows = nearest[kept]
+    later = counts[predicted.now[windows][:, None] + np.array(steps)].astype(np.float64)
+    now = counts[predicted.now[windows]].astype(np.float64)[:, None]
+    found = {
+        LIVE: truth.sums(values[kept][:, own] + chain.rest, ahead[kept]),
+        LIVE_STILL: truth.sums(held, ahead[kept]),
+        OFFLINE: truth.sums(predicted.ahead[windows][:, [step - 1 for step in steps]] + rest, later),
+        STILL: truth.sums(now, later),
+    }
+    return int(kept.sum()), found
+
+
+def _after(differing_ns: Times, late_ns: Times, forecaster: Forecaster) -> int:
+    """Return how many rows differ within a context after, or a row before, samples that came too late."""
+    period_ns = 1e9 / float(forecaster.config["rate_hz"])
+    reach_ns = (forecaster.context + 1) * period_ns
+    if not len(late_ns):
+        return 0
+    place = np.searchsorted(late_ns, differing_ns + 1.5 * period_ns, side="right") - 1
+    return int(((place >= 0) & (differing_ns - late_ns[np.maximum(place, 0)] <= reach_ns)).sum())
+
+
+def _alarms(
+    forecaster: Forecaster,
+    recording: Recording,
+    tables: Mapping[str, Any],
+    track: Track,
+    predicted: _Offline,
+    offline: Any,
+) -> dict[str, dict[str, dict[str, Any]]]:
+    """Return what alarms were worth: by alarm, by event, live and offline."""
+    stream = tables["alarm"]
+    states = {name: stream.column(f"{name}_state").to_numpy().astype(np.int64) for name in NAMES}
+    if not any((one >= 0).any() for one in states.values()):
+        return {}
+    series = {LIVE: (_times(stream), states)}
+    if LEVELS in recording.attributes and len(predicted.now):
+        series[OFFLINE] = (track.t_ns[predicted.now], _offline_states(forecaster, recording, track, predicted))
+    period_ns = round(1e9 / float(forecaster.config["rate_hz"]))
+    found: dict[str, dict[str, dict[str, Any]]] = {}
+    for event, onset_ns in _events(forecaster, track, offline).items():
+        for name in NAMES:
+            for who, (t_ns, each) in series.items():
+                one = leads(t_ns, each[name], onset_ns, forecaster.horizon * period_ns, period_ns)
+                found.setdefault(f"{name} alarm, {event}", {})[who] = {
+                    "events": one.events,
+                    "led": len(one.leads_ms),
+                    "leads_ms": list(one.leads_ms),
+                    "false_alarms": one.false_alarms,
+                    "hours": one.hours,
+                }
+    return found
+
+
+def _events(forecaster: Forecaster, track: Track, offline: Any) -> dict[str, Times]:
+    """Return when loads begin to change, as `tacpipe evaluate` defines it, and when the object begins to slip, if known."""
+    found: dict[str, Times] = {}
+    sd = forecaster.config.get("anticipation", {}).get("sd")
+    if sd:
+        values = loads(np.where(track.usable[:, None], track.tactile[:], np.nan), forecaster.codec.layout)
+        rows = anticipation.changes(values, track.groups, horizon=forecaster.horizon, sd=np.array(sd))
+        begun = np.zeros(len(track.t_ns), bool)
+        for each in rows:
+            for first, stop in each:
+                begun[first:stop] = True
+        found["changes of load"] = onsets(track.t_ns, begun)
+    slips: Bools | None = slips_of(offline)
+    if slips is not None:
+        found["slips"] = onsets(track.t_ns, np.asarray(slips))
+    return found
+
+
+def _offline_states(
+    forecaster: Forecaster, recording: Recording, track: Track, predicted: _Offline
+) -> dict[str, Int64s]:
+    """Return the states of alarms (window,) with the session's levels, of offline predictions."""
+    alarms = Alarms.from_json(json.loads(str(recording.attributes[LEVELS])))
+    layout = forecaster.codec.layout
+    found = {name: np.empty(len(predicted.now), np.int64) for name in NAMES}
+    for place, (row, ahead) in enumerate(zip(predicted.now.tolist(), predicted.ahead, strict=True)):
+        for name, one in alarms.states(ahead, track.tactile[row], layout).items():
+            found[name][place] = one.state
+    return found
+
+
+def _headline(
+    forecaster: Forecaster, sessions: Mapping[str, Session], steps: tuple[int, ...], channels: int
+) -> list[Any]:
+    """Return how what was published compares with persistence of the same rows."""
+    held = {name: one for name, one in sessions.items() if one.rows}
+    if not held:
+        return []
+
+    def sums(name: str) -> Any:
+        return {
+            (0, recording): headlines.sums(*one.sums[name], one.sums[LIVE_STILL][0], one.rows * channels)
+            for recording, one in held.items()
+        }
+
+    method = f"{forecaster.config['architecture']} · {forecaster.config['codec']['name']} · published live"
+    others = {"persistence": sums(LIVE_STILL)}
+    unit = units.of_model(forecaster.config)
+    found = headlines.headline(method, steps, sums(LIVE), others, None, unit=unit)
+    return [found] if found else []

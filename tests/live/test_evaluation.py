@@ -1,0 +1,68 @@
+"""`tacpipe evaluate --live`: what a session published, next to the offline chain on the same recording."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+import tacpipe
+from tacpipe.live import evaluation, worth
+from tests.conftest import Lab
+from tests.fake_recordings import FakeRecording
+from tests.live.test_replay import TRAINED
+
+LATENCY_MS, LATE_ROW, CHANGED_ROW = 5.0, 20, 22
+
+
+def recorded(recording: Any, predictions: pa.Table) -> FakeRecording:
+    """A recording with the streams of a session that published ``predictions``, one of them altered after a late sample."""
+    t_ns = predictions["t_ns"].to_numpy()
+    columns = {name: predictions[name].to_numpy().copy() for name in predictions.column_names[1:]}
+    columns[next(iter(columns))][CHANGED_ROW] += 1
+    clocks = {"t_ns": t_ns + 5_000_000, "t_device_ns": t_ns}
+    late = (np.arange(len(t_ns)) >= LATE_ROW).astype(np.float32)
+    own = {
+        "forecast": pa.table({**clocks, **columns}),
+        "alarm": pa.table(
+            {**clocks, "load_state": np.full(len(t_ns), -1, np.int8), "slip_state": np.full(len(t_ns), -1, np.int8)}
+        ),
+        "latency": pa.table(
+            {**clocks, "latency_ms": np.full(len(t_ns), LATENCY_MS, np.float32), "late": late, "skipped": 0 * late}
+        ),
+    }
+    tables = {name: recording.table(name) for name in recording.streams}
+    return FakeRecording({**tables, **own}, recording.name, recording.attributes)
+
+
+@pytest.mark.long
+def test_published_forecasts_are_compared_with_the_offline_chain_and_recomputed(lab: Lab) -> None:
+    for command in TRAINED:
+        lab.run(command)
+    lab.run("predict models/f data/r -o data/p --steps 1,2 --causal")
+    model, name = tacpipe.open("models/f"), "trial-000"
+    session = recorded(tacpipe.open("data/r")[name], tacpipe.open("data/p")[name].table())
+    given: Any = type("Given", (), {"recordings": {name: session}, "files": {}})()
+    result = evaluation.evaluate(model, given)
+    live = json.loads(result.files["metrics.json"])["live"]
+    rows = live["rows"]
+    assert rows["compared"] == rows["published"] == rows["recomputed"] == session.table("forecast").num_rows
+    assert rows["equal"] == rows["compared"] - 1 and rows["differ_after_late_samples"] == 1
+    assert rows["late_samples"] == 1 and rows["skipped"] == 0 and 0 < rows["of_errors"] < rows["published"]
+    assert live["latency"]["median_ms"] == LATENCY_MS
+    assert set(live["mae"]) == set(worth.PREDICTORS)
+    assert 0 < live["mae"]["live"]["t1"] < 10 * live["mae"]["offline"]["t1"]
+    assert len(result.files["live.csv"].decode().splitlines()) == 1 + len(worth.PREDICTORS)
+    assert "bit for bit" in result.notes[-2] and "1 others" in result.notes[-2]
+
+
+@pytest.mark.long
+def test_a_recording_without_a_session_is_refused(lab: Lab) -> None:
+    for command in TRAINED:
+        lab.run(command)
+    ran = lab.call("evaluate models/f data/r --live -o results/live")
+    assert ran.code == 2 and "tacpipe live -o" in ran.err and not Path("results/live").exists()
