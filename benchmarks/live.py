@@ -53,9 +53,12 @@ class Replay:
     def __init__(self, model: Path, seconds: float) -> None:
         rig = rigs.read(RIG)
         about, _ = described(model)
+        assert isinstance(about, session.Described), "a model of forward"
         own = session.with_own(rig, about, tuple(range(1, about.horizon + 1)))
         self.sensors = {name: own.streams[name].sensor for name in OWN}
-        self.engine: Engine = opening.engine(Options(str(model), own.text, tuple(rig.streams)))
+        engine = opening.engine(Options(str(model), own.text, tuple(rig.streams)))
+        assert isinstance(engine, Engine)
+        self.engine = engine
         self.sent = sent(rig, seconds)
         self.steps = int(seconds * 1e9 / PERIOD_NS)
         self.early_ms: list[float] = []
@@ -82,7 +85,7 @@ class Replay:
             for message in found:
                 for sensor in self.sensors.values():
                     assert isinstance(sensor, Live)
-                    messages.packet(message, sensor, 0)
+                    messages.packets(message, sensor, 0)
                 packed_s = time.process_time()
                 messages.to_json(message.to_dict())
                 if message.values is not None:

@@ -45,7 +45,7 @@ class Size(NamedTuple):
 
 
 class MixedForecast(nn.Module):
-    """Reads raw channels; begins at persistence."""
+    """Reads raw channels; begins at persistence. Its trees are computed by numpy, so it cannot be traced."""
 
     ROWS = Rows(given=1, returned=(1,))
     change_only = True

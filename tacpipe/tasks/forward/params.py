@@ -52,10 +52,13 @@ class Forward(ABC):
     precision: Precision = added("float32")
     arm: str = added("")  # stream whose position and orientation are the motion; empty: the only one with a position
     PANELS: ClassVar[Panels] = {
-        "Model": ("architecture", "actions", "hidden", "dropout", "context", "horizon"),
+        "Model": (
+            *("architecture", "actions", "hidden", "dropout", "context", "horizon"),
+            *("networks", "frames", "history", "trees"),
+        ),
         "Training": (
             *("loss", "epochs", "batch", "learning_rate", "cycle", "patience", "gradient_clip"),
-            *("precision", "seed", "baselines"),
+            *("precision", "seed", "baselines", "boosted"),
         ),
         "Data": ("windows", "stride", "arm"),
     }
@@ -161,18 +164,12 @@ class Mixed(Forward):
     epochs: PositiveInt = 8  # maximum number of passes over the training windows
     dropout: Dropout = 0.2  # fraction of units left out of each training step
     networks: Annotated[int, Range(0)] = 3  # networks that read new frames, next to one taxelwise
-    frames: Annotated[int, Range(2)] = (
-        8  # newest frames that they and the trees read; rows that repeat the one before do not count
-    )
+    # newest frames that they and the trees read; rows that repeat the one before do not count
+    frames: Annotated[int, Range(2)] = 8
     history: PositiveInt = 50  # past rows that are read where there are as many; the first is repeated where not
-    trees: Annotated[int, Range(0)] = 80  # of the gradient boosting; 0: none
+    trees: Annotated[int, Range(0)] = 0  # of a gradient boosting next to the networks; 0: none
     boosted: PositiveInt = 4000  # training windows that trees are fitted on at most
-    PANELS: ClassVar[Panels] = {
-        **Forward.PANELS,
-        "Model": (*Forward.PANELS["Model"], "networks", "frames", "history", "trees"),
-        "Training": (*Forward.PANELS["Training"], "boosted"),
-    }
-    PRESETS: ClassVar[Presets] = {"quick": {"hidden": 32, "epochs": 3, "networks": 1, "trees": 20, "boosted": 500}}
+    PRESETS: ClassVar[Presets] = {"quick": {"hidden": 32, "epochs": 3, "networks": 1}}
 
     @property
     def reads(self) -> int:
