@@ -1,4 +1,4 @@
-"""Whether probabilities are frequencies: temperature, reliability, and how well a score tells unknown classes from known.
+"""Whether probabilities are frequencies: temperature, reliability, and how well a score distinguishes unknown classes.
 
 Temperature scaling divides scores by one number before the softmax, which changes no name (Guo, Pleiss, Sun and Weinberger,
 On calibration of modern neural networks, ICML 2017). It is fitted by the likelihood of labels that hedge as Platt's do

@@ -38,7 +38,7 @@ def signs(past: AnyFloats, ahead: AnyFloats, arm: AnyFloats, finger: AnyFloats, 
     ]
     speed = np.abs(arm[..., POSE:])
     moved, planned = speed[:, :context], speed[:, context:]
-    repeats = np.cumprod(still.all(axis=2)[:, ::-1], axis=1).sum(axis=1)
+    repeats = np.cumprod(np.asarray(still.all(axis=2))[:, ::-1], axis=1).sum(axis=1)
     shared = [
         np.log1p(level.std(axis=1).mean(axis=1) * 100),
         repeats,

@@ -37,14 +37,14 @@ def calibrate(model: Mapping[str, bytes], asked: Asked, training: Dataset, valid
         labels = np.searchsorted(classifier.classes, some.materials)
         seen = Watched(scores, some.frames, labels)
         classes = np.array(classifier.classes)
-        found[sensor], told = known_of.fit((known.frames, known.materials), seen, classes, asked.false_unknown)
+        found[sensor], areas = known_of.fit((known.frames, known.materials), seen, classes, asked.false_unknown)
         about[sensor] = {
             "slides": len(some),
             "temperature": found[sensor].temperature,
             "rule": found[sensor].rule,
             "threshold": found[sensor].threshold,
             "false_unknown": asked.false_unknown,
-            "told_apart": told,
+            "auroc_left_out": areas,
             "calibration_error": _errors(scores, labels, found[sensor].temperature),
         }
     config = {**classifier.config, "known": about}

@@ -81,7 +81,7 @@ def fit(
     """Return the bundle of a sensor, and by which measure its rule was chosen.
 
     The distance is fitted on ``learned``, frames (slide, time, channel) and classes (slide,) of training slides; all else
-    on ``watched``. The rule is the one that tells validation slides better from themselves with their own class left
+    on ``watched``. The rule is the one that distinguishes validation slides better from themselves with their own class left
     out of the answers (area under the curve); no slide of an unknown class is needed. The threshold is that of split
     conformal prediction: a new slide of a known class falls below it with a probability of at most ``false_unknown``.
     Raises `TacpipeError` with too few slides for that.
@@ -103,10 +103,10 @@ def fit(
         "probability": _log_odds(np.where(own, -np.inf, watched.scores / temperature)),
         "distance": np.where(left_out, -np.inf, away).max(axis=1),
     }
-    told = {rule: calibration.auroc(whole[rule], without[rule]) for rule in RULES}
-    rule = max(RULES, key=lambda one: told[one])
+    areas = {rule: calibration.auroc(whole[rule], without[rule]) for rule in RULES}
+    rule = max(RULES, key=lambda one: areas[one])
     threshold = -conformal.quantile(-whole[rule], np.arange(count), 1 - false_unknown, promised=True)
-    return Known(temperature, rule, threshold, made.distance), told
+    return Known(temperature, rule, threshold, made.distance), areas
 
 
 def packed(known: Mapping[str, Known]) -> bytes:
