@@ -76,13 +76,13 @@ def replayed(folder: Path, model: Path, name: str, tables: Mapping[str, Any], ch
     t_ns = tables[MASTER].column("t_ns").to_numpy()
     rows = min(tables[one].num_rows for one in STREAMS)
     period_s = float(np.median(np.diff(t_ns))) / 1e9
-    *numbers, told = free_ports(len(STREAMS) + 1)
+    *numbers, answers = free_ports(len(STREAMS) + 1)
     ports = dict(zip(STREAMS, numbers, strict=True))
     rig_file = folder / f"{name}.toml"
     rig_file.write_text(rig(tables, 1 / period_s, ports))
     sent = packets(rigs.read(rig_file), tables, rows)
     words = [sys.executable, "-m", "tacpipe", "live", str(rig_file), "--model", str(model), "-o", str(folder / "live")]
-    words += ["--name", name, "--quiet", "--steps", "1,3,5,10", "--publish", f"udp:127.0.0.1:{told}"]
+    words += ["--name", name, "--quiet", "--steps", "1,3,5,10", "--publish", f"udp:127.0.0.1:{answers}"]
     words += [
         "--alarms-per-hour",
         f"{chosen.per_hour:g}",
@@ -96,7 +96,7 @@ def replayed(folder: Path, model: Path, name: str, tables: Mapping[str, Any], ch
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as hearing,
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link,
     ):
-        hearing.bind(("127.0.0.1", told))
+        hearing.bind(("127.0.0.1", answers))
         hearing.setblocking(False)
         with subprocess.Popen(words) as session:
             paced(link, ports, sent, period_s, rows, hearing, session)

@@ -1,4 +1,4 @@
-"""What recordings of live sessions tell, over all of them: metrics, a table, and sentences."""
+"""What recordings of live sessions show, over all of them: metrics, a table, and sentences."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Sums = dict[str, tuple[Floats, Floats]]  # squared and absolute errors (step,) b
 
 
 class Session(NamedTuple):
-    """What a recording tells of a live session."""
+    """What a recording shows of a live session."""
 
     equality: truth.Equality
     explained: int  # published rows that differ after a sample that came too late
