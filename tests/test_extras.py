@@ -86,6 +86,7 @@ LACK = {  # and for each that does need one, with that extra
     "train forward data/segments --split data/split -o {o} --track tensorboard": "tensorboard",
     "train touch data/grasps --split data/grasps-split -o {o}": "learn",
     "evaluate models/forward data/latents --rerun -o {o}": "learn",
+    "calibrate models/forward data/latents --split data/split -o {o}": "learn",
     "predict models/forward data/latents -o {o}": "learn",
     "report results/forward -o {o}.html --traces 1": "learn",
     "ingest hdf5 arrays -o {o}": "hdf5",
