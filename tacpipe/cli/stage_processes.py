@@ -62,7 +62,7 @@ class StageProcesses:
         for process in self._running.values():
             if process.pid is not None and process.is_alive():
                 with contextlib.suppress(OSError):
-                    os.kill(process.pid, signal.SIGINT)
+                    os.kill(process.pid, signal.SIGTERM)  # SIGINT is ignored in what a script starts behind it
         while self._running and (left_s := until_s - time.monotonic()) > 0:
             for name in self._ended(left_s):
                 self._taken(name)
