@@ -122,12 +122,12 @@ def add(program: typer.Typer, summary: str) -> None:
             "" if alarms_on is None else str(alarms_on.absolute()),
             "" if split is None else str(split.absolute()),
             settle_ms,
-            session.targets_of(asked, plan),
-            about.kind,
-            sensor,
-            every_ms,
-            least,
-            rank,
+            plan_from=session.targets_of(asked, plan),
+            kind=about.kind,
+            sensor=sensor,
+            every_ms=every_ms,
+            least=least,
+            rank=rank,
         )
         attributes = {"live_model": digest, "live_plan": plan, "live_alarms_per_hour": alarms_per_hour}
         _run(found, options, output, name, duration, label or [], attributes, quiet=quiet, as_json=as_json)
