@@ -131,12 +131,12 @@ def add(program: typer.Typer, summary: str) -> None:
             "" if alarms_on is None else str(alarms_on.absolute()),
             "" if split is None else str(split.absolute()),
             settle_ms,
-            session.targets_of(asked, plan),
-            about.kind,
-            sensor,
-            every_ms,
-            least,
-            rank,
+            plan_from=session.targets_of(asked, plan),
+            kind=about.kind,
+            sensor=sensor,
+            every_ms=every_ms,
+            least=least,
+            rank=rank,
             realtime=realtime,
         )
         attributes = {"live_model": digest, "live_plan": plan, "live_alarms_per_hour": alarms_per_hour}

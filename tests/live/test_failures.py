@@ -52,7 +52,7 @@ def test_a_stream_that_stalls_costs_the_forecasts_of_that_time_and_alarms_are_un
     points = shard.table("forecast").column("t_device_ns").to_numpy()
     newest = arrivals[np.searchsorted(arrivals, points, side="right") - 1]
     assert ((points - newest) <= GAP_NS).all()  # and a sample was due a period after the newest
-    assert GAP_NS <= 3 * PERIOD_NS and len(points) == printed["live"]["forecasts"]
+    assert GAP_NS <= 3 * PERIOD_NS and 0 < len(points) <= printed["live"]["forecasts"]
     assert whole(shard, "skin") and whole(shard, "wrench")
 
 
@@ -120,4 +120,6 @@ def test_a_subscriber_that_never_reads_keeps_no_message_from_the_others(lab: Lab
         assert (np.diff([one["seq"] for one in heard]) == 1).all()
     shard = live.only(lab.folder)
     assert whole(shard, "skin")
-    assert len(shard.table("forecast")) == len(forecasts(messages))
+    recorded = shard.table("forecast").column("t_device_ns").to_pylist()
+    assert len(recorded) > 100  # but for the last ones, which left when the recording was over
+    assert recorded == [one["t_ns"] for one in forecasts(messages)][: len(recorded)]
