@@ -3,13 +3,13 @@
 Prints how the model compares with the best baseline, with intervals over recordings, and writes it to ``headline.json``,
 and to ``summary.json`` in few numbers, for DVC. Writes ``metrics.json``,
 ``horizons.csv`` (errors by step), ``trials.csv`` (errors by recording), ``errors.parquet`` (the sums behind them) and the
-predictions of each recording. Recordings that the model was trained on are reported apart,
-under ``seen``. With ``--live`` recordings of `tacpipe live -o` are evaluated: what was published is compared with the
-offline chain on the same recordings (``live`` of ``metrics.json``, ``live.csv``), and bit for bit with `predict --causal`.
+predictions of each recording. Recordings that the model was trained on are reported apart, under ``seen``.
+
+With ``--live`` recordings of `tacpipe live -o` are evaluated, given as they were recorded: what was published is compared
+with the offline chain on the same recordings (``live`` of ``metrics.json``, ``live.csv``), and bit for bit with
+`predict --causal`.
 
 Example: tacpipe evaluate models/forward data/segments --split data/split -o results/forward
-
-Example: tacpipe evaluate models/forward data/live --live -o results/live
 """
 
 from __future__ import annotations
