@@ -7,6 +7,7 @@ import numpy as np
 from tacpipe.arrays import AnyFloats, Bools, Float32s
 from tacpipe.models.windows import POSE
 
+SIGNS = 13  # features beside the predicted change at each step
 LATEST = 3  # rows whose change is looked at beside that of the whole context
 
 

@@ -15,7 +15,7 @@ from tacpipe.errors import TacpipeError
 from tacpipe.metrics import conformal
 from tacpipe.models.residual_quantiles import ResidualQuantiles
 from tacpipe.models.tensors import under
-from tacpipe.tasks.forward.signs import signs
+from tacpipe.tasks.forward.signs import SIGNS, signs
 
 if TYPE_CHECKING:
     from tacpipe.models.windows import Windows
@@ -104,6 +104,8 @@ class Uncertainty:
         shapes = {(levels, channels, horizon)} | {one.shape for one in (made.unconditional, made.persistence)}
         if len(shapes) > 1 or made.moved.shape != (levels, horizon) or made.errors.unit.shape != (channels, horizon):
             raise ValueError("the quantiles are of other channels or steps")
+        if made.errors.centre.shape != (SIGNS + horizon,):
+            raise ValueError(f"the quantiles read {made.errors.centre.shape} features, not {SIGNS + horizon}")
         return made
 
 
