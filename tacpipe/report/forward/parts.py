@@ -19,8 +19,8 @@ from tacpipe.report import blocks, charts, learning
 from tacpipe.report.blocks import NONE, Cell, Chart, Charts, Fold, Note, Table, fold, number, table
 from tacpipe.report.charts import Line
 from tacpipe.report.context import Context, median_run
+from tacpipe.report.forward import live, reading, representations, single_run, traces
 from tacpipe.report.forward import methods as by_method
-from tacpipe.report.forward import reading, representations, single_run, traces
 from tacpipe.report.forward.error_sums import BASELINE
 from tacpipe.tasks.forward import headline, units
 
@@ -46,6 +46,7 @@ def folds(context: Context) -> list[Fold]:
         *_channels(context),
         *_ablations(context),
         *_anticipation(context),
+        *live.folds(context),
         *representations.folds(context),
         *_predictions(context),
         *_training(context),
