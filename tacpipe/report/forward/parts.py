@@ -19,7 +19,7 @@ from tacpipe.report import blocks, charts, learning
 from tacpipe.report.blocks import NONE, Cell, Chart, Charts, Fold, Note, Table, fold, number, table
 from tacpipe.report.charts import Line
 from tacpipe.report.context import Context, median_run
-from tacpipe.report.forward import bands, reading, representations, single_run, situations, traces
+from tacpipe.report.forward import bands, live, reading, representations, single_run, situations, traces
 from tacpipe.report.forward import methods as by_method
 from tacpipe.report.forward.error_sums import BASELINE
 from tacpipe.tasks.forward import headline, units
@@ -48,6 +48,7 @@ def folds(context: Context) -> list[Fold]:
         *bands.folds(context),
         *_anticipation(context),
         *situations.folds(context),
+        *live.folds(context),
         *representations.folds(context),
         *_predictions(context),
         *_training(context),
