@@ -214,7 +214,11 @@ class Classifier:
         material if all are as likely. Scores of ``minirocket`` and ``statistics`` are distances to class means of no fixed
         scale: there it only orders the classes. See `predict` for the arguments.
         """
-        return softmax(self.scores(slides, sensor))
+        return self.probabilities_of(self.scores(slides, sensor), sensor)
+
+    def probabilities_of(self, scores: Float32s, sensor: str = "") -> Float32s:
+        """Return the probabilities (slide, class) that scores (slide, class) of slides of a sensor state."""
+        return softmax(scores)
 
     def scores(self, slides: Float32s | Floats, sensor: str = "") -> Float32s:
         """Return the score of each class (slide, class), in the order of ``classes``; see `predict`."""
