@@ -108,7 +108,9 @@ class SlideSoFar:
         if not lacks and not self._layout.alike(layout):
             return replace(there, cause=f"the slide {difference(self._layout, layout)} as the model was trained on")
         scores = self._reader.read(frames[None]).scores
-        return replace(there, scores=scores[0], probabilities=self._classifier.likely(scores, self._sensor)[0])
+        return replace(
+            there, scores=scores[0], probabilities=self._classifier.probabilities_of(scores, self._sensor)[0]
+        )
 
     def _cut(self, held: Held, table: pa.Table) -> tuple[Any, bool]:
         """Return the rows of the slide that count, as the stage cuts them out or as far as they have come, and which."""

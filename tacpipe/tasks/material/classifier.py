@@ -219,10 +219,10 @@ class Classifier:
         material if all are as likely. Scores of ``minirocket`` and ``statistics`` are distances to class means of no fixed
         scale: there it only orders the classes. See `predict` for the arguments.
         """
-        return self.likely(self.scores(slides, sensor), self._sensor(sensor))
+        return self.probabilities_of(self.scores(slides, sensor), self._sensor(sensor))
 
-    def likely(self, scores: Float32s, sensor: str) -> Float32s:
-        """Return the probabilities (slide, class) of slides of a sensor whose scores (slide, class) are known."""
+    def probabilities_of(self, scores: Float32s, sensor: str) -> Float32s:
+        """Return the probabilities (slide, class) that scores (slide, class) of slides of a sensor state."""
         found = self.known[sensor].probabilities(scores) if self.known else calibration.probabilities(scores)
         return found.astype(np.float32)
 
