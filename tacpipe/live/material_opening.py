@@ -41,7 +41,7 @@ def engine(options: Options, model: Dataset, sensors: Mapping[str, Sensor]) -> M
             f"model was trained on, or train one on recordings of this rig."
         )
     slide = SlideSoFar(classifier, params, sensor, options.least, sensors[finger].rate_hz)
-    stated = isinstance(classifier.readers[sensor], NetworkReader | SpectraReader)
+    stated = classifier.known or isinstance(classifier.readers[sensor], NetworkReader | SpectraReader)
     about = MaterialDescription(
         classifier.names,
         sensor,

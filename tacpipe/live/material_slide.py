@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 ENDED_NS = 200_000_000  # without a row of the slide, after which it counts as over
+UNLIKE = "the slide is like none of the materials that the model knows"
 
 
 @dataclass(frozen=True)
@@ -108,6 +109,8 @@ class SlideSoFar:
         if not lacks and not self._layout.alike(layout):
             return replace(there, cause=f"the slide {difference(self._layout, layout)} as the model was trained on")
         scores = self._reader.read(frames[None]).scores
+        if self._classifier.unlike(scores, frames[None], self._sensor)[0]:
+            return replace(there, scores=scores[0], cause=UNLIKE)
         return replace(
             there, scores=scores[0], probabilities=self._classifier.probabilities_of(scores, self._sensor)[0]
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.live import material_opening, wire
 from tacpipe.live.material_engine import RESTARTED, THROWN, MaterialEngine
 from tacpipe.live.material_messages import FINAL, SLIDING, WAITING, MaterialMessage
+from tacpipe.live.material_slide import UNLIKE
 from tacpipe.live.messages import packets
 from tacpipe.live.options import Options
 from tacpipe.metrics import calibration
@@ -23,7 +25,8 @@ from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.live import SLIDE, Live
 from tacpipe.sensors.sensor import Samples
 from tacpipe.simulation.slide import Rig, simulate_trial
-from tacpipe.tasks.material import prediction
+from tacpipe.tasks.calibrated import Asked
+from tacpipe.tasks.material import known, prediction
 from tacpipe.tasks.material import task as material
 from tacpipe.tasks.material.classifier import Classifier
 from tests.asked import fitting
@@ -150,6 +153,23 @@ def test_each_answer_is_that_of_a_recording_which_ends_then(kind: str, models: d
         rows = int((session.t_ns <= one.t_ns - OFFSET_NS).sum())
         wanted = predicted(models[kind], session.table.slice(0, rows))
         assert one.probabilities is not None and one.probabilities.tobytes() == wanted.tobytes()
+
+
+def test_a_calibrated_model_names_what_predict_answers_or_states_that_the_slide_is_like_none(
+    models: dict[str, Opened],
+) -> None:
+    learned, watched = (slides(RIG, indices(RIG, ["biotac"], some), frames=FRAMES) for some in (TRAINED, range(4, 8)))
+    files = material.calibrate(models["statistics"].files, Asked((10, 50, 90), False, 0.1, 0), learned, watched)
+    fitted = known.unpacked(files[known.FILE], {"biotac": None})
+    for moved, cause in ((-1e9, ""), (1e9, UNLIKE)):
+        bundles = {name: replace(one, threshold=one.threshold + moved) for name, one in fitted.items()}
+        session = Session(Opened({**files, known.FILE: known.packed(bundles)}))
+        session.begin()
+        session.run(int(session.t_ns[-1]))
+        last = session.end()
+        assert (last.probabilities is None) == bool(cause)
+        assert last.cause == cause
+    assert session.engine.about("models/material").to_dict()["confidence"] == "probability"
 
 
 @pytest.mark.parametrize("kind", KINDS)

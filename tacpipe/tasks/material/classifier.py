@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Self, cast
 import numpy as np
 import torch
 
-from tacpipe.arrays import Float32s, Floats, Int64s
+from tacpipe.arrays import Bools, Float32s, Floats, Int64s
 from tacpipe.datasets import model_files
 from tacpipe.datasets.dataset import Dataset
 from tacpipe.errors import TacpipeError, UsageError
@@ -242,10 +242,13 @@ class Classifier:
                 "The model has no calibrated probabilities and no answer unknown. Run `tacpipe calibrate MODEL DATASET "
                 "--split SPLIT -o CALIBRATED` and give that one."
             )
-        found = self.known[sensor]
-        refused = found.score(scores, frames) < found.threshold
-        names = self.naming.named(self.named(scores))
+        refused, names = self.unlike(scores, frames, sensor), self.naming.named(self.named(scores))
         return [UNKNOWN_ANSWER if no else str(name) for no, name in zip(refused, names, strict=True)]
+
+    def unlike(self, scores: Float32s, frames: Float32s, sensor: str) -> Bools:
+        """Return which slides are like no class (slide,), as `answered` takes them; none of an uncalibrated model."""
+        found = self.known.get(sensor)
+        return np.zeros(len(scores), dtype=bool) if found is None else found.score(scores, frames) < found.threshold
 
     def _sensor(self, sensor: str) -> str:
         """Return the sensor of slides: the one that is named, or the only one."""
