@@ -12,6 +12,7 @@ from tacpipe.tasks.forward import evaluation, predictors, tracks
 from tacpipe.tasks.forward.alarms import Loads
 from tacpipe.tasks.forward.forecaster import Forecaster
 from tacpipe.tasks.forward.metrics import Trial
+from tacpipe.tasks.forward.situations import BySituation
 from tests.fake_recordings import FakeShard
 from tests.stages.learning_fakes import motion
 from tests.tasks.forward.trials import trained
@@ -25,7 +26,8 @@ def peak_bytes(forecaster: Forecaster, rows: int) -> int:
     track = tracks.track(shard, forecaster.codec)  # type: ignore[arg-type]
     loads = Loads(forecaster.codec.layout, forecaster.horizon)
     tracemalloc.start()
-    evaluation._predictions(forecaster, track, Trial("a", True), loads)
+    apart = BySituation(forecaster.horizon, len(forecaster.codec.channels))
+    evaluation._predictions(forecaster, track, Trial("a", True), loads, apart)
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     return peak
