@@ -248,7 +248,7 @@ def test_baselines_can_be_left_out(tmp_path: Path) -> None:
     assert set(files) == FILES - {"baselines.safetensors"}
     assert not {"baselines", "anticipation"} & set(config(files))
     metrics, _ = evaluated(files, motion(20))
-    assert {"model", "persistence", "context_mean", "skill", "counts"} == set(metrics)
+    assert {"model", "persistence", "context_mean", "skill", "counts", "situations"} == set(metrics)
 
 
 def test_ground_truth_columns_change_nothing(tmp_path: Path) -> None:
