@@ -3,7 +3,7 @@
 Trains on 8, 16, 33 and all training recordings of a random split, each smaller set being part of the larger ones, evaluates
 on the same test recordings, and prints a table of skill over persistence with its interval over recordings. Each model makes
 about as many steps, so fewer recordings have more epochs, and the best epoch on the validation recordings counts. Results
-lie in ``.cache/learning-curve``: what is there is not computed again. The table is ``docs/results/forward-learning.csv``.
+lie in ``.cache/learning-curve``: what is there is not computed again. The table is ``docs/tasks/forward-learning.csv``.
 
 ``DATA`` is a dataset of segments (`tacpipe segment contacts`). Options are ``--sizes 8,16,33,0``, 0 being all, ``--draws 2``
 of the split, and those of `tacpipe train forward` behind ``--``, as ``-- --architecture mixed``.
@@ -26,7 +26,7 @@ from tacpipe.arrays import AnyFloats
 from tacpipe.metrics import forecast
 
 ROOT = Path(__file__).parents[1]
-WORK, TABLE = ROOT / ".cache" / "learning-curve", ROOT / "docs" / "results" / "forward-learning.csv"
+WORK, TABLE = ROOT / ".cache" / "learning-curve", ROOT / "docs" / "tasks" / "forward-learning.csv"
 STEPS = (1, 5, 10)
 EPOCHS = 6  # on `MOST` recordings or more
 MOST = 40  # recordings on which `EPOCHS` are made; of fewer, as many more epochs

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING
 from tacpipe.engine import processor
 from tacpipe.engine.executors import forking
 from tacpipe.io import termination
+from tacpipe.plugins import registry
 
 if TYPE_CHECKING:
     from multiprocessing.context import ForkServerContext
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
 
 Command = str | Sequence[str]  # a text for the shell, or the words of a command of tacpipe without its name
 MODULES = ("tacpipe.cli.main", "tacpipe.cli.stages", "tacpipe.engine.pipeline", "tacpipe.io.parquet")
-LEARNING = tuple(f"tacpipe.tasks.{name}.task" for name in ("forward", "material", "touch"))  # these import torch
 _LEARNS = re.compile(r"\btacpipe (train|evaluate|predict|compress autoencoder) ")
 
 
@@ -38,7 +38,8 @@ def modules(commands: Iterable[str]) -> tuple[str, ...]:
     >>> modules(["tacpipe split data -o split"]) == MODULES
     True
     """
-    return (*MODULES, *LEARNING) if any(_LEARNS.search(command) for command in commands) else MODULES
+    learning = any(_LEARNS.search(command) for command in commands)
+    return (*MODULES, *registry.task_modules()) if learning else MODULES
 
 
 class StageProcesses:

@@ -9,11 +9,11 @@ from typing import Any
 
 from tacpipe.datasets import manifest, pages
 from tacpipe.datasets.manifest import Entry, Manifest
-from tacpipe.engine import execution, keys, provenance
-from tacpipe.engine.execution import Done, Task
+from tacpipe.engine import computing, execution, keys, provenance
 from tacpipe.engine.executors.executor import Chosen
 from tacpipe.engine.outcome import Outcome
 from tacpipe.engine.request import Request
+from tacpipe.engine.task import Done, Task
 from tacpipe.errors import FAILED, LOCKED, LockedError, TacpipeError, UsageError, WouldChangeError
 from tacpipe.io import progress
 from tacpipe.io.hashing import digest
@@ -190,9 +190,9 @@ class ByRecording:
         bad: dict[str, Done] = {}
         executor = self.chosen.opened()
         module = registry.stages()[registry.whole(name)].partition(":")[0]
-        preload = ["tacpipe.io.parquet", "tacpipe.engine.execution", module]
+        preload = ["tacpipe.io.parquet", "tacpipe.engine.computing", module]
         with progress.bar(registry.whole(name), len(tasks)) as advance:
-            for done in executor.run(execution.compute, tasks, preload):
+            for done in executor.run(computing.compute, tasks, preload):
                 advance(note=done.recording)
                 if done.record is None:
                     bad[done.recording] = done

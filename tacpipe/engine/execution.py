@@ -1,26 +1,21 @@
-"""How one key is made: arguments out of an identity, then the stage, then objects and a record."""
+"""How a stage is run for a key: arguments out of an identity, then the stage, then objects."""
 
 from __future__ import annotations
 
 import contextlib
-import json
-import shutil
-import time
-from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass, field
+from contextlib import contextmanager
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from tacpipe.datasets import adoption, roles
 from tacpipe.datasets.dataset import Dataset, Recording
-from tacpipe.datasets.manifest import ACQUIRE, VALUES, Manifest, shard_path
-from tacpipe.engine import provenance, rank_processes
-from tacpipe.engine.rank_processes import Crew
+from tacpipe.datasets.manifest import ACQUIRE, Manifest, shard_path
+from tacpipe.engine import provenance
 from tacpipe.engine.shared import SharedFiles
-from tacpipe.errors import FAILED, DamagedError, MissingModuleError, StorageError, TacpipeError
+from tacpipe.engine.task import Task
+from tacpipe.errors import FAILED, DamagedError, StorageError, TacpipeError
 from tacpipe.io import memory
 from tacpipe.io.drafts import Hashed
 from tacpipe.io.hashing import bytes_digest, digest, remembered_file_digest
@@ -30,196 +25,7 @@ from tacpipe.plugins.stage import AnyStage, RecordingOutput, Result, Stage
 from tacpipe.store import records
 from tacpipe.store.location import opened
 from tacpipe.store.store import MissingError, Object, Store
-from tacpipe.training import devices, display, following
-from tacpipe.training.devices import Compute
-
-if TYPE_CHECKING:
-    from concurrent.futures import Future
-
-AT_ONCE = 8  # tasks that wait for a distant store while one is computed
-_MANY = 4  # tasks for which threads are started
-ALONE = "no network was trained, so one process computed it, whatever --devices is"
-
-
-@dataclass(frozen=True)
-class Task:
-    """One key to make: all that a worker process needs."""
-
-    store: str  # its path or address
-    name: str  # of the stage
-    identity: Mapping[str, Any]
-    recording: str = ""
-    files: Mapping[str, str] | None = None  # of a published source: name to path
-    beside: tuple[str, ...] = ()  # dataset directories whose shards can be adopted
-    replace: bool = False  # the old record names objects that are gone
-    dry: bool = False  # compute and compare, store nothing
-    rerun: bool = False  # compute although a result is stored
-    compute: Compute = field(default_factory=Compute)  # what networks are trained on
-    run: str = ""  # the lease of the run that it is part of
-
-    def to_text(self) -> str:
-        """Return what `task_of` reads."""
-        return json.dumps({**vars(self), "compute": asdict(self.compute)})  # an identity may name all recordings
-
-
-def task_of(text: str) -> Task:
-    """Return the task that `Task.to_text` wrote."""
-    given = json.loads(text)
-    return Task(**{**given, "beside": tuple(given["beside"]), "compute": Compute(**given["compute"])})
-
-
-@dataclass(frozen=True)
-class Done:
-    """What became of a task: a record, or what was wrong with the recording."""
-
-    recording: str
-    record: Mapping[str, Any] | None
-    error: str = ""
-    exit_code: int = 0
-    made: bool = True  # False if another process was faster
-    at_fault: bool = True  # the recording is, and not the disk, a damaged input or another process
-
-
-class _Computing:
-    """What `compute` is: a function of one task, which takes several where they wait for a store that is kept elsewhere."""
-
-    def __call__(self, task: Task) -> Done:
-        """Make the task's key and return its record; a `TacpipeError` becomes a `Done` with its sentence."""
-        store = opened(task.store, task.run)
-        try:
-            return _begun(task, store)()
-        finally:
-            store.close()
-
-    def each(self, tasks: Sequence[Task]) -> Iterator[Done]:
-        """Yield what this gives for each task, in their order.
-
-        Of a store that is kept elsewhere the records of the next tasks are looked for, and the results of those before are
-        sent, while one is computed: each of these requests takes as long as a small recording.
-        """
-        stores: dict[tuple[str, str], Store] = {}
-        for task in tasks:
-            if (task.store, task.run) not in stores:
-                stores[task.store, task.run] = opened(task.store, task.run)
-        if len(tasks) >= _MANY and any(store.distant for store in stores.values()):
-            try:
-                yield from _overlapped([(task, stores[task.store, task.run]) for task in tasks])
-            finally:
-                for store in stores.values():
-                    store.close()
-        else:
-            yield from map(self, tasks)
-
-
-compute = _Computing()
-
-
-def _overlapped(tasks: Sequence[tuple[Task, Store]]) -> Iterator[Done]:
-    """Yield what becomes of each task. Stages run in this thread alone."""
-    from concurrent.futures import ThreadPoolExecutor  # which a hit does not load
-
-    pool = ThreadPoolExecutor(AT_ONCE)
-    looks: deque[Future[None]] = deque()
-    sent: deque[Future[Done]] = deque()
-    begun: list[Callable[[], Done]] = []
-    try:
-        for task, store in tasks[:AT_ONCE]:
-            looks.append(pool.submit(store.seek, digest(task.identity)))
-        for place, (task, store) in enumerate(tasks):
-            with contextlib.suppress(TacpipeError):  # what it was is found by who looks again
-                looks.popleft().result()
-            if place + AT_ONCE < len(tasks):
-                later, its_store = tasks[place + AT_ONCE]
-                looks.append(pool.submit(its_store.seek, digest(later.identity)))
-            begun.append(_begun(task, store))
-            sent.append(pool.submit(begun[-1]))
-            while sent and (sent[0].done() or len(sent) > AT_ONCE):
-                begun.pop(0)
-                yield sent.popleft().result()
-        while sent:
-            begun.pop(0)
-            yield sent.popleft().result()
-    finally:
-        pool.shutdown(cancel_futures=True)
-        for finish, future in zip(begun, sent, strict=False):
-            if future.cancelled() and isinstance(finish, _Sending):
-                finish.leases.close()
-
-
-def _begun(task: Task, store: Store) -> Callable[[], Done]:
-    """Compute the task where its record is not stored; return what stores the result and returns what became of it."""
-    key = digest(task.identity)
-    text = task.to_text() if task.compute.devices > 1 else ""
-    try:
-        with ExitStack() as leases:
-            with devices.given(task.compute), rank_processes.available(text, task.compute) as crew:
-                found = _computed(task, store, key, crew, leases)
-            if isinstance(found, _Made):
-                return _Sending(task, store, found, leases.pop_all())
-    except TacpipeError as error:
-        found = _failed(task, store, error)
-    done: Done = found
-    return lambda: done
-
-
-def _failed(task: Task, store: Store, error: TacpipeError) -> Done:
-    with contextlib.suppress(OSError):  # a workspace in which nothing was saved; one with a checkpoint stays
-        _workspace(store, digest(task.identity)).rmdir()
-    at_fault = error.exit_code == FAILED and not isinstance(error, (StorageError, MissingModuleError))
-    return Done(task.recording, None, str(error), error.exit_code, at_fault=at_fault)
-
-
-@dataclass(frozen=True)
-class _Made:
-    """What a stage gave, its content put into the store, before there is a record of it."""
-
-    result: Mapping[str, Any]
-    provenance: Mapping[str, Any]
-    replace: bool  # an older record names objects that are gone
-    durable: bool
-
-
-@dataclass(frozen=True)
-class _Sending:
-    """What commits a result; the leases end with that."""
-
-    task: Task
-    store: Store
-    made: _Made
-    leases: ExitStack
-
-    def __call__(self) -> Done:
-        task, store, made = self.task, self.store, self.made
-        try:
-            with self.leases:
-                record = store.commit(
-                    task.identity, made.result, made.provenance, replace=made.replace, durable=made.durable
-                )
-                shutil.rmtree(_workspace(store, digest(task.identity)), ignore_errors=True)
-        except TacpipeError as error:
-            return _failed(task, store, error)
-        return Done(task.recording, record)
-
-
-def _computed(task: Task, store: Store, key: str, crew: Crew | None, leases: ExitStack) -> Done | _Made:
-    if task.dry:
-        result, _ = execute(task, store, Scratch())
-        return Done(task.recording, {"result": result, "provenance": provenance.of(0.0)})
-    leases.enter_context(store.leases.hold(key, f"{task.name} {task.recording}".strip()))
-    record = store.record(key)
-    if record is not None and not task.rerun and records.complete(store, record):
-        return Done(task.recording, record, made=False)
-    started = time.perf_counter()
-    replace = task.replace or record is not None
-    result, notes = execute(task, store, store)
-    stage = stage_of(task.name)
-    made = {**provenance.of(round(time.perf_counter() - started, 4)), "irreplaceable": stage.source}
-    made |= {"code": provenance.code(stage), "notes": notes}
-    if crew is not None:
-        made |= {"devices": task.compute.devices} if crew.started else {"notes": [*notes, ALONE]}
-    if stage.source:  # the record alone would mark this as a recording, until a dataset's manifest does
-        store.put(_manifest_of(task, stage, result).content, durable=True)
-    return _Made(result, made, replace, stage.source)
+from tacpipe.training import display, following
 
 
 class Scratch:
@@ -269,19 +75,6 @@ def _stored(returned: Result, sink: Store | Scratch, *, durable: bool) -> dict[s
     }
     files = {name: vars(sink.put(returned.files[name])) for name in sorted(returned.files)}
     return {"recordings": recordings, "files": files}
-
-
-def _manifest_of(task: Task, stage: AnyStage, result: Mapping[str, Any]) -> Manifest:
-    """Return a manifest of one recording that was read from published files."""
-    (entry,), inputs = result["recordings"].values(), task.identity["inputs"]
-    files, values = inputs[stage.argument("Files")], inputs.get(stage.argument("Values"))
-    return Manifest(
-        task.name,
-        stage.version,
-        task.identity["params"],
-        recordings={task.recording: entry},
-        sources={task.recording: {**files, **({VALUES: digest(values)} if values else {})}},
-    )
 
 
 def stage_of(name: str) -> AnyStage:
@@ -449,13 +242,13 @@ def _arguments(stage: AnyStage, task: Task, store: Store) -> Iterator[dict[str, 
             raise StorageError(f"{path} changed while it was read. Run the same command again.")
 
 
-def _workspace(store: Store, key: str) -> Path:
+def workspace(store: Store, key: str) -> Path:
     """Return the folder in which a key's training keeps what it resumes from."""
     return store.root / "checkpoints" / key
 
 
 def _begun_workspace(store: Store, key: str) -> Path:
-    folder = _workspace(store, key)
+    folder = workspace(store, key)
     if folder.is_symlink():
         raise StorageError(f"{folder} is a symbolic link, and none is followed within a store. Remove it.")
     folder.mkdir(parents=True, exist_ok=True)
@@ -480,7 +273,7 @@ def watching(task: Task) -> Iterator[Sequence[following.Follower]]:
         yield ()
         return
     store = opened(task.store)
-    here = None if store.distant else _workspace(store, digest(task.identity))  # else it is in the worker's own folder
+    here = None if store.distant else workspace(store, digest(task.identity))  # else it is in the worker's own folder
     with display.on_stderr(registry.whole(task.name), here) as shown:
         yield (*following.trackers(), *shown)
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from tacpipe.datasets.manifest import Entry, Manifest
 from tacpipe.engine import execution
-from tacpipe.engine.execution import Task
+from tacpipe.engine.task import Task
 from tacpipe.io.hashing import digest
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins.stage import ALL, AnyStage, Source

@@ -13,13 +13,13 @@ from typing import Any
 from tacpipe.datasets import manifest, replacing, roles
 from tacpipe.datasets.dataset import Dataset
 from tacpipe.datasets.manifest import Entry, Manifest, shard_path
-from tacpipe.engine import by_recording, execution, keys, output, provenance
+from tacpipe.engine import by_recording, computing, execution, keys, output, provenance
 from tacpipe.engine.by_recording import ByRecording
-from tacpipe.engine.execution import Task
 from tacpipe.engine.executors.executor import Chosen
 from tacpipe.engine.outcome import Outcome
 from tacpipe.engine.output import Unread
 from tacpipe.engine.request import Inputs, Request
+from tacpipe.engine.task import Task
 from tacpipe.errors import TacpipeError, UsageError, WouldChangeError
 from tacpipe.io import progress
 from tacpipe.io.hashing import digest
@@ -343,7 +343,7 @@ class _Run:
             compute=self.request.compute,
             run=self.store.run,
         )
-        (done,) = self.chosen.opened().run(execution.compute, [task], [])
+        (done,) = self.chosen.opened().run(computing.compute, [task], [])
         if done.record is None:
             raise by_recording.error(done.exit_code, done.error)
         self.outcome.add_record(name, "", done.record)

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from tacpipe.engine import execution, rank_processes
+from tacpipe.engine.task import task_of
 from tacpipe.errors import FAILED, TacpipeError
 from tacpipe.io import processes, progress
 from tacpipe.store.location import opened
@@ -63,7 +64,7 @@ def main() -> None:
 def _compute(text: str, rank: int, size: int, local: int, meet: Callable[[], Any]) -> None:
     from tacpipe.training import ranks
 
-    task = execution.task_of(text)
+    task = task_of(text)
     store = opened(task.store)
     try:
         with (

@@ -155,6 +155,11 @@ def tasks() -> list[str]:
     return sorted(entry_points()[TASKS])
 
 
+def task_modules() -> list[str]:
+    """Return the names of the modules of all tasks, which import torch."""
+    return sorted(target.partition(":")[0] for target in entry_points()[TASKS].values())
+
+
 def load_task(name: str) -> Any:
     """Return the module of the task of this name."""
     return _named(TASKS, "task", name)

@@ -62,7 +62,7 @@ class Receiver:
                 one.batch(message["batch"], lambda: float(message["loss"]))
         elif "line" in message:
             self._line(message["line"], message["learning_rate"])
-        elif message["end"]:  # else the training may go on elsewhere
+        elif message["end"]:  # else another process may continue the training
             self._end(trained=True)
 
     def close(self) -> None:

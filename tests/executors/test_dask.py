@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from tacpipe.engine.execution import Task
 from tacpipe.engine.executors import agreement, dask
+from tacpipe.engine.task import Task
 from tests.conftest import Lab
 from tests.executors.conftest import GIVE_UP_S, Apart
 from tests.executors.test_ends import begun, records, wait_for_one_more

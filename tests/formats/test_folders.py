@@ -17,7 +17,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tacpipe.datasets import manifest, recording_names
-from tacpipe.engine import execution
+from tacpipe.engine import computing
+from tacpipe.engine.task import Done, Task
 from tacpipe.errors import UsageError
 from tacpipe.formats.folders import PREFIX, trials, valid
 from tacpipe.io import files, regular
@@ -257,10 +258,10 @@ def test_a_disk_that_fails_is_no_bad_recording_whichever_file_it_is(
     lab: Lab, monkeypatch: pytest.MonkeyPatch, name: str, file: str, number: int
 ) -> None:
     published(name, lab.folder / "raw")
-    real, compute = regular.opened, execution.compute
+    real, compute = regular.opened, computing.compute
     hashed: list[bool] = []
 
-    def computing(task: execution.Task) -> execution.Done:
+    def counted(task: Task) -> Done:
         hashed.append(True)
         return compute(task)
 
@@ -279,7 +280,7 @@ def test_a_disk_that_fails_is_no_bad_recording_whichever_file_it_is(
             raise OSError(number, os.strerror(number), str(path))
         return whole(path, *given, **named)
 
-    monkeypatch.setattr(execution, "compute", computing)
+    monkeypatch.setattr(computing, "compute", counted)
     monkeypatch.setattr(regular, "opened", opened)
     monkeypatch.setattr(regular, "content", content)
     ran = lab.call(f"ingest {name} raw -o data/r --skip-bad")

@@ -15,8 +15,8 @@ from pathlib import Path
 
 import pytest
 
-from tacpipe.engine import execution
-from tacpipe.engine.execution import Done, Task
+from tacpipe.engine import computing
+from tacpipe.engine.task import Done, Task
 from tacpipe.errors import StorageError, TacpipeError, UsageError
 from tacpipe.maintenance import remote_upkeep, transfer
 from tacpipe.store import bucket, cached, location, records
@@ -616,7 +616,7 @@ def test_results_are_sent_while_others_are_computed_and_objects_still_come_befor
 
     monkeypatch.setattr(files, "create", creating)
     computers.run("first", SIMULATE.replace("--trials 3", "--trials 12"))
-    assert several.is_set() and 1 < under_way[1] <= execution.AT_ONCE
+    assert several.is_set() and 1 < under_way[1] <= computing.AT_ONCE
     expect_whole(files)
     assert not [path for path in computers.store.root.glob("leases/*") if not path.name.startswith("run-")]
     computers.run("second", SIMULATE.replace("--trials 3", "--trials 12"))
@@ -634,7 +634,7 @@ def test_what_another_computer_made_meanwhile_is_not_computed_where_many_are_loo
         if identity.get("stage") in tasks:
             tasks[identity["stage"]].append(Task(computers.address, identity["stage"], identity))
     computers.enter("second")
-    done = list(execution.compute.each(tasks["simulate.toy"]))
+    done = list(computing.compute.each(tasks["simulate.toy"]))
     assert len(done) == 12 and not any(one.made for one in done)
 
 
@@ -826,7 +826,7 @@ def test_a_worker_of_dask_reaches_the_bucket_by_its_address_and_keeps_copies_of_
 def test_a_worker_with_a_folder_of_its_own_gives_its_results_by_way_of_the_bucket(
     computers: Computers, files: Stepping, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    honest = execution.compute
+    honest = computing.compute
 
     def elsewhere(task: Task) -> Done:
         with monkeypatch.context() as there:
@@ -835,7 +835,7 @@ def test_a_worker_with_a_folder_of_its_own_gives_its_results_by_way_of_the_bucke
 
     computers.run("first", SIMULATE)
     with monkeypatch.context() as there:
-        there.setattr(execution, "compute", elsewhere)
+        there.setattr(computing, "compute", elsewhere)
         assert counts(computers.lab.run(f"{SCALE} --json").out) == (3, 0)
     assert json.loads(computers.lab.run(f"{SCALE} --json").out)["reused"] == 3
     expect_whole(files)

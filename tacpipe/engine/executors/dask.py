@@ -24,9 +24,9 @@ from queue import Queue
 from typing import TYPE_CHECKING, Any
 
 from tacpipe.engine import execution, provenance
-from tacpipe.engine.execution import Done, Task
 from tacpipe.engine.executors import agreement, chunks
 from tacpipe.engine.processor import usable_cores
+from tacpipe.engine.task import Done, Task
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import progress, termination
 from tacpipe.io.hashing import digest
