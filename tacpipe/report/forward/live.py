@@ -29,7 +29,7 @@ def folds(context: Context) -> list[Fold]:
 
 
 def _tables(run: Run, live: Mapping[str, Any]) -> list[Table]:
-    steps = list(next(iter(live["mae"].values()), {}))
+    steps = sorted(next(iter(live["mae"].values()), {}), key=lambda step: int(step.removeprefix("t")))
     errors: list[Cells] = [
         [NAMES.get(name, name), *(number(each[step]) for step in steps)] for name, each in live["mae"].items()
     ]

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from tacpipe.comparison.runs import MODEL, Method
-from tacpipe.report.blocks import Cell, Fold, Note, fold, number, table
+from tacpipe.report.blocks import Cell, Fold, Note, fold, interval, number, table
 from tacpipe.report.context import Context
 from tacpipe.report.forward.error_sums import BASELINE
 from tacpipe.tasks.forward.situations import LOST, PACE_M_S, SITUATIONS, TURNING_RAD_S, WIDTH_M
@@ -32,9 +32,7 @@ def folds(context: Context) -> list[Fold]:
             found = of_method(method, name)
             if found:
                 share = f"{100 * found['part']:.1f} %"
-                low, high = found["low"], found["high"]
-                bounds = "" if np.isnan(low) or np.isnan(high) else f"{low:+.3f} to {high:+.3f}"
-                skill = Cell(number(found["skill"], 3).text, bounds, found["skill"])
+                skill = interval(found["skill"], found["low"], found["high"])
                 errors = (number(found[BASELINE]), number(found[MODEL]))
                 rows.append([name, method.name, f"{found['windows']:,.0f}", share, *errors, skill])
     heads = ["situation", "method", "windows", "of persistence's error", "MAE of persistence", "MAE", "skill"]

@@ -37,6 +37,13 @@ def test_a_result_of_live_sessions_has_errors_rows_and_alarms() -> None:
         assert shown in text
 
 
+def test_steps_stand_in_their_order() -> None:
+    errors = {"live": {"t1": 1.0, "t10": 3.0, "t5": 2.0}}  # as JSON sorts them
+    (found,) = live.folds(context({"live": {**LIVE, "mae": errors}}))
+    text = str(found)
+    assert text.index("t+1'") < text.index("t+5'") < text.index("t+10'")
+
+
 def test_a_session_without_forecasts_or_alarms_has_its_rows() -> None:
     (found,) = live.folds(context({"live": {**LIVE, "mae": {}, "alarms": {}, "latency": {"count": 0}}}))
     assert "1,500" in str(found) and "published live" not in str(found)
