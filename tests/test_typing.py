@@ -51,6 +51,7 @@ WRONG = {
 }
 
 
+TITLED = re.compile(r'^```python title="([^"]+)"\n(.*?)^```$', re.DOTALL | re.MULTILINE)
 CONFIG = """
 [mypy]
 [mypy-tacpipe.*]
@@ -99,11 +100,23 @@ def test_mypy_refuses_a_stage_called_with_wrong_arguments_and_accepts_the_right_
     assert len(told) == len(WRONG), ran.stdout  # and none of good.py
 
 
+def beside() -> dict[str, str]:
+    """Return the modules that stages of the texts import from the same page, by the name of the file."""
+    found: dict[str, str] = {}
+    for page in sorted((ROOT / "docs" / "extending").glob("*.md")):
+        text = page.read_text()
+        if any("@stage(" in code for code in blocks(text, "python")):
+            found |= {name: code for name, code in TITLED.findall(text) if "@stage(" not in code}
+    return found
+
+
 @pytest.mark.long
 def test_the_stages_of_the_texts_pass_mypy_strict_as_printed(tmp_path: Path) -> None:
     files = [tmp_path / f"{name}.py" for name in printed()]
     for file, code in zip(files, printed().values(), strict=True):
         file.write_text(code)
+    for name, code in beside().items():
+        (tmp_path / name).write_text(code)
     ran = checked(tmp_path, *files)
     assert files and (ran.returncode, ran.stdout) == (0, "")
 

@@ -105,6 +105,7 @@ def on_recordings(model: Dataset, recordings: Dataset, per_hour: float) -> Alarm
     """Return alarms of a model with levels for ``per_hour`` false alarms each on recordings, each row's forecast made."""
     from tacpipe.tasks.forward import predictors, tracks
     from tacpipe.tasks.forward.alarms import Loads
+    from tacpipe.tasks.forward.headline import MODEL
     from tacpipe.tasks.opened import Chain as Stages
     from tacpipe.tasks.opened import opened
 
@@ -115,14 +116,14 @@ def on_recordings(model: Dataset, recordings: Dataset, per_hour: float) -> Alarm
         track = tracks.track(shard, forecaster.codec, forecaster.pose)
         loads.begin(track)
         for some in predictors.forecasts(forecaster, track, track.starts(forecaster.context, forecaster.horizon)):
-            loads.add_one(predictors.MODEL, some.now, predictors.Prediction(some.features, some.count))
+            loads.add_one(MODEL, some.now, predictors.Prediction(some.features, some.count))
         slips.append(slips_of(shard))
     if not slips:
         raise UsageError("There is no validation recording that alarms could be set on; give --alarms-on others.")
     known = None if any(one is None for one in slips) else np.concatenate(slips)
     return alarms_of.set_on(
         np.concatenate(loads.truth),
-        np.concatenate(loads.ahead[predictors.MODEL]),
+        np.concatenate(loads.ahead[MODEL]),
         np.concatenate(loads.groups),
         known,
         loads.layout,

@@ -17,7 +17,6 @@ import torch
 from torch import Tensor, nn
 
 from tacpipe.models import blending
-from tacpipe.models.batch import Rows
 from tacpipe.models.boosting import Boosting
 from tacpipe.models.channel_rows import ChannelRows
 from tacpipe.models.frames import FramesForecast
@@ -47,7 +46,7 @@ class Size(NamedTuple):
 class MixedForecast(nn.Module):
     """Reads raw channels; begins at persistence. Its trees are computed by numpy, so it cannot be traced."""
 
-    ROWS = Rows(given=1, returned=(1,))
+    # no ROWS: several processes share the batches of each network within, which is what computes the loss
     change_only = True
     blend: Tensor
     scale: Tensor

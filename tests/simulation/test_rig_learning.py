@@ -22,7 +22,8 @@ from tacpipe.simulation import taxels, trajectory
 from tacpipe.tasks.forward import task as forward
 from tacpipe.tasks.forward import tracks
 from tacpipe.tasks.forward.forecaster import Forecaster
-from tacpipe.tasks.forward.predictors import BASELINE, MODEL, predicted
+from tacpipe.tasks.forward.headline import BASELINE, MODEL
+from tacpipe.tasks.forward.predictors import predicted
 from tests.asked import fitting
 from tests.fake_recordings import FakeRecording, FakeShard, column, dataset
 

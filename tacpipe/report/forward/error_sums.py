@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 
 
 FILE = "errors.parquet"
-MODEL, BASELINE = "model", "persistence"
 COLUMNS = (
     "recording",
     "known",

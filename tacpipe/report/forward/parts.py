@@ -21,8 +21,8 @@ from tacpipe.report.charts import Line
 from tacpipe.report.context import Context, median_run
 from tacpipe.report.forward import bands, live, reading, representations, single_run, situations, traces
 from tacpipe.report.forward import methods as by_method
-from tacpipe.report.forward.error_sums import BASELINE
 from tacpipe.tasks.forward import headline, units
+from tacpipe.tasks.forward.headline import BASELINE
 
 if TYPE_CHECKING:
     from collections.abc import Callable

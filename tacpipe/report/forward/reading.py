@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 from tacpipe.comparison.runs import Errors, Question, Run
 from tacpipe.comparison.specification import Kind
 from tacpipe.report.forward import methods
-from tacpipe.report.forward.error_sums import BASELINE
 from tacpipe.report.forward.methods import Result
 from tacpipe.tasks.forward import headline, units
+from tacpipe.tasks.forward.headline import BASELINE
 
 if TYPE_CHECKING:
     from tacpipe.arrays import AnyFloats

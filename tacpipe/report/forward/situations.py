@@ -10,7 +10,7 @@ import numpy as np
 from tacpipe.comparison.runs import MODEL, Method
 from tacpipe.report.blocks import Cell, Fold, Note, fold, interval, number, table
 from tacpipe.report.context import Context
-from tacpipe.report.forward.error_sums import BASELINE
+from tacpipe.tasks.forward.headline import BASELINE
 from tacpipe.tasks.forward.situations import LOST, PACE_M_S, SITUATIONS, TURNING_RAD_S, WIDTH_M
 
 Tree = Mapping[str, Any]

@@ -12,7 +12,8 @@ import numpy as np
 from tacpipe.arrays import AnyFloats, Int64s
 from tacpipe.signals import anticipation, holds
 from tacpipe.signals.loads import loads
-from tacpipe.tasks.forward.predictors import BASELINE, MODEL, Predicted, Prediction
+from tacpipe.tasks.forward.headline import BASELINE, MODEL
+from tacpipe.tasks.forward.predictors import Predicted, Prediction
 from tacpipe.tasks.forward.tracks import Track
 
 Layout = Sequence[Mapping[str, str]]

@@ -15,8 +15,9 @@ from tacpipe.io.parquet import to_parquet
 from tacpipe.metrics import quantiles
 from tacpipe.metrics.quantiles import Sums
 from tacpipe.tasks.forward.forecaster import Forecaster
+from tacpipe.tasks.forward.headline import BASELINE, MODEL
 from tacpipe.tasks.forward.metrics import Trial
-from tacpipe.tasks.forward.predictors import BASELINE, MODEL, Forecast, forecasts
+from tacpipe.tasks.forward.predictors import Forecast, forecasts
 from tacpipe.tasks.forward.tracks import Track
 from tacpipe.tasks.forward.uncertainty import CHUNK, Uncertainty, window_signs
 

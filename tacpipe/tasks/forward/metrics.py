@@ -17,7 +17,8 @@ from tacpipe.io.parquet import to_parquet
 from tacpipe.metrics import forecast
 from tacpipe.metrics.headline import Headline
 from tacpipe.tasks.forward import headline as headlines
-from tacpipe.tasks.forward.predictors import BASELINE, MODEL, Prediction
+from tacpipe.tasks.forward.headline import BASELINE, MODEL
+from tacpipe.tasks.forward.predictors import Prediction
 from tacpipe.tasks.forward.units import COUNTS
 
 Masks = Mapping[str, Bools]  # name of a group of channels, (channel,)

@@ -14,10 +14,10 @@ from tacpipe.codecs.frame_stacking import INCREMENTS
 from tacpipe.models.windows import Windows, motion
 from tacpipe.tasks.forward import tracks
 from tacpipe.tasks.forward.forecaster import Forecaster
+from tacpipe.tasks.forward.headline import BASELINE, MODEL
 from tacpipe.tasks.forward.rows import rows
 from tacpipe.tasks.forward.tracks import Track
 
-MODEL, BASELINE = "model", "persistence"
 CHUNK = 2048  # windows predicted at once
 
 

@@ -8,14 +8,17 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from tacpipe.arrays import AnyFloats, Int64s
 from tacpipe.metrics import forecast
-from tacpipe.tasks.forward.predictors import BASELINE, MODEL, Prediction
-from tacpipe.tasks.forward.tracks import Track
+from tacpipe.tasks.forward.headline import BASELINE, MODEL
+
+if TYPE_CHECKING:  # these import torch, and a report names situations without it
+    from tacpipe.tasks.forward.predictors import Prediction
+    from tacpipe.tasks.forward.tracks import Track
 
 SITUATIONS = ("no contact", "closing", "releasing", "slipping", "holding in motion", "holding still")
 WIDTH_M = 0.0005  # by which the gripper's width changes over the rows to come where it closes or opens
@@ -89,7 +92,7 @@ class BySituation:
     windows: dict[str, Int64s] = field(default_factory=dict)  # by recording, (situation,)
     squared: dict[tuple[str, str], AnyFloats] = field(
         default_factory=dict
-    )  # by recording, predictor: (situation, step)
+    )  # (situation, step), by recording, predictor
     absolute: dict[tuple[str, str], AnyFloats] = field(default_factory=dict)
 
     def count(self, recording: str, situations: Int64s) -> None:
