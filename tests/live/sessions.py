@@ -21,6 +21,15 @@ from tests.recording import live
 
 MODULES = (b"tacpipe.live.process", b"tests.live.persistent")  # that a model's process runs
 
+# commands that train a small forecaster, models/f, on simulated recordings
+TRAINED = (
+    "simulate forward --trials 3 --duration-s 4 --robot-rate-hz 200 -o data/r",
+    "synchronize data/r -o data/synced",
+    "segment contacts data/synced -o data/c",
+    "split data/c -o data/split --scheme random --val 0.34 --test 0",
+    "train forward data/c --split data/split -o models/f --architecture gru --hidden 4 --epochs 1 --context 3 --horizon 2",
+)
+
 
 def started(lab: Lab, options: str, behaviour: str = "") -> subprocess.Popen[str]:
     """Return ``tacpipe live`` with a model that predicts no change, running in a process of its own."""

@@ -14,7 +14,7 @@ import tacpipe
 from tacpipe.live import evaluation, worth
 from tests.conftest import Lab
 from tests.fake_recordings import FakeRecording
-from tests.live.test_replay import TRAINED
+from tests.live.sessions import TRAINED
 
 LATENCY_MS, LATE_ROW, CHANGED_ROW = 5.0, 20, 22
 

@@ -17,17 +17,10 @@ import tacpipe
 from tacpipe.live.session import free_ports
 from tacpipe.sensors import plan as plans
 from tests.conftest import Lab
-from tests.live.sessions import commanded, ended, forecasts, subscriber, whole
+from tests.live.sessions import TRAINED, commanded, ended, forecasts, subscriber, whole
 from tests.recording import live
 
 pytestmark = [pytest.mark.rig, pytest.mark.long]
-TRAINED = (
-    "simulate forward --trials 3 --duration-s 4 --robot-rate-hz 200 -o data/r",
-    "synchronize data/r -o data/synced",
-    "segment contacts data/synced -o data/c",
-    "split data/c -o data/split --scheme random --val 0.34 --test 0",
-    "train forward data/c --split data/split -o models/f --architecture gru --hidden 4 --epochs 1 --context 3 --horizon 2",
-)
 SKINS = tuple(live.stream(f"xela{n}", "xela", "ws:127.0.0.1:5000", f"{{ sensor = {n}, rate_hz = 50 }}") for n in (1, 2))
 ARM = live.stream("robot", "franka", "tcp+udp:172.16.0.2:1337", "{ targets = true }")
 ENDED, NONE = "the plan has ended", "there is no plan"

@@ -12,15 +12,9 @@ import tacpipe
 from tacpipe.live.chain import Chain
 from tacpipe.live.sources import plan_table
 from tests.conftest import Lab
+from tests.live.sessions import TRAINED
 
 MS = 1_000_000
-TRAINED = (
-    "simulate forward --trials 3 --duration-s 4 --robot-rate-hz 200 -o data/r",
-    "synchronize data/r -o data/synced",
-    "segment contacts data/synced -o data/c",
-    "split data/c -o data/split --scheme random --val 0.34 --test 0",
-    "train forward data/c --split data/split -o models/f --architecture gru --hidden 4 --epochs 1 --context 3 --horizon 2",
-)
 
 
 @pytest.mark.long

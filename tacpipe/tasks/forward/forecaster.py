@@ -25,6 +25,7 @@ from tacpipe.plugins import params as params_of
 from tacpipe.printable import plain
 from tacpipe.signals import kinematics
 from tacpipe.signals.rotations import continuous
+from tacpipe.tasks import calibrated
 from tacpipe.tasks.forward import networks, tracks
 from tacpipe.tasks.forward.params import Params
 from tacpipe.tasks.forward.rows import acted
@@ -226,16 +227,8 @@ class Forecaster:
         return predicted[0] if single else predicted
 
     def quantiles_of(self, percents: Sequence[int]) -> tuple[Uncertainty, list[int]]:
-        """Return what the model knows of its uncertainty, and where the quantiles of these levels, in percent, stand in it.
-
-        Raises `TacpipeError` where the model has none, or not these.
-        """
-        if self.uncertainty is None:
-            raise TacpipeError(
-                "The model has no quantiles. Run `tacpipe calibrate MODEL DATASET --split SPLIT -o CALIBRATED` and give "
-                "that one."
-            )
-        return self.uncertainty, self.uncertainty.chosen(percents)
+        """Return `tacpipe.tasks.calibrated.quantiles_of` of the model."""
+        return calibrated.quantiles_of(self.uncertainty, percents)
 
     def predict_quantiles(self, window: AnyFloats, plan: AnyFloats, percents: Sequence[int]) -> AnyFloats:
         """Return quantiles of counts above rest of arrays; `model.ForwardModel.predict` describes all three."""

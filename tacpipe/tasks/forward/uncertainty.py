@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Self
 
@@ -15,6 +14,7 @@ from tacpipe.errors import TacpipeError
 from tacpipe.metrics import conformal
 from tacpipe.models.residual_quantiles import ResidualQuantiles
 from tacpipe.models.tensors import under
+from tacpipe.tasks import calibrated
 from tacpipe.tasks.forward.signs import SIGNS, signs
 
 if TYPE_CHECKING:
@@ -37,17 +37,7 @@ class Uncertainty:
     @property
     def percents(self) -> tuple[int, ...]:
         """The levels of the quantiles in percent, ascending."""
-        return tuple(round(float(100 * one)) for one in self.errors.levels)
-
-    def chosen(self, percents: Sequence[int]) -> list[int]:
-        """Return where quantiles of these levels, in percent, stand. Raises `TacpipeError` for one that was not fitted."""
-        for one in percents:
-            if one not in self.percents:
-                raise TacpipeError(
-                    f"The model has the quantiles {','.join(map(str, self.percents))}, not {one}. Give --quantiles of "
-                    f"these, or run `tacpipe calibrate` with others."
-                )
-        return [self.percents.index(one) for one in percents]
+        return calibrated.percents(self.errors.levels)
 
     def quantiles(self, read: Float32s, ahead: AnyFloats) -> Float32s:
         """Return quantiles in counts above rest (window, step, channel, level), ascending, of the forecast ``ahead``

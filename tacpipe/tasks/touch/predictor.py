@@ -14,11 +14,11 @@ from tacpipe.channels import biotac_sp
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
 from tacpipe.datasets import model_files
-from tacpipe.errors import TacpipeError
 from tacpipe.models.forest import Forest
 from tacpipe.models.tensors import under
 from tacpipe.plugins import params as params_of
 from tacpipe.printable import excerpt
+from tacpipe.tasks import calibrated
 from tacpipe.tasks.opened import Chain
 from tacpipe.tasks.touch import members
 from tacpipe.tasks.touch.baselines import Baselines
@@ -118,16 +118,8 @@ class Predictor:
         )
 
     def quantiles_of(self, percents: Sequence[int]) -> tuple[Uncertainty, list[int]]:
-        """Return what the model knows of its uncertainty, and where the quantiles of these levels, in percent, stand in it.
-
-        Raises `TacpipeError` where the model has none, or not these.
-        """
-        if self.uncertainty is None:
-            raise TacpipeError(
-                "The model has no quantiles. Run `tacpipe calibrate MODEL DATASET --split SPLIT -o CALIBRATED` and give "
-                "that one."
-            )
-        return self.uncertainty, self.uncertainty.chosen(percents)
+        """Return `tacpipe.tasks.calibrated.quantiles_of` of the model."""
+        return calibrated.quantiles_of(self.uncertainty, percents)
 
     def predict_all(self, cloud: Cloud, grasps: Sequence[Grasp]) -> list[Touch]:
         """Return the touch of several grasps on one cloud, in one pass; `model.TouchModel.predict` describes both."""

@@ -21,6 +21,7 @@ from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError
 from tacpipe.metrics import conformal
 from tacpipe.models.tensors import under
+from tacpipe.tasks import calibrated
 from tacpipe.tasks.touch.grasps import Grasps
 
 FILE = "quantiles.safetensors"
@@ -40,22 +41,12 @@ class Uncertainty:
     @property
     def percents(self) -> tuple[int, ...]:
         """The levels of the quantiles in percent, ascending."""
-        return tuple(round(float(100 * one)) for one in self.levels)
+        return calibrated.percents(self.levels)
 
     def quantiles(self, predicted: Readings, predictor: str = MODEL) -> dict[str, Floats]:
         """Return quantiles by target (grasp, value, level), device counts, of what a predictor predicts."""
         offsets = self.offsets[predictor]
         return {target: values[..., None] + offsets[target].T for target, values in predicted.items()}
-
-    def chosen(self, percents: Sequence[int]) -> list[int]:
-        """Return where quantiles of these levels, in percent, stand. Raises `TacpipeError` for one that was not fitted."""
-        for one in percents:
-            if one not in self.percents:
-                raise TacpipeError(
-                    f"The model has the quantiles {','.join(map(str, self.percents))}, not {one}. Give --quantiles of "
-                    f"these, or run `tacpipe calibrate` with others."
-                )
-        return [self.percents.index(one) for one in percents]
 
     @classmethod
     def fit(
