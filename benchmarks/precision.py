@@ -1,10 +1,12 @@
 """A training step of each network in float32 and in bfloat16: milliseconds, and the error of loss and gradient.
 
-``python benchmarks/precision.py``; whether bfloat16 pays depends on the processor's instructions (AMX, AVX512-BF16).
+``python benchmarks/precision.py [--device cuda]``; whether bfloat16 pays on a processor depends on its instructions
+(AMX, AVX512-BF16).
 """
 
 from __future__ import annotations
 
+import argparse
 import time
 from collections.abc import Callable
 from functools import partial
@@ -72,21 +74,33 @@ CASES: dict[str, Callable[[], Case]] = {
 }
 
 
+def wait(device: str) -> None:
+    """Wait for all that was given to a device."""
+    if device == "cuda":
+        torch.cuda.synchronize()
+
+
 def measured(case: Case, precision: str) -> tuple[float, float, Tensor]:
     """Return the milliseconds of the fastest step, the loss and the gradient of all weights."""
     model, loss = case
     best_s, value = float("inf"), 0.0
+    device = next(model.parameters()).device.type
     for _ in range(REPEATS):
+        wait(device)
         began_s = time.perf_counter()
-        with torch.autocast("cpu", torch.bfloat16, enabled=precision == "bfloat16"):
+        with torch.autocast(device, torch.bfloat16, enabled=precision == "bfloat16"):
             found = loss()
         model.zero_grad()
         found.backward()  # type: ignore[no-untyped-call]
+        wait(device)
         best_s, value = min(best_s, time.perf_counter() - began_s), float(found.detach())
     return 1e3 * best_s, value, torch.cat([one.grad.flatten() for one in model.parameters() if one.grad is not None])
 
 
 def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--device", default="cpu", choices=("cpu", "cuda"))
+    torch.set_default_device(parser.parse_args().device)
     torch.manual_seed(0)
     for name, make in CASES.items():
         case = make()

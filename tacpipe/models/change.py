@@ -11,6 +11,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from tacpipe.models import recurrent_layer
 from tacpipe.models.batch import Dropout, Rows
 from tacpipe.models.windows import MOTION, Shape, Windows, held, motion
 
@@ -136,7 +137,7 @@ class SequenceForecast(ChangeForecast):
         if self.cell == "tcn":
             states = self._convolved(read, plan)
         else:
-            states, _ = self.decoder(plan, self.encoder(read)[1])
+            states, _ = recurrent_layer.through(self.decoder, plan, recurrent_layer.through(self.encoder, read)[1])
         return self.touched(self.head(self.drop(states)), windows)
 
     def _convolved(self, read: Tensor, plan: Tensor) -> Tensor:

@@ -18,6 +18,7 @@ How many they are is chosen so that they stay in a core's cache: over all steps,
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections import deque
 from typing import TYPE_CHECKING, Any
@@ -28,6 +29,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from tacpipe.arrays import Bytes
+from tacpipe.models.recurrent_layer import in_float16
 
 CACHED = 2**17  # numbers of one kind that a core's cache holds beside others of their kind: half a megabyte
 State = tuple[Tensor, Tensor]  # h and c, each (window, hidden)
@@ -63,9 +65,12 @@ def _of_torch(inputs: Tensor, state: State | None, weights: Weights, lead: Lead 
         zero = inputs.new_zeros(inputs.shape[1], from_state.shape[1])
         state = zero, zero
     flat = [from_input, from_state, bias, torch.zeros_like(bias)]
-    states, hidden, cell = torch.lstm(
-        inputs, (state[0][None], state[1][None]), flat, True, 1, 0.0, torch.is_grad_enabled(), False, False
-    )
+    begun = [state[0][None], state[1][None]]
+    exact = in_float16(inputs)
+    if exact:
+        inputs, begun, flat = inputs.float(), [one.float() for one in begun], [one.float() for one in flat]
+    with torch.autocast("cuda", enabled=False) if exact else contextlib.nullcontext():
+        states, hidden, cell = torch.lstm(inputs, begun, flat, True, 1, 0.0, torch.is_grad_enabled(), False, False)
     return states, (hidden[0], cell[0])
 
 

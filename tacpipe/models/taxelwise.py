@@ -16,6 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from tacpipe.errors import TacpipeError
+from tacpipe.models import recurrent_layer
 from tacpipe.models.change import CLIPPED, ChangeForecast, closing, spread
 from tacpipe.models.windows import MOTION, UP, Windows, held
 
@@ -83,7 +84,8 @@ class TaxelwiseForecast(ChangeForecast):
         factors = self.factors(hidden).view(*hidden.shape[:2], self.axes, RANK)  # (window, taxel, axis, rank)
         new = self._new(windows)
         plan = self.arm(windows)[0][windows.context :]  # (horizon, window, motion)
-        states, _ = self.plan(torch.cat([plan, new.expand(len(plan), -1, -1)], -1), self.start(whole)[None])
+        told = torch.cat([plan, new.expand(len(plan), -1, -1)], -1)
+        states, _ = recurrent_layer.through(self.plan, told, self.start(whole)[None])
         steps = (self.steps(states) + self.step) * torch.sigmoid(self.gate(new)).T[..., None]
         change = torch.einsum("ntar,hnr->hnta", factors, steps)
         return self.touched(change.flatten(2), windows)

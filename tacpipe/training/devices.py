@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import sys
 from collections.abc import Iterator
 from contextvars import ContextVar
@@ -64,4 +65,12 @@ def _check(compute: Compute) -> None:
         raise UsageError(
             f"device is {compute.device}, and this computer or this build of torch has none; it has {there}. "
             f"Leave --device out to use what there is."
+        )
+    asked = CUDA if compute.device == AUTO and has[CUDA] else compute.device
+    counts = {CUDA: torch.cuda.device_count(), MPS: 1}  # the processor takes any number of processes
+    here = int(os.environ.get("LOCAL_WORLD_SIZE", compute.devices))  # torchrun counts those of all computers
+    if here > counts.get(asked, here):
+        raise UsageError(
+            f"--devices is {compute.devices}, and this computer has {counts[asked]} of {asked}. "
+            f"Give --devices {counts[asked]}, or --device cpu to train in {compute.devices} processes of the processor."
         )

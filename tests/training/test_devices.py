@@ -10,7 +10,7 @@ import torch
 from tacpipe.engine import provenance
 from tacpipe.errors import UsageError
 from tacpipe.training import devices
-from tacpipe.training.devices import AUTO, Compute
+from tacpipe.training.devices import AUTO, Compute, Device
 from tests.conftest import Lab
 
 
@@ -37,6 +37,26 @@ def test_a_device_that_is_not_there_is_refused_with_those_that_are(
     monkeypatch.setattr(torch.backends.mps, "is_available", lambda: False)
     with pytest.raises(UsageError, match=f"{wanted}.*it has cpu"), devices.given(Compute(wanted)):  # type: ignore[arg-type]
         raise AssertionError
+
+
+@pytest.mark.parametrize("device", ["auto", "cuda"])
+def test_more_gpus_than_there_are_are_refused_and_processes_of_the_processor_are_not(
+    device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    with pytest.raises(UsageError, match=r"--devices is 3.* 2 of cuda"), devices.given(Compute(device, 3)):
+        raise AssertionError
+    with devices.given(Compute(device, 2)), devices.given(Compute("cpu", 3)):
+        assert devices.current().devices == 3
+
+
+def test_of_torchrun_the_processes_of_this_computer_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", "2")
+    with devices.given(Compute("cuda", 8)):
+        assert devices.current().devices == 8
 
 
 def test_only_stages_that_train_take_a_device(lab: Lab) -> None:
