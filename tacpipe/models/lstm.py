@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import warnings
 from collections import deque
 from typing import TYPE_CHECKING, Any
 
@@ -31,6 +32,8 @@ from torch.autograd.function import once_differentiable
 from tacpipe.arrays import Bytes
 from tacpipe.models.recurrent_layer import in_float16
 
+# weights that are computed lie apart, so cuDNN copies them together in every call
+warnings.filterwarnings("ignore", message="RNN module weights are not part of single contiguous chunk")
 CACHED = 2**17  # numbers of one kind that a core's cache holds beside others of their kind: half a megabyte
 State = tuple[Tensor, Tensor]  # h and c, each (window, hidden)
 Weights = tuple[Tensor, Tensor, Tensor]  # W (4 hidden, input), R (4 hidden, hidden), b (4 hidden,)
