@@ -11,9 +11,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-import tacpipe
 from tacpipe.errors import TacpipeError
-from tacpipe.plugins import registry
 from tacpipe.tasks.calibrated import Asked
 from tacpipe.tasks.forward import prediction
 from tacpipe.tasks.forward import task as forward
@@ -165,9 +163,3 @@ def test_quantiles_of_another_model_are_refused(model: dict[str, bytes], tmp_pat
     other = trained(tmp_path, horizon=2)
     with pytest.raises(TacpipeError, match="other channels or steps"):
         forward.evaluate({**other, "quantiles.safetensors": model["quantiles.safetensors"]}, dataset(TEST))
-
-
-def test_causal_predictions_have_no_quantiles() -> None:
-    stage = registry.load("predict")
-    with pytest.raises(tacpipe.UsageError, match="causal has no quantiles"):
-        stage(stage.params(causal=True, quantiles="10"), dataset(), dataset())
