@@ -2,7 +2,7 @@
 
 `tacpipe evaluate` reports how good the predictions are. With ``--causal`` each prediction reads what had arrived by then
 and no more, from recordings as they were recorded: what a live session publishes, bit for bit. ``--quantiles 10,50,90`` adds
-quantiles of a model that `tacpipe calibrate` made.
+quantiles of a model that `tacpipe calibrate` made, with ``--causal`` too.
 
 Example: tacpipe predict models/forward data/segments -o data/predictions
 """

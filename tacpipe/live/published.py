@@ -25,7 +25,7 @@ class Published:
 
     @classmethod
     def of(cls, forecast: Any, channels: Sequence[str], known: Sequence[int] = ()) -> Published:
-        """Return what a stream of forecasts (an arrow table) of some channels holds, and its quantiles of ``known`` levels."""
+        """Return what a stream of forecasts (an arrow table) of some channels holds, and quantiles of ``known`` levels."""
         ends = {name.rpartition("_t")[2] for name in forecast.column_names if name.rpartition("_t")[0] in channels}
         steps = sorted({int(end.partition("_q")[0]) for end in ends})
         levels = [level for level in known if any(end.endswith(f"_q{level}") for end in ends)]
