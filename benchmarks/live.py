@@ -1,6 +1,6 @@
 """What a forecast costs: the first paper's rig through a live session's engine, without links and without waiting.
 
-    python benchmarks/live.py MODEL [--seconds 10] [--profile]
+    python benchmarks/live.py MODEL [--seconds 10] [--quantiles 10,90] [--profile]
 
 The emulated rig's bytes (2 uSkin at 50 Hz, proximity at 400 Hz, an arm at 1 kHz) are decoded, brought onto the rows of the
 model and predicted, a grid point at a time, as the model's process does it. Printed is the processor's time of each.
@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import cProfile
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -50,13 +51,14 @@ def sent(rig: rigs.Rig, seconds: float) -> dict[str, Sent]:
 class Replay:
     """An engine that is fed what came, and the processor's time of each step."""
 
-    def __init__(self, model: Path, seconds: float) -> None:
+    def __init__(self, model: Path, seconds: float, quantiles: tuple[int, ...] = ()) -> None:
         rig = rigs.read(RIG)
         about, _ = described(model)
         assert isinstance(about, session.Described), "a model of forward"
+        about = replace(about, quantiles=quantiles)
         own = session.with_own(rig, about, tuple(range(1, about.horizon + 1)))
-        self.sensors = {name: own.streams[name].sensor for name in OWN}
-        engine = opening.engine(Options(str(model), own.text, tuple(rig.streams)))
+        self.sensors = {name: own.streams[name].sensor for name in OWN if name in own.streams}
+        engine = opening.engine(Options(str(model), own.text, tuple(rig.streams), quantiles=quantiles))
         assert isinstance(engine, Engine)
         self.engine = engine
         self.sent = sent(rig, seconds)
@@ -109,9 +111,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("model", type=Path)
     parser.add_argument("--seconds", type=float, default=10.0)
+    parser.add_argument("--quantiles", default="", help="levels that are published, in percent, of a calibrated model")
     parser.add_argument("--profile", action="store_true")
     chosen = parser.parse_args()
-    replay = Replay(chosen.model, chosen.seconds)
+    levels = tuple(int(level) for level in chosen.quantiles.split(",") if level)
+    replay = Replay(chosen.model, chosen.seconds, levels)
     if chosen.profile:
         with cProfile.Profile() as profile:
             replay.run()

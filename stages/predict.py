@@ -49,8 +49,7 @@ def predict(params: Params, model: Model, recordings: Dataset) -> Result:
     steps = sorted(set(STEPS.items(params.steps)))
     quantiles = sorted(set(CommaList(PositiveInt).items(params.quantiles)))
     if params.causal:
-        _check_causal(quantiles)
-        return _causal(model, recordings, steps)
+        return _causal(model, recordings, steps, quantiles)
     task = model_files.task(model.files)
     with model_files.validated("the model"):
         result: Result = task.predict(model.files, recordings, steps, **_asked(task, params, quantiles))
@@ -70,14 +69,7 @@ def _asked(task: Any, params: Params, quantiles: list[int]) -> dict[str, Any]:
     return given
 
 
-def _check_causal(quantiles: list[int]) -> None:
-    from tacpipe.errors import UsageError
-
-    if quantiles:
-        raise UsageError("causal has no quantiles; leave out --quantiles, or --causal.")
-
-
-def _causal(model: Model, recordings: Dataset, steps: list[int]) -> Result:
+def _causal(model: Model, recordings: Dataset, steps: list[int], quantiles: list[int]) -> Result:
     from tacpipe.datasets import model_files
     from tacpipe.errors import UsageError
     from tacpipe.live import replay
@@ -87,4 +79,4 @@ def _causal(model: Model, recordings: Dataset, steps: list[int]) -> Result:
     if name != "forward":
         raise UsageError(f"causal is for models of the task forward, and this one is of {name}; leave --causal out.")
     with model_files.validated("the model"):
-        return replay.predict(model, recordings, steps)
+        return replay.predict(model, recordings, steps, quantiles)

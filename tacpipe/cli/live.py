@@ -15,6 +15,7 @@ from tacpipe.io import terminal
 if TYPE_CHECKING:
     from tacpipe.io.termination import Ended
     from tacpipe.live.options import Options
+    from tacpipe.live.session import Described
     from tacpipe.live.supervisor import Supervisor
     from tacpipe.recording import trials as trials_of
     from tacpipe.recording.recorder import Recorder
@@ -33,6 +34,8 @@ A model of materials names the surface during a slide, with a probability of eac
 what `tacpipe predict` gives. One of touch ranks candidate grasps on a cloud, which come to a stream of the sensor grasps.
 
 Example: tacpipe live finger.toml --model models/material -o data/live --publish udp:127.0.0.1:9000
+
+Example: tacpipe live rig.toml --model models/calibrated --quantiles 10,90   # as `tacpipe calibrate` gave it
 
 Example: tacpipe live rig.toml --model models/forward --realtime   # on a computer that does other work too
 
@@ -61,6 +64,12 @@ def add(program: typer.Typer, summary: str) -> None:
             typer.Option("--publish", help="Where to publish: ws:HOST:PORT, udp:HOST:PORT, lsl:NAME, mcap:FILE."),
         ] = None,
         steps: Annotated[str, typer.Option("--steps", help="Steps ahead that are published; all by default.")] = "",
+        quantiles: Annotated[
+            str,
+            typer.Option(
+                "--quantiles", help="Quantiles published next to forecasts, percent, as 10,90; none by default."
+            ),
+        ] = "",
         alarms_per_hour: Annotated[
             float,
             typer.Option("--alarms-per-hour", help="False alarms an hour that each alarm may give; 0: no alarms."),
@@ -113,9 +122,10 @@ def add(program: typer.Typer, summary: str) -> None:
         about, digest = description.described(model)
         if isinstance(about, session.Described):
             wanted = _steps(steps, about.horizon)
-        elif steps or plan != session.MEASURED or alarms_per_hour:
+            about = replace(about, quantiles=_quantiles(quantiles, about))
+        elif steps or quantiles or plan != session.MEASURED or alarms_per_hour:
             raise UsageError(
-                f"{model} is of the kind {about.kind}; --steps, --plan and --alarms-per-hour are for forecasts."
+                f"{model} is of the kind {about.kind}; --steps, --quantiles, --plan and --alarms-per-hour are for forecasts."
             )
         else:
             wanted = ()
@@ -126,6 +136,7 @@ def add(program: typer.Typer, summary: str) -> None:
             found.text,
             tuple(asked.streams),
             wanted,
+            about.quantiles if isinstance(about, session.Described) else (),
             tuple(publish or []),
             alarms_per_hour,
             "" if alarms_on is None else str(alarms_on.absolute()),
@@ -267,6 +278,24 @@ def _check_slides(every_ms: float, least: float) -> None:
         raise UsageError(f"--every-ms is {every_ms:g}; it must be between 10 and 10,000.")
     if not 0 < least <= 1:
         raise UsageError(f"--least is {least:g}; it must be above 0 and at most 1.")
+
+
+def _quantiles(text: str, about: Described) -> tuple[int, ...]:
+    """Return the levels in percent that are published. Raises `UsageError` for others than the model has."""
+    from tacpipe.errors import TacpipeError
+    from tacpipe.tasks import calibrated
+
+    if not text:
+        return ()
+    try:
+        found = tuple(sorted({int(part) for part in text.split(",")}))
+    except ValueError:
+        raise UsageError(f"--quantiles {text} is not a list of percentages, as 10,90.") from None
+    try:
+        calibrated.quantiles_of(about if about.percents else None, found)
+    except TacpipeError as error:
+        raise UsageError(str(error)) from error
+    return found
 
 
 def _steps(text: str, horizon: int) -> tuple[int, ...]:

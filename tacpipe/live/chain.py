@@ -64,6 +64,9 @@ class Forecast:
     now: Float32s | None  # (channel,), above rest at t_ns; None before the level at rest is known
     cause: Cause
     gaps: tuple[str, ...] = ()  # streams whose newest sample is too old
+    quantiles: Float32s | None = (
+        None  # (horizon, channel, quantile), above rest, of those asked for; None without `count`
+    )
 
 
 class Beginning(NamedTuple):
@@ -108,9 +111,11 @@ class Chain:
         layout: Layout,
         beginning: Beginning | None = None,
         targets: Targets | None = None,
+        quantiles: Sequence[int] = (),
     ) -> None:
         """Make a chain of parts that fit; `of` checks that they do."""
         self._targets = targets
+        self._quantiles = forecaster.quantiles_of(quantiles)[1] if quantiles else []  # where they stand in a band
         stages = causal_stages(steps)
         self._forecaster, self._stages, self._layout = forecaster, stages, layout
         sync = stages.synchronize
@@ -142,6 +147,7 @@ class Chain:
         master: str = "",
         beginning: Beginning | None = None,
         plan_from: str = "",
+        quantiles: Sequence[int] = (),
     ) -> Chain:
         """Return the chain of a model: its files, the stages it was trained behind, and the schema of each recorded stream.
 
@@ -158,6 +164,8 @@ class Chain:
 
         ``plan_from`` names the stream of an arm whose set-points are the planned motion (`tacpipe.live.targets`), in the
         place of the stream ``plan``. Raises `UsageError` where it has none.
+
+        ``quantiles`` (percent) are added to each forecast. Raises `TacpipeError` where the model has none, or not these.
         """
         forecaster = model if isinstance(model, Forecaster) else Forecaster.load(model)
         if forecaster.actions == "shuffled":
@@ -169,7 +177,8 @@ class Chain:
         if plan_from and plan_from not in layouts:
             raise UsageError(f"There is no stream {plan_from} that plans could come from; there are {listed(layouts)}.")
         targets = Targets(plan_from, layouts[plan_from]) if plan_from else None
-        return cls(forecaster, steps, Layout.of(forecaster, stages.synchronize, layouts, master), beginning, targets)
+        layout = Layout.of(forecaster, stages.synchronize, layouts, master)
+        return cls(forecaster, steps, layout, beginning, targets, quantiles)
 
     @property
     def streams(self) -> tuple[str, ...]:
@@ -316,7 +325,9 @@ class Chain:
         if cause:
             return Forecast(row.t_ns, row.newest_ns, None, now, cause, row.gaps)
         ahead, lacking = self._ahead(row.t_ns)
-        return Forecast(row.t_ns, row.newest_ns, self._rolling.predict(ahead), now, lacking)
+        count = self._rolling.predict(ahead)
+        band = self._rolling.band(ahead, count)[..., self._quantiles] if self._quantiles else None
+        return Forecast(row.t_ns, row.newest_ns, count, now, lacking, quantiles=band)
 
     def _take(self, row: _Row) -> bool:
         """Give a row to the model's window; return whether its values are finite."""

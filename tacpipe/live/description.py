@@ -34,4 +34,6 @@ def described(model: Path) -> tuple[Described | Surfaces | Grasped, str]:
         )
     config = model_files.tree(found.files, CONFIG, {"horizon": int, "inputs.tactile": list})
     inputs = config["inputs"]
-    return Described(tuple(inputs["tactile"]), config["horizon"], str(inputs.get("unit", "count"))), found.digest
+    percents = tuple(int(one) for one in config.get("quantiles", {}).get("levels", []))
+    about = Described(tuple(inputs["tactile"]), config["horizon"], str(inputs.get("unit", "count")), percents)
+    return about, found.digest

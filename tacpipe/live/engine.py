@@ -99,10 +99,11 @@ class Engine:
         steps: Sequence[int] | None = None,
         *,
         settle_ns: int = SETTLE_NS,
+        quantiles: Sequence[int] = (),
     ) -> None:
         self.sensors = dict(sensors)
         self._opened, self._alarms_of = opened, alarms
-        self.settle_ns = settle_ns
+        self.settle_ns, self.quantiles = settle_ns, tuple(quantiles)
         self.chain = opened({name: likely_schema(one) for name, one in self.sensors.items()}, None)
         self.alarms = alarms(self.chain)
         self.steps = tuple(steps) if steps else tuple(range(1, self.chain.horizon + 1))
@@ -139,7 +140,7 @@ class Engine:
     def about(self, model: str) -> Description:
         """Return what the values of messages are."""
         chain = self.chain
-        return Description(chain.channels, self.steps, chain.unit, chain.rate_hz, model)
+        return Description(chain.channels, self.steps, chain.unit, chain.rate_hz, model, self.quantiles)
 
     def ready(self) -> dict[str, Any]:
         """Return how many channels are predicted, and the levels of the alarms."""
@@ -221,9 +222,12 @@ class Engine:
 
     def _message(self, forecast: Forecast, now_ns: int) -> Message:
         self._seq += 1
-        values, states = None, dict(NOTHING_KNOWN)
+        values, levels, states = None, None, dict(NOTHING_KNOWN)
         if forecast.count is not None and forecast.now is not None:
-            values = np.ascontiguousarray(forecast.count[[step - 1 for step in self.steps]], dtype=np.float32)
+            wanted = [step - 1 for step in self.steps]
+            values = np.ascontiguousarray(forecast.count[wanted], dtype=np.float32)
+            if forecast.quantiles is not None:
+                levels = np.ascontiguousarray(forecast.quantiles[wanted].transpose(2, 0, 1), dtype=np.float32)
             states = self.alarms.states(forecast.count, forecast.now, self.chain.layout)
         return Message(
             self._seq,
@@ -234,6 +238,8 @@ class Engine:
             states,
             forecast.made_from_t_ns,
             skipped=self.skipped,
+            levels=self.quantiles,
+            quantiles=levels,
         )
 
     def _silence(self, now_ns: int) -> list[Message]:
@@ -254,7 +260,9 @@ class Engine:
         reasons = [self._why] if self._why else []
         reasons += [f"nothing comes from {', '.join(silent)}"] if silent else []
         why = "; ".join(reasons) or "no row is complete"
-        return [Message(self._seq, now_ns + self._offset_ns, None, why, skipped=self.skipped, late=self.late)]
+        message = Message(self._seq, now_ns + self._offset_ns, None, why, skipped=self.skipped, late=self.late)
+        message.levels = self.quantiles
+        return [message]
 
     def _begin(self, offset_ns: int) -> None:
         """Begin a recording: from here on `offset_ns` is added to the monotonic clock."""

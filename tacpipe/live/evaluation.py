@@ -14,13 +14,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from tacpipe.arrays import AnyFloats, Bools, Float32s, Int64s, Times
+from tacpipe.arrays import AnyFloats, Bools, Int64s, Times
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.live import replay, truth, worth
 from tacpipe.live.alarms import NAMES, Alarms
 from tacpipe.live.chain import Chain, Forecast
 from tacpipe.live.leads import leads, onsets
 from tacpipe.live.opening import slips_of
+from tacpipe.live.published import Published, times
 from tacpipe.live.unstored import Recordings, continued
 from tacpipe.live.worth import LIVE, LIVE_STILL, OFFLINE, STILL, Session, Sums, summed
 from tacpipe.metrics import headline
@@ -87,27 +88,22 @@ def _session(
     forecaster: Forecaster, model: Model, recording: Recording, offline: Any, steps: tuple[int, ...]
 ) -> Session:
     tables = replay.recorded(recording)
-    published_ns, published, published_steps = _published(tables["forecast"], forecaster)
-    schemas = {name: one.schema for name, one in tables.items()}
-    chain = Chain.of(forecaster, model.source.chain, schemas, str(recording.attributes.get("master", "")))
+    known = () if forecaster.uncertainty is None else forecaster.uncertainty.percents
+    session = Published.of(tables["forecast"], forecaster.codec.channels, known)
+    chain = replay.chain_of(forecaster, model.source.chain, recording, tables, session.levels)
     every = list(replay.replayed(chain, tables))
     made = [one for one in every if one.count is not None]
     made_ns = np.array([one.t_ns for one in made], np.int64)
-    again = (
-        np.stack([one.count[[step - 1 for step in published_steps]] for one in made if one.count is not None])
-        if made
-        else published[:0]
-    )
-    same, equal = truth.equality(published_ns, published, made_ns, again)
+    same, equal = truth.equality(session.t_ns, session.whole(), made_ns, session.alike(made))
     latency = tables["latency"]
     track = tracks.track(offline, forecaster.codec, forecaster.pose)
     predicted = _offline(forecaster, track)
-    rows, sums = _errors(forecaster, chain, every, (published_ns, published, published_steps), track, predicted, steps)
+    rows, sums = _errors(forecaster, chain, every, session, track, predicted, steps)
     late = latency.column("late").to_numpy()
-    grew = _times(latency)[np.flatnonzero(np.diff(late, prepend=0) > 0)]
+    grew = times(latency)[np.flatnonzero(np.diff(late, prepend=0) > 0)]
     return Session(
         same,
-        _after(published_ns[~equal & np.isin(published_ns, made_ns)], grew, forecaster),
+        _after(session.t_ns[~equal & np.isin(session.t_ns, made_ns)], grew, forecaster),
         rows,
         sums,
         _alarms(forecaster, recording, tables, track, predicted, offline),
@@ -115,27 +111,6 @@ def _session(
         int(latency.column("skipped").to_numpy().max(initial=0)),
         int(late.max(initial=0)),
     )
-
-
-def _published(forecast: Any, forecaster: Forecaster) -> tuple[Times, Float32s, tuple[int, ...]]:
-    """Return times (row,), values (row, step, channel) and steps of a stream of forecasts."""
-    channels = forecaster.codec.channels
-    steps = tuple(
-        sorted(
-            {int(name.rpartition("_t")[2]) for name in forecast.column_names if name.rpartition("_t")[0] in channels}
-        )
-    )
-    values = np.empty((forecast.num_rows, len(steps), len(channels)), np.float32)
-    for place, step in enumerate(steps):
-        for channel, name in enumerate(channels):
-            values[:, place, channel] = forecast.column(f"{name}_t{step}").to_numpy()
-    return _times(forecast), values, steps
-
-
-def _times(stream: Any) -> Times:
-    """Return the times of the rows that a stream of a session is about (row,)."""
-    found: Times = stream.column("t_device_ns").to_numpy()
-    return found
 
 
 def _offline(forecaster: Forecaster, track: Track) -> _Offline:
@@ -151,14 +126,14 @@ def _errors(
     forecaster: Forecaster,
     chain: Chain,
     every: Sequence[Forecast],
-    published: tuple[Times, Float32s, tuple[int, ...]],
+    session: Published,
     track: Track,
     predicted: _Offline,
     steps: tuple[int, ...],
 ) -> tuple[int, Sums]:
     """Return how many rows all predictors have, and the sums of their errors over these."""
-    row_ns, values, published_steps = published
-    if not set(steps) <= set(published_steps) or chain.rest is None or not len(predicted.now):
+    row_ns, values = session.t_ns, session.values
+    if not set(steps) <= set(session.steps) or chain.rest is None or not len(predicted.now):
         return 0, {}
     uniform = forecaster.config["timeline"] == "uniform"
     period_ns = 1e9 / float(forecaster.config["rate_hz"])
@@ -175,7 +150,7 @@ def _errors(
     if not kept.any():
         return 0, {}
     rest = counts[0] - track.tactile[0]  # offline
-    own = [published_steps.index(step) for step in steps]
+    own = [session.steps.index(step) for step in steps]
     held = np.stack([still[at_ns] for at_ns in row_ns[kept].tolist()])[:, None] + chain.rest
     windows = nearest[kept]
     later = counts[predicted.now[windows][:, None] + np.array(steps)].astype(np.float64)
@@ -212,7 +187,7 @@ def _alarms(
     states = {name: stream.column(f"{name}_state").to_numpy().astype(np.int64) for name in NAMES}
     if not any((one >= 0).any() for one in states.values()):
         return {}
-    series = {LIVE: (_times(stream), states)}
+    series = {LIVE: (times(stream), states)}
     if LEVELS in recording.attributes and len(predicted.now):
         series[OFFLINE] = (track.t_ns[predicted.now], _offline_states(forecaster, recording, track, predicted))
     period_ns = round(1e9 / float(forecaster.config["rate_hz"]))

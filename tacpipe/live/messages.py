@@ -85,6 +85,8 @@ class Message:
     compute_ms: float = math.nan
     skipped: int = 0
     late: int = 0
+    levels: tuple[int, ...] = ()  # of quantiles, in percent, that the session publishes
+    quantiles: Float32s | None = None  # (level, step, channel), of a forecast in a session that publishes some
 
     def to_dict(self) -> dict[str, Any]:
         """Return the message as JSON and msgpack hold it; what is not known is null."""
@@ -94,12 +96,19 @@ class Message:
             "seq": self.seq,
             "t_ns": self.t_ns,
             "values": None if self.values is None else self.values.tolist(),
+            **({"quantiles": self._quantiles()} if self.levels else {}),
             "cause": self.cause,
             "alarms": {name: {"state": one.word, "score": known(one.score)} for name, one in self.alarms.items()},
             "latency_ms": known(self.latency_ms),
             "age_ms": known(self.age_ms),
             "skipped": self.skipped,
         }
+
+    def _quantiles(self) -> dict[str, Any] | None:
+        """Return the quantiles by level, None without a forecast."""
+        if self.quantiles is None:
+            return None
+        return {str(level): one.tolist() for level, one in zip(self.levels, self.quantiles, strict=True)}
 
     @property
     def answers(self) -> bool:
@@ -112,14 +121,15 @@ class Message:
         return {name: one.word for name, one in self.alarms.items()}
 
     def columns(self) -> Float32s:
-        """Return the values (step x channel,), empty without a forecast, and the state of each alarm."""
-        values = np.zeros(0) if self.values is None else self.values.ravel()
-        return np.concatenate([values, [self.alarms[name].state for name in NAMES]]).astype(np.float32)
+        """Return values and quantiles (level x step x channel,), empty without a forecast, and the state of each alarm."""
+        values = [one.ravel() for one in (self.values, self.quantiles) if one is not None]
+        return np.concatenate([*values, [self.alarms[name].state for name in NAMES]]).astype(np.float32)
 
     def outputs(self, output: str) -> tuple[Any, ...] | None:
         """Return the numbers of the session's stream ``forecast``, ``alarm`` or ``latency``."""
         if output == "forecast":
-            return None if self.values is None else (self.values.reshape(1, -1),)
+            values = (self.values, *([self.quantiles] if self.levels else []))
+            return None if self.values is None else tuple(one.reshape(1, -1) for one in values if one is not None)
         if output == "alarm":
             states = list(self.alarms.values())
             return (
@@ -139,18 +149,28 @@ class Description:
     unit: str
     rate_hz: float
     model: str
+    quantiles: tuple[int, ...] = ()  # levels in percent
     kind: ClassVar[str] = "forecast"
 
     def columns(self) -> list[tuple[str, str]]:
-        """Return each channel at each step with its unit, and the state of each alarm."""
-        names = [(f"{channel}_t{step}", self.unit) for step in self.steps for channel in self.channels]
+        """Return each channel at each step with its unit, the same of each quantile, and the state of each alarm."""
+        endings = ["", *(f"_q{level}" for level in self.quantiles)]
+        names = [
+            (f"{channel}_t{step}{ending}", self.unit)
+            for ending in endings
+            for step in self.steps
+            for channel in self.channels
+        ]
         return names + [(f"{alarm}_state", "1") for alarm in NAMES]
 
     def schema(self) -> dict[str, Any]:
         """Return the properties of a message, as JSON schema has them."""
+        values = {"type": "array", "items": {"type": "array", "items": {"type": "number"}}}
+        levels = {"type": "object", "properties": {str(level): values for level in self.quantiles}}
         return {
             **properties("version", "seq", "t_ns", "skipped", kind="string", cause="string"),
-            "values": {"type": "array", "items": {"type": "array", "items": {"type": "number"}}},
+            "values": values,
+            **({"quantiles": levels} if self.quantiles else {}),
             **properties(alarms="object", latency_ms="number", age_ms="number"),
         }
 
@@ -164,6 +184,7 @@ class Description:
             "unit": self.unit,
             "rate_hz": self.rate_hz,
             "model": self.model,
+            **({"quantiles": list(self.quantiles)} if self.quantiles else {}),
         }
 
 

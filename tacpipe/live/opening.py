@@ -63,7 +63,9 @@ def touches(options: Options, model: Dataset, rig: Rig, sensors: Mapping[str, Se
 def forecasts(options: Options, model: Dataset, rig: Rig, sensors: Mapping[str, Sensor]) -> Engine:
     """Return the engine of a session with a model of future signals. Raises as `engine`."""
     forecaster = Forecaster.load(model.files)
-    opened = functools.partial(chain, forecaster, model.source.chain, rig.master, options.plan_from)
+    opened = functools.partial(
+        chain, forecaster, model.source.chain, rig.master, options.plan_from, quantiles=options.quantiles
+    )
     first: list[Alarms] = []
 
     def levels(made: Chainlike) -> Alarms:
@@ -71,7 +73,8 @@ def forecasts(options: Options, model: Dataset, rig: Rig, sensors: Mapping[str, 
             first.append(_alarms(options, model, made))
         return first[0]
 
-    found = Engine(sensors, opened, levels, options.steps or None, settle_ns=round(options.settle_ms * 1e6))
+    settle_ns = round(options.settle_ms * 1e6)
+    found = Engine(sensors, opened, levels, options.steps or None, settle_ns=settle_ns, quantiles=options.quantiles)
     if options.steps and max(options.steps) > found.chain.horizon:
         raise UsageError(f"The model predicts 1 to {found.chain.horizon} steps ahead; give --steps of these.")
     forecaster.prepare_single()
@@ -85,9 +88,11 @@ def chain(
     plan_from: str,
     layouts: Mapping[str, pa.Schema],
     beginning: Beginning | None = None,
+    *,
+    quantiles: Sequence[int] = (),
 ) -> Chain:
     """Return the chain of a model for streams of these layouts, which continues another's session; raises as `Chain.of`."""
-    return Chain.of(forecaster, steps, layouts, master, beginning, plan_from)
+    return Chain.of(forecaster, steps, layouts, master, beginning, plan_from, quantiles)
 
 
 def _alarms(options: Options, model: Dataset, made: Chainlike) -> Alarms:

@@ -17,6 +17,7 @@ class Options:
     rig: str  # text of the rig file, with the session's own streams
     streams: tuple[str, ...]  # of the rig that are handed on, in the order of their numbers
     steps: tuple[int, ...] = ()  # that are published; empty: every step of the horizon
+    quantiles: tuple[int, ...] = ()  # levels in percent that are published next to each forecast
     publish: tuple[str, ...] = ()  # addresses
     alarms_per_hour: float = 0.0  # 0: no alarms
     alarms_on: str = ""  # recordings that their levels are set on

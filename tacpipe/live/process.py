@@ -22,6 +22,7 @@ from tacpipe.live.latency import Latencies
 from tacpipe.live.messages import About, Published
 from tacpipe.live.options import Options
 from tacpipe.live.publishing import Publishers
+from tacpipe.plugins import extras
 from tacpipe.recording.spool_blocks import Note
 
 REPORT_NS = 250_000_000  # between two reports to the recording process
@@ -182,8 +183,9 @@ def main(arguments: Sequence[str], made: Callable[[Options], Engine] = engine_of
     connection.setblocking(True)
     options = Options.from_json(_first_line(connection))
     try:
-        engine = made(options)
-        publishers = publishing.opened(options, engine)
+        with extras.named("tacpipe live"):
+            engine = made(options)
+            publishers = publishing.opened(options, engine)
     except TacpipeError as error:
         send(connection, {"refused": str(error), "exit_code": error.exit_code})
         return REFUSED

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from tacpipe.io import progress
 from tacpipe.live.chain import BLOCKING, Cause, Chain, Forecast
 from tacpipe.plugins.stage import RecordingOutput, Result
 from tacpipe.sensors.plan import NAME as PLAN
+from tacpipe.tasks.forward.forecaster import Forecaster
 from tacpipe.tasks.forward.prediction import prediction_table
 
 if TYPE_CHECKING:
@@ -23,18 +24,21 @@ if TYPE_CHECKING:
 PIECE_NS = 1_000_000_000  # of a recording that is given at once
 
 
-def predict(model: Model, recordings: Dataset, steps: Sequence[int]) -> Result:
+def predict(model: Model, recordings: Dataset, steps: Sequence[int], quantiles: Sequence[int] = ()) -> Result:
     """Return a table a recording, as `tasks.forward.prediction.predict` does, of forecasts that look at no later sample.
 
     Attributes count the grid points without a forecast, by cause. Raises `TacpipeError` for a step that the model does not
-    reach, and where a recording's streams are not what it reads.
+    reach, for ``quantiles`` (percent) that it does not have, and where a recording's streams are not what it reads.
     """
+    forecaster = Forecaster.load(model.files)
+    if quantiles:
+        forecaster.quantiles_of(quantiles)
     found: dict[str, RecordingOutput] = {}
     without, unplanned, every = [], 0, 0
     with progress.bar("predict", len(recordings.recordings)) as advance:
         for name, recording in sorted(recordings.recordings.items()):
             try:
-                found[name], causes = _predicted(model, recording, steps)
+                found[name], causes = _predicted(forecaster, model, recording, steps, quantiles)
             except TacpipeError as error:
                 raise type(error)(f"{name}: {error}") from error
             if not found[name].streams[""].num_rows:
@@ -50,32 +54,56 @@ def predict(model: Model, recordings: Dataset, steps: Sequence[int]) -> Result:
     return Result(found, notes=without)
 
 
-def _predicted(model: Model, recording: Recording, steps: Sequence[int]) -> tuple[RecordingOutput, Counter[Cause]]:
+def _predicted(
+    forecaster: Forecaster, model: Model, recording: Recording, steps: Sequence[int], quantiles: Sequence[int]
+) -> tuple[RecordingOutput, Counter[Cause]]:
     """Return the predictions of a recording, and how many grid points each cause had."""
     tables = recorded(recording)
-    master = str(recording.attributes.get("master", ""))
-    schemas = {name: table.schema for name, table in tables.items()}
-    plan = str(recording.attributes.get("live_plan", ""))
-    source = plan.removeprefix("rig:") if plan.startswith("rig:") else ""
-    chain = Chain.of(model.files, model.source.chain, schemas, master, plan_from=source if source in schemas else "")
+    chain = chain_of(forecaster, model.source.chain, recording, tables, quantiles)
     for step in steps:
         if not 1 <= step <= chain.horizon:
             raise TacpipeError(
                 f"The model predicts 1 to {chain.horizon} steps ahead, not {step}. Give --steps of these."
             )
-    t_ns, counts, causes = [], [], Counter[Cause]()
+    t_ns, counts, bands, causes = [], [], [], Counter[Cause]()
     wanted = [step - 1 for step in steps]
     for one in replayed(chain, tables):
         causes.update(one.cause)
         if one.count is not None:
             t_ns.append(one.t_ns)
             counts.append(one.count[wanted])
-    stacked = np.stack(counts) if counts else np.zeros((0, len(wanted), len(chain.channels)), np.float32)
-    table = prediction_table(chain.forecaster, np.array(t_ns, np.int64), stacked.transpose(1, 2, 0).copy(), steps)
+        if one.quantiles is not None:
+            bands.append(one.quantiles[wanted])
+    shape = len(wanted), len(chain.channels)
+    stacked = np.stack(counts) if counts else np.zeros((0, *shape), np.float32)
+    levels = np.stack(bands) if bands else np.zeros((0, *shape, len(quantiles)), np.float32)
+    table = prediction_table(
+        forecaster,
+        np.array(t_ns, np.int64),
+        stacked.transpose(1, 2, 0).copy(),
+        steps,
+        dict(zip(quantiles, levels.transpose(3, 1, 2, 0).copy(), strict=True)),
+    )
     described = {
         f"forecast_{_name(cause)}": count for cause, count in sorted(causes.items(), key=lambda one: one[0].value)
     }
     return RecordingOutput(table, {"causal": True, **described}), causes
+
+
+def chain_of(
+    forecaster: Forecaster,
+    steps: Sequence[Mapping[str, Any]],
+    recording: Recording,
+    tables: Mapping[str, pa.Table],
+    quantiles: Sequence[int] = (),
+) -> Chain:
+    """Return the chain of a model for the streams ``tables`` of a recording, with the master and source of plans that it
+    names; all else is as in `Chain.of`."""
+    schemas = {name: table.schema for name, table in tables.items()}
+    plan = str(recording.attributes.get("live_plan", ""))
+    source = plan.removeprefix("rig:") if plan.startswith("rig:") else ""
+    master, source = str(recording.attributes.get("master", "")), source if source in schemas else ""
+    return Chain.of(forecaster, steps, schemas, master, plan_from=source, quantiles=quantiles)
 
 
 def recorded(recording: Recording) -> dict[str, pa.Table]:

@@ -36,13 +36,16 @@ class Described:
     channels: tuple[str, ...]
     horizon: int
     unit: str
+    percents: tuple[int, ...] = ()  # levels of the quantiles that it has
+    quantiles: tuple[int, ...] = ()  # those of them that are asked for
     kind: ClassVar[str] = "forecast"  # of its messages
 
     def own(self, steps: Sequence[int]) -> dict[str, Mapping[str, Any]]:
         """Return the session's own streams, with the options of the sensor ``live``."""
         forecast = {"output": "forecast", "channels": list(self.channels), "steps": list(steps), "unit": self.unit}
+        levels = {"quantiles": list(self.quantiles)} if self.quantiles else {}
         return {
-            "forecast": forecast,
+            "forecast": {**forecast, **levels},
             "alarm": {"output": "alarm", "alarms": list(NAMES)},
             "latency": {"output": "latency"},
         }

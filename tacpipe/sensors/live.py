@@ -1,7 +1,8 @@
 """What `tacpipe live` publishes, as a stream of a rig: its forecasts, its alarms, or how long they took.
 
 A packet is ``tacL``, the version, what it holds (0 forecast, 1 alarm, 2 latency, 3 material, 4 touch), a counter of 32 bits
-and the time of the grid point in UTC ns, and then numbers, all little-endian: of a forecast float32 by step and channel, of
+and the time of the grid point in UTC ns, and then numbers, all little-endian: of a forecast float32 by step and channel,
+and the same of each quantile that is published, of
 alarms a state and a score each, of latencies the numbers of `LATENCY`, of materials those of `SLIDE` and a probability each,
 of a grasp's touch `ORDER`, `WORTH` and the predicted values. So what a session publishes is recorded like any sensor, by any
 computer.
@@ -62,6 +63,7 @@ class Live(Sensor):
     # of a forecast and of touch: what is predicted; of materials: their names
     channels: tuple[str, ...] = ()
     steps: tuple[int, ...] = ()  # of a forecast: how many rows ahead
+    quantiles: tuple[int, ...] = ()  # of a forecast: levels in percent
     unit: str = "count"  # of the channels
     alarms: tuple[str, ...] = ()  # of alarms: their names
     rate_hz: float = 0.0  # packets a second; 0: they come when they come
@@ -79,8 +81,8 @@ class Live(Sensor):
             raise UsageError(f"live: a stream of the output {self.output} needs {needed}.")
         if self.size > MOST:
             raise UsageError(
-                f"live: {len(self.channels)} channels at {len(self.steps)} steps make packets of {self.size} bytes, and UDP "
-                f"carries {MOST}. Give fewer --steps."
+                f"live: {len(self.channels)} channels at {len(self.steps)} steps with {len(self.quantiles)} quantiles make "
+                f"packets of {self.size} bytes, and UDP carries {MOST}. Give fewer --steps."
             )
 
     @property
@@ -90,8 +92,10 @@ class Live(Sensor):
 
     def _rows(self, count: int) -> AnyArray:
         """Return the numbers of ``count`` packets, zeros."""
+        values = len(self.channels) * len(self.steps)
+        levels = [("quantiles", "<f4", (len(self.quantiles) * values,))] if self.quantiles else []
         parts = {
-            "forecast": [("values", "<f4", (len(self.channels) * len(self.steps),))],
+            "forecast": [("values", "<f4", (values,)), *levels],
             "alarm": [("state", "i1", (len(self.alarms),)), ("score", "<f4", (len(self.alarms),))],
             "latency": [("values", "<f4", (len(LATENCY),))],
             "touch": [("order", "<i8", (len(ORDER),)), ("values", "<f4", (len(WORTH) + len(self.channels),))],
@@ -100,8 +104,8 @@ class Live(Sensor):
         return np.zeros(count, dtype=parts[self.output])
 
     def fields(self) -> list[pa.Field]:
-        """Return a field for each step and channel, for state and score of each alarm, for each of `LATENCY`, or for each of
-        `SLIDE` and the probability of each material.
+        """Return a field for each step and channel and for each quantile of these, for state and score of each alarm, for
+        each of `LATENCY`, or for each of `SLIDE` and the probability of each material.
         """
         import pyarrow as pa
 
@@ -127,15 +131,19 @@ class Live(Sensor):
                 pa.field(f"probability_{name}", pa.float32(), metadata={**about, "material": name})
                 for name in self.channels
             ]
-        return [
-            pa.field(
-                f"{channel}_t{step}",
-                pa.float32(),
-                metadata={"unit": self.unit, "quantity": "prediction", "step": str(step)},
-            )
-            for step in self.steps
-            for channel in self.channels
-        ]
+        found = []
+        for level in (None, *self.quantiles):
+            ending, about = ("", {}) if level is None else (f"_q{level}", {"quantile": f"{level / 100:g}"})
+            found += [
+                pa.field(
+                    f"{channel}_t{step}{ending}",
+                    pa.float32(),
+                    metadata={"unit": self.unit, "quantity": "prediction", "step": str(step), **about},
+                )
+                for step in self.steps
+                for channel in self.channels
+            ]
+        return found
 
     def framer(self) -> Framer:
         """Return a framer that takes packets of this output and size."""

@@ -6,10 +6,11 @@ process be slow (``slow:SECONDS`` a grid point) or end by itself (``die:FORECAST
 
 from __future__ import annotations
 
+import functools
 import os
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -43,7 +44,9 @@ class Persistence:
     layout = tuple({"stream": "skin", "axis": name[-1], "taxel": name[10:12]} for name in CHANNELS)
     unit = "count"
 
-    def __init__(self, layouts: Mapping[str, Any], beginning: Beginning | None = None) -> None:
+    def __init__(
+        self, layouts: Mapping[str, Any], beginning: Beginning | None = None, quantiles: Sequence[int] = ()
+    ) -> None:
         if "skin" not in layouts:
             raise UsageError(f"The model reads the stream skin, and the rig has {', '.join(layouts)}.")
         names = set(layouts["skin"].names)
@@ -51,7 +54,7 @@ class Persistence:
             raise UsageError("The model reads 16 taxels of the stream skin, and the rig's skin has another layout.")
         self.late = {"skin": 0}
         self._samples: list[tuple[int, Any]] = []
-        self.beginning = beginning
+        self.beginning, self.quantiles = beginning, np.array(quantiles, np.float32)
         self._next_ns: int | None = None
         self._passed_ns = 0
 
@@ -76,7 +79,9 @@ class Persistence:
             found.append(self._at(self._next_ns))
             self._next_ns += PERIOD_NS
         if newest_only:
-            found[:-1] = [replace(one, count=None, cause=one.cause | Cause.SKIPPED) for one in found[:-1]]
+            found[:-1] = [
+                replace(one, count=None, quantiles=None, cause=one.cause | Cause.SKIPPED) for one in found[:-1]
+            ]
         return found
 
     def _at(self, point_ns: int) -> Forecast:
@@ -85,7 +90,9 @@ class Persistence:
         at_ns, now = self._samples[0]
         if point_ns - at_ns > GAP_NS:
             return Forecast(point_ns, at_ns, None, now, Cause.GAP, ("skin",))
-        return Forecast(point_ns, at_ns, np.repeat(now[None], HORIZON, axis=0), now, Cause.NONE)
+        ahead = np.repeat(now[None], HORIZON, axis=0)
+        band = ahead[..., None] + self.quantiles - 50 if len(self.quantiles) else None
+        return Forecast(point_ns, at_ns, ahead, now, Cause.NONE, quantiles=band)
 
 
 def engine(options: Options) -> Engine:
@@ -94,7 +101,9 @@ def engine(options: Options) -> Engine:
     layout = axes(Persistence.layout)
     levels = {name: tuple(1e9 for _ in layout) for name in ("load", "slip")}
     sensors = {name: rig.streams[name].sensor for name in options.streams}
-    found = Engine(sensors, Persistence, lambda _: Alarms(layout, levels, 1.0), options.steps or None)
+    opened = functools.partial(Persistence, quantiles=options.quantiles)
+    alarms = Alarms(layout, levels, 1.0)
+    found = Engine(sensors, opened, lambda _: alarms, options.steps or None, quantiles=options.quantiles)
     behaviour, _, value = os.environ.get("BEHAVIOUR", "").partition(":")
     if behaviour:
         _behave(found, behaviour, value)
@@ -122,7 +131,8 @@ def main() -> None:
         sys.exit(process.main(sys.argv[1:], engine))
     patch = pytest.MonkeyPatch()
     patch.setattr(supervisor, "MODULE", "tests.live.persistent")
-    patch.setattr("tacpipe.live.description.described", lambda model: (Described(CHANNELS, HORIZON, "count"), "0" * 64))
+    about = Described(CHANNELS, HORIZON, "count", (10, 50, 90))
+    patch.setattr("tacpipe.live.description.described", lambda model: (about, "0" * 64))
     from tacpipe.cli import main as cli
     from tests.recording import patient
 

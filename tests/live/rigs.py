@@ -14,12 +14,14 @@ from tacpipe.live.chain import Chain, Forecast
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
 from tacpipe.plugins.stage import RecordingOutput
+from tacpipe.tasks.calibrated import Asked
 from tacpipe.tasks.forward import task as forward
 from tests.asked import fitting
 from tests.fake_recordings import FakeRecording, FakeShard, dataset
 
 T0 = 1_700_000_000_000_000_000
 MS = 1_000_000
+ASKED = Asked((5, 10, 50, 90, 95), promise=False, false_unknown=0.05, seed=0)  # of a calibration
 SMALL = {"architecture": "gru", "hidden": 8, "epochs": 1, "batch": 64, "context": 4, "horizon": 3}
 Made = tuple[Mapping[str, bytes], Sequence[Mapping[str, Any]]]
 
@@ -70,7 +72,9 @@ def step(name: str, **values: Any) -> Mapping[str, Any]:
     return {"stage": name, "version": found.version, "params": params, "fitted": None}
 
 
-def model(folder: Path, codec: str = "raw", representation: str = "levels", **values: Any) -> Made:
+def model(
+    folder: Path, codec: str = "raw", representation: str = "levels", *, calibrated: bool = False, **values: Any
+) -> Made:
     """The files of a small model, and the chain that it was trained behind; ``values`` are params of both."""
     names = {"grid", "rate_hz", "gap_ms", "unwrap", "causal", "master"}
     sync = {name: value for name, value in values.items() if name in names}
@@ -87,17 +91,18 @@ def model(folder: Path, codec: str = "raw", representation: str = "levels", **va
         steps.append(step("compress.pca", components=3, representation=representation))
     trained = {name: value for name, value in values.items() if name not in names}
     params = fitting("train.forward", {**SMALL, **trained})
-    return forward.train(params, parts[0], parts[1], folder), steps
+    files = forward.train(params, parts[0], parts[1], folder)
+    return (forward.calibrate(files, ASKED, parts[0], parts[1]) if calibrated else files), steps
 
 
-def chain(made: Made, given: FakeRecording) -> Chain:
+def chain(made: Made, given: FakeRecording, quantiles: Sequence[int] = ()) -> Chain:
     """The chain of a model, for the streams of a recording."""
-    return Chain.of(*made, {name: table.schema for name, table in given.tables.items()})
+    return Chain.of(*made, {name: table.schema for name, table in given.tables.items()}, quantiles=quantiles)
 
 
-def whole(made: Made, given: FakeRecording) -> list[Forecast]:
+def whole(made: Made, given: FakeRecording, quantiles: Sequence[int] = ()) -> list[Forecast]:
     """The forecasts of a recording that is given whole."""
-    fed = chain(made, given)
+    fed = chain(made, given, quantiles)
     for name, table in given.tables.items():
         fed.push(name, table)
     return fed.advance(max(int(table["t_ns"][-1].as_py()) for table in given.tables.values()))

@@ -30,6 +30,9 @@ TRAINED = (
     "train forward data/c --split data/split -o models/f --architecture gru --hidden 4 --epochs 1 --context 3 --horizon 2",
 )
 
+# and another that gives it quantiles, models/g
+CALIBRATED = "calibrate models/f data/c --split data/split -o models/g"
+
 
 def started(lab: Lab, options: str, behaviour: str = "") -> subprocess.Popen[str]:
     """Return ``tacpipe live`` with a model that predicts no change, running in a process of its own."""

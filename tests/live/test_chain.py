@@ -17,9 +17,10 @@ from tacpipe.codecs import tactile
 from tacpipe.codecs.frame_stacking import breaks
 from tacpipe.errors import TacpipeError
 from tacpipe.live.chain import BLOCKING, Beginning, Cause, Chain, Forecast
-from tacpipe.tasks.forward import tracks
+from tacpipe.tasks.forward import prediction, tracks
 from tacpipe.tasks.forward.forecaster import Forecaster
 from tacpipe.tasks.forward.predictors import forecasts
+from tests.fake_recordings import dataset
 from tests.live import rigs
 from tests.live.rigs import MS, T0, Made
 
@@ -32,6 +33,12 @@ KINDS: dict[str, dict[str, Any]] = {
     "fresh": {"actions": "none", "grid": "fresh"},
     "mixed": {"architecture": "mixed", "actions": "none", "networks": 1, "trees": 6, "history": 30, "frames": 4},
 }
+KINDS |= {
+    "planned with quantiles": {"calibrated": True},
+    "latents with quantiles": {**KINDS["latents"], "calibrated": True},
+    "mixed with quantiles": {**KINDS["mixed"], "calibrated": True},
+}
+QUANTILES = {kind: (10, 95) for kind, values in KINDS.items() if "calibrated" in values}
 GIVEN = rigs.recording(20, gap_ms=200.0)
 
 
@@ -44,7 +51,7 @@ def same(found: Sequence[Forecast], wanted: Sequence[Forecast]) -> bool:
     """Whether forecasts are equal to the last bit."""
 
     def content(one: Forecast) -> tuple[Any, ...]:
-        arrays = (None if values is None else values.tobytes() for values in (one.count, one.now))
+        arrays = (None if values is None else values.tobytes() for values in (one.count, one.now, one.quantiles))
         return (one.t_ns, one.made_from_t_ns, *arrays, one.cause, one.gaps)
 
     return [content(one) for one in found] == [content(one) for one in wanted]
@@ -57,12 +64,14 @@ def same(found: Sequence[Forecast], wanted: Sequence[Forecast]) -> bool:
 def test_any_cut_of_a_recording_gives_the_same_forecasts_to_the_last_bit(
     kind: str, models: dict[str, Made], data: st.DataObject
 ) -> None:
-    wanted = rigs.whole(models[kind], GIVEN)
+    asked = QUANTILES.get(kind, ())
+    wanted = rigs.whole(models[kind], GIVEN, asked)
     assert sum(one.count is not None for one in wanted) > 30
+    assert all((one.quantiles is None) == (one.count is None or not asked) for one in wanted)
     cuts = data.draw(st.lists(st.integers(T0 - 10 * MS, T0 + 3000 * MS), max_size=30))
     order = data.draw(st.permutations(sorted(GIVEN.tables)))
     chunk = data.draw(st.sampled_from([1, 7, 1000]))
-    fed, found = rigs.chain(models[kind], GIVEN), []
+    fed, found = rigs.chain(models[kind], GIVEN, asked), []
     for name, table, end in rigs.pieces(GIVEN, cuts, order):
         for batch in table.to_batches(max_chunksize=chunk):
             fed.push(name, batch)
@@ -72,12 +81,10 @@ def test_any_cut_of_a_recording_gives_the_same_forecasts_to_the_last_bit(
     assert not any(fed.late.values())
 
 
-@pytest.mark.parametrize("kind", ["raw", "latents", "increments", "logged", "fresh", "mixed"])
-def test_forecasts_are_those_of_the_stages_of_the_whole_recording(kind: str, models: dict[str, Made]) -> None:
-    made = models[kind]
+def offline(kind: str, forecaster: Forecaster) -> Any:
+    """The recording after the stages that a model was trained behind, run on the whole of it."""
     values = {"causal": True, **{name: KINDS[kind][name] for name in ("grid",) if name in KINDS[kind]}}
     shard = rigs.segmented(GIVEN, **values)
-    forecaster = Forecaster.load(made[0])
     table = shard.content
     if "codec" in KINDS[kind]:
         codec = forecaster.codec
@@ -85,7 +92,14 @@ def test_forecasts_are_those_of_the_stages_of_the_whole_recording(kind: str, mod
         for index, name in enumerate(codec.latents):
             field = pa.field(name, pa.float32(), metadata={"quantity": "latent"})
             table = table.append_column(field, pa.array(latents[:, index]))
-    whole: Any = type(shard)(shard.name, table, shard.attributes)
+    return type(shard)(shard.name, table, shard.attributes)
+
+
+@pytest.mark.parametrize("kind", ["raw", "latents", "increments", "logged", "fresh", "mixed"])
+def test_forecasts_are_those_of_the_stages_of_the_whole_recording(kind: str, models: dict[str, Made]) -> None:
+    made = models[kind]
+    forecaster = Forecaster.load(made[0])
+    whole = offline(kind, forecaster)
     track = tracks.track(whole, forecaster.codec, forecaster.pose)
     by_time = {one.t_ns: one for one in rigs.whole(made, GIVEN)}
     known = sorted(t_ns for t_ns, one in by_time.items() if one.now is not None)
@@ -107,6 +121,29 @@ def test_forecasts_are_those_of_the_stages_of_the_whole_recording(kind: str, mod
             compared += 1
     assert compared > 30
     assert all((one.count is None) == bool(one.cause & BLOCKING) for one in by_time.values())
+
+
+@pytest.mark.parametrize("kind", ["latents with quantiles", "mixed with quantiles"])
+def test_quantiles_are_those_of_the_stages_of_the_whole_recording(kind: str, models: dict[str, Made]) -> None:
+    forecaster = Forecaster.load(models[kind][0])
+    recordings = dataset(offline(kind, forecaster), files=forecaster.codec_files)
+    table = prediction.tables(forecaster, recordings, [1, 3], QUANTILES[kind])[GIVEN.name]
+    by_time = {one.t_ns: one for one in rigs.whole(models[kind], GIVEN, QUANTILES[kind])}
+    rows = [row for row, t_ns in enumerate(table["t_ns"].to_pylist()) if by_time[t_ns].quantiles is not None]
+    assert len(rows) > 30
+    found = [by_time[table["t_ns"][row].as_py()].quantiles for row in rows]
+    for channel, name in enumerate(forecaster.codec.channels):
+        for step, at, percent in ((1, 0, 10), (1, 1, 95), (3, 0, 10), (3, 1, 95)):
+            wanted = table[f"{name}_t{step}_q{percent}"].to_numpy()[rows]
+            own = [one[step - 1, channel, at] for one in found if one is not None]
+            np.testing.assert_allclose(own, wanted, rtol=1e-4, atol=0.05)
+
+
+def test_quantiles_that_a_model_does_not_have_are_refused(models: dict[str, Made]) -> None:
+    with pytest.raises(TacpipeError, match="tacpipe calibrate MODEL"):
+        rigs.chain(models["planned"], GIVEN, [10])
+    with pytest.raises(TacpipeError, match="5,10,50,90,95, not 25"):
+        rigs.chain(models["planned with quantiles"], GIVEN, [10, 25])
 
 
 def test_what_comes_later_changes_no_forecast(models: dict[str, Made]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 
 import numpy as np
@@ -84,6 +85,23 @@ def test_a_session_that_fell_behind_publishes_the_newest_row_and_counts_the_othe
     (message,) = session.at(7)
     assert message.values is not None and (message.values == session.values[7]).all()
     assert message.skipped == session.engine.skipped == 7
+
+
+def test_quantiles_that_were_asked_for_are_published_at_the_steps_that_are() -> None:
+    session = Session()
+    opened = functools.partial(Persistence, quantiles=(10, 90))
+    engine = Engine({"skin": session.sensor}, opened, session.engine._alarms_of, (1, 3), quantiles=(10, 90))
+    session.engine = engine
+    session.begin()
+    session.send(0, 1)
+    (message,) = session.at(0)
+    assert message.levels == (10, 90) and message.quantiles is not None and message.values is not None
+    assert message.quantiles.shape == (2, 2, len(CHANNELS)) and message.quantiles.flags["C_CONTIGUOUS"]
+    assert (message.quantiles[1] == message.values + 40).all()
+    found = [one for periods in range(1, 10) for one in session.at(periods)]
+    assert any(one.values is None for one in found)
+    assert all(one.levels == (10, 90) and (one.quantiles is None) == (one.values is None) for one in found)
+    assert engine.about("m").quantiles == (10, 90)
 
 
 @pytest.mark.parametrize("cut", [1, 3, 7, 50])

@@ -14,7 +14,7 @@ import tacpipe
 from tacpipe.live import evaluation, worth
 from tests.conftest import Lab
 from tests.fake_recordings import FakeRecording
-from tests.live.sessions import TRAINED
+from tests.live.sessions import CALIBRATED, TRAINED
 
 LATENCY_MS, LATE_ROW, CHANGED_ROW = 5.0, 20, 22
 
@@ -24,6 +24,7 @@ def recorded(recording: Any, predictions: pa.Table) -> FakeRecording:
     t_ns = predictions["t_ns"].to_numpy()
     columns = {name: predictions[name].to_numpy().copy() for name in predictions.column_names[1:]}
     columns[next(iter(columns))][CHANGED_ROW] += 1
+    columns[list(columns)[-1]][CHANGED_ROW + 1] += 1  # a quantile
     clocks = {"t_ns": t_ns + 5_000_000, "t_device_ns": t_ns}
     late = (np.arange(len(t_ns)) >= LATE_ROW).astype(np.float32)
     own = {
@@ -41,23 +42,25 @@ def recorded(recording: Any, predictions: pa.Table) -> FakeRecording:
 
 @pytest.mark.long
 def test_published_forecasts_are_compared_with_the_offline_chain_and_recomputed(lab: Lab) -> None:
-    for command in TRAINED:
+    for command in (*TRAINED, CALIBRATED):
         lab.run(command)
-    lab.run("predict models/f data/r -o data/p --steps 1,2 --causal")
-    model, name = tacpipe.open("models/f"), "trial-000"
+    lab.run("predict models/g data/r -o data/p --steps 1,2 --causal --quantiles 10,90")
+    model, name = tacpipe.open("models/g"), "trial-000"
     session = recorded(tacpipe.open("data/r")[name], tacpipe.open("data/p")[name].table())
     given: Any = type("Given", (), {"recordings": {name: session}, "files": {}})()
     result = evaluation.evaluate(model, given)
     live = json.loads(result.files["metrics.json"])["live"]
     rows = live["rows"]
     assert rows["compared"] == rows["published"] == rows["recomputed"] == session.table("forecast").num_rows
-    assert rows["equal"] == rows["compared"] - 1 and rows["differ_after_late_samples"] == 1
+    assert rows["equal"] == rows["compared"] - 2 and rows["differ_after_late_samples"] == 2
+    uncalibrated = json.loads(evaluation.evaluate(tacpipe.open("models/f"), given).files["metrics.json"])["live"]
+    assert uncalibrated["rows"]["equal"] == rows["compared"] - 1  # which has no quantiles to compare
     assert rows["late_samples"] == 1 and rows["skipped"] == 0 and 0 < rows["of_errors"] < rows["published"]
     assert live["latency"]["median_ms"] == LATENCY_MS
     assert set(live["mae"]) == set(worth.PREDICTORS)
     assert 0 < live["mae"]["live"]["t1"] < 10 * live["mae"]["offline"]["t1"]
     assert len(result.files["live.csv"].decode().splitlines()) == 1 + len(worth.PREDICTORS)
-    assert "bit for bit" in result.notes[-2] and "1 others" in result.notes[-2]
+    assert "bit for bit" in result.notes[-2] and "2 others" in result.notes[-2]
 
 
 @pytest.mark.long

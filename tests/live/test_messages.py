@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from tacpipe.arrays import Float32s
 from tacpipe.errors import UsageError
 from tacpipe.live import messages
 from tacpipe.live.alarms import State
-from tacpipe.live.messages import Message
+from tacpipe.live.messages import Description, Message
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.live import LATENCY, Live
 from tacpipe.sensors.plan import Plan, is_plan, packet
@@ -32,6 +33,26 @@ def test_json_holds_each_value_to_the_bit_and_null_where_nothing_is_known() -> N
     assert found["alarms"] == {"load": {"state": "on", "score": 2.5}, "slip": {"state": "unknown", "score": None}}
     assert (found["version"], found["seq"], found["t_ns"], found["cause"]) == (1, 7, 10**18, "why")
     assert json.loads(messages.to_json(message(None).to_dict()))["values"] is None
+
+
+def test_quantiles_are_in_messages_of_sessions_that_publish_them_alone() -> None:
+    about = Description(CHANNELS, (1, 2, 3), "count", 50.0, "m")
+    assert not {"quantiles"} & {*message().to_dict(), *about.to_dict(), *about.schema()}
+    plain, about = message(), replace(about, quantiles=(10, 90))
+    found = replace(plain, levels=(10, 90), quantiles=np.stack([VALUES - 1, VALUES + 1]))
+    sent = json.loads(messages.to_json(found.to_dict()))
+    assert list(sent["quantiles"]) == ["10", "90"] and sent.pop("quantiles")["90"] == (VALUES + 1).tolist()
+    assert sent == json.loads(messages.to_json(plain.to_dict()))
+    assert replace(message(None), levels=(10, 90)).to_dict()["quantiles"] is None
+    assert about.to_dict()["quantiles"] == [10, 90] and set(about.schema()) == set(found.to_dict())
+    columns = dict(zip([name for name, _ in about.columns()], found.columns().tolist(), strict=True))
+    assert columns["c4_t3"] == VALUES[2, 4] and columns["c4_t3_q10"] == VALUES[2, 4] - 1 and columns["load_state"] == 1
+    sensor = Live(output="forecast", channels=CHANNELS, steps=(1, 2, 3), quantiles=(10, 90))
+    (packet,) = messages.packets(found, sensor, 41)
+    values = [one for block in decoded(sensor, packet)[0] for one in block]
+    named = dict(zip([field.name for field in sensor.fields()], values, strict=True))
+    assert named == {name: value for name, value in columns.items() if not name.endswith("state")}
+    assert sensor.fields()[-1].metadata[b"quantile"] == b"0.9"
 
 
 def decoded(sensor: Live, sent: bytes) -> tuple[list[list[float]], int, int]:

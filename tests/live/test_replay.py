@@ -12,16 +12,19 @@ import tacpipe
 from tacpipe.live.chain import Chain
 from tacpipe.live.sources import plan_table
 from tests.conftest import Lab
-from tests.live.sessions import TRAINED
+from tests.live.sessions import CALIBRATED, TRAINED
 
 MS = 1_000_000
 
 
+QUANTILES = (10, 90)
+
+
 @pytest.mark.long
 def test_what_a_session_published_is_what_predict_causal_writes_to_the_last_bit(lab: Lab) -> None:
-    for command in TRAINED:
+    for command in (*TRAINED, CALIBRATED):
         lab.run(command)
-    ran = lab.run("predict models/f data/r -o data/p --steps 1,2 --causal")
+    ran = lab.run("predict models/g data/r -o data/p --steps 1,2 --causal --quantiles 90,10")
     assert "plan" in ran.err
     predictions = tacpipe.open("data/p")
     for recording in tacpipe.open("data/r"):
@@ -29,19 +32,28 @@ def test_what_a_session_published_is_what_predict_causal_writes_to_the_last_bit(
         table = predictions[recording.name].table()
         assert table["t_ns"].to_pylist() == [one.t_ns for one in published] != []
         for step in (1, 2):
-            for index, name in enumerate(table.schema.names[1::2]):
-                wanted = np.array([one.count[step - 1, index] for one in published])
-                column = table[f"{name.removesuffix('_t1')}_t{step}"].to_numpy()
-                assert column.tobytes() == wanted.tobytes()
+            for index, name in enumerate(table.schema.names[1::6]):
+                name = f"{name.removesuffix('_t1')}_t{step}"
+                assert table[name].to_numpy().tobytes() == b"".join(one.count[step - 1, index] for one in published)
+                for at, level in enumerate(QUANTILES):
+                    wanted = b"".join(one.quantiles[step - 1, index, at] for one in published)
+                    assert table[f"{name}_q{level}"].to_numpy().tobytes() == wanted
         assert predictions[recording.name].attributes["forecast_no_plan"] == len(published)
     ran = lab.call("predict models/f data/c -o data/after --causal")
     assert ran.code == 2 and "trial-000" in ran.err  # what had arrived when cannot be seen after a stage
+    ran = lab.call("predict models/f data/r -o data/without --causal --quantiles 10")
+    assert ran.code == 1 and "tacpipe calibrate MODEL" in ran.err
+    lab.run("predict models/f data/r -o data/without --steps 1,2 --causal")
+    name = next(iter(predictions.recordings))
+    without = tacpipe.open("data/without")[name].table()
+    assert predictions[name].table().select(without.column_names).equals(without)
 
 
 def session(tables: dict[str, pa.Table]) -> list[Any]:
     """The forecasts of a session in which each sample came alone, two milliseconds late."""
-    model = tacpipe.open("models/f")
-    chain = Chain.of(model.files, model.source.chain, {name: table.schema for name, table in tables.items()})
+    model = tacpipe.open("models/g")
+    schemas = {name: table.schema for name, table in tables.items()}
+    chain = Chain.of(model.files, model.source.chain, schemas, quantiles=QUANTILES)
     arrivals = sorted(
         (t_ns, name, row)
         for name, table in tables.items()

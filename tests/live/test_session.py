@@ -24,15 +24,22 @@ def patience(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_what_is_published_is_recorded_to_the_bit_and_predicted_from_what_was_recorded(lab: Lab) -> None:
     with live.served(lab.folder, SKIN, live.WRENCH), subscriber() as (port, messages):
-        printed = ended(started(lab, f"-o rec --duration 2 --json --publish udp:127.0.0.1:{port}"))
+        options = f"-o rec --duration 2 --json --quantiles 90,10 --publish udp:127.0.0.1:{port}"
+        printed = ended(started(lab, options))
     shard = live.only(lab.folder)
     table = shard.table("forecast")
+    assert next(one for one in messages if one["kind"] == "description")["quantiles"] == [10, 90]
     published = {one["t_ns"]: np.array(one["values"], dtype=np.float32) for one in forecasts(messages)}
     names = [f"{channel}_t{step}" for step in range(1, HORIZON + 1) for channel in CHANNELS]
     recorded = np.column_stack([table.column(name).to_numpy() for name in names]).reshape(-1, HORIZON, len(CHANNELS))
     points = table.column("t_device_ns").to_numpy()
     assert len(points) > 10 and set(points.tolist()) <= set(published)
     assert all((published[t_ns] == values).all() for t_ns, values in zip(points.tolist(), recorded, strict=True))
+    bands = {one["t_ns"]: np.array(one["quantiles"]["90"], dtype=np.float32) for one in forecasts(messages)}
+    for level, above in ((10, -40), (90, 40)):  # what is published as that level, and what was recorded of it
+        levels = np.column_stack([table.column(f"{name}_q{level}").to_numpy() for name in names])
+        assert (levels == recorded.reshape(len(points), -1) + np.float32(above)).all()
+    assert all((bands[t_ns].ravel() == row).all() for t_ns, row in zip(points.tolist(), levels, strict=True))
 
     skin = shard.table("skin")
     arrivals = skin.column("t_ns").to_numpy()

@@ -19,7 +19,7 @@ from tacpipe.tasks.forward.headline import BASELINE, MODEL
 from tacpipe.tasks.forward.metrics import Trial
 from tacpipe.tasks.forward.predictors import Forecast, forecasts
 from tacpipe.tasks.forward.tracks import Track
-from tacpipe.tasks.forward.uncertainty import CHUNK, Uncertainty, window_signs
+from tacpipe.tasks.forward.uncertainty import CHUNK, Uncertainty
 
 UNCONDITIONAL = (
     "model_unconditional"  # the model's forecast with constant quantiles of its error on calibration recordings
@@ -110,10 +110,8 @@ def band(forecaster: Forecaster, track: Track, some: Forecast, part: slice) -> F
 
     The model must have quantiles.
     """
-    assert forecaster.uncertainty is not None
-    past, ahead = track.tactile[some.past[part]], some.count[part]
     windows = type(some.windows)(*(one[:, part] for one in some.windows))
-    return forecaster.uncertainty.quantiles(window_signs(windows, past, ahead, forecaster.channel_scale), ahead)
+    return forecaster.band(windows, track.tactile[some.past[part]], some.count[part])
 
 
 def _predicted(

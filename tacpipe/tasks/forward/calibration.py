@@ -17,7 +17,7 @@ from tacpipe.tasks.forward.evaluation import check_rate
 from tacpipe.tasks.forward.forecaster import CONFIG, Forecaster
 from tacpipe.tasks.forward.predictors import forecasts
 from tacpipe.tasks.forward.training import check_codec
-from tacpipe.tasks.forward.uncertainty import FILE, Errors, Uncertainty, fewer, window_signs
+from tacpipe.tasks.forward.uncertainty import FILE, Errors, Uncertainty, fewer
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
@@ -63,7 +63,7 @@ def errors_of(forecaster: Forecaster, recordings: Dataset, most: int) -> Errors:
                 past, truth = track.tactile[some.past], track.tactile[some.future]
                 parts.append(
                     (
-                        window_signs(some.windows, past, some.count, forecaster.channel_scale),
+                        forecaster.signs(some.windows, past, some.count),
                         (truth - some.count).transpose(0, 2, 1).astype(np.float32),
                         (truth - past[:, -1:]).transpose(0, 2, 1).astype(np.float32),
                         np.full(len(past), number),

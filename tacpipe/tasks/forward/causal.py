@@ -6,11 +6,13 @@ differently, and a forecast must not depend on how many rows came together.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 import numpy as np
 import torch
+from threadpoolctl import ThreadpoolController
 
 from tacpipe.arrays import AnyFloats, Bools, Float32s, Floats
 from tacpipe.codecs.frame_stacking import INCREMENTS
@@ -108,6 +110,7 @@ class Rolling:
         frames = int(getattr(codec, "frames", 1)) + (codec.representation == INCREMENTS)
         self._levels = np.zeros((frames, len(codec.channels)))
         self._begins: Bools = np.zeros(frames, bool)
+        self._past = np.zeros((forecaster.context if forecaster.uncertainty else 0, len(codec.channels)))
         self._rows = self._run = 0
         self._unknown = max(1, frames - 1) if continues else 0
 
@@ -136,6 +139,8 @@ class Rolling:
         """
         self._levels[:-1], self._begins[:-1] = self._levels[1:], self._begins[1:]
         self._levels[-1], self._begins[-1] = level, not encodes
+        self._past[:-1] = self._past[1:]
+        self._past[-1:] = level
         kept = min(self._rows + 1, len(self._levels))
         self._rows += 1
         codec = self._forecaster.codec
@@ -153,23 +158,41 @@ class Rolling:
 
     def predict(self, plan: AnyFloats) -> Float32s:
         """Return the levels above rest (horizon, channel) that are predicted with the arm's planned rows (horizon, 13)."""
-        reads = self._forecaster.reads
-        past = np.maximum(np.arange(reads), reads - self._run)  # before the first usable row that one is repeated
-        arm = np.concatenate([self._arm[past], plan.astype(np.float32)])
-        read = (self._latent[past], arm, self._finger[past])
-        windows = Windows(*(torch.from_numpy(np.ascontiguousarray(one[:, None])) for one in read))
-        features = self._forecaster.single.features(windows)
+        features = self._forecaster.single.features(self._windows(plan))
         levels = self._forecaster.decoded(features, self._levels[None, -1], self._latent[None, -1])
         found: Float32s = levels[0].astype(np.float32)
         return found
 
+    def band(self, plan: AnyFloats, ahead: Float32s) -> Float32s:
+        """Return all quantiles (horizon, channel, level) of what `predict` returned for the same ``plan``.
+
+        The model must have quantiles.
+        """
+        found: Float32s = self._forecaster.band(self._windows(plan), self._past[None], ahead[None])[0]
+        return found
+
+    def _windows(self, plan: AnyFloats) -> Windows:
+        """Return the rows that are read, and the arm's planned ones, as one window."""
+        reads = self._forecaster.reads
+        past = np.maximum(np.arange(reads), reads - self._run)  # before the first usable row that one is repeated
+        arm = np.concatenate([self._arm[past], plan.astype(np.float32)])
+        read = (self._latent[past], arm, self._finger[past])
+        return Windows(*(torch.from_numpy(np.ascontiguousarray(one[:, None])) for one in read))
+
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Have torch work in one thread: a row is too little to share, and sums in several threads round otherwise."""
+    """Have torch and numpy work in one thread: a row is too little to share, and sums in several threads round otherwise."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        yield
+        with _libraries().limit(limits=1, user_api="blas"):
+            yield
     finally:
         torch.set_num_threads(before)
+
+
+@functools.cache
+def _libraries() -> ThreadpoolController:
+    """Return the libraries of linear algebra that are loaded; to look for them takes a millisecond."""
+    return ThreadpoolController()

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from tacpipe.arrays import AnyFloats, Bools, Times
+from tacpipe.arrays import AnyFloats, Bools, Float32s, Times
 from tacpipe.channels.pose import NAMED, Pose
 from tacpipe.codecs import codec as codecs
 from tacpipe.codecs import stored
@@ -232,15 +232,28 @@ class Forecaster:
 
     def predict_quantiles(self, window: AnyFloats, plan: AnyFloats, percents: Sequence[int]) -> AnyFloats:
         """Return quantiles of counts above rest of arrays; `model.ForwardModel.predict` describes all three."""
-        uncertainty, at = self.quantiles_of(percents)
+        _, at = self.quantiles_of(percents)
         window = np.asarray(window)
         single = window.ndim == 2
         touch, arm, finger = self._parts(*((window[None], plan[None]) if single else (window, plan)))
         self._check_levels(touch)
         ahead = self._of_arrays(touch, arm, finger)
         read = Windows(*(torch.from_numpy(one.swapaxes(0, 1)) for one in (touch, arm, finger)))
-        found = uncertainty.quantiles(window_signs(read, touch, ahead, self.channel_scale), ahead)[..., at]
+        found = self.band(read, touch[:, -self.context :], ahead)[..., at]
         return found[0] if single else found
+
+    def signs(self, windows: Windows, past: AnyFloats, ahead: AnyFloats) -> Float32s:
+        """Return what states how uncertain the forecast ``ahead`` (window, step, channel) is: `uncertainty.window_signs`
+        of windows and their levels ``past`` (window, context, channel), both above rest."""
+        return window_signs(windows, past, ahead, self.channel_scale, self.actions)
+
+    def band(self, windows: Windows, past: AnyFloats, ahead: AnyFloats) -> Float32s:
+        """Return all quantiles (window, step, channel, level) of the forecast ``ahead``; `signs` describes what is given.
+
+        The model must have quantiles.
+        """
+        assert self.uncertainty is not None
+        return self.uncertainty.quantiles(self.signs(windows, past, ahead), ahead)
 
     def _of_arrays(self, touch: AnyFloats, arm: AnyFloats, finger: AnyFloats) -> AnyFloats:
         """Return the future tactile signals (window, horizon, channel) of what `_parts` returns."""

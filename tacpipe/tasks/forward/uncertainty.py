@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 import numpy as np
 from safetensors.numpy import save
@@ -14,11 +14,9 @@ from tacpipe.errors import TacpipeError
 from tacpipe.metrics import conformal
 from tacpipe.models.residual_quantiles import ResidualQuantiles
 from tacpipe.models.tensors import under
+from tacpipe.models.windows import Windows, without_plan
 from tacpipe.tasks import calibrated
 from tacpipe.tasks.forward.signs import SIGNS, signs
-
-if TYPE_CHECKING:
-    from tacpipe.models.windows import Windows
 
 FILE = "quantiles.safetensors"
 ERRORS = "errors."  # begins the names of the tensors of `ResidualQuantiles`
@@ -109,8 +107,15 @@ class Errors:
     recordings: Int64s  # (window,), the number of the recording
 
 
-def window_signs(windows: Windows, past: AnyFloats, ahead: AnyFloats, scale: AnyFloats) -> Float32s:
-    """Return `signs.signs` of windows as a forecaster reads them, their levels (window, context, channel) and forecast."""
+def window_signs(
+    windows: Windows, past: AnyFloats, ahead: AnyFloats, scale: AnyFloats, actions: str = "planned"
+) -> Float32s:
+    """Return `signs.signs` of windows as a forecaster reads them, their levels (window, context, channel) and forecast.
+
+    Rows older than those of ``past`` are not looked at, nor the plan for a model that reads none or a wrong one.
+    """
+    windows = windows.latest(past.shape[1])
+    windows = windows if actions == "planned" else without_plan(windows)
     arm, finger = windows.arm.transpose(0, 1).numpy(), windows.finger.T.numpy()
     return signs(past, ahead, arm, finger, scale)
 

@@ -5,19 +5,19 @@ from __future__ import annotations
 import io
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-import tacpipe
 from tacpipe.errors import TacpipeError
-from tacpipe.plugins import registry
 from tacpipe.tasks.calibrated import Asked
+from tacpipe.tasks.forward import prediction
 from tacpipe.tasks.forward import task as forward
 from tests.fake_recordings import dataset
 from tests.stages.learning_fakes import CHANNELS, motion
-from tests.tasks.forward.trials import HORIZON, asked, compressed, evaluated, predicted_windows, trained
+from tests.tasks.forward.trials import HORIZON, MIXED, asked, compressed, evaluated, predicted_windows, trained
 
 TEST = motion(20)
 PERCENTS = (10, 50, 90)
@@ -64,6 +64,22 @@ def test_the_table_and_arrays_have_the_same_quantiles(model: dict[str, bytes]) -
         assert np.allclose(arrays[:, 3, 3, at], wanted, rtol=1e-4, atol=0.05)
     one = loaded.predict(*(part[0] for part in asked(found, starts)), quantiles=[90])
     assert np.allclose(one[..., 0], arrays[0, ..., 2], rtol=1e-4, atol=0.05)
+
+
+@pytest.mark.parametrize("changed", [MIXED, {"actions": "none"}])
+def test_table_and_arrays_have_the_same_quantiles_where_older_rows_or_no_plan_are_read(
+    changed: dict[str, Any], tmp_path: Path
+) -> None:
+    files = calibrated(trained(tmp_path, **changed))
+    table = forward.predict(files, dataset(TEST), [4], PERCENTS).recordings[TEST.name].streams[""]
+    model = forward.load(files)
+    window, plan, _ = prediction.inputs(model, dataset(TEST))
+    if "actions" in changed:
+        plan = plan[::-1].copy()  # another plan, of which this model reads nothing
+    arrays = model.predict(window, plan, quantiles=PERCENTS)
+    for at, percent in enumerate(PERCENTS):
+        wanted = table[f"{CHANNELS[3]}_t4_q{percent}"].to_numpy()
+        assert np.allclose(arrays[:, 3, 3, at], wanted, rtol=1e-4, atol=0.05)
 
 
 def test_as_many_values_of_calibration_recordings_lie_below_a_quantile_as_its_level_states(
@@ -147,9 +163,3 @@ def test_quantiles_of_another_model_are_refused(model: dict[str, bytes], tmp_pat
     other = trained(tmp_path, horizon=2)
     with pytest.raises(TacpipeError, match="other channels or steps"):
         forward.evaluate({**other, "quantiles.safetensors": model["quantiles.safetensors"]}, dataset(TEST))
-
-
-def test_causal_predictions_have_no_quantiles() -> None:
-    stage = registry.load("predict")
-    with pytest.raises(tacpipe.UsageError, match="causal has no quantiles"):
-        stage(stage.params(causal=True, quantiles="10"), dataset(), dataset())

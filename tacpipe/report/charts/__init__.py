@@ -1,0 +1,29 @@
+"""Charts in Vega-Lite's grammar: the same numbers give the same specification, and colours are the page's variables.
+
+A specification has no width: the page draws it as wide as its column. Points state their numbers under the cursor, lines
+are shown and hidden by their legend, and axes zoom with Shift and the wheel, or by dragging.
+"""
+
+from tacpipe.report.charts.columns import bars
+from tacpipe.report.charts.curves import POINTS, Line, decimated, lines
+from tacpipe.report.charts.grammar import Spec
+from tacpipe.report.charts.planes import plane
+from tacpipe.report.charts.points import joined, scatter
+from tacpipe.report.charts.rankings import Dot, ranking
+from tacpipe.report.charts.squares import grid, matrix
+
+__all__ = [
+    "POINTS",
+    "Dot",
+    "Line",
+    "Spec",
+    "bars",
+    "decimated",
+    "grid",
+    "joined",
+    "lines",
+    "matrix",
+    "plane",
+    "ranking",
+    "scatter",
+]

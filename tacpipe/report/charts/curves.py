@@ -1,0 +1,157 @@
+"""Lines over x, with their bands."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from tacpipe.arrays import AnyFloats, Floats
+from tacpipe.report.charts.grammar import COLOURS, INK, QUIET, Spec, legend_of, short, tip_of, y_of, zoom
+
+POINTS = 300  # of a line that are drawn
+
+
+@dataclass(frozen=True)
+class Line:
+    """Values over x, with the bounds of each where they are given; NaN breaks the line."""
+
+    name: str
+    x: Sequence[float] | AnyFloats
+    y: Sequence[float] | AnyFloats
+    low: Sequence[float] | AnyFloats | None = None
+    high: Sequence[float] | AnyFloats | None = None
+    dashed: bool = False
+    thin: bool = False  # a single run, next to its mean
+
+
+def lines(
+    several: Sequence[Line],
+    x: str,
+    y: str,
+    *,
+    order: Sequence[str] = (),
+    log: bool = False,
+    level: tuple[str, float] | None = None,
+    floor: float | None = None,
+    shade: tuple[float, float] | None = None,
+    points: bool = True,
+    height: int = 240,
+) -> Spec:
+    """Return lines over x, each with its band; ``level`` is drawn across, ``shade`` is a span of x, ``floor`` ends y.
+
+    Charts with the same ``order`` of names give a name the same colour.
+    """
+    names = list(order) or list(dict.fromkeys(one.name for one in several if not one.thin))
+    held = [name for name in names if any(one.name == name for one in several)]
+    values = [row for number, one in enumerate(several) for row in _rows(one, number)]
+    scale: Spec = {"zero": False, **({"type": "log"} if log else {})}
+    if floor is not None:
+        described = [row[key] for row in values for key in ("y", "low", "high") if row.get(key) is not None]
+        scale["domain"] = [max(floor, min([0.0, *described])), max([0.05, *described])]
+    colour: Spec = {
+        "field": "name",
+        "type": "nominal",
+        "scale": {"domain": held, "range": [COLOURS[names.index(name) % len(COLOURS)] for name in held]},
+        "legend": legend_of(len(held)),
+    }
+    base: Spec = {
+        "x": {"field": "x", "type": "quantitative", "title": x, "scale": {"zero": False, "nice": False}},
+        "y": {"field": "y", "type": "quantitative", "title": y, "scale": scale},
+        "color": colour,
+        "detail": {"field": "run", "type": "nominal"},
+        "opacity": {"condition": {"param": "shown", "value": 1, "empty": True}, "value": 0.07},
+    }
+    mark: Spec = {"type": "line", "clip": True, "strokeWidth": {"expr": "datum.thin ? 0.6 : 1.8"}}
+    layers: list[Spec] = []
+    if shade:
+        span = {
+            "data": {"values": [{"a": shade[0], "b": shade[1]}]},
+            "mark": {"type": "rect", "opacity": 0.12, "fill": INK},
+        }
+        layers.append({**span, "encoding": {"x": {"field": "a", "type": "quantitative"}, "x2": {"field": "b"}}})
+    if level:
+        rule = {"type": "rule", "stroke": QUIET, "strokeDash": [4, 3], "strokeWidth": 1.5, "tooltip": level[0]}
+        layers.append({"data": {"values": [{"y": level[1]}]}, "mark": rule, "encoding": {"y": y_of("y")}})
+    if any(one.low is not None for one in several):
+        band = {**base, "y": {**base["y"], "field": "low"}, "y2": {"field": "high"}}
+        band["opacity"] = {"condition": {"param": "shown", "value": 0.16, "empty": True}, "value": 0.02}
+        band.pop("detail")
+        # bands are drawn of what has bounds alone
+        layers.append(
+            {"transform": [{"filter": "isValid(datum.low)"}], "mark": {"type": "area", "clip": True}, "encoding": band}
+        )
+    tip = [tip_of("name", ""), tip_of("x", x), tip_of("y", y)]
+    params: list[Spec] = [
+        {"name": "shown", "select": {"type": "point", "fields": ["name"]}, "bind": "legend"},
+        *([] if log else [zoom()]),
+    ]
+    for thin in (True, False):
+        chosen = [{"filter": f"datum.thin === {str(thin).lower()}"}]
+        if any(one.thin is thin for one in several):
+            drawn = {**mark, "strokeWidth": 0.7 if thin else 1.9}
+            encoding = {**base, "strokeDash": {"field": "dashed", "type": "nominal", "legend": None,
+                                               "scale": {"domain": [False, True], "range": [[1, 0], [5, 3]]}}}  # fmt: skip
+            layer: Spec = {"transform": chosen, "mark": drawn, "encoding": encoding}
+            if thin:
+                encoding["opacity"] = {"condition": {"param": "shown", "value": 0.4, "empty": True}, "value": 0.03}
+            layers.append(layer)
+    if points:
+        dots = {**base, "tooltip": tip}
+        dots.pop("detail")
+        layers.append(
+            {
+                "transform": [{"filter": "datum.thin === false"}],
+                "params": params,
+                "mark": {"type": "circle", "size": 28, "clip": True},
+                "encoding": dots,
+            }
+        )
+    else:
+        layers[-1]["params"] = params
+        layers[-1]["encoding"]["tooltip"] = tip
+    return {"data": {"values": values}, "height": height, "layer": layers}
+
+
+def decimated(x: Floats, y: Floats, count: int = POINTS) -> tuple[Floats, Floats]:
+    """Return a line of at most about ``count`` points: of each stretch, its least and its largest value, in their order.
+
+    NaN, which breaks a line, is kept where a stretch holds nothing else.
+
+    >>> x, y = decimated(np.arange(1000.0), np.r_[np.zeros(500), 9.0, np.zeros(499)], 10)
+    >>> len(x) <= 20, float(y.max())
+    (True, 9.0)
+    """
+    if len(x) <= count:
+        return x, y
+    kept: list[int] = []
+    for part in np.array_split(np.arange(len(x)), max(count // 2, 1)):
+        held = part[~np.isnan(y[part])]
+        if len(held) < len(part):
+            kept.append(int(part[np.isnan(y[part])][0]))
+        if len(held):
+            kept += sorted({int(held[np.argmin(y[held])]), int(held[np.argmax(y[held])])})
+    at = np.array(sorted(set(kept)))
+    return x[at], y[at]
+
+
+def _rows(one: Line, number: int) -> list[Spec]:
+    x, y = (np.asarray(part, np.float64) for part in (one.x, one.y))
+    bounds = [None if part is None else np.asarray(part, np.float64) for part in (one.low, one.high)]
+    if bounds[0] is None:
+        x, y = decimated(x, y)
+    rows = []
+    for place, (at, value) in enumerate(zip(x, y, strict=True)):
+        row: Spec = {
+            "name": one.name,
+            "run": number,
+            "x": short(at),
+            "y": short(value),
+            "dashed": one.dashed,
+            "thin": one.thin,
+        }
+        if bounds[0] is not None and bounds[1] is not None and not np.isnan([bounds[0][place], bounds[1][place]]).any():
+            row |= {"low": short(bounds[0][place]), "high": short(bounds[1][place])}
+        rows.append(row)
+    return rows
