@@ -5,7 +5,8 @@ from __future__ import annotations
 import io
 import itertools
 import json
-from collections.abc import Callable, Mapping, Sequence
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ import pyarrow.parquet as pq
 
 from tacpipe.errors import DamagedError, ShortageError, TacpipeError
 from tacpipe.io import memory, row_groups
-from tacpipe.io.parquet_claims import claimed
+from tacpipe.io.parquet_claims import claimed, counted
 from tacpipe.printable import plain
 
 ROW_GROUP_ROWS = 1 << 20
@@ -26,6 +27,7 @@ PAGE_BYTES = 1 << 20  # of encoded frames; a batch of 1024 of them could be beyo
 GROUP_BYTES = 1 << 28  # of encoded frames in a group of rows
 TRIED_BYTES = 1 << 20  # of encoded frames that are compressed to see whether it is worth it
 WORTH = 0.95  # of their size
+SOME_ROWS = 1 << 14  # that are decoded at once where rows are read some at a time
 ZSTD_LEVEL = 3
 ZSTD_LEVEL_HELD = 9  # long runs of equal values are worth the search
 _CLOCKS = ("t_ns", "t_device_ns", "seq")
@@ -141,8 +143,46 @@ class ParquetTable:
         except BROKEN as error:
             raise _unread(self._content.size, error) from error
 
+    def batches(self, columns: Sequence[str] | None = None, rows: int = SOME_ROWS) -> Iterator[pa.Table]:
+        """Yield tables of up to ``rows`` rows, decoded as they are asked for, with field metadata."""
+        try:
+            total, page, count = counted(self._file.schema, memoryview(self._content).cast("B"), columns)
+        except BROKEN as error:
+            raise _unread(self._content.size, error) from error
+        at_once = total * min(rows, self.num_rows) // max(1, self.num_rows)
+        memory.require(at_once + page * count, f"A Parquet file of {self._content.size} bytes", error=ShortageError)
+        wanted = list(columns) if columns is not None else None
+        file = pq.ParquetFile(pa.BufferReader(self._content), pre_buffer=False)
+        try:
+            for batch in file.iter_batches(rows, columns=wanted, use_threads=False):
+                table = pa.Table.from_batches([batch])
+                yield table if self._fields is None else table.cast(self._with_fields(table.schema))
+        except BROKEN as error:
+            raise _unread(self._content.size, error) from error
+
     def _with_fields(self, schema: pa.Schema) -> pa.Schema:
         return schema if self._fields is None else _with_fields(schema, self._file.schema_arrow.names, self._fields)
+
+
+def stored_batches(path: str, rows: int = SOME_ROWS) -> pa.RecordBatchReader:
+    """Return the rows of a Parquet file on disk as batches of up to ``rows`` rows, decoded as they are asked for.
+
+    It is for files that this program wrote: what they declare is not checked first. Raises `DamagedError` as
+    `from_parquet` does, also while batches are taken.
+    """
+    size = os.stat(path).st_size  # noqa: PTH116
+
+    def taken() -> Iterator[pa.RecordBatch]:
+        try:
+            yield from file.iter_batches(rows, use_threads=False)
+        except BROKEN as error:
+            raise _unread(size, error) from error
+
+    try:
+        file = pq.ParquetFile(path, buffer_size=1 << 16, pre_buffer=False)
+        return pa.RecordBatchReader.from_batches(file.schema_arrow, taken())
+    except BROKEN as error:
+        raise _unread(size, error) from error
 
 
 def owned(*pieces: bytes | memoryview) -> pa.Buffer:

@@ -31,8 +31,9 @@ class Piece:
 class Spill:
     """A temporary file of tables without a name, which is gone with this object or with the process."""
 
-    def __init__(self) -> None:
-        self._file = tempfile.SpooledTemporaryFile(IN_MEMORY)  # noqa: SIM115  (closed by the line below)
+    def __init__(self, in_memory: int = IN_MEMORY) -> None:
+        """Take how many bytes stay in memory, before a file is made of them."""
+        self._file = tempfile.SpooledTemporaryFile(in_memory)  # noqa: SIM115  (closed by the line below)
         weakref.finalize(self, self._file.close)
         self._lock = threading.Lock()  # streams of one file may be read by threads
         self._end = 0
