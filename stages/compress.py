@@ -68,13 +68,13 @@ class AutoencoderParams:
             )
 
 
-@stage(version=2)
+@stage(version=3)
 def fit(params: Params, train: Dataset) -> Result:
     """Return the principal components of the training recordings' rows in contact that no gap touches."""
     from tacpipe.codecs import pca, training_rows
     from tacpipe.plugins.stage import Result
 
-    rows = training_rows.read(train.recordings, params.representation)
+    rows = training_rows.stored(train.recordings, params.representation)
     kept, notes = _kept(params.components, len(rows.channels))
     codec = pca.fit_and_measure(rows, components=kept, variance=params.variance, representation=params.representation)
     return Result(files=codec.to_files(), notes=[] if params.variance else notes)

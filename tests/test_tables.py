@@ -1,8 +1,11 @@
 import ast
+import errno
 import io
 import itertools
+import tempfile
 import weakref
 from pathlib import Path
+from typing import Any
 
 import duckdb
 import numpy as np
@@ -13,8 +16,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from tacpipe.errors import DamagedError
-from tacpipe.io import parquet
+from tacpipe.errors import DamagedError, StorageError
+from tacpipe.io import parquet, row_groups
 from tacpipe.io.parquet import from_parquet, owned, to_parquet, with_metadata
 from tests.any_table import bits, tables
 
@@ -113,6 +116,43 @@ def test_groups_of_rows_are_the_same_in_batches(monkeypatch: pytest.MonkeyPatch,
         (rows - 1) // 400
     )
     assert from_parquet(content).equals(table)
+
+
+@pytest.mark.parametrize("size", [1, 7, 399, 400, 3000])
+def test_rows_that_are_put_aside_on_disk_give_the_bytes_of_their_table(
+    monkeypatch: pytest.MonkeyPatch, size: int
+) -> None:
+    monkeypatch.setattr(parquet, "ROW_GROUP_ROWS", 400)
+    monkeypatch.setattr(row_groups, "IN_MEMORY", 0)
+    monkeypatch.setattr(row_groups, "AT_ONCE", 5000)
+    rows, rng = 1001, np.random.default_rng(0)
+    gone = rng.random(rows) < 0.2
+    gone[400:800] = False  # a whole group without a null
+    table = pa.table(
+        {
+            "t_ns": np.arange(rows),
+            "x": rng.integers(0, 50_000, rows).astype(np.uint16),
+            "y": pa.array(rng.normal(size=rows), mask=gone),
+            "z": pa.array(rng.integers(-9, 9, rows), pa.int8(), mask=gone),
+            "at": pa.array(np.arange(rows), pa.timestamp("us")),
+            "on": pa.array(rng.random(rows) < 0.5, mask=gone),
+            "text": pa.array([f"row {row}" for row in range(rows)], mask=gone),
+        }
+    )
+    assert written(batches_of(table, size)) == to_parquet(table)
+    within = batches_of(pa.concat_tables([table.slice(0, 3), table]).combine_chunks().slice(3), size)
+    assert written(within) == to_parquet(table)
+
+
+def test_a_disk_that_is_full_while_rows_are_put_aside_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(row_groups, "IN_MEMORY", 0)
+
+    def full(*_: Any) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(row_groups, "write_all", full)
+    with pytest.raises(StorageError, match=f"The disk under {tempfile.gettempdir()} is full"):
+        written(batches_of(pa.table({"x": np.arange(100)}), 10))
 
 
 def test_frames_of_many_sizes_are_grouped_alike_in_a_table_and_in_batches(monkeypatch: pytest.MonkeyPatch) -> None:

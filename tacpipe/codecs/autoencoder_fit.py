@@ -121,8 +121,8 @@ def fit(
         _told(network, one) | {"kept": at == best} for at, (network, one) in enumerate(zip(tried, found, strict=True))
     ]
     measured = {
-        "reconstruction": measures.reconstructions(codec, train, val),
-        "latent_covariance": measures.covariance(codec, train),
+        "reconstruction": measures.reconstructions(codec, {"train": [train], "val": [val]}),
+        "latent_covariance": measures.covariance(codec.project(train)),
         "search": described,
     }
     return replace(codec, measured=measured)

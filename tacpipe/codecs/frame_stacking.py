@@ -42,3 +42,21 @@ def inputs(values: AnyFloats, begins: Bools | None, representation: str, frames:
     if frames == 1:
         return values
     return np.hstack([values[np.maximum(rows - lag, first)] for lag in reversed(range(frames))])
+
+
+class Stacking:
+    """What `inputs` makes of rows that come in pieces; it keeps the last rows of a piece, which the next one reads."""
+
+    def __init__(self, representation: str, frames: int = 1) -> None:
+        check(representation)
+        self._representation, self._frames = representation, frames
+        self._values: AnyFloats | None = None  # of the last rows
+        self._begins = np.zeros(0, dtype=bool)
+
+    def next(self, values: AnyFloats, begins: Bools) -> AnyFloats:
+        """Return what a codec reads of the next rows; ``values`` (time, channel) and ``begins`` (time,) as for `inputs`."""
+        before = len(self._begins)
+        if self._values is not None:
+            values, begins = np.concatenate([self._values, values]), np.concatenate([self._begins, begins])
+        self._values, self._begins = values[-self._frames :], begins[-self._frames :]
+        return inputs(values, begins, self._representation, self._frames)[before:]

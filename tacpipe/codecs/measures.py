@@ -13,7 +13,7 @@ Errors are those of the newest frame and, of a codec of increments, those of the
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -39,26 +39,37 @@ class Fitted(Protocol):
         """Return the counts that latents decode to."""
 
 
-def reconstructions(codec: Fitted, train: Floats, val: Floats) -> dict[str, dict[str, float]]:
-    """Return the errors on both parts, inputs (row, frames * channel); ``val`` is left out where it has no rows."""
-    parts = {"train": train, "val": val}
-    return {name: reconstruction(codec, rows) for name, rows in parts.items() if len(rows)}
+def reconstructions(codec: Fitted, parts: Mapping[str, Iterable[Floats]]) -> dict[str, dict[str, float]]:
+    """Return the errors on each part, of rows (row, frames * channel) in pieces; a part without rows is left out."""
+    found = {name: reconstruction(codec, pieces) for name, pieces in parts.items()}
+    return {name: errors for name, errors in found.items() if errors}
 
 
-def reconstruction(codec: Fitted, inputs: Floats) -> dict[str, float]:
-    """Return the errors of encoding and decoding ``inputs`` (row, frames * channel), and the number of rows."""
-    newest = inputs[:, -len(codec.scale_count) :]
-    error = codec.decode(codec.project(inputs).astype(np.float32)) - newest
+def reconstruction(codec: Fitted, pieces: Iterable[Floats]) -> dict[str, float]:
+    """Return the errors of encoding and decoding rows (row, frames * channel), and their number; nothing of no rows."""
+    rows, squares, deviations, width = 0, 0.0, 0.0, len(codec.scale_count)
+    for inputs in pieces:
+        newest = inputs[:, -width:]
+        error = codec.decode(codec.project(inputs).astype(np.float32)) - newest
+        rows += len(inputs)
+        squares += float(np.square(error / codec.scale_count).sum())
+        deviations += float(np.abs(error).sum())
+    if not rows:
+        return {}
     return {
-        "rows": len(inputs),
-        "mse_standardised": rounded(float(np.square(error / codec.scale_count).mean())),
-        "mae_counts": rounded(float(np.abs(error).mean())),
+        "rows": rows,
+        "mse_standardised": rounded(squares / (rows * width)),
+        "mae_counts": rounded(deviations / (rows * width)),
     }
 
 
-def covariance(codec: Fitted, inputs: Floats) -> list[list[float]]:
-    """Return the covariance of the latents of ``inputs`` (row, frames * channel), (latent, latent)."""
-    found = np.atleast_2d(np.cov(codec.project(inputs).astype(np.float64), rowvar=False))
+def covariance(latents: Floats) -> list[list[float]]:
+    """Return the covariance of latents (row, latent), (latent, latent)."""
+    return rounded_matrix(np.atleast_2d(np.cov(latents.astype(np.float64), rowvar=False)))
+
+
+def rounded_matrix(found: Floats) -> list[list[float]]:
+    """Return a matrix rounded to the stored digits of its largest entry."""
     digits = DIGITS - 1 - int(np.floor(np.log10(max(float(np.abs(found).max()), 1e-30))))
     return (found.round(digits) + 0.0).tolist()  # type: ignore[no-any-return]  # + 0.0: no minus before a 0
 

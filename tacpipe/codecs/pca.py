@@ -7,8 +7,9 @@ mean is 0.
 
 from __future__ import annotations
 
+import functools
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -24,8 +25,8 @@ from tacpipe.codecs.codec import (
     encode_finite,
     latent_names,
 )
-from tacpipe.codecs.standard import standard
-from tacpipe.codecs.training_rows import TrainingRows
+from tacpipe.codecs.moments import Moments
+from tacpipe.codecs.training_rows import Rows, held_out, warn_of_still
 from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError
 
@@ -52,6 +53,11 @@ class PCA:
     def latents(self) -> tuple[str, ...]:
         """The names of the latents: ``z00`` holds the most variance."""
         return latent_names(len(self.components))
+
+    @property
+    def reads(self) -> int:
+        """How many rows up to each its latents depend on."""
+        return 2 if self.representation == frame_stacking.INCREMENTS else 1
 
     def encode(self, values: Floats, channels: Sequence[str], begins: Flags | None = None) -> Floats:
         """Return the latents of counts above rest as float32, (time, channel) to (time, latent).
@@ -117,27 +123,42 @@ def fit(
 ) -> PCA:
     """Return the codec fitted on ``inputs`` (row, channel), counts above rest or their increments (``representation``).
 
+    Raises as `of_moments`.
+    """
+    found = Moments.of([inputs], inputs.shape[1])
+    return of_moments(found, channels, layout, components=components, variance=variance, representation=representation)
+
+
+def of_moments(
+    rows: Moments,
+    channels: Sequence[str],
+    layout: Sequence[Mapping[str, str]],
+    *,
+    components: int = 20,
+    variance: float = 0.0,
+    representation: str = frame_stacking.LEVELS,
+) -> PCA:
+    """Return the codec of training rows of which these are the moments.
+
     It keeps ``components`` latents or, where ``variance`` is above 0, as many as hold this fraction of the variance.
     A channel that never moves gets the scale 1. The sign of each component is such that its largest weight is positive.
     Raises `TacpipeError` for a count or fraction that the data cannot give.
     """
-    rows, width = inputs.shape
-    most = min(rows - 1, width)
+    width = len(channels)
+    most = min(rows.count - 1, width)
     if most < 1:
-        raise TacpipeError(f"A codec cannot be fitted on {rows} rows. Give it training recordings with contact.")
+        raise TacpipeError(f"A codec cannot be fitted on {rows.count} rows. Give it training recordings with contact.")
     if not 0 <= variance < 1:
         raise TacpipeError(
             f"variance is {variance}; it must be a fraction between 0 and 1. Use 0 to count components instead."
         )
     if variance == 0 and not 1 <= components <= most:
-        raise TacpipeError(f"components is {components}; {rows} rows of {width} channels give 1 to {most}.")
-    mean, scale = standard(inputs, representation)
+        raise TacpipeError(f"components is {components}; {rows.count} rows of {width} channels give 1 to {most}.")
+    mean, scale = rows.standard(representation)
     # scikit-learn's PCA always takes the mean off, which increments keep; the triangle of a QR has the same singular
     # values and right vectors as all the rows, and as few rows as there are channels.
-    triangle = np.linalg.qr((inputs - mean) / scale, mode="r")
-    _, singular, weights = np.linalg.svd(triangle)
-    power = np.zeros(width)
-    power[: len(singular)] = singular**2
+    _, singular, weights = np.linalg.svd(rows.standardised(representation))
+    power = singular**2
     ratio = power / power.sum()
     kept = int(np.searchsorted(ratio.cumsum(), variance, side="right")) + 1 if variance else components
     kept = min(kept, most)
@@ -155,25 +176,39 @@ def fit(
 
 
 def fit_and_measure(
-    rows: TrainingRows, *, components: int = 20, variance: float = 0.0, representation: str = frame_stacking.LEVELS
+    rows: Rows, *, components: int = 20, variance: float = 0.0, representation: str = frame_stacking.LEVELS
 ) -> PCA:
-    """Return the codec fitted on ``rows`` of all recordings, with its measures.
+    """Return the codec fitted on ``rows`` of all recordings, with its measures; they are read twice, in pieces.
 
     The errors are those of as many components fitted without the recordings that are held out, as an autoencoder of
-    the same recordings is, so that the two compare. Without any held out, ``val`` is left out.
+    the same recordings is, so that the two compare. Without any held out, ``val`` is left out. Warns of channels that
+    never move while others do.
     """
-    everything = rows.of(rows.inputs.keys())
-    codec = fit(
-        everything, rows.channels, rows.layout, components=components, variance=variance, representation=representation
-    )
-    train, val = rows.parts
-    kept = len(codec.components)
-    if len(val) and len(train) > kept:
-        evaluated = fit(train, rows.channels, rows.layout, components=kept, representation=representation)
+    held = held_out(rows.names)
+    parts: dict[str, Collection[str]] = {"train": set(rows.names) - held, "val": held}
+    width = len(rows.channels)
+    train, val = (Moments.of(rows.each(names), width) for names in parts.values())
+    everything = train.merged(val)
+    if everything.count > 1:
+        still = [name for name, moves in zip(rows.channels, everything.moves, strict=True) if not moves]
+        warn_of_still(still, width)
+    made = functools.partial(of_moments, channels=rows.channels, layout=rows.layout, representation=representation)
+    codec = made(everything, components=components, variance=variance)
+    evaluated = codec
+    if val.count and train.count > len(codec.components):
+        evaluated = made(train, components=len(codec.components))
     else:
-        evaluated, train, val = codec, everything, everything[:0]
+        parts = {"train": rows.names}
     measured = {
-        "reconstruction": measures.reconstructions(evaluated, train, val),
-        "latent_covariance": measures.covariance(codec, everything),
+        "reconstruction": measures.reconstructions(
+            evaluated, {part: rows.each(names) for part, names in parts.items()}
+        ),
+        "latent_covariance": _covariance(codec, everything),
     }
     return replace(codec, measured=measured)
+
+
+def _covariance(codec: PCA, rows: Moments) -> list[list[float]]:
+    """Return the covariance of the latents of all rows, (latent, latent)."""
+    spread = rows.centred / codec.scale_count @ codec.components.T
+    return measures.rounded_matrix(spread.T @ spread / (rows.count - 1))

@@ -27,12 +27,17 @@ def standard(values: Floats, representation: str) -> tuple[Floats, Floats]:
     """
     moves = _moves(values)
     if not moves.any():
-        raise TacpipeError(
-            f"None of the {values.shape[1]} tactile channels moves in {len(values)} training rows, so there is nothing "
-            "to compress. Give training recordings with contact."
-        )
+        raise none_moves(values.shape[1], len(values))
     mean = values.mean(axis=0) if representation == LEVELS else np.zeros(values.shape[1])
     return mean, np.where(moves, values.std(axis=0), 1.0)
+
+
+def none_moves(channels: int, rows: int) -> TacpipeError:
+    """Return the error of training rows in which no channel moves."""
+    return TacpipeError(
+        f"None of the {channels} tactile channels moves in {rows} training rows, so there is nothing to compress. Give "
+        "training recordings with contact."
+    )
 
 
 def _moves(values: Floats) -> np.ndarray[Any, np.dtype[np.bool_]]:

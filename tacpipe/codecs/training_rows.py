@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -15,9 +15,8 @@ from tacpipe.datasets import splits
 from tacpipe.errors import TacpipeError
 
 if TYPE_CHECKING:
-    import pyarrow as pa
-
     from tacpipe.datasets.dataset import Recording
+    from tacpipe.io.columns import Columns
 
     Floats = np.ndarray[Any, np.dtype[np.floating[Any]]]
 
@@ -25,26 +24,42 @@ HELD_OUT = 0.15  # fraction of the training recordings that a codec is measured 
 log = logging.getLogger(__name__)
 
 
+class Rows(Protocol):
+    """What codecs read of rows in contact that no gap touches and that are finite, by recording."""
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """The tactile channels."""
+
+    @property
+    def layout(self) -> tuple[Mapping[str, str], ...]:
+        """Stream, taxel and axis of each channel."""
+
+    @property
+    def names(self) -> Collection[str]:
+        """The names of all recordings."""
+
+    def each(self, names: Collection[str]) -> Iterator[Floats]:
+        """Yield the rows (row, frames * channel) of some recordings, in the order of their names and of time, in pieces."""
+
+
 @dataclass(frozen=True)
 class TrainingRows:
-    """What codecs read of rows in contact that no gap touches and that are finite, by recording."""
+    """The rows of all recordings, in memory."""
 
     channels: tuple[str, ...]
     layout: tuple[Mapping[str, str], ...]
     inputs: Mapping[str, Floats]  # (row, frames * channel), in counts, newest frame last
 
     @property
-    def held_out(self) -> frozenset[str]:
-        """The recordings to measure a codec on: always the same ones of the same recordings, so that errors compare.
+    def names(self) -> Collection[str]:
+        """The names of all recordings."""
+        return self.inputs.keys()
 
-        At least one, and none where there is one recording alone.
-        """
-        count = len(self.inputs)
-        if count < 2:
-            return frozenset()
-        scheme = splits.Scheme(val=max(HELD_OUT, 1 / count), test=0.0)
-        roles = splits.assign({name: {} for name in self.inputs}, scheme)
-        return frozenset(name for (name, _), role in roles.items() if role == "val")
+    @property
+    def held_out(self) -> frozenset[str]:
+        """The recordings to measure a codec on, as `held_out` chooses them."""
+        return held_out(self.names)
 
     @property
     def parts(self) -> tuple[Floats, Floats]:
@@ -54,59 +69,114 @@ class TrainingRows:
     def of(self, names: Collection[str]) -> Floats:
         """Return the rows (row, frames * channel) of some recordings, in the order of their names."""
         width = max(rows.shape[1] for rows in self.inputs.values())
-        return np.concatenate([np.zeros((0, width)), *(self.inputs[name] for name in sorted(names))])
+        return np.concatenate([np.zeros((0, width)), *self.each(names)])
+
+    def each(self, names: Collection[str]) -> Iterator[Floats]:
+        """Yield the rows of each of some recordings, in the order of their names."""
+        return (self.inputs[name] for name in sorted(names))
 
 
-def read(shards: Mapping[str, Recording], representation: str, frames: int = 1) -> TrainingRows:
+@dataclass(frozen=True)
+class StoredRows:
+    """The rows of all recordings, which are read each time that they are asked for: a piece of one is in memory."""
+
+    channels: tuple[str, ...]
+    layout: tuple[Mapping[str, str], ...]
+    recordings: Mapping[str, Recording]
+    representation: str
+    frames: int = 1
+
+    @property
+    def names(self) -> Collection[str]:
+        """The names of all recordings."""
+        return self.recordings.keys()
+
+    def each(self, names: Collection[str]) -> Iterator[Floats]:
+        """Yield the rows of some recordings, in the order of their names and of time, in pieces.
+
+        Raises `TacpipeError` naming the recording whose channels are others.
+        """
+        for name in sorted(names):
+            try:
+                yield from self._pieces(self.recordings[name].columns())
+            except TacpipeError as error:
+                raise TacpipeError(f"{name}: {error}") from error
+
+    def read(self) -> TrainingRows:
+        """Return the rows of all recordings. Warns of channels that never move while others do."""
+        inputs = {name: np.concatenate([self._none, *self.each([name])]) for name in sorted(self.names)}
+        rows = TrainingRows(self.channels, self.layout, inputs)
+        newest = rows.of(rows.names)[:, -len(self.channels) :]
+        if len(newest) > 1:
+            warn_of_still(standard.still(newest, self.channels), len(self.channels))
+        return rows
+
+    @property
+    def _none(self) -> Floats:
+        return np.zeros((0, self.frames * len(self.channels)))
+
+    def _pieces(self, stored: Columns) -> Iterator[Floats]:
+        """Yield the rows of a recording that a codec may be fitted on."""
+        check_channels(self.channels, tactile.columns(stored.schema, "tactile"))
+        begins, gaps = frame_stacking.breaks(tactile.times(stored)), tactile.gaps(stored)
+        in_contact = np.ones(len(begins), dtype=bool)
+        if "contact" in stored.column_names:
+            in_contact = stored.column("contact").to_numpy() >= 0
+        stored.forget()
+        stacking, row = frame_stacking.Stacking(self.representation, self.frames), 0
+        for table in stored.batches(self.channels):
+            now = slice(row, row + table.num_rows)
+            counts = tactile.above_rest(table, self.channels)
+            counts[gaps[now]] = np.nan  # what is made of such a row is not finite either
+            made = stacking.next(counts, begins[now])
+            yield made[np.isfinite(made).all(axis=1) & in_contact[now]]
+            row += table.num_rows
+
+
+def held_out(names: Collection[str]) -> frozenset[str]:
+    """Return the recordings to measure a codec on: always the same ones of the same recordings, so that errors compare.
+
+    At least one, and none where there is one recording alone.
+    """
+    if len(names) < 2:
+        return frozenset()
+    scheme = splits.Scheme(val=max(HELD_OUT, 1 / len(names)), test=0.0)
+    roles = splits.assign({name: {} for name in names}, scheme)
+    return frozenset(name for (name, _), role in roles.items() if role == "val")
+
+
+def stored(recordings: Mapping[str, Recording], representation: str, frames: int = 1) -> StoredRows:
     """Return the rows of recordings that a codec of a ``representation`` and some ``frames`` is fitted on.
 
-    A row counts where it lies in contact and all frames that it is made of are finite and outside of gaps. Warns of
-    channels that never move while others do. Raises `TacpipeError` where there is no recording or no tactile channel,
-    and naming the recording whose channels are others.
+    A row counts where it lies in contact and all frames that it is made of are finite and outside of gaps. Raises
+    `TacpipeError` where there is no recording or no tactile channel.
     """
     frame_stacking.check(representation)
-    if not shards:
+    if not recordings:
         raise TacpipeError("There is no training recording to fit a codec on. Make a split that has some.")
-    channels: tuple[str, ...] | None = None
-    layout: tuple[Mapping[str, str], ...] = ()
-    inputs: dict[str, Floats] = {}
-    for name, shard in sorted(shards.items()):
-        table = shard.table()
-        found = tactile.columns(table.schema, "tactile")
-        if channels is None:
-            channels, layout = found, tuple(tactile.layout(table.schema, found))
-        try:
-            check_channels(channels, found)
-            inputs[name] = _usable(table, channels, representation, frames)
-        except TacpipeError as error:
-            raise TacpipeError(f"{name}: {error}") from error
+    schema = recordings[min(recordings)].columns().schema
+    channels = tactile.columns(schema, "tactile")
     if not channels:
         raise TacpipeError("The recordings have no tactile channel (field metadata quantity=tactile) to compress.")
-    rows = TrainingRows(channels, layout, inputs)
-    _warn_of_still(rows)
-    return rows
+    return StoredRows(channels, tuple(tactile.layout(schema, channels)), recordings, representation, frames)
 
 
-def _usable(table: pa.Table, channels: tuple[str, ...], representation: str, frames: int) -> Floats:
-    """Return the rows (row, frames * channel) of a recording that a codec may be fitted on."""
-    counts = tactile.above_rest(table, channels)
-    counts[tactile.gaps(table)] = np.nan  # what is made of such a row is not finite either
-    made = frame_stacking.inputs(counts, frame_stacking.breaks(tactile.times(table)), representation, frames)
-    usable = np.isfinite(made).all(axis=1)
-    if "contact" in table.column_names:
-        usable &= table.column("contact").to_numpy() >= 0
-    return made[usable]
+def read(recordings: Mapping[str, Recording], representation: str, frames: int = 1) -> TrainingRows:
+    """Return the rows that `stored` returns, read: all are in memory.
+
+    Warns of channels that never move while others do. Raises `TacpipeError` as `stored`, and naming the recording whose
+    channels are others.
+    """
+    return stored(recordings, representation, frames).read()
 
 
-def _warn_of_still(rows: TrainingRows) -> None:
-    """Log the channels that have one value in all rows, unless all do."""
-    newest = rows.of(rows.inputs.keys())[:, -len(rows.channels) :]
-    names = standard.still(newest, rows.channels)
-    if len(newest) > 1 and 0 < len(names) < len(rows.channels):
+def warn_of_still(names: Sequence[str], channels: int) -> None:
+    """Log the names of channels, of so many, that have one value in all training rows, unless all do."""
+    if 0 < len(names) < channels:
         log.warning(
             "%d of %d tactile channels never move in the training recordings: %s. Their taxels may be dead; a codec "
             "gives them back as they were here.",
             len(names),
-            len(rows.channels),
+            channels,
             ", ".join(names),
         )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import pyarrow as pa
 
@@ -44,6 +44,10 @@ class Columns:
             self.forget()  # before the next block is decoded
             self._decoded = self._file.read(block)
         return self._decoded.column(name)
+
+    def batches(self, columns: Sequence[str] | None = None) -> Iterator[pa.Table]:
+        """Yield tables of some thousand rows each, in order, decoded as they are asked for; of ``columns`` alone."""
+        return self._file.batches(columns)
 
     def forget(self) -> None:
         """Let go of what was decoded last, unless it is the whole of a small stream."""

@@ -5,7 +5,8 @@ from __future__ import annotations
 import io
 import itertools
 import json
-from collections.abc import Iterator, Mapping, Sequence
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,8 +15,8 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from tacpipe.errors import DamagedError, ShortageError, TacpipeError
-from tacpipe.io import memory
-from tacpipe.io.parquet_claims import claimed
+from tacpipe.io import memory, row_groups
+from tacpipe.io.parquet_claims import claimed, counted
 from tacpipe.printable import plain
 
 ROW_GROUP_ROWS = 1 << 20
@@ -24,9 +25,9 @@ LARGE_BYTES = 1 << 25  # in memory
 BATCH_ROWS = 1024  # Arrow's own
 PAGE_BYTES = 1 << 20  # of encoded frames; a batch of 1024 of them could be beyond the 2 GiB that a page may have
 GROUP_BYTES = 1 << 28  # of encoded frames in a group of rows
-BESIDE_BYTES = 32  # that a frame may take in memory beside its own: offsets, whether it is there
 TRIED_BYTES = 1 << 20  # of encoded frames that are compressed to see whether it is worth it
 WORTH = 0.95  # of their size
+SOME_ROWS = 1 << 14  # that are decoded at once where rows are read some at a time
 ZSTD_LEVEL = 3
 ZSTD_LEVEL_HELD = 9  # long runs of equal values are worth the search
 _CLOCKS = ("t_ns", "t_device_ns", "seq")
@@ -55,18 +56,19 @@ def write(source: pa.Table | pa.RecordBatchReader, sink: Any) -> int:
     """Write a table, or batches as they come, to the file ``sink`` as Parquet; return how many rows there were.
 
     The same rows give the same bytes, as one table and in batches of any sizes: how columns are stored is decided from the
-    first group of rows. Of batches one group of rows is in memory.
+    first group of rows. Of batches one group of rows is put aside (`tacpipe.io.row_groups`), or is in memory where there
+    are encoded frames among the columns.
     """
-    rows = _Rows(source)
+    rows = row_groups.of(source, ROW_GROUP_ROWS, GROUP_BYTES)
     head = rows.head()
-    held = _held_share(head) > HELD_SHARE
+    held = _held_share(head, rows.release) > HELD_SHARE
     encoding, compression_level = {}, {}
     compression = dict.fromkeys(source.schema.names, "zstd")
     value_bytes = max(
-        [_mean_bytes(head.column(field.name)) for field in source.schema if _holds_bytes(field)], default=0
+        [_mean_bytes(head.column(field.name)) for field in source.schema if row_groups.holds_bytes(field)], default=0
     )
     for field in source.schema:
-        if _holds_bytes(field) and _compressed_already(head.column(field.name)):
+        if row_groups.holds_bytes(field) and _compressed_already(head.column(field.name)):
             compression[field.name] = "none"
         delta = pa.types.is_integer(field.type) and (field.name in _CLOCKS or not held)
         compression_level[field.name] = ZSTD_LEVEL if delta or not held else ZSTD_LEVEL_HELD
@@ -79,7 +81,7 @@ def write(source: pa.Table | pa.RecordBatchReader, sink: Any) -> int:
     bare = pa.schema([pa.field(field.name, field.type) for field in source.schema])
     del head
     with pq.ParquetWriter(
-        sink,
+        rows.releasing(sink),
         bare,
         use_dictionary=False,
         column_encoding=encoding,
@@ -96,57 +98,6 @@ def write(source: pa.Table | pa.RecordBatchReader, sink: Any) -> int:
             count += group.num_rows
         writer.add_key_value_metadata({_KEY: _fields_to_json(source.schema)})
     return count
-
-
-class _Rows:
-    """The rows of a table or of batches, taken group by group."""
-
-    def __init__(self, source: pa.Table | pa.RecordBatchReader) -> None:
-        self._next = source if isinstance(source, pa.Table) else source.schema.empty_table()
-        batches = () if isinstance(source, pa.Table) else source
-        self._more = (pa.Table.from_batches([batch]) for batch in batches if batch.num_rows)
-
-    def head(self) -> pa.Table:
-        """Return the rows by which it is decided how columns are stored; they stay to be taken."""
-        frames = [field.name for field in self._next.schema if _holds_bytes(field)]
-        if not frames:
-            self._fill(ROW_GROUP_ROWS)
-        while frames and self._next.num_rows < ROW_GROUP_ROWS and self._fill(self._next.num_rows + 1):
-            most = GROUP_BYTES + BESIDE_BYTES * self._next.num_rows
-            if any(self._next.column(name).nbytes > most for name in frames):
-                break
-        head = self._first(ROW_GROUP_ROWS)
-        for name in frames:
-            ends = np.cumsum(pc.binary_length(head.column(name)).fill_null(0).to_numpy(), dtype=np.int64)
-            head = head.slice(0, max(1, int(np.searchsorted(ends, GROUP_BYTES, side="right"))))
-        return head
-
-    def groups(self, rows: int) -> Iterator[pa.Table]:
-        """Yield tables of ``rows`` rows, a last one with the rest; an empty one where there is none at all."""
-        self._fill(rows)
-        while True:
-            yield self._first(rows)
-            self._next = self._next.slice(rows)
-            self._fill(rows)
-            if not self._next.num_rows:
-                return
-
-    def _first(self, rows: int) -> pa.Table:
-        return self._next.slice(
-            0, min(rows, self._next.num_rows)
-        )  # without columns a slice has as many as are asked for
-
-    def _fill(self, rows: int) -> bool:
-        """Have ``rows`` rows waiting, or all that are left; return whether there are so many."""
-        waiting, count = [self._next], int(self._next.num_rows)
-        for more in self._more if count < rows else ():
-            waiting.append(more)
-            count += more.num_rows
-            if count >= rows:
-                break
-        if len(waiting) > 1:
-            self._next = pa.concat_tables(waiting)
-        return count >= rows
 
 
 def from_parquet(content: bytes, columns: Sequence[str] | None = None) -> pa.Table:
@@ -192,8 +143,46 @@ class ParquetTable:
         except BROKEN as error:
             raise _unread(self._content.size, error) from error
 
+    def batches(self, columns: Sequence[str] | None = None, rows: int = SOME_ROWS) -> Iterator[pa.Table]:
+        """Yield tables of up to ``rows`` rows, decoded as they are asked for, with field metadata."""
+        try:
+            total, page, count = counted(self._file.schema, memoryview(self._content).cast("B"), columns)
+        except BROKEN as error:
+            raise _unread(self._content.size, error) from error
+        at_once = total * min(rows, self.num_rows) // max(1, self.num_rows)
+        memory.require(at_once + page * count, f"A Parquet file of {self._content.size} bytes", error=ShortageError)
+        wanted = list(columns) if columns is not None else None
+        file = pq.ParquetFile(pa.BufferReader(self._content), pre_buffer=False)
+        try:
+            for batch in file.iter_batches(rows, columns=wanted, use_threads=False):
+                table = pa.Table.from_batches([batch])
+                yield table if self._fields is None else table.cast(self._with_fields(table.schema))
+        except BROKEN as error:
+            raise _unread(self._content.size, error) from error
+
     def _with_fields(self, schema: pa.Schema) -> pa.Schema:
         return schema if self._fields is None else _with_fields(schema, self._file.schema_arrow.names, self._fields)
+
+
+def stored_batches(path: str, rows: int = SOME_ROWS) -> pa.RecordBatchReader:
+    """Return the rows of a Parquet file on disk as batches of up to ``rows`` rows, decoded as they are asked for.
+
+    It is for files that this program wrote: what they declare is not checked first. Raises `DamagedError` as
+    `from_parquet` does, also while batches are taken.
+    """
+    size = os.stat(path).st_size  # noqa: PTH116
+
+    def taken() -> Iterator[pa.RecordBatch]:
+        try:
+            yield from file.iter_batches(rows, use_threads=False)
+        except BROKEN as error:
+            raise _unread(size, error) from error
+
+    try:
+        file = pq.ParquetFile(path, buffer_size=1 << 16, pre_buffer=False)
+        return pa.RecordBatchReader.from_batches(file.schema_arrow, taken())
+    except BROKEN as error:
+        raise _unread(size, error) from error
 
 
 def owned(*pieces: bytes | memoryview) -> pa.Buffer:
@@ -214,10 +203,6 @@ def _unread(size: int, error: Exception) -> TacpipeError:
     if memory.scarce() and (short := memory.shortage(error)) is not None:
         return short
     return DamagedError(f"These {size} bytes are no Parquet file: {plain(' '.join(str(error).split()), 200)}.")
-
-
-def _holds_bytes(field: pa.Field) -> bool:
-    return bool(pa.types.is_binary(field.type) or pa.types.is_large_binary(field.type))
 
 
 def _uncut(group: pa.Table) -> pa.Table:
@@ -246,18 +231,23 @@ def _compressed_already(column: pa.ChunkedArray) -> bool:
     return len(content) > 0 and len(pa.Codec("zstd", 1).compress(bytes(content), asbytes=True)) > WORTH * len(content)
 
 
-def _held_share(table: pa.Table) -> float:
-    """Return the fraction of rows whose integer channels all equal those of the row before."""
+def _held_share(table: pa.Table, release: Callable[[], None]) -> float:
+    """Return the fraction of rows whose integer channels all equal those of the row before.
+
+    What was read of a channel is let go of before the next one.
+    """
     channels = [
-        column.to_numpy()
+        column
         for name, column in zip(table.column_names, table.columns, strict=True)
         if pa.types.is_integer(column.type) and name not in _CLOCKS and not column.null_count
     ]
     if not channels or table.num_rows < 2:
         return 0.0
     same = np.ones(table.num_rows - 1, dtype=bool)  # (time,)
-    for channel in channels:
+    for column in channels:
+        channel = column.to_numpy()
         same &= channel[1:] == channel[:-1]
+        release()
     return float(same.mean())
 
 

@@ -40,6 +40,17 @@ class Page(NamedTuple):
 def claimed(schema: ParquetSchema, content: bytes | memoryview, columns: Collection[str] | None = None) -> int:
     """Return how many bytes the ``columns`` of a file (None: all) are in memory by what they declare, at least.
 
+    Raises `ValueError` as `counted` does.
+    """
+    total, largest, _ = counted(schema, content, columns)
+    return total + largest
+
+
+def counted(
+    schema: ParquetSchema, content: bytes | memoryview, columns: Collection[str] | None = None
+) -> tuple[int, int, int]:
+    """Return how many bytes all values of ``columns`` are, how many the largest page is, and how many columns there are.
+
     The footer is read here, because pyarrow's own look at it ends the process where its parts contradict one another.
     Raises `ValueError` where a column states another number of values than its pages, or of pages that are not there.
     """
@@ -62,7 +73,7 @@ def claimed(schema: ParquetSchema, content: bytes | memoryview, columns: Collect
             largest = max(largest, *(page.unpacked for page in pages), 0)
     if told.get(3) != rows:
         raise ValueError(f"it declares {told.get(3)} rows, and its groups of {rows}")
-    return total + largest
+    return total, largest, len(leaves)
 
 
 def _leaves(schema: ParquetSchema, columns: Collection[str] | None) -> Iterator[tuple[int, str, int]]:

@@ -31,11 +31,18 @@ class Piece:
 class Spill:
     """A temporary file of tables without a name, which is gone with this object or with the process."""
 
-    def __init__(self) -> None:
-        self._file = tempfile.SpooledTemporaryFile(IN_MEMORY)  # noqa: SIM115  (closed by the line below)
+    def __init__(self, in_memory: int | None = None) -> None:
+        """Take how many bytes stay in memory, before a file is made of them; `IN_MEMORY` by default."""
+        self._most = IN_MEMORY if in_memory is None else in_memory
+        self._file = tempfile.SpooledTemporaryFile(self._most)  # noqa: SIM115  (closed by the line below)
         weakref.finalize(self, self._file.close)
         self._lock = threading.Lock()  # streams of one file may be read by threads
         self._end = 0
+
+    @property
+    def in_memory(self) -> bool:
+        """Whether all that was put aside is in memory still."""
+        return self._end <= self._most
 
     def add(self, table: pa.Table, orders: Sequence[str] = ()) -> Piece:
         """Put a table aside; ``orders`` are columns of numbers without nulls.
@@ -68,6 +75,26 @@ class Spill:
             self._file.seek(piece.start)
             content = self._file.read(piece.size)
         return pa.ipc.open_stream(owned(content)).read_all()
+
+
+class Gathered:
+    """One table, put together of tables of the same columns that come one after another and are put aside meanwhile."""
+
+    def __init__(self, spill: Spill, empty: pa.Table) -> None:
+        """Take where the tables are put aside, and one without rows."""
+        self._spill, self._schema = spill, empty.schema
+        self._pieces: list[Piece] = []
+
+    def add(self, table: pa.Table) -> None:
+        """Add rows. Raises `StorageError` where the disk is full."""
+        self._pieces.append(self._spill.add(table.combine_chunks()))
+
+    def rows(self) -> pa.Table | pa.RecordBatchReader:
+        """Return all rows: as a table while all that is put aside is in memory, else as batches that are read back."""
+        if self._spill.in_memory:
+            return pa.concat_tables([self._schema.empty_table(), *map(self._spill.read, self._pieces)]).combine_chunks()
+        batches = (batch for piece in self._pieces for batch in self._spill.read(piece).to_batches())
+        return pa.RecordBatchReader.from_batches(self._schema, batches)
 
 
 def sorted_by(table: pa.Table, order: str) -> pa.Table:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
+import shutil
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -26,8 +28,6 @@ from tacpipe.store.store import Object, Store
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from tacpipe.io.parquet import ParquetTable
-
 VERSION = 1
 BYTES = "bytes"  # and under this one its spool, where a driver could not read all of it
 RIG = "rig.toml"  # under this name the rig file goes along with a recording
@@ -44,18 +44,20 @@ def append(store: Store, output: Path, spooled: Spooled, rig: Rig, sealed: Mappi
     gave anything (`TacpipeError` if they gave no sample), and `DamagedError` if what was written is not what is read.
     """
     began_s = time.perf_counter()
-    tables = {name: one.table for name, one in sealed.items() if one.table.num_rows}
-    if not tables:
+    streams = {name: one.batches for name, one in sealed.items() if one.rows}
+    if not streams:
         _refuse(spooled, sealed)
     events = events_table(sealed, spooled)
     if events.num_rows:
-        tables[EVENTS] = events
-    shards = {name: _shard(store, name, table) for name, table in sorted(tables.items())}
+        streams[EVENTS] = events.to_reader
+    shards = {name: _shard(store, name, batches) for name, batches in sorted(streams.items())}
     text = vars(store.put(rig.text.encode(), durable=True))
     entry: Entry = {"attributes": _attributes(spooled, rig, sealed), "shards": shards}
     files = {RIG: text}
     if any(one.undecoded for one in sealed.values()):  # what no driver could read today, a better one may
-        files[BYTES] = vars(store.put((spooled.folder / "bytes").read_bytes(), durable=True))
+        with (spooled.folder / "bytes").open("rb") as spool:
+            copied = functools.partial(shutil.copyfileobj, spool)
+            files[BYTES] = vars(store.put_written(copied, durable=True))
     result = {"recordings": {"": entry}, "files": files}
     identity = keys.identity(ACQUIRE, VERSION, {"rig": text["digest"]}, {"spool": spooled.folder.name})
     made = {**provenance.of(round(time.perf_counter() - began_s, 4)), "irreplaceable": True}
@@ -152,40 +154,49 @@ def _free(wanted: str, taken: Mapping[str, Any]) -> str:
     return name
 
 
-def _shard(store: Store, stream: str, table: pa.Table) -> dict[str, Any]:
-    from tacpipe.io import parquet
+def _shard(store: Store, stream: str, batches: Callable[[], pa.RecordBatchReader]) -> dict[str, Any]:
+    from tacpipe.io import columns, parquet
 
-    stored: Object = store.put_written(lambda file: parquet.write(table, file), durable=True)
-    if not _same(parquet.ParquetTable(_read(store, stored)), table):
+    rows: list[int] = []
+    stored: Object = store.put_written(lambda file: rows.append(parquet.write(batches(), file)), durable=True)
+    columns.release()
+    for _ in store.blocks(stored.digest, stored.bytes):
+        pass  # each is read back, and all are hashed
+    if not _same(parquet.stored_batches(store.object_path(stored.digest)), batches()):
         raise DamagedError(f"Stream {stream} does not read as it was written: the disk is not to be trusted.")
-    return {"digest": stored.digest, "rows": table.num_rows, "bytes": stored.bytes}
+    return {"digest": stored.digest, "rows": rows[0], "bytes": stored.bytes}
 
 
-def _read(store: Store, stored: Object) -> pa.Buffer:
-    """Return what the store holds of a shard, verified, once in memory."""
+def _same(stored: pa.RecordBatchReader, written: pa.RecordBatchReader) -> bool:
+    """Return whether a shard holds the rows of batches to the bit, NaN equal to itself; some rows at a time."""
     import pyarrow as pa
 
-    content = pa.allocate_buffer(stored.bytes)
-    with pa.FixedSizeBufferWriter(content) as sink:
-        for block in store.blocks(stored.digest, stored.bytes):
-            sink.write(block)
-    return content
-
-
-def _same(stored: ParquetTable, written: pa.Table) -> bool:
-    """Return whether a shard holds a table to the bit, NaN equal to itself; a column at a time, to save memory."""
-    import pyarrow as pa
-
-    for kind in written.schema:
-        read = stored.read([kind.name])
-        if not read.schema.equals(pa.schema([kind])):
+    if not stored.schema.equals(written.schema):
+        return False
+    waiting: list[pa.RecordBatch] = []  # of the shard
+    for batch in written:
+        count = batch.num_rows
+        while sum(one.num_rows for one in waiting) < count:
+            more = next(stored, None)
+            if more is None:
+                return False
+            waiting.append(more)
+        there = pa.Table.from_batches(waiting)
+        if not _equal(there.slice(0, count), pa.Table.from_batches([batch])):
             return False
-        ours, theirs = read.column(0), written.column(kind.name)
+        waiting = [one for one in there.slice(count).to_batches() if one.num_rows]
+    return not waiting and next(stored, None) is None
+
+
+def _equal(ours: pa.Table, theirs: pa.Table) -> bool:
+    import pyarrow as pa
+
+    for kind, *columns in zip(theirs.schema, ours.columns, theirs.columns, strict=True):
         if pa.types.is_floating(kind.type):
-            one, other = (column.to_numpy().view(f"u{kind.type.bit_width // 8}") for column in (ours, theirs))
+            one, other = (column.to_numpy().view(f"u{kind.type.bit_width // 8}") for column in columns)
             if not np.array_equal(one, other):
                 return False
-        elif not ours.equals(theirs):
+        elif not columns[0].equals(columns[1]):
             return False
     return True
 
@@ -200,7 +211,7 @@ def _attributes(spooled: Spooled, rig: Rig, sealed: Mapping[str, Sealed]) -> dic
         attributes["requested_duration_s"] = float(spooled.header["duration_s"])
     for name, one in sealed.items():
         attributes[f"{name}_lost"] = one.lost
-        if not one.table.num_rows:
+        if not one.rows:
             attributes[f"{name}_missing"] = True
         if one.undecoded:
             attributes[f"{name}_undecoded_bytes"] = one.undecoded

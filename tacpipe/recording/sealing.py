@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tacpipe.arrays import AnyArray, Int64s, Times
+from tacpipe.arrays import Int64s, Times
 from tacpipe.errors import TacpipeError
+from tacpipe.recording.decoded import UNCERTAIN as UNCERTAIN
+from tacpipe.recording.decoded import Decoded, Stamping
 from tacpipe.recording.ending import COMPLETED
 from tacpipe.recording.pace import MOST_CATCH_UP_NS, parsed
 from tacpipe.recording.reading import SILENT, SILENT_PERIODS, Batch, Event, Reading
@@ -23,18 +25,22 @@ from tacpipe.sensors.sensor import Sensor
 if TYPE_CHECKING:
     import pyarrow as pa
 
+    from tacpipe.io.spill import Spill
+
 END_S = 0.5  # by which a stream may end before the others without a word
 UNDECODED = "undecoded"  # bytes at which the driver gave up
 CRASH = "crash"  # what a process had read and not yet written when it ended
-UNCERTAIN = "t_uncertain_ns"  # column, only where this program was held up
+IN_MEMORY = 1 << 24  # bytes of decoded samples, before they are put aside on disk
 MOST_BYTES = 2 << 20  # of a stream's chunks that are decoded in one go
 
 
 @dataclass(frozen=True)
 class Sealed:
-    """One stream of a spool as a table, and what became of the rest of its bytes."""
+    """One stream of a spool, and what became of the rest of its bytes."""
 
-    table: pa.Table
+    rows: int
+    batches: Callable[[], pa.RecordBatchReader]  # the samples, some at a time
+    span_ns: tuple[int, int] | None  # stamps of the first sample and of the last one, where there are any
     events: list[Event]
     lost: int  # frames, by counter where there is one
     received: int = 0  # bytes
@@ -42,55 +48,10 @@ class Sealed:
     crashed: tuple[int, int] = (0, 0)  # chunks and bytes that were read and never spooled
     uncertain: int = 0  # samples that had waited while this program was held up
 
-
-class _Column:
-    """Values (sample,) that grow in place: pieces that are joined in the end would be in memory twice."""
-
-    def __init__(self) -> None:
-        self._values: AnyArray = np.zeros(0)
-        self._count = 0
-
-    def add(self, values: AnyArray) -> None:
-        stop = self._count + len(values)
-        kind = np.result_type(self._values, values) if self._count else values.dtype
-        if kind != self._values.dtype:
-            self._values = self._values.astype(kind)
-        if stop > len(self._values):
-            self._values.resize(stop + stop // 4, refcheck=False)
-        self._values[self._count : stop] = values
-        self._count = stop
-
-    def taken(self, kind: pa.DataType) -> pa.Array:
-        """Return the values, which are here no longer."""
-        import pyarrow as pa
-
-        values, self._values = self._values, np.zeros(0)
-        values.resize(self._count, refcheck=False)
-        return pa.array(values if self._count else [], kind)
-
-
-class _Parts:
-    """What was decoded of a stream so far: its channels one by one, as the table will hold them, and all else in batches."""
-
-    def __init__(self, fields: Sequence[pa.Field]) -> None:
-        self.fields = fields
-        self.batches: list[Batch] = []  # without their values
-        self.events: list[Event] = []
-        self._columns = [_Column() for _ in fields]
-
-    def add(self, batch: Batch) -> None:
-        self.events += batch.events
-        if not len(batch):
-            return
-        channels = [block[:, number] for block in batch.values for number in range(block.shape[1])]
-        for column, values in zip(self._columns, channels, strict=True):
-            column.add(values)
-        self.batches.append(replace(batch, values=()))
-
-    def channels(self) -> Iterator[pa.Array]:
-        """Yield the values of each channel (sample,), which are here no longer: a recording of hours is large."""
-        for kind, column in zip(self.fields, self._columns, strict=True):
-            yield column.taken(kind.type)
+    @property
+    def table(self) -> pa.Table:
+        """All samples at once."""
+        return self.batches().read_all()
 
 
 class _Stalls:
@@ -118,6 +79,10 @@ class _Stalls:
         facts += [f"what came meanwhile is stamped up to {stall.late_ns / 1e9:.3f} s late"] if stall.late_ns else []
         return Event(note.t_ns, STALLED, detail="; ".join(facts))
 
+    def __bool__(self) -> bool:
+        """Whether any stamp may be late."""
+        return bool(self._windows)
+
     def uncertain_ns(self, t_ns: Times) -> Int64s:
         """Return by how much samples may have come earlier than these stamps (sample,); 0 where they are certain."""
         found = np.zeros_like(t_ns)
@@ -133,52 +98,73 @@ class _Stalls:
 
 def seal(spooled: Spooled, rig: Rig) -> dict[str, Sealed]:
     """Return every stream of a spool."""
+    from tacpipe.io.spill import Spill
+
     end_ns = max((one.last_ns for one in spooled.tallied().values()), default=0)
-    return {name: stream(spooled, rig, name, end_ns) for name in spooled.streams}
+    spill = Spill(IN_MEMORY)
+    return {name: stream(spooled, rig, name, end_ns, spill) for name in spooled.streams}
 
 
-def stream(spooled: Spooled, rig: Rig, name: str, end_ns: int = 0) -> Sealed:
+def stream(spooled: Spooled, rig: Rig, name: str, end_ns: int = 0, spill: Spill | None = None) -> Sealed:
     """Return one stream of a spool: ``t_ns`` in UTC, the device's time and counters next to it, and the channels.
 
-    ``end_ns`` is when the last byte of any stream came: one that fell silent long before states it.
+    ``end_ns`` is when the last byte of any stream came: one that fell silent long before states it. Samples are put aside
+    in ``spill``, or in one of its own, for as long as they are asked for.
     """
+    from tacpipe.io.spill import Spill
+
     sensor = rig.streams[name].sensor
-    reading, parts, stalls = Reading(sensor), _Parts(sensor.fields()), _Stalls()
+    reading, stalls = Reading(sensor), _Stalls()
+    decoded, events = Decoded(sensor.fields(), spill or Spill(IN_MEMORY)), list[Event]()
+
+    def add(batch: Batch) -> None:
+        events.extend(batch.events)
+        decoded.add(batch)
+
     chunks = size = undecoded = 0
     away = False
     for block in _gathered(spooled, name):
         if isinstance(block, Note):
             away |= block.what == LOST
             if block.what == LOST:
-                parts.add(reading.broken())
+                add(reading.broken())
             if block.what in (STALLED, CAUGHT_UP):
                 stall = stalls.take(block)
-                parts.events += [] if stall is None else [stall]
+                events += [] if stall is None else [stall]
             elif block.what != OPENED or away:  # that it opened before it was recorded is not an event
-                parts.events.append(_event_of(block, sensor))
+                events.append(_event_of(block, sensor))
             continue
         chunks += len(block.size)
         size += len(block.data)
         try:
-            parts.add(reading.feed(block))
+            add(reading.feed(block))
         except Exception as error:  # of a driver: the other streams, and what came before and after, are sealed
             undecoded += len(block.data)
             why = str(error) if isinstance(error, TacpipeError) else f"{type(error).__name__}: {error}"
-            parts.events.append(Event(int(block.t_ns[-1]), UNDECODED, bytes=len(block.data), detail=why))
+            events.append(Event(int(block.t_ns[-1]), UNDECODED, bytes=len(block.data), detail=why))
             reading = Reading(sensor)
-    parts.add(reading.finish())
-    parts.events += _silent_end(sensor, parts.batches, end_ns)
+        decoded.put_aside()
+    add(reading.finish())
+    last_ns = decoded.last_ns if decoded.count else end_ns
+    events += _silent_end(sensor, last_ns, end_ns)
     crashed = _crashed(spooled, name, chunks, size)
     if crashed[0]:
         last_ns, detail = spooled.tallied()[name].last_ns, f"{crashed[0]} reads were never written"
-        parts.events.append(Event(last_ns, CRASH, bytes=crashed[1], detail=detail))
-    events = [event._replace(t_ns=spooled.utc_ns(stalls.awake_ns(event.t_ns))) for event in parts.events]
-    lost = sum(event.frames for event in events)
-    t_ns = _joined([batch.t_ns for batch in parts.batches], np.int64)
-    uncertain_ns = stalls.uncertain_ns(t_ns)
-    made = _table(parts, spooled.utc_ns(stalls.awake_ns(t_ns)), uncertain_ns)
-    late = int(np.count_nonzero(uncertain_ns))
-    return Sealed(made, events, lost, received=size, undecoded=undecoded, crashed=crashed, uncertain=late)
+        events.append(Event(last_ns, CRASH, bytes=crashed[1], detail=detail))
+    stamping = Stamping(lambda t_ns: spooled.utc_ns(stalls.awake_ns(t_ns)), stalls.uncertain_ns)
+    events = [event._replace(t_ns=stamping.utc_ns(event.t_ns)) for event in events]
+    late = decoded.uncertain(stamping) if stalls else 0
+    return Sealed(
+        decoded.count,
+        lambda: decoded.batches(stamping, uncertain=late > 0),
+        (stamping.utc_ns(decoded.first_ns), stamping.utc_ns(decoded.last_ns)) if decoded.count else None,
+        events,
+        sum(event.frames for event in events),
+        received=size,
+        undecoded=undecoded,
+        crashed=crashed,
+        uncertain=late,
+    )
 
 
 def _crashed(spooled: Spooled, name: str, chunks: int, size: int) -> tuple[int, int]:
@@ -193,9 +179,8 @@ def _event_of(note: Note, sensor: Sensor) -> Event:
     return Event(note.t_ns, note.what, dropped, detail=note.detail)
 
 
-def _silent_end(sensor: Sensor, batches: Sequence[Batch], end_ns: int) -> list[Event]:
+def _silent_end(sensor: Sensor, last_ns: int, end_ns: int) -> list[Event]:
     """Return the event of a stream that gave nothing any more well before the end; no counter reports on that."""
-    last_ns = int(batches[-1].t_ns[-1]) if batches else end_ns
     apart_s = (end_ns - last_ns) / 1e9
     if not sensor.awaited or apart_s < max(END_S, SILENT_PERIODS / sensor.rate_hz):
         return []
@@ -221,36 +206,12 @@ def _gathered(spooled: Spooled, name: str) -> Iterator[Chunks | Note]:
         yield Chunks.joined(waiting)
 
 
-def _table(parts: _Parts, t_ns: Times, uncertain_ns: Times) -> pa.Table:
-    """Return the table of a stream with these stamps (sample,), and how uncertain they are where any is."""
-    import pyarrow as pa
-
-    from tacpipe.channels import schema
-
-    columns: list[tuple[pa.Field, Any]] = []
-    columns.append((schema.time_field(), t_ns))
-    if uncertain_ns.any():
-        kind = pa.field(UNCERTAIN, pa.int64(), metadata={"unit": "ns", "quantity": "time"})
-        columns.append((kind, uncertain_ns))
-    batches = parts.batches
-    if batches:
-        first = batches[0]
-        kinds = schema.device_fields(clock=first.t_device_ns is not None, counters=first.counters)
-        columns += [(kind, _joined([getattr(batch, kind.name) for batch in batches], np.int64)) for kind in kinds]
-    arrays = [*(pa.array(values, kind.type) for kind, values in columns), *parts.channels()]
-    return pa.Table.from_arrays(arrays, schema=pa.schema([*(kind for kind, _ in columns), *parts.fields]))
-
-
-def _joined(parts: Sequence[Any], kind: Any) -> AnyArray:
-    return np.concatenate(parts) if parts else np.zeros(0, dtype=kind)
-
-
 def _cut_off(sealed: Mapping[str, Sealed], spooled: Spooled) -> list[tuple[Event, str]]:
     """Return the event of a recording that was not completed, with how much of it there is; nothing for one that was."""
-    stamps = [one.table.column("t_ns") for one in sealed.values() if one.table.num_rows]
-    if spooled.ended == COMPLETED or not stamps:
+    spans_ns = [one.span_ns for one in sealed.values() if one.span_ns is not None]
+    if spooled.ended == COMPLETED or not spans_ns:
         return []
-    first_ns, last_ns = min(times[0].as_py() for times in stamps), max(times[-1].as_py() for times in stamps)
+    first_ns, last_ns = min(first for first, _ in spans_ns), max(last for _, last in spans_ns)
     requested_s = spooled.header.get("duration_s")
     of = "no duration was requested" if requested_s is None else f"{requested_s:g} s were requested"
     return [(Event(last_ns, spooled.ended, detail=f"{(last_ns - first_ns) / 1e9:.1f} s are there; {of}"), "")]

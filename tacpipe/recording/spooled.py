@@ -25,7 +25,7 @@ from tacpipe.sensors.framing import Chunks
 from tacpipe.store import layout
 
 KEPT = layout.KEPT  # within the store
-PASSED_BYTES = 1 << 25  # whole pages
+PASSED_BYTES = 1 << 23  # whole pages
 HEADER_BYTES = 16 << 20  # at most
 
 

@@ -165,9 +165,9 @@ def _sealed(store: Store, output: Path, spooled: Spooled, rig: Rig) -> Recorded:
         name = appending.append(store, output, spooled, rig, sealed)
     kept = str(spooled.keep()) if spooled.header.get("keep") is True else ""
     spooled.remove()
-    rows = {stream: one.table.num_rows for stream, one in sealed.items()}
-    stamps = [one.table.column("t_ns") for one in sealed.values() if one.table.num_rows]
-    first, last = (min(times[0].as_py() for times in stamps), max(times[-1].as_py() for times in stamps))
+    rows = {stream: one.rows for stream, one in sealed.items()}
+    spans_ns = [one.span_ns for one in sealed.values() if one.span_ns is not None]
+    first, last = min(first for first, _ in spans_ns), max(last for _, last in spans_ns)
     lost = {stream: one.lost for stream, one in sealed.items()}
     return Recorded(name, (last - first) / 1e9, rows, lost, spooled.ended, kept)
 

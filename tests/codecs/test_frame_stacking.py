@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -32,6 +34,20 @@ def test_inputs_are_those_of_a_reader_that_walks_row_by_row(seed: int, of: str, 
     begins = rng.random(12) < 0.3
     begins[0] = True
     assert np.allclose(frame_stacking.inputs(values, begins, of, frames), by_hand(values, begins, of, frames))
+
+
+@given(st.integers(0, 2**16), st.sampled_from(["levels", "increments"]), st.integers(1, 3))
+@settings(max_examples=40, deadline=None)
+def test_rows_in_pieces_give_the_inputs_of_the_whole(seed: int, of: str, frames: int) -> None:
+    rng = np.random.default_rng(seed)
+    values = rng.normal(size=(12, 2))
+    values[rng.random((12, 2)) < 0.1] = np.nan
+    begins = rng.random(12) < 0.3
+    cuts = [0, *sorted(rng.integers(0, 13, 4).tolist()), 12]
+    stacking = frame_stacking.Stacking(of, frames)
+    pieces = [stacking.next(values[start:stop], begins[start:stop]) for start, stop in itertools.pairwise(cuts)]
+    whole = frame_stacking.inputs(values, begins, of, frames)
+    assert np.array_equal(np.concatenate(pieces), whole, equal_nan=True)
 
 
 def test_later_rows_change_nothing_before_them() -> None:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import functools
 import logging
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 
 from tacpipe.codecs import training_rows
 from tacpipe.codecs.training_rows import TrainingRows
+from tacpipe.io.parquet import ParquetTable
 from tests.fake_recordings import FakeShard
 from tests.stages.learning_fakes import CHANNELS, motion, table
 
@@ -82,3 +84,21 @@ def test_channels_that_move_in_one_of_the_recordings_are_no_cause_for_a_warning(
     still[:, 4] = 0.0
     read(FakeShard("a", table(still)), motion(0))
     assert caplog.text == ""
+
+
+@pytest.mark.parametrize("representation", ["levels", "increments"])
+@pytest.mark.parametrize("rows", [1, 7, 19, 400])
+def test_rows_that_are_read_in_pieces_are_those_of_the_whole_recording(
+    monkeypatch: pytest.MonkeyPatch, rows: int, representation: str
+) -> None:
+    values = counts()
+    values[7, 3] = np.nan
+    contact, gap = np.zeros(20), np.zeros(20, dtype=bool)
+    contact[:4], gap[12] = -1, True
+    shard = FakeShard("a", table(values, contact=contact, gap=gap))
+    whole = read(shard, representation=representation, frames=2).inputs["a"]
+    monkeypatch.setattr(ParquetTable, "batches", functools.partialmethod(ParquetTable.batches, rows=rows))
+    found = training_rows.stored({"a": shard}, representation, 2)  # type: ignore[dict-item]
+    pieces = list(found.each(["a"]))
+    assert len(pieces) == -(-20 // rows)
+    assert np.array_equal(np.concatenate(pieces), whole)

@@ -13,6 +13,7 @@ from tacpipe.arrays import Float32s, Int64s
 from tacpipe.codecs import codec as codecs
 from tacpipe.errors import TacpipeError
 from tacpipe.io import progress
+from tacpipe.io.spill import Gathered, Spill
 from tacpipe.metrics import headline
 from tacpipe.plugins.stage import RecordingOutput, Result
 from tacpipe.tasks.forward import metrics, situations, tracks, units
@@ -45,14 +46,15 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
     known, objects = set(forecaster.config["trained_on"].values()), set(forecaster.config["objects"])
     trials, kept = [], {}
     loads, bands = Loads(forecaster.codec.layout, forecaster.horizon), Bands(forecaster)
-    apart = BySituation(forecaster.horizon, len(forecaster.codec.channels))
+    apart, spill = BySituation(forecaster.horizon, len(forecaster.codec.channels)), Spill()
     with progress.bar("evaluate", len(recordings.recordings)) as advance:
         for name, shard in sorted(recordings.recordings.items()):
             track = tracks.track(shard, forecaster.codec, forecaster.pose)
             check_rate(track, forecaster)
             trial = Trial(name, shard.digest in known, track.object, track.object is None or track.object in objects)
             attributes = {**shard.attributes, "seen": trial.seen}
-            kept[name] = RecordingOutput(_predictions(forecaster, track, trial, loads, apart), attributes)
+            rows = _predictions(forecaster, track, trial, loads, apart, spill)
+            kept[name] = RecordingOutput(rows, attributes)
             trials.append(trial)
             bands.add(track, trial)
             del track
@@ -80,18 +82,20 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
     return Result(kept, files)
 
 
-def _predictions(forecaster: Forecaster, track: Track, trial: Trial, loads: Loads, apart: BySituation) -> pa.Table:
-    """Return the predictions for all windows of a recording; its errors are added to ``trial``.
+def _predictions(
+    forecaster: Forecaster, track: Track, trial: Trial, loads: Loads, apart: BySituation, spill: Spill
+) -> pa.Table | pa.RecordBatchReader:
+    """Return the predictions for all windows of a recording, put aside in ``spill``; its errors are added to ``trial``.
 
     Where the model has not seen it, its loads are added to ``loads`` and its errors by situation
     to ``apart``. Some windows are in memory at a time, and of each one of the predictors.
     """
     starts = track.starts(forecaster.context, forecaster.horizon)
     steps = [step for step in STORED_STEPS if step <= forecaster.horizon]
-    stored = np.empty((len(steps), len(forecaster.codec.latents), len(starts)), np.float32)
+    none = np.zeros((len(steps), len(forecaster.codec.latents), 0), np.float32)
+    gathered = Gathered(spill, _prediction_table(forecaster, track, starts[:0], steps, none))
     if not trial.seen:
         loads.begin(track)
-    begins = 0
     for some in predicted(forecaster, track, starts):
         trial.windows += len(some.now)
         doing = situations.of_windows(track, some.now, forecaster.horizon)
@@ -102,28 +106,27 @@ def _predictions(forecaster: Forecaster, track: Track, trial: Trial, loads: Load
             if not trial.seen:
                 loads.add_one(name, some.now, prediction)
                 apart.add(trial.name, doing, name, prediction, some.truth)
-        ends = begins + len(some.now)
-        stored[..., begins:ends] = some.features[:, [step - 1 for step in steps]].transpose(1, 2, 0)
-        begins = ends
-        del some  # before the next one is made
-    return _prediction_table(forecaster, track, starts, steps, stored)
+        stored = some.features[:, [step - 1 for step in steps]].transpose(1, 2, 0).astype(np.float32)
+        gathered.add(_prediction_table(forecaster, track, some.now, steps, np.ascontiguousarray(stored)))
+        del some, stored  # before the next ones are made
+    return gathered.rows()
 
 
 def _prediction_table(
-    forecaster: Forecaster, track: Track, starts: Int64s, steps: Sequence[int], stored: Float32s
+    forecaster: Forecaster, track: Track, now: Int64s, steps: Sequence[int], stored: Float32s
 ) -> pa.Table:
     """Return one row a window: the time at which its prediction is available, the features then and those predicted.
 
-    ``stored`` (step, feature, window) becomes the columns without a copy.
+    ``now`` (window,) are the last rows that are read; ``stored`` (step, feature, window) becomes the columns without a copy.
     """
-    now = starts + forecaster.context - 1
     columns = [track.t_ns[now], track.contact[now].astype(np.int32)]
+    latent = track.latent[now]
     fields = [
         pa.field("t_ns", pa.int64(), metadata={"quantity": "time", "unit": "ns"}),
         pa.field("contact", pa.int32(), metadata={"quantity": "label"}),
     ]
     for index, name in enumerate(forecaster.codec.latents):
-        columns += [track.latent[now, index], *stored[:, index]]
+        columns += [latent[:, index], *stored[:, index]]
         for step in (0, *steps):
             about = {"quantity": "latent", "step": str(step)}
             fields.append(pa.field(f"{name}_t{step}" if step else name, pa.float32(), metadata=about))

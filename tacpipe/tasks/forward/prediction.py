@@ -10,6 +10,7 @@ import pyarrow as pa
 
 from tacpipe.arrays import Float32s, Times
 from tacpipe.errors import TacpipeError
+from tacpipe.io.spill import Gathered, Spill
 from tacpipe.models.windows import ARM, POSE
 from tacpipe.plugins.stage import RecordingOutput, Result
 from tacpipe.tasks.forward import tracks, units
@@ -33,14 +34,22 @@ def predict(
     Raises `TacpipeError` for a step that the model does not reach, for quantiles that it does not have, and where the
     recordings are not what it reads.
     """
-    found = tables(Forecaster.load(model), recordings, steps, quantiles)
-    return Result({name: RecordingOutput(table) for name, table in found.items()})
+    found = _gathered(Forecaster.load(model), recordings, steps, quantiles)
+    return Result({name: RecordingOutput(one.rows()) for name, one in found.items()})
 
 
 def tables(
     forecaster: Forecaster, recordings: Dataset, steps: Sequence[int], quantiles: Sequence[int] = ()
 ) -> dict[str, pa.Table]:
     """Return the table of each recording's predictions; steps and errors are those of `predict`."""
+    rows = {name: one.rows() for name, one in _gathered(forecaster, recordings, steps, quantiles).items()}
+    return {name: one if isinstance(one, pa.Table) else one.read_all() for name, one in rows.items()}
+
+
+def _gathered(
+    forecaster: Forecaster, recordings: Dataset, steps: Sequence[int], quantiles: Sequence[int]
+) -> dict[str, Gathered]:
+    """Return the predictions of each recording, put aside some windows at a time."""
     for step in steps:
         if not 1 <= step <= forecaster.horizon:
             raise TacpipeError(
@@ -48,25 +57,27 @@ def tables(
             )
     levels = forecaster.quantiles_of(quantiles)[1] if quantiles else []
     check_codec(forecaster.codec_files, recordings.files)
-    found = {}
+    wanted, channels = [step - 1 for step in steps], len(forecaster.codec.channels)
+    spill, found = Spill(), {}
+    none = np.zeros((len(steps), channels, 0), np.float32)
+    empty = prediction_table(forecaster, np.zeros(0, np.int64), none, steps, dict.fromkeys(quantiles, none))
     for name, shard in sorted(recordings.recordings.items()):
         track = tracks.track(shard, forecaster.codec, forecaster.pose)
         check_rate(track, forecaster)
         starts = track.starts(forecaster.context, forecaster.horizon)
-        counts = np.empty((len(steps), len(forecaster.codec.channels), len(starts)), np.float32)
-        bands = np.empty((len(levels), *counts.shape), np.float32)
-        wanted, begins = [step - 1 for step in steps], 0
+        found[name] = Gathered(spill, empty)
         for some in forecasts(forecaster, track, starts):
-            ends = begins + len(some.count)
-            counts[..., begins:ends] = some.count[:, wanted].transpose(1, 2, 0)
+            counts = some.count[:, wanted].transpose(1, 2, 0).astype(np.float32, order="C")  # (step, channel, window)
+            bands = np.empty((len(levels), *counts.shape), np.float32)
             for first in range(0, len(some.count) if levels else 0, CHUNK):
                 part = slice(first, min(first + CHUNK, len(some.count)))
                 own = band(forecaster, track, some, part)[:, wanted][..., levels].transpose(3, 1, 2, 0)
-                bands[..., begins + part.start : begins + part.stop] = own
-            begins = ends
-            del some  # before the next one is made
-        t_ns = track.t_ns[starts + forecaster.context - 1]
-        found[name] = prediction_table(forecaster, t_ns, counts, steps, dict(zip(quantiles, bands, strict=True)))
+                bands[..., part] = own
+            t_ns = track.t_ns[some.now]
+            rows = prediction_table(forecaster, t_ns, counts, steps, dict(zip(quantiles, bands, strict=True)))
+            found[name].add(rows)
+            del some, counts, bands, rows  # before the next ones are made
+        del track
     return found
 
 

@@ -1,0 +1,287 @@
+"""The rows of a Parquet file in the groups in which they are written: of batches one is put aside, column by column."""
+
+from __future__ import annotations
+
+import mmap
+import os
+import tempfile
+import weakref
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from tacpipe.arrays import AnyArray, Bools
+from tacpipe.io.files import sentence, write_all
+
+IN_MEMORY = 1 << 25  # bytes of rows, before a file is made of them
+AT_ONCE = 1 << 22  # bytes of rows that are then written at once
+BESIDE_BYTES = 32  # that an encoded frame may take in memory beside its own: offsets, whether it is there
+
+
+def of(source: pa.Table | pa.RecordBatchReader, most: int, group_bytes: int) -> Rows | RowsAside:
+    """Return the rows of a table or of batches, to be taken in groups of at most ``most`` rows.
+
+    A group has about ``group_bytes`` of encoded frames at most, where there are any.
+    """
+    framed = any(holds_bytes(field) for field in source.schema)
+    if framed or isinstance(source, pa.Table):
+        return Rows(source, most, group_bytes)
+    return RowsAside(source, most)
+
+
+def holds_bytes(field: pa.Field) -> bool:
+    """Return whether a column holds bytes, as encoded frames."""
+    return bool(pa.types.is_binary(field.type) or pa.types.is_large_binary(field.type))
+
+
+class Rows:
+    """The rows of a table or of batches, taken group by group."""
+
+    def __init__(self, source: pa.Table | pa.RecordBatchReader, most: int, group_bytes: int) -> None:
+        self._most, self._group_bytes = most, group_bytes
+        self._next = source if isinstance(source, pa.Table) else source.schema.empty_table()
+        batches = () if isinstance(source, pa.Table) else source
+        self._more = (pa.Table.from_batches([batch]) for batch in batches if batch.num_rows)
+
+    def release(self) -> None:
+        """Do nothing: the rows are in memory."""
+
+    def releasing(self, sink: Any) -> Any:
+        """Return ``sink``."""
+        return sink
+
+    def head(self) -> pa.Table:
+        """Return the rows by which it is decided how columns are stored; they stay to be taken."""
+        frames = [field.name for field in self._next.schema if holds_bytes(field)]
+        if not frames:
+            self._fill(self._most)
+        while frames and self._next.num_rows < self._most and self._fill(self._next.num_rows + 1):
+            most = self._group_bytes + BESIDE_BYTES * self._next.num_rows
+            if any(self._next.column(name).nbytes > most for name in frames):
+                break
+        head = self._first(self._most)
+        for name in frames:
+            ends = np.cumsum(pc.binary_length(head.column(name)).fill_null(0).to_numpy(), dtype=np.int64)
+            head = head.slice(0, max(1, int(np.searchsorted(ends, self._group_bytes, side="right"))))
+        return head
+
+    def groups(self, rows: int) -> Iterator[pa.Table]:
+        """Yield tables of ``rows`` rows, a last one with the rest; an empty one where there is none at all."""
+        self._fill(rows)
+        while True:
+            yield self._first(rows)
+            self._next = self._next.slice(rows)
+            self._fill(rows)
+            if not self._next.num_rows:
+                return
+
+    def _first(self, rows: int) -> pa.Table:
+        return self._next.slice(
+            0, min(rows, self._next.num_rows)
+        )  # without columns a slice has as many as are asked for
+
+    def _fill(self, rows: int) -> bool:
+        """Have ``rows`` rows waiting, or all that are left; return whether there are so many."""
+        waiting, count = [self._next], int(self._next.num_rows)
+        for more in self._more if count < rows else ():
+            waiting.append(more)
+            count += more.num_rows
+            if count >= rows:
+                break
+        if len(waiting) > 1:
+            self._next = pa.concat_tables(waiting)
+        return count >= rows
+
+
+class RowsAside:
+    """The rows of batches without encoded frames, taken group by group, each put aside while it is written."""
+
+    def __init__(self, source: pa.RecordBatchReader, most: int) -> None:
+        self._most = most
+        self._groups = Groups(source, most)
+        self._head: pa.Table | None = self._groups.next()
+        self.release = self._groups.release
+
+    def head(self) -> pa.Table:
+        """Return the first group of rows, which stays to be taken."""
+        return self._head
+
+    def groups(self, rows: int) -> Iterator[pa.Table]:
+        """Yield tables of ``most`` rows, a last one with the rest; an empty one where there is none at all."""
+        assert rows == self._most
+        group, self._head = self._head, None
+        while group is not None:
+            yield group
+            del group
+            following = self._groups.next()
+            group = following if following.num_rows else None
+
+    def releasing(self, sink: Any) -> Any:
+        """Return a file that writes to ``sink``, and lets go of what was read for that."""
+        return _Releasing(sink, self._groups)
+
+
+class Groups:
+    """The rows of batches in tables of so many rows. There is one table at a time; the next one takes its place.
+
+    Rows of numbers lie in a temporary file that is mapped: their pages are let go of with `release`, and come back from
+    the disk's cache where they are read again. Other columns, as of texts, stay in memory.
+    """
+
+    def __init__(self, source: pa.RecordBatchReader, rows: int) -> None:
+        self._source, self._rows = iter(source), rows
+        self._left: pa.RecordBatch | None = None  # of a batch, that belongs to the next group
+        self._group = _Group(source.schema, rows)
+
+    def next(self) -> pa.Table:
+        """Return the next group; one without rows where there is none. Raises `StorageError` where the disk is full."""
+        self._group.clear()
+        while self._group.count < self._rows and (batch := self._more()) is not None:
+            room = self._rows - self._group.count
+            self._group.add(batch.slice(0, room))
+            self._left = batch.slice(room) if batch.num_rows > room else None
+        return self._group.table()
+
+    def release(self) -> None:
+        """Let go of what was read of the group so far, which stays where it is."""
+        self._group.release()
+
+    def _more(self) -> pa.RecordBatch | None:
+        left, self._left = self._left, None
+        return next(self._source, None) if left is None else left
+
+
+@dataclass
+class _Column:
+    """One column of a group: where its numbers lie in the file, or its values, and where it has nulls."""
+
+    field: pa.Field
+    width: int  # bytes of a number; 0: not of numbers
+    start: int = 0
+    values: list[pa.Array] = field(default_factory=list)
+    valid: list[tuple[int, Bools]] = field(default_factory=list)  # first row, and which rows hold a value
+
+
+class _Group:
+    """Up to so many rows."""
+
+    def __init__(self, schema: pa.Schema, rows: int) -> None:
+        self.count = self._aside = 0  # rows, and of them those in the file
+        self._schema = schema
+        self._waiting: list[pa.RecordBatch] = []  # until they are too large
+        self._bytes = 0  # of those that wait
+        self._columns = [_Column(one, _width(one.type)) for one in schema]
+        place = 0
+        for column in self._columns:
+            column.start, place = place, place + _whole_pages(column.width * rows)
+        self._size = place
+        self._file: Any = None
+        self._mapped: mmap.mmap | None = None
+
+    def clear(self) -> None:
+        """Begin anew."""
+        self.count = self._aside = self._bytes = 0
+        self._waiting, self._mapped = [], None  # it is unmapped with the last table that reads it
+        for column in self._columns:
+            column.values, column.valid = [], []
+
+    def add(self, batch: pa.RecordBatch) -> None:
+        """Add rows."""
+        self._waiting.append(batch)
+        self._bytes += batch.nbytes
+        self.count += batch.num_rows
+        if self._size and self._bytes > (AT_ONCE if self._aside else IN_MEMORY):
+            self._put_aside()
+
+    def _put_aside(self) -> None:
+        try:
+            if self._file is None:
+                self._file = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115  (closed by the line below)
+                weakref.finalize(self, self._file.close)
+                os.ftruncate(self._file.fileno(), self._size)
+            for batch in self._waiting:
+                for column, values in zip(self._columns, batch.columns, strict=True):
+                    self._write(column, values, self._aside)
+                self._aside += batch.num_rows
+        except OSError as error:
+            raise sentence(tempfile.gettempdir(), error) from error
+        self._waiting, self._bytes = [], 0
+
+    def _write(self, column: _Column, values: pa.Array, row: int) -> None:
+        if not column.width:
+            column.values.append(values.take(pa.array(np.arange(len(values)))))  # what it was a part of can go
+            return
+        if values.null_count:
+            column.valid.append((row, values.is_valid().to_numpy(zero_copy_only=False)))
+        os.lseek(self._file.fileno(), column.start + row * column.width, os.SEEK_SET)
+        write_all(self._file.fileno(), _raw(values, column.width).data)
+
+    def table(self) -> pa.Table:
+        """Return the rows."""
+        if not self._aside:
+            return pa.Table.from_batches(self._waiting, self._schema)
+        self._put_aside()
+        self._mapped = mmap.mmap(self._file.fileno(), self._size, access=mmap.ACCESS_READ)
+        content = pa.py_buffer(self._mapped)
+        return pa.Table.from_arrays([self._array(column, content) for column in self._columns], schema=self._schema)
+
+    def _array(self, column: _Column, content: pa.Buffer) -> pa.Array | pa.ChunkedArray:
+        kind = column.field.type
+        if not column.width:
+            return pa.chunked_array(column.values, kind)
+        numbers = content.slice(column.start, column.width * self.count)
+        valid = None
+        if column.valid:
+            there = np.ones(self.count, dtype=bool)
+            for row, some in column.valid:
+                there[row : row + len(some)] = some
+            valid = pa.py_buffer(np.packbits(there, bitorder="little").tobytes())
+        return pa.Array.from_buffers(kind, self.count, [valid, numbers])
+
+    def release(self) -> None:
+        """Let go of pages that were read."""
+        if self._mapped is not None:
+            self._mapped.madvise(mmap.MADV_DONTNEED)
+
+
+def _width(kind: pa.DataType) -> int:
+    """Return how many bytes a number of this type has, 0 for other types."""
+    return kind.bit_width // 8 if pa.types.is_primitive(kind) and not pa.types.is_boolean(kind) else 0
+
+
+def _whole_pages(size: int) -> int:
+    return -(-size // mmap.PAGESIZE) * mmap.PAGESIZE
+
+
+def _raw(values: pa.Array, width: int) -> AnyArray:
+    """Return the bytes of numbers."""
+    content = values.buffers()[1]
+    return np.frombuffer(content, np.uint8)[values.offset * width : (values.offset + len(values)) * width]
+
+
+class _Releasing:
+    """A file to write to, after each piece of which what was read for it is let go of."""
+
+    closed = False
+
+    def __init__(self, sink: Any, groups: Groups) -> None:
+        self._sink, self._groups = sink, groups
+
+    def write(self, content: bytes | memoryview) -> int:
+        """Write all of ``content``."""
+        written: int = self._sink.write(content)
+        self._groups.release()
+        return written
+
+    def tell(self) -> int:
+        """Return how many bytes were written."""
+        place: int = self._sink.tell()
+        return place
+
+    def flush(self) -> None:
+        """Hand over what the file holds back."""
+        self._sink.flush()

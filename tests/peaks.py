@@ -1,0 +1,35 @@
+"""The peak of resident memory of a command, in a process of its own."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+# the kernel counts a process' peak from its `exec` on; `ru_maxrss` would hold that of the process which started it
+PROGRAM = """
+import atexit, re, sys
+from tacpipe.cli.main import main
+def state():
+    print("peak", re.search("VmHWM:\\\\s+([0-9]+)", open("/proc/self/status").read())[1])
+atexit.register(state)
+sys.argv[0] = "tacpipe"
+sys.exit(main())
+"""
+
+
+def bytes_of(folder: Path, command: str) -> int:
+    """Return how many bytes of memory ``tacpipe COMMAND`` had at most, in ``folder``; it must succeed.
+
+    The command is run in one process, with temporary files that lie on ``folder``'s disk.
+    """
+    words = [sys.executable, "-c", PROGRAM, *shlex.split(command)]
+    environment = {name: value for name, value in os.environ.items() if name != "TACPIPE_STORE"}
+    environment |= {"OMP_NUM_THREADS": "1", "TMPDIR": str(folder), "COLUMNS": "120"}
+    done = subprocess.run(words, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    name, kilobytes = done.stdout.splitlines()[-1].split()
+    assert name == "peak"
+    return int(kilobytes) << 10
