@@ -14,7 +14,8 @@ from typing import Any, Literal
 
 from tacpipe.datasets import adoption, pages, replacing
 from tacpipe.datasets.delivery import deliver
-from tacpipe.datasets.manifest import NAME, Manifest, parse, shard_path
+from tacpipe.datasets.manifest import NAME, Manifest, parse
+from tacpipe.datasets.paths import shard_path
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import regular
 from tacpipe.io.files import listed, sync_folder, sync_folders, walk, write_whole

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any
 
-from tacpipe.datasets import manifest, pages
+from tacpipe.datasets import merging, pages
 from tacpipe.datasets.manifest import Entry, Manifest
 from tacpipe.engine import computing, execution, keys, provenance
 from tacpipe.engine.executors.executor import Chosen
@@ -163,7 +163,7 @@ class ByRecording:
         if list(given.chain) != list(wanted[: len(given.chain)]):
             raise UsageError(
                 f"The model was trained behind other stages than {where} went through: "
-                f"{manifest.chain_difference(wanted, given.chain)}. Give the recordings themselves: the model's own "
+                f"{merging.chain_difference(wanted, given.chain)}. Give the recordings themselves: the model's own "
                 f"stages are then run on them."
             )
         for step in wanted[len(given.chain) :]:

@@ -10,9 +10,10 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from tacpipe.datasets import manifest, replacing, roles
+from tacpipe.datasets import checks, manifest, replacing, roles
 from tacpipe.datasets.dataset import Dataset
-from tacpipe.datasets.manifest import Entry, Manifest, shard_path
+from tacpipe.datasets.manifest import Entry, Manifest
+from tacpipe.datasets.paths import shard_path
 from tacpipe.engine import by_recording, computing, execution, keys, output, provenance
 from tacpipe.engine.by_recording import ByRecording
 from tacpipe.engine.executors.executor import Chosen
@@ -180,7 +181,7 @@ class _Run:
                 self.store.put(found.content)  # explain and gc follow a dataset to the manifests it descends from
         made = self._make()
         try:
-            manifest.check(made)
+            checks.check(made)
         except (ValueError, TypeError, KeyError) as error:
             raise TacpipeError(f"{self.request.name} gave what no dataset can hold: {error}.") from None
         return made
