@@ -33,7 +33,7 @@ def shows(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Path]]:
     monkeypatch.setattr(presence.Look, "_clock_ns", lambda self: clock_ns(self) + DAY_NS)
     monkeypatch.setattr(pages, "LARGE", 0)
     monkeypatch.setattr(pages, "MANY", 1)
-    monkeypatch.setattr(pages, "PAGE_BYTES", 300)
+    monkeypatch.setattr(pages, "GROUPED", 2)
     monkeypatch.setattr(manifest, "_parsed", {})
     yield asked
 

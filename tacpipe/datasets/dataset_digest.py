@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Mapping
 from typing import Any
 
-from tacpipe.datasets.pages import Entry
+from tacpipe.datasets.page_text import Entry
 from tacpipe.io.hashing import canonical
 
 
@@ -19,7 +19,10 @@ class DatasetDigest:
 
     def add(self, recordings: Mapping[str, Entry]) -> None:
         """Add those that come next in the order of names."""
-        text = canonical({name: _described(entry) for name, entry in recordings.items()})[1:-1]
+        self.add_described(canonical({name: _described(entry) for name, entry in recordings.items()})[1:-1])
+
+    def add_described(self, text: bytes) -> None:
+        """Add what `page_text.described` returned for those that come next."""
         if text:
             self._hash.update(self._between + text)
             self._between = b","

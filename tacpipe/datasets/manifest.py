@@ -12,7 +12,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from tacpipe.datasets import pages
+from tacpipe.datasets import page_text, pages
 from tacpipe.datasets.checks import Listed, check
 from tacpipe.datasets.dataset_digest import DatasetDigest
 from tacpipe.datasets.paths import MANIFEST, shard_path
@@ -28,9 +28,9 @@ NAME = MANIFEST
 VALUES = "{values}"  # among the files of a source: the digest of what was read beside them, as labels
 EXPORT = "export."  # begins the names of stages whose result is other tools' files
 ACQUIRE = "acquire"  # the command that records a rig; it stands where others name their stage, and has no key
+Entry = page_text.Entry
 _REMEMBERED = 2
 _parsed: dict[str, Manifest] = {}  # by the digest of their content, the last ones that were verified
-Entry = pages.Entry
 
 
 @dataclass(frozen=True)

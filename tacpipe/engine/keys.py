@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
+from tacpipe.datasets import pages
 from tacpipe.datasets.manifest import Entry, Manifest
 from tacpipe.engine import execution
 from tacpipe.engine.task import Task
@@ -13,8 +13,6 @@ from tacpipe.io.hashing import digest
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins.stage import ALL, AnyStage, Source
 from tacpipe.store.store import Store
-
-GROUPED = 256  # names in a group, in the mean
 
 
 def identity(name: str, version: int, params: Any, inputs: Mapping[str, Any]) -> dict[str, Any]:
@@ -55,9 +53,9 @@ def chain_step(name: str, stage: AnyStage, params: Any, fitted: Mapping[str, Any
 
 
 def groups(names: Iterable[str]) -> Iterator[list[str]]:
-    """Yield names, sorted, in groups of some `GROUPED`, of which one more or one less name changes one or two.
+    """Yield names, sorted, in groups of some `pages.GROUPED`, of which one more or one less name changes one or two.
 
-    Where a group ends depends on the name after it alone.
+    Where a group ends depends on the name after it alone, as `pages.begins` states.
 
     >>> names = [f"trial-{number:04d}" for number in range(2000)]
     >>> before, now = (set(map(tuple, groups(some))) for some in (names, [*names, "trial-0500-again"]))
@@ -66,7 +64,7 @@ def groups(names: Iterable[str]) -> Iterator[list[str]]:
     """
     group: list[str] = []
     for name in sorted(names):
-        if group and zlib.crc32(name.encode(errors="surrogatepass")) % GROUPED == 0:
+        if group and pages.begins(name):
             yield group
             group = []
         group.append(name)
