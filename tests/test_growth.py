@@ -12,8 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import tacpipe
-from tacpipe.datasets import directory, manifest, page_text, pages
-from tacpipe.engine import keys
+from tacpipe.datasets import directory, groups, manifest, page_text, pages
 from tacpipe.errors import DamagedError
 from tacpipe.store.store import Store
 from tests.conftest import Lab
@@ -53,7 +52,7 @@ def test_one_more_recording_reads_the_records_of_its_group_and_places_its_own_fi
     lab.run(f"simulate toy --rows 2 --trials {COUNT} -o data/toy")
     lab.run("scale data/toy -o data/scaled --jobs 1")
     names = list(tacpipe.open(lab.folder / "data/toy").recordings)
-    sizes = [len(group) for group in keys.groups(names)]
+    sizes = [len(group) for group in groups.of_names(names)]
     assert max(sizes) < COUNT / 2
     before = {path: path.stat().st_ino for path in (lab.folder / "data/toy").rglob("*.parquet")}
 

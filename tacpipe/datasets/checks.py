@@ -7,8 +7,9 @@ from array import array
 from collections.abc import Collection, Iterable, Mapping
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from tacpipe.datasets import pages, paths
+from tacpipe.datasets import page_text, pages, paths
 from tacpipe.datasets.dataset_digest import DatasetDigest
+from tacpipe.datasets.page_text import Entry
 from tacpipe.io.hashing import DIGEST
 
 if TYPE_CHECKING:
@@ -32,16 +33,8 @@ def check(manifest: Manifest, *, hashed: bool = True, listing: list[Listed] | No
     foldered, rows = False, 0
     hashes = DatasetDigest(manifest.files) if hashed else None
     for part in pages.parts(manifest.recordings):
-        for entry in part.values():
-            if not _ATTRIBUTES.issuperset(map(type, entry["attributes"].values())):
-                _refuse_attributes(entry["attributes"])
-        shards = [shard for entry in part.values() for shard in entry["shards"].values()]
-        _check_contents(shards)
-        counts = [shard["rows"] for shard in shards]
-        _check_counts(counts)
-        rows += sum(counts)
-        places = [paths.shard_path(name, stream) for name, entry in part.items() for stream in entry["shards"]]
-        paths.check(places, manifest.files)
+        shards, places = _check_part(part, manifest.files)
+        rows += sum(shard["rows"] for shard in shards)
         foldered |= any("/" in name for name in part)
         if hashes is not None:
             hashes.add(part)
@@ -52,6 +45,68 @@ def check(manifest: Manifest, *, hashed: bool = True, listing: list[Listed] | No
     if foldered and isinstance(manifest.recordings, pages.Pages):  # two pages may name one path
         paths.refuse_shared([path for path, _ in manifest.objects()])
     manifest.__dict__.update({"rows": rows} | ({} if hashes is None else {"digest": hashes.digest()}))
+
+
+def check_beside(manifest: Manifest, known: Manifest) -> bool:
+    """Do as `check` for a manifest that shares pages with one that was checked: these are not parsed.
+
+    What the digests of both are made of is read from the text of these pages. Return False where that does not give the
+    digest that ``known`` has, or where a manifest is not in pages: then all is to be looked at. Raises as `check` does.
+    """
+    before, now = known.recordings, manifest.recordings
+    if not (isinstance(before, pages.Pages) and isinstance(now, pages.Pages)) or manifest.files != known.files:
+        return False
+    if pages.foldered(before) or pages.foldered(now):
+        return False
+    _check_lineage(manifest)
+    both = pages.shared(before, now)
+    old, new = DatasetDigest(known.files), DatasetDigest(manifest.files)
+    last, reached, rows, count = "", 0, 0, 0
+    for number in range(len(now.texts)):
+        place = both.get(number)
+        if place is None:
+            part = now.part(number, last)
+            shards, _ = _check_part(part, manifest.files)
+            rows, count = rows + sum(shard["rows"] for shard in shards), count + len(part)
+            new.add(part)
+        else:
+            rows -= _add_pages(old, before, range(reached, place))
+            text = page_text.described(now.texts[number])
+            for hashes, recordings, at in ((old, before, place), (new, now, number)):
+                hashes.add(recordings.part(at)) if text is None else hashes.add_described(text)
+            reached, count = place + 1, count + now.count(number)
+        first, ending = now.ends(number)
+        if last and first <= last:
+            raise ValueError(pages.ORDER)
+        last = ending
+    rows -= _add_pages(old, before, range(reached, len(before.texts)))
+    if old.digest() != known.digest or count != len(now):
+        return False
+    manifest.__dict__.update({"digest": new.digest()} | ({"rows": known.rows + rows} if "rows" in vars(known) else {}))
+    return True
+
+
+def _add_pages(hashes: DatasetDigest, recordings: pages.Pages, numbers: Iterable[int]) -> int:
+    """Add pages to what a digest is made of, and return the rows of their shards."""
+    rows = 0
+    for number in numbers:
+        part = recordings.part(number)
+        hashes.add(part)
+        rows += sum(shard["rows"] for entry in part.values() for shard in entry["shards"].values())
+    return rows
+
+
+def _check_part(part: Mapping[str, Entry], files: Collection[str]) -> tuple[list[Mapping[str, Any]], list[str]]:
+    """Return the shards of recordings and their paths, once both were looked at."""
+    for entry in part.values():
+        if not _ATTRIBUTES.issuperset(map(type, entry["attributes"].values())):
+            _refuse_attributes(entry["attributes"])
+    shards = [shard for entry in part.values() for shard in entry["shards"].values()]
+    _check_contents(shards)
+    _check_counts([shard["rows"] for shard in shards])
+    places = [paths.shard_path(name, stream) for name, entry in part.items() for stream in entry["shards"]]
+    paths.check(places, files)
+    return shards, places
 
 
 def _listed(places: Iterable[str], contents: Collection[Mapping[str, Any]]) -> Listed:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from tacpipe.datasets import page_text, pages
-from tacpipe.datasets.checks import Listed, check
+from tacpipe.datasets.checks import Listed, check, check_beside
 from tacpipe.datasets.dataset_digest import DatasetDigest
 from tacpipe.datasets.paths import MANIFEST, shard_path
 from tacpipe.errors import DamagedError, StorageError, UsageError
@@ -29,7 +29,8 @@ VALUES = "{values}"  # among the files of a source: the digest of what was read 
 EXPORT = "export."  # begins the names of stages whose result is other tools' files
 ACQUIRE = "acquire"  # the command that records a rig; it stands where others name their stage, and has no key
 Entry = page_text.Entry
-_REMEMBERED = 2
+_REMEMBERED = 3
+_STATED = ("format", "digest")  # in the file, besides what a manifest has
 _parsed: dict[str, Manifest] = {}  # by the digest of their content, the last ones that were verified
 
 
@@ -123,14 +124,22 @@ class Manifest:
         """Yield digest and size in bytes of every shard and file."""
         return ((name, size) for _, name, size in self.contents())
 
-    def size_of(self, name: str, path: str) -> int | None:
-        """Return how many bytes the shard or file of this digest has at ``path``, None where there is none."""
+    def at(self, path: str) -> Mapping[str, Any] | None:
+        """Return digest and size of the shard or file at ``path``, None where there is none."""
+        if path in self.files:
+            file: Mapping[str, Any] = self.files[path]
+            return file
         bare = path.removesuffix(".parquet")
         parts = bare.split("/")
         places = [(bare, ""), *(("/".join(parts[:at]), "/".join(parts[at:])) for at in range(1, len(parts)))]
-        known = [self.recordings[one]["shards"].get(stream) for one, stream in places if one in self.recordings]
-        sizes = (one["bytes"] for one in [self.files.get(path), *known] if one is not None and one["digest"] == name)
-        return next(sizes, None)
+        known = (one for one in places if bare != path and one[0] in self.recordings)
+        shards = (self.recordings[one]["shards"].get(stream) for one, stream in known)
+        return next((shard for shard in shards if shard is not None), None)
+
+    def size_of(self, name: str, path: str) -> int | None:
+        """Return how many bytes the shard or file of this digest has at ``path``, None where there is none."""
+        found = self.at(path)
+        return found["bytes"] if found is not None and found["digest"] == name else None
 
     @cached_property
     def _listing(self) -> list[Listed] | None:
@@ -143,16 +152,17 @@ class Manifest:
         return sum(shard["rows"] for entry in self.recordings.values() for shard in entry["shards"].values())
 
 
-def parse(content: bytes, where: str, *, verified: bool = False) -> Manifest:
+def parse(content: bytes, where: str, *, verified: bool = False, beside: Manifest | None = None) -> Manifest:
     """Return the manifest of these bytes; ``verified`` ones come from the store and need no second look.
 
-    Raises `DamagedError` if they are not a manifest, or if what they name does not give their digest.
+    Of a large one that shares pages with the manifest ``beside``, which was checked, the others alone are parsed. Raises
+    `DamagedError` if they are not a manifest, or if what they name does not give their digest.
     """
     name = bytes_digest(content)
     if name in _parsed:  # a command meets the same manifest several times
         return _parsed[name]
     try:
-        manifest, stored = _read(content, where, verified=verified)
+        manifest, stored = _read(content, where, verified=verified, beside=beside)
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise DamagedError(
             f"{where} is not a manifest of tacpipe ({plain(str(error), 200)}). Restore it, or run the stage that made it "
@@ -166,16 +176,51 @@ def parse(content: bytes, where: str, *, verified: bool = False) -> Manifest:
             f"Run the stage that made it again; labels are changed with `tacpipe label`."
         )
     if not verified:  # all of it was looked at
-        _parsed[name] = manifest
-        for oldest in list(_parsed)[:-_REMEMBERED]:
-            del _parsed[oldest]
+        _remember(manifest, name)
     return manifest
 
 
-def _read(content: bytes, where: str, *, verified: bool) -> tuple[Manifest, str]:
+def unparsed(content: bytes, where: str) -> Manifest | None:
+    """Return the manifest of bytes that were checked before, none of whose recordings is parsed yet.
+
+    None where it is not kept in pages. Raises `StorageError` where memory is short.
+    """
+    value = pages.split(content, where) if len(content) >= pages.LARGE else None
+    if value is None or value.pop("format") != FORMAT:
+        return None
+    stored = value.pop("digest")
+    manifest = Manifest(**value)
+    manifest.__dict__.update(content=content, content_digest=bytes_digest(content), digest=stored)
+    return manifest
+
+
+def noted(file: Path, wanted: str, rows: int) -> None:
+    """Have whoever asks next for the manifest in ``file`` get it `unparsed`: it was checked before, if it has this digest.
+
+    ``rows`` are those that its shards have together.
+    """
+    if wanted in _parsed:
+        return
+    found = unparsed(regular.content(file, regular.JSON_BYTES), str(file))
+    if found is not None and found.content_digest == wanted:
+        found.__dict__["rows"] = rows
+        _remember(found, wanted)
+
+
+def _remember(manifest: Manifest, name: str) -> None:
+    _parsed[name] = manifest
+    for oldest in list(_parsed)[:-_REMEMBERED]:
+        del _parsed[oldest]
+
+
+def _read(content: bytes, where: str, *, verified: bool, beside: Manifest | None) -> tuple[Manifest, str]:
     """Return the manifest of these bytes, with its own digest at hand, and the digest that they state."""
     if len(content) >= pages.LARGE and (value := pages.split(content, where)) is not None:
         with contextlib.suppress(ValueError):  # pages that are not as they should be: all of it is parsed
+            if beside is not None and value["format"] == FORMAT:
+                manifest = Manifest(**{key: one for key, one in value.items() if key not in _STATED})
+                if check_beside(manifest, beside) and manifest.digest == value["digest"]:
+                    return manifest, manifest.digest
             return _checked(value, where, verified=verified)
     regular.expect_parsed(where, len(content))
     return _checked(json.loads(content), where, verified=verified)
@@ -226,6 +271,8 @@ class Found:
     @cached_property
     def manifest(self) -> Manifest:
         """The manifest, checked. Raises `DamagedError` if it was edited by hand."""
+        if self.digest in _parsed:  # it need not be read
+            return _parsed[self.digest]
         return parse(self.content, str(self.directory / NAME))
 
 

@@ -10,22 +10,22 @@ import re
 import zlib
 from bisect import bisect_right
 from collections.abc import Collection, ItemsView, Iterable, Iterator, Mapping, Sequence, ValuesView
-from dataclasses import dataclass
 from typing import Any
 
 from tacpipe.datasets.page_text import Entry, indented, page
 from tacpipe.io import regular
 
-LARGE = 1 << 22  # bytes of a manifest from which on its recordings are kept as text
-MANY = 10_000  # recordings from which on a result is: they have about as many bytes
+LARGE = 1 << 20  # bytes of a manifest from which on its recordings are kept as text
+MANY = 3_000  # recordings from which on a result is: they have about as many bytes
 GROUPED = 256  # recordings of a page, in the mean
 _MOST_BYTES = 1 << 24  # of a page
 _KEPT = 4  # pages that stay parsed
 _BEGIN, _END = b'\n "recordings": {\n', b"\n }"
 _MEMBER = b'\n  "'  # begins a line of a recording's name, and no other line
 _NAME = re.compile(rb'  ("(?:[^"\\]|\\.)*"): ')
-_ORDER = "its recordings are not in the order of their names"
+ORDER = "its recordings are not in the order of their names"
 _NAMES = re.compile(rb'\n  ("(?:[^"\\]|\\.)*"): ')  # literal from the start, so that searching is fast
+_FOLDERED = re.compile(rb'\n  "(?:[^"\\/]|\\.)*/|\\u002[fF]')
 _FOLLOWING = re.compile(rb',\n  ("(?:[^"\\]|\\.)*"): ')  # a name that is not the first
 
 
@@ -45,7 +45,7 @@ class Pages(Mapping[str, Entry]):
         self._count = count
         self._first = [json.loads(found[1]) for text in texts if (found := _NAME.match(text))]
         if len(self._first) < len(texts) or any(a >= b for a, b in zip(self._first, self._first[1:], strict=False)):
-            raise ValueError(_ORDER)
+            raise ValueError(ORDER)
         self._sound = bytearray(len(texts))  # whether a page holds what its lines begin with, in order
         self._parsed: dict[int, dict[str, Entry]] = {}
 
@@ -90,16 +90,31 @@ class Pages(Mapping[str, Entry]):
         names = list(part)
         if not self._sound[number]:
             if not names or names != sorted(names) or names != self._names(number):
-                raise ValueError(_ORDER)
+                raise ValueError(ORDER)
             self._sound[number] = True
         if before and names[0] <= before:
-            raise ValueError(_ORDER)
+            raise ValueError(ORDER)
         return part
 
     def of(self, numbers: Collection[int]) -> Pages:
         """Return some of the pages, in their order."""
         texts = [self.texts[number] for number in sorted(numbers)]
         return Pages(texts, sum(map(_count, texts)))
+
+    def grouped(self) -> Iterator[list[int]]:
+        """Yield the pages of each group that has a record: one, and more where the recording that began one is gone."""
+        group: list[int] = []
+        for number, name in enumerate(self._first):
+            if group and begins(name):
+                yield group
+                group = []
+            group.append(number)
+        if group:
+            yield group
+
+    def names(self, numbers: Iterable[int]) -> list[bytes]:
+        """Return the names on pages, as they are written."""
+        return [name for number in numbers for name in _NAMES.findall(b"\n" + bytes(self.texts[number]))]
 
     def ends(self, number: int) -> tuple[str, str]:
         """Return the names with which a page begins and ends, as its lines state them."""
@@ -133,8 +148,7 @@ class Pages(Mapping[str, Entry]):
                 yield self._page(number)
 
     def _names(self, number: int) -> list[str]:
-        names = _NAMES.findall(b"\n" + bytes(self.texts[number]))
-        found: list[str] = json.loads(b"[%b]" % b",".join(names))
+        found: list[str] = json.loads(b"[%b]" % b",".join(self.names([number])))
         return found
 
     def _page(self, number: int) -> dict[str, Entry]:
@@ -204,6 +218,11 @@ def same(one: bytes | memoryview, other: bytes | memoryview) -> bool:
     return one is other or (len(one) == len(other) and bytes(one) == bytes(other))
 
 
+def foldered(recordings: Pages) -> bool:
+    """Return whether a name may lead into a folder: then recordings of two pages may name one path."""
+    return any(_FOLDERED.search(b"\n" + bytes(text)) for text in recordings.texts)
+
+
 def differing(before: Mapping[str, Entry], now: Mapping[str, Entry]) -> tuple[Mapping[str, Entry], Mapping[str, Entry]]:
     """Return those recordings of two datasets among which all are that are not in both, or not the same in both."""
     if not (isinstance(before, Pages) and isinstance(now, Pages)):
@@ -236,32 +255,6 @@ def write(value: Mapping[str, Any]) -> bytes:
     assert empty
     texts = (text for number, one in enumerate(recordings.texts) for text in ((b",\n" if number else b""), one))
     return b"".join([before, _BEGIN, *texts, _END, after])
-
-
-@dataclass(frozen=True)
-class Kept:
-    """A part of the recordings of a result, as text or as it is, and how many they are."""
-
-    entries: Mapping[str, Entry] | bytes
-    count: int
-
-
-def kept(entries: Mapping[str, Entry], *, as_text: bool) -> Kept:
-    """Return recordings as they are kept until all are there: as text where they are many."""
-    return Kept(page(entries) if as_text else entries, len(entries))
-
-
-def joined(given: Iterable[Kept]) -> Mapping[str, Entry]:
-    """Return recordings that come in parts, in the order of names, as one mapping; all parts are kept in the same way."""
-    found: dict[str, Entry] = {}
-    texts, count = [], 0
-    for part in given:
-        if isinstance(part.entries, bytes):
-            texts += [part.entries] if part.count else []
-            count += part.count
-        else:
-            found |= part.entries
-    return Pages(texts, count) if texts else found
 
 
 def split(content: bytes, where: str) -> dict[str, Any] | None:
