@@ -12,8 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import tacpipe
-from tacpipe.datasets import directory, manifest, pages
-from tacpipe.engine import keys
+from tacpipe.datasets import directory, groups, manifest, page_text, pages
 from tacpipe.errors import DamagedError
 from tacpipe.store.store import Store
 from tests.conftest import Lab
@@ -37,7 +36,7 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], dict[str, 
 
     monkeypatch.setattr(Store, "read_record", reading)
     monkeypatch.setattr(directory, "place", placing)
-    monkeypatch.setattr(keys, "GROUPED", GROUPED)
+    monkeypatch.setattr(pages, "GROUPED", GROUPED)
 
     def taken() -> dict[str, int]:
         found = dict(calls)
@@ -53,7 +52,7 @@ def test_one_more_recording_reads_the_records_of_its_group_and_places_its_own_fi
     lab.run(f"simulate toy --rows 2 --trials {COUNT} -o data/toy")
     lab.run("scale data/toy -o data/scaled --jobs 1")
     names = list(tacpipe.open(lab.folder / "data/toy").recordings)
-    sizes = [len(group) for group in keys.groups(names)]
+    sizes = [len(group) for group in groups.of_names(names)]
     assert max(sizes) < COUNT / 2
     before = {path: path.stat().st_ino for path in (lab.folder / "data/toy").rglob("*.parquet")}
 
@@ -74,7 +73,7 @@ def test_groups_hold_every_recording_and_the_results_are_those_without_groups(
 ) -> None:
     lab.run("simulate toy --trials 9 -o data/toy")
     lab.run("scale data/toy -o alone")
-    monkeypatch.setattr(keys, "GROUPED", 2)
+    monkeypatch.setattr(pages, "GROUPED", 2)
     lab.run("label data/toy trial-003 --set material=felt")
     lab.run("scale data/toy -o first --jobs 1")
     lab.run("label data/toy trial-003 --set material=silk")
@@ -133,7 +132,7 @@ VALUES = st.recursive(
 
 @given(VALUES)
 def test_a_manifest_is_indented_as_the_standard_library_does(value: Any) -> None:
-    assert pages.indented(value) == json.dumps(value, sort_keys=True, indent=1, allow_nan=False)
+    assert page_text.indented(value) == json.dumps(value, sort_keys=True, indent=1, allow_nan=False)
 
 
 def test_what_json_cannot_hold_is_refused_as_by_the_standard_library() -> None:
@@ -141,7 +140,7 @@ def test_what_json_cannot_hold_is_refused_as_by_the_standard_library() -> None:
         with pytest.raises((ValueError, TypeError)) as expected:
             json.dumps(value, sort_keys=True, indent=1, allow_nan=False)
         with pytest.raises(expected.type):
-            pages.indented(value)
+            page_text.indented(value)
 
 
 def test_a_manifest_that_was_edited_is_refused_though_the_sound_one_was_read(lab: Lab) -> None:

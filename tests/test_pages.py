@@ -12,7 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import tacpipe
-from tacpipe.datasets import manifest, pages
+from tacpipe.datasets import manifest, page_text, pages
+from tacpipe.datasets.dataset_digest import DatasetDigest
 from tacpipe.datasets.manifest import Manifest
 from tacpipe.errors import DamagedError, TacpipeError
 from tests.conftest import Lab
@@ -34,17 +35,17 @@ MANY = st.dictionaries(NAMES, ENTRIES, min_size=1, max_size=12)
 
 @pytest.fixture
 def few_are_many(monkeypatch: pytest.MonkeyPatch) -> None:
-    """All recordings are kept as text, some hundred bytes a page."""
+    """All recordings are kept as text, two a page in the mean."""
     monkeypatch.setattr(pages, "LARGE", 0)
     monkeypatch.setattr(pages, "MANY", 1)
-    monkeypatch.setattr(pages, "PAGE_BYTES", 300)
+    monkeypatch.setattr(pages, "GROUPED", 2)
     monkeypatch.setattr(manifest, "_parsed", {})
 
 
-def paged(whole: Manifest, page_bytes: int) -> Manifest:
+def paged(whole: Manifest, grouped: int) -> Manifest:
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(pages, "LARGE", 1 << 20)
-        patched.setattr(pages, "PAGE_BYTES", page_bytes)
+        patched.setattr(pages, "GROUPED", grouped)
         value = pages.split(whole.content, "given")
     assert value is not None
     assert isinstance(value["recordings"], pages.Pages)
@@ -52,10 +53,10 @@ def paged(whole: Manifest, page_bytes: int) -> Manifest:
     return Manifest(**value)
 
 
-@given(MANY, st.integers(1, 600))
-def test_a_manifest_in_pages_holds_what_it_holds_parsed_at_once(recordings: dict[str, Any], page_bytes: int) -> None:
+@given(MANY, st.integers(1, 5))
+def test_a_manifest_in_pages_holds_what_it_holds_parsed_at_once(recordings: dict[str, Any], grouped: int) -> None:
     whole = Manifest("stage", 1, recordings=recordings, files={"a": {"digest": "0" * 64, "bytes": 1}})
-    found = paged(whole, page_bytes)
+    found = paged(whole, grouped)
 
     assert (
         list(found.recordings.items())
@@ -71,13 +72,13 @@ def test_a_manifest_in_pages_holds_what_it_holds_parsed_at_once(recordings: dict
     assert pickle.loads(pickle.dumps(found.recordings)) == recordings
 
 
-@given(MANY, ENTRIES, st.integers(1, 600), st.data())
+@given(MANY, ENTRIES, st.integers(1, 5), st.data())
 def test_what_is_changed_in_pages_is_what_is_changed_in_a_mapping(
-    recordings: dict[str, Any], entry: Any, page_bytes: int, data: st.DataObject
+    recordings: dict[str, Any], entry: Any, grouped: int, data: st.DataObject
 ) -> None:
     whole = Manifest("stage", 1, recordings=recordings)
     some = data.draw(st.dictionaries(st.sampled_from(sorted(recordings)), st.none() | st.just(entry)))
-    found = pages.changed(paged(whole, page_bytes).recordings, some)
+    found = pages.changed(paged(whole, grouped).recordings, some)
 
     expected = {**recordings, **some}
     expected = {name: one for name, one in expected.items() if one is not None}
@@ -142,7 +143,7 @@ def test_two_recordings_on_two_pages_that_name_one_path_are_refused(few_are_many
 
 def test_a_large_manifest_takes_little_more_memory_than_its_text(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pages, "LARGE", 1 << 18)
-    monkeypatch.setattr(pages, "PAGE_BYTES", 1 << 12)
+    monkeypatch.setattr(pages, "GROUPED", 20)
     attributes = {"material": "felt", "sensor": "xela-uskin", "speed_m_s": 0.25}
     entries = {f"trial-{number:06d}": {"attributes": attributes, "shards": {"": SHARD}} for number in range(2_000)}
     content = Manifest("stage", 1, recordings=entries).content
@@ -203,11 +204,57 @@ def test_a_dataset_in_pages_opens_its_recordings_when_they_are_asked_for(lab: La
     assert [one.name for one in opened.select(trial=lambda trial: trial > 6)] == ["trial-007", "trial-008"]
 
 
-@given(MANY, st.integers(1, 600))
-def test_the_size_of_a_shard_is_found_by_its_path(recordings: dict[str, Any], page_bytes: int) -> None:
+@given(MANY, st.integers(1, 5))
+def test_the_size_of_a_shard_is_found_by_its_path(recordings: dict[str, Any], grouped: int) -> None:
     whole = Manifest("stage", 1, recordings=recordings, files={"a/b": {"digest": "0" * 64, "bytes": 7}})
-    found = paged(whole, page_bytes)
+    found = paged(whole, grouped)
     for path, name, size in whole.contents():
         assert found.size_of(name, path) == whole.size_of(name, path) == size
         assert found.size_of("1" * 64, path) is None
     assert whole.size_of("0" * 64, "not/there") is None
+
+
+@given(MANY, st.integers(1, 5))
+def test_what_a_digest_is_made_of_is_the_same_of_text_as_of_what_was_parsed(
+    recordings: dict[str, Any], grouped: int
+) -> None:
+    whole = Manifest("stage", 1, recordings=recordings)
+    found = paged(whole, grouped).recordings
+    assert isinstance(found, pages.Pages)
+    by_text, by_value = DatasetDigest({}), DatasetDigest({})
+    for number, text in enumerate(found.texts):
+        described = page_text.described(text)
+        part = found.part(number)
+        if described is None:
+            assert b'\\": ' in bytes(text)
+            by_text.add(part)
+        else:
+            by_text.add_described(described)
+        by_value.add(part)
+    assert by_text.digest() == by_value.digest() == whole.digest
+
+
+@given(MANY, st.dictionaries(NAMES, st.none() | ENTRIES, max_size=4), st.integers(1, 5))
+def test_what_differs_between_two_datasets_in_pages_is_what_differs_between_two_mappings(
+    recordings: dict[str, Any], other: dict[str, Any], grouped: int
+) -> None:
+    after = {name: one for name, one in {**recordings, **other}.items() if one is not None}
+    before, now = (
+        paged(Manifest("stage", 1, recordings=some), grouped).recordings if some else some
+        for some in (recordings, after)
+    )
+    unlike = {name: (old, new) for name, old, new in pages.beside(*pages.differing(before, now)) if old != new}
+    expected = {name for name in {*recordings, *after} if recordings.get(name) != after.get(name)}
+    assert set(unlike) == expected
+    assert all(unlike[name] == (recordings.get(name), after.get(name)) for name in expected)
+
+
+def test_one_more_recording_leaves_all_pages_but_its_own_as_they_were() -> None:
+    recordings = {f"trial-{number:05d}": ENTRY for number in range(3_000)}
+    before, now = (
+        paged(Manifest("stage", 1, recordings=some), pages.GROUPED).recordings
+        for some in (recordings, {**recordings, "trial-01500-again": ENTRY})
+    )
+    assert isinstance(before, pages.Pages) and isinstance(now, pages.Pages)
+    assert len(before.texts) > 4
+    assert len(now.texts) - len(pages.shared(before, now)) <= 2

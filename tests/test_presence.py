@@ -12,7 +12,7 @@ import pytest
 
 from tacpipe.datasets import directory, manifest, pages
 from tacpipe.io.hashing import file_digest
-from tacpipe.store import layout, presence
+from tacpipe.store import layout, notes, presence
 from tests.conftest import Lab
 
 SCALE = "scale data/r -o data/s --factor 2 --jobs 1"
@@ -33,7 +33,7 @@ def shows(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Path]]:
     monkeypatch.setattr(presence.Look, "_clock_ns", lambda self: clock_ns(self) + DAY_NS)
     monkeypatch.setattr(pages, "LARGE", 0)
     monkeypatch.setattr(pages, "MANY", 1)
-    monkeypatch.setattr(pages, "PAGE_BYTES", 300)
+    monkeypatch.setattr(pages, "GROUPED", 2)
     monkeypatch.setattr(manifest, "_parsed", {})
     yield asked
 
@@ -148,9 +148,14 @@ FAULTS = [
 
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: str(fault.__name__))
 @pytest.mark.parametrize("kept_times", [False, True], ids=["", "times kept"])
+@pytest.mark.parametrize("settled", [True, False], ids=["", "a moment ago"])
 def test_what_comes_goes_or_is_exchanged_is_found_by_the_next_command(
-    noted: Lab, fault: Callable[[Lab], None], kept_times: bool
+    noted: Lab, fault: Callable[[Lab], None], kept_times: bool, settled: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    if not settled:
+        monkeypatch.setattr(presence, "SETTLED_NS", 2 * DAY_NS)
+        noted.run("scale data/r -o data/s --factor 3 --jobs 1")
+        noted.run(SCALE)
     folder = noted.folder / "data/s"
     wanted = content(folder)
     folders = [path for path in noted.folder.rglob("*") if path.is_dir()]
@@ -188,7 +193,7 @@ def test_a_note_is_written_anew_where_many_shelves_changed(
     (stored.parent / "x").touch()
     noted.run(SCALE)
     assert shows == [] and note.read_bytes() != before
-    monkeypatch.setattr(presence, "_lies", lambda *given: False)  # nothing is looked at now
+    monkeypatch.setattr(presence.Look, "_lie", lambda *given: False)  # nothing is looked at now
     noted.run(SCALE)
     assert shows == []
 
@@ -225,11 +230,27 @@ def test_a_damaged_note_is_passed_over(noted: Lab, shows: list[Path], at: int | 
     }
 
 
-def test_where_folders_changed_a_moment_ago_nothing_is_noted(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pages, "LARGE", 0)
+def test_where_folders_changed_a_moment_ago_their_names_are_looked_at_and_their_times_are_not(
+    lab: Lab, shows: list[Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(presence, "SETTLED_NS", 2 * DAY_NS)
     lab.run("simulate toy --trials 2 --rows 3 -o data/r")
     lab.run(SCALE)
-    monkeypatch.setattr(presence, "SETTLED_NS", DAY_NS)
+    note = notes.known(lab.store, lab.folder / "data/s")
+    assert note is not None and note.head.directory is None
+    assert {state for state, *_ in note.shelves.values()} == {None}
+    shows.clear()
+    lab.run(SCALE)
+    assert shows == []
+
+
+def test_where_a_list_of_the_directory_gives_no_inodes_nothing_is_noted(
+    lab: Lab, shows: list[Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    listed = presence._inodes
+    monkeypatch.setattr(presence, "_inodes", lambda folder: dict.fromkeys(listed(folder), 0))
+    lab.run("simulate toy --trials 2 --rows 3 -o data/r")
+    lab.run(SCALE)
     lab.run(SCALE)
     assert not (lab.folder / ".tacpipe/presence").exists()
 
@@ -241,8 +262,10 @@ def test_copies_are_looked_at_each_time(lab: Lab, shows: list[Path]) -> None:
     path, stored = lab.folder / "data/s/trial-001.parquet", first(lab)[1]
     path.unlink()
     shutil.copy(stored, path)
+    shows.clear()
     lab.run(SCALE)
-    assert not (lab.folder / ".tacpipe/presence").exists()
+    lab.run(SCALE)
+    assert len(shows) == 2
 
 
 def test_symbolic_links_are_followed_each_time(lab: Lab, shows: list[Path]) -> None:
@@ -251,8 +274,10 @@ def test_symbolic_links_are_followed_each_time(lab: Lab, shows: list[Path]) -> N
     path, stored = first(lab)
     path.unlink()
     path.symlink_to(stored)
+    shows.clear()
     lab.run(SCALE)
-    assert path.is_symlink() and not (lab.folder / ".tacpipe/presence").exists()
+    lab.run(SCALE)
+    assert path.is_symlink() and len(shows) == 2
 
 
 def test_a_collection_removes_the_notes_on_directories_that_are_gone(noted: Lab) -> None:
@@ -272,12 +297,13 @@ def test_a_store_that_cannot_be_written_is_a_hit_all_the_same(noted: Lab, monkey
     def refused(*given: object) -> None:
         raise PermissionError("no")
 
-    monkeypatch.setattr(presence, "_write", refused)
+    monkeypatch.setattr(notes, "write", refused)
     assert '"reused": 4' in noted.run(f"{SCALE} --json").out
 
 
 def test_a_manifest_that_changes_between_its_digest_and_its_reading_is_refused(noted: Lab) -> None:
     found = manifest.find(noted.folder / "data/r")
+    manifest._parsed.clear()
     path = noted.folder / "data/r/manifest.json"
     path.write_bytes(path.read_bytes() + b"\n")
     with pytest.raises(Exception, match="changed by another program"):

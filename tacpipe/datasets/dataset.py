@@ -9,8 +9,9 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
-from tacpipe.datasets.manifest import Entry, Manifest, shard_path
+from tacpipe.datasets.manifest import Entry, Manifest
 from tacpipe.datasets.pages import Pages
+from tacpipe.datasets.paths import shard_path
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io.hashing import digest
 from tacpipe.plugins import extras

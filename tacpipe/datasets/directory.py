@@ -14,8 +14,9 @@ from typing import Any, Literal
 
 from tacpipe.datasets import adoption, pages, replacing
 from tacpipe.datasets.delivery import deliver
-from tacpipe.datasets.manifest import NAME, Manifest, parse, shard_path
-from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.datasets.manifest import NAME, Manifest, find
+from tacpipe.datasets.paths import shard_path
+from tacpipe.errors import StorageError, TacpipeError, UsageError
 from tacpipe.io import regular
 from tacpipe.io.files import listed, sync_folder, sync_folders, walk, write_whole
 from tacpipe.io.hashing import digest, file_digest
@@ -30,12 +31,14 @@ class Change:
     """What a directory is to show.
 
     Shards at the paths ``may_lack`` stay as they are where they are damaged: a lost recording must not hinder the next one.
-    Where a dataset was only ``relabelled`` nothing goes and no shard is looked at: a label costs what it changes.
+    Where a dataset was only ``relabelled`` nothing goes and no shard is looked at: a label costs what it changes. Where it
+    was found ``whole`` what it shows already is not looked at again.
     """
 
     manifest: Manifest
     may_lack: Collection[str] = ()
     relabelled: bool = False
+    whole: bool = False
 
 
 def publish(store: Store, manifest: Manifest, directory: Path) -> None:
@@ -106,7 +109,7 @@ def _show(store: Store, wanted: Change, directory: Path) -> None:
     ):  # files of an export are large copies: those that are right stay
         stale = dict(_stale(store, manifest, directory))
     if not current and not relabelled:  # what was named already stays, so that a recording that comes costs itself
-        unlike, gone = _compared(_shown(directory), manifest, directory)
+        unlike, gone = _compared(_shown(directory), manifest, directory, whole=wanted.whole)
         stale = stale if manifest.exported else unlike
     refuse_links(directory, {*stale, *gone})
     with writing(directory):
@@ -190,15 +193,19 @@ def _stale(store: Store, manifest: Manifest, directory: Path) -> Iterator[tuple[
     return (one for one in manifest.objects() if not _matches(f"{directory}/{one[0]}", store, one[1]))
 
 
-def _compared(shown: Manifest | None, manifest: Manifest, directory: Path) -> tuple[dict[str, str], set[str]]:
+def _compared(
+    shown: Manifest | None, manifest: Manifest, directory: Path, *, whole: bool
+) -> tuple[dict[str, str], set[str]]:
     """Return what is to be placed in ``directory``, path and digest, and the paths that are to go.
 
-    Placed is what it lacks, in this size, and what ``shown``, its manifest, has otherwise.
+    Placed is what it lacks, in this size, and what ``shown``, its manifest, has otherwise. Where all that it names was found
+    there, ``whole``, pages that both have are passed over.
     """
     stale: dict[str, str] = {}
     gone: set[str] = set()
     files = {} if shown is None else shown.files
-    for name, before, now in pages.beside({} if shown is None else shown.recordings, manifest.recordings):
+    both = {} if shown is None else shown.recordings, manifest.recordings
+    for name, before, now in pages.beside(*(pages.differing(*both) if whole else both)):
         old, new = ({} if one is None else one["shards"] for one in (before, now))
         gone.update(shard_path(name, stream) for stream in old if stream not in new)
         for stream, shard in new.items():
@@ -209,7 +216,7 @@ def _compared(shown: Manifest | None, manifest: Manifest, directory: Path) -> tu
     for path, file in manifest.files.items():
         if not (_same(files.get(path), file) and _lies(directory, path, file["bytes"])):
             stale[path] = file["digest"]
-    return stale, gone.difference(path for path, _ in manifest.objects()) if gone else gone
+    return stale, {path for path in gone if manifest.at(path) is None}
 
 
 def _same(before: Mapping[str, Any] | None, now: Mapping[str, Any]) -> bool:
@@ -311,7 +318,10 @@ def _matches(path: str, store: Store, name: str) -> Literal["", "files", "links"
 
 def _current(directory: Path, manifest: Manifest) -> bool:
     try:
-        return regular.content(directory / NAME, regular.JSON_BYTES) == manifest.content
+        file = directory / NAME
+        if file.stat().st_size != len(manifest.content):
+            return False
+        return regular.content(file, regular.JSON_BYTES) == manifest.content
     except (FileNotFoundError, NotADirectoryError):
         return False
 
@@ -328,6 +338,8 @@ def _lies(directory: Path, path: str, size: int) -> bool:
 def _shown(directory: Path) -> Manifest | None:
     """Return the manifest in ``directory``; None if there is no readable one."""
     try:
-        return parse(regular.content(directory / NAME, regular.JSON_BYTES), str(directory))
-    except (FileNotFoundError, TacpipeError):
+        return find(directory).manifest
+    except StorageError:
+        raise
+    except TacpipeError:
         return None

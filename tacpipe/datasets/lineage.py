@@ -135,11 +135,11 @@ def _together(manifests: Sequence[Manifest]) -> Mapping[str, Entry]:
 
 
 def _recordings_compared(what: str, before: Mapping[str, Entry], now: Mapping[str, Entry]) -> list[str]:
-    """Return in words in which recordings two datasets differ; each is looked at once, next to the one of its name."""
+    """Return in words in which recordings two datasets differ; those of pages that both have are alike."""
     new: list[str] = []
     gone: list[str] = []
     others: dict[str, list[str]] = {"shards": [], "attributes": []}
-    for name, old, entry in pages.beside(before, now):
+    for name, old, entry in pages.beside(*pages.differing(before, now)):
         if old is None or entry is None:
             (new if old is None else gone).append(name)
             continue

@@ -7,28 +7,34 @@ from __future__ import annotations
 
 import json
 import re
+import zlib
 from bisect import bisect_right
-from collections.abc import ItemsView, Iterable, Iterator, Mapping, Sequence, ValuesView
-from dataclasses import dataclass
-from json.encoder import encode_basestring_ascii
-from math import isfinite
+from collections.abc import Collection, ItemsView, Iterable, Iterator, Mapping, Sequence, ValuesView
 from typing import Any
 
+from tacpipe.datasets.page_text import Entry, indented, page
 from tacpipe.io import regular
 
-LARGE = 1 << 22  # bytes of a manifest from which on its recordings are kept as text
-MANY = 10_000  # recordings from which on a result is: they have about as many bytes
-PAGE_BYTES = 1 << 16
-_MOST_BYTES = 1 << 22  # of a page; a sound one has little more than `PAGE_BYTES`
+LARGE = 1 << 20  # bytes of a manifest from which on its recordings are kept as text
+MANY = 3_000  # recordings from which on a result is: they have about as many bytes
+GROUPED = 256  # recordings of a page, in the mean
+_MOST_BYTES = 1 << 24  # of a page
 _KEPT = 4  # pages that stay parsed
 _BEGIN, _END = b'\n "recordings": {\n', b"\n }"
 _MEMBER = b'\n  "'  # begins a line of a recording's name, and no other line
 _NAME = re.compile(rb'  ("(?:[^"\\]|\\.)*"): ')
-_SHARD = ("bytes", "digest", "rows")
-_ORDER = "its recordings are not in the order of their names"
+ORDER = "its recordings are not in the order of their names"
 _NAMES = re.compile(rb'\n  ("(?:[^"\\]|\\.)*"): ')  # literal from the start, so that searching is fast
-_CONSTANTS = {None: "null", True: "true", False: "false"}
-Entry = dict[str, Any]  # {"attributes": {...}, "shards": {stream: {"digest", "rows", "bytes"}}}
+_FOLDERED = re.compile(rb'\n  "(?:[^"\\/]|\\.)*/|\\u002[fF]')
+_FOLLOWING = re.compile(rb',\n  ("(?:[^"\\]|\\.)*"): ')  # a name that is not the first
+
+
+def begins(name: str) -> bool:
+    """Return whether a page, and a group of recordings that has a record, begins with the recording of this name.
+
+    That rests on the name alone: so a recording that comes or goes changes one page, or two.
+    """
+    return zlib.crc32(name.encode(errors="surrogatepass")) % GROUPED == 0
 
 
 class Pages(Mapping[str, Entry]):
@@ -39,7 +45,7 @@ class Pages(Mapping[str, Entry]):
         self._count = count
         self._first = [json.loads(found[1]) for text in texts if (found := _NAME.match(text))]
         if len(self._first) < len(texts) or any(a >= b for a, b in zip(self._first, self._first[1:], strict=False)):
-            raise ValueError(_ORDER)
+            raise ValueError(ORDER)
         self._sound = bytearray(len(texts))  # whether a page holds what its lines begin with, in order
         self._parsed: dict[int, dict[str, Entry]] = {}
 
@@ -72,16 +78,58 @@ class Pages(Mapping[str, Entry]):
         """
         count, last = 0, ""
         for number in range(len(self.texts)):
-            part = self._page(number)
-            names = list(part)
-            if not self._sound[number]:
-                if names != sorted(names) or names != self._names(number) or (count and names[0] <= last):
-                    raise ValueError(_ORDER)
-                self._sound[number] = True
-            count, last = count + len(names), names[-1]
+            part = self.part(number, last)
+            count, last = count + len(part), next(reversed(part))
             yield part
         if count != self._count:
             raise ValueError("two of its recordings share a name")
+
+    def part(self, number: int, before: str = "") -> dict[str, Entry]:
+        """Return the recordings of a page, whose names come after ``before``. Raises `ValueError` where it is not one."""
+        part = self._page(number)
+        names = list(part)
+        if not self._sound[number]:
+            if not names or names != sorted(names) or names != self._names(number):
+                raise ValueError(ORDER)
+            self._sound[number] = True
+        if before and names[0] <= before:
+            raise ValueError(ORDER)
+        return part
+
+    def of(self, numbers: Collection[int]) -> Pages:
+        """Return some of the pages, in their order."""
+        texts = [self.texts[number] for number in sorted(numbers)]
+        return Pages(texts, sum(map(_count, texts)))
+
+    def grouped(self) -> Iterator[list[int]]:
+        """Yield the pages of each group that has a record: one, and more where the recording that began one is gone."""
+        group: list[int] = []
+        for number, name in enumerate(self._first):
+            if group and begins(name):
+                yield group
+                group = []
+            group.append(number)
+        if group:
+            yield group
+
+    def names(self, numbers: Iterable[int]) -> list[bytes]:
+        """Return the names on pages, as they are written."""
+        return [name for number in numbers for name in _NAMES.findall(b"\n" + bytes(self.texts[number]))]
+
+    def ends(self, number: int) -> tuple[str, str]:
+        """Return the names with which a page begins and ends, as its lines state them."""
+        text = bytes(self.texts[number])
+        last = _NAME.match(text, text.rfind(_MEMBER) + 1)
+        return self._first[number], self._first[number] if last is None else json.loads(last[1])
+
+    @property
+    def beginnings(self) -> Sequence[str]:
+        """The name with which each page begins."""
+        return self._first
+
+    def count(self, number: int) -> int:
+        """Return how many recordings are on a page, as its lines state them."""
+        return _count(self.texts[number])
 
     def changed(self, entries: Mapping[str, Entry | None]) -> Pages:
         """Return the recordings with others in the place of some that are there; None leaves one out."""
@@ -100,8 +148,7 @@ class Pages(Mapping[str, Entry]):
                 yield self._page(number)
 
     def _names(self, number: int) -> list[str]:
-        names = _NAMES.findall(b"\n" + bytes(self.texts[number]))
-        found: list[str] = json.loads(b"[%b]" % b",".join(names))
+        found: list[str] = json.loads(b"[%b]" % b",".join(self.names([number])))
         return found
 
     def _page(self, number: int) -> dict[str, Entry]:
@@ -112,6 +159,10 @@ class Pages(Mapping[str, Entry]):
                 del self._parsed[next(iter(self._parsed))]
             self._parsed[number] = found
         return found
+
+
+def _count(text: bytes | memoryview) -> int:
+    return bytes(text).count(_MEMBER) + 1
 
 
 class _Items(ItemsView[str, Entry]):
@@ -155,6 +206,32 @@ def beside(before: Mapping[str, Entry], now: Mapping[str, Entry]) -> Iterator[tu
             old, new = next(left, None), next(right, None)
 
 
+def shared(before: Pages, now: Pages) -> dict[int, int]:
+    """Return the pages that two datasets have both, byte for byte: the number in ``now`` to that in ``before``."""
+    places = {name: number for number, name in enumerate(before.beginnings)}
+    found = {number: places[name] for number, name in enumerate(now.beginnings) if name in places}
+    return {number: place for number, place in found.items() if same(before.texts[place], now.texts[number])}
+
+
+def same(one: bytes | memoryview, other: bytes | memoryview) -> bool:
+    """Return whether the texts of two pages are the same."""
+    return one is other or (len(one) == len(other) and bytes(one) == bytes(other))
+
+
+def foldered(recordings: Pages) -> bool:
+    """Return whether a name may lead into a folder: then recordings of two pages may name one path."""
+    return any(_FOLDERED.search(b"\n" + bytes(text)) for text in recordings.texts)
+
+
+def differing(before: Mapping[str, Entry], now: Mapping[str, Entry]) -> tuple[Mapping[str, Entry], Mapping[str, Entry]]:
+    """Return those recordings of two datasets among which all are that are not in both, or not the same in both."""
+    if not (isinstance(before, Pages) and isinstance(now, Pages)):
+        return before, now
+    both = shared(before, now)
+    gone = set(range(len(before.texts))).difference(both.values())
+    return before.of(gone), now.of(set(range(len(now.texts))).difference(both))
+
+
 def ordered(recordings: Mapping[str, Entry]) -> Iterator[tuple[str, Entry]]:
     """Return names and entries in the order of names."""
     return iter(recordings.items() if isinstance(recordings, Pages) else sorted(recordings.items()))
@@ -178,65 +255,6 @@ def write(value: Mapping[str, Any]) -> bytes:
     assert empty
     texts = (text for number, one in enumerate(recordings.texts) for text in ((b",\n" if number else b""), one))
     return b"".join([before, _BEGIN, *texts, _END, after])
-
-
-def page(entries: Mapping[str, Entry]) -> bytes:
-    """Return recordings as they stand in a manifest, in the order of names, between the braces."""
-    return ",\n".join(
-        [f"  {encode_basestring_ascii(name)}: {_entry(entries[name])}" for name in sorted(entries)]
-    ).encode()
-
-
-def _entry(entry: Entry) -> str:
-    """Return what `indented` returns for the entry of a recording, in half the time where it has the usual form."""
-    attributes, shards = entry["attributes"], entry["shards"]
-    usual = all(type(one["bytes"]) is type(one["rows"]) is int and len(one) == len(_SHARD) for one in shards.values())
-    if len(entry) > len(("attributes", "shards")) or not (attributes and shards and usual):
-        return indented(entry, "\n  ")
-    labels = [f"{encode_basestring_ascii(name)}: {_label(attributes[name])}" for name in sorted(attributes)]
-    streams = [
-        f'{encode_basestring_ascii(name)}: {{\n     "bytes": {one["bytes"]},\n     "digest": '
-        f'{encode_basestring_ascii(one["digest"])},\n     "rows": {one["rows"]}\n    }}'
-        for name, one in sorted(shards.items())
-    ]
-    inner = ",\n    "
-    return (
-        f'{{\n   "attributes": {{\n    {inner.join(labels)}\n   }},'
-        f'\n   "shards": {{\n    {inner.join(streams)}\n   }}\n  }}'
-    )
-
-
-def _label(value: Any) -> str:
-    kind = type(value)
-    if kind is str:
-        return encode_basestring_ascii(value)
-    return repr(value) if kind is int else indented(value, "\n    ")
-
-
-@dataclass(frozen=True)
-class Kept:
-    """A part of the recordings of a result, as text or as it is, and how many they are."""
-
-    entries: Mapping[str, Entry] | bytes
-    count: int
-
-
-def kept(entries: Mapping[str, Entry], *, as_text: bool) -> Kept:
-    """Return recordings as they are kept until all are there: as text where they are many."""
-    return Kept(page(entries) if as_text else entries, len(entries))
-
-
-def joined(given: Iterable[Kept]) -> Mapping[str, Entry]:
-    """Return recordings that come in parts, in the order of names, as one mapping; all parts are kept in the same way."""
-    found: dict[str, Entry] = {}
-    texts, count = [], 0
-    for part in given:
-        if isinstance(part.entries, bytes):
-            texts += [part.entries] if part.count else []
-            count += part.count
-        else:
-            found |= part.entries
-    return Pages(texts, count) if texts else found
 
 
 def split(content: bytes, where: str) -> dict[str, Any] | None:
@@ -266,36 +284,13 @@ def split(content: bytes, where: str) -> dict[str, Any] | None:
 
 def _texts(content: bytes, begin: int, end: int) -> Iterator[memoryview]:
     view = memoryview(content)
-    while True:
-        stop = content.find(b"," + _MEMBER, begin + PAGE_BYTES, end)
-        yield view[begin : end if stop < 0 else stop]
-        if stop < 0:
-            return
-        begin = stop + len(b",\n")
+    for found in _FOLLOWING.finditer(content, begin, end):
+        if _begins(found[1]):
+            yield view[begin : found.start()]
+            begin = found.start() + len(b",\n")
+    yield view[begin:end]
 
 
-def indented(value: Any, line: str = "\n") -> str:
-    """Return what ``json.dumps(value, sort_keys=True, indent=1, allow_nan=False)`` returns, in half the time.
-
-    The standard library indents in Python and not in C. ``line`` begins each line. Raises as that does.
-
-    >>> indented({"b": [1, {"c": None}], "a": {}}) == json.dumps({"a": {}, "b": [1, {"c": None}]}, indent=1)
-    True
-    """
-    kind = type(value)
-    if kind is str:
-        return encode_basestring_ascii(value)
-    if kind is int or (kind is float and isfinite(value)):
-        return repr(value)
-    if value is None or kind is bool:
-        return _CONSTANTS[value]
-    inner = f"{line} "
-    if kind is dict and value:
-        if any(type(key) is not str for key in value):
-            return json.dumps(value, sort_keys=True, indent=1, allow_nan=False).replace("\n", line)
-        names = sorted(value)
-        texts = [f"{encode_basestring_ascii(name)}: {indented(value[name], inner)}" for name in names]
-        return f"{{{inner}{f',{inner}'.join(texts)}{line}}}"
-    if kind in (list, tuple) and value:
-        return f"[{inner}{f',{inner}'.join([indented(one, inner) for one in value])}{line}]"
-    return json.dumps(value, sort_keys=True, indent=1, allow_nan=False).replace("\n", line)
+def _begins(name: bytes) -> bool:
+    """Return what `begins` returns for a name in quotation marks, as JSON has it."""
+    return begins(json.loads(name)) if b"\\" in name else zlib.crc32(name[1:-1]) % GROUPED == 0

@@ -10,7 +10,7 @@ import unicodedata
 from collections.abc import Iterable
 from pathlib import Path
 
-from tacpipe.datasets.manifest import NAME_BYTES
+from tacpipe.datasets.paths import NAME_BYTES
 from tacpipe.errors import UsageError
 from tacpipe.io.hashing import bytes_digest
 from tacpipe.printable import plain

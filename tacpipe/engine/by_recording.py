@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
 from typing import Any
 
-from tacpipe.datasets import manifest, pages
+from tacpipe.datasets import groups, merging, pages
 from tacpipe.datasets.manifest import Entry, Manifest
 from tacpipe.engine import computing, execution, keys, provenance
 from tacpipe.engine.executors.executor import Chosen
 from tacpipe.engine.outcome import Outcome
+from tacpipe.engine.previous import Previous
 from tacpipe.engine.request import Request
 from tacpipe.engine.task import Done, Task
 from tacpipe.errors import FAILED, LOCKED, LockedError, TacpipeError, UsageError, WouldChangeError
@@ -38,6 +38,7 @@ class ByRecording:
     request: Request
     outcome: Outcome
     chosen: Chosen
+    previous: Previous | None = None  # of which results are taken over
 
     def mapped(self, given: Manifest, step: Mapping[str, Any], beside: tuple[str, ...]) -> Mapping[str, Entry]:
         """Return what the map stage of a link of a chain gives for each recording of ``given``; raises as `run`.
@@ -47,16 +48,21 @@ class ByRecording:
         text where recordings are many.
         """
         entries, name, stage = given.included, step["stage"], execution.stage_of(step["stage"])
-        answered: list[pages.Kept | _Asked] = []
+        answered: list[groups.Kept | _Asked] = []
         missing: list[Task] = []
         stored: dict[str, Mapping[str, Any]] = {}  # of groups of which something is missing
-        many = len(entries) >= pages.MANY
-        self.store.expect(
-            digest(keys.of_group(step, stage, {one: entries[one] for one in group})) for group in keys.groups(entries)
-        )
-        ordered = pages.ordered(entries)
-        for group in keys.groups(entries):
-            some = dict(islice(ordered, len(group)))
+        taken = None if self.previous is None else self.previous.taken(entries, step)
+        many = taken is not None or len(entries) >= pages.MANY
+        if taken is not None:
+            self.outcome.reused += taken.count
+            self.outcome.add_group(taken.stated)
+        else:
+            self.store.expect(digest(keys.of_group(step, stage, some)) for _, some in groups.of(entries))
+        known = {} if taken is None else taken.groups
+        for first, some in groups.of(entries, known):
+            if first in known:
+                answered.append(known[first])
+                continue
             asked = _Asked(keys.of_group(step, stage, some), some)
             made = None if self.request.compare or self._reruns(name) else self._of_group(asked)
             if made is None:
@@ -68,19 +74,19 @@ class ByRecording:
                     answered.append(asked)
                     continue
                 made = self._remember_group(name, asked, found)
-            answered.append(pages.kept(_after(made, some), as_text=many))
+            answered.append(groups.kept(_after(made, some), as_text=many))
         computed = self._computed(name, missing, stored, len(entries))
 
-        def parts() -> Iterator[pages.Kept]:
+        def parts() -> Iterator[groups.Kept]:
             for one in answered:
                 if not isinstance(one, _Asked):
                     yield one
                     continue
                 records_of = {recording: computed[recording] for recording in one.entries if recording in computed}
                 made = self._remember_group(name, one, records_of)
-                yield pages.kept(_after(made, one.entries), as_text=many)
+                yield groups.kept(_after(made, one.entries), as_text=many)
 
-        return pages.joined(parts())
+        return groups.joined(parts())
 
     def _of_group(self, asked: _Asked) -> Mapping[str, Entry] | None:
         """Return what the record of a group holds, None where there is none or an object is gone."""
@@ -163,7 +169,7 @@ class ByRecording:
         if list(given.chain) != list(wanted[: len(given.chain)]):
             raise UsageError(
                 f"The model was trained behind other stages than {where} went through: "
-                f"{manifest.chain_difference(wanted, given.chain)}. Give the recordings themselves: the model's own "
+                f"{merging.chain_difference(wanted, given.chain)}. Give the recordings themselves: the model's own "
                 f"stages are then run on them."
             )
         for step in wanted[len(given.chain) :]:

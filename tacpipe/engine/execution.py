@@ -11,7 +11,8 @@ from typing import Any
 
 from tacpipe.datasets import adoption, roles
 from tacpipe.datasets.dataset import Dataset, Recording
-from tacpipe.datasets.manifest import ACQUIRE, Manifest, shard_path
+from tacpipe.datasets.manifest import ACQUIRE, Manifest
+from tacpipe.datasets.paths import shard_path
 from tacpipe.engine import provenance
 from tacpipe.engine.shared import SharedFiles
 from tacpipe.engine.task import Task

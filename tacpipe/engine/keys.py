@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import zlib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 from tacpipe.datasets.manifest import Entry, Manifest
@@ -13,8 +12,6 @@ from tacpipe.io.hashing import digest
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins.stage import ALL, AnyStage, Source
 from tacpipe.store.store import Store
-
-GROUPED = 256  # names in a group, in the mean
 
 
 def identity(name: str, version: int, params: Any, inputs: Mapping[str, Any]) -> dict[str, Any]:
@@ -52,26 +49,6 @@ def chain_step(name: str, stage: AnyStage, params: Any, fitted: Mapping[str, Any
     """Return the link of a chain that a map stage adds."""
     files = {file: value["digest"] for file, value in fitted.items()} if fitted is not None else None
     return {"stage": name, "version": stage.version, "params": params_of.to_json(params), "fitted": files}
-
-
-def groups(names: Iterable[str]) -> Iterator[list[str]]:
-    """Yield names, sorted, in groups of some `GROUPED`, of which one more or one less name changes one or two.
-
-    Where a group ends depends on the name after it alone.
-
-    >>> names = [f"trial-{number:04d}" for number in range(2000)]
-    >>> before, now = (set(map(tuple, groups(some))) for some in (names, [*names, "trial-0500-again"]))
-    >>> len(before) > 2, len(now - before) <= 2
-    (True, True)
-    """
-    group: list[str] = []
-    for name in sorted(names):
-        if group and zlib.crc32(name.encode(errors="surrogatepass")) % GROUPED == 0:
-            yield group
-            group = []
-        group.append(name)
-    if group:
-        yield group
 
 
 def of_group(step: Mapping[str, Any], stage: AnyStage, entries: Mapping[str, Entry]) -> dict[str, Any]:

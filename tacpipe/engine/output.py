@@ -6,18 +6,21 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import chain
+from functools import cached_property
 from typing import Any, Protocol
 
 from tacpipe.datasets import directory, pages, replacing
 from tacpipe.datasets import manifest as manifest_of
 from tacpipe.datasets.delivery import deliver
 from tacpipe.datasets.manifest import Manifest
+from tacpipe.engine import previous as previous_of
+from tacpipe.engine.previous import Previous
 from tacpipe.engine.request import Request
 from tacpipe.errors import DamagedError, TacpipeError, UsageError, WouldChangeError
 from tacpipe.io.hashing import file_digest
 from tacpipe.plugins.stage import Attribute
-from tacpipe.store import presence
+from tacpipe.store import notes
+from tacpipe.store.notes import Head, Note
 from tacpipe.store.presence import Look
 from tacpipe.store.store import MissingError, Store
 
@@ -36,9 +39,8 @@ class Work(Protocol):
     def key(self) -> str:
         """What names the run."""
 
-    @property
-    def reused(self) -> int:
-        """How many results of the store the answer consists of."""
+    def count(self, made: Manifest) -> int:
+        """Return how many results of the store the answer consists of, which gave this manifest."""
 
     def recall(self, manifest_digest: str, reused: int) -> bool:
         """Take over what is known of the run before; return whether it gave the manifest of this digest."""
@@ -53,8 +55,11 @@ class Work(Protocol):
     def make(self) -> Manifest:
         """Return the result, having run what was missing; the run is not remembered."""
 
-    def result(self, *, rerun: bool) -> Manifest:
-        """Return the result, answered by the store or made and remembered; ``rerun``: made in any case."""
+    def result(self, *, rerun: bool, previous: Previous | None = None) -> Manifest:
+        """Return the result, answered by the store or made and remembered; ``rerun``: made in any case.
+
+        Of a ``previous`` run what did not change is taken over.
+        """
 
 
 def settle(store: Store, request: Request, plan: replacing.Plan, work: Work) -> Manifest | Unread:
@@ -79,7 +84,7 @@ def settle(store: Store, request: Request, plan: replacing.Plan, work: Work) -> 
         return unread
     look = place.look()
     hit = None if request.compare or request.rerun else work.answer()
-    shown = hit is not None and place.shows(hit)
+    shown = hit is not None and place.shows(hit, look)
     if shown and hit is not None:
         place.note(look, work, hit)
     if not (shown or request.compare):
@@ -89,11 +94,12 @@ def settle(store: Store, request: Request, plan: replacing.Plan, work: Work) -> 
         if request.check:
             place.check(made)
         return made
-    with store.at_work(work.reads):
+    with store.at_work([*work.reads, *place.named]):
+        previous = None if request.rerun else place.previous()
         try:
-            return place.publish(work.result(rerun=request.rerun))
+            return place.published(work, work.result(rerun=request.rerun, previous=previous), previous)
         except MissingError:  # damaged in the store, which shows when it is linked: then it is recomputed
-            return place.publish(work.result(rerun=False))
+            return place.published(work, work.result(rerun=False))
 
 
 def shown(store: Store, request: Request, work: Work) -> Manifest | Unread | None:
@@ -103,7 +109,7 @@ def shown(store: Store, request: Request, work: Work) -> Manifest | Unread | Non
         return unread
     look = place.look()
     hit = work.answer()
-    if hit is None or not place.shows(hit):
+    if hit is None or not place.shows(hit, look):
         return None
     place.note(look, work, hit)
     return place.settled(hit)
@@ -125,8 +131,11 @@ class _Place(ABC):
         return self.store.roots.get(self.path)
 
     @abstractmethod
-    def shows(self, hit: Manifest) -> bool:
-        """Return whether it holds the answer already and nothing is to be written; its root too is known."""
+    def shows(self, hit: Manifest, look: Look | None) -> bool:
+        """Return whether it holds the answer already and nothing is to be written; its root too is known.
+
+        The files are part of the ``look``.
+        """
 
     def unread(self, work: Work) -> Unread | None:
         """Return what is known of the answer where it is noted that all of it is shown, and the note still holds."""
@@ -139,6 +148,19 @@ class _Place(ABC):
     def note(self, look: Look | None, work: Work, hit: Manifest) -> bool:
         """Note that the look found all of the answer shown; return whether that is noted."""
         return False
+
+    @property
+    def named(self) -> list[str]:
+        """The digests of manifests of which results may be taken over."""
+        return []
+
+    def previous(self) -> Previous | None:
+        """Return the run that gave what is shown, where all of that is noted and still there."""
+        return None
+
+    def published(self, work: Work, made: Manifest, previous: Previous | None = None) -> Manifest:
+        """Show ``made``, of which some was taken over from a ``previous`` run, and return the manifest that is shown now."""
+        return self.publish(made)
 
     @abstractmethod
     def refuse(self, plan: replacing.Plan) -> None:
@@ -164,7 +186,7 @@ class _Directory(_Place):
 
     _linked = False  # whether it was found to hold nothing but links to objects
 
-    def shows(self, hit: Manifest) -> bool:
+    def shows(self, hit: Manifest, look: Look | None) -> bool:
         root = self.root
         if root is None:
             return False
@@ -173,21 +195,33 @@ class _Directory(_Place):
         self._linked = False
         if not known:
             return False
+        if look is not None:
+            look.begin()
         how = directory.showing(self.store, wanted, self.path)
         self._linked = how == "links"
         return bool(how)
 
-    def unread(self, work: Work) -> Unread | None:
-        request, root = self.request, self.root
-        if root is None or request.compare or request.rerun or request.track or request.check:
-            return None
-        note = presence.known(self.store, self.path)
-        if note is None or (note.key, note.manifest) != (work.key, root["manifest"]):
+    @cached_property
+    def _noted(self) -> Note | None:
+        """The note on what is shown here, if that is the manifest that was noted."""
+        note, root = notes.known(self.store, self.path), self.root
+        if note is None or root is None or root["manifest"] != note.head.manifest:
             return None
         with suppress(OSError, TacpipeError):
-            same = manifest_of.hashed(self.path / manifest_of.NAME) == note.manifest
-            if same and presence.holds(note, self.store, self.path) and work.recall(note.manifest, note.reused):
-                return Unread(note.rows)
+            if manifest_of.hashed(self.path / manifest_of.NAME) == note.head.manifest:
+                return note
+        return None
+
+    def unread(self, work: Work) -> Unread | None:
+        request = self.request
+        if request.compare or request.rerun or request.track or request.check:
+            return None
+        note = self._noted
+        if note is None or note.head.key != work.key:
+            return None
+        with suppress(OSError, TacpipeError):
+            if Look(self.store, self.path).holds(note) and work.recall(note.head.manifest, note.head.reused):
+                return Unread(note.head.rows)
         return None
 
     def look(self) -> Look | None:
@@ -199,11 +233,36 @@ class _Directory(_Place):
     def note(self, look: Look | None, work: Work, hit: Manifest) -> bool:
         if look is None or hit.copied or not self._linked:
             return False
-        objects = chain([(hit.content_digest, len(hit.content))], hit.sizes())
-        return look.note(work.key, hit.content_digest, objects, reused=work.reused, rows=hit.rows)
+        return look.note(_head(work, hit), hit.contents())
+
+    @property
+    def named(self) -> list[str]:
+        return [] if self._noted is None else [self._noted.head.manifest, *previous_of.inputs(self.store, self._noted)]
+
+    def previous(self) -> Previous | None:
+        return None if self._noted is None else previous_of.found(self.store, self.path, self._noted)
+
+    def published(self, work: Work, made: Manifest, previous: Previous | None = None) -> Manifest:
+        shown = self.publish(made, previous)
+        if made.copied or len(shown.content) < pages.LARGE:
+            return shown
+        head = _head(work, shown)
+        if previous is not None and previous.succeed(head, shown):
+            return shown
+        look = Look(self.store, self.path)
+        look.begin()
+        how = directory.showing(self.store, shown, self.path)
+        if how == "links":
+            look.note(head, shown.contents())
+        elif not how:  # what was there already has another content, which its size does not show
+            directory.publish(self.store, shown, self.path)
+        return shown
 
     def refuse(self, plan: replacing.Plan) -> None:
         directory.check_output(self.store, self.request.output)
+        if self._noted is not None:  # it was checked then, and need not be parsed
+            with suppress(OSError, TacpipeError):
+                manifest_of.noted(self.path / manifest_of.NAME, self._noted.head.manifest, self._noted.head.rows)
         if not self.request.replace:
             replacing.refuse_plan(self._occupant(), self.request.output, plan)
 
@@ -230,7 +289,7 @@ class _Directory(_Place):
         self._refuse_losses(made)
         super().check(made)
 
-    def publish(self, made: Manifest) -> Manifest:
+    def publish(self, made: Manifest, previous: Previous | None = None) -> Manifest:
         if not made.recorded and directory.shows(self.store, made, self.path):
             deliver(self.store, self.path, made)
             self.store.roots.set(self.path, made.content_digest)
@@ -239,7 +298,7 @@ class _Directory(_Place):
         def decided() -> directory.Change:  # somebody may have labelled what is there
             wanted = self.settled(made)
             self._refuse_losses(wanted)
-            return directory.Change(wanted)
+            return directory.Change(wanted, whole=previous is not None and previous.stands())
 
         return directory.change(self.store, self.request.output, decided)
 
@@ -261,7 +320,7 @@ class _Directory(_Place):
 class _File(_Place):
     """One file of a result, in place of a dataset."""
 
-    def shows(self, hit: Manifest) -> bool:
+    def shows(self, hit: Manifest, look: Look | None) -> bool:
         root = self.root
         known = root is not None and root["manifest"] == hit.content_digest and self.path.exists()
         return known and file_digest(self.path) == self._digest(hit)
@@ -295,3 +354,7 @@ class _File(_Place):
 
 def _labelled(made: Manifest, labels: Mapping[str, Mapping[str, Attribute]]) -> Manifest:
     return made.labelled(labels) if labels else made
+
+
+def _head(work: Work, made: Manifest) -> Head:
+    return Head(work.key, made.content_digest, work.count(made), made.rows)

@@ -10,14 +10,16 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from tacpipe.datasets import manifest, replacing, roles
+from tacpipe.datasets import checks, manifest, replacing, roles
 from tacpipe.datasets.dataset import Dataset
-from tacpipe.datasets.manifest import Entry, Manifest, shard_path
+from tacpipe.datasets.manifest import Entry, Manifest
+from tacpipe.datasets.paths import shard_path
 from tacpipe.engine import by_recording, computing, execution, keys, output, provenance
 from tacpipe.engine.by_recording import ByRecording
 from tacpipe.engine.executors.executor import Chosen
 from tacpipe.engine.outcome import Outcome
 from tacpipe.engine.output import Unread
+from tacpipe.engine.previous import Previous
 from tacpipe.engine.request import Inputs, Request
 from tacpipe.engine.task import Task
 from tacpipe.errors import TacpipeError, UsageError, WouldChangeError
@@ -122,16 +124,16 @@ class _Run:
         self.stage = inputs.stage
         self.outcome = Outcome(request.output, digest(identity))
         self.reads = [found.digest for found in inputs.used]
+        self.previous: Previous | None = None  # of which results are taken over
 
     @property
     def key(self) -> str:
         """What names the run."""
         return self.outcome.key
 
-    @property
-    def reused(self) -> int:
-        """How many results of the store the answer consists of."""
-        return self.outcome.reused
+    def count(self, made: Manifest) -> int:
+        """Return how many results of the store the answer consists of, which gave this manifest."""
+        return len(self.inputs.merged.included) if self.stage.part else len(made.recordings) or 1
 
     def recall(self, manifest_digest: str, reused: int) -> bool:
         """Take over what is known of the run before; return whether it gave the manifest of this digest."""
@@ -160,12 +162,16 @@ class _Run:
         if not all(self.store.has(name, size) for name, size in found.sizes()):
             return None
         self.outcome.restore(record["provenance"])
-        self.outcome.reused = len(self.inputs.merged.included) if self.stage.part else len(found.recordings) or 1
+        self.outcome.reused = self.count(found)
         return found
 
-    def result(self, *, rerun: bool) -> Manifest:
-        """Return the manifest as the store answers it, or made and then remembered; ``rerun``: made in any case."""
+    def result(self, *, rerun: bool, previous: Previous | None = None) -> Manifest:
+        """Return the manifest as the store answers it, or made and then remembered; ``rerun``: made in any case.
+
+        Of a ``previous`` run what did not change is taken over.
+        """
         made = None if rerun else self.answer()
+        self.previous = previous if self.stage.mapped and self.stage.argument("Recording") else None
         if made is None:
             self.outcome.begin()
             made = self.make()
@@ -174,13 +180,16 @@ class _Run:
 
     def make(self) -> Manifest:
         """Return the manifest of the result, having run what was missing."""
+        if self.previous is not None:
+            self.previous.checked(self.inputs.datasets[0])
         for found in self.inputs.used:
             found.manifest  # noqa: B018  (a manifest edited by hand is refused before anything is written)
             if self.store.run:
                 self.store.put(found.content)  # explain and gc follow a dataset to the manifests it descends from
         made = self._make()
         try:
-            manifest.check(made)
+            if self.previous is None or not checks.check_beside(made, self.previous.made):
+                checks.check(made)
         except (ValueError, TypeError, KeyError) as error:
             raise TacpipeError(f"{self.request.name} gave what no dataset can hold: {error}.") from None
         return made
@@ -231,7 +240,7 @@ class _Run:
 
     @property
     def _by_recording(self) -> ByRecording:
-        return ByRecording(self.store, self.request, self.outcome, self.chosen)
+        return ByRecording(self.store, self.request, self.outcome, self.chosen, self.previous)
 
     def _chain(self) -> Sequence[Mapping[str, Any]]:
         if "model" in self.inputs.named:

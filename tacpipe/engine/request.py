@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
-from tacpipe.datasets import manifest, recording_names, roles
+from tacpipe.datasets import manifest, merging, recording_names, roles
 from tacpipe.datasets.manifest import VALUES, Entry, Found, Manifest
 from tacpipe.datasets.replacing import Plan
 from tacpipe.engine import execution
@@ -136,7 +136,7 @@ class Inputs:
         """The given datasets read as one."""
         if not self.datasets:
             raise UsageError(f"{self.request.name} needs a dataset to read.")
-        return manifest.merge([found.manifest for found in self.datasets])
+        return merging.merge([found.manifest for found in self.datasets])
 
     @property
     def model(self) -> Manifest:

@@ -23,7 +23,7 @@ from tacpipe.io import regular
 from tacpipe.io.files import readable_errors
 from tacpipe.io.hashing import DIGEST, bytes_digest
 from tacpipe.maintenance import unnamed
-from tacpipe.store import layout, presence
+from tacpipe.store import layout, notes
 from tacpipe.store.records import named
 from tacpipe.store.roots import PUSHED
 from tacpipe.store.store import MissingError, Store
@@ -321,7 +321,7 @@ def _sweep(
             _drop(path, dry_run=dry_run)
     if not dry_run:
         store.leases.sweep()
-        presence.forget(store, [path.stem for path in layout.entries(store.root, "roots")])
+        notes.forget(store, [path.stem for path in layout.entries(store.root, "roots")])
     for folder in layout.entries(store.root, "checkpoints"):
         if store.record(folder.name) is not None:
             collected.checkpoints += 1

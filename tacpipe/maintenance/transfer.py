@@ -10,7 +10,7 @@ from typing import Any
 
 from tacpipe.datasets import directory as directory_of
 from tacpipe.datasets import manifest as manifest_of
-from tacpipe.datasets import replacing
+from tacpipe.datasets import paths, replacing
 from tacpipe.engine import execution
 from tacpipe.errors import DamagedError, StorageError, TacpipeError, UsageError
 from tacpipe.io import places, progress, regular, threads
@@ -249,7 +249,7 @@ def _wanted(path: Path, there: AnyStore) -> tuple[manifest_of.Found, str]:
     here = locate(directory if directory.exists() else None)
     root = pushed.find(there, str(path), name, projects.known(here, folder))
     if root["path"] != name:  # PROJECT:PATH
-        if not manifest_of.safe_path(root["path"]):
+        if not paths.safe_path(root["path"]):
             raise UsageError(
                 f"{plain(root['path'])} is not a path within a project. `tacpipe store checkout {root['manifest'][:12]} "
                 f"--store {there.place} -o DIRECTORY` writes it elsewhere."

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import numpy as np
 
 from tacpipe.channels.streams import EVENTS
-from tacpipe.datasets import directory, recording_names
+from tacpipe.datasets import checks, directory, recording_names
 from tacpipe.datasets import manifest as manifest_of
 from tacpipe.datasets.manifest import ACQUIRE, Entry, Manifest
 from tacpipe.engine import keys, provenance
@@ -81,7 +81,7 @@ def append(store: Store, output: Path, spooled: Spooled, rig: Rig, sealed: Mappi
             sources=dict(sorted({**now.sources, name: {RIG: text["digest"]}}.items())),
         )
         try:
-            manifest_of.check(now)
+            checks.check(now)
             now.content  # noqa: B018  (what JSON cannot hold is refused here)
         except (ValueError, TypeError, KeyError) as error:  # what every reader would refuse is never published
             raise TacpipeError(

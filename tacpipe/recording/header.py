@@ -13,7 +13,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from tacpipe.datasets import manifest
+from tacpipe.datasets import manifest, paths
 from tacpipe.errors import TacpipeError
 from tacpipe.printable import excerpt
 from tacpipe.store import location
@@ -78,7 +78,7 @@ def is_name(name: str) -> bool:
     >>> [is_name(name) for name in ("press-001", "木", "a/b", "../a", ".a", "manifest.json", "rig-0123abcd.toml")]
     [True, True, False, False, False, False, False]
     """
-    return "/" not in name and manifest.safe_path(name) and name.lower() != manifest.NAME and not FILE.fullmatch(name)
+    return "/" not in name and paths.safe_path(name) and name.lower() != manifest.NAME and not FILE.fullmatch(name)
 
 
 def _is_attribute(value: object) -> bool:
@@ -99,6 +99,6 @@ def _projects(beside: Store) -> list[Path]:
 
 
 def _within(path: Path, project: Path) -> bool:
-    if not path.is_relative_to(project) or not manifest.safe_path(path.relative_to(project).as_posix()):
+    if not path.is_relative_to(project) or not paths.safe_path(path.relative_to(project).as_posix()):
         return False
     return path.resolve().is_relative_to(project.resolve())

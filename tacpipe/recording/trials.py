@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from tacpipe.datasets.manifest import NAME_BYTES
+from tacpipe.datasets.paths import NAME_BYTES
 from tacpipe.errors import TacpipeError
 from tacpipe.io import termination
 from tacpipe.io.termination import Ended

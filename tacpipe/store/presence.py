@@ -1,96 +1,184 @@
 """What a look at each file of a large dataset found, and the state of the folders then: while they stay as they were, the
 files are there, and none of them is looked at.
 
-A folder changes its time whenever a name in it comes, goes or is given to another file. What is written into a file in place
-changes no folder; whoever reads the file finds that. No result rests on a note: a key is made of bytes that were hashed.
+A folder changes its time whenever a name in it comes, goes or is given to another file. Where it changed so shortly before
+the look that the next change might have the same time, its time is not noted. Of a folder of objects each object is looked
+at then; of the dataset's directory the names and inodes are listed, which are those of the objects. What is written into a
+file in place changes no folder; whoever reads the file finds that.
 """
 
 from __future__ import annotations
 
 import contextlib
 import hashlib
-import json
 import os
 import stat
 import time
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 from tacpipe.errors import TacpipeError
-from tacpipe.io import regular
-from tacpipe.io.hashing import SETTLED_NS, digest
-from tacpipe.store import layout
-from tacpipe.store.roots import name_of
+from tacpipe.io.hashing import SETTLED_NS
+from tacpipe.store import notes
+from tacpipe.store.notes import Head, Note, Row, State
 from tacpipe.store.store import Store
 
 BOOT = Path("/proc/sys/kernel/random/boot_id")  # a file system is repaired between two starts of a computer
-FORMAT = 1
-_HEAD_BYTES = 1 << 20  # the longest first line that is read
-_ROW = 40  # bytes: a digest of 32, and the size of the object
 _MOST_CHANGED = 32  # shelves that are looked at again by each command before the note is written anew
-_State = list[int]  # of a folder: what the system states of it
-
-
-@dataclass(frozen=True)
-class Note:
-    """What was found of a dataset: all of its objects in the store, and nothing but links to them in its directory."""
-
-    key: str  # of the run that gave the dataset
-    manifest: str  # digest
-    reused: int  # results of that run
-    rows: int
-    boot: str
-    directory: _State
-    shelves: Mapping[str, tuple[_State, int, int, str]]  # state, first row, rows, digest of these rows
-    file: Path
-    body: int  # where in the file the rows begin
+_SAMPLE = 16  # files of which both ways to learn the inode are compared
+_MANIFEST = "manifest.json"  # in the directory, and no link: whoever relies on a note hashes it
 
 
 class Look:
-    """A look at all files of a dataset that begins now. What is found is noted after it, if no folder changed meanwhile."""
+    """A look at the files of a dataset that begins now, and what is noted of it afterwards."""
 
     def __init__(self, store: Store, directory: Path) -> None:
         self._store, self._directory = store, directory
         self._begun_ns = time.monotonic_ns()
-        self._states = _states(store), _state(directory)
+        self._shelves, self._here = _states(store), _state(directory)
 
-    def note(self, key: str, manifest: str, objects: Iterable[tuple[str, int]], *, reused: int, rows: int) -> bool:
-        """Note that the objects (digest, bytes) of the dataset are there; return False where that would not be safe.
+    @cached_property
+    def inodes(self) -> Mapping[str, int]:
+        """The inode of each name in the directory, as it is when this is first asked for: before the files are looked at."""
+        return _inodes(self._directory)
 
-        It is safe where the file system gives folders a new time for each change, by a clock that is not too coarse, and
-        where none that matters changed since shortly before the look. What cannot be written is not noted.
+    def begin(self) -> None:
+        """List the directory, before its files are looked at."""
+        self.inodes  # noqa: B018  (it is cached)
+
+    @property
+    def unchanged(self) -> bool:
+        """Whether the names in the directory are those of the files that it had as the look began."""
+        return _inodes(self._directory) == self.inodes
+
+    def holds(self, note: Note, *, listed: bool = False) -> bool:
+        """Return whether all that was noted is still there.
+
+        Of a folder of objects that changed, or whose state is not noted, each object is looked at. The directory is listed
+        where it changed, and for whoever is about to change it and `succeed`: ``listed``. Else the note is written anew
+        where that saves the next look something. False where it is not known: then each file is to be looked at.
         """
-        boot, shelves = _boot(), _states(self._store)
-        here = _state(self._directory)
-        with contextlib.suppress(OSError, TacpipeError):
-            settled_ns = self._clock_ns() - (time.monotonic_ns() - self._begun_ns) - SETTLED_NS
-            by_shelf = _by_shelf(objects)
-            used = [here, *(shelves.get(shelf) for shelf in by_shelf)]
-            calm = all(one is not None and max(one[-2:]) < settled_ns for one in used)
-            if not (boot and calm and (shelves, here) == self._states):
+        head = note.head
+        if not head.boot or head.boot != _boot() or self._here is None:
+            return False
+        if (listed or head.directory != self._here) and _listing(self._here, self.inodes) != head.listing:
+            return False
+        changed = self._changed(note)
+        if not all(self._lie(note.rows(shelf)) for shelf in changed):
+            return False
+        if not listed and (head.directory != self._here or len(changed) > _MOST_CHANGED):
+            self._renew(note, changed)
+        return True
+
+    def note(self, head: Head, contents: Iterable[tuple[str, str, int]]) -> bool:
+        """Note that a look at each file found all of a dataset there; return False where that would not be safe.
+
+        ``contents`` are path in the directory, digest and size in bytes of each shard and file: links to the objects.
+        """
+        boot, here, inodes = _boot(), self._here, self.inodes
+        if not boot or here is None:
+            return False
+        with contextlib.suppress(OSError, TacpipeError, KeyError):
+            rows = [(name, size, inodes[path]) for path, name, size in contents]
+            rows.append(self._stored(head.manifest))
+            settled = self._settled()
+            if _inodes(self._directory) != inodes or not self._alike(rows):
                 return False
-            body, places, begin = [], {}, 0
-            for shelf, found in sorted(by_shelf.items()):
-                content = b"".join(found)
-                places[shelf] = shelves[shelf], begin, len(found), hashlib.sha256(content).hexdigest()
-                body.append(content)
-                begin += len(found)
-            head = {
-                "format": FORMAT,
-                "key": key,
-                "manifest": manifest,
-                "reused": reused,
-                "rows": rows,
-                "boot": boot,
-                "directory": here,
-                "shelves": places,
+            shelves = {
+                shelf: (settled(self._shelves[shelf]), notes.encoded(some)) for shelf, some in notes.shelved(rows)
             }
-            first = json.dumps({**head, "check": digest(head)}).encode() + b"\n"
-            _write(self._store, _file(self._store, self._directory), [first, *body])
+            listing = _listing(here, inodes)
+            notes.write(
+                self._store,
+                self._directory,
+                replace(head, boot=boot, directory=settled(here), listing=listing),
+                shelves,
+            )
             return True
         return False
+
+    def succeed(self, note: Note, head: Head, before: Iterable[str], now: Iterable[tuple[str, str, int]]) -> bool:
+        """Note what is there after a dataset was changed whose note held when the look began; False where it is not safe.
+
+        ``before`` are the paths of what the dataset named then and does not name now, or otherwise, and ``now`` path, digest
+        and size of what it names now in their place. Objects that it named stay in the note until all are looked at again.
+        """
+        here = _state(self._directory)
+        if here is None:
+            return False
+        with contextlib.suppress(OSError, TacpipeError, KeyError):
+            wanted = dict(self.inodes)
+            for path in before:
+                wanted.pop(path, None)
+            placed = [*now]
+            new = [self._stored(name) for _, name, _ in placed]
+            wanted |= {path: row[2] for (path, _, _), row in zip(placed, new, strict=True)}
+            found = _inodes(self._directory)
+            if any(found.get(path) != inode for path, inode in wanted.items()):
+                return False
+            added = dict(notes.shelved({*new, self._stored(head.manifest)}))
+            settled = self._settled()
+            shelves = {}
+            for shelf in {*note.shelves, *added}:
+                state, content = self._shelves[shelf], note.content(shelf)
+                if content is None:
+                    return False
+                known = shelf in note.shelves and note.shelves[shelf][0] == state
+                shelves[shelf] = state if known else settled(state), content + notes.encoded(added.get(shelf, ()))
+            listing = _listing(here, found)
+            notes.write(
+                self._store, self._directory, replace(head, boot=_boot(), directory=None, listing=listing), shelves
+            )
+            return True
+        return False
+
+    def _renew(self, note: Note, changed: Collection[str]) -> None:
+        """Note the states that folders have now, where they can be noted; all that was noted was found there."""
+        with contextlib.suppress(OSError, TacpipeError):
+            settled = self._settled()
+            here = settled(self._here) or note.head.directory
+            states = {shelf: settled(self._shelves[shelf]) for shelf in changed}
+            gained = sum(state is not None for state in states.values()) > _MOST_CHANGED
+            if here == note.head.directory and not gained:
+                return
+            shelves = {}
+            for shelf, (state, *_) in note.shelves.items():
+                content = note.content(shelf)
+                if content is None:
+                    return
+                shelves[shelf] = states.get(shelf, state), content
+            notes.write(self._store, self._directory, replace(note.head, directory=here), shelves)
+
+    def _changed(self, note: Note) -> set[str]:
+        return {shelf for shelf, (state, *_) in note.shelves.items() if state is None or state != self._shelves[shelf]}
+
+    def _stored(self, name: str) -> Row:
+        """Return digest, size and inode of an object. Raises `KeyError` where it is not a file next to the directory."""
+        found = os.lstat(f"{self._store.root}/objects/{name[:2]}/{name}")
+        if not stat.S_ISREG(found.st_mode) or self._here is None or found.st_dev != self._here[0]:
+            raise KeyError(name)
+        return name, found.st_size, found.st_ino
+
+    def _lie(self, rows: Iterable[Row] | None) -> bool:
+        """Return whether objects lie where they should, the very files that were noted."""
+        try:
+            return rows is not None and all(self._stored(row[0]) == row for row in rows)
+        except (OSError, KeyError):
+            return False
+
+    def _alike(self, rows: Sequence[Row]) -> bool:
+        """Return whether a list of the directory gives the inodes that files have: not every file system does."""
+        return self._lie(rows[:: max(1, len(rows) // _SAMPLE)])
+
+    def _settled(self) -> Callable[[State | None], State | None]:
+        """Return a function of what a folder's state was as the look began, which is None where it had changed just before.
+
+        Then the next change might have the same time. Raises `TacpipeError` where a change leaves no time in its folder.
+        """
+        before_ns = self._clock_ns() - (time.monotonic_ns() - self._begun_ns) - SETTLED_NS
+        return lambda state: state if state is not None and max(state[-2:]) < before_ns else None
 
     def _clock_ns(self) -> int:
         """Return the time by the file system's clock. Raises `TacpipeError` where a change leaves no time in its folder."""
@@ -107,82 +195,23 @@ class Look:
         return now_ns
 
 
-def known(store: Store, directory: Path) -> Note | None:
-    """Return the note on a directory; None where there is none, or none that can be read."""
-    file = _file(store, directory)
-    with contextlib.suppress(OSError, TacpipeError, ValueError, TypeError, KeyError, RecursionError):
-        with regular.opened(file, follow=False) as reading:
-            first = reading.readline(_HEAD_BYTES)
-        head: dict[str, Any] = json.loads(first)
-        if head.pop("check") == digest(head) and head.pop("format") == FORMAT:
-            shelves = {shelf: tuple(found) for shelf, found in head.pop("shelves").items()}
-            return Note(**head, shelves=shelves, file=file, body=len(first))
-    return None
+def _inodes(directory: Path) -> dict[str, int]:
+    with contextlib.suppress(OSError), os.scandir(directory) as found:
+        return {one.name: one.inode() for one in found if one.name != _MANIFEST}
+    return {}
 
 
-def holds(note: Note, store: Store, directory: Path) -> bool:
-    """Return whether all that was noted is still there; of a folder that changed each object is looked at.
-
-    False where that is not known: then each file is to be looked at.
-    """
-    look = Look(store, directory)
-    if not note.boot or note.boot != _boot() or note.directory != _state(directory):
-        return False
-    changed = [shelf for shelf in note.shelves if _state(_shelf(store, shelf)) != note.shelves[shelf][0]]
-    if not all(_lies(store, name, size) for shelf in changed for name, size in _rows(note, shelf)):
-        return False
-    if len(changed) > _MOST_CHANGED:
-        objects = (row for shelf in note.shelves for row in _rows(note, shelf))
-        look.note(note.key, note.manifest, objects, reused=note.reused, rows=note.rows)
-    return True
+def _listing(state: State, inodes: Mapping[str, int]) -> str:
+    """Return the digest of the names in a directory, on a device, and of their inodes."""
+    lines = [f"{name}/{inodes[name]}" for name in sorted(inodes)]
+    return hashlib.sha256("\n".join([str(state[0]), *lines]).encode(errors="surrogateescape")).hexdigest()
 
 
-def forget(store: Store, names: Iterable[str]) -> None:
-    """Remove the notes on directories that no root of these names has."""
-    kept = set(names)
-    for path in layout.entries(store.root, layout.PRESENCE):
-        if path.name not in kept:
-            path.unlink(missing_ok=True)
+def _states(store: Store) -> dict[str, State | None]:
+    return {shelf: _state(f"{store.root}/objects/{shelf}") for shelf in map("{:02x}".format, range(256))}
 
 
-def _rows(note: Note, shelf: str) -> Iterator[tuple[str, int]]:
-    """Yield digest and bytes of the objects that were noted on a shelf; what is none where the note is damaged."""
-    _, begin, count, wanted = note.shelves[shelf]
-    content = b""
-    with contextlib.suppress(OSError, TacpipeError), regular.opened(note.file, follow=False) as reading:
-        reading.seek(note.body + begin * _ROW)
-        content = reading.read(count * _ROW)
-    if hashlib.sha256(content).hexdigest() != wanted:
-        yield "", 0
-        return
-    for at in range(0, len(content), _ROW):
-        yield content[at : at + 32].hex(), int.from_bytes(content[at + 32 : at + _ROW], "little")
-
-
-def _lies(store: Store, name: str, size: int) -> bool:
-    try:
-        found = os.lstat(f"{store.root}/objects/{name[:2]}/{name}")
-    except OSError:
-        return False
-    return stat.S_ISREG(found.st_mode) and found.st_size == size
-
-
-def _by_shelf(objects: Iterable[tuple[str, int]]) -> dict[str, list[bytes]]:
-    found: dict[str, list[bytes]] = {}
-    for name, size in objects:
-        found.setdefault(name[:2], []).append(bytes.fromhex(name) + size.to_bytes(8, "little"))
-    return found
-
-
-def _states(store: Store) -> dict[str, _State | None]:
-    return {shelf: _state(_shelf(store, shelf)) for shelf in map("{:02x}".format, range(256))}
-
-
-def _shelf(store: Store, shelf: str) -> str:
-    return f"{store.root}/objects/{shelf}"
-
-
-def _state(folder: Path | str) -> _State | None:
+def _state(folder: Path | str) -> State | None:
     """Return what changes with a folder's names, None where there is no folder."""
     try:
         found = os.lstat(folder)
@@ -199,20 +228,3 @@ def _boot() -> str:
         return BOOT.read_text().strip()
     except OSError:
         return ""
-
-
-def _file(store: Store, directory: Path) -> Path:
-    return store.root / layout.PRESENCE / name_of(*store.roots.named(directory))
-
-
-def _write(store: Store, file: Path, content: Iterable[bytes]) -> None:
-    """Write a note whole or not at all; it need not outlast a loss of power."""
-    draft = Path(store.draft())
-    try:
-        with draft.open("xb") as writing:
-            writing.writelines(content)
-        file.parent.mkdir(exist_ok=True)
-        if not layout.is_linked(str(store.root), file):
-            draft.replace(file)
-    finally:
-        draft.unlink(missing_ok=True)

@@ -16,7 +16,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tacpipe.datasets import manifest, recording_names
+from tacpipe.datasets import paths, recording_names
 from tacpipe.engine import computing
 from tacpipe.engine.task import Done, Task
 from tacpipe.errors import UsageError
@@ -63,8 +63,8 @@ def test_a_name_keeps_its_letters_and_nothing_that_a_path_or_a_terminal_minds(fo
 @given(st.text(max_size=400))
 def test_every_name_is_one_that_a_manifest_accepts_and_that_stays(folder: str) -> None:
     name = valid(folder)
-    assert manifest.safe_path(f"{name}.parquet")
-    assert manifest.safe_path(f"{name}/xela1.parquet")
+    assert paths.safe_path(f"{name}.parquet")
+    assert paths.safe_path(f"{name}/xela1.parquet")
     assert name.isprintable()
     assert unicodedata.is_normalized("NFC", name)
     assert recording_names.valid(name) == name

@@ -1,0 +1,244 @@
+"""What is taken over from the run before where few recordings changed: the result is that of a first run, byte for byte."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shlex
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tacpipe.datasets import checks, groups, manifest, pages
+from tacpipe.datasets.manifest import Manifest
+from tacpipe.engine.previous import Previous, Taken
+from tacpipe.errors import DAMAGED
+from tacpipe.io.hashing import file_digest
+from tacpipe.store import presence
+from tacpipe.store.store import Store
+from tests.conftest import Lab
+from tests.test_pages import ENTRIES, MANY, NAMES, paged
+from tests.test_presence import DAY_NS, FAULTS
+
+NAMED = "named data/r -o data/s --jobs 1"
+TRIALS = 14
+MATERIALS = ("felt", "silk", "cork")
+NOTES = ("a", 'say ": this', "é", "\\", "a\nb")
+
+
+@pytest.fixture
+def taken(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
+    """How many results each command took over; all datasets are large, a group has two recordings in the mean."""
+    counts: list[int] = []
+    take = Previous.taken
+
+    def taking(self: Previous, *given: Any) -> Taken | None:
+        found = take(self, *given)
+        counts.append(0 if found is None else found.count)
+        return found
+
+    monkeypatch.setattr(Previous, "taken", taking)
+    monkeypatch.setattr(pages, "LARGE", 0)
+    monkeypatch.setattr(pages, "MANY", 1)
+    monkeypatch.setattr(pages, "GROUPED", 2)
+    monkeypatch.setattr(manifest, "_parsed", {})
+    yield counts
+
+
+@pytest.fixture(params=["settled", "unsettled"])
+def clock(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All folders changed long ago, or a moment ago, so that their times are not noted."""
+    clock_ns, ago_ns = presence.Look._clock_ns, DAY_NS if request.param == "settled" else -DAY_NS
+    monkeypatch.setattr(presence.Look, "_clock_ns", lambda self: clock_ns(self) + ago_ns)
+
+
+def shown(folder: Path) -> dict[str, str]:
+    return {str(path.relative_to(folder)): file_digest(path) for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def first_run(lab: Lab, place: Path, command: str) -> dict[str, str]:
+    """Return what the command gives of the same dataset in a project of its own, whose store is empty."""
+    shutil.rmtree(place, ignore_errors=True)
+    shutil.copytree(lab.folder / "data/r", place / "data/r")
+    (place / ".tacpipe").mkdir()
+    known = dict(manifest._parsed)
+    manifest._parsed.clear()
+    os.chdir(place)
+    try:
+        lab.run(command)
+    finally:
+        os.chdir(lab.folder)
+        manifest._parsed.clear()
+        manifest._parsed.update(known)
+    return shown(place / "data/s")
+
+
+def change(lab: Lab, chance: random.Random) -> None:
+    """Change the recordings in one of the ways in which commands do."""
+    names = [path.name for path in (lab.folder / "data/r").iterdir() if path.is_dir()]
+    some = chance.sample(sorted(names), chance.randint(1, 3))
+    which = chance.choice(["more", "one", "several", "excluded", "included", "all"])
+    if which == "more":
+        lab.run(f"simulate toy --rows 3 --trials {len(names) + chance.randint(1, 3)} -o data/r --jobs 1")
+    elif which == "one":
+        lab.run(f"label data/r {some[0]} --set material={chance.choice(MATERIALS)}")
+    elif which == "several":
+        lab.run(f"label data/r {' '.join(some)} --set note={shlex.quote(chance.choice(NOTES))}")
+    elif which == "excluded":
+        lab.run(f"label data/r {' '.join(some)} --exclude dropped")
+    elif which == "included":
+        lab.run("label data/r '*' --include")
+    else:
+        lab.run(f"label data/r '*' --set batch={chance.randint(1, 3)}")
+
+
+@pytest.mark.usefixtures("clock")
+@pytest.mark.parametrize("seed", range(4))
+def test_a_run_over_a_changed_dataset_gives_the_bytes_of_a_first_run_in_an_empty_store(
+    lab: Lab, taken: list[int], tmp_path_factory: pytest.TempPathFactory, seed: int
+) -> None:
+    chance, other = random.Random(seed), tmp_path_factory.mktemp("other")
+    lab.run(f"simulate toy --rows 3 --trials {TRIALS} -o data/r --jobs 1")
+    lab.run(NAMED)
+    for _ in range(8):
+        change(lab, chance)
+        if chance.random() < 0.3:
+            change(lab, chance)
+        if chance.random() < 0.2:
+            manifest._parsed.clear()  # a command is a process of its own
+        lab.run(NAMED)
+        assert shown(lab.folder / "data/s") == first_run(lab, other / "first", NAMED)
+        assert '"ran": 0' in lab.run(f"{NAMED} --json").out
+    assert max(taken) >= TRIALS // 2
+    shutil.rmtree(lab.folder / ".tacpipe/presence")
+    assert '"ran": 0' in lab.run(f"{NAMED} --json").out  # each file is looked at
+    lab.run("store verify")
+
+
+@pytest.mark.usefixtures("clock")
+@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: str(fault.__name__))
+def test_what_is_lost_is_found_by_the_run_that_takes_over_the_rest(
+    lab: Lab, taken: list[int], fault: Callable[[Lab], None], tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    lab.run(f"simulate toy --rows 3 --trials {TRIALS} -o data/r --jobs 1")
+    lab.run(NAMED)
+    lab.run("label data/r trial-009 --set material=felt")
+    lab.run(NAMED)
+    assert taken[-1] > 0
+    lab.run("label data/r trial-010 --set material=silk")
+    fault(lab)
+    manifest._parsed.clear()
+    lab.run(NAMED)
+    lab.run("store verify")
+    assert shown(lab.folder / "data/s") == first_run(lab, tmp_path_factory.mktemp("other") / "first", NAMED)
+
+
+def test_of_a_dataset_of_which_one_recording_changed_no_other_group_is_asked_for(
+    lab: Lab, taken: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pages, "GROUPED", 4)
+    count = 60
+    lab.run(f"simulate toy --rows 2 --trials {count} -o data/r --jobs 1")
+    lab.run(NAMED)
+    lab.run("label data/r trial-030 --set material=felt")
+    sizes = [len(group) for group in groups.of_names(f"trial-{number:03d}" for number in range(count))]
+    keys: list[str] = []
+    read = Store.read_record
+    monkeypatch.setattr(Store, "read_record", lambda self, key: (keys.append(key), read(self, key))[1])
+    ran = json.loads(lab.run(f"{NAMED} --json").out)
+
+    assert (ran["ran"], ran["reused"]) == (1, count - 1)
+    assert taken[-1] >= count - max(sizes)
+    assert len(keys) < max(sizes) + 10 < count / 2
+
+
+def test_what_records_state_of_results_is_the_same_with_and_without_a_previous_run(lab: Lab, taken: list[int]) -> None:
+    lab.run(f"simulate toy --rows 3 --trials {TRIALS} -o data/r --jobs 1")
+    lab.run(NAMED)
+    lab.run("label data/r trial-003 --set material=felt")
+    lab.run(NAMED)
+    assert taken[-1] > 0
+
+    def stated() -> Any:
+        wanted = file_digest(lab.folder / "data/s/manifest.json")
+        (run,) = [
+            record
+            for _, record in lab.store.records()
+            if record["result"]["files"].get("manifest.json", {}).get("digest") == wanted
+        ]
+        return {name: run["provenance"][name] for name in ("code", "notes")}
+
+    by_taking = stated()
+    shutil.rmtree(lab.folder / ".tacpipe/presence")
+    lab.run(f"{NAMED} --rerun")
+    assert by_taking == stated()
+    assert sum(by_taking["code"]["named"].values()) == TRIALS
+
+
+def test_results_that_other_code_gave_are_not_taken_over_as_it_is_not_known_which(
+    lab: Lab, taken: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lab.run(f"simulate toy --rows 3 --trials {TRIALS} -o data/r --jobs 1")
+    lab.run(NAMED)
+    from tacpipe.engine import provenance
+
+    monkeypatch.setattr(provenance, "code", lambda stage: "0" * 64)
+    lab.run("label data/r trial-003 --set material=felt")
+    lab.run(NAMED)
+    assert taken[-1] > 0
+    lab.run("label data/r trial-004 --set material=felt")
+    ran = json.loads(lab.run(f"{NAMED} --json").out)
+    assert taken[-1] == 0
+    assert (ran["ran"], ran["reused"]) == (1, TRIALS - 1)
+
+
+@pytest.mark.parametrize("name", ["trial-003", "trial-012"])
+def test_a_dataset_that_was_edited_by_hand_is_refused_whichever_page_it_is_on(
+    lab: Lab, taken: list[int], name: str
+) -> None:
+    lab.run(f"simulate toy --rows 3 --trials {TRIALS} -o data/r --jobs 1")
+    lab.run(NAMED)
+    lab.run("label data/r trial-003 --set material=felt")
+    file = lab.folder / "data/r/manifest.json"
+    before, mark, after = file.read_text().partition(f'  "{name}": {{')
+    file.write_text(before + mark + after.replace('"trial": ', '"trial": 1', 1))
+    kept = shown(lab.folder / "data/s")
+    ran = lab.call(NAMED)
+    assert ran.code == DAMAGED
+    assert "edited by hand" in ran.err
+    assert shown(lab.folder / "data/s") == kept
+
+
+def test_another_stage_and_other_params_take_over_nothing(lab: Lab, taken: list[int]) -> None:
+    lab.run(f"simulate toy --rows 3 --trials {TRIALS} -o data/r --jobs 1")
+    lab.run("scale data/r -o data/s --factor 2 --jobs 1")
+    lab.run("scale data/r -o data/s --factor 3 --jobs 1")
+    assert taken[-1] == 0
+    lab.run(f"{NAMED} --replace")
+    assert taken[-1] == 0
+
+
+@given(MANY, st.dictionaries(NAMES, st.none() | ENTRIES, max_size=4), st.integers(1, 5))
+def test_a_manifest_checked_beside_another_has_the_digest_that_it_has_checked_alone(
+    recordings: dict[str, Any], other: dict[str, Any], grouped: int
+) -> None:
+    after = {name: one for name, one in {**recordings, **other}.items() if one is not None}
+    if not after:
+        return
+    known, now = (paged(Manifest("stage", 1, recordings=some), grouped) for some in (recordings, after))
+    alone = paged(Manifest("stage", 1, recordings=after), grouped)
+    checks.check(known)
+    try:
+        checks.check(alone)
+    except (ValueError, TypeError) as error:
+        with pytest.raises(type(error)):
+            checks.check_beside(now, known)
+        return
+    assert checks.check_beside(now, known)
+    assert (now.digest, now.rows) == (alone.digest, alone.rows)
