@@ -20,13 +20,14 @@ from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.live.sources import Layout, plan_table
 from tacpipe.live.stages import causal_stages
 from tacpipe.live.targets import Targets, facing
+from tacpipe.models.threads import one_thread
 from tacpipe.models.windows import ARM
 from tacpipe.printable import listed
 from tacpipe.sensors.plan import NAME as PLAN
 from tacpipe.sensors.plan import POSE
 from tacpipe.synchronization.causal import Grid, Rows
 from tacpipe.tasks.forward import planned, units
-from tacpipe.tasks.forward.causal import Arm, Rolling, one_thread
+from tacpipe.tasks.forward.causal import Arm, Rolling
 from tacpipe.tasks.forward.forecaster import Forecaster
 from tacpipe.tasks.forward.planned import Plan
 
@@ -286,6 +287,8 @@ class Chain:
         self._until_ns = t_ns if self._until_ns is None else max(t_ns, self._until_ns)
         rows = self._grid.rows(t_ns)
         found: list[Forecast] = []
+        if not len(rows.t_ns):
+            return found
         with one_thread():
             for index, at_ns in enumerate(rows.t_ns.tolist()):
                 if not rows.begun[index]:

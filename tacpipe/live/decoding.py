@@ -42,6 +42,13 @@ class Decoder:
         if isinstance(block, Chunks) or block.what == LOST:
             self._waiting.append(block)
 
+    def may_hold(self, until_ns: int) -> bool:
+        """Return whether what waits may hold a sample that arrived by a moment, or complete one that began by then."""
+        if not self._waiting:
+            return False
+        first = self._waiting[0]
+        return not isinstance(first, Chunks) or int(first.t_ns[0]) <= until_ns or self._reading.account.pending > 0
+
     def batches(self) -> list[Batch]:
         """Return what is complete now, as `tacpipe.recording.sealing` will decode it."""
         waiting, self._waiting = self._waiting, []

@@ -195,8 +195,9 @@ class Engine:
         if self._offset_ns is None or len(self._begun) < len(self.sensors):
             return []
         began_s = time.perf_counter()
-        self._decode(self._offset_ns)
-        found = self.chain.advance(now_ns + self._offset_ns - self.settle_ns, newest_only=True)
+        until_ns = now_ns - self.settle_ns
+        self._decode(self._offset_ns, until_ns if self._is_due(until_ns) else None)
+        found = self.chain.advance(until_ns + self._offset_ns, newest_only=True)
         if not found:
             return self._silence(now_ns)
         self._why = ""
@@ -214,11 +215,18 @@ class Engine:
         heard_ns = self._decoders[self.chain.master].heard_ns if self.chain.master in self._decoders else None
         message.age_ms = math.nan if heard_ns is None else (now_ns - heard_ns) / 1e6
 
-    def _decode(self, offset_ns: int) -> None:
-        """Decode what came and give it to the chain."""
+    def _is_due(self, until_ns: int) -> bool:
+        """Return whether there is a row to make of what came by a moment."""
+        if self._point_ns is None or self._offset_ns is None:
+            return False
+        return until_ns + self._offset_ns >= self._point_ns + self.period_ns
+
+    def _decode(self, offset_ns: int, until_ns: int | None) -> None:
+        """Decode what came and give it to the chain; where a row is due, only what may hold samples up to ``until_ns``."""
         for name, decoder in self._decoders.items():
-            for batch in decoder.batches():
-                self.chain.push(name, decoder.columns(batch, offset_ns))
+            if until_ns is None or decoder.may_hold(until_ns):
+                for batch in decoder.batches():
+                    self.chain.push(name, decoder.columns(batch, offset_ns))
 
     def _message(self, forecast: Forecast, now_ns: int) -> Message:
         self._seq += 1

@@ -197,7 +197,9 @@ def main(arguments: Sequence[str], made: Callable[[Options], Engine] = engine_of
     if options.realtime:
         scheduling.realtime(scheduling.MODEL)
     send(connection, {"ready": engine.ready()})
-    with publishers:
+    from tacpipe.models.threads import one_thread  # torch, which the engine has loaded
+
+    with publishers, one_thread():  # once, not in each forecast
         Loop(connection, engine, publishers, wire.Blocks(options.streams)).run()
     return 0
 

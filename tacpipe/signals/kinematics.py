@@ -87,12 +87,16 @@ def hand_velocity(chain: Chain, joint_rad: AnyFloats, joint_rad_s: AnyFloats, ha
     """
     velocity = np.empty((len(joint_rad), 6))
     for some in _blocks(len(joint_rad)):
-        frames = joint_frames(chain, joint_rad[some])
-        axes, places = frames[:, :, :3, 2], frames[:, :, :3, 3]  # (time, joint, 3)
-        levers = np.cross(axes, hand_m[some, None] - places)
-        velocity[some, :3] = np.einsum("tja,tj->ta", levers, joint_rad_s[some])
-        velocity[some, 3:] = np.einsum("tja,tj->ta", axes, joint_rad_s[some])
+        velocity[some] = velocity_in(joint_frames(chain, joint_rad[some]), joint_rad_s[some], hand_m[some])
     return velocity
+
+
+def velocity_in(frames: AnyFloats, joint_rad_s: AnyFloats, hand_m: AnyFloats) -> AnyFloats:
+    """Return the velocity (time, 6) that `hand_velocity` does, with the poses of the joints from `joint_frames`."""
+    axes, places = frames[:, :, :3, 2], frames[:, :, :3, 3]  # (time, joint, 3)
+    levers = np.cross(axes, hand_m[:, None] - places)
+    parts = [np.einsum("tja,tj->ta", one, joint_rad_s) for one in (levers, axes)]
+    return np.concatenate(parts, axis=1)
 
 
 def _blocks(rows: int) -> Iterator[slice]:

@@ -6,13 +6,8 @@ differently, and a forecast must not depend on how many rows came together.
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Iterator
-from contextlib import contextmanager
-
 import numpy as np
 import torch
-from threadpoolctl import ThreadpoolController
 
 from tacpipe.arrays import AnyFloats, Bools, Float32s, Floats
 from tacpipe.codecs.frame_stacking import INCREMENTS
@@ -82,14 +77,15 @@ class Arm:
     def _by_joints(self, angles: Floats, speeds: Floats, hand_m: Floats) -> Floats | None:
         if not self._carried:
             return None
+        frames = kinematics.joint_frames(kinematics.PANDA, angles[None])
         if np.isfinite(angles).all() and np.isfinite(hand_m).all():
-            last = kinematics.joint_frames(kinematics.PANDA, angles[None])[0, -1]
+            last = frames[0, -1]
             tool_m = last[:3, :3].T @ (hand_m - last[:3, 3])
             self._tool_m = tool_m if self._tool_m is None else self._tool_m
             self._carried = bool((np.abs(tool_m - self._tool_m) < JOINED).all())
             if not self._carried:
                 return None
-        found: Floats = kinematics.hand_velocity(kinematics.PANDA, angles[None], speeds[None], hand_m[None])[0]
+        found: Floats = kinematics.velocity_in(frames, speeds[None], hand_m[None])[0]
         return found
 
 
@@ -178,21 +174,3 @@ class Rolling:
         arm = np.concatenate([self._arm[past], plan.astype(np.float32)])
         read = (self._latent[past], arm, self._finger[past])
         return Windows(*(torch.from_numpy(np.ascontiguousarray(one[:, None])) for one in read))
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Have torch and numpy work in one thread: a row is too little to share, and sums in several threads round otherwise."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        with _libraries().limit(limits=1, user_api="blas"):
-            yield
-    finally:
-        torch.set_num_threads(before)
-
-
-@functools.cache
-def _libraries() -> ThreadpoolController:
-    """Return the libraries of linear algebra that are loaded; to look for them takes a millisecond."""
-    return ThreadpoolController()

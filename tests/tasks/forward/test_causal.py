@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from threadpoolctl import ThreadpoolController
 
 from tacpipe.models.windows import POSE
 from tacpipe.signals import kinematics
 from tacpipe.tasks.forward import planned, tracks
-from tacpipe.tasks.forward.causal import Arm, one_thread
+from tacpipe.tasks.forward.causal import Arm
 from tacpipe.tasks.forward.planned import Plan
 from tests.tasks.forward import trials
 
@@ -90,11 +89,3 @@ def test_without_a_plan_the_hand_moves_and_turns_on_as_it_does(turning: float) -
 def test_a_recording_of_one_row_has_an_arm_at_rest() -> None:
     row = Arm(np.array([0.0, 0.0, 0.0, 1.0])).row(0, np.zeros(3), np.array([0.0, 0.0, 0.0, 2.0]))
     assert row.tolist() == [0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0]
-
-
-def test_products_of_matrices_have_one_thread_while_a_row_is_predicted_and_as_many_as_before_after_it() -> None:
-    several = ThreadpoolController().select(user_api="blas")  # which round otherwise with another number of threads
-    with several.limit(limits=2):
-        with one_thread():
-            assert [one["num_threads"] for one in several.info()] == [1] * len(several) != []
-        assert [one["num_threads"] for one in several.info()] == [2] * len(several)

@@ -1,0 +1,38 @@
+"""How many threads torch and numpy compute with."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+
+import torch
+from threadpoolctl import ThreadpoolController
+
+_within: ContextVar[bool] = ContextVar("within", default=False)
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Have torch and numpy work in one thread: a row is too little to share, and sums in several threads round otherwise.
+
+    Within another such block it does nothing, and costs nothing.
+    """
+    if _within.get():
+        yield
+        return
+    before, token = torch.get_num_threads(), _within.set(True)
+    torch.set_num_threads(1)
+    try:
+        with _libraries().limit(limits=1, user_api="blas"):
+            yield
+    finally:
+        torch.set_num_threads(before)
+        _within.reset(token)
+
+
+@functools.cache
+def _libraries() -> ThreadpoolController:
+    """Return the libraries of linear algebra that are loaded; to look for them takes a millisecond."""
+    return ThreadpoolController()

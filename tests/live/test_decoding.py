@@ -1,0 +1,48 @@
+"""One stream of a live session: what is decoded when a row waits for it, and what can wait until after."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tacpipe.live.decoding import Decoder
+from tacpipe.recording import rig as rigs
+from tacpipe.recording.spool_blocks import Note
+from tacpipe.recording.station import LOST
+from tacpipe.sensors.framing import Chunks
+from tests.sensors import made
+
+ROW_NS = 10**12
+
+
+def decoder_and_packets(sensor: str) -> tuple[Decoder, list[bytes]]:
+    of = rigs.make(sensor, {}, "stream")
+    samples = made.samples(sensor, of, 4, 1)
+    return Decoder(of), made.pieces(of, of.encode(samples))
+
+
+@pytest.mark.parametrize(("arrived_ns", "waits"), [(ROW_NS - 1, True), (ROW_NS, True), (ROW_NS + 1, False)])
+def test_a_row_waits_for_what_arrived_by_then(arrived_ns: int, waits: bool) -> None:
+    decoder, packets = decoder_and_packets("xela")
+    assert not decoder.may_hold(ROW_NS)
+    decoder.take(Chunks.of([(arrived_ns, packets[0]), (ROW_NS + 5, packets[1])]))
+    assert decoder.may_hold(ROW_NS) == waits
+
+
+def test_a_row_waits_for_the_rest_of_a_frame_that_began_before_it() -> None:
+    decoder, pieces = decoder_and_packets("tfmini")
+    data = b"".join(pieces)
+    cut = len(pieces[0]) // 2
+    decoder.take(Chunks.of([(ROW_NS - 1, data[:cut])]))
+    assert decoder.batches() == []
+    assert not decoder.may_hold(ROW_NS)  # nothing more came
+    decoder.take(Chunks.of([(ROW_NS + 1, data[cut:])]))
+    assert decoder.may_hold(ROW_NS)
+    stamps = np.concatenate([one.t_ns for one in decoder.batches()])
+    assert stamps[0] <= ROW_NS + 1
+
+
+def test_a_row_waits_for_what_a_lost_link_leaves() -> None:
+    decoder, _ = decoder_and_packets("xela")
+    decoder.take(Note(ROW_NS + 1, "stream", LOST))
+    assert decoder.may_hold(ROW_NS)

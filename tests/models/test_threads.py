@@ -1,0 +1,29 @@
+"""One thread for torch and numpy, and as many as before afterwards."""
+
+from __future__ import annotations
+
+import torch
+from threadpoolctl import ThreadpoolController
+
+from tacpipe.models.threads import one_thread
+
+
+def test_products_of_matrices_have_one_thread_in_the_block_and_as_many_as_before_after_it() -> None:
+    several = ThreadpoolController().select(user_api="blas")  # which round otherwise with another number of threads
+    with several.limit(limits=2):
+        with one_thread():
+            assert [one["num_threads"] for one in several.info()] == [1] * len(several) != []
+        assert [one["num_threads"] for one in several.info()] == [2] * len(several)
+
+
+def test_a_block_within_another_leaves_one_thread_until_the_outer_one_ends() -> None:
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        with one_thread():
+            with one_thread():
+                pass
+            assert torch.get_num_threads() == 1
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
