@@ -19,7 +19,7 @@ from tacpipe.datasets.paths import MANIFEST, shard_path
 from tacpipe.errors import DamagedError, StorageError, UsageError
 from tacpipe.io import places, regular
 from tacpipe.io.files import unread
-from tacpipe.io.hashing import bytes_digest
+from tacpipe.io.hashing import bytes_digest, remembered_file_digest
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import excerpt, plain
 
@@ -298,7 +298,14 @@ def find(path: Path | str) -> Found:
 
 
 def hashed(file: Path) -> str:
-    """Return the digest of a manifest file, of which memory holds a block at a time; raises as `regular.content`."""
+    """Return the digest of a manifest file, of which memory holds a block at a time; raises as `regular.content`.
+
+    One that this process has read and that did not change since is not read again.
+    """
+    return remembered_file_digest(file, _hashed)
+
+
+def _hashed(file: Path | str) -> str:
     found = hashlib.sha256()
     for block in regular.blocks(file, regular.JSON_BYTES):
         found.update(block)

@@ -12,7 +12,8 @@ from typing import Any
 Entry = dict[str, Any]  # {"attributes": {...}, "shards": {stream: {"digest", "rows", "bytes"}}}
 _SHARD = ("bytes", "digest", "rows")
 _CONSTANTS = {None: "null", True: "true", False: "false"}
-_SHARD_TEXT = re.compile(rb'\{\n     "bytes": \d+,\n     "digest": ("[0-9a-f]{64}"),\n     "rows": \d+\n    \}')
+_SHARD_END = re.compile(rb',\n     "rows": \d+\n    \}')
+_SHARD_BEGIN = re.compile(rb'\{\n     "bytes": \d+,\n     "digest": (?="[0-9a-f]{64}"' + _SHARD_END.pattern + rb")")
 _BEGINNINGS = (b"\n    ", b"\n   ", b"\n  ")  # of lines, but for those within a shard
 
 
@@ -58,7 +59,7 @@ def described(text: bytes | memoryview) -> bytes | None:
     >>> described(page({"a": {"attributes": {"n": 1, "of": "cork"}, "shards": {"": shard}}}))[:52]
     b'"a":{"attributes":{"n":1,"of":"cork"},"shards":{"":"'
     """
-    found = _SHARD_TEXT.sub(rb"\1", bytes(text))
+    found = _SHARD_END.sub(b"", _SHARD_BEGIN.sub(b"", bytes(text)))
     if (
         b'\\": ' in found or b"\n     " in found
     ):  # a quotation mark and a colon within a text, or a shard of another form

@@ -7,6 +7,7 @@ import json
 import os
 import re
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -65,8 +66,10 @@ def file_digest(path: Path | str) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def remembered_file_digest(path: Path | str) -> str:
-    """Return `file_digest`, without reading again a file that this process has read and that did not change since.
+def remembered_file_digest(path: Path | str, digest_of: Callable[[Path | str], str] = file_digest) -> str:
+    """Return `file_digest`, or what ``digest_of`` returns as such.
+
+    A file that this process has read and that did not change since is not read again.
 
     Of a file that holds hundreds of recordings each asks for the digest. A file counts as unchanged while the system gives
     the same inode, size and times of change; one that was written in the last `SETTLED_NS` is always read.
@@ -76,7 +79,7 @@ def remembered_file_digest(path: Path | str) -> str:
     known = _remembered.get(name)
     if known is not None and known[0] == before:
         return known[1]
-    found = file_digest(path)
+    found = digest_of(path)
     if before == _traits(name) and time.time_ns() - max(before[-2:]) > SETTLED_NS:
         _remembered[name] = before, found
     return found
