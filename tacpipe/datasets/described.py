@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from tacpipe.datasets import page_text
@@ -12,18 +12,30 @@ from tacpipe.datasets.page_text import Entry
 from tacpipe.datasets.pages import Pages
 from tacpipe.io.hashing import Written, canonical
 
+_MOST_BYTES = 1 << 25  # of the JSON that is kept
+
 
 class Described(Pages, Written):
     """What a key holds of each recording of a large dataset: parsed a page at a time, and written as JSON from the text."""
 
+    def __init__(self, texts: Sequence[bytes | memoryview], count: int) -> None:
+        super().__init__(texts, count)
+        self._written: dict[int, bytes] = {}
+        self._kept_bytes = 0
+
     def written(self) -> Iterator[bytes]:
-        """Yield the canonical JSON of all recordings, a page at a time."""
-        between = b"{"
+        """Yield the canonical JSON of all recordings, a page at a time; a key and its record ask several times for it."""
+        yield b"{"
         for number, text in enumerate(self.texts):
-            found = page_text.described(text, keyed=True)
-            yield between + (canonical(self.part(number))[1:-1] if found is None else found)
-            between = b","
-        yield b"}" if self.texts else b"{}"
+            known = self._written.get(number)
+            if known is None:
+                found = page_text.described(text, keyed=True)
+                known = canonical(self.part(number))[1:-1] if found is None else found
+                if self._kept_bytes + len(known) <= _MOST_BYTES:
+                    self._written[number] = known
+                    self._kept_bytes += len(known)
+            yield b"," * bool(number) + known
+        yield b"}"
 
     def __reduce__(self) -> tuple[Any, ...]:
         return Described, ([bytes(text) for text in self.texts], len(self))

@@ -121,8 +121,9 @@ def file_digest(path: Path | str) -> str:
 def remembered_file_digest(path: Path | str, digest_of: Callable[[Path | str], str] | None = None) -> str:
     """Return `file_digest`, or what ``digest_of`` returns as such.
 
-    A file that this process has read and that did not change since is not read again: of a file that holds hundreds of recordings each asks for the digest. It counts as unchanged while the system gives
-    the same inode, size and times of change; one that was written in the last `SETTLED_NS` is always read.
+    A file that this process has read and that did not change since is not read again: of a file that holds hundreds of
+    recordings each asks for the digest. It counts as unchanged while the system gives the same inode, size and times of
+    change; one that was written in the last `SETTLED_NS` is always read.
     """
     name = os.fspath(path)
     before = _traits(name)
