@@ -117,7 +117,8 @@ def split(params: Params, recordings: Dataset, extend: Roles | None = None) -> R
     """
     import pyarrow as pa
 
-    from tacpipe.datasets.splits import OfRecordings, Scheme, assign, sufficient_val, without_val
+    from tacpipe.datasets.attributes import OfRecordings
+    from tacpipe.datasets.splits import Scheme, assign, sufficient_val, without_val
 
     values = asdict(params)
     scheme = Scheme(name=values.pop("scheme"), **values)

@@ -30,11 +30,11 @@ def check(manifest: Manifest, *, hashed: bool = True, listing: list[Listed] | No
     _check_lineage(manifest)
     _check_contents(manifest.files.values())
     paths.check([*manifest.files], ())
-    foldered, rows = False, 0
+    foldered, rows, size = False, 0, 0
     hashes = DatasetDigest(manifest.files) if hashed else None
     for part in pages.parts(manifest.recordings):
         shards, places = _check_part(part, manifest.files)
-        rows += sum(shard["rows"] for shard in shards)
+        rows, size = (number + sum(one[what] for one in shards) for number, what in ((rows, "rows"), (size, "bytes")))
         foldered |= any("/" in name for name in part)
         if hashes is not None:
             hashes.add(part)
@@ -44,7 +44,8 @@ def check(manifest: Manifest, *, hashed: bool = True, listing: list[Listed] | No
         listing.append(_listed([*manifest.files], manifest.files.values()))
     if foldered and isinstance(manifest.recordings, pages.Pages):  # two pages may name one path
         paths.refuse_shared([path for path, _ in manifest.objects()])
-    manifest.__dict__.update({"rows": rows} | ({} if hashes is None else {"digest": hashes.digest()}))
+    sums = {"rows": rows, "shard_bytes": size}
+    manifest.__dict__.update(sums | ({} if hashes is None else {"digest": hashes.digest()}))
 
 
 def check_beside(manifest: Manifest, known: Manifest) -> bool:

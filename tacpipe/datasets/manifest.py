@@ -87,7 +87,7 @@ class Manifest:
     def included(self) -> Mapping[str, Entry]:
         """The recordings that nobody excluded."""
         recordings = self.recordings
-        some = recordings.holding(b'"excluded"') if isinstance(recordings, pages.Pages) else [recordings]
+        some = pages.holding(recordings, b'"excluded"')
         excluded = [name for part in some for name, entry in part.items() if entry["attributes"].get("excluded")]
         return pages.changed(self.recordings, dict.fromkeys(excluded)) if excluded else self.recordings
 
@@ -145,6 +145,11 @@ class Manifest:
     def _listing(self) -> list[Listed] | None:
         """What `check` found of a manifest of many recordings, so that `contents` parses them not again."""
         return None
+
+    @cached_property
+    def shard_bytes(self) -> int:
+        """How many bytes all shards have together."""
+        return sum(shard["bytes"] for entry in self.recordings.values() for shard in entry["shards"].values())
 
     @cached_property
     def rows(self) -> int:

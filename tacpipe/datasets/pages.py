@@ -181,6 +181,11 @@ class _Values(ValuesView[Entry]):
             yield from part.values()
 
 
+def holding(recordings: Mapping[str, Entry], word: bytes) -> Iterable[Mapping[str, Entry]]:
+    """Return the recordings, of those kept as text only pages in which a word stands."""
+    return recordings.holding(word) if isinstance(recordings, Pages) else [recordings]
+
+
 def changed(recordings: Mapping[str, Entry], entries: Mapping[str, Entry | None]) -> Mapping[str, Entry]:
     """Return recordings with others in the place of some that are there; None leaves one out."""
     if isinstance(recordings, Pages):

@@ -8,17 +8,13 @@ from __future__ import annotations
 
 import itertools
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins.stage import ROLES, Attribute
-
-if TYPE_CHECKING:
-    from tacpipe.datasets.dataset import Dataset
 
 SCHEMES = ("random", "kfold", "blocked", "leave-one-out", "authors")
 SHARES = (0.2, 0.25, 0.3, 0.35, 0.4, 0.5, 0.6)  # of validation recordings, that are advised where there are too few
@@ -44,22 +40,6 @@ class Scheme:
     few: int = 0  # at most so many train, all others that would are unused; 0 for all
     few_by: str = ""  # attribute of whose every value ``few`` train; empty for ``few`` altogether
     few_of: str = ""  # attribute=value of those that ``few`` is about, as sensor=roboskin; empty for all
-
-
-class OfRecordings(Mapping[str, Attributes]):
-    """The attributes of each recording of a dataset by name; of a large one they are read when they are asked for."""
-
-    def __init__(self, dataset: Dataset) -> None:
-        self._recordings = dataset.recordings
-
-    def __getitem__(self, name: str) -> Attributes:
-        return self._recordings[name].attributes
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._recordings)
-
-    def __len__(self) -> int:
-        return len(self._recordings)
 
 
 def assign(attributes: Mapping[str, Attributes], scheme: Scheme, keep: Mapping[tuple[str, int], str] = {}) -> Roles:
