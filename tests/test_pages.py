@@ -14,8 +14,12 @@ from hypothesis import strategies as st
 import tacpipe
 from tacpipe.datasets import manifest, page_text, pages
 from tacpipe.datasets.dataset_digest import DatasetDigest
+from tacpipe.datasets.described import Described
 from tacpipe.datasets.manifest import Manifest
+from tacpipe.engine import keys
+from tacpipe.engine.task import Task, task_of
 from tacpipe.errors import DamagedError, TacpipeError
+from tacpipe.io import hashing
 from tests.conftest import Lab
 from tests.promises.test_hostile_manifest import HOSTILE
 
@@ -258,3 +262,34 @@ def test_one_more_recording_leaves_all_pages_but_its_own_as_they_were() -> None:
     assert isinstance(before, pages.Pages) and isinstance(now, pages.Pages)
     assert len(before.texts) > 4
     assert len(now.texts) - len(pages.shared(before, now)) <= 2
+
+
+@given(MANY, st.sampled_from([None, ("*",)]), st.integers(1, 5))
+def test_a_key_made_of_text_is_the_key_made_of_what_was_parsed(
+    recordings: dict[str, Any], reads: tuple[str, ...] | None, grouped: int
+) -> None:
+    whole = Manifest("stage", 1, recordings=recordings)
+    found = paged(whole, grouped)
+    assert found.digest == whole.digest
+    by_value = keys.of_dataset(whole, reads, whole.included)
+    if not whole.included:
+        return
+    by_text = keys.of_dataset(found, reads, found.included)
+    kept = by_text["recordings"]
+    assert isinstance(kept, Described)
+    assert hashing.canonical({"b": by_text, "a": 1}) == hashing.canonical({"b": by_value, "a": 1})
+    assert hashing.digest(by_text) == hashing.digest(by_value)
+    assert dict(kept) == by_value["recordings"]
+    assert dict(pickle.loads(pickle.dumps(kept))) == by_value["recordings"]
+    text = Task("place", "stage", {"inputs": by_text}, "").to_text()
+    assert task_of(text).to_text() == Task("place", "stage", {"inputs": by_value}, "").to_text()
+
+
+def test_of_text_that_tacpipe_would_not_write_a_key_is_made_of_what_was_parsed(few_are_many: None) -> None:
+    whole = Manifest("stage", 1, recordings={name: {**ENTRY, "attributes": {"n": 1.5}} for name in "abcdef"})
+    content = whole.content.replace(b'"n": 1.5', b'"n": 1.50', 1)
+    found = manifest.parse(content, "given")
+    assert found.digest == whole.digest and isinstance(found.recordings, pages.Pages)
+    by_text, by_value = (keys.of_dataset(one, None, one.included) for one in (found, whole))
+    assert not isinstance(by_text["recordings"], Described)
+    assert hashing.digest(by_text) == hashing.digest(by_value)

@@ -6,7 +6,7 @@ What is shown follows from what the dataset holds, whichever stage made it.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +14,8 @@ from tacpipe import printable
 from tacpipe.channels import streams
 from tacpipe.cli import model_overview
 from tacpipe.datasets import manifest as manifest_of
+from tacpipe.datasets import pages
+from tacpipe.datasets.attributes import OfRecordings
 from tacpipe.datasets.dataset import Dataset, Recording
 from tacpipe.engine import execution
 from tacpipe.metrics.headline import counted
@@ -34,8 +36,8 @@ def of(path: Path, *, most: int | None = None) -> dict[str, Any]:
     """Return what is in the dataset at ``path``: its ``kind``, files, and the rest by kind.
 
     The kind is recordings, split, model, result or export. Of recordings, labels, and numbers a stream of the first ``most``
-    by name (None: of all), whose shards alone are read; of a split, recordings by fold and role; of a model and of a result,
-    what `tacpipe.cli.model_overview` finds.
+    by name (None: of all), whose shards alone are read; with ``most`` labels are read when they are asked for. Of a split,
+    recordings by fold and role; of a model and of a result, what `tacpipe.cli.model_overview` finds.
     """
     found = manifest_of.find(path)
     store = locate(found.directory)
@@ -59,7 +61,9 @@ def of(path: Path, *, most: int | None = None) -> dict[str, Any]:
         "kind": "recordings",
         **about,
         "recordings": {name: _recording(opened.recordings[name]) for name in sorted(opened.recordings)[:most]},
-        "attributes": {name: dict(shard.attributes) for name, shard in opened.recordings.items()},
+        "attributes": {name: dict(shard.attributes) for name, shard in opened.recordings.items()}
+        if most is None
+        else OfRecordings(opened),
         "excluded": _excluded(opened),
     }
 
@@ -72,7 +76,7 @@ def _about(opened: Dataset) -> dict[str, Any]:
         "digest": manifest.digest,
         "skipped": dict(manifest.skipped),
         "files": {name: file["bytes"] for name, file in manifest.files.items()},
-        "bytes": sum(shard["bytes"] for entry in manifest.recordings.values() for shard in entry["shards"].values()),
+        "bytes": manifest.shard_bytes,
         "rows": manifest.rows,
     }
 
@@ -92,8 +96,8 @@ def _folds(opened: Dataset) -> dict[str, dict[str, int]]:
 
 
 def _excluded(opened: Dataset) -> dict[str, str]:
-    entries = opened.source.recordings
-    return {name: str(why) for name, entry in entries.items() if (why := entry["attributes"].get("excluded"))}
+    some = pages.holding(opened.source.recordings, b'"excluded"')
+    return {name: str(why) for part in some for name, one in part.items() if (why := one["attributes"].get("excluded"))}
 
 
 def _recording(shard: Recording) -> dict[str, Any]:
@@ -185,25 +189,44 @@ def _role_order(role: str) -> tuple[int, str]:
     return (ROLES.index(role) if role in ROLES else len(ROLES)), role
 
 
-def _labels(attributes: dict[str, dict[str, Any]], full: bool) -> list[str]:
+class _Values:
+    """The values of a label, one after another: how often each is taken, or the range of numbers that are not whole."""
+
+    def __init__(self) -> None:
+        self._counts: Counter[str] | None = Counter()  # None once one of them was a float
+        self._least, self._most = float("inf"), float("-inf")
+
+    def add(self, value: Any) -> None:
+        """Add the value of one more recording."""
+        if isinstance(value, int | float):
+            self._least, self._most = min(self._least, value), max(self._most, value)
+        if isinstance(value, float):
+            self._counts = None
+        elif self._counts is not None:
+            self._counts[str(value)] += 1
+
+    def __str__(self) -> str:
+        """Return the range, or each value with its count; of many different ones their number."""
+        if self._counts is None:
+            return f"{self._least:g} to {self._most:g}"
+        if len(self._counts) > SHOWN:
+            return f"{len(self._counts)} values"
+        return ", ".join(f"{value} ({count})" for value, count in sorted(self._counts.items()))
+
+
+def _labels(attributes: Mapping[str, Mapping[str, Any]], full: bool) -> list[str]:
     """Return one line a label that takes few values, with how often it takes each; a simulator's truth on one in all."""
     lines = []
-    names = sorted({label for labels in attributes.values() for label in labels})
+    found: dict[str, _Values] = {}
+    for labels in attributes.values():
+        for label, value in labels.items():
+            found.setdefault(label, _Values()).add(value)
+    names = sorted(found)
     truth = [name for name in names if name.startswith(_TRUTH)]
     if truth and not full:
         names = [name for name in names if name not in truth]
         lines.append(
             f"{_TRUTH}*: {counted(len(truth), 'labels')} with the simulator's ground truth (--full lists them)"
         )
-    for label in names:
-        values = [labels[label] for labels in attributes.values() if label in labels]
-        if any(isinstance(value, float) for value in values):
-            numbers = [value for value in values if isinstance(value, int | float)]
-            lines.append(f"{label}: {min(numbers):g} to {max(numbers):g}")
-            continue
-        counts = Counter(str(value) for value in values)
-        if len(counts) <= SHOWN:
-            lines.append(f"{label}: " + ", ".join(f"{value} ({count})" for value, count in sorted(counts.items())))
-        else:
-            lines.append(f"{label}: {len(counts)} values")
+    lines += [f"{label}: {found[label]}" for label in names]
     return lines

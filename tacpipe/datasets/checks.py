@@ -30,11 +30,11 @@ def check(manifest: Manifest, *, hashed: bool = True, listing: list[Listed] | No
     _check_lineage(manifest)
     _check_contents(manifest.files.values())
     paths.check([*manifest.files], ())
-    foldered, rows = False, 0
+    foldered, rows, size = False, 0, 0
     hashes = DatasetDigest(manifest.files) if hashed else None
     for part in pages.parts(manifest.recordings):
         shards, places = _check_part(part, manifest.files)
-        rows += sum(shard["rows"] for shard in shards)
+        rows, size = (number + sum(one[what] for one in shards) for number, what in ((rows, "rows"), (size, "bytes")))
         foldered |= any("/" in name for name in part)
         if hashes is not None:
             hashes.add(part)
@@ -44,7 +44,8 @@ def check(manifest: Manifest, *, hashed: bool = True, listing: list[Listed] | No
         listing.append(_listed([*manifest.files], manifest.files.values()))
     if foldered and isinstance(manifest.recordings, pages.Pages):  # two pages may name one path
         paths.refuse_shared([path for path, _ in manifest.objects()])
-    manifest.__dict__.update({"rows": rows} | ({} if hashes is None else {"digest": hashes.digest()}))
+    sums = {"rows": rows, "shard_bytes": size}
+    manifest.__dict__.update(sums | ({} if hashes is None else {"digest": hashes.digest()}))
 
 
 def check_beside(manifest: Manifest, known: Manifest) -> bool:
@@ -61,26 +62,26 @@ def check_beside(manifest: Manifest, known: Manifest) -> bool:
     _check_lineage(manifest)
     both = pages.shared(before, now)
     old, new = DatasetDigest(known.files), DatasetDigest(manifest.files)
-    last, reached, rows, count = "", 0, 0, 0
+    last, reached, rows = "", 0, 0
     for number in range(len(now.texts)):
         place = both.get(number)
         if place is None:
             part = now.part(number, last)
             shards, _ = _check_part(part, manifest.files)
-            rows, count = rows + sum(shard["rows"] for shard in shards), count + len(part)
+            rows += sum(shard["rows"] for shard in shards)
             new.add(part)
         else:
             rows -= _add_pages(old, before, range(reached, place))
             text = page_text.described(now.texts[number])
             for hashes, recordings, at in ((old, before, place), (new, now, number)):
                 hashes.add(recordings.part(at)) if text is None else hashes.add_described(text)
-            reached, count = place + 1, count + now.count(number)
+            reached = place + 1
         first, ending = now.ends(number)
         if last and first <= last:
             raise ValueError(pages.ORDER)
         last = ending
     rows -= _add_pages(old, before, range(reached, len(before.texts)))
-    if old.digest() != known.digest or count != len(now):
+    if old.digest() != known.digest:
         return False
     manifest.__dict__.update({"digest": new.digest()} | ({"rows": known.rows + rows} if "rows" in vars(known) else {}))
     return True

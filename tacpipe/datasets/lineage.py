@@ -81,7 +81,7 @@ def _changes(store: Store, root: dict[str, Any] | None, now: Manifest) -> list[s
     if root is None or root.get("previous") is None:
         return None
     try:
-        before = manifest_of.parse(store.read(root["previous"]), "the manifest before", verified=True)
+        before = manifest_of.parse(store.read(root["previous"]), "the manifest before", verified=True, beside=now)
     except StorageError:
         raise
     except TacpipeError:
@@ -115,10 +115,11 @@ def _input_changes(store: Store, argument: str, before: list[dict[str, str]], no
     if [given["dataset"] for given in before] == [given["dataset"] for given in now]:
         return []
     try:
-        old, new = (
-            [manifest_of.parse(store.read(given["manifest"]), argument, verified=True) for given in several]
-            for several in (before, now)
-        )
+        new = [manifest_of.parse(store.read(given["manifest"]), argument, verified=True) for given in now]
+        beside = new[0] if len(new) == 1 else None
+        old = [
+            manifest_of.parse(store.read(given["manifest"]), argument, verified=True, beside=beside) for given in before
+        ]
     except StorageError:
         raise
     except TacpipeError:

@@ -19,7 +19,7 @@ from tacpipe.datasets.paths import MANIFEST, shard_path
 from tacpipe.errors import DamagedError, StorageError, UsageError
 from tacpipe.io import places, regular
 from tacpipe.io.files import unread
-from tacpipe.io.hashing import bytes_digest
+from tacpipe.io.hashing import bytes_digest, remembered_file_digest
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import excerpt, plain
 
@@ -87,7 +87,7 @@ class Manifest:
     def included(self) -> Mapping[str, Entry]:
         """The recordings that nobody excluded."""
         recordings = self.recordings
-        some = recordings.holding(b'"excluded"') if isinstance(recordings, pages.Pages) else [recordings]
+        some = pages.holding(recordings, b'"excluded"')
         excluded = [name for part in some for name, entry in part.items() if entry["attributes"].get("excluded")]
         return pages.changed(self.recordings, dict.fromkeys(excluded)) if excluded else self.recordings
 
@@ -145,6 +145,11 @@ class Manifest:
     def _listing(self) -> list[Listed] | None:
         """What `check` found of a manifest of many recordings, so that `contents` parses them not again."""
         return None
+
+    @cached_property
+    def shard_bytes(self) -> int:
+        """How many bytes all shards have together."""
+        return sum(shard["bytes"] for entry in self.recordings.values() for shard in entry["shards"].values())
 
     @cached_property
     def rows(self) -> int:
@@ -298,7 +303,14 @@ def find(path: Path | str) -> Found:
 
 
 def hashed(file: Path) -> str:
-    """Return the digest of a manifest file, of which memory holds a block at a time; raises as `regular.content`."""
+    """Return the digest of a manifest file, of which memory holds a block at a time; raises as `regular.content`.
+
+    One that this process has read and that did not change since is not read again.
+    """
+    return remembered_file_digest(file, _hashed)
+
+
+def _hashed(file: Path | str) -> str:
     found = hashlib.sha256()
     for block in regular.blocks(file, regular.JSON_BYTES):
         found.update(block)

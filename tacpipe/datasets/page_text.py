@@ -12,7 +12,8 @@ from typing import Any
 Entry = dict[str, Any]  # {"attributes": {...}, "shards": {stream: {"digest", "rows", "bytes"}}}
 _SHARD = ("bytes", "digest", "rows")
 _CONSTANTS = {None: "null", True: "true", False: "false"}
-_SHARD_TEXT = re.compile(rb'\{\n     "bytes": \d+,\n     "digest": ("[0-9a-f]{64}"),\n     "rows": \d+\n    \}')
+_SHARD_END = re.compile(rb',\n     "rows": \d+\n    \}')
+_SHARD_BEGIN = re.compile(rb'\{\n     "bytes": \d+,\n     "digest": (?="[0-9a-f]{64}"' + _SHARD_END.pattern + rb")")
 _BEGINNINGS = (b"\n    ", b"\n   ", b"\n  ")  # of lines, but for those within a shard
 
 
@@ -49,19 +50,20 @@ def _label(value: Any) -> str:
     return repr(value) if kind is int else indented(value, "\n    ")
 
 
-def described(text: bytes | memoryview) -> bytes | None:
+def described(text: bytes | memoryview, *, keyed: bool = False) -> bytes | None:
     """Return what the dataset's digest is made of, of recordings as `page` wrote them; None where they are to be parsed.
 
-    It is their canonical JSON, names, attributes and digests of shards alone, without the braces around it.
+    It is their canonical JSON, names, attributes and digests of shards alone, without the braces around it. In what a key
+    holds of them, ``keyed``, a digest is a mapping of its own.
 
     >>> shard = {"bytes": 1, "digest": "0" * 64, "rows": 2}
-    >>> described(page({"a": {"attributes": {"n": 1, "of": "cork"}, "shards": {"": shard}}}))[:52]
-    b'"a":{"attributes":{"n":1,"of":"cork"},"shards":{"":"'
+    >>> text = page({"a": {"attributes": {"n": 1, "of": "cork"}, "shards": {"": shard}}})
+    >>> described(text)[:52], b'"shards":{"":{"digest":"0' in described(text, keyed=True)
+    (b'"a":{"attributes":{"n":1,"of":"cork"},"shards":{"":"', True)
     """
-    found = _SHARD_TEXT.sub(rb"\1", bytes(text))
-    if (
-        b'\\": ' in found or b"\n     " in found
-    ):  # a quotation mark and a colon within a text, or a shard of another form
+    begin, end = (b'{"digest": ', b"}") if keyed else (b"", b"")
+    found = _SHARD_END.sub(end, _SHARD_BEGIN.sub(begin, bytes(text)))
+    if b'\\": ' in found or b"\n     " in found:  # `": ` may be within a text, or a shard has another form
         return None
     for beginning in _BEGINNINGS:
         found = found.replace(beginning, b"")

@@ -25,7 +25,7 @@ _MEMBER = b'\n  "'  # begins a line of a recording's name, and no other line
 _NAME = re.compile(rb'  ("(?:[^"\\]|\\.)*"): ')
 ORDER = "its recordings are not in the order of their names"
 _NAMES = re.compile(rb'\n  ("(?:[^"\\]|\\.)*"): ')  # literal from the start, so that searching is fast
-_FOLDERED = re.compile(rb'\n  "(?:[^"\\/]|\\.)*/|\\u002[fF]')
+_FOLDERED = re.compile(rb'\n  "(?:[^"\\/]|\\.)*/')
 _FOLLOWING = re.compile(rb',\n  ("(?:[^"\\]|\\.)*"): ')  # a name that is not the first
 
 
@@ -181,6 +181,11 @@ class _Values(ValuesView[Entry]):
             yield from part.values()
 
 
+def holding(recordings: Mapping[str, Entry], word: bytes) -> Iterable[Mapping[str, Entry]]:
+    """Return the recordings, of those kept as text only pages in which a word stands."""
+    return recordings.holding(word) if isinstance(recordings, Pages) else [recordings]
+
+
 def changed(recordings: Mapping[str, Entry], entries: Mapping[str, Entry | None]) -> Mapping[str, Entry]:
     """Return recordings with others in the place of some that are there; None leaves one out."""
     if isinstance(recordings, Pages):
@@ -220,7 +225,11 @@ def same(one: bytes | memoryview, other: bytes | memoryview) -> bool:
 
 def foldered(recordings: Pages) -> bool:
     """Return whether a name may lead into a folder: then recordings of two pages may name one path."""
-    return any(_FOLDERED.search(b"\n" + bytes(text)) for text in recordings.texts)
+    return any(map(_foldered, map(bytes, recordings.texts)))
+
+
+def _foldered(text: bytes) -> bool:
+    return b"\\u002" in text or (b"/" in text and _FOLDERED.search(b"\n" + text) is not None)
 
 
 def differing(before: Mapping[str, Entry], now: Mapping[str, Entry]) -> tuple[Mapping[str, Entry], Mapping[str, Entry]]:
@@ -283,14 +292,10 @@ def split(content: bytes, where: str) -> dict[str, Any] | None:
 
 
 def _texts(content: bytes, begin: int, end: int) -> Iterator[memoryview]:
-    view = memoryview(content)
+    view, crc, grouped = memoryview(content), zlib.crc32, GROUPED  # what is called once a recording has a name here
     for found in _FOLLOWING.finditer(content, begin, end):
-        if _begins(found[1]):
+        name = found[1]
+        if begins(json.loads(name)) if b"\\" in name else crc(name[1:-1]) % grouped == 0:
             yield view[begin : found.start()]
             begin = found.start() + len(b",\n")
     yield view[begin:end]
-
-
-def _begins(name: bytes) -> bool:
-    """Return what `begins` returns for a name in quotation marks, as JSON has it."""
-    return begins(json.loads(name)) if b"\\" in name else zlib.crc32(name[1:-1]) % GROUPED == 0

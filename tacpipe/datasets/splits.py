@@ -70,7 +70,7 @@ def assign(attributes: Mapping[str, Attributes], scheme: Scheme, keep: Mapping[t
     `TacpipeError` for a scheme, share or attribute that cannot be, and where no recording is left to train on.
     """
     _check(attributes, scheme)
-    fresh = sorted(name for name in attributes if not any(kept == name for kept, _ in keep))
+    fresh = sorted(set(attributes).difference(name for name, _ in keep))
     if scheme.name == "random":
         folds = [_drawn(fresh, attributes, scheme, draw) for draw in range(scheme.repeats)]
     elif scheme.name == "blocked":
@@ -276,8 +276,8 @@ def _kfold(
     unknown = _unknown(attributes, scheme, keep) if scheme.apart else {}
     folds = []
     for fold in range(scheme.folds):
-        tested = [name for name in names if fold in (part[name], unknown.get(name))]
-        rest = _val_of([name for name in names if name not in set(tested)], attributes, scheme, fold + 1)
+        tested = {name for name in names if fold in (part[name], unknown.get(name))}
+        rest = _val_of([name for name in names if name not in tested], attributes, scheme, fold + 1)
         folds.append(rest | dict.fromkeys(tested, "test"))
     return folds
 
@@ -315,9 +315,12 @@ def _unknown(
 
 def _unknown_before(values: Mapping[str, str], scheme: Scheme, keep: Mapping[tuple[str, int], str]) -> dict[str, int]:
     """Return the fold in which an older split tests all recordings of a value, by value."""
+    folds_of: dict[str, set[int]] = {name: set() for name, _ in keep if name in values}
+    for (name, fold), role in keep.items():
+        if role == "test" and name in folds_of:
+            folds_of[name].add(fold)
     tested: dict[str, set[int]] = {}
-    for name in sorted({name for name, _ in keep if name in values}):
-        folds = {fold for (kept, fold), role in keep.items() if kept == name and role == "test"}
+    for name, folds in sorted(folds_of.items()):
         tested[values[name]] = tested.get(values[name], folds) & folds
     known = [value for value, folds in tested.items() if not folds]
     if known:

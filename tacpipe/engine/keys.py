@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from tacpipe.datasets import described
 from tacpipe.datasets.manifest import Entry, Manifest
 from tacpipe.engine import execution
 from tacpipe.engine.task import Task
@@ -33,6 +34,9 @@ def of_recording(entry: Entry, reads: tuple[str, ...] | None) -> dict[str, Any]:
 
 def of_dataset(manifest: Manifest, reads: tuple[str, ...] | None, chosen: Mapping[str, Entry]) -> dict[str, Any]:
     """Return what a whole-dataset key holds of the ``chosen`` recordings: names, attributes, digests, chain, files."""
+    recordings: Mapping[str, Entry] | None = described.of(manifest, chosen) if reads in (None, ALL) else None
+    if recordings is None:
+        recordings = {name: of_recording(entry, reads) for name, entry in sorted(chosen.items())}
     return {
         "lineage": {
             "stage": manifest.stage,
@@ -40,7 +44,7 @@ def of_dataset(manifest: Manifest, reads: tuple[str, ...] | None, chosen: Mappin
             "params": manifest.params,
             "chain": manifest.chain,
         },
-        "recordings": {name: of_recording(entry, reads) for name, entry in sorted(chosen.items())},
+        "recordings": recordings,
         "files": {name: file["digest"] for name, file in manifest.files.items()},
     }
 
@@ -53,8 +57,8 @@ def chain_step(name: str, stage: AnyStage, params: Any, fitted: Mapping[str, Any
 
 def of_group(step: Mapping[str, Any], stage: AnyStage, entries: Mapping[str, Entry]) -> dict[str, Any]:
     """Return what names the results of a map stage for several recordings, by all that their own keys hold."""
-    described = digest({name: of_recording(entry, stage.reads or ()) for name, entry in entries.items()})
-    return {"group": step["stage"], "step": step, "recordings": described}
+    named = digest({name: of_recording(entry, stage.reads or ()) for name, entry in entries.items()})
+    return {"group": step["stage"], "step": step, "recordings": named}
 
 
 def shard_tasks(store: Store, given: Manifest, step: Mapping[str, Any], beside: tuple[str, ...]) -> list[Task]:

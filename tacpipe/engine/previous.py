@@ -38,7 +38,7 @@ class Taken:
         return sum(kept.count for kept in self.groups.values())
 
 
-@dataclass(frozen=True)
+@dataclass
 class Previous:
     """A run over one dataset, recording by recording, whose output is as it left it."""
 
@@ -47,7 +47,7 @@ class Previous:
     note: Note
     look: Look
     record: Mapping[str, Any]
-    given: Manifest  # what it read, of which nothing is parsed yet
+    given: Manifest | None  # what it read, of which nothing is parsed yet; None once all that is asked of it was asked
     made: Manifest  # what it gave
 
     def checked(self, found: Found) -> None:
@@ -55,9 +55,16 @@ class Previous:
         manifest_of.parse(found.content, str(found.directory / manifest_of.NAME), beside=self.given)
 
     def taken(self, entries: Mapping[str, Entry], step: Mapping[str, Any]) -> Taken | None:
-        """Return what is taken over of the results of a link of a chain for ``entries``; None where nothing can be."""
-        made, given = self.made, self.given.included
-        if not (isinstance(entries, pages.Pages) and isinstance(given, pages.Pages) and self._gave(step)):
+        """Return what is taken over of the results of a link of a chain for ``entries``; None where nothing can be.
+
+        It is asked once: what the run read is not kept.
+        """
+        made, before = self.made, self.given
+        self.given = None
+        if before is None or not isinstance(entries, pages.Pages) or not self._gave(step, before.content_digest):
+            return None
+        given = before.included
+        if not isinstance(given, pages.Pages):
             return None
         assert isinstance(made.recordings, pages.Pages)
         both, results = pages.shared(given, entries), made.recordings
@@ -92,13 +99,13 @@ class Previous:
         files = [(path, file["digest"], file["bytes"]) for path, file in shown.files.items()]
         return self.look.succeed(self.note, head, [*gone, *self.made.files], [*placed, *files])
 
-    def _gave(self, step: Mapping[str, Any]) -> bool:
+    def _gave(self, step: Mapping[str, Any], given: str) -> bool:
         made = self.made
         named = [one["manifest"] for one in made.inputs.get("datasets", ())]
         return (
             isinstance(made.recordings, pages.Pages)
             and made.stage == self.record["identity"]["run"] == step["stage"]
-            and named == [self.given.content_digest]
+            and named == [given]
             and bool(made.chain)
             and digest(made.chain[-1]) == digest(step)
         )

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+from tacpipe.io.hashing import canonical
 from tacpipe.training.devices import Compute
 
 
@@ -28,7 +29,9 @@ class Task:
 
     def to_text(self) -> str:
         """Return what `task_of` reads."""
-        return json.dumps({**vars(self), "compute": asdict(self.compute)})  # an identity may name all recordings
+        return canonical(
+            {**vars(self), "compute": asdict(self.compute)}
+        ).decode()  # an identity may name all recordings
 
 
 def task_of(text: str) -> Task:

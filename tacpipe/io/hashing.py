@@ -7,6 +7,9 @@ import json
 import os
 import re
 import time
+import uuid
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +22,37 @@ SETTLED_NS = 2_000_000_000  # the coarsest clock of a file system in use; a youn
 _remembered: dict[str, tuple[tuple[int, ...], str]] = {}  # path: what the system stated of the file, its digest
 
 
+class Written(ABC):
+    """A mapping that is written as JSON in parts, which memory holds one after another."""
+
+    @abstractmethod
+    def written(self) -> Iterator[bytes]:
+        """Yield what `canonical` of the mapping as a plain dict is, in parts."""
+
+
+class _WithinError(Exception):
+    """A value holds a `Written`, which `json` does not know."""
+
+
+def parts(value: Any) -> Iterator[bytes]:
+    """Yield `canonical` of a value in parts: those of a `Written` in it as they come. Raises as that does."""
+    within: dict[str, Written] = {}
+
+    def named(one: Any) -> str:
+        if not isinstance(one, Written):
+            raise TypeError(f"Object of type {type(one).__name__} is not JSON serializable")
+        name = f"written {uuid.uuid4().hex}"
+        within[name] = one
+        return name
+
+    text = _canonical(value, named)
+    for found in re.split("|".join(f'"({name})"' for name in within), text) if within else [text]:
+        if found in within:
+            yield from within[found].written()
+        elif found:
+            yield found.encode()
+
+
 def canonical(value: Any) -> bytes:
     """Return ``value`` as canonical JSON: the same value gives the same bytes everywhere.
 
@@ -28,10 +62,23 @@ def canonical(value: Any) -> bytes:
     b'{"a":[1.5,null],"b":1}'
     """
     try:
-        text = json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
+        return _canonical(value, _refused).encode()
+    except _WithinError:
+        return b"".join(parts(value))
+
+
+def _refused(one: Any) -> str:
+    if isinstance(one, Written):
+        raise _WithinError
+    raise TypeError(f"Object of type {type(one).__name__} is not JSON serializable")
+
+
+def _canonical(value: Any, default: Callable[[Any], str]) -> str:
+    try:
+        text = json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False, default=default)
         if "\\ud" in text:  # beyond 16 bits, or half a character, of which two would read as a whole one
-            json.dumps(value, ensure_ascii=False).encode()
-        return text.encode()
+            json.dumps(value, ensure_ascii=False, default=default).encode()
+        return text
     except (TypeError, ValueError, RecursionError) as error:
         raise TacpipeError(
             f"A key cannot be made of {excerpt(value)}: {error}. Use numbers, text, lists and mappings."
@@ -44,7 +91,13 @@ def digest(value: Any) -> str:
     >>> digest({})[:8]
     '44136fa3'
     """
-    return hashlib.sha256(canonical(value)).hexdigest()
+    try:
+        return hashlib.sha256(_canonical(value, _refused).encode()).hexdigest()
+    except _WithinError:
+        found = hashlib.sha256()
+        for part in parts(value):
+            found.update(part)
+        return found.hexdigest()
 
 
 def bytes_digest(content: bytes) -> str:
@@ -65,18 +118,19 @@ def file_digest(path: Path | str) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def remembered_file_digest(path: Path | str) -> str:
-    """Return `file_digest`, without reading again a file that this process has read and that did not change since.
+def remembered_file_digest(path: Path | str, digest_of: Callable[[Path | str], str] | None = None) -> str:
+    """Return `file_digest`, or what ``digest_of`` returns as such.
 
-    Of a file that holds hundreds of recordings each asks for the digest. A file counts as unchanged while the system gives
-    the same inode, size and times of change; one that was written in the last `SETTLED_NS` is always read.
+    A file that this process has read and that did not change since is not read again: of a file that holds hundreds of
+    recordings each asks for the digest. It counts as unchanged while the system gives the same inode, size and times of
+    change; one that was written in the last `SETTLED_NS` is always read.
     """
     name = os.fspath(path)
     before = _traits(name)
     known = _remembered.get(name)
     if known is not None and known[0] == before:
         return known[1]
-    found = file_digest(path)
+    found = (digest_of or file_digest)(path)
     if before == _traits(name) and time.time_ns() - max(before[-2:]) > SETTLED_NS:
         _remembered[name] = before, found
     return found

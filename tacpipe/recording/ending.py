@@ -22,7 +22,8 @@ def lines(attributes: Mapping[str, Mapping[str, Any]], recordings: Mapping[str, 
     ``attributes`` are those of each recording, ``recordings`` the figures of its streams.
     """
     found = []
-    for name, values in sorted(attributes.items()):
+    for name in sorted(attributes):
+        values = attributes[name]
         if values.get("ended") in REASONS:
             lasts_s = max(
                 (figures.get("duration_s", 0.0) for figures in recordings.get(name, {}).values()), default=0.0

@@ -14,6 +14,7 @@ import hashlib
 import os
 import stat
 import time
+from array import array
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -51,6 +52,9 @@ class Look:
     @property
     def unchanged(self) -> bool:
         """Whether the names in the directory are those of the files that it had as the look began."""
+        with contextlib.suppress(OSError, TacpipeError):
+            if self._settled()(self._here) is not None:
+                return _state(self._directory) == self._here
         return _inodes(self._directory) == self.inodes
 
     def holds(self, note: Note, *, listed: bool = False) -> bool:
@@ -63,7 +67,11 @@ class Look:
         head = note.head
         if not head.boot or head.boot != _boot() or self._here is None:
             return False
-        if (listed or head.directory != self._here) and _listing(self._here, self.inodes) != head.listing:
+        same = head.directory == self._here
+        if listed:
+            self.begin()
+            same = same and _state(self._directory) == self._here
+        if not same and _listing(self._here, self.inodes) != head.listing:
             return False
         changed = self._changed(note)
         if not all(self._lie(note.rows(shelf)) for shelf in changed):
@@ -203,8 +211,10 @@ def _inodes(directory: Path) -> dict[str, int]:
 
 def _listing(state: State, inodes: Mapping[str, int]) -> str:
     """Return the digest of the names in a directory, on a device, and of their inodes."""
-    lines = [f"{name}/{inodes[name]}" for name in sorted(inodes)]
-    return hashlib.sha256("\n".join([str(state[0]), *lines]).encode(errors="surrogateescape")).hexdigest()
+    names = sorted(inodes)
+    found = hashlib.sha256("\0".join([str(state[0]), *names]).encode(errors="surrogateescape"))
+    found.update(array("Q", [inodes[name] for name in names]).tobytes())
+    return found.hexdigest()
 
 
 def _states(store: Store) -> dict[str, State | None]:

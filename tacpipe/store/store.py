@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import json
 import os
 import shutil
 import sys
@@ -19,7 +18,7 @@ from tacpipe.errors import DamagedError, StorageError, TacpipeError
 from tacpipe.io import drafts, memory, regular
 from tacpipe.io.drafts import Draft
 from tacpipe.io.files import listed, move, present, readable_errors, sync_folder, sync_folders
-from tacpipe.io.hashing import bytes_digest, digest
+from tacpipe.io.hashing import bytes_digest, canonical, digest
 from tacpipe.store import layout
 from tacpipe.store.directory import Directory
 from tacpipe.store.leases import Announcing, Leases
@@ -420,7 +419,7 @@ def record_content(
     """Return the record that ``identity`` gave ``result``, with digests of itself, and how it is kept."""
     body = {"identity": identity, "result": result}
     record = {**body, "digest": digest(body), "provenance": provenance, "check": digest(provenance)}
-    return record, json.dumps(record, sort_keys=True).encode()
+    return record, canonical(record)
 
 
 def sound(record: dict[str, Any], key: str) -> bool:
