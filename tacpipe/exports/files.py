@@ -2,23 +2,38 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Iterator, Mapping
+from typing import IO, Any
 
-Content = bytes | Callable[[], bytes]
+from tacpipe.plugins.stage import Written
+
+Content = bytes | Callable[[], bytes] | Written
 
 
-class Files(Mapping[str, bytes]):
-    """Files by name; the content of each is bytes, or a function that returns them."""
+class Files(Mapping[str, bytes | Written]):
+    """Files by name; the content of each is bytes, a function that returns them, or `Written`."""
 
     def __init__(self, contents: Mapping[str, Content]) -> None:
         self._contents = contents
 
-    def __getitem__(self, name: str) -> bytes:
+    def __getitem__(self, name: str) -> bytes | Written:
         content = self._contents[name]
-        return content if isinstance(content, bytes) else content()
+        return content if isinstance(content, bytes | Written) else content()
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._contents)
 
     def __len__(self) -> int:
         return len(self._contents)
+
+
+def copied(file: IO[bytes]) -> Written:
+    """Return a file that is written by copying another one, which is closed then."""
+
+    def write(sink: Any) -> None:
+        with file:
+            file.seek(0)
+            shutil.copyfileobj(file, sink, 1 << 20)
+
+    return Written(write)

@@ -103,14 +103,22 @@ First = Callable[[Any], Mapping[str, Mapping[str, Any]]]  # of params: stages by
 
 
 @dataclass(frozen=True)
+class Written:
+    """A file of a result that memory need not hold: ``write`` writes it, once, to the file that it is given."""
+
+    write: Callable[[Any], object]
+
+
+@dataclass(frozen=True)
 class Result:
     """What a stage over whole datasets returns: recordings, files or both, and notes for the user (as `RecordingOutput`).
 
-    Files are taken one by one, so a mapping that makes each when it is asked for holds one in memory.
+    Files are taken one by one, so a mapping that makes each when it is asked for holds one in memory; one that is `Written`
+    is stored as it is written.
     """
 
     recordings: Mapping[str, RecordingOutput] = field(default_factory=dict)
-    files: Mapping[str, bytes] = field(default_factory=dict)
+    files: Mapping[str, bytes | Written] = field(default_factory=dict)
     notes: Sequence[str] = ()
 
 
