@@ -21,7 +21,7 @@ from tacpipe.io.drafts import Hashed
 from tacpipe.io.hashing import bytes_digest, digest, remembered_file_digest
 from tacpipe.plugins import extras, failures, registry
 from tacpipe.plugins import params as params_of
-from tacpipe.plugins.stage import AnyStage, RecordingOutput, Result, Stage, Written
+from tacpipe.plugins.stage import AnyStage, RecordingOutput, Result, Stage
 from tacpipe.store import records
 from tacpipe.store.location import opened
 from tacpipe.store.store import MissingError, Object, Store
@@ -73,12 +73,9 @@ def _stored(returned: Result, sink: Store | Scratch, *, durable: bool) -> dict[s
     recordings = {
         name: _entry(recording, sink, durable=durable) for name, recording in sorted(returned.recordings.items())
     }
-    files = {name: vars(_file(returned.files[name], sink)) for name in sorted(returned.files)}
+    files = {name: vars(sink.put(returned.files[name])) for name in sorted(returned.files)}
+    files |= {name: vars(sink.put_written(returned.written[name])) for name in sorted(returned.written)}
     return {"recordings": recordings, "files": files}
-
-
-def _file(content: bytes | Written, sink: Store | Scratch) -> Object:
-    return sink.put_written(content.write) if isinstance(content, Written) else sink.put(content)
 
 
 def stage_of(name: str) -> AnyStage:

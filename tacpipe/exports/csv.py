@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from tacpipe.exports import contents, readme
 from tacpipe.exports.contents import TIME, Contents, Stream, shown
 from tacpipe.exports.files import Content, Files
-from tacpipe.plugins.stage import RecordingName, RecordingOutput, Result, Written, stage
+from tacpipe.plugins.stage import RecordingName, RecordingOutput, Result, stage
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -50,11 +50,11 @@ class Params:
 @stage(version=1)
 def part(params: Params, recording: Recording, name: RecordingName) -> Result:
     """Return a file a stream."""
-    files, losses = {}, []
+    written, losses = {}, []
     for stream in recording.streams:
         losses += list(_losses(stream, recording.columns(stream)))
-        files[f"{name}/{shown(stream)}.csv"] = Written(functools.partial(_write, recording, stream))
-    return Result({"": RecordingOutput(contents.part(recording, losses))}, files)
+        written[f"{name}/{shown(stream)}.csv"] = functools.partial(_write, recording, stream)
+    return Result({"": RecordingOutput(contents.part(recording, losses))}, written=written)
 
 
 @stage(version=1, part=part)

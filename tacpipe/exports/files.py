@@ -6,20 +6,18 @@ import shutil
 from collections.abc import Callable, Iterator, Mapping
 from typing import IO, Any
 
-from tacpipe.plugins.stage import Written
-
-Content = bytes | Callable[[], bytes] | Written
+Content = bytes | Callable[[], bytes]
 
 
-class Files(Mapping[str, bytes | Written]):
-    """Files by name; the content of each is bytes, a function that returns them, or `Written`."""
+class Files(Mapping[str, bytes]):
+    """Files by name; the content of each is bytes or a function that returns them."""
 
     def __init__(self, contents: Mapping[str, Content]) -> None:
         self._contents = contents
 
-    def __getitem__(self, name: str) -> bytes | Written:
+    def __getitem__(self, name: str) -> bytes:
         content = self._contents[name]
-        return content if isinstance(content, bytes | Written) else content()
+        return content if isinstance(content, bytes) else content()
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._contents)
@@ -28,12 +26,12 @@ class Files(Mapping[str, bytes | Written]):
         return len(self._contents)
 
 
-def copied(file: IO[bytes]) -> Written:
-    """Return a file that is written by copying another one, which is closed then."""
+def copied(file: IO[bytes]) -> Callable[[Any], None]:
+    """Return a function that copies a file to the one that it is given, and closes it."""
 
     def write(sink: Any) -> None:
         with file:
             file.seek(0)
             shutil.copyfileobj(file, sink, 1 << 20)
 
-    return Written(write)
+    return write

@@ -11,14 +11,14 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import IO, TYPE_CHECKING, Any, Literal
 
 from tacpipe.errors import UsageError
 from tacpipe.exports import contents, readme
 from tacpipe.exports.contents import TIME, shown
-from tacpipe.exports.files import Content, Files, copied
+from tacpipe.exports.files import Files, copied
 from tacpipe.plugins.constraints import Rate
 from tacpipe.plugins.stage import ALL, Attribute, RecordingName, RecordingOutput, Result, stage
 
@@ -89,7 +89,7 @@ def part(params: Params, recording: Recording, name: RecordingName) -> Result:
         return Result({"": RecordingOutput(contents.part(recording, arrays.losses(recording)))})
     losses: list[str] = []
     content = _recording(recording, losses)
-    return Result({"": RecordingOutput(contents.part(recording, losses))}, {f"{name}.h5": copied(content)})
+    return Result({"": RecordingOutput(contents.part(recording, losses))}, written={f"{name}.h5": copied(content)})
 
 
 @stage(version=1, part=part, first=first)
@@ -101,15 +101,15 @@ def hdf5(params: Params, recordings: Dataset, parts: Parts) -> Result:
     Example: tacpipe export hdf5 data/recordings -o exports/hdf5
     """
     found = contents.of_parts(parts)
-    files: dict[str, Content] = {}
+    written: dict[str, Callable[[Any], object]] = {}
     opening = _STREAMS
     if params.structure == "robomimic":
         from tacpipe.exports import frames
 
         columns, found = frames.columns(found, common=params.common)
-        opening, files[DEMOS] = _DEMOS, copied(_demos(params, recordings, columns))
-    files[readme.NAME] = readme.text("Tactile recordings as HDF5", opening, recordings, found)
-    return Result(files=Files(files), notes=readme.notes(recordings, found))
+        opening, written[DEMOS] = _DEMOS, copied(_demos(params, recordings, columns))
+    text = readme.text("Tactile recordings as HDF5", opening, recordings, found)
+    return Result(files=Files({readme.NAME: text}), notes=readme.notes(recordings, found), written=written)
 
 
 def _recording(recording: Recording, losses: list[str]) -> IO[bytes]:

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 from tacpipe.exports import contents, readme
 from tacpipe.exports.contents import TIME, shown
 from tacpipe.exports.files import Files
-from tacpipe.plugins.stage import ALL, RecordingName, RecordingOutput, Result, Written, stage
+from tacpipe.plugins.stage import ALL, RecordingName, RecordingOutput, Result, stage
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -57,8 +57,8 @@ def part(params: Params, recording: Recording, name: RecordingName) -> Result:
     """Return the MCAP file of one recording."""
     losses: list[str] = []
     streams = list(_streams(params, recording, losses))
-    written = Written(functools.partial(_write, recording, name, streams))
-    return Result({"": RecordingOutput(contents.part(recording, losses))}, {f"{name}.mcap": written})
+    write = functools.partial(_write, recording, name, streams)
+    return Result({"": RecordingOutput(contents.part(recording, losses))}, written={f"{name}.mcap": write})
 
 
 @stage(version=1, part=part)

@@ -103,23 +103,17 @@ First = Callable[[Any], Mapping[str, Mapping[str, Any]]]  # of params: stages by
 
 
 @dataclass(frozen=True)
-class Written:
-    """A file of a result that memory need not hold: ``write`` writes it, once, to the file that it is given."""
-
-    write: Callable[[Any], object]
-
-
-@dataclass(frozen=True)
 class Result:
     """What a stage over whole datasets returns: recordings, files or both, and notes for the user (as `RecordingOutput`).
 
-    Files are taken one by one, so a mapping that makes each when it is asked for holds one in memory; one that is `Written`
-    is stored as it is written.
+    Files are taken one by one, so a mapping that makes each when it is asked for holds one in memory. Those of ``written``
+    memory need not hold: each is a function that writes the file, once, to what it is given.
     """
 
     recordings: Mapping[str, RecordingOutput] = field(default_factory=dict)
-    files: Mapping[str, bytes | Written] = field(default_factory=dict)
+    files: Mapping[str, bytes] = field(default_factory=dict)
     notes: Sequence[str] = ()
+    written: Mapping[str, Callable[[Any], object]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
