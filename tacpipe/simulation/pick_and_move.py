@@ -40,6 +40,7 @@ RESERVE = (
 OPEN_M, GRASPED_M = 0.070, 0.040  # finger width
 APPROACH_S, RAMP_S, PAUSE_S = (0.6, 1.2), 0.4, (0.2, 0.5)
 BLOCK_ROWS = 1 << 16  # of a stream that are made at once
+KEPT_BYTES = 1 << 24  # of streams in memory, before they are put aside on disk
 LOSS_S, SLIDE_S = 0.02, 0.04  # over which a grip gives way, and for which the load must then be too much
 
 
@@ -92,7 +93,7 @@ def simulate_trial(seed: int, index: int, rig: Rig = Rig()) -> RecordingOutput:
     scene = perform(seed, index, rig)
     start_ns = START_NS + index * TRIAL_NS
     streams: dict[str, pa.Table | pa.RecordBatchReader] = {}
-    spill = Spill()
+    spill = Spill(KEPT_BYTES)
     known: dict[str, Attribute] = {}
     duration_ns = int(scene.path.t_ns[-1])
     devices = {
