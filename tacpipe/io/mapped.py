@@ -69,7 +69,10 @@ def _file(size: int) -> mmap.mmap:
     """Return a temporary file of this size, mapped; all of it has its place on the disk."""
     try:
         with tempfile.TemporaryFile() as file:
-            os.posix_fallocate(file.fileno(), 0, size)  # a hole that a full disk cannot fill kills its writer
+            if hasattr(os, "posix_fallocate"):
+                os.posix_fallocate(file.fileno(), 0, size)  # a hole that a full disk cannot fill kills its writer
+            else:
+                file.truncate(size)
             return mmap.mmap(file.fileno(), size)
     except OSError as error:
         raise sentence(tempfile.gettempdir(), error) from error
