@@ -19,7 +19,6 @@ HITS = {  # commands whose results are in the store, under the keys that they ha
     "data/synced": "synchronize data/recordings --rate-hz 25",
     "data/segments": "segment contacts data/synced",
     "data/split": "split data/segments --scheme random --val 0.34 --test 0.34",
-    "data/latents": "compress pca data/segments --split data/split --components 2",
     "data/predicted": "predict models/forward data/latents --steps 1",
 }
 
@@ -47,6 +46,19 @@ def test_a_command_finds_its_older_result_under_the_same_key(
     assert done.code == 0, done.err
     assert json.loads(done.out)["ran"] == 0
     assert (older / output / "manifest.json").read_bytes() == before
+
+
+def test_components_are_fitted_anew_since_their_stage_has_another_version_and_are_those_of_before(
+    older: Path, call: Callable[[str], Ran]
+) -> None:
+    then = tacpipe.open("data/latents").table()
+    done = call("compress pca data/segments --split data/split --components 2 -o data/latents --json")
+    assert done.code == 0, done.err
+    assert json.loads(done.out)["ran"] == 3
+    found = tacpipe.open("data/latents").table()
+    assert found.column_names == then.column_names
+    for name in ("z00", "z01"):
+        assert np.allclose(found.column(name).to_numpy(), then.column(name).to_numpy(), rtol=1e-5, atol=1e-5), name
 
 
 def test_an_older_dataset_is_opened_with_the_label_that_was_set_by_hand(older: Path) -> None:

@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from tacpipe.arrays import AnyArray, Indices, Int64s
+    from tacpipe.io.columns import Columns
 
 COUNT = "count"  # the unit of readings as a sensor gives them
 EVENTS = "events"  # the stream of what went wrong while recording; no signal
@@ -16,7 +17,7 @@ TRUTH = "gt_"  # how columns with ground truth begin
 _GAP_FACTOR = 3.0  # a step this many times the median step is a gap
 
 
-def rate_hz(table: pa.Table) -> float | None:
+def rate_hz(table: pa.Table | Columns) -> float | None:
     """Return the rate of a stream's rows: by the device's own counter where there is one, else by the median step.
 
     None where there are no times, or too few rows.
@@ -25,9 +26,9 @@ def rate_hz(table: pa.Table) -> float | None:
 
     if "t_ns" not in table.column_names or table.num_rows < 2:
         return None
-    step_ns = np.diff(table["t_ns"].to_numpy())  # (time - 1,)
+    step_ns = np.diff(table.column("t_ns").to_numpy())  # (time - 1,)
     if "seq" in table.column_names and step_ns.sum() > 0:  # the device counts: late arrivals are then no gaps
-        return round(float(np.diff(table["seq"].to_numpy()).sum() / step_ns.sum()) * 1e9, 3)
+        return round(float(np.diff(table.column("seq").to_numpy()).sum() / step_ns.sum()) * 1e9, 3)
     median_ns = float(np.median(step_ns))
     return round(1e9 / median_ns, 3) if median_ns else None
 

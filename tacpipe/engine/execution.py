@@ -75,6 +75,7 @@ def _stored(returned: Result, sink: Store | Scratch, *, durable: bool) -> dict[s
         name: _entry(recording, sink, durable=durable) for name, recording in sorted(returned.recordings.items())
     }
     files = {name: vars(sink.put(returned.files[name])) for name in sorted(returned.files)}
+    files |= {name: vars(sink.put_written(returned.written[name])) for name in sorted(returned.written)}
     return {"recordings": recordings, "files": files}
 
 

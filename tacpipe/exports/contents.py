@@ -78,13 +78,15 @@ def part(recording: Recording, losses: Iterable[str] = ()) -> dict[str, pa.Table
 
     columns, rows = [], []
     for name in recording.streams:
-        table = recording.table(name)
-        columns += [(name, one.name, one.type, json.dumps(dict(one.about), sort_keys=True)) for one in _columns(table)]
-        t_ns = table[TIME].to_numpy() if TIME in table.column_names and table.num_rows else None
-        floats = (column.to_numpy() for column in table.columns if pa.types.is_floating(column.type))
+        table = recording.columns(name)
+        described = _columns(table.schema)
+        columns += [(name, one.name, one.type, json.dumps(dict(one.about), sort_keys=True)) for one in described]
+        t_ns = table.column(TIME).to_numpy() if TIME in table.column_names and table.num_rows else None
+        rate_hz = streams.rate_hz(table)
+        floats = (table.column(one.name).to_numpy() for one in table.schema if pa.types.is_floating(one.type))
         nan = any(bool(np.isnan(values).any()) for values in floats)
         ends = (int(t_ns[0]), int(t_ns[-1])) if t_ns is not None else (None, None)
-        rows.append((name, table.num_rows, *ends, streams.rate_hz(table), nan))
+        rows.append((name, table.num_rows, *ends, rate_hz, nan))
     return {
         COLUMNS: _table(columns, stream=pa.string(), column=pa.string(), type=pa.string(), about=pa.string()),
         STREAMS: _table(
@@ -155,8 +157,8 @@ def about(field: pa.Field) -> dict[str, str]:
     return {key.decode(): value.decode() for key, value in given.items() if not key.startswith(b"PARQUET:")}
 
 
-def _columns(table: pa.Table) -> list[Column]:
-    return [Column(field.name, str(field.type), about(field)) for field in table.schema]
+def _columns(schema: pa.Schema) -> list[Column]:
+    return [Column(field.name, str(field.type), about(field)) for field in schema]
 
 
 def _by_stream(rows: Iterable[Mapping[str, Any]]) -> dict[str, tuple[Column, ...]]:

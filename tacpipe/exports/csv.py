@@ -8,11 +8,11 @@ Example: tacpipe export csv data/recordings -o exports/csv
 
 from __future__ import annotations
 
-import io
+import functools
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from tacpipe.exports import contents, readme
 from tacpipe.exports.contents import TIME, Contents, Stream, shown
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from tacpipe.datasets.dataset import Dataset, Recording
+    from tacpipe.io.columns import Columns
 
     Parts = Dataset
 
@@ -49,12 +50,11 @@ class Params:
 @stage(version=1)
 def part(params: Params, recording: Recording, name: RecordingName) -> Result:
     """Return a file a stream."""
-    files, losses = {}, []
+    written, losses = {}, []
     for stream in recording.streams:
-        table = recording.table(stream)
-        losses += list(_losses(stream, table))
-        files[f"{name}/{shown(stream)}.csv"] = _content(table)
-    return Result({"": RecordingOutput(contents.part(recording, losses))}, files)
+        losses += list(_losses(stream, recording.columns(stream)))
+        written[f"{name}/{shown(stream)}.csv"] = functools.partial(_write, recording, stream)
+    return Result({"": RecordingOutput(contents.part(recording, losses))}, written=written)
 
 
 @stage(version=1, part=part)
@@ -116,15 +116,21 @@ def _text(value: str) -> str:
     return json.dumps(value, ensure_ascii=True)  # a basic string of TOML is written alike
 
 
-def _content(table: pa.Table) -> bytes:
-    """Return a table as CSV: floats with the fewest digits that give the same bits back, NaN as ``nan``."""
-    import pyarrow as pa
+def _write(recording: Recording, stream: str, sink: Any) -> None:
+    """Write a stream as CSV: floats with the fewest digits that give the same bits back, NaN as ``nan``."""
     import pyarrow.csv as pc
 
-    bare = pa.Table.from_arrays([_written(column) for column in table.columns], names=table.column_names)
-    sink = io.BytesIO()
-    pc.write_csv(bare, sink)
-    return sink.getvalue()
+    stored = recording.columns(stream)
+    with pc.CSVWriter(sink, _bare(stored.schema.empty_table()).schema) as writer:
+        for table in stored.batches():
+            writer.write_table(_bare(table))
+
+
+def _bare(table: pa.Table) -> pa.Table:
+    """Return a table whose columns can be written, without metadata."""
+    import pyarrow as pa
+
+    return pa.Table.from_arrays([_written(column) for column in table.columns], names=table.column_names)
 
 
 def _written(column: pa.ChunkedArray) -> pa.ChunkedArray:
@@ -140,7 +146,7 @@ def _written(column: pa.ChunkedArray) -> pa.ChunkedArray:
     return column.cast(column.type.value_type) if pa.types.is_dictionary(column.type) else column
 
 
-def _losses(stream: str, table: pa.Table) -> Iterator[str]:
+def _losses(stream: str, table: Columns) -> Iterator[str]:
     """Yield what of a stream CSV and the layout do not give back."""
     import numpy as np
     import pyarrow as pa
@@ -155,7 +161,8 @@ def _losses(stream: str, table: pa.Table) -> Iterator[str]:
     about: Mapping[str, str] = contents.about(table.schema.field(TIME))
     if "made" in about:
         yield f"how the stamps of {where} were made ({about['made']})"
-    for field, column in zip(table.schema, table.columns, strict=True):
+    for field in table.schema:
+        column = table.column(field.name)
         if str(field.type) not in READ:
             yield f"column {field.name} of {where}, of the type {field.type}: {LAYOUT} leaves it out"
         elif column.null_count and not pa.types.is_string(field.type):

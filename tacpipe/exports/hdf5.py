@@ -9,16 +9,16 @@ Example: tacpipe export hdf5 data/recordings -o exports/hdf5
 
 from __future__ import annotations
 
-import io
 import json
-from collections.abc import Iterator, Mapping, Sequence
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import IO, TYPE_CHECKING, Any, Literal
 
 from tacpipe.errors import UsageError
 from tacpipe.exports import contents, readme
 from tacpipe.exports.contents import TIME, shown
-from tacpipe.exports.files import Content, Files
+from tacpipe.exports.files import Files, copied
 from tacpipe.plugins.constraints import Rate
 from tacpipe.plugins.stage import ALL, Attribute, RecordingName, RecordingOutput, Result, stage
 
@@ -89,7 +89,7 @@ def part(params: Params, recording: Recording, name: RecordingName) -> Result:
         return Result({"": RecordingOutput(contents.part(recording, arrays.losses(recording)))})
     losses: list[str] = []
     content = _recording(recording, losses)
-    return Result({"": RecordingOutput(contents.part(recording, losses))}, {f"{name}.h5": content})
+    return Result({"": RecordingOutput(contents.part(recording, losses))}, written={f"{name}.h5": copied(content)})
 
 
 @stage(version=1, part=part, first=first)
@@ -101,29 +101,30 @@ def hdf5(params: Params, recordings: Dataset, parts: Parts) -> Result:
     Example: tacpipe export hdf5 data/recordings -o exports/hdf5
     """
     found = contents.of_parts(parts)
-    files: dict[str, Content] = {}
+    written: dict[str, Callable[[Any], object]] = {}
     opening = _STREAMS
     if params.structure == "robomimic":
         from tacpipe.exports import frames
 
         columns, found = frames.columns(found, common=params.common)
-        opening, files[DEMOS] = _DEMOS, lambda: _demos(params, recordings, columns)
-    files[readme.NAME] = readme.text("Tactile recordings as HDF5", opening, recordings, found)
-    return Result(files=Files(files), notes=readme.notes(recordings, found))
+        opening, written[DEMOS] = _DEMOS, copied(_demos(params, recordings, columns))
+    text = readme.text("Tactile recordings as HDF5", opening, recordings, found)
+    return Result(files=Files({readme.NAME: text}), notes=readme.notes(recordings, found), written=written)
 
 
-def _recording(recording: Recording, losses: list[str]) -> bytes:
+def _recording(recording: Recording, losses: list[str]) -> IO[bytes]:
+    """Return a temporary file with a recording, as HDF5 goes back and forth in what it writes."""
     import h5py
 
-    sink = io.BytesIO()
+    sink = tempfile.TemporaryFile()  # noqa: SIM115  (closed by whoever copies it)
     with h5py.File(sink, "w", track_order=True, libver=VERSION) as file:
         losses += _attributes(file, recording.attributes)
         for stream in recording.streams:
             group = file.create_group(shown(stream), track_order=True)
-            table = recording.table(stream)
-            for field, column in zip(table.schema, table.columns, strict=True):
-                losses += _column(group, field, column, shown(stream))
-    return sink.getvalue()
+            table = recording.columns(stream)
+            for field in table.schema:
+                losses += _column(group, field, table.column(field.name), shown(stream))
+    return sink
 
 
 def _attributes(group: h5py.Group, values: Mapping[str, Attribute]) -> Iterator[str]:
@@ -172,14 +173,14 @@ def _storage(values: AnyArray) -> dict[str, Any]:
     return {"chunks": chunks, "compression": "gzip", "compression_opts": LEVEL, "shuffle": True}
 
 
-def _demos(params: Params, recordings: Dataset, columns: Sequence[str]) -> bytes:
+def _demos(params: Params, recordings: Dataset, columns: Sequence[str]) -> IO[bytes]:
     import h5py
 
     from tacpipe.exports import arrays, frames
 
     every = list(recordings)
     rate_hz = frames.rate_hz(every)
-    sink = io.BytesIO()
+    sink = tempfile.TemporaryFile()  # noqa: SIM115  (closed by whoever copies it)
     with h5py.File(sink, "w", track_order=True, libver=VERSION) as file:
         data = file.create_group("data", track_order=True)
         total = 0
@@ -198,4 +199,4 @@ def _demos(params: Params, recordings: Dataset, columns: Sequence[str]) -> bytes
             total += table.num_rows
         data.attrs["total"] = total
         data.attrs["env_args"] = json.dumps({"env_name": "tacpipe", "type": 1, "env_kwargs": {"control_freq": rate_hz}})
-    return sink.getvalue()
+    return sink

@@ -9,10 +9,12 @@ Example: tacpipe export mcap data/recordings -o exports/mcap
 
 from __future__ import annotations
 
+import functools
 import heapq
-import io
+import itertools
 import json
-from collections.abc import Iterable, Iterator
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -28,6 +30,7 @@ if TYPE_CHECKING:
     from tacpipe.arrays import Int64s
     from tacpipe.datasets.dataset import Dataset, Recording
     from tacpipe.exports.ros import Topic
+    from tacpipe.io.columns import Columns
 
     Parts = Dataset
 
@@ -53,8 +56,9 @@ class Params:
 def part(params: Params, recording: Recording, name: RecordingName) -> Result:
     """Return the MCAP file of one recording."""
     losses: list[str] = []
-    content = _written(params, recording, name, losses)
-    return Result({"": RecordingOutput(contents.part(recording, losses))}, {f"{name}.mcap": content})
+    streams = list(_streams(params, recording, losses))
+    write = functools.partial(_write, recording, name, streams)
+    return Result({"": RecordingOutput(contents.part(recording, losses))}, written={f"{name}.mcap": write})
 
 
 @stage(version=1, part=part)
@@ -71,33 +75,41 @@ def mcap(params: Params, recordings: Dataset, parts: Parts) -> Result:
     return Result(files=Files({readme.NAME: text}), notes=readme.notes(recordings, found))
 
 
-def _written(params: Params, recording: Recording, name: str, losses: list[str]) -> bytes:
+@dataclass(frozen=True)
+class _Stream:
+    """A stream that becomes topics: what makes them of its rows, which come in blocks, in the order of time or not."""
+
+    topics: Callable[[pa.Table], Sequence[tuple[Topic, Int64s]]]
+    name: str
+    ordered: bool
+
+
+def _write(recording: Recording, name: str, streams: Sequence[_Stream], sink: Any) -> None:
+    """Write the MCAP file of a recording: some rows of each stream are in memory."""
     from mcap.writer import CompressionType, Writer
 
-    sink = io.BytesIO()
     writer = Writer(sink, compression=CompressionType.ZSTD)
     writer.start(profile="ros2", library="tacpipe")
     record = {"recording": name, "attributes": json.dumps(dict(recording.attributes), sort_keys=True)}
     writer.add_metadata(RECORD, record)
-    messages = [_messages(writer, topic, t_ns) for topic, t_ns in _topics(params, recording, losses)]
+    messages = [one for stream in streams for one in _messages(writer, recording, stream)]
     for number, (log_ns, channel, content) in enumerate(heapq.merge(*messages, key=lambda one: one[0])):
         writer.add_message(channel, log_ns, content, log_ns, number)
     writer.finish()  # type: ignore[no-untyped-call]
-    return sink.getvalue()
 
 
-def _topics(params: Params, recording: Recording, losses: list[str]) -> Iterator[tuple[Topic, Int64s]]:
+def _streams(params: Params, recording: Recording, losses: list[str]) -> Iterator[_Stream]:
     import numpy as np
 
     from tacpipe.exports import ros
 
     starts = [start for stream in recording.streams if (start := _start(recording, stream)) is not None]
     for stream in recording.streams:
-        table = recording.table(stream)
+        table = recording.columns(stream)
         losses += _losses(stream, table)
         if TIME not in table.column_names:
             if set(ros.POINT) <= set(table.column_names) and starts and min(starts) >= 0:
-                yield ros.cloud(stream, table, min(starts)), np.array([min(starts)])
+                yield _Stream(functools.partial(_cloud, stream, min(starts)), stream, ordered=False)
                 losses.append(
                     f"stream {shown(stream)} has no time: its one message is stamped with the recording's start"
                 )
@@ -110,10 +122,25 @@ def _topics(params: Params, recording: Recording, losses: list[str]) -> Iterator
                 f"stream {shown(stream)}: its stamps lie before 1970 or after 2038, which ROS has no stamps for"
             )
             continue
-        yield ros.own(stream, table, t_ns), t_ns
-        if params.usual_messages:
-            for topic in ros.usual(stream, table, t_ns):
-                yield topic, t_ns
+        yield _Stream(functools.partial(_topics, params, stream), stream, ordered=not np.any(np.diff(t_ns) < 0))
+
+
+def _cloud(stream: str, start_ns: int, table: pa.Table) -> list[tuple[Topic, Int64s]]:
+    """Return the topic of a cloud of points, whose one message has all rows."""
+    import numpy as np
+
+    from tacpipe.exports import ros
+
+    return [(ros.cloud(stream, table, start_ns), np.array([start_ns]))]
+
+
+def _topics(params: Params, stream: str, table: pa.Table) -> list[tuple[Topic, Int64s]]:
+    """Return the topics of some rows of a stream."""
+    from tacpipe.exports import ros
+
+    t_ns = table.column(TIME).to_numpy()
+    usual = ros.usual(stream, table, t_ns) if params.usual_messages else []
+    return [(topic, t_ns) for topic in [ros.own(stream, table, t_ns), *usual]]
 
 
 def _start(recording: Recording, stream: str) -> int | None:
@@ -124,24 +151,65 @@ def _start(recording: Recording, stream: str) -> int | None:
     return int(columns.column(TIME)[0].as_py())
 
 
-def _messages(writer: Writer, topic: Topic, t_ns: Int64s) -> Iterable[tuple[int, int, bytes]]:
-    """Register a topic, and return log time, channel and content of each message, in the order of time."""
+def _messages(writer: Writer, recording: Recording, stream: _Stream) -> list[Iterator[tuple[int, int, bytes]]]:
+    """Register the topics of a stream, and return log time, channel and content of the messages of each, by time.
+
+    Topics have the same stamps, so they are asked for the same rows at about the same time.
+    """
+    stored = recording.columns(stream.name)
+    tables = stored.batches() if stream.ordered else iter([recording.table(stream.name)])
+    head = next(tables, stored.schema.empty_table())
+    first = stream.topics(head)
+    blocks = _shared(itertools.chain([first], map(stream.topics, tables)), len(first))
+    channels = []
+    for topic, _ in first:
+        schema = writer.register_schema(topic.type, "ros2msg", topic.definition.encode())
+        metadata = {"tacpipe": json.dumps(topic.metadata, sort_keys=True)}
+        channels.append(writer.register_channel(topic.name, "cdr", schema, metadata))
+    return [
+        _of_topic(number, channel, mine) for number, (channel, mine) in enumerate(zip(channels, blocks, strict=True))
+    ]
+
+
+def _shared(values: Iterator[Any], readers: int) -> list[Iterator[Any]]:
+    """Return iterators over the same values: one stays until all have had it (that of itertools keeps 57 together)."""
+    waiting: list[deque[Any]] = [deque() for _ in range(readers)]
+
+    def read(mine: deque[Any]) -> Iterator[Any]:
+        while True:
+            if not mine:
+                try:
+                    value = next(values)
+                except StopIteration:
+                    return
+                for one in waiting:
+                    one.append(value)
+                del value
+            yield mine.popleft()
+
+    return [read(mine) for mine in waiting]
+
+
+def _of_topic(
+    number: int, channel: int, blocks: Iterable[Sequence[tuple[Topic, Int64s]]]
+) -> Iterator[tuple[int, int, bytes]]:
+    """Yield log time, channel and content of the messages of the topic of this number."""
     import numpy as np
 
     from tacpipe.exports import cdr
 
-    schema = writer.register_schema(topic.type, "ros2msg", topic.definition.encode())
-    metadata = {"tacpipe": json.dumps(topic.metadata, sort_keys=True)}
-    channel = writer.register_channel(topic.name, "cdr", schema, metadata)
-    contents_ = cdr.packed(topic.parts, len(t_ns))
-    stamps = t_ns.tolist()
-    if np.any(np.diff(t_ns) < 0):  # events come stream by stream
-        every = list(contents_)
-        return ((stamps[row], channel, every[row]) for row in np.argsort(t_ns, kind="stable").tolist())
-    return zip(stamps, (channel for _ in stamps), contents_, strict=True)
+    for topics in blocks:
+        topic, t_ns = topics[number]
+        stamps, messages = t_ns.tolist(), cdr.packed(topic.parts, len(t_ns))
+        del topics, topic
+        if np.any(np.diff(t_ns) < 0):  # events come stream by stream
+            every = list(messages)
+            yield from ((stamps[row], channel, every[row]) for row in np.argsort(t_ns, kind="stable").tolist())
+        else:
+            yield from zip(stamps, (channel for _ in stamps), messages, strict=True)
 
 
-def _losses(stream: str, table: pa.Table) -> Iterator[str]:
+def _losses(stream: str, table: Columns) -> Iterator[str]:
     """Yield what of a stream its messages do not hold."""
     import pyarrow as pa
 
@@ -150,7 +218,8 @@ def _losses(stream: str, table: pa.Table) -> Iterator[str]:
     where = f"stream {shown(stream)}"
     if TIME not in table.column_names:
         return
-    for field, column in zip(table.schema, table.columns, strict=True):
+    for field in table.schema:
+        column = table.column(field.name)
         if str(field.type) not in ros.TYPES:
             yield f"column {field.name} of {where}: messages have no type for {field.type}"
         elif column.null_count:

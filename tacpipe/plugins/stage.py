@@ -106,12 +106,14 @@ First = Callable[[Any], Mapping[str, Mapping[str, Any]]]  # of params: stages by
 class Result:
     """What a stage over whole datasets returns: recordings, files or both, and notes for the user (as `RecordingOutput`).
 
-    Files are taken one by one, so a mapping that makes each when it is asked for holds one in memory.
+    Files are taken one by one, so a mapping that makes each when it is asked for holds one in memory. Those of ``written``
+    memory need not hold: each is a function that writes the file, once, to what it is given.
     """
 
     recordings: Mapping[str, RecordingOutput] = field(default_factory=dict)
     files: Mapping[str, bytes] = field(default_factory=dict)
     notes: Sequence[str] = ()
+    written: Mapping[str, Callable[[Any], object]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

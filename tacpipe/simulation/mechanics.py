@@ -23,6 +23,7 @@ uniform pressure on a disc of radius R does. The twist has a friction limit of i
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,6 +37,7 @@ KINETIC = 0.8  # mu_k / mu_s
 DROP_M = 0.025
 TABLE_M = 0.001  # rise over which the table hands the object's weight over to the fingers
 PATCH_M = 0.008  # R, radius of the patch that twists
+BLOCK_ROWS = 1 << 14  # that are plain numbers at once: these take ten times the memory of an array
 GYRATION_M = 0.06  # radius of gyration of a small bottle
 
 
@@ -136,18 +138,17 @@ def _slide(grasp: Grasp, acceleration_m_s2: Floats, rise_m: Floats | None, step_
     mass, rate = grasp.mass_kg, step_s / grasp.mass_kg
     damping = 2 * math.sqrt(STIFFNESS_N_M * mass)
     yielding = 1 / (1 + rate * damping + rate * step_s * STIFFNESS_N_M)
-    pull_x = (mass * acceleration_m_s2[:, 0]).tolist()
-    pull_z = (mass * (acceleration_m_s2[:, 2] + GRAVITY_M_S2)).tolist()
-    limits = grasp.limit_n.tolist()
-    rises = rise_m.tolist() if rise_m is not None else [1.0] * rows
+    limits, rises = grasp.limit_n, np.ones(rows) if rise_m is None else rise_m
     sx = sz = vx = vz = 0.0  # displacement by slip and relative velocity
-    borne = min(max(rises[first] / TABLE_M, 0.0), 1.0)
-    ex, ez = -pull_x[first] / STIFFNESS_N_M, -pull_z[first] * borne / STIFFNESS_N_M  # deflection of the spring
+    borne = min(max(float(rises[first]) / TABLE_M, 0.0), 1.0)
+    ex = -(mass * float(acceleration_m_s2[first, 0])) / STIFFNESS_N_M  # deflection of the spring
+    ez = -(mass * (float(acceleration_m_s2[first, 2]) + GRAVITY_M_S2)) * borne / STIFFNESS_N_M
     slipping = False
-    found = []
-    for row in range(first, rows):
-        borne = min(max((rises[row] + sz) / TABLE_M, 0.0), 1.0)
-        dx, dz, limit = pull_x[row], pull_z[row] * borne, limits[row]
+    found: list[tuple[float, ...]] = []  # of rows that `moves` does not hold yet
+    last = first  # row before which it does
+    for rise, pull_x, pull_z, limit in _plain(mass, acceleration_m_s2, limits, rises, first):
+        borne = min(max((rise + sz) / TABLE_M, 0.0), 1.0)
+        dx, dz = pull_x, pull_z * borne
         if not slipping:
             vx = (vx - rate * (STIFFNESS_N_M * ex + dx)) * yielding
             vz = (vz - rate * (STIFFNESS_N_M * ez + dz)) * yielding
@@ -167,17 +168,32 @@ def _slide(grasp: Grasp, acceleration_m_s2: Floats, rise_m: Floats | None, step_
                 if sx * sx + sz * sz > DROP_M**2:
                     break
         found.append((fx, fz, sx, sz, vx if slipping else 0.0, vz if slipping else 0.0, float(slipping)))
-    moves[first : first + len(found)] = found
-    if first + len(found) < rows:
-        fall = _fall(acceleration_m_s2[first + len(found) :], rises[first + len(found) :], (sx, sz), (vx, vz), step_s)
-        moves[first + len(found) :, 2:6] = fall
-        moves[first + len(found) :, 6] = 2
+        if len(found) == BLOCK_ROWS:
+            moves[last : last + len(found)] = found
+            last += len(found)
+            found.clear()
+    moves[last : last + len(found)] = found
+    last += len(found)
+    if last < rows:
+        moves[last:, 2:6] = _fall(acceleration_m_s2[last:], rises[last:], (sx, sz), (vx, vz), step_s)
+        moves[last:, 6] = 2
     return moves
+
+
+def _plain(
+    mass_kg: float, acceleration_m_s2: Floats, limits_n: Floats, rises_m: Floats, first: int
+) -> Iterator[tuple[float, float, float, float]]:
+    """Yield rise, pull along x and z and friction limit of each row from ``first``, as plain numbers."""
+    for begin in range(first, len(rises_m), BLOCK_ROWS):
+        some = slice(begin, begin + BLOCK_ROWS)
+        pull_x = (mass_kg * acceleration_m_s2[some, 0]).tolist()
+        pull_z = (mass_kg * (acceleration_m_s2[some, 2] + GRAVITY_M_S2)).tolist()
+        yield from zip(rises_m[some].tolist(), pull_x, pull_z, limits_n[some].tolist(), strict=True)
 
 
 def _fall(
     acceleration_m_s2: Floats,
-    rises: list[float],
+    height: Floats,
     displacement_m: tuple[float, float],
     velocity_m_s: tuple[float, float],
     step_s: float,
@@ -185,7 +201,6 @@ def _fall(
     """Return displacement x and z and velocity x and z of an object let go (time, 4), until it lands and then lies."""
     velocity = np.array(velocity_m_s) - np.cumsum(acceleration_m_s2[:, ::2] + [0.0, GRAVITY_M_S2], axis=0) * step_s
     displacement = np.array(displacement_m) + np.cumsum(velocity, axis=0) * step_s
-    height = np.array(rises)
     landed = height + displacement[:, 1] <= 0
     if landed.any():
         row = int(landed.argmax())

@@ -16,7 +16,7 @@ The spread of the tared counts comes near that of the published recordings, 279,
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,6 +25,7 @@ import pyarrow as pa
 
 from tacpipe.arrays import AnyArray, Floats, Times
 from tacpipe.channels import schema
+from tacpipe.io.spill import Gathered, Spill
 from tacpipe.plugins.stage import Attribute, RecordingOutput
 from tacpipe.simulation import faults, mechanics, proximity, taxels, trajectory
 
@@ -38,6 +39,8 @@ RESERVE = (
 )
 OPEN_M, GRASPED_M = 0.070, 0.040  # finger width
 APPROACH_S, RAMP_S, PAUSE_S = (0.6, 1.2), 0.4, (0.2, 0.5)
+BLOCK_ROWS = 1 << 16  # of a stream that are made at once
+KEPT_BYTES = 1 << 24  # of streams in memory, before they are put aside on disk
 LOSS_S, SLIDE_S = 0.02, 0.04  # over which a grip gives way, and for which the load must then be too much
 
 
@@ -89,7 +92,8 @@ def simulate_trial(seed: int, index: int, rig: Rig = Rig()) -> RecordingOutput:
     """
     scene = perform(seed, index, rig)
     start_ns = START_NS + index * TRIAL_NS
-    streams: dict[str, pa.Table] = {}
+    streams: dict[str, pa.Table | pa.RecordBatchReader] = {}
+    spill = Spill(KEPT_BYTES)
     known: dict[str, Attribute] = {}
     duration_ns = int(scene.path.t_ns[-1])
     devices = {
@@ -104,12 +108,25 @@ def simulate_trial(seed: int, index: int, rig: Rig = Rig()) -> RecordingOutput:
         offset, skew = rng.uniform(-1, 1, 2)
         clock = faults.Clock(round(offset * offset_ms * 1e6), float(skew * rig.clock_skew_ppm * 1e-6))
         arrived_ns = faults.arrivals(samples.true_ns, delay_ms * 1e6, rng)
-        values, fields = _measured(name, scene, samples.true_ns, rig, rng)
-        clocks = [start_ns + faults.device_stamps(samples.true_ns, clock), samples.seq]
-        streams[name] = schema.stream(start_ns + arrived_ns, [*clocks, *values.T], [*_clock_fields(), *fields])
+        measured, fields = _measured(name, scene, samples.true_ns, rig, rng)
+
+        def made(some: slice) -> pa.Table:
+            clocks = [start_ns + faults.device_stamps(samples.true_ns[some], clock), samples.seq[some]]  # noqa: B023
+            columns = [*clocks, *measured(some).T]  # noqa: B023
+            return schema.stream(start_ns + arrived_ns[some], columns, [*_clock_fields(), *fields])  # noqa: B023
+
+        streams[name] = _in_blocks(len(samples.seq), made, spill)
         known |= {f"gt_{name}_clock_offset_ns": clock.offset_ns, f"gt_{name}_clock_skew": clock.skew}
-    streams["truth"] = _truth(scene, start_ns)
+    streams["truth"] = _in_blocks(len(scene.path.t_ns), _truth(scene, start_ns), spill)
     return RecordingOutput(streams, _attributes(scene, index, start_ns, rig) | known)
+
+
+def _in_blocks(rows: int, made: Callable[[slice], pa.Table], spill: Spill) -> pa.Table | pa.RecordBatchReader:
+    """Return a stream of so many rows, of which some are made at a time and put aside."""
+    gathered = Gathered(spill, made(slice(0, 0)))
+    for first in range(0, rows, BLOCK_ROWS):
+        gathered.add(made(slice(first, first + BLOCK_ROWS)))
+    return gathered.rows()
 
 
 def perform(seed: int, index: int, rig: Rig = Rig()) -> Scene:
@@ -164,21 +181,24 @@ def touch(scene: Scene, finger: int, true_ns: Times, *, creep: float = taxels.CR
 
 def _measured(
     name: str, scene: Scene, true_ns: Times, rig: Rig, rng: np.random.Generator
-) -> tuple[AnyArray, list[Any]]:
-    """Return what a device logs of samples taken at ``true_ns`` (time, channel), and its fields."""
+) -> tuple[Callable[[slice], AnyArray], list[Any]]:
+    """Return what a device logs of some of the samples taken at ``true_ns`` (time, channel), and its fields."""
     if name == "robot":
-        return arm(scene, true_ns), [schema.float_field("finger_m", "m", "finger_width"), *schema.pose_fields()]
+        return lambda some: arm(scene, true_ns[some]), [
+            schema.float_field("finger_m", "m", "finger_width"),
+            *schema.pose_fields(),
+        ]
     if name == "proximity":
         up_m = interpolation(scene, true_ns)(scene.contact.displacement_m[:, 1])
         field = pa.field("distance", pa.int16(), metadata={"unit": "count", "quantity": "proximity"})
-        return proximity.readings(up_m, rig.noise_scale, rng)[:, None], [field]
+        return proximity.readings(up_m, rig.noise_scale, rng)[:, None].__getitem__, [field]
     finger = ("xela1", "xela2").index(name)
     one = scene.skins[finger]
     force = touch(scene, finger, true_ns, creep=0.0 if rig.still else taxels.CREEP)
     drift_scale = 0.0 if rig.still else rig.noise_scale
     errors = taxels.errors(true_ns / 1e9, rig.noise_scale, drift_scale, rng)
     counts = taxels.digitised(one.base_count + taxels.signal(one, force) + errors)
-    return faults.hold(counts, rig.hold_probability, rng)[0], schema.uskin_fields()
+    return faults.hold(counts, rig.hold_probability, rng)[0].__getitem__, schema.uskin_fields()
 
 
 def _grip(mass_kg: float, load_n: float, effort: float, rng: np.random.Generator) -> tuple[float, float]:
@@ -239,26 +259,31 @@ def _clock_fields() -> list[Any]:
     return [device, pa.field("seq", pa.int64(), metadata={"unit": "1", "quantity": "sequence"})]
 
 
-def _truth(scene: Scene, start_ns: int) -> Any:
-    """Return the stream ``truth`` at 1 kHz."""
-    contact = scene.contact
-    columns: list[tuple[Any, Any]] = [
-        (schema.float_field(f"gt_finger{j + 1}_normal_n", "N", "force"), contact.normal_n[:, j]) for j in (0, 1)
-    ]
-    columns += _vector("gt_force_{}_n", "N", "force", contact.force_n)
-    columns += _vector("gt_acceleration_{}_m_s2", "m/s^2", "acceleration", scene.path.acceleration_m_s2)
-    moved, speed = contact.displacement_m, contact.velocity_m_s
-    columns += _vector("gt_displacement_{}_m", "m", "position", moved, "xz")
-    columns.append((schema.float_field("gt_displacement_m", "m", "position"), np.linalg.norm(moved, axis=1)))
-    columns += _vector("gt_velocity_{}_m_s", "m/s", "velocity", speed, "xz")
-    columns.append((schema.float_field("gt_velocity_m_s", "m/s", "velocity"), np.linalg.norm(speed, axis=1)))
-    columns.append((schema.float_field("gt_torque_y_nm", "N m", "torque"), contact.torque_nm))
-    columns.append((schema.float_field("gt_rotation_y_rad", "rad", "angle"), contact.rotation_rad))
-    mass = np.full(len(scene.path.t_ns), scene.grasp.mass_kg)
-    columns.append((schema.float_field("gt_mass_kg", "kg", "mass"), mass))
-    columns += [(schema.label_field("gt_slip"), contact.slip), (schema.label_field("gt_dropped"), contact.dropped)]
-    fields, values = zip(*columns, strict=True)
-    return schema.stream(start_ns + scene.path.t_ns, values, fields)
+def _truth(scene: Scene, start_ns: int) -> Callable[[slice], pa.Table]:
+    """Return a function that returns some rows of the stream ``truth`` at 1 kHz."""
+    contact, acceleration_m_s2 = scene.contact, scene.path.acceleration_m_s2
+
+    def made(some: slice) -> pa.Table:
+        columns: list[tuple[Any, Any]] = [
+            (schema.float_field(f"gt_finger{j + 1}_normal_n", "N", "force"), contact.normal_n[some, j]) for j in (0, 1)
+        ]
+        columns += _vector("gt_force_{}_n", "N", "force", contact.force_n[some])
+        columns += _vector("gt_acceleration_{}_m_s2", "m/s^2", "acceleration", acceleration_m_s2[some])
+        moved, speed = contact.displacement_m[some], contact.velocity_m_s[some]
+        columns += _vector("gt_displacement_{}_m", "m", "position", moved, "xz")
+        columns.append((schema.float_field("gt_displacement_m", "m", "position"), np.linalg.norm(moved, axis=1)))
+        columns += _vector("gt_velocity_{}_m_s", "m/s", "velocity", speed, "xz")
+        columns.append((schema.float_field("gt_velocity_m_s", "m/s", "velocity"), np.linalg.norm(speed, axis=1)))
+        columns.append((schema.float_field("gt_torque_y_nm", "N m", "torque"), contact.torque_nm[some]))
+        columns.append((schema.float_field("gt_rotation_y_rad", "rad", "angle"), contact.rotation_rad[some]))
+        mass = np.full(len(moved), scene.grasp.mass_kg)
+        columns.append((schema.float_field("gt_mass_kg", "kg", "mass"), mass))
+        columns.append((schema.label_field("gt_slip"), contact.slip[some]))
+        columns.append((schema.label_field("gt_dropped"), contact.dropped[some]))
+        fields, values = zip(*columns, strict=True)
+        return schema.stream(start_ns + scene.path.t_ns[some], values, fields)
+
+    return made
 
 
 def _vector(name: str, unit: str, quantity: str, values: Floats, axes: Sequence[str] = schema.AXES) -> list[Any]:

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import functools
+
 import pyarrow as pa
 import pytest
 
 import tacpipe
 from tacpipe.channels import schema
+from tacpipe.formats.lerobot import container
+from tacpipe.io import row_groups
+from tacpipe.io.parquet import ParquetTable
 from tests.conftest import Lab
 from tests.exports import recordings
 
-
-@pytest.mark.parametrize(
+FORMATS = pytest.mark.parametrize(
     ("export", "ingest"),
     [
         ("csv rec", "table out --layout out/layout.toml"),
@@ -21,7 +25,24 @@ from tests.exports import recordings
     ],
     ids=["csv", "mcap", "hdf5", "lerobot"],
 )
+
+
+@FORMATS
 def test_the_shards_are_the_same(rig: Lab, export: str, ingest: str) -> None:
+    assert_same(rig, export, ingest)
+
+
+@FORMATS
+def test_the_shards_are_the_same_when_few_rows_are_read_at_a_time(
+    rig: Lab, monkeypatch: pytest.MonkeyPatch, export: str, ingest: str
+) -> None:
+    monkeypatch.setattr(ParquetTable, "batches", functools.partialmethod(ParquetTable.batches, rows=7))
+    monkeypatch.setattr(container, "SOME_ROWS", 7)
+    monkeypatch.setattr(row_groups, "IN_MEMORY", 0)
+    assert_same(rig, export, ingest)
+
+
+def assert_same(rig: Lab, export: str, ingest: str) -> None:
     rig.run(f"export {export} -o out")
     rig.run(f"ingest {ingest} -o back")
     given, back = tacpipe.open("rec"), tacpipe.open("back")

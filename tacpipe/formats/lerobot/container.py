@@ -6,8 +6,9 @@ nanosecond; else they are the column's own float32 seconds. The metadata of ``t_
 
 from __future__ import annotations
 
+import contextlib
 import functools
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,12 +22,12 @@ from tacpipe.errors import TacpipeError
 from tacpipe.formats.arrays import known
 from tacpipe.formats.arrays.frames import NAME as PICTURE
 from tacpipe.formats.containers import kinds
-from tacpipe.formats.containers.container import Contents, Share, SourceStream, Time
+from tacpipe.formats.containers.container import Batched, Contents, Share, SourceStream, Time
 from tacpipe.formats.lerobot import description
 from tacpipe.formats.lerobot.description import Description, Episode, Feature
 from tacpipe.io import files as file_system
 from tacpipe.io import memory, regular
-from tacpipe.io.parquet import ParquetTable
+from tacpipe.io.parquet import SOME_ROWS, ParquetTable
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import plain
 
@@ -111,12 +112,17 @@ class LeRobotContainer:
         return Contents(streams, attributes | {"fps": self._about.fps}, skipped)
 
     def _exact(self, name: str, path: Path) -> SourceStream:
-        """Return a stream as it was before the export, to the bit."""
-        try:
-            table = ParquetTable(regular.source(path)).read()
-        except TacpipeError as error:
-            raise TacpipeError(f"{path} cannot be read: {error} Copy it again.") from error
-        return SourceStream(name, name, Time(column="t_ns", unit="ns"), table, table.num_rows)
+        """Return a stream as it was before the export, to the bit; the rows of a long one are decoded as they are read."""
+        with _copied_again(path):
+            stored = ParquetTable(regular.source(path))
+            content = stored.read() if stored.num_rows <= SOME_ROWS else None
+
+        def read() -> Iterator[pa.Table]:
+            with _copied_again(path):
+                yield from stored.batches()
+
+        rows = Batched(stored.schema, stored.num_rows, read) if content is None else content
+        return SourceStream(name, name, Time(column="t_ns", unit="ns"), rows, stored.num_rows)
 
     def _streams(self, episode: Episode, sources: Collection[str] | None, *, rows: bool) -> list[SourceStream]:
         by_source: dict[str, list[Feature]] = {}
@@ -156,8 +162,11 @@ class LeRobotContainer:
                 raise TacpipeError(f"{path} has no column {plain(missing[0])}, which {description.INFO} names.")
             groups = _groups(file, episode.index)
             memory.require(sum(file.metadata.row_group(one).total_byte_size for one in groups), str(path))
-            found = file.read_row_groups(groups, columns=[INDEX, FRAME, STAMP, *keys], use_threads=False)
-        found = found.filter(pc.equal(found.column(INDEX), episode.index))
+            columns = [INDEX, FRAME, STAMP, *keys]
+            found = file.read_row_groups([], columns=columns, use_threads=False)
+            for group in groups:  # others' rows of one go before the next is read
+                rows = file.read_row_group(group, columns=columns, use_threads=False)
+                found = pa.concat_tables([found, rows.filter(pc.equal(rows.column(INDEX), episode.index))])
         if found.num_rows != episode.length:
             raise TacpipeError(
                 f"{path} holds {found.num_rows} frames of episode {episode.index}, and the folder meta states "
@@ -210,6 +219,15 @@ class LeRobotContainer:
 def opened(path: Path) -> LeRobotContainer:
     """Return the dataset in the folder ``path``."""
     return LeRobotContainer(path)
+
+
+@contextlib.contextmanager
+def _copied_again(path: Path) -> Iterator[None]:
+    """State of a file that is damaged what to do."""
+    try:
+        yield
+    except TacpipeError as error:
+        raise TacpipeError(f"{path} cannot be read: {error} Copy it again.") from error
 
 
 def _wanted(source: str, sources: Collection[str] | None) -> bool:

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
 
 
+KEPT_BYTES = 1 << 24  # of predictions in memory, before they are put aside on disk
 STORED_STEPS = (1, 3, 5, 10)  # whose predictions are stored; 3, 5 and 10 are those of the paper's figures
 
 
@@ -46,7 +47,7 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
     known, objects = set(forecaster.config["trained_on"].values()), set(forecaster.config["objects"])
     trials, kept = [], {}
     loads, bands = Loads(forecaster.codec.layout, forecaster.horizon), Bands(forecaster)
-    apart, spill = BySituation(forecaster.horizon, len(forecaster.codec.channels)), Spill()
+    apart, spill = BySituation(forecaster.horizon, len(forecaster.codec.channels)), Spill(KEPT_BYTES)
     with progress.bar("evaluate", len(recordings.recordings)) as advance:
         for name, shard in sorted(recordings.recordings.items()):
             track = tracks.track(shard, forecaster.codec, forecaster.pose)

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from tacpipe.io.columns import Columns
+    from tacpipe.io.mapped import MappedArrays
 
 BLOCK_ROWS = 1 << 14  # looked at at once
 _EXACT_BITS = 16  # of an integer that float32 holds exactly
@@ -56,6 +57,10 @@ class Levels:
     def between(self, first: int, last: int) -> Levels:
         """Return the levels of the rows from ``first`` to before ``last``."""
         return Levels(self.stored[first:last], self.rest, self.dtype)
+
+    def put_aside(self, aside: MappedArrays) -> Levels:
+        """Return the same levels, whose rows lie in ``aside``."""
+        return Levels(aside.kept(self.stored), self.rest, self.dtype)
 
     def finite(self) -> Bools:
         """Return for each row (time,) whether all its levels are finite."""

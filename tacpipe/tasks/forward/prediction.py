@@ -15,7 +15,7 @@ from tacpipe.models.windows import ARM, POSE
 from tacpipe.plugins.stage import RecordingOutput, Result
 from tacpipe.tasks.forward import tracks, units
 from tacpipe.tasks.forward.bands import band
-from tacpipe.tasks.forward.evaluation import check_rate
+from tacpipe.tasks.forward.evaluation import KEPT_BYTES, check_rate
 from tacpipe.tasks.forward.forecaster import Forecaster, WindowArrays
 from tacpipe.tasks.forward.predictors import forecasts
 from tacpipe.tasks.forward.training import check_codec
@@ -58,7 +58,7 @@ def _gathered(
     levels = forecaster.quantiles_of(quantiles)[1] if quantiles else []
     check_codec(forecaster.codec_files, recordings.files)
     wanted, channels = [step - 1 for step in steps], len(forecaster.codec.channels)
-    spill, found = Spill(), {}
+    spill, found = Spill(KEPT_BYTES), {}
     none = np.zeros((len(steps), channels, 0), np.float32)
     empty = prediction_table(forecaster, np.zeros(0, np.int64), none, steps, dict.fromkeys(quantiles, none))
     for name, shard in sorted(recordings.recordings.items()):

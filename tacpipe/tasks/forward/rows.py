@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from tacpipe.arrays import AnyFloats, Int64s
 from tacpipe.errors import TacpipeError
+from tacpipe.io.mapped import MappedArrays
 from tacpipe.models import windows as windows_of
 from tacpipe.models.windows import Windows
 from tacpipe.tasks.forward.tracks import Track
@@ -33,6 +34,7 @@ class Rows:
     actions: str = "planned"
     reads: int = 0  # rows of the past that windows have, at least `context`
     begins: Tensor | None = None  # (time,), the first row that may be read with each; None where `reads` is `context`
+    aside: MappedArrays | None = None  # what the rows lie in
 
     @property
     def part(self) -> loop.Part:
@@ -48,6 +50,8 @@ class Rows:
         if self.begins is not None:
             rows = torch.maximum(rows, self.begins[starts + self.context - 1])
         touch, arm = (one.index_select(0, rows.flatten()).view(*rows.shape, -1) for one in (self.touch, self.arm))
+        if self.aside is not None:
+            self.aside.read(touch.nbytes + arm.nbytes)
         return Windows(touch[:reads], arm, self.finger[rows[:reads]]), touch[reads:]
 
     def loss(self, model: nn.Module, indices: Tensor) -> Tensor:
@@ -64,6 +68,8 @@ class Rows:
         for number in np.unique(among):
             track, of_track = self.tracks[number], among == number
             found[of_track] = track.tactile[rows[of_track] - (ends[number] - len(track.t_ns))]
+            if self.aside is not None:
+                self.aside.release()
         return found
 
     def some(self, most: int) -> Tensor:
@@ -80,31 +86,40 @@ def rows(
     actions: str = "planned",
     device: str = "cpu",
     reads: int = 0,
+    aside: MappedArrays | None = None,
 ) -> Rows:
     """Return the rows of all tracks and the windows that begin at ``starts``, counted within each track.
 
-    A window has ``reads`` rows of the past, or ``context`` if that is more; see `Track.past`.
+    A window has ``reads`` rows of the past, or ``context`` if that is more; see `Track.past`. The rows lie in ``aside``
+    where it is given. Raises `StorageError` where its disk is full.
     """
     if actions not in ACTIONS:
         raise TacpipeError(f"There are no actions {actions!r}; there are {', '.join(ACTIONS)}.")
     offsets = np.cumsum([0] + [len(one.t_ns) for one in tracks])
 
     def stacked(name: str, width: tuple[int, ...]) -> AnyFloats:
-        parts = [getattr(one, name)[:] for one in tracks]
-        return parts[0] if len(parts) == 1 else np.concatenate([np.zeros((0, *width), np.float32), *parts])
+        if len(tracks) == 1 and aside is None:
+            return np.ascontiguousarray(getattr(tracks[0], name)[:], dtype=np.float32)
+        shape = (int(offsets[-1]), *width)
+        made: AnyFloats = np.empty(shape, np.float32) if aside is None else aside.empty(shape, np.float32)
+        for one, first in zip(tracks, offsets, strict=False):
+            made[first : first + len(one.t_ns)] = getattr(one, name)[:]
+            if aside is not None:
+                aside.release()
+        return made
 
     features = tracks[0].latent.shape[1:] if tracks else (0,)
     begins = [one + offset for one, offset in zip(starts, offsets, strict=False)]
     touch, arm, finger = (
-        torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32)).to(device)
+        torch.from_numpy(values).to(device)
         for values in (stacked("latent", features), stacked("arm", (windows_of.ARM,)), stacked("finger", ()))
     )
     first = torch.from_numpy(np.concatenate([np.zeros(0, np.int64), *begins])).to(device)
     if reads <= context:
-        return Rows(touch, arm, finger, tracks, first, context, horizon, actions)
+        return Rows(touch, arm, finger, tracks, first, context, horizon, actions, aside=aside)
     own = [one.begins() + offset for one, offset in zip(tracks, offsets, strict=False)]
     earliest = torch.from_numpy(np.concatenate([np.zeros(0, np.int64), *own])).to(device)
-    return Rows(touch, arm, finger, tracks, first, context, horizon, actions, reads, earliest)
+    return Rows(touch, arm, finger, tracks, first, context, horizon, actions, reads, earliest, aside)
 
 
 def acted(windows: Windows, actions: str) -> Windows:

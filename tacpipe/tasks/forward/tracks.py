@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
     from tacpipe.datasets.dataset import Recording
     from tacpipe.io.columns import Columns
+    from tacpipe.io.mapped import MappedArrays
 
 
 POSE = poses.NAMED.columns
@@ -85,6 +86,21 @@ class Track:
             name: getattr(self, name)[first:last] for name in ("t_ns", "contact", "groups", "usable", "arm", "finger")
         }
         return replace(self, latent=of(self.latent), tactile=of(self.tactile), **cut)
+
+    def put_aside(self, aside: MappedArrays) -> Track:
+        """Return the same track, whose rows lie in ``aside``."""
+        tactile = self.tactile.put_aside(aside) if isinstance(self.tactile, Levels) else aside.kept(self.tactile)
+        latent: AnyFloats | Levels
+        if not isinstance(self.latent, Levels):
+            latent = aside.kept(self.latent)
+        elif isinstance(self.tactile, Levels) and self.latent.stored is self.tactile.stored:
+            assert isinstance(tactile, Levels)
+            latent = tactile.of_type(self.latent.dtype)
+        else:
+            latent = self.latent.put_aside(aside)
+        names = ("t_ns", "contact", "groups", "usable", "arm", "finger")
+        others: dict[str, Any] = {name: aside.kept(getattr(self, name)) for name in names}
+        return replace(self, tactile=tactile, latent=latent, **others)
 
     def contact_starts(self, context: int, horizon: int, stride: int) -> Int64s:
         """Return the first rows of the windows that lie within one contact (window,)."""

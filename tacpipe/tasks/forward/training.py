@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
 
@@ -13,11 +13,12 @@ from safetensors.numpy import save as save_arrays
 from safetensors.torch import save as save_tensors
 from torch import nn
 
-from tacpipe.arrays import AnyFloats
+from tacpipe.arrays import AnyFloats, Int64s
 from tacpipe.channels.pose import NAMED, Pose
 from tacpipe.codecs import codec as codecs
 from tacpipe.codecs.frame_stacking import INCREMENTS
 from tacpipe.errors import TacpipeError
+from tacpipe.io.mapped import MappedArrays
 from tacpipe.models import forecasts
 from tacpipe.models.linear import Baselines
 from tacpipe.models.windows import motion
@@ -47,6 +48,8 @@ if TYPE_CHECKING:
 
 HISTORY = "history.jsonl"
 CALIBRATED = 16_384  # windows that scales are fitted on, evenly spread: they overlap, so hardly a row is left out
+BLOCK_ROWS = 1 << 14  # that are looked at at once
+IN_MEMORY = 1 << 27  # bytes of rows of recordings, before they lie on disk
 LINEAR = 20_000  # windows that the linear baselines are fitted on
 
 
@@ -75,16 +78,17 @@ def train(
     if init and start:
         _check_start(start, init, params, codec, training.files)
         _check_pose(start, pose)
+    aside = MappedArrays(IN_MEMORY)
     parts = [
-        [tracks.track(shard, codec, pose) for _, shard in sorted(dataset.recordings.items())]
+        [tracks.track(shard, codec, pose).put_aside(aside) for _, shard in sorted(dataset.recordings.items())]
         for dataset in (training, validation)
     ]
     rate_hz = tracks.rate_hz([one for part in parts for one in part])
-    reference = start.orientation if start else _reference([one.arm[one.usable, 3:7] for one in parts[0]])
-    parts = [[dataclasses.replace(one, arm=tracks.aligned(one.arm, reference)) for one in part] for part in parts]
+    reference = start.orientation if start else _reference(one.arm[one.usable, 3:7] for one in parts[0])
+    parts = [[_aligned(one, reference, aside) for one in part] for part in parts]
     device = devices.kind()
     known, watched = (
-        _windows(part, params, stride, device) for part, stride in zip(parts, (params.stride, 1), strict=True)
+        _windows(part, params, stride, device, aside) for part, stride in zip(parts, (params.stride, 1), strict=True)
     )
     _check_channels(codec, parts[0])
 
@@ -128,8 +132,8 @@ def train(
             **({} if unit == units.COUNT else {"unit": unit}),
             **({} if pose == NAMED else {"pose": {"position": pose.position, "orientation": pose.orientation}}),
         },
-        "scaling": _scaling(parts[0]),
-        "largest_level": largest_level(np.concatenate([one.tactile[one.usable] for one in parts[0]])),
+        "scaling": _scaling(parts[0], aside),
+        "largest_level": max(largest_level(one.tactile[some]) for one, some in _usable(parts[0], aside)),
         "validation": {"loss": best["val_loss"], "epoch": best["epoch"]},
         "trained_on": _trained_on((training, validation), start),
         "objects": sorted({one.object for one in parts[0] if one.object is not None}),
@@ -174,11 +178,17 @@ def check_codec(model: Mapping[str, bytes], recordings: Mapping[str, bytes]) -> 
         )
 
 
-def _windows(part: Sequence[Track], params: Params, stride: int, device: str) -> Rows:
+def _aligned(track: Track, reference: AnyFloats, aside: MappedArrays) -> Track:
+    """Return a track whose quaternions have the sign of ``reference``; where they had the other one, in ``aside``."""
+    arm = tracks.aligned(track.arm, reference)
+    return track if arm is track.arm else dataclasses.replace(track, arm=aside.kept(arm))
+
+
+def _windows(part: Sequence[Track], params: Params, stride: int, device: str, aside: MappedArrays) -> Rows:
     """Return the rows of a part and its windows, all or those in contact."""
     context, horizon = params.context, params.horizon
     starts = [(one.starts if params.windows == "all" else one.contact_starts)(context, horizon, stride) for one in part]
-    return rows(part, starts, context, horizon, actions=params.actions, device=device, reads=params.reads)
+    return rows(part, starts, context, horizon, actions=params.actions, device=device, reads=params.reads, aside=aside)
 
 
 def _linear(part: Rows) -> tuple[AnyFloats, AnyFloats, AnyFloats]:
@@ -199,15 +209,40 @@ def _check_channels(codec: codecs.Codec, part: Sequence[Track]) -> None:
         )
 
 
-def _scaling(part: Sequence[Track]) -> dict[str, list[float]]:
+def _scaling(part: Sequence[Track], aside: MappedArrays) -> dict[str, list[float]]:
     """Return half the range of each feature and the standard deviation of each channel over usable training rows."""
-    latent = np.concatenate([one.latent[one.usable] for one in part])
-    tactile = np.concatenate([one.tactile[one.usable] for one in part])
-    spread = tactile.std(axis=0)
+    ranges = [scaling.fit(one.latent[some]) for one, some in _usable(part, aside)]
+    if not ranges:
+        scaling.fit(part[0].latent[:0])  # states what to do
+    total: AnyFloats = np.zeros(0)
+    count = 0
+    for one, some in _usable(part, aside):
+        total, count = _summed(total, one.tactile[some]), count + len(some)
+    mean = total / count
+    squares: AnyFloats = np.zeros(0)
+    for one, some in _usable(part, aside):
+        squares = _summed(squares, (one.tactile[some] - mean) ** 2)
+    spread = np.sqrt(squares / count)
+    low, high = np.min([one.low for one in ranges], axis=0), np.max([one.high for one in ranges], axis=0)
     return {
-        "feature_half": scaling.fit(latent).half.tolist(),
+        "feature_half": scaling.MinMax(low, high).half.tolist(),
         "channel_count": np.where(spread > 0, spread, 1.0).tolist(),
     }
+
+
+def _usable(part: Sequence[Track], aside: MappedArrays) -> Iterator[tuple[Track, Int64s]]:
+    """Yield each recording with its usable rows, some at a time."""
+    for one in part:
+        rows = np.flatnonzero(one.usable)
+        for first in range(0, len(rows), BLOCK_ROWS):
+            yield one, rows[first : first + BLOCK_ROWS]
+        aside.release()
+
+
+def _summed(total: AnyFloats, more: AnyFloats) -> AnyFloats:
+    """Return the sum of rows (row, channel) and of those before them (channel,), to the bit as numpy adds all at once."""
+    found: AnyFloats = np.add.reduce(np.concatenate([total[None], more]) if total.size else more, axis=0)
+    return found
 
 
 def _described(codec: codecs.Codec) -> dict[str, Any]:
@@ -219,7 +254,7 @@ def _described(codec: codecs.Codec) -> dict[str, Any]:
     return {"kind": codec.kind, "of": codec.representation, "frames": frames, "latents": latents, "name": name}
 
 
-def _reference(quaternions: Sequence[AnyFloats]) -> AnyFloats:
+def _reference(quaternions: Iterable[AnyFloats]) -> AnyFloats:
     """Return the first usable quaternion of the training recordings (4,): the sign that all are given."""
     return next((one[0].astype(np.float64) for one in quaternions if len(one)), np.array([0.0, 0.0, 0.0, 1.0]))
 

@@ -1,4 +1,4 @@
-"""What evaluation holds of a long recording: the recording as it is stored and its predictions, and one batch of windows."""
+"""What evaluation holds of a long recording: the recording as it is stored, and one batch of windows."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tacpipe.io.spill import Spill
 from tacpipe.tasks.forward import evaluation, predictors, tracks
 from tacpipe.tasks.forward.alarms import Loads
 from tacpipe.tasks.forward.forecaster import Forecaster
@@ -27,22 +28,20 @@ def peak_bytes(forecaster: Forecaster, rows: int) -> int:
     loads = Loads(forecaster.codec.layout, forecaster.horizon)
     apart = BySituation(forecaster.horizon, len(forecaster.codec.channels))
     tracemalloc.start()
-    evaluation._predictions(forecaster, track, Trial("a", True), loads, apart)
+    evaluation._predictions(forecaster, track, Trial("a", True), loads, apart, Spill(1))
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     return peak
 
 
-def test_the_evaluation_of_a_longer_recording_takes_more_by_its_predictions_alone(
+def test_the_evaluation_of_a_longer_recording_takes_hardly_more_besides_its_track(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(predictors, "CHUNK", 64)
     forecaster = Forecaster.load(trained(tmp_path))
     short, long = (peak_bytes(forecaster, rows) for rows in (ROWS, 3 * ROWS))
-    steps = sum(step <= forecaster.horizon for step in evaluation.STORED_STEPS)
-    stored = steps * len(forecaster.codec.latents) * 4  # bytes of the predictions that are kept of a window
     grown = (long - short) / (2 * ROWS)  # bytes a row
-    assert grown < 2 * stored + 25, grown
+    assert grown < 25, grown
 
 
 def test_the_predictions_of_a_batch_are_made_one_after_another(tmp_path: Path) -> None:

@@ -13,9 +13,11 @@ import pytest
 from safetensors.numpy import load
 
 from tacpipe.errors import TacpipeError
+from tacpipe.io import mapped
 from tacpipe.plugins import registry
 from tacpipe.plugins.params import to_json
 from tacpipe.tasks.forward import task as forward
+from tacpipe.tasks.forward import training
 from tacpipe.training import checkpoint
 from tests.fake_recordings import FakeShard, dataset
 from tests.stages.learning_fakes import CHANNELS, motion, table
@@ -47,6 +49,29 @@ def test_a_tiny_deterministic_set_is_learned_by_heart(tmp_path: Path) -> None:
     sizes = {"hidden": 24, "epochs": 200, "patience": 200, "learning_rate": 0.01, "cycle": False, "baselines": False}
     found = losses(trained(tmp_path, one, one, architecture="recurrent", batch=32, **sizes))
     assert min(found) < 0.001 < found[0]
+
+
+@pytest.mark.parametrize("latents", [False, True])
+def test_recordings_that_lie_on_disk_while_it_is_trained_give_the_same_model(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, latents: bool
+) -> None:
+    shards = [*TRAIN, *VAL]
+    given = compressed(*shards) if latents else dataset(*shards)
+    train, val = ([one.name for one in part] for part in (TRAIN, VAL))
+
+    def model(folder: str) -> dict[str, bytes]:
+        parts = (
+            dataset(*(given.recordings[name] for name in names), files=dict(given.files)) for names in (train, val)
+        )
+        (tmp_path / folder).mkdir()
+        return trained(tmp_path / folder, *parts)
+
+    in_memory = model("in-memory")
+    monkeypatch.setattr(training, "IN_MEMORY", 0)
+    monkeypatch.setattr(training, "BLOCK_ROWS", 7)
+    monkeypatch.setattr(mapped, "SEGMENT_BYTES", 1 << 14)
+    monkeypatch.setattr(mapped, "MOST_READ", 0)
+    assert model("on-disk") == in_memory
 
 
 @pytest.mark.parametrize("architecture", registry.architectures("forward"))

@@ -1,0 +1,53 @@
+"""What a stage holds in memory does not grow with the recordings of a dataset: peaks over 10 and over 100 of them."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests import peaks
+from tests.conftest import tacpipe
+
+pytestmark = pytest.mark.long
+
+SIMULATE = "simulate forward --duration-s 20 --robot-rate-hz 50 --jobs 1 -o rec"
+LITTLE = {  # of what may stay in memory, less than ten recordings have
+    "tacpipe.tasks.forward.evaluation.KEPT_BYTES": 1 << 20,
+    "tacpipe.tasks.forward.prediction.KEPT_BYTES": 1 << 20,
+    "tacpipe.tasks.forward.training.IN_MEMORY": 1 << 20,
+    "tacpipe.io.mapped.SEGMENT_BYTES": 1 << 22,
+    "tacpipe.io.mapped.MOST_READ": 1 << 22,
+}
+STAGES = {  # in this order
+    "synchronize": "synchronize rec --jobs 1 -o synced",
+    "segment": "segment contacts synced --jobs 1 -o segments",
+    "split": "split segments --scheme blocked --val 0.1 --test 0 -o split",
+    "compress": "compress pca segments --split split --jobs 1 -o latents",
+    "train": "train forward segments --split split --preset quick --epochs 1 --stride 10 -o model",
+    "predict": "predict model segments -o predicted",
+    "evaluate": "evaluate model segments -o results",
+    "export csv": "export csv rec --jobs 1 -o csv",
+    "export hdf5": "export hdf5 segments --structure robomimic --common --jobs 1 -o hdf5",
+}
+OF_MODELS = ("train", "predict", "evaluate")
+MOST = {"train": 1.1, "predict": 1.1, "evaluate": 1.1}  # times; PyTorch alone takes as much as the others in all
+
+
+@pytest.fixture(scope="module")
+def grown(tmp_path_factory: pytest.TempPathFactory) -> dict[str, float]:
+    """Return the peak of each stage over 100 recordings, in units of that over 10."""
+    found: dict[int, dict[str, int]] = {}
+    for count in (10, 100):
+        folder = tmp_path_factory.mktemp(f"of-{count}")
+        (folder / ".tacpipe").mkdir()
+        done = tacpipe(folder, f"{SIMULATE} --trials {count}")
+        assert done.returncode == 0, done.stderr
+        found[count] = {
+            stage: peaks.bytes_of(folder, command, LITTLE if stage in OF_MODELS else {})
+            for stage, command in STAGES.items()
+        }
+    return {stage: found[100][stage] / found[10][stage] for stage in STAGES}
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_a_stage_over_a_hundred_recordings_takes_the_memory_of_ten(grown: dict[str, float], stage: str) -> None:
+    assert grown[stage] < MOST.get(stage, 1.2)

@@ -1,0 +1,68 @@
+"""Arrays that lie in mapped files hold what was put into them, and take memory only while they are read."""
+
+from __future__ import annotations
+
+import errno
+import os
+import re
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tacpipe.arrays import AnyArray
+from tacpipe.errors import StorageError
+from tacpipe.io import mapped
+from tacpipe.io.mapped import MappedArrays
+
+
+def test_arrays_of_all_shapes_and_types_come_back_also_after_they_were_let_go_of(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(mapped, "SEGMENT_BYTES", 1 << 16)
+    rng, aside = np.random.default_rng(0), MappedArrays(100)
+    given: list[AnyArray] = [
+        rng.normal(size=(7, 3)).astype(np.float32),
+        rng.integers(0, 9, 5000),
+        rng.random(11) < 0.5,
+        np.zeros((0, 4)),
+        rng.normal(size=(900, 12)),
+        np.asfortranarray(rng.normal(size=(20, 30))),
+    ]
+    kept = [aside.kept(one) for one in given]
+    filled = aside.empty((50, 2), np.float32)
+    filled[:] = 3
+    aside.release()
+    assert kept[0] is given[0]  # the first bytes stay in memory
+    for one, other in zip(kept, given, strict=True):
+        assert one.dtype == other.dtype and np.array_equal(one, other)
+    assert (filled == 3).all()
+
+
+def resident() -> int:
+    """Return how many bytes of this process are in memory."""
+    found = re.search(r"VmRSS:\s+(\d+)", Path("/proc/self/status").read_text())
+    assert found
+    return int(found[1]) << 10
+
+
+def test_what_was_read_takes_no_memory_once_it_is_let_go_of() -> None:
+    aside, size = MappedArrays(0), 200 << 20
+    made = aside.empty((size // 8,), np.float64)
+    before = resident()
+    made[:] = 1.0
+    assert resident() > before + size // 2
+    aside.read(mapped.MOST_READ + 1)
+    assert resident() < before + size // 8
+    assert made.sum() == len(made)
+
+
+def test_a_full_disk_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: Any) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "posix_fallocate", full)
+    with pytest.raises(StorageError, match=f"The disk under {tempfile.gettempdir()} is full"):
+        MappedArrays(0).kept(np.zeros(10))
