@@ -92,9 +92,9 @@ def engine(options: Options) -> Engine:
     """Return an engine of this chain, with alarms that are never on."""
     rig = rigs.parse(options.rig)
     layout = axes(Persistence.layout)
-    levels = {name: tuple(1e9 for _ in layout) for name in ("load", "slip")}
+    levels = {"load": tuple(1e9 for _ in layout), "slip": (1e9,)}
     sensors = {name: rig.streams[name].sensor for name in options.streams}
-    found = Engine(sensors, Persistence, lambda _: Alarms(layout, levels, 1.0), options.steps or None)
+    found = Engine(sensors, Persistence, lambda _: Alarms(layout, levels, 1.0, (1.0,)), options.steps or None)
     behaviour, _, value = os.environ.get("BEHAVIOUR", "").partition(":")
     if behaviour:
         _behave(found, behaviour, value)

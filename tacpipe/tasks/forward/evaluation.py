@@ -22,6 +22,7 @@ from tacpipe.tasks.forward.forecaster import CONFIG, Forecaster
 from tacpipe.tasks.forward.metrics import Trial
 from tacpipe.tasks.forward.predictors import predicted
 from tacpipe.tasks.forward.situations import BySituation
+from tacpipe.tasks.forward.slip_alarms import SlipAlarms
 from tacpipe.tasks.forward.tracks import Track
 from tacpipe.tasks.forward.training import HISTORY, check_codec
 
@@ -45,6 +46,7 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
     known, objects = set(forecaster.config["trained_on"].values()), set(forecaster.config["objects"])
     trials, kept = [], {}
     loads, bands = Loads(forecaster.codec.layout, forecaster.horizon), Bands(forecaster)
+    slipping = SlipAlarms.of(forecaster)
     apart = BySituation(forecaster.horizon, len(forecaster.codec.channels))
     with progress.bar("evaluate", len(recordings.recordings)) as advance:
         for name, shard in sorted(recordings.recordings.items()):
@@ -52,7 +54,10 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
             check_rate(track, forecaster)
             trial = Trial(name, shard.digest in known, track.object, track.object is None or track.object in objects)
             attributes = {**shard.attributes, "seen": trial.seen}
-            kept[name] = RecordingOutput(_predictions(forecaster, track, trial, loads, apart), attributes)
+            if not trial.seen:
+                loads.begin(track)
+                slipping.begin(track)
+            kept[name] = RecordingOutput(_predictions(forecaster, track, trial, (loads, slipping), apart), attributes)
             trials.append(trial)
             bands.add(track, trial)
             del track
@@ -61,6 +66,8 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
     tree = metrics.summary(trials, groups, forecaster.horizon, forecaster.channel_scale)
     if warned := loads.scored(forecaster.config.get("anticipation", {})):
         tree["anticipation"] = warned
+    if led := slipping.scored():
+        tree["slips"] = led
     if found := apart.summary():
         tree["situations"] = found
     if stated := bands.summary(trials):
@@ -80,27 +87,30 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
     return Result(kept, files)
 
 
-def _predictions(forecaster: Forecaster, track: Track, trial: Trial, loads: Loads, apart: BySituation) -> pa.Table:
+def _predictions(
+    forecaster: Forecaster, track: Track, trial: Trial, alarms: tuple[Loads, SlipAlarms], apart: BySituation
+) -> pa.Table:
     """Return the predictions for all windows of a recording; its errors are added to ``trial``.
 
-    Where the model has not seen it, its loads are added to ``loads`` and its errors by situation
-    to ``apart``. Some windows are in memory at a time, and of each one of the predictors.
+    Where the model has not seen it, what alarms look at is added to ``alarms``, which the recording was begun in, and its
+    errors by situation to ``apart``. Some windows are in memory at a time, and of each one of the predictors.
     """
+    loads, slipping = alarms
     starts = track.starts(forecaster.context, forecaster.horizon)
     steps = [step for step in STORED_STEPS if step <= forecaster.horizon]
     stored = np.empty((len(steps), len(forecaster.codec.latents), len(starts)), np.float32)
-    if not trial.seen:
-        loads.begin(track)
     begins = 0
     for some in predicted(forecaster, track, starts):
         trial.windows += len(some.now)
         doing = situations.of_windows(track, some.now, forecaster.horizon)
         if not trial.seen:
             apart.count(trial.name, doing)
+        present = track.tactile[some.now]
         for name, prediction in some.predictions.items():
             trial.add_errors(name, prediction, some.truth, forecaster.feature_half)
             if not trial.seen:
                 loads.add_one(name, some.now, prediction)
+                slipping.add_one(name, some.now, present, prediction.count)
                 apart.add(trial.name, doing, name, prediction, some.truth)
         ends = begins + len(some.now)
         stored[..., begins:ends] = some.features[:, [step - 1 for step in steps]].transpose(1, 2, 0)

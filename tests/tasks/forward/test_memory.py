@@ -13,6 +13,7 @@ from tacpipe.tasks.forward.alarms import Loads
 from tacpipe.tasks.forward.forecaster import Forecaster
 from tacpipe.tasks.forward.metrics import Trial
 from tacpipe.tasks.forward.situations import BySituation
+from tacpipe.tasks.forward.slip_alarms import SlipAlarms
 from tests.fake_recordings import FakeShard
 from tests.stages.learning_fakes import motion
 from tests.tasks.forward.trials import trained
@@ -27,7 +28,7 @@ def peak_bytes(forecaster: Forecaster, rows: int) -> int:
     loads = Loads(forecaster.codec.layout, forecaster.horizon)
     apart = BySituation(forecaster.horizon, len(forecaster.codec.channels))
     tracemalloc.start()
-    evaluation._predictions(forecaster, track, Trial("a", True), loads, apart)
+    evaluation._predictions(forecaster, track, Trial("a", True), (loads, SlipAlarms.of(forecaster)), apart)
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     return peak
