@@ -97,6 +97,13 @@ def add(program: typer.Typer, summary: str) -> None:
             float | None,
             typer.Option("--least", help="Fraction of a slide before which its material is unknown, 0 to 1 [0.25]."),
         ] = None,
+        pause_s: Annotated[
+            float | None,
+            typer.Option(
+                "--pause-s",
+                help="Pause after which a slide is over and another may begin, s; 0: a recording is one slide [0].",
+            ),
+        ] = None,
         rank: Annotated[
             str | None,
             typer.Option("--rank", help="Criterion for a model of touch: contact (default), balance, level:0.4."),
@@ -130,6 +137,7 @@ def add(program: typer.Typer, summary: str) -> None:
             "sensor": sensor,
             "every_ms": every_ms,
             "least": least,
+            "pause_s": pause_s,
             "rank": rank,
             "settle_ms": settle_ms,
             "realtime": realtime,
@@ -140,6 +148,7 @@ def add(program: typer.Typer, summary: str) -> None:
             "live_model": digest,
             "live_plan": asked.plan,
             "live_alarms_per_hour": asked.alarms_per_hour,
+            **({"live_pause_s": asked.pause_s, "live_least": asked.least} if asked.pause_s else {}),
         }
         _run(found, options, output, name, duration, label or [], attributes, quiet=quiet, as_json=as_json)
 
@@ -190,6 +199,7 @@ def _asked(read: Rig, asked: Settings) -> tuple[Rig, Options, str]:
         sensor=asked.sensor,
         every_ms=asked.every_ms,
         least=asked.least,
+        pause_s=asked.pause_s,
         rank=asked.rank,
         realtime=asked.realtime,
     )

@@ -86,7 +86,7 @@ def evaluate(model: Model, recordings: Dataset) -> Result:
 def check(digest: str, recordings: Dataset) -> None:
     """Refuse recordings without a session, and those of a session that ran another model than that of this digest.
 
-    What another model published says nothing about this one, and differs from what this one predicts in every row.
+    What another model published describes nothing of this one, and differs from what this one predicts in every row.
     """
     for name, recording in sorted(recordings.recordings.items()):
         if "forecast" not in recording.streams:

@@ -13,7 +13,8 @@ if TYPE_CHECKING:
 
     from tacpipe.io.columns import Columns
 
-COLUMNS = ("slip", "gt_slip")  # a label, of `segment slips` or of a person; the simulator's truth
+# a label, of `segment slips` or of a person; that of a stream of labels, as a published set has it; the simulator's truth
+COLUMNS = ("slip", "slip_slip", "gt_slip")
 
 
 def slips_of(table: pa.Table | Columns) -> Bools | None:

@@ -7,11 +7,13 @@ import math
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pytest
 
 from tacpipe.arrays import AnyFloats, Bools
 from tacpipe.signals.shear import Layout
 from tacpipe.tasks.forward.slip_alarms import SlipAlarms
+from tacpipe.tasks.forward.slip_labels import slips_of
 from tacpipe.tasks.forward.tracks import Track
 from tests.stages.learning_fakes import CHANNELS, table
 from tests.tasks.forward.trials import track
@@ -91,3 +93,15 @@ def test_one_recording_or_none_that_slips_states_nothing() -> None:
 
 def test_predictors_that_nobody_watches_are_left_out() -> None:
     assert alarms((slip(200), {}), (slip(200), {}), name="context_mean").scored() == {}
+
+
+def test_slips_are_read_from_a_label_before_the_simulators_truth_and_are_unknown_without_either() -> None:
+    one, two = pa.array([0, 1, 0], pa.int8()), pa.array([0, 0, 1], pa.int8())
+
+    def found(**columns: pa.Array) -> list[bool] | None:
+        slips = slips_of(pa.table({"t_ns": [0, 1, 2], **columns}))
+        return None if slips is None else slips.tolist()
+
+    assert found(slip=one, gt_slip=two) == [False, True, False]
+    assert found(slip_slip=two) == found(gt_slip=two) == [False, False, True]
+    assert found() is None
