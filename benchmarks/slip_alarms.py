@@ -2,7 +2,7 @@
 
     python benchmarks/slip_alarms.py FOLDER [--seeds 0,1,2,3] [--per-hour 60] [--set-on-both]
 
-A seed is a rig: a model of 30 trials (as `make live-demo` trains it), 24 further trials that levels are set on, 24 that are
+A seed is a rig: a model of 30 trials, 24 further trials that levels are set on, 24 that are
 counted on, and 24 in which the plan stays below what friction holds, so that nothing slips. Each score has its level from
 the same 24 trials; with ``--set-on-both`` from these and half of those in which nothing slips, which are then not counted.
 Rows of the table: the model; one trained on shuffled plans; the model given another trial's plan; the true future in the

@@ -29,7 +29,7 @@ from tacpipe.simulation import pick_and_move
 from tacpipe.simulation.emulation.emulator import Emulator
 from tacpipe.simulation.emulation.world import World
 
-TRIALS, EPOCHS, STRIDE = 30, 6, 2
+TRIALS, EPOCHS, STRIDE = 60, 8, 2
 SETTING, SETTING_SEED = 24, 1  # further trials, which the levels of the alarms are set on
 EFFORT = 1.15  # the largest load of the plan over the limit of friction: each trial slips because of its plan
 LIVE_S = 30.0
@@ -81,7 +81,7 @@ def _simulate(output: Path, name: str, trials: int, seed: int) -> None:
     recordings, synced = str(output / f"{name}-recordings"), str(output / f"{name}-synced")
     asked = ("--trials", str(trials), "--seed", str(seed), "--effort", str(EFFORT))
     _tacpipe("simulate", "forward", *asked, "-o", recordings, "--quiet")
-    _tacpipe("synchronize", recordings, "-o", synced, "--quiet")
+    _tacpipe("synchronize", recordings, "-o", synced, "--causal", "--quiet")  # as the session makes its rows
     _tacpipe("segment", "contacts", synced, "-o", str(output / name), "--quiet")
 
 

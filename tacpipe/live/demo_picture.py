@@ -29,23 +29,24 @@ def draw(
     alarm = recording.table("alarm").to_pandas()
     alarm_ns = alarm["t_device_ns"].to_numpy()
     columns = max(1, min(MOST_SLIPS, len(found)))
-    figure = pyplot.figure(figsize=(11, 7.5))
+    figure = pyplot.figure(figsize=(12, 7.5), layout="constrained")
     grid = figure.add_gridspec(3, columns, height_ratios=(2, 1, 2))
     upper = figure.add_subplot(grid[0, :])
     lower = figure.add_subplot(grid[1, :], sharex=upper)
-    upper.set_title(headline, loc="left")
+    figure.suptitle(headline, x=0.01, ha="left")
     _loads(upper, recording.table("forecast"), layout, start_ns, horizon_ns)
     _strips(lower, alarm, (alarm_ns - start_ns) / 1e9, (truth_ns[slips] - start_ns) / 1e9)
     for axes in (upper, lower):
         for begins_ns in found[:, 0].tolist():
             axes.axvline((begins_ns - start_ns) / 1e9, color=SLIPPED, linewidth=0.6, alpha=0.6)
+    nears: list[Any] = []
     for place, begins_ns in enumerate(found[:MOST_SLIPS, 0].tolist()):
-        near = figure.add_subplot(grid[2, place])
+        near = figure.add_subplot(grid[2, place], sharey=nears[0] if nears else None)
+        nears.append(near)
         _near(near, alarm, (alarm_ns - begins_ns) / 1e6, horizon_ns / 1e6)
         near.set_title(f"slip at {(begins_ns - start_ns) / 1e9:.1f} s\n{lead_in_words(alarm, begins_ns, horizon_ns)}")
         if place == 0:
             near.set_ylabel("slip alarm's score,\nmultiples of its level")
-    figure.tight_layout()
     figure.savefig(path, dpi=120)
     pyplot.close(figure)
     return path
@@ -88,7 +89,8 @@ def _loads(axes: Any, table: Any, layout: Any, start_ns: int, horizon_ns: int) -
     line(pulled.max(axis=1), PREDICTED, f"largest predicted of the next {horizon_ns / 1e6:.0f} ms")
     line(pulled[:, 0], MEASURED, "predicted for the next row")
     axes.set_ylabel("load along the skin\nof one finger, count")
-    axes.legend(loc="upper right", frameon=False)
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, frameon=False)
+    axes.tick_params(labelbottom=False)
 
 
 def _strips(axes: Any, alarm: Any, alarm_s: AnyFloats, slips_s: AnyFloats) -> None:
@@ -117,3 +119,4 @@ def _near(axes: Any, alarm: Any, since_ms: AnyFloats, horizon_ms: float) -> None
     axes.set_xlim(-BEFORE_MS, AFTER_MS)
     axes.set_ylim(bottom=0)
     axes.set_xlabel("ms from the slip")
+    axes.tick_params(labelleft=True)
