@@ -1,8 +1,9 @@
 """Predict recordings with a trained model, row by row.
 
 `tacpipe evaluate` reports how good the predictions are. With ``--causal`` each prediction reads what had arrived by then
-and no more, from recordings as they were recorded: what a live session publishes, bit for bit. ``--quantiles 10,50,90`` adds
-quantiles of a model that `tacpipe calibrate` made, with ``--causal`` too.
+and no more, from recordings as they were recorded: what a live session publishes, bit for bit; of a model of materials the
+final answer of each slide. ``--quantiles 10,50,90`` adds quantiles of a model that `tacpipe calibrate` made, also to causal
+forecasts.
 
 Example: tacpipe predict models/forward data/segments -o data/predictions
 """
@@ -72,11 +73,15 @@ def _asked(task: Any, params: Params, quantiles: list[int]) -> dict[str, Any]:
 def _causal(model: Model, recordings: Dataset, steps: list[int], quantiles: list[int]) -> Result:
     from tacpipe.datasets import model_files
     from tacpipe.errors import UsageError
-    from tacpipe.live import replay
+    from tacpipe.live import material_replay, replay
 
     model_files.task(model.files)
     name = model_files.tree(model.files, model_files.CONFIG)["task"]
-    if name != "forward":
-        raise UsageError(f"causal is for models of the task forward, and this one is of {name}; leave --causal out.")
+    if name not in ("forward", "material"):
+        raise UsageError(
+            f"causal is for models of the tasks forward and material, and this one is of {name}; leave --causal out."
+        )
     with model_files.validated("the model"):
+        if name == "material":
+            return material_replay.predict(model, recordings)
         return replay.predict(model, recordings, steps, quantiles)

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from tacpipe.io.termination import Ended
     from tacpipe.live.options import Options
     from tacpipe.live.session import Described
+    from tacpipe.live.settings import Settings
     from tacpipe.live.supervisor import Supervisor
     from tacpipe.recording import trials as trials_of
     from tacpipe.recording.recorder import Recorder
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
 
 SCHEMA_VERSION = 1
 HELP = """
+
+What the table [live] of the rig file states need not be given; options of the command win.
 
 The streams of the rig go through the model's own stages, with no look-ahead, and at each row of the model its forecast is
 published. With -o the rig is recorded as by `tacpipe acquire`, and forecasts, alarms and latencies are streams of the
@@ -49,31 +52,37 @@ def add(program: typer.Typer, summary: str) -> None:
     def live(
         rig: Annotated[Path, typer.Argument(help="Rig file, as of `tacpipe acquire`.")],
         model: Annotated[
-            Path, typer.Option("--model", help="Trained model, as of `tacpipe train forward`, `material` or `touch`.")
-        ],
+            Path | None,
+            typer.Option("--model", help="Trained model, as of `tacpipe train forward`, `material` or `touch`."),
+        ] = None,
         plan: Annotated[
-            str,
+            str | None,
             typer.Option(
                 "--plan",
-                help="Source of plans: measured (motion continues), udp::PORT, ws:HOST:PORT, rig:STREAM (its set-points).",
+                help="Source of plans: measured (motion continues; default), udp::PORT, ws:HOST:PORT, rig:STREAM (its "
+                "set-points).",
             ),
-        ] = "measured",
+        ] = None,
         output: Annotated[Path | None, typer.Option("-o", "--output", help="Dataset to append recordings to.")] = None,
         publish: Annotated[
             list[str] | None,
             typer.Option("--publish", help="Where to publish: ws:HOST:PORT, udp:HOST:PORT, lsl:NAME, mcap:FILE."),
         ] = None,
-        steps: Annotated[str, typer.Option("--steps", help="Steps ahead that are published; all by default.")] = "",
+        steps: Annotated[
+            str | None, typer.Option("--steps", help="Steps ahead that are published; all by default.")
+        ] = None,
         quantiles: Annotated[
-            str,
+            str | None,
             typer.Option(
                 "--quantiles", help="Quantiles published next to forecasts, percent, as 10,90; none by default."
             ),
-        ] = "",
+        ] = None,
         alarms_per_hour: Annotated[
-            float,
-            typer.Option("--alarms-per-hour", help="False alarms an hour that each alarm may give; 0: no alarms."),
-        ] = 0.0,
+            float | None,
+            typer.Option(
+                "--alarms-per-hour", help="False alarms an hour that each alarm may give; 0: no alarms (default)."
+            ),
+        ] = None,
         alarms_on: Annotated[
             Path | None, typer.Option("--alarms-on", help="Recordings that the levels of alarms are set on.")
         ] = None,
@@ -88,70 +97,128 @@ def add(program: typer.Typer, summary: str) -> None:
             str | None, typer.Option(help="Name of the recording; the time of its start by default.")
         ] = None,
         sensor: Annotated[
-            str, typer.Option("--sensor", help="Sensor of the rig, of those that a model of materials knows.")
-        ] = "",
+            str | None, typer.Option("--sensor", help="Sensor of the rig, of those that a model of materials knows.")
+        ] = None,
         every_ms: Annotated[
-            float, typer.Option("--every-ms", help="Time between two answers of a model of materials, ms.")
-        ] = 100.0,
+            float | None, typer.Option("--every-ms", help="Time between two answers of a model of materials, ms [100].")
+        ] = None,
         least: Annotated[
-            float, typer.Option("--least", help="Fraction of a slide before which its material is unknown, 0 to 1.")
-        ] = 0.25,
+            float | None,
+            typer.Option("--least", help="Fraction of a slide before which its material is unknown, 0 to 1 [0.25]."),
+        ] = None,
+        pause_s: Annotated[
+            float | None,
+            typer.Option(
+                "--pause-s",
+                help="Pause after which a slide is over and another may begin, s; 0: a recording is one slide [0].",
+            ),
+        ] = None,
         rank: Annotated[
-            str, typer.Option("--rank", help="Criterion for a model of touch: contact, balance, level:0.4.")
-        ] = "contact",
+            str | None,
+            typer.Option("--rank", help="Criterion for a model of touch: contact (default), balance, level:0.4."),
+        ] = None,
         settle_ms: Annotated[
-            float, typer.Option("--settle-ms", help="Time after a row in which its samples are awaited, ms.")
-        ] = 2.0,
+            float | None, typer.Option("--settle-ms", help="Time after a row in which its samples are awaited, ms [2].")
+        ] = None,
         realtime: Annotated[
-            bool, typer.Option("--realtime", help="Real-time scheduling of the session, where the system allows it.")
-        ] = False,
+            bool | None,
+            typer.Option(
+                "--realtime/--no-realtime", help="Real-time scheduling of the session, where the system allows it."
+            ),
+        ] = None,
         quiet: Annotated[bool, typer.Option("--quiet", help="Print only errors on stderr.")] = False,
         as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
     ) -> None:
-        from tacpipe.live import description, publishing, scheduling, session
-        from tacpipe.live.options import Options
-        from tacpipe.recording import completing
+        from tacpipe.live.settings import Settings
         from tacpipe.recording import rig as rigs
 
-        _check(duration, alarms_per_hour, alarms_on, split, settle_ms)
-        _check_slides(every_ms, least)
-        if realtime:
-            scheduling.check()
-        for address in publish or []:
-            publishing.check(address)
-        about, digest = description.described(model)
-        if isinstance(about, session.Described):
-            wanted = _steps(steps, about.horizon)
-            about = replace(about, quantiles=_quantiles(quantiles, about))
-        elif steps or quantiles or plan != session.MEASURED or alarms_per_hour:
-            raise UsageError(
-                f"{model} is of the kind {about.kind}; --steps, --quantiles, --plan and --alarms-per-hour are for forecasts."
-            )
-        else:
-            wanted = ()
-        asked = session.with_plan(rigs.read(rig), plan)
-        found = session.with_own(completing.completed(asked), about, wanted)
-        options = Options(
-            str(model.absolute()),
-            found.text,
-            tuple(asked.streams),
-            wanted,
-            about.quantiles if isinstance(about, session.Described) else (),
-            tuple(publish or []),
-            alarms_per_hour,
-            "" if alarms_on is None else str(alarms_on.absolute()),
-            "" if split is None else str(split.absolute()),
-            settle_ms,
-            plan_from=session.targets_of(asked, plan),
-            kind=about.kind,
-            sensor=sensor,
-            every_ms=every_ms,
-            least=least,
-            rank=rank,
-            realtime=realtime,
-        )
-        attributes = {"live_model": digest, "live_plan": plan, "live_alarms_per_hour": alarms_per_hour}
+        if duration is not None and duration <= 0:
+            raise UsageError("--duration must be above 0.")
+        read = rigs.read(rig)
+        given = {
+            "model": None if model is None else str(model),
+            "plan": plan,
+            "publish": tuple(publish) if publish else None,
+            "steps": None if steps is None else _steps(steps),
+            "quantiles": None if quantiles is None else _percents(quantiles),
+            "alarms_per_hour": alarms_per_hour,
+            "alarms_on": None if alarms_on is None else str(alarms_on),
+            "split": None if split is None else str(split),
+            "sensor": sensor,
+            "every_ms": every_ms,
+            "least": least,
+            "pause_s": pause_s,
+            "rank": rank,
+            "settle_ms": settle_ms,
+            "realtime": realtime,
+        }
+        asked = Settings.of(read.live, str(rig), given)
+        found, options, digest = _asked(read, asked)
+        attributes = {
+            "live_model": digest,
+            "live_plan": asked.plan,
+            "live_alarms_per_hour": asked.alarms_per_hour,
+            **({"live_pause_s": asked.pause_s, "live_least": asked.least} if asked.pause_s else {}),
+        }
         _run(found, options, output, name, duration, label or [], attributes, quiet=quiet, as_json=as_json)
+
+
+def _asked(read: Rig, asked: Settings) -> tuple[Rig, Options, str]:
+    """Return the rig with the session's own streams, what the model's process is asked for, and the model's digest."""
+    from tacpipe.live import description, publishing, scheduling, session
+    from tacpipe.live.options import Options
+    from tacpipe.live.settings import MEASURED
+    from tacpipe.recording import completing
+
+    if asked.realtime:
+        with asked.naming("realtime"):
+            scheduling.check()
+    with asked.naming("publish"):
+        for address in asked.publish:
+            publishing.check(address)
+    with asked.naming("model"):
+        about, digest = description.described(Path(asked.model))
+    if isinstance(about, session.Described):
+        with asked.naming("steps"):
+            wanted = asked.steps_of(about.horizon)
+        with asked.naming("quantiles"):
+            _check_quantiles(asked.quantiles, about)
+        about = replace(about, quantiles=tuple(sorted(set(asked.quantiles))))
+    elif asked.steps or asked.quantiles or asked.plan != MEASURED or asked.alarms_per_hour:
+        raise UsageError(
+            f"{asked.model} is of the kind {about.kind}; "
+            f"--steps, --quantiles, --plan and --alarms-per-hour are for forecasts."
+        )
+    else:
+        wanted = ()
+    with asked.naming("plan"):
+        with_plans = session.with_plan(read, asked.plan)
+    found = session.with_own(completing.completed(with_plans), about, wanted)
+
+    def absolute(path: str) -> str:
+        return str(Path(path).absolute()) if path else ""
+
+    options = Options(
+        absolute(asked.model),
+        found.text,
+        tuple(with_plans.streams),
+        wanted,
+        about.quantiles if isinstance(about, session.Described) else (),
+        asked.publish,
+        asked.alarms_per_hour,
+        absolute(asked.alarms_on),
+        absolute(asked.split),
+        asked.settle_ms,
+        plan_from=session.targets_of(with_plans, asked.plan),
+        kind=about.kind,
+        sensor=asked.sensor,
+        every_ms=asked.every_ms,
+        least=asked.least,
+        pause_s=asked.pause_s,
+        rank=asked.rank,
+        realtime=asked.realtime,
+    )
+    return found, options, digest
 
 
 def _run(
@@ -255,57 +322,30 @@ def _report(
         raise failed
 
 
-def _check(
-    duration_s: float | None, alarms_per_hour: float, alarms_on: Path | None, split: Path | None, settle_ms: float
-) -> None:
-    if duration_s is not None and duration_s <= 0:
-        raise UsageError("--duration must be above 0.")
-    if alarms_per_hour < 0 or not alarms_per_hour < 1e6:
-        raise UsageError(f"--alarms-per-hour is {alarms_per_hour:g}; it must be 0 or more.")
-    if bool(alarms_per_hour) != (alarms_on is not None):
-        raise UsageError(
-            "--alarms-per-hour and --alarms-on belong together: the levels of alarms are set on recordings, as in "
-            "`--alarms-per-hour 6 --alarms-on data/segments --split data/split`."
-        )
-    if split is not None and alarms_on is None:
-        raise UsageError("--split has no effect without --alarms-on.")
-    if not 0 <= settle_ms <= 1000:
-        raise UsageError(f"--settle-ms is {settle_ms:g}; it must be between 0 and 1000.")
-
-
-def _check_slides(every_ms: float, least: float) -> None:
-    if not 10 <= every_ms <= 10_000:
-        raise UsageError(f"--every-ms is {every_ms:g}; it must be between 10 and 10,000.")
-    if not 0 < least <= 1:
-        raise UsageError(f"--least is {least:g}; it must be above 0 and at most 1.")
-
-
-def _quantiles(text: str, about: Described) -> tuple[int, ...]:
-    """Return the levels in percent that are published. Raises `UsageError` for others than the model has."""
+def _check_quantiles(percents: tuple[int, ...], about: Described) -> None:
+    """Raise `UsageError` for quantiles that the model does not have."""
     from tacpipe.errors import TacpipeError
     from tacpipe.tasks import calibrated
 
-    if not text:
-        return ()
+    if not percents:
+        return
     try:
-        found = tuple(sorted({int(part) for part in text.split(",")}))
-    except ValueError:
-        raise UsageError(f"--quantiles {text} is not a list of percentages, as 10,90.") from None
-    try:
-        calibrated.quantiles_of(about if about.percents else None, found)
+        calibrated.quantiles_of(about if about.percents else None, percents)
     except TacpipeError as error:
         raise UsageError(str(error)) from error
-    return found
 
 
-def _steps(text: str, horizon: int) -> tuple[int, ...]:
-    """Return the steps ahead that are published. Raises `UsageError` for others than the model predicts."""
-    if not text:
-        return tuple(range(1, horizon + 1))
+def _percents(text: str) -> tuple[int, ...]:
+    """Return a list of percentages; none for an empty text."""
     try:
-        found = tuple(sorted({int(part) for part in text.split(",")}))
+        return tuple(sorted({int(part) for part in text.split(",")})) if text else ()
+    except ValueError:
+        raise UsageError(f"--quantiles {text} is not a list of percentages, as 10,90.") from None
+
+
+def _steps(text: str) -> tuple[int, ...]:
+    """Return a list of steps; none for an empty text."""
+    try:
+        return tuple(int(part) for part in text.split(",")) if text else ()
     except ValueError:
         raise UsageError(f"--steps {text} is not a list of whole numbers, as 1,5,10.") from None
-    if found[0] < 1 or found[-1] > horizon:
-        raise UsageError(f"--steps {text}: the model predicts 1 to {horizon} steps ahead.")
-    return found

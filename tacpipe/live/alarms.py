@@ -1,11 +1,12 @@
 """Alarms of a live session: a score of each forecast, a level beyond which it is on, and "unknown" without a forecast.
 
 Two scores. *Load*: by how much the mean count of an axis of a sensor is predicted to change within the horizon, over the
-level of that axis; the largest of all axes counts. *Slip*: the same of what is predicted along the skin alone (axes x and
-y), because an object that slides changes what pulls along the skin, and one that is gripped harder what presses on it.
+level of that axis; the largest of all axes counts. *Slip*: how far the load along the skin is predicted to rise and then to
+fall again, as a fraction of what presses (`tacpipe.signals.shear`); one level for all sensors.
 
 Levels are set on validation recordings, as `tacpipe evaluate` sets its own (`tacpipe.signals.anticipation`): the least that
-gives no more than a number of false alarms an hour where nothing changes. Of several axes each gets its part of them.
+gives no more than a number of false alarms an hour. An alarm of load is false where no load changes, and each axis gets its
+part of them; one of slip is false where the object does not slip, and wherever no recording states that.
 """
 
 from __future__ import annotations
@@ -13,17 +14,21 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from tacpipe.arrays import AnyFloats, Int64s
+from tacpipe.arrays import AnyFloats
 from tacpipe.sensors.live import OFF, ON, UNKNOWN
 from tacpipe.signals.loads import axes, loads
+from tacpipe.signals.shear import rise_and_fall
+
+if TYPE_CHECKING:
+    from tacpipe.tasks.forward.alarms import Loads
+    from tacpipe.tasks.forward.slip_alarms import SlipAlarms
 
 LOAD, SLIP = "load", "slip"
 NAMES = (LOAD, SLIP)
-ALONG = ("x", "y")  # axes along the skin
 LEAST = 1e-9  # that a level counts as, so that a forecast of no change is never beyond it
 WORDS = {UNKNOWN: "unknown", OFF: "off", ON: "on"}
 
@@ -46,11 +51,14 @@ NOTHING_KNOWN = {name: State(UNKNOWN, math.nan) for name in NAMES}
 
 @dataclass(frozen=True)
 class Alarms:
-    """The levels of a model's alarms, by sensor and axis."""
+    """The levels of a model's alarms."""
 
     axes: tuple[tuple[str, str], ...]  # stream and axis of each load
-    levels: Mapping[str, tuple[float, ...]]  # alarm to the level of each load, infinite where it has none
+    levels: Mapping[
+        str, tuple[float, ...]
+    ]  # of ``load`` for each of these, of ``slip`` one; infinite where there is none
     per_hour: float = math.nan  # false alarms that they were set for
+    floors: tuple[float, ...] = ()  # of the score for slips, of each skin
 
     @classmethod
     def unset(cls, layout: Sequence[Mapping[str, str]]) -> Self:
@@ -59,83 +67,64 @@ class Alarms:
 
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> Self:
-        """Return what `to_json` gave."""
+        """Return what `to_json` gave. A level for slips of before these had floors is of another score, and left out."""
         levels = {
             name: tuple(math.inf if one is None else float(one) for one in values)
             for name, values in content["levels"].items()
         }
-        return cls(tuple((stream, axis) for stream, axis in content["axes"]), levels, float(content["per_hour"]))
+        if "floors" not in content and SLIP in levels:
+            levels[SLIP] = (math.inf,)
+        places = tuple((stream, axis) for stream, axis in content["axes"])
+        return cls(places, levels, float(content["per_hour"]), tuple(map(float, content.get("floors", ()))))
 
     def states(self, ahead: AnyFloats, now: AnyFloats, layout: Sequence[Mapping[str, str]]) -> dict[str, State]:
         """Return the state of each alarm, of counts predicted (step, channel) and the last ones (channel,)."""
         if not self.levels:
             return dict(NOTHING_KNOWN)
+        scores = {LOAD: self._moved(ahead, now, layout), SLIP: np.full(1, math.nan)}
+        if math.isfinite(self.levels[SLIP][0]):
+            scores[SLIP] = rise_and_fall(ahead[None], now[None], layout, np.array(self.floors))
+        return {name: _state(scores[name], np.array(self.levels[name])) for name in NAMES}
+
+    def _moved(self, ahead: AnyFloats, now: AnyFloats, layout: Sequence[Mapping[str, str]]) -> AnyFloats:
+        """Return by how much each load (load,) is predicted to change within the horizon."""
         last, present = (loads(np.asarray(one, np.float64), layout)[0] for one in (ahead[-1:], now[None]))
-        moved = np.abs(last - present)
-        found = {}
-        for name in NAMES:
-            levels = np.array(self.levels[name])
-            set_for = np.isfinite(levels)
-            score = float((moved[set_for] / np.maximum(levels[set_for], LEAST)).max(initial=0.0))  # NaN stays one
-            known = bool(set_for.any()) and math.isfinite(score)
-            found[name] = State(UNKNOWN if not known else ON if score > 1 else OFF, score if known else math.nan)
+        found: AnyFloats = np.abs(last - present)
         return found
 
     def to_json(self) -> dict[str, Any]:
         """Return the levels as JSON can hold them: null where there is none."""
         levels = {name: [one if math.isfinite(one) else None for one in values] for name, values in self.levels.items()}
-        return {"axes": [list(one) for one in self.axes], "levels": levels, "per_hour": self.per_hour}
+        return {
+            "axes": [list(one) for one in self.axes],
+            "levels": levels,
+            "floors": list(self.floors),
+            "per_hour": self.per_hour,
+        }
 
 
-def set_on(
-    truth: AnyFloats,
-    ahead: AnyFloats,
-    groups: Int64s,
-    slips: Any,
-    layout: Sequence[Mapping[str, str]],
-    *,
-    horizon: int,
-    rate_hz: float,
-    per_hour: float,
-) -> Alarms:
-    """Return alarms with levels for ``per_hour`` false alarms each.
+def _state(scores: AnyFloats, levels: AnyFloats) -> State:
+    """Return the state of an alarm with these scores and levels (one,): the largest of those that have a level counts."""
+    set_for = np.isfinite(levels)
+    score = float((scores[set_for] / np.maximum(levels[set_for], LEAST)).max(initial=0.0))  # NaN stays one
+    known = bool(set_for.any()) and math.isfinite(score)
+    return State(UNKNOWN if not known else ON if score > 1 else OFF, score if known else math.nan)
 
-    ``truth`` and ``ahead`` (time, load) are loads and what was predicted of them at the last step, NaN without a forecast,
-    of rows whose ``groups`` (time,) are equal where they follow one another. ``slips`` (time,) is where the object slips,
-    None where no recording states that: slip is then set where no load changes, as load is.
-    """
+
+def set_on(several: Loads, slipping: SlipAlarms, predictor: str, per_hour: float) -> Alarms:
+    """Return alarms with levels for ``per_hour`` false alarms each, set on the recordings that were added."""
     from tacpipe.signals import anticipation
 
-    places = axes(layout)
-    sd = anticipation.difference_sd(truth, groups, horizon=horizon)
-    levels: dict[str, tuple[float, ...]] = {}
-    for name in NAMES:
-        chosen = [index for index, (_, axis) in enumerate(places) if name == LOAD or axis in ALONG]
-        found = np.full(len(places), math.inf)
-        if chosen:
-            quiet = (
-                ahead
-                if name == LOAD or slips is None
-                else np.where(_near(slips, groups, horizon)[:, None], np.nan, ahead)
-            )
-            found[chosen] = anticipation.calibrate(
-                truth[:, chosen],
-                quiet[:, chosen],
-                groups,
-                horizon=horizon,
-                sd=sd[chosen],
-                rate_hz=rate_hz,
-                per_minute=per_hour / 60 / len(chosen),
-            )
-        levels[name] = tuple(found.tolist())
-    return Alarms(places, levels, per_hour)
-
-
-def _near(slips: Any, groups: Int64s, horizon: int) -> Any:
-    """Return the rows (time,) in which an object slips, or will within the horizon."""
-    rows = np.flatnonzero(slips)
-    found = np.zeros(len(groups), dtype=bool)
-    for row in rows:
-        first = max(0, row - horizon)
-        found[first : row + 1] |= groups[first : row + 1] == groups[row]
-    return found
+    truth, groups = np.concatenate(several.truth), np.concatenate(several.groups)
+    places = axes(several.layout)
+    levels = anticipation.calibrate(
+        truth,
+        np.concatenate(several.ahead[predictor]),
+        groups,
+        horizon=several.horizon,
+        sd=anticipation.difference_sd(truth, groups, horizon=several.horizon),
+        rate_hz=several.rate_hz,
+        per_minute=per_hour / 60 / len(places),
+    )
+    slip = slipping.level(predictor, per_hour)
+    return Alarms(places, {LOAD: tuple(levels.tolist()), SLIP: (slip,)}, per_hour, tuple(slipping.floors.tolist()))

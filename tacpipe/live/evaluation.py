@@ -14,19 +14,18 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from tacpipe.arrays import AnyFloats, Bools, Int64s, Times
+from tacpipe.arrays import AnyFloats, Int64s, Times
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.live import replay, truth, worth
 from tacpipe.live.alarms import NAMES, Alarms
 from tacpipe.live.chain import Chain, Forecast
-from tacpipe.live.leads import leads, onsets
-from tacpipe.live.opening import slips_of
 from tacpipe.live.published import Published, times
 from tacpipe.live.unstored import Recordings, continued
 from tacpipe.live.worth import LIVE, LIVE_STILL, OFFLINE, STILL, Session, Sums, summed
 from tacpipe.metrics import headline
 from tacpipe.plugins.stage import Result
 from tacpipe.signals import anticipation
+from tacpipe.signals.leads import events, leads
 from tacpipe.signals.loads import loads
 from tacpipe.tasks.forward import evaluation, tracks, units
 from tacpipe.tasks.forward import headline as headlines
@@ -39,6 +38,8 @@ if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset, Model, Recording
 
 LEVELS = "live_alarm_levels"  # attribute of a recording: the levels of its alarms, as JSON
+DIGITS = 12  # of a digest in a message, as `tacpipe show` prints it
+MODEL = "live_model"  # attribute of a recording: the digest of the model that its session ran
 
 
 class _Offline(NamedTuple):
@@ -49,17 +50,16 @@ class _Offline(NamedTuple):
 
 
 def evaluate(model: Model, recordings: Dataset) -> Result:
-    """Return the evaluation of recordings of live sessions. Raises `UsageError` where one has no stream ``forecast``."""
+    """Return the evaluation of recordings of live sessions.
+
+    Raises `UsageError` where one has no stream ``forecast``, or its session ran another model.
+    """
+    check(model.digest, recordings)
     forecaster = Forecaster.load(model.files)
     steps = headlines.shown(range(1, forecaster.horizon + 1))
     offline: dict[str, Any] = {}
     sessions: dict[str, Session] = {}
     for name, recording in sorted(recordings.recordings.items()):
-        if "forecast" not in recording.streams:
-            raise UsageError(
-                f"{name} is not a recording of a live session: it has no stream forecast. Give what `tacpipe live -o` "
-                f"recorded, or leave --live out."
-            )
         try:
             offline[name] = continued(recording, model)
             sessions[name] = _session(forecaster, model, recording, offline[name], steps)
@@ -84,6 +84,26 @@ def evaluate(model: Model, recordings: Dataset) -> Result:
     return dataclasses.replace(result, files=files, notes=[*result.notes, *worth.sentences(tree["live"])])
 
 
+def check(digest: str, recordings: Dataset) -> None:
+    """Refuse recordings without a session, and those of a session that ran another model than that of this digest.
+
+    What another model published describes nothing of this one, and differs from what this one predicts in every row.
+    """
+    for name, recording in sorted(recordings.recordings.items()):
+        if "forecast" not in recording.streams:
+            raise UsageError(
+                f"{name} is not a recording of a live session: it has no stream forecast. Give what `tacpipe live -o` "
+                f"recorded, or leave --live out."
+            )
+        ran = recording.attributes.get(MODEL, digest)  # nothing states it in what other programs recorded
+        if ran != digest:
+            raise UsageError(
+                f"The session of {name} ran the model {str(ran)[:DIGITS]}, and this one is {digest[:DIGITS]}: what was "
+                f"published is that model's. Give the model that the session ran, or leave --live out to evaluate this one "
+                f"on the same recordings."
+            )
+
+
 def _session(
     forecaster: Forecaster, model: Model, recording: Recording, offline: Any, steps: tuple[int, ...]
 ) -> Session:
@@ -106,7 +126,7 @@ def _session(
         _after(session.t_ns[~equal & np.isin(session.t_ns, made_ns)], grew, forecaster),
         rows,
         sums,
-        _alarms(forecaster, recording, tables, track, predicted, offline),
+        _alarms(forecaster, recording, tables, track, predicted),
         latency.column("latency_ms").to_numpy().astype(np.float64),
         int(latency.column("skipped").to_numpy().max(initial=0)),
         int(late.max(initial=0)),
@@ -180,7 +200,6 @@ def _alarms(
     tables: Mapping[str, Any],
     track: Track,
     predicted: _Offline,
-    offline: Any,
 ) -> dict[str, dict[str, dict[str, Any]]]:
     """Return what alarms were worth: by alarm, by event, live and offline."""
     stream = tables["alarm"]
@@ -192,10 +211,10 @@ def _alarms(
         series[OFFLINE] = (track.t_ns[predicted.now], _offline_states(forecaster, recording, track, predicted))
     period_ns = round(1e9 / float(forecaster.config["rate_hz"]))
     found: dict[str, dict[str, dict[str, Any]]] = {}
-    for event, onset_ns in _events(forecaster, track, offline).items():
+    for event, times_ns in _events(forecaster, track).items():
         for name in NAMES:
             for who, (t_ns, each) in series.items():
-                one = leads(t_ns, each[name], onset_ns, forecaster.horizon * period_ns, period_ns)
+                one = leads(t_ns, each[name], times_ns, forecaster.horizon * period_ns, period_ns)
                 found.setdefault(f"{name} alarm, {event}", {})[who] = {
                     "events": one.events,
                     "led": len(one.leads_ms),
@@ -206,8 +225,8 @@ def _alarms(
     return found
 
 
-def _events(forecaster: Forecaster, track: Track, offline: Any) -> dict[str, Times]:
-    """Return when loads begin to change, as `tacpipe evaluate` defines it, and when the object begins to slip, if known."""
+def _events(forecaster: Forecaster, track: Track) -> dict[str, Times]:
+    """Return when loads change, as `tacpipe evaluate` defines it, and when the object slips, if known (event, 2)."""
     found: dict[str, Times] = {}
     sd = forecaster.config.get("anticipation", {}).get("sd")
     if sd:
@@ -217,10 +236,9 @@ def _events(forecaster: Forecaster, track: Track, offline: Any) -> dict[str, Tim
         for each in rows:
             for first, stop in each:
                 begun[first:stop] = True
-        found["changes of load"] = onsets(track.t_ns, begun)
-    slips: Bools | None = slips_of(offline)
-    if slips is not None:
-        found["slips"] = onsets(track.t_ns, np.asarray(slips))
+        found["changes of load"] = events(track.t_ns, begun)
+    if track.slips is not None:
+        found["slips"] = events(track.t_ns, track.slips)
     return found
 
 

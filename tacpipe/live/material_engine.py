@@ -1,7 +1,8 @@
 """A live session's logic for models of materials: blocks of bytes in, answers out; as `tacpipe.live.engine` for forecasts.
 
-A recording holds one slide, as `tacpipe segment slides` has it. Several times a second the slide so far is read, from all
-samples up to a moment; the last answer of a recording, from all that is in it, is its final one.
+A recording holds one slide, as `tacpipe segment slides` has it, or with a pause several, one after another
+(`tacpipe.live.material_parts`). Several times a second the slide so far is read, from all samples up to a moment; the last
+answer of a slide, from all that belongs to it, is its final one.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from tacpipe.live import wire
 from tacpipe.live.decoding import Decoder, likely_schema
 from tacpipe.live.material_messages import ENDED, FINAL, SLIDING, WAITING, MaterialDescription, MaterialMessage
+from tacpipe.live.material_parts import Parting, after, up_to
 from tacpipe.live.material_slide import Answer, SlideSoFar
 from tacpipe.recording.spool_blocks import Note
 from tacpipe.recording.station import BEGAN, OVER
@@ -52,8 +54,12 @@ class MaterialEngine:
         *,
         every_ns: int,
         settle_ns: int = SETTLE_NS,
+        pause_ns: int = 0,
     ) -> None:
+        """Take what is read. A pause of 0: a recording is one slide."""
         self.sensors = dict(sensors)
+        self._parting = Parting(slide, finger, pause_ns) if pause_ns else None
+        self._number = 1  # of the slide in its recording
         self.settle_ns, self.every_ns = settle_ns, every_ns
         self.skipped = self.overflows = self.late = self._seq = 0
         self._finger, self._slide, self._description = finger, slide, description
@@ -108,7 +114,7 @@ class MaterialEngine:
         return now_ns + IDLE_NS if self._due_ns is None or self._over else max(self._due_ns, now_ns + IDLE_NS // 20)
 
     def step(self, now_ns: int) -> list[MaterialMessage]:
-        """Return the answer that is due; where nothing more comes of the recording, its final one."""
+        """Return the answer that is due, behind the final ones of slides that are over."""
         if self.offset_ns is None:
             return []
         if self._over:
@@ -118,15 +124,15 @@ class MaterialEngine:
         if self._due_ns is not None:
             self.skipped += (now_ns - self._due_ns) // self.every_ns
         self._due_ns = now_ns + self.every_ns
-        return [self._answered(now_ns + self.offset_ns - self.settle_ns, final=False)]
+        return self._answered(now_ns + self.offset_ns - self.settle_ns, final=False)
 
     def finish(self) -> list[MaterialMessage]:
-        """Return the final answer of the recording, which is over."""
+        """Return the final answers that are left of the recording, which is over."""
         if self.offset_ns is None:
             return []
         found = self._answered(0, final=True)
         self.offset_ns = None
-        return [found]
+        return found
 
     def published(self, message: MaterialMessage, now_ns: int) -> None:
         """Write into a message how long it took, when it is about to go out."""
@@ -136,21 +142,44 @@ class MaterialEngine:
     def _begin(self, offset_ns: int) -> None:
         self.offset_ns, self._due_ns, self._read_ns = offset_ns, None, 0
         self._decoders, self._tables, self._over = {}, {}, set()
+        self._number = 1
+        if self._parting is not None:
+            self._parting.begin()
 
-    def _answered(self, until_ns: int, *, final: bool) -> MaterialMessage:
-        """Return the answer from all samples up to a moment; the final one is from all there are."""
+    def _answered(self, until_ns: int, *, final: bool) -> list[MaterialMessage]:
+        """Return the answers from all samples up to a moment; the final one of a recording is from all there are."""
         began_s = time.perf_counter()
         self._fetch(final=final)
-        stamps = {name: table.column("t_ns").to_numpy() for name, table in self._tables.items()}
         if final:
-            until_ns = int(max((some[-1] for some in stamps.values()), default=self._read_ns))
-        rows = {name: int(some.searchsorted(until_ns, side="right")) for name, some in stamps.items()}
-        streams = {name: self._tables[name].slice(0, count) for name, count in rows.items() if count}
-        newest_ns = {name: int(stamps[name][rows[name] - 1]) for name in streams}
+            last = (table.column("t_ns")[-1].as_py() for table in self._tables.values())
+            until_ns = int(max(last, default=self._read_ns))
+        found = self._final_ones(until_ns)
+        if not found or self._finger in self._tables:  # else nothing has come of the next slide
+            found.append(self._message(until_ns, final=final))
+        found[-1].compute_ms = (time.perf_counter() - began_s) * 1e3
+        return found
+
+    def _final_ones(self, until_ns: int) -> list[MaterialMessage]:
+        """Return the final answers of the slides that are over by a moment, and forget what belongs to them."""
+        found: list[MaterialMessage] = []
+        while self._parting is not None and not self._lacks:
+            end_ns = self._parting.end_ns(self._tables, until_ns)
+            if end_ns is None:
+                break
+            found.append(self._message(end_ns, final=True))
+            self._tables = after(self._tables, end_ns)
+            self._number += 1
+            self._parting.begin()
+        return found
+
+    def _message(self, until_ns: int, *, final: bool) -> MaterialMessage:
+        """Return the answer of the slide from its samples up to a moment."""
+        streams = up_to(self._tables, until_ns)
+        newest_ns = {name: int(table.column("t_ns")[-1].as_py()) for name, table in streams.items()}
         answer = self._answer(streams, 0 if final else until_ns - newest_ns.get(self._finger, until_ns))
         self._read_ns = max(self._read_ns, until_ns)
         self._seq += 1
-        found = MaterialMessage(
+        return MaterialMessage(
             self._seq,
             until_ns,
             self._description.names,
@@ -162,9 +191,8 @@ class MaterialEngine:
             max(newest_ns.values(), default=0),
             skipped=self.skipped,
             late=self.late,
+            slide=self._number,
         )
-        found.compute_ms = (time.perf_counter() - began_s) * 1e3
-        return found
 
     def _answer(self, streams: Mapping[str, pa.Table], silent_ns: int) -> Answer:
         if self._lacks:

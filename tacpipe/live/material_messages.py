@@ -32,6 +32,7 @@ class MaterialMessage:
     compute_ms: float = math.nan
     skipped: int = 0
     late: int = 0
+    slide: int = 1  # number of the slide in its recording
 
     @property
     def named(self) -> int:
@@ -62,6 +63,7 @@ class MaterialMessage:
             "probability": None if several is None else several[self.named],
             "probabilities": None if several is None else dict(zip(self.names, several, strict=True)),
             "state": self.state,
+            "slide": self.slide,
             "rows": self.rows,
             "seen": round(self.seen, 4),
             "cause": self.cause,
@@ -81,7 +83,7 @@ class MaterialMessage:
         return (np.array([numbers], dtype=np.float32),)
 
     def _slide(self) -> Float32s:
-        return np.array([self.named, self.rows, self.seen, self.state in (ENDED, FINAL)], np.float32)
+        return np.array([self.named, self.rows, self.seen, self.state in (ENDED, FINAL), self.slide], np.float32)
 
     def _probabilities(self) -> Float32s:
         found = np.full(len(self.names), np.nan, np.float32) if self.probabilities is None else self.probabilities
@@ -111,7 +113,9 @@ class MaterialDescription:
         """Return the properties of a message, as JSON schema has them."""
         texts = dict.fromkeys(("kind", "material", "state", "cause"), "string")
         numbers = dict.fromkeys(("probability", "seen", "latency_ms"), "number")
-        return properties("version", "seq", "t_ns", "rows", "skipped", **texts, **numbers, probabilities="object")
+        return properties(
+            "version", "seq", "t_ns", "slide", "rows", "skipped", **texts, **numbers, probabilities="object"
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Return the description as JSON and msgpack hold it."""

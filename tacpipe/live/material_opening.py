@@ -41,6 +41,11 @@ def engine(options: Options, model: Dataset, sensors: Mapping[str, Sensor]) -> M
             f"model was trained on, or train one on recordings of this rig."
         )
     slide = SlideSoFar(classifier, params, sensor, options.least, sensors[finger].rate_hz)
+    if options.pause_s and slide.ends_by_arm and len(sensors) == 1:
+        raise UsageError(
+            f"--pause-s {options.pause_s:g}: slides of this model end when the arm stops, and the rig has no stream but "
+            f"{finger}. Add the arm, or train on `segment slides --trigger load`, whose slides end when nothing is touched."
+        )
     stated = classifier.known or isinstance(classifier.readers[sensor], NetworkReader | SpectraReader)
     about = MaterialDescription(
         classifier.names,
@@ -52,4 +57,5 @@ def engine(options: Options, model: Dataset, sensors: Mapping[str, Sensor]) -> M
         options.model,
     )
     every_ns, settle_ns = round(options.every_ms * 1e6), round(options.settle_ms * 1e6)
-    return MaterialEngine(sensors, finger, slide, about, every_ns=every_ns, settle_ns=settle_ns)
+    pause_ns = round(options.pause_s * 1e9)
+    return MaterialEngine(sensors, finger, slide, about, every_ns=every_ns, settle_ns=settle_ns, pause_ns=pause_ns)

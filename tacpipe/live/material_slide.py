@@ -115,6 +115,28 @@ class SlideSoFar:
             there, scores=scores[0], probabilities=self._classifier.probabilities_of(scores, self._sensor)[0]
         )
 
+    def is_over(self, streams: Mapping[str, pa.Table], finger_stream: str, pause_ns: int) -> bool:
+        """Return whether the slide in these streams ended, and nothing of it came for a pause.
+
+        With the trigger ``load`` that is where the finger touches nothing, whatever the arm does: what comes then begins
+        free, as a recording does. With ``pressure`` it is where the arm has stopped.
+        """
+        free = self._params.trigger == "load"
+        held = {name: table for name, table in streams.items() if not free or name == finger_stream}
+        if finger_stream not in held:
+            return False
+        try:
+            whole = self._stage(replace(self._params, crop="none"), Held(held, self._attributes)).streams[STREAM]
+        except TacpipeError:  # no slide has begun
+            return False
+        newest_ns, last_ns = (one.column("t_ns")[-1].as_py() for one in (held[finger_stream], whole))
+        return bool(newest_ns - last_ns >= pause_ns)
+
+    @property
+    def ends_by_arm(self) -> bool:
+        """Whether only the arm, when it stops, ends a slide."""
+        return bool(self._params.trigger != "load")
+
     def _cut(self, held: Held, table: pa.Table) -> tuple[Any, bool]:
         """Return the rows of the slide that count, as the stage cuts them out or as far as they have come, and which."""
         params = self._params

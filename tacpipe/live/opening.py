@@ -6,8 +6,6 @@ import functools
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from tacpipe.errors import FAILED, TacpipeError, UsageError
 from tacpipe.live import alarms as alarms_of
 from tacpipe.live.alarms import Alarms
@@ -24,8 +22,6 @@ if TYPE_CHECKING:
     from tacpipe.live.process import Engine as Working
     from tacpipe.recording.rig import Rig
     from tacpipe.sensors.sensor import Sensor
-
-SLIP_COLUMN = "slip"  # where `tacpipe segment slips` states that the object slips
 
 
 def engine(options: Options) -> Working:
@@ -111,37 +107,19 @@ def on_recordings(model: Dataset, recordings: Dataset, per_hour: float) -> Alarm
     from tacpipe.tasks.forward import predictors, tracks
     from tacpipe.tasks.forward.alarms import Loads
     from tacpipe.tasks.forward.headline import MODEL
+    from tacpipe.tasks.forward.slip_alarms import SlipAlarms
     from tacpipe.tasks.opened import Chain as Stages
     from tacpipe.tasks.opened import opened
 
     forecaster = Forecaster.load(model.files)
-    loads = Loads(forecaster.codec.layout, forecaster.horizon)
-    slips: list[Any] = []
+    loads, slipping = Loads(forecaster.codec.layout, forecaster.horizon), SlipAlarms.of(forecaster)
     for shard in opened(recordings, Stages(model)).recordings.values():
         track = tracks.track(shard, forecaster.codec, forecaster.pose)
         loads.begin(track)
+        slipping.begin(track)
         for some in predictors.forecasts(forecaster, track, track.starts(forecaster.context, forecaster.horizon)):
             loads.add_one(MODEL, some.now, predictors.Prediction(some.features, some.count))
-        slips.append(slips_of(shard))
-    if not slips:
+            slipping.add_one(MODEL, some.now, track.tactile[some.now], some.count)
+    if not loads.truth:
         raise UsageError("There is no validation recording that alarms could be set on; give --alarms-on others.")
-    known = None if any(one is None for one in slips) else np.concatenate(slips)
-    return alarms_of.set_on(
-        np.concatenate(loads.truth),
-        np.concatenate(loads.ahead[MODEL]),
-        np.concatenate(loads.groups),
-        known,
-        loads.layout,
-        horizon=loads.horizon,
-        rate_hz=loads.rate_hz,
-        per_hour=per_hour,
-    )
-
-
-def slips_of(shard: Any) -> Any:
-    """Return where an object slips (time,), by label or the simulator's truth; None where nothing states that."""
-    table = shard.columns()
-    for name in (SLIP_COLUMN, "gt_slip"):
-        if name in table.column_names:
-            return np.asarray(table.column(name).to_numpy()) > 0
-    return None
+    return alarms_of.set_on(loads, slipping, MODEL, per_hour)

@@ -28,6 +28,9 @@ class Options:
     sensor: str = ""  # of a model of materials: which of those that it knows; empty: the only one
     every_ms: float = 100.0  # of a model of materials: from one answer to the next
     least: float = 0.25  # of a model of materials: fraction of the slide that it reads before it names one
+    pause_s: float = (
+        0.0  # of a model of materials: after which a slide is over and another may begin; 0: one a recording
+    )
     rank: str = "contact"  # of a model of touch: what candidates are ranked by
     nice: int = 1  # by how much the model's process stands back behind the recording
     realtime: bool = False  # whether both run before all ordinary programs

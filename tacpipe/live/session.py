@@ -14,6 +14,7 @@ from tacpipe.errors import UsageError
 from tacpipe.links.link import Address
 from tacpipe.live.alarms import NAMES
 from tacpipe.live.options import OWN, Options
+from tacpipe.live.settings import MEASURED
 from tacpipe.live.supervisor import Supervisor
 from tacpipe.live.tap import Tap
 from tacpipe.printable import excerpt, listed
@@ -25,7 +26,6 @@ from tacpipe.sensors.plan import NAME as PLAN
 
 ANSWERS = {"forecast": "forecasts", "material": "materials named", "touch": "rankings"}  # by kind of message
 RIG = "rig"  # scheme of a plan from one of the rig's own streams
-MEASURED = "measured"  # in the place of an address: the recorded motion is taken to continue
 SWITCH_S = 0.0005  # that one thread may hold up another: the threads that read must not wait 5 ms for the view
 
 

@@ -90,8 +90,6 @@ def sentences(live: Mapping[str, Any]) -> list[str]:
             f"; of the {differ} others {rows['differ_after_late_samples']} follow samples that came too late "
             f"({rows['late_samples']} samples), and the largest difference is {rows['largest_difference']:.3g}"
         )
-    if rows["compared"] and not rows["equal"]:
-        same += ". Give the model that the session ran: its digest is the recordings' attribute live_model"
     found = [f"{same}. {rows['skipped']} rows were skipped under overload."]
     if latency["count"]:
         found.append(

@@ -56,6 +56,7 @@ class Rig:
     master: str
     labels: Mapping[str, Attribute] = field(default_factory=dict)
     emulate: Mapping[str, Any] = field(default_factory=dict)
+    live: Mapping[str, Any] = field(default_factory=dict)  # what `tacpipe live` is asked for, as written
     text: str = ""  # the file as it was read, which goes along with what is recorded
 
 
@@ -81,7 +82,7 @@ def parse(text: str, where: str = "rig.toml") -> Rig:
         found = tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # numbers of thousands of digits, brackets within brackets
         raise UsageError(f"{where} is not valid TOML: {plain(str(error), 200)}.") from error
-    _known(found, ("master", "labels", "stream", "emulate"), where)
+    _known(found, ("master", "labels", "stream", "emulate", "live"), where)
     tables = found.get("stream")
     if not isinstance(tables, list) or not tables or not all(isinstance(table, dict) for table in tables):
         raise UsageError(f"{where} lists no stream; each is a table [[stream]] with name, sensor and transport.")
@@ -101,7 +102,7 @@ def parse(text: str, where: str = "rig.toml") -> Rig:
         if not isinstance(value, str | int | float | bool) or (isinstance(value, float) and not math.isfinite(value)):
             described = f"label {plain(name)} is {excerpt(value)}"
             raise UsageError(f"{where}: {described}; it must be text, a finite number, true or false.")
-    return Rig(streams, master, labels, _table(found, "emulate", where), text)
+    return Rig(streams, master, labels, _table(found, "emulate", where), _table(found, "live", where), text)
 
 
 def _stream(table: Mapping[str, Any], where: str) -> Stream:

@@ -13,6 +13,10 @@ def of(rig: Rig) -> str:
         parts.append(
             "[labels]\n" + "".join(f"{toml.key(name)} = {toml.value(value)}\n" for name, value in rig.labels.items())
         )
+    if rig.live:
+        parts.append(
+            "[live]\n" + "".join(f"{toml.key(name)} = {toml.value(value)}\n" for name, value in rig.live.items())
+        )
     for stream in rig.streams.values():
         lines = {"name": stream.name, "sensor": stream.kind, "transport": str(stream.address)}
         table = "".join(f"{name} = {toml.value(value)}\n" for name, value in lines.items())

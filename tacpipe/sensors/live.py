@@ -46,6 +46,7 @@ SLIDE = {  # column to unit
     "rows": "1",  # rows of the slide so far
     "seen": "1",  # of the rows that the model reads, the fraction that has come
     "ended": "1",  # whether the slide is over
+    "slide": "1",  # number of the slide in its recording, from 1
 }
 
 

@@ -97,19 +97,40 @@ def calibrate(
     for feature, those in enumerate(changes(truth, groups, horizon=horizon, sd=sd)):
         deviation = np.abs(ahead[:, feature] - truth[:, feature])
         free = _free(deviation, those, stretches, horizon)
-        if not free.any():
-            continue
-        allowed = per_minute * _minutes(free, rate_hz)
-        levels = np.unique(deviation[free])
-        low, high = 0, len(levels) - 1  # the highest level is never passed, and what passes a lower one passes it too
-        while low < high:
-            middle = (low + high) // 2
-            if _count(spaced[free & (deviation > levels[middle])], horizon, allowed) > allowed:
-                low = middle + 1
-            else:
-                high = middle
-        found[feature] = levels[low]
+        found[feature] = _least(deviation, free, spaced, horizon, per_minute * _minutes(free, rate_hz))
     return found
+
+
+def level(
+    scores: AnyFloats, free: Bools, groups: AnyArray, *, horizon: int, rate_hz: float, per_minute: float
+) -> float:
+    """Return the least level of ``scores`` (time,) that gives no more than ``per_minute`` false alarms a minute.
+
+    ``free`` (time,) are the rows in which an alarm is false; of them those count that have a score. An alarm represents
+    ``horizon`` rows. Infinite where no row counts.
+
+    >>> scores, alike = np.array([1.0, 9.0, 2.0, 8.0, 3.0, 7.0]), np.zeros(6)
+    >>> level(scores, scores < 9, alike, horizon=1, rate_hz=0.1, per_minute=1.2)  # one alarm in the 50 s that are free
+    7.0
+    """
+    counted = free & np.isfinite(scores)
+    spaced = _spaced(_stretches(groups), horizon)
+    return _least(scores, counted, spaced, horizon, per_minute * _minutes(counted, rate_hz))
+
+
+def _least(deviation: AnyFloats, free: Bools, spaced: Indices, horizon: int, allowed: float) -> float:
+    """Return the least level that ``deviation`` (time,) passes in no more than ``allowed`` alarms; infinite without rows."""
+    if not free.any():
+        return float("inf")
+    levels = np.unique(deviation[free])
+    low, high = 0, len(levels) - 1  # the highest level is never passed, and what passes a lower one passes it too
+    while low < high:
+        middle = (low + high) // 2
+        if _count(spaced[free & (deviation > levels[middle])], horizon, allowed) > allowed:
+            low = middle + 1
+        else:
+            high = middle
+    return float(levels[low])
 
 
 def score(

@@ -99,10 +99,10 @@ def engine(options: Options) -> Engine:
     """Return an engine of this chain, with alarms that are never on."""
     rig = rigs.parse(options.rig)
     layout = axes(Persistence.layout)
-    levels = {name: tuple(1e9 for _ in layout) for name in ("load", "slip")}
+    levels = {"load": tuple(1e9 for _ in layout), "slip": (1e9,)}
     sensors = {name: rig.streams[name].sensor for name in options.streams}
     opened = functools.partial(Persistence, quantiles=options.quantiles)
-    alarms = Alarms(layout, levels, 1.0)
+    alarms = Alarms(layout, levels, 1.0, (1.0,))
     found = Engine(sensors, opened, lambda _: alarms, options.steps or None, quantiles=options.quantiles)
     behaviour, _, value = os.environ.get("BEHAVIOUR", "").partition(":")
     if behaviour:

@@ -33,8 +33,8 @@ class Session:
     def __init__(self, count: int = 200) -> None:
         self.sensor: Sensor = rigs.make("xela", {"rate_hz": 50}, "skin")
         axes = tuple(dict.fromkeys(("skin", name[-1]) for name in CHANNELS))
-        levels = {name: tuple(LEVEL for _ in axes) for name in ("load", "slip")}
-        self.engine = Engine({"skin": self.sensor}, Persistence, lambda _: Alarms(axes, levels), settle_ns=SETTLE_NS)
+        alarms = Alarms(axes, {"load": tuple(LEVEL for _ in axes), "slip": (LEVEL,)}, floors=(1.0,))
+        self.engine = Engine({"skin": self.sensor}, Persistence, lambda _: alarms, settle_ns=SETTLE_NS)
         samples = made.samples("xela", self.sensor, count, 1)
         self.values = np.hstack(samples.values).astype(np.float32)
         self.packets = made.pieces(self.sensor, self.sensor.encode(samples))

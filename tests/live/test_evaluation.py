@@ -11,7 +11,8 @@ import pyarrow as pa
 import pytest
 
 import tacpipe
-from tacpipe.live import evaluation, worth
+from tacpipe.errors import UsageError
+from tacpipe.live import description, evaluation, worth
 from tests.conftest import Lab
 from tests.fake_recordings import FakeRecording
 from tests.live.sessions import CALIBRATED, TRAINED
@@ -61,6 +62,39 @@ def test_published_forecasts_are_compared_with_the_offline_chain_and_recomputed(
     assert 0 < live["mae"]["live"]["t1"] < 10 * live["mae"]["offline"]["t1"]
     assert len(result.files["live.csv"].decode().splitlines()) == 1 + len(worth.PREDICTORS)
     assert "bit for bit" in result.notes[-2] and "2 others" in result.notes[-2]
+
+
+class Session:
+    """A recording of a session that ran the model of a digest."""
+
+    streams = ("forecast", "latency")
+
+    def __init__(self, digest: str | None) -> None:
+        self.attributes = {} if digest is None else {evaluation.MODEL: digest}
+
+
+def test_a_session_of_another_model_is_refused_with_both_digests() -> None:
+    mine, other = "ab" * 32, "cd" * 32
+    given: Any = type("Given", (), {"recordings": {"one": Session(mine), "two": Session(other)}})()
+    with pytest.raises(UsageError) as raised:
+        evaluation.check(mine, given)
+    assert "session of two ran the model cdcdcdcdcdcd, and this one is abababababab" in str(raised.value)
+    assert "leave --live out" in str(raised.value)
+    given.recordings = {"one": Session(mine), "stated by nobody": Session(None)}
+    evaluation.check(mine, given)
+
+
+@pytest.mark.long
+def test_the_model_of_the_session_is_known_by_the_digest_that_tacpipe_live_records(lab: Lab) -> None:
+    for command in TRAINED:
+        lab.run(command)
+    lab.run(TRAINED[-1].replace("models/f", "models/g").replace("--hidden 4", "--hidden 5"))
+    (_, digest), (_, other) = (description.described(Path(model)) for model in ("models/f", "models/g"))
+    given: Any = type("Given", (), {"recordings": {"one": Session(digest)}})()
+    assert digest != other
+    evaluation.check(tacpipe.open("models/f").digest, given)
+    with pytest.raises(UsageError, match="ran the model"):
+        evaluation.evaluate(tacpipe.open("models/g"), given)
 
 
 @pytest.mark.long

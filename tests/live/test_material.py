@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pytest
 
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.live import material_opening, wire
+from tacpipe.live import material_opening, material_replay, wire
 from tacpipe.live.material_engine import RESTARTED, THROWN, MaterialEngine
 from tacpipe.live.material_messages import FINAL, SLIDING, WAITING, MaterialMessage
 from tacpipe.live.material_slide import UNLIKE
@@ -30,7 +31,7 @@ from tacpipe.tasks.material import known, prediction
 from tacpipe.tasks.material import task as material
 from tacpipe.tasks.material.classifier import Classifier
 from tests.asked import fitting
-from tests.fake_recordings import FakeDataset
+from tests.fake_recordings import FakeDataset, FakeRecording
 from tests.live import rigs
 from tests.sensors import made
 from tests.simulation.slide_datasets import SEED, indices, slides
@@ -71,14 +72,18 @@ def options(**changed: Any) -> Options:
     return Options("models/material", "", ("finger",), kind="material", **{"least": 0.5, **changed})
 
 
+def trial(kind: int) -> Any:
+    """Return the stream of a simulated slide that no model was trained on."""
+    return simulate_trial(SEED, indices(RIG, ["biotac"], [UNSEEN])[kind], RIG).streams["biotac"]
+
+
 class Session:
     """An engine with a BioTac, whose frames arrive as those of a simulated trial."""
 
-    def __init__(self, model: Any, kind: int = 1) -> None:
+    def __init__(self, model: Any, kind: int = 1, table: Any = None, **changed: Any) -> None:
         self.sensor = rigs_of.make("biotac", {}, "finger")
-        self.engine: MaterialEngine = material_opening.engine(options(), model, {"finger": self.sensor})
-        trial = simulate_trial(SEED, indices(RIG, ["biotac"], [UNSEEN])[kind], RIG)
-        self.table = trial.streams["biotac"]
+        self.engine: MaterialEngine = material_opening.engine(options(**changed), model, {"finger": self.sensor})
+        self.table = trial(kind) if table is None else table
         names = [field.name for field in self.sensor.fields()]
         values = np.column_stack([self.table.column(name).to_numpy() for name in names]).astype(np.uint16)
         self.t_ns = self.table.column("t_ns").to_numpy() - OFFSET_NS
@@ -106,16 +111,15 @@ class Session:
         """End the recording and return the last message."""
         self.engine.take("", Note(0, "", wire.END))
         self.engine.take("finger", Note(0, "finger", OVER))
-        (last,) = self.engine.step(int(self.t_ns[-1]) + 10**9)
-        return last
+        return self.engine.step(int(self.t_ns[-1]) + 10**9)[-1]
 
 
-def predicted(model: Any, table: Any) -> Any:
+def predicted(model: Any, table: Any, **params: Any) -> Any:
     """Return the probabilities that `tacpipe predict` gives a recording of this stream, None where it refuses it."""
     stage = registry.load("segment.slides")
     given = Slide({"finger": table}, "trial", {"sensor": "biotac"})
     try:
-        cut = stage(stage.params(frames=FRAMES), given)
+        cut = stage(stage.params(frames=FRAMES, **params), given)
     except TacpipeError:
         return None
     shard = Slide(cut.streams, "trial", {**given.attributes, **cut.attributes})
@@ -201,6 +205,78 @@ def test_a_finger_that_falls_silent_is_named_and_the_material_is_unknown_until_i
     assert session.run(10**19)[-1].probabilities is not None
 
 
+PAUSE_NS, FREE_ROWS = 400_000_000, 120  # of a pause; rows in which nothing is touched between two slides, at 100 Hz
+
+
+def touches() -> tuple[Any, list[int]]:
+    """Return a stream of three slides with rows between in which nothing is touched, and the last row of each slide."""
+    several, ends, rows = [], [], 0
+    for kind in range(3):
+        table = trial(kind)
+        begins = int((table.column("pdc").to_numpy() > 20).argmax())
+        free = table.slice(0, begins)
+        assert begins > 10
+        several += [table, *[free] * (FREE_ROWS // begins)]
+        rows += table.num_rows
+        ends.append(rows - 1)
+        rows += begins * (FREE_ROWS // begins)
+    joined = pa.concat_tables(several).combine_chunks()
+    t_ns = joined.column("t_ns")[0].as_py() + np.arange(joined.num_rows, dtype=np.int64) * 10_000_000
+    place = joined.column_names.index("t_ns")
+    return joined.set_column(place, joined.schema.field("t_ns"), pa.array(t_ns)), ends
+
+
+@pytest.mark.parametrize("cut", [1, 13])
+def test_each_of_several_slides_has_its_final_answer_which_is_that_of_predict(
+    cut: int, models: dict[str, Opened]
+) -> None:
+    model = Opened(models["statistics"].files, trigger="load")
+    table, ends = touches()
+    session = Session(model, table=table, pause_s=PAUSE_NS / 1e9)
+    session.begin()
+    published = session.run(10**19, cut)
+    published.append(session.end())
+    finals = [one for one in published if one.state == FINAL]
+    assert [one.slide for one in finals] == [1, 2, 3, 4]  # behind the last slide a pause is left, in which none began
+    assert finals[-1].probabilities is None and finals[-1].cause == "no slide has begun"
+    t_ns, begins = table.column("t_ns").to_numpy(), 0
+    answered: list[bytes] = []
+    for one, last in zip(finals[:3], ends, strict=True):
+        stop = int(np.searchsorted(t_ns, one.t_ns, side="right"))
+        assert 0 < one.t_ns - t_ns[last] <= PAUSE_NS + 10**8  # in the pause: the finger leaves within the trial
+        wanted = predicted(model, table.slice(begins, stop - begins), trigger="load")
+        assert one.probabilities is not None and one.probabilities.tobytes() == wanted.tobytes()
+        answered.append(one.probabilities.tobytes())
+        assert all(other.slide == one.slide for other in published if t_ns[begins] < other.t_ns <= one.t_ns)
+        begins = stop
+    given: Any = type("Given", (), {"recordings": {"rec": FakeRecording({"finger": table}, "rec", RECORDED)}})()
+    (replayed,) = material_replay.predict(model, given).recordings.values()  # type: ignore[arg-type]
+    rows = replayed.streams[""]
+    assert rows.column("slide").to_pylist() == [1, 2, 3, 4]
+    assert rows.column("t_ns").to_pylist()[:3] == [one.t_ns for one in finals[:3]]
+    names = [name for name in rows.column_names if name.startswith("probability_")]
+    likely = np.column_stack([rows.column(name).to_numpy() for name in names]).astype(np.float32)
+    assert likely[:3].tobytes() == b"".join(answered)
+    assert rows.column("material").to_pylist()[3] == "unknown" and np.isnan(likely[3]).all()
+
+
+RECORDED = {"sensor": "biotac", "rate_hz": 100, "live_pause_s": PAUSE_NS / 1e9, "live_least": 0.5}
+
+
+def test_without_a_pause_a_recording_is_one_slide(models: dict[str, Opened]) -> None:
+    model = Opened(models["statistics"].files, trigger="load")
+    table, _ = touches()
+    session = Session(model, table=table)
+    session.begin()
+    assert all(one.slide == 1 and one.state != FINAL for one in session.run(10**19, 50))
+    assert session.end().state == FINAL
+
+
+def test_a_pause_is_refused_where_only_an_arm_could_end_a_slide(models: dict[str, Opened]) -> None:
+    with pytest.raises(UsageError, match="the rig has no stream but finger"):
+        Session(models["statistics"], pause_s=0.5)
+
+
 def test_what_was_lost_makes_this_recording_unknown_and_not_the_next(models: dict[str, Opened]) -> None:
     session = Session(models["statistics"])
     session.engine.take("", Note(0, "", wire.CONTINUE, "{}"))
@@ -226,8 +302,8 @@ def test_rows_of_the_sessions_stream_hold_what_was_published() -> None:
         assert found.seq is not None and found.t_device_ns is not None
         assert (found.seq[0], found.t_device_ns[0]) == (7, 5)
         number = -1 if probabilities is None else 1
-        assert found.values[0][0].tolist() == [number, 60, 0.5, 0]
-        assert np.array_equal(found.values[1][0], message.columns()[4:], equal_nan=True)
+        assert found.values[0][0].tolist() == [number, 60, 0.5, 0, 1]
+        assert np.array_equal(found.values[1][0], message.columns()[5:], equal_nan=True)
 
 
 def test_a_rig_that_the_model_cannot_read_is_refused_by_what_is_missing(models: dict[str, Opened]) -> None:

@@ -23,6 +23,7 @@ from tacpipe.tasks.forward.forecaster import CONFIG, Forecaster
 from tacpipe.tasks.forward.metrics import Trial
 from tacpipe.tasks.forward.predictors import predicted
 from tacpipe.tasks.forward.situations import BySituation
+from tacpipe.tasks.forward.slip_alarms import SlipAlarms
 from tacpipe.tasks.forward.tracks import Track
 from tacpipe.tasks.forward.training import HISTORY, check_codec
 
@@ -47,6 +48,7 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
     known, objects = set(forecaster.config["trained_on"].values()), set(forecaster.config["objects"])
     trials, kept = [], {}
     loads, bands = Loads(forecaster.codec.layout, forecaster.horizon), Bands(forecaster)
+    slipping = SlipAlarms.of(forecaster)
     apart, spill = BySituation(forecaster.horizon, len(forecaster.codec.channels)), Spill(KEPT_BYTES)
     with progress.bar("evaluate", len(recordings.recordings)) as advance:
         for name, shard in sorted(recordings.recordings.items()):
@@ -54,7 +56,10 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
             check_rate(track, forecaster)
             trial = Trial(name, shard.digest in known, track.object, track.object is None or track.object in objects)
             attributes = {**shard.attributes, "seen": trial.seen}
-            rows = _predictions(forecaster, track, trial, loads, apart, spill)
+            if not trial.seen:
+                loads.begin(track)
+                slipping.begin(track)
+            rows = _predictions(forecaster, track, trial, (loads, slipping), apart, spill)
             kept[name] = RecordingOutput(rows, attributes)
             trials.append(trial)
             bands.add(track, trial)
@@ -64,6 +69,8 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
     tree = metrics.summary(trials, groups, forecaster.horizon, forecaster.channel_scale)
     if warned := loads.scored(forecaster.config.get("anticipation", {})):
         tree["anticipation"] = warned
+    if led := slipping.scored():
+        tree["slips"] = led
     if found := apart.summary():
         tree["situations"] = found
     if stated := bands.summary(trials):
@@ -84,28 +91,34 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
 
 
 def _predictions(
-    forecaster: Forecaster, track: Track, trial: Trial, loads: Loads, apart: BySituation, spill: Spill
+    forecaster: Forecaster,
+    track: Track,
+    trial: Trial,
+    alarms: tuple[Loads, SlipAlarms],
+    apart: BySituation,
+    spill: Spill,
 ) -> pa.Table | pa.RecordBatchReader:
     """Return the predictions for all windows of a recording, put aside in ``spill``; its errors are added to ``trial``.
 
-    Where the model has not seen it, its loads are added to ``loads`` and its errors by situation
-    to ``apart``. Some windows are in memory at a time, and of each one of the predictors.
+    Where the model has not seen it, what alarms look at is added to ``alarms``, which the recording was begun in, and its
+    errors by situation to ``apart``. Some windows are in memory at a time, and of each one of the predictors.
     """
+    loads, slipping = alarms
     starts = track.starts(forecaster.context, forecaster.horizon)
     steps = [step for step in STORED_STEPS if step <= forecaster.horizon]
     none = np.zeros((len(steps), len(forecaster.codec.latents), 0), np.float32)
     gathered = Gathered(spill, _prediction_table(forecaster, track, starts[:0], steps, none))
-    if not trial.seen:
-        loads.begin(track)
     for some in predicted(forecaster, track, starts):
         trial.windows += len(some.now)
         doing = situations.of_windows(track, some.now, forecaster.horizon)
         if not trial.seen:
             apart.count(trial.name, doing)
+        present = track.tactile[some.now]
         for name, prediction in some.predictions.items():
             trial.add_errors(name, prediction, some.truth, forecaster.feature_half)
             if not trial.seen:
                 loads.add_one(name, some.now, prediction)
+                slipping.add_one(name, some.now, present, prediction.count)
                 apart.add(trial.name, doing, name, prediction, some.truth)
         stored = some.features[:, [step - 1 for step in steps]].transpose(1, 2, 0).astype(np.float32)
         gathered.add(_prediction_table(forecaster, track, some.now, steps, np.ascontiguousarray(stored)))

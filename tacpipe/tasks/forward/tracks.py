@@ -23,6 +23,7 @@ from tacpipe.signals.rotations import continuous
 from tacpipe.signals.windows import window_starts
 from tacpipe.tasks.forward import levels
 from tacpipe.tasks.forward.levels import Levels
+from tacpipe.tasks.forward.slip_labels import slips_of
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -57,6 +58,7 @@ class Track:
     tactile: AnyFloats | Levels  # (time, channel), float64
     timeline: str = "uniform"  # the grid: uniform, logged or fresh
     object: str | None = None  # the grasped object, where a label names it
+    slips: Bools | None = None  # (time,), where it slips, if that is known; for evaluation alone
 
     def starts(self, context: int, horizon: int, stride: int = 1) -> Int64s:
         """Return the first rows of all windows of ``context + horizon`` rows (window,)."""
@@ -85,6 +87,8 @@ class Track:
         cut = {
             name: getattr(self, name)[first:last] for name in ("t_ns", "contact", "groups", "usable", "arm", "finger")
         }
+        if self.slips is not None:
+            cut["slips"] = self.slips[first:last]
         return replace(self, latent=of(self.latent), tactile=of(self.tactile), **cut)
 
     def put_aside(self, aside: MappedArrays) -> Track:
@@ -191,7 +195,7 @@ def track(shard: Recording, codec: codecs.Codec, pose: Pose = poses.NAMED) -> Tr
         placed = np.hstack([_position(table, pose), _orientation(table, pose)])
         t_ns, contact = (whole_numbers(table, name) for name in ("t_ns", "contact"))
         finger = _opening(table)
-        gaps = tactile.gaps(table)
+        gaps, slips = tactile.gaps(table), slips_of(table)
     except TacpipeError as error:
         raise TacpipeError(f"{shard.name}: {error}") from error
     arm = np.hstack([placed, _velocity(table, pose, t_ns, placed)]).astype(np.float32)
@@ -212,6 +216,7 @@ def track(shard: Recording, codec: codecs.Codec, pose: Pose = poses.NAMED) -> Tr
         above_rest,
         timeline,
         None if held is None else str(held),
+        slips,
     )
 
 

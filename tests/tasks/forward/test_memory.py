@@ -14,6 +14,7 @@ from tacpipe.tasks.forward.alarms import Loads
 from tacpipe.tasks.forward.forecaster import Forecaster
 from tacpipe.tasks.forward.metrics import Trial
 from tacpipe.tasks.forward.situations import BySituation
+from tacpipe.tasks.forward.slip_alarms import SlipAlarms
 from tests.fake_recordings import FakeShard
 from tests.stages.learning_fakes import motion
 from tests.tasks.forward.trials import trained
@@ -28,7 +29,8 @@ def peak_bytes(forecaster: Forecaster, rows: int) -> int:
     loads = Loads(forecaster.codec.layout, forecaster.horizon)
     apart = BySituation(forecaster.horizon, len(forecaster.codec.channels))
     tracemalloc.start()
-    evaluation._predictions(forecaster, track, Trial("a", True), loads, apart, Spill(1))
+    alarms = (loads, SlipAlarms.of(forecaster))
+    evaluation._predictions(forecaster, track, Trial("a", True), alarms, apart, Spill(1))
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     return peak

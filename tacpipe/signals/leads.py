@@ -1,0 +1,69 @@
+"""How long before an event an alarm came, and how often one came for nothing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tacpipe.arrays import Bools, Int64s, Times
+
+GAP_NS = 500_000_000  # between two events at least; what follows sooner belongs to the one before
+
+
+@dataclass(frozen=True)
+class Leads:
+    """What an alarm was worth, against events that are known otherwise."""
+
+    events: int  # with a known alarm in all of the time before
+    leads_ms: tuple[float, ...]  # of the events that an alarm came before
+    false_alarms: int  # that no event followed
+    hours: float  # in which the alarm was known and no event was near
+
+
+def events(t_ns: Times, active: Bools) -> Times:
+    """Return when events begin and when they were last there (event, 2), of whether one is there at ``t_ns`` (time,).
+
+    Those close together are one.
+    """
+    starts = np.flatnonzero(active & ~np.concatenate([[False], active[:-1]]))
+    ends = np.flatnonzero(active & ~np.concatenate([active[1:], [False]]))
+    new = np.ones(len(starts), dtype=bool)
+    new[1:] = t_ns[starts[1:]] - t_ns[ends[:-1]] >= GAP_NS
+    last = np.append(new[1:], True)[: len(ends)]
+    return np.stack([t_ns[starts[new]], t_ns[ends[last]]], axis=1).astype(np.int64)
+
+
+def near(t_ns: Times, found: Times, horizon_ns: int) -> Bools:
+    """Return which rows at ``t_ns`` (time,) are near one of the events ``found`` (event, 2): no alarm is false there.
+
+    That is from ``horizon_ns`` before it begins until `GAP_NS` after it was last there.
+    """
+    rows = np.zeros(len(t_ns), dtype=bool)
+    for begins_ns, ends_ns in found.tolist():
+        rows |= (t_ns >= begins_ns - horizon_ns) & (t_ns < ends_ns + GAP_NS)
+    return rows
+
+
+def leads(t_ns: Times, states: Int64s, found: Times, horizon_ns: int, period_ns: int) -> Leads:
+    """Return what an alarm with ``states`` (time,) at ``t_ns`` (time,) was worth for events ``found`` (event, 2).
+
+    An alarm leads an event by the time from its first row that is on within ``horizon_ns`` before. A false alarm is one that
+    is not `near` an event; it represents the horizon.
+    """
+    led: list[float] = []
+    counted = 0
+    for begins_ns in found[:, 0].tolist():
+        before = (t_ns >= begins_ns - horizon_ns) & (t_ns < begins_ns)
+        if not before.any() or (states[before] < 0).any():
+            continue
+        counted += 1
+        on = t_ns[before & (states > 0)]
+        led += [(begins_ns - int(on[0])) / 1e6] if len(on) else []
+    quiet = ~near(t_ns, found, horizon_ns)
+    false, until_ns = 0, np.iinfo(np.int64).min
+    for at_ns in t_ns[(states > 0) & quiet].tolist():
+        if at_ns > until_ns:
+            false, until_ns = false + 1, at_ns + horizon_ns
+    hours = float(((states >= 0) & quiet).sum()) * period_ns / 3.6e12
+    return Leads(counted, tuple(led), false, hours)

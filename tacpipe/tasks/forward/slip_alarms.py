@@ -1,0 +1,136 @@
+"""Whether forecasts warn of a slip before it begins: the slip alarm's score, its level, and what it is worth."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+
+from tacpipe.arrays import AnyFloats, Bools, Floats, Int64s, Times
+from tacpipe.signals import anticipation
+from tacpipe.signals.leads import Leads, events, leads, near
+from tacpipe.signals.shear import Layout, floors, rise_and_fall
+from tacpipe.tasks.forward.alarms import WATCHED
+from tacpipe.tasks.forward.tracks import Track
+
+if TYPE_CHECKING:
+    from tacpipe.tasks.forward.forecaster import Forecaster
+
+PER_HOUR = 60.0  # false alarms that `evaluate` sets levels for
+PARTS = 5  # of the recordings; each has the level that was set on the others
+
+
+@dataclass(frozen=True)
+class Rows:
+    """The rows of one recording."""
+
+    t_ns: Times  # (time,)
+    slips: Bools | None  # (time,)
+    scores: dict[str, Floats] = field(default_factory=dict)  # (time,) by predictor, NaN without a forecast
+
+    @property
+    def period_ns(self) -> int:
+        """Time from one row to the next, in the median."""
+        return int(np.median(np.diff(self.t_ns))) if len(self.t_ns) > 1 else 1
+
+    def events(self) -> Times:
+        """Return when slips begin and end (event, 2)."""
+        return events(self.t_ns, np.zeros(len(self.t_ns), bool) if self.slips is None else self.slips)
+
+
+@dataclass
+class SlipAlarms:
+    """The slip alarm's scores (`tacpipe.signals.shear`) of predictors, on recordings one after another."""
+
+    layout: Layout
+    floors: AnyFloats  # (skin,), of the model's training
+    horizon: int
+    recordings: list[Rows] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, forecaster: Forecaster) -> Self:
+        """Return those of a model, without recordings yet."""
+        layout = forecaster.codec.layout
+        return cls(layout, floors(forecaster.channel_scale, layout), forecaster.horizon)
+
+    def begin(self, track: Track) -> None:
+        """Add the rows of a recording, without predictions yet."""
+        self.recordings.append(Rows(track.t_ns, track.slips))
+
+    def add_one(self, name: str, now: Int64s, present: AnyFloats, counts: AnyFloats) -> None:
+        """Add what one predictor gives, ``counts`` (window, step, channel), for windows whose last rows are ``now``.
+
+        They are of the recording that was begun last; ``present`` (window, channel) is what it has in these rows.
+        """
+        if name in WATCHED:
+            last = self.recordings[-1]
+            scores = last.scores.setdefault(name, np.full(len(last.t_ns), np.nan))
+            scores[now] = rise_and_fall(counts, present, self.layout, self.floors)
+
+    def level(self, name: str, per_hour: float, some: Sequence[int] | None = None) -> float:
+        """Return the level of a predictor's score for so many false alarms an hour, set on all or some recordings.
+
+        An alarm is false where it is not near a slip. Of a recording that does not state where it slips every alarm
+        counts as false. Infinite where there is no forecast.
+        """
+        chosen = [self.recordings[place] for place in (range(len(self.recordings)) if some is None else some)]
+        chosen = [one for one in chosen if name in one.scores]
+        if not chosen:
+            return math.inf
+        free = [~near(one.t_ns, one.events(), self.horizon * one.period_ns) for one in chosen]
+        return anticipation.level(
+            np.concatenate([one.scores[name] for one in chosen]),
+            np.concatenate(free),
+            np.repeat(np.arange(len(chosen)), [len(one.t_ns) for one in chosen]),
+            horizon=self.horizon,
+            rate_hz=1e9 / float(np.median([one.period_ns for one in chosen])),
+            per_minute=per_hour / 60,
+        )
+
+    def scored(self, per_hour: float = PER_HOUR) -> dict[str, dict[str, Any]]:
+        """Return by predictor what its alarm is worth on the recordings that state where they slip.
+
+        Levels are set for ``per_hour`` false alarms: for each fifth of the recordings on the others, so that no recording
+        sets its own. Nothing where fewer than two recordings state it, or none slips.
+        """
+        known = [place for place, one in enumerate(self.recordings) if one.slips is not None]
+        if len(known) < 2 or not any(one.slips is not None and one.slips.any() for one in self.recordings):
+            return {}
+        parts = [part for part in (known[first::PARTS] for first in range(PARTS)) if part]
+        found: dict[str, dict[str, Any]] = {}
+        for name in dict.fromkeys(name for place in known for name in self.recordings[place].scores):
+            several: list[Leads] = []
+            for part in parts:
+                level = self.level(name, per_hour, [place for place in known if place not in part])
+                several += [self._worth(self.recordings[place], name, level) for place in part]
+            found[name] = summed(several)
+        return found
+
+    def _worth(self, one: Rows, name: str, level: float) -> Leads:
+        scores = one.scores.get(name, np.full(len(one.t_ns), np.nan))
+        known = np.isfinite(scores) & math.isfinite(level)
+        states = np.where(known, (scores > level).astype(np.int64), -1)
+        return leads(one.t_ns, states, one.events(), self.horizon * one.period_ns, one.period_ns)
+
+
+def summed(several: Sequence[Leads]) -> dict[str, Any]:
+    """Return what alarms were worth together; None where there is nothing to divide by.
+
+    >>> summed([Leads(3, (40.0, 120.0), 1, 0.25), Leads(1, (), 0, 0.25)])["recall"]
+    0.5
+    """
+    leads_ms = [lead for one in several for lead in one.leads_ms]
+    count, hours = sum(one.events for one in several), sum(one.hours for one in several)
+    false = sum(one.false_alarms for one in several)
+    return {
+        "events": count,
+        "led": len(leads_ms),
+        "recall": round(len(leads_ms) / count, 9) if count else None,
+        "median_lead_ms": round(float(np.median(leads_ms)), 3) if leads_ms else None,
+        "false_alarms": false,
+        "false_alarms_per_hour": round(false / hours, 3) if hours else None,
+        "minutes": round(60 * hours, 4),
+    }

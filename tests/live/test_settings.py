@@ -1,0 +1,139 @@
+"""What a live session is asked for: by the rig file, over it by the command; what is wrong is named with its place."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tacpipe.cli import live as command
+from tacpipe.errors import UsageError
+from tacpipe.live.settings import Settings
+from tacpipe.recording import rig as rigs
+from tacpipe.recording import rig_text
+from tests.conftest import Lab
+from tests.live.sessions import TRAINED
+from tests.test_docs import fenced
+
+ROOT = Path(__file__).parents[2]
+STREAM = '[[stream]]\nname = "skin"\nsensor = "xela"\ntransport = "ws:127.0.0.1:5000"\n'
+FULL = {
+    "model": "models/f",
+    "plan": "rig:robot",
+    "publish": ["ws:127.0.0.1:8765", "udp:10.0.0.2:9000"],
+    "steps": [1, 5],
+    "alarms_per_hour": 6,
+    "alarms_on": "data/c",
+    "split": "data/split",
+    "settle_ms": 3,
+    "realtime": True,
+    "quantiles": [10, 90],
+}
+
+
+def settings(stated: dict[str, Any], **given: Any) -> Settings:
+    return Settings.of(stated, "rig.toml", given)
+
+
+def test_what_the_file_states_counts_and_options_of_the_command_win() -> None:
+    found = settings(FULL, plan=None, realtime=False, publish=("lsl:touch",), settle_ms=1.5)
+    assert found == Settings(
+        "models/f", "rig:robot", ("lsl:touch",), (1, 5), (10, 90), 6.0, "data/c", "data/split", 1.5, realtime=False
+    )
+    assert settings({}, model="models/g") == Settings("models/g")
+
+
+def test_alarms_of_the_file_are_switched_off_by_the_option_and_a_split_belongs_to_its_recordings() -> None:
+    off = settings(FULL, alarms_per_hour=0.0)
+    assert (off.alarms_per_hour, off.alarms_on, off.split) == (0.0, "", "")
+    others = settings(FULL, alarms_on="data/others")
+    assert (others.alarms_per_hour, others.alarms_on, others.split) == (6.0, "data/others", "")
+
+
+@pytest.mark.parametrize(
+    ("stated", "given", "sentence"),
+    [
+        ({"modle": "x"}, {}, "rig.toml, live: there is no key modle; there are model, plan,"),
+        ({**FULL, "settle_ms": 5000}, {}, "rig.toml, live: settle_ms is 5000; it must be a number from 0 to 1000."),
+        ({**FULL, "publish": "ws:a:1"}, {}, "rig.toml, live: publish is 'ws:a:1'; it must be a list"),
+        ({**FULL, "realtime": "yes"}, {}, "rig.toml, live: realtime is 'yes'; it must be true or false"),
+        ({**FULL, "places": {}}, {}, "there is no key places"),
+        (FULL, {"settle_ms": 5000.0}, "--settle-ms is 5000; it must be a number from 0 to 1000."),
+        ({"plan": "measured"}, {}, 'state model = "models/forward" in the table [live] of rig.toml'),
+        ({"model": "m", "alarms_per_hour": 6}, {}, "rig.toml, live: alarms_per_hour needs alarms_on with it"),
+        ({"model": "m", "alarms_on": "d"}, {}, "rig.toml, live: alarms_on needs alarms_per_hour with it"),
+        ({"model": "m"}, {"alarms_per_hour": 6.0}, "--alarms-per-hour needs --alarms-on with it"),
+        ({"model": "m", "split": "s"}, {}, "rig.toml, live: split has no effect without --alarms-on."),
+        ({"model": "m", "steps": [0]}, {}, "rig.toml, live: steps"),
+    ],
+)
+def test_what_is_wrong_is_named_with_its_place(stated: dict[str, Any], given: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(UsageError) as raised:
+        settings(stated, **given)
+    assert sentence in str(raised.value)
+
+
+def test_steps_beyond_the_horizon_are_refused_and_none_are_all() -> None:
+    assert settings({"model": "m"}).steps_of(3) == (1, 2, 3)
+    assert settings({"model": "m", "steps": [5, 1, 5]}).steps_of(10) == (1, 5)
+    with pytest.raises(UsageError, match="1 to 4 steps ahead"):
+        settings({"model": "m", "steps": [5]}).steps_of(4)
+
+
+def test_the_table_stays_in_the_text_of_a_rig_and_recorders_do_not_look_at_it() -> None:
+    text = STREAM + '[live]\nmodel = "models/f"\npublish = ["udp:127.0.0.1:9000"]\nsettle_ms = 3\n'
+    rig = rigs.parse(text)
+    assert rig.live == {"model": "models/f", "publish": ["udp:127.0.0.1:9000"], "settle_ms": 3}
+    assert rigs.parse(rig_text.of(rig)).live == rig.live
+    assert rigs.parse(STREAM + '[live]\nanything = "else"\n').live  # `tacpipe acquire` records such a rig
+    with pytest.raises(UsageError, match="live is 3; it must be a table"):
+        rigs.parse("live = 3\n" + STREAM)
+
+
+@pytest.mark.parametrize("page", ["docs/rig.md", "docs/howto/live.md"])
+def test_the_examples_of_the_pages_are_read(page: str) -> None:
+    texts = [block.text for block in fenced((ROOT / page).read_text()) if block.language == "toml"]
+    found = [text for text in texts if "[live]" in text]
+    assert found
+    for text in found:
+        stated = tomllib.loads(text)["live"]
+        assert settings(stated).model == stated["model"]
+        if "[[stream]]" in text:
+            assert rigs.parse(text).live == stated
+
+
+@pytest.mark.long
+def test_a_session_is_what_the_file_states_but_for_the_options_given(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    for one in TRAINED:
+        lab.run(one)
+    stated = 'model = "models/f"\nplan = "udp::9100"\nsteps = [2]\nsettle_ms = 3\n'
+    alarms = 'alarms_per_hour = 60\nalarms_on = "data/c"\nsplit = "data/split"\n'
+    Path("rig.toml").write_text(f"{STREAM}[live]\n{stated}{alarms}")
+    asked: list[Any] = []
+    monkeypatch.setattr(command, "_run", lambda found, options, *rest, **more: asked.append((options, rest)))
+    lab.run("live rig.toml --settle-ms 1 --publish udp:127.0.0.1:9000")
+    ((options, rest),) = asked
+    assert options.model == str(Path("models/f").absolute()) and options.steps == (2,) and options.settle_ms == 1.0
+    assert options.alarms_per_hour == 60 and options.split == str(Path("data/split").absolute())
+    assert options.publish == ("udp:127.0.0.1:9000",) and "plan" in options.streams
+    assert rest[4]["live_plan"] == "udp::9100" and rest[4]["live_alarms_per_hour"] == 60
+
+
+@pytest.mark.long
+def test_a_value_of_the_file_that_the_session_refuses_is_named_with_the_file(lab: Lab) -> None:
+    for one in TRAINED:
+        lab.run(one)
+    for line, sentence in (
+        ('plan = "carrier pigeon"', "rig.toml, live: plan 'carrier pigeon' is not a source of plans"),
+        ('plan = "rig:arm"', "rig.toml, live: plan 'rig:arm': the rig has no stream"),
+        ('publish = ["ftp:a"]', "rig.toml, live: publish"),
+        ("steps = [9]", "rig.toml, live: The steps 9"),
+    ):
+        Path("rig.toml").write_text(f'{STREAM}[live]\nmodel = "models/f"\n{line}\n')
+        ran = lab.call("live rig.toml")
+        assert ran.code == 2 and sentence in ran.err, ran.err
+    Path("rig.toml").write_text(f'{STREAM}[live]\nmodel = "models/none"\n')
+    ran = lab.call("live rig.toml")
+    assert ran.code == 2 and "rig.toml, live: " in ran.err and "models/none" in ran.err, ran.err
