@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tacpipe.arrays import AnyFloats
+from tacpipe.arrays import AnyFloats, Floats
 from tacpipe.channels import biotac_sp
 from tacpipe.comparison.runs import Method
 from tacpipe.io.parquet import from_parquet
 from tacpipe.metrics import forecast
 from tacpipe.report import blocks, charts
-from tacpipe.report.blocks import Cell, Chart, Charts, Fold, fold, number, table
+from tacpipe.report.blocks import NONE, Cell, Chart, Charts, Fold, fold, number, table
 from tacpipe.report.charts import Dot
 from tacpipe.report.touch import electrodes, wording
 from tacpipe.report.touch import methods as by_method
@@ -24,12 +24,11 @@ from tacpipe.tasks.touch.result_names import CONSTANT, COVERAGE, MODEL, OBJECT_M
 if TYPE_CHECKING:
     import pandas as pd
 
-NAMES = {MODEL: "quantiles of the model", CONSTANT: "constant, quantiles of its errors",
-         OBJECT_MEAN: "mean of the object, quantiles of its errors"}  # fmt: skip
+NAMES = {MODEL: "model", CONSTANT: "constant", OBJECT_MEAN: "mean of the object"}
 EXPLAINED = (
     "A band holds as often as it states if its coverage lies on the dashed line. Intervals are over grasps of known "
-    "objects, and over novel objects. The narrowest band of the right coverage is best, which the "
-    "pinball loss measures (lower is better)."
+    "objects, and over novel objects; the baselines have the quantiles of their own errors in training. The narrowest "
+    "band of the right coverage is best, which the pinball loss measures (lower is better)."
 )
 ELECTRODES = "Coverage in percent. Blue: more than asked for; orange: less."
 STRONGEST = 0.2  # difference of coverage that has the strongest colour
@@ -41,8 +40,9 @@ class Measured:
 
     values: int
     coverage: tuple[float, float, float]  # with its 95 % interval
-    width: float  # fraction of the target's range
+    width: float  # counts
     pinball: float  # counts
+    gain: tuple[float, float, float]  # 1 - pinball / pinball of the constant, with its 95 % interval
 
 
 def folds(methods: Sequence[Method]) -> list[Fold]:
@@ -81,18 +81,32 @@ def folds(methods: Sequence[Method]) -> list[Fold]:
 def measured(rows: pd.DataFrame, known: bool) -> dict[tuple[str, str], Measured]:
     """Return what each predictor's band is worth on each target, of grasps of known objects or of novel ones."""
     found = {}
-    for (target, predictor), one in rows.groupby(["target", "predictor"]):
-        by = one.groupby("recording" if known else "object")["covered"].agg(["sum", "count"])
-        low, high = (float("nan"),) * 2
-        if len(by) > 1:
-            weights = forecast.draws(len(by))
-            drawn = (weights @ by["sum"].to_numpy(float)) / (weights @ by["count"].to_numpy(float))
-            low, high = (float(end) for end in forecast.bounds(drawn))
-        ends = biotac_sp.RANGES[str(target)]
-        width = float(one.width.mean()) / (ends[1] - ends[0])
-        coverage = float(one.covered.mean()), low, high
-        found[str(target), str(predictor)] = Measured(len(one), coverage, width, float(one.pinball.mean()))
+    for target, same in rows.groupby("target"):
+        clustered = same.groupby(["predictor", "recording" if known else "object"])
+        sums = clustered[["covered", "pinball"]].sum().join(clustered.size().rename("values"))
+        constant = sums.loc[CONSTANT]
+        for predictor, one in same.groupby("predictor"):
+            own = sums.loc[predictor]
+            lost, still = (each["pinball"].to_numpy(float)[:, None] for each in (own, constant))
+            gain = forecast.skill_interval(lost, still)
+            coverage = float(one.covered.mean()), *_bounds(own.covered.to_numpy(float), own["values"].to_numpy(float))
+            found[str(target), str(predictor)] = Measured(
+                len(one),
+                coverage,
+                float(one.width.mean()),
+                float(one.pinball.mean()),
+                (float(gain.mean[0]), float(gain.low[0]), float(gain.high[0])),
+            )
     return found
+
+
+def _bounds(covered: Floats, values: Floats) -> tuple[float, float]:
+    """Return the ends of the 95 % interval of coverage over clusters (cluster,) that are drawn anew; NaN of one alone."""
+    if len(values) < 2:
+        return float("nan"), float("nan")
+    weights = forecast.draws(len(values))
+    low, high = forecast.bounds(((weights @ covered) / (weights @ values))[:, None])
+    return float(low[0]), float(high[0])
 
 
 def by_electrode(rows: pd.DataFrame, target: str) -> AnyFloats:
@@ -134,22 +148,27 @@ def _rows(rows: pd.DataFrame, known: bool) -> list[Sequence[str | Cell]]:
     found = measured(rows, known)
     shown: list[Sequence[str | Cell]] = []
     for target in (name for name in headlines.TARGETS if (name, MODEL) in found):
-        constant = found[target, CONSTANT].pinball
+        low_count, high_count = biotac_sp.RANGES[target]
         for predictor in (one for one in NAMES if (target, one) in found):
             one = found[target, predictor]
-            mean, low, high = one.coverage
-            below = "" if np.isnan(low) else f"{blocks.fixed(low, 2)} to {blocks.fixed(high, 2)}"
             shown.append(
                 [
                     f"{headlines.PARTS[known]}, {headlines.TARGETS[target]}: {NAMES[predictor]}",
                     f"{one.values:,}",
-                    Cell(blocks.fixed(mean, 2), below, mean),
-                    number(100 * one.width, 3),
+                    _with_interval(one.coverage, 2),
+                    number(100 * one.width / (high_count - low_count), 3),
                     number(one.pinball, 3),
-                    number(100 * (1 - one.pinball / constant) if constant else float("nan"), 2),
+                    Cell(NONE) if predictor == CONSTANT else _with_interval([100 * part for part in one.gain], 0),
                 ]
             )
     return shown
+
+
+def _with_interval(values: Sequence[float], digits: int) -> Cell:
+    """Return a number above its interval, where that is defined."""
+    mean, low, high = values
+    below = "" if np.isnan(low) else f"{blocks.fixed(low, digits)} to {blocks.fixed(high, digits)}"
+    return Cell(blocks.fixed(mean, digits), below, mean)
 
 
 def _by_electrode(rows: pd.DataFrame, known: bool, asked: float) -> Chart | None:
