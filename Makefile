@@ -54,7 +54,7 @@ fi; \
 mkdir -p $(dir $(COUNTS)); : > $(COUNTS)
 endef
 
-.PHONY: help demo rig-demo live-demo wheel docs pictures result-pages learning-curve unknown-materials test test-long test-rig test-ci test-loaded test-faults test-exports test-trackers test-viewer viewer-pictures test-install test-power test-slurm test-exits fuzz test-kernel check lint types bless bench clean
+.PHONY: help demo rig-demo live-demo wheel docs pictures result-pages learning-curve touch-uncertainty unknown-materials test test-long test-rig test-ci test-loaded test-faults test-exports test-trackers test-viewer viewer-pictures test-install test-power test-slurm test-exits fuzz test-kernel check lint types bless bench clean
 
 help: ## show the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -77,6 +77,9 @@ result-pages: $(VENV)/.dev ## compute the three result pages of a release from t
 
 learning-curve: $(VENV)/.dev ## measure what more recordings are worth to forward, on the dataset of segments DATA; OPTIONS="--draws 2"; minutes to hours
 	@$(BIN)/python docs/learning_curve.py $(DATA) $(OPTIONS)
+
+touch-uncertainty: $(VENV)/.dev ## measure quantiles of predicted touch on the published grasps in DATA; a table
+	@$(BIN)/python docs/touch_uncertainty.py $(DATA)
 
 unknown-materials: $(VENV)/.dev ## measure the answer unknown with materials left out, on the published slides in DATA; a table
 	@$(BIN)/python docs/unknown_materials.py $(DATA)

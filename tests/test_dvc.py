@@ -158,7 +158,7 @@ def test_a_method_of_the_forward_chain_runs_once_and_dvc_shows_its_metrics_param
     params["forward"]["quick"]["methods"]["taxelwise"] |= {"epochs": 1, "hidden": 8}
     (project.folder / "params.yaml").write_text(yaml.safe_dump(params, sort_keys=False))
     project.start()
-    target, results = "forward-raw@taxelwise-0", "results/forward/taxelwise/0"
+    target, results = "forward-calibrated@taxelwise-0", "results/forward/taxelwise/0"
     project.run(f"dvc repro {target}")
     again = project.run(f"dvc repro {target}")
     project.commit("one epoch")
@@ -169,6 +169,8 @@ def test_a_method_of_the_forward_chain_runs_once_and_dvc_shows_its_metrics_param
     metrics = shown[""]["data"][f"{results}/metrics.json"]["data"]
     assert metrics["model"]["mae_counts"]["both"]["t10"] > 0
     assert metrics["persistence"]["mae_counts"]["both"]["t10"] > 0
+    stated = json.loads((project.folder / "results/forward/taxelwise-calibrated/0/metrics.json").read_text())
+    assert stated["quantiles"]["levels"] == [10, 50, 90] and stated["model"] == metrics["model"]
     project.change("rest_s: 0.2", "rest_s: 0.3")
     changed = json.loads(project.run("dvc params diff --json"))["params.yaml"]
     assert changed == {"forward.segment.rest_s": {"old": 0.2, "new": 0.3, "diff": pytest.approx(0.1)}}
@@ -178,8 +180,8 @@ def test_a_method_of_the_forward_chain_runs_once_and_dvc_shows_its_metrics_param
     assert "mse_counts" in page
     assert "<DVC_METRIC" not in page
     contents = cached(project.folder)
-    # a manifest each of recordings, synced, segments, split, model and results
-    assert sum(b'"format": 1' in content for content in contents) == 6
+    # a manifest each of recordings, synced, segments and split, and of model and results before and after calibration
+    assert sum(b'"format": 1' in content for content in contents) == 8
     assert not [content for content in contents if content.startswith(b"PAR1")]
     assert max(map(len, contents)) < 5_000_000
 
@@ -209,6 +211,9 @@ def test_a_method_of_the_material_chain_runs_once_and_is_reported(
     assert metrics["model"]["accuracy"]["biotac"] > metrics["chance"]["accuracy"]["biotac"]
     project.run("tacpipe report results/material/patterns/0 data/material/slides -o results/material.html")
     assert "simulated" in (project.folder / "results/material.html").read_text()
+    project.run("dvc repro material-calibrated@0")
+    calibrated = json.loads((project.folder / "results/material/calibrated/0/metrics.json").read_text())
+    assert set(calibrated["unknown"]) == {"biotac", "roboskin"}
 
 
 @pytest.mark.long
@@ -239,7 +244,9 @@ def test_methods_and_settings_of_the_touch_chain_run_once_and_are_reported(
         str(path.relative_to(project.folder / "results")) for path in project.folder.glob("results/touch/*/*")
     )
     both = [f"touch/{method}-{split}/0" for method in ("pointnet", "trees") for split in ("known", "later", "novel")]
-    assert found == [*both, "touch/xyz/0"]
+    assert found == ["touch/calibrated/0", *both, "touch/xyz/0"]
+    stated = json.loads((project.folder / "results/touch/calibrated/0/metrics.json").read_text())["quantiles"]
+    assert stated["levels"] == [10, 50, 90] and 0 <= stated["known"]["model"]["coverage"]["e_th"] <= 1
     metrics = {name: json.loads((project.folder / f"results/{name}/metrics.json").read_text()) for name in both}
     assert metrics["touch/trees-known/0"]["known"]["counts"]["grasps"] in (4, 5, 6)  # of 24 in 5 folds of 2 objects
     assert metrics["touch/trees-novel/0"]["novel"]["counts"] == {"grasps": 12, "objects": 1}
@@ -247,7 +254,15 @@ def test_methods_and_settings_of_the_touch_chain_run_once_and_are_reported(
     lines = project.run("dvc metrics show " + " ".join(f"results/{name}/summary.json" for name in both)).splitlines()
     assert lines[0].split()[:5] == ["Path", "e_mf", "e_th", "gain", "high"] and max(map(len, lines)) <= 120
     page = (project.folder / "results/touch.html").read_text()
-    for shown in ("5 folds", "leave one object out", "later grasps", "<td>XYZ</td>", "<td>RGBCont</td>"):
+    for shown in (
+        "5 folds",
+        "5 folds, calibrated",
+        "Coverage of each electrode",
+        "leave one object out",
+        "later grasps",
+        "<td>XYZ</td>",
+        "<td>RGBCont</td>",
+    ):
         assert shown in page
     assert "XYZCont" not in page  # of the paper's rows, those that were run
 

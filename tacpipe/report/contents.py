@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
 
 Tree = Mapping[str, Any]
+CALIBRATION = ("quantiles", "known")  # what `tacpipe calibrate` adds to a model's configuration
+GROWS = "trained_on"  # which names the recordings of the calibration too
 
 
 class Result:
@@ -68,3 +70,24 @@ def tree(result: Dataset, name: str) -> Tree:
     """Return what a JSON file of a result holds; empty where there is none of the name."""
     found: Tree = json.loads(result.files[name]) if name in result.files else {}
     return found
+
+
+def counted_once(results: Sequence[Dataset]) -> list[Dataset]:
+    """Return results without those whose model was evaluated on the same recordings once it was calibrated too.
+
+    Both hold the same predictions, so that one training would count as two.
+    """
+    keys = [_key(one) for one in results]
+    calibrated = {key for key, one in zip(keys, results, strict=True) if _is_calibrated(one)}
+    return [one for key, one in zip(keys, results, strict=True) if _is_calibrated(one) or key not in calibrated]
+
+
+def _is_calibrated(result: Dataset) -> bool:
+    return any(name in tree(result, "config.json") for name in CALIBRATION)
+
+
+def _key(result: Dataset) -> str:
+    """Return what is the same of a model and its calibrated copy, and what they were evaluated on."""
+    config = {key: value for key, value in tree(result, "config.json").items() if key not in (*CALIBRATION, GROWS)}
+    given = {name: one for name, one in result.manifest.get("inputs", {}).items() if name != "model"}
+    return json.dumps([config, given], sort_keys=True)

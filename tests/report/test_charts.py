@@ -20,6 +20,8 @@ def test_what_is_not_defined_is_null_and_no_specification_holds_nan() -> None:
     specs = [
         charts.lines([Line("a", [0, 1], [np.nan, 2.0], [0.0, np.nan], [1.0, 3.0])], "x", "y", level=("zero", 0.0)),
         charts.lines([Line("a", [1, 2], [0.1, 0.2]), Line("a", [1, 2], [0.1, 0.3], thin=True)], "x", "y", log=True),
+        charts.lines([Line("a", [0, 1], [0.2, 0.9])], "x", "y", diagonal=(0, 1)),
+        charts.marked([("a", 0.5, np.nan)], "x", "y"),
         charts.ranking([Dot("a", 0.5, np.nan, np.nan), Dot("b", np.nan, np.nan, np.nan)], "x"),
         charts.scatter([{"x": 1.0, "y": 2.0, "name": "a"}], "x", "y", diagonal=True, level=("c", np.nan)),
         charts.matrix(np.array([[3, 1], [0, 4]]), ["a", "b"], "true", "named"),

@@ -8,7 +8,7 @@ from tacpipe.report.charts.columns import bars
 from tacpipe.report.charts.curves import POINTS, Line, decimated, lines
 from tacpipe.report.charts.grammar import Spec
 from tacpipe.report.charts.planes import plane
-from tacpipe.report.charts.points import joined, scatter
+from tacpipe.report.charts.points import joined, marked, scatter
 from tacpipe.report.charts.rankings import Dot, ranking
 from tacpipe.report.charts.squares import grid, matrix
 
@@ -22,6 +22,7 @@ __all__ = [
     "grid",
     "joined",
     "lines",
+    "marked",
     "matrix",
     "plane",
     "ranking",

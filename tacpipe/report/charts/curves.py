@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from tacpipe.arrays import AnyFloats, Floats
-from tacpipe.report.charts.grammar import COLOURS, INK, QUIET, Spec, legend_of, short, tip_of, y_of, zoom
+from tacpipe.report.charts.grammar import COLOURS, INK, QUIET, Spec, diagonal_of, legend_of, short, tip_of, y_of, zoom
 
 POINTS = 300  # of a line that are drawn
+ROOM = 0.02  # beyond the ends of a diagonal, as a fraction of it
 
 
 @dataclass(frozen=True)
@@ -36,11 +37,13 @@ def lines(
     level: tuple[str, float] | None = None,
     floor: float | None = None,
     shade: tuple[float, float] | None = None,
+    diagonal: Sequence[float] = (),
     points: bool = True,
     height: int = 240,
 ) -> Spec:
     """Return lines over x, each with its band; ``level`` is drawn across, ``shade`` is a span of x, ``floor`` ends y.
 
+    With ``diagonal``, two numbers, a thin line lies where x and y are the same, between them.
     Charts with the same ``order`` of names give a name the same colour.
     """
     names = list(order) or list(dict.fromkeys(one.name for one in several if not one.thin))
@@ -50,6 +53,11 @@ def lines(
     if floor is not None:
         described = [row[key] for row in values for key in ("y", "low", "high") if row.get(key) is not None]
         scale["domain"] = [max(floor, min([0.0, *described])), max([0.05, *described])]
+    across: Spec = {"zero": False, "nice": False}
+    if diagonal:  # what lies on its ends is drawn whole
+        room = ROOM * (diagonal[1] - diagonal[0])
+        scale |= {"nice": False, "domain": [short(diagonal[0] - room), short(diagonal[1] + room)]}
+        across["domain"] = scale["domain"]
     colour: Spec = {
         "field": "name",
         "type": "nominal",
@@ -57,7 +65,7 @@ def lines(
         "legend": legend_of(len(held)),
     }
     base: Spec = {
-        "x": {"field": "x", "type": "quantitative", "title": x, "scale": {"zero": False, "nice": False}},
+        "x": {"field": "x", "type": "quantitative", "title": x, "scale": across},
         "y": {"field": "y", "type": "quantitative", "title": y, "scale": scale},
         "color": colour,
         "detail": {"field": "run", "type": "nominal"},
@@ -71,6 +79,8 @@ def lines(
             "mark": {"type": "rect", "opacity": 0.12, "fill": INK},
         }
         layers.append({**span, "encoding": {"x": {"field": "a", "type": "quantitative"}, "x2": {"field": "b"}}})
+    if diagonal:
+        layers.append(diagonal_of(diagonal))
     if level:
         rule = {"type": "rule", "stroke": QUIET, "strokeDash": [4, 3], "strokeWidth": 1.5, "tooltip": level[0]}
         layers.append({"data": {"values": [{"y": level[1]}]}, "mark": rule, "encoding": {"y": y_of("y")}})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 Spec = dict[str, Any]
@@ -39,6 +40,17 @@ def tip_of(name: str, title: str) -> Spec:
 def y_of(name: str) -> Spec:
     """Return the place of a field up and down."""
     return {"field": name, "type": "quantitative"}
+
+
+def diagonal_of(ends: Sequence[float]) -> Spec:
+    """Return a thin line on which x and y are the same, between its ends."""
+    values = [{"x": short(one), "y": short(one)} for one in ends]
+    mark = {"type": "line", "stroke": INK, "strokeWidth": 0.8}
+    return {
+        "data": {"values": values},
+        "mark": mark,
+        "encoding": {"x": {"field": "x", "type": "quantitative"}, "y": y_of("y")},
+    }
 
 
 def text_of(value: float) -> str:

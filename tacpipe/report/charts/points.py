@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from tacpipe.arrays import AnyFloats
-from tacpipe.report.charts.grammar import INK, QUIET, Spec, colour_of, legend_of, short, tip_of, y_of, zoom
+from tacpipe.report.charts.grammar import INK, QUIET, Spec, colour_of, diagonal_of, legend_of, short, tip_of, y_of, zoom
 
 
 def scatter(
@@ -54,16 +54,23 @@ def scatter(
     layers = []
     if diagonal and values:
         both = [float(row[key] or 0.0) for row in values for key in ("x", "y")]
-        ends = [min(both), max(both)]
-        line = {
-            "data": {"values": [{"x": one, "y": one} for one in ends]},
-            "mark": {"type": "line", "stroke": INK, "strokeWidth": 0.8},
-        }
-        layers.append({**line, "encoding": {"x": {"field": "x", "type": "quantitative"}, "y": y_of("y")}})
+        layers.append(diagonal_of([min(both), max(both)]))
     if level and not math.isnan(level[1]):
         rule = {"type": "rule", "stroke": QUIET, "strokeDash": [4, 3], "tooltip": level[0]}
         layers.append({"data": {"values": [{"y": short(level[1])}]}, "mark": rule, "encoding": {"y": y_of("y")}})
     return {"data": {"values": values}, "height": height, "layer": [*layers, points]}
+
+
+def marked(points: Sequence[tuple[str, float, float]], x: str, y: str) -> Spec:
+    """Return a layer of diamonds at points (name, x, y), which state their numbers under the cursor."""
+    values = [{"name": name, "x": short(one), "y": short(other)} for name, one, other in points]
+    places: Spec = {"x": {"field": "x", "type": "quantitative"}, "y": {"field": "y", "type": "quantitative"}}
+    mark = {"type": "point", "shape": "diamond", "filled": True, "size": 110, "fill": INK, "opacity": 1}
+    return {
+        "data": {"values": values},
+        "mark": mark,
+        "encoding": {**places, "tooltip": [tip_of("name", ""), tip_of("x", x), tip_of("y", y)]},
+    }
 
 
 def joined(pairs: Sequence[tuple[str, AnyFloats, AnyFloats]]) -> Spec:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from tacpipe.comparison.runs import Errors, Question, Run
 from tacpipe.comparison.specification import Kind
+from tacpipe.report.contents import counted_once
 from tacpipe.report.forward import methods
 from tacpipe.report.forward.methods import Result
 from tacpipe.tasks.forward import headline, units
@@ -21,7 +22,7 @@ ORACLES = ("codec", "codec_anchored")  # of what knows the true future
 
 def read(results: Sequence[Dataset]) -> list[Run]:
     """Return the runs of results that hold error sums of recordings which the model has not seen."""
-    every = [Result(one) for one in results if methods.comparable(one)]
+    every = [Result(one) for one in counted_once(results) if methods.comparable(one)]
     runs = [one for one in every if one.errors.recordings]
     if not runs:
         return []

@@ -20,6 +20,7 @@ from tacpipe.report.material import (
     reading,
     reduction,
     tables,
+    uncertainty,
     wording,
     zero_shot,
 )
@@ -49,6 +50,7 @@ def folds(context: Context) -> list[Fold]:
         *curves.few_slides(methods),
         *zero_shot.folds(methods),
         *confusion.folds(context),
+        *uncertainty.folds(methods),
         *latents.folds(methods),
         *curves.training(methods),
         *profiles.folds(context.others),

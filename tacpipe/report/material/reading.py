@@ -9,6 +9,7 @@ import numpy as np
 
 from tacpipe.comparison.runs import Errors, Question, Run
 from tacpipe.comparison.specification import Kind
+from tacpipe.report.contents import counted_once
 from tacpipe.report.material import methods
 from tacpipe.report.material.methods import Result
 from tacpipe.report.material.predictions import (
@@ -47,7 +48,7 @@ KINDS: dict[str, Kind] = {
 
 def read(results: Sequence[Dataset]) -> list[Run]:
     """Return the runs of results that hold predictions of slides which the model has not seen."""
-    every = [Result(one) for one in results if "predictions" in one.recordings]
+    every = [Result(one) for one in counted_once(results) if "predictions" in one.recordings]
     held = [one for one in every if one.sensors]
     return [_run(*pair) for pair in zip(held, methods.settings(held), strict=True)]
 

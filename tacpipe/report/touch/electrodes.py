@@ -75,10 +75,10 @@ def _explained(method: Method, fingers: Sequence[str], known: bool) -> Chart | N
         found = scores.by_electrode(tables.predictions(method), target, known)
         if found is not None:
             strength = np.nan_to_num(np.clip(found, -1, 1))
-            rows += _tip(wording.FINGERS[target], strength, [wording.signed_short(value) for value in found], "R²")
+            rows += tip(wording.FINGERS[target], strength, [wording.signed_short(value) for value in found], "R²")
     if not rows:
         return None
-    return Chart(f"R² of each electrode, {headlines.PARTS[known]}", _plane(rows))
+    return Chart(f"R² of each electrode, {headlines.PARTS[known]}", plane(rows))
 
 
 def _pair(rows: Predictions, one: Chosen, fingers: Sequence[str]) -> Chart:
@@ -92,16 +92,14 @@ def _pair(rows: Predictions, one: Chosen, fingers: Sequence[str]) -> Chart:
         usual = rows.true[target].mean(axis=0) if constant is None else constant[one.row]
         widest = float(np.abs(true - usual).max()) or 1.0
         for title, values in (("true", true), ("predicted", predicted)):
-            tips += _tip(
-                f"{finger}, {title}", (usual - values) / widest, [f"{value:.0f}" for value in values], "Counts"
-            )
+            tips += tip(f"{finger}, {title}", (usual - values) / widest, [f"{value:.0f}" for value in values], "Counts")
         errors.append(f"{finger} {regression.rmse(true[None], predicted[None]):.0f} counts")
     known = headlines.PARTS[bool(rows.known[one.row])].removesuffix("s")
     caption = f"{rows.objects[one.row]} ({known}). RMSE {one.error:.4f} of the range; {', '.join(errors)}."
-    return Chart(f"True next to predicted: {one.place} by error, {one.recording}", _plane(tips), caption, wide=True)
+    return Chart(f"True next to predicted: {one.place} by error, {one.recording}", plane(tips), caption, wide=True)
 
 
-def _tip(panel: str, strength: AnyFloats, texts: Sequence[str], quantity: str) -> list[dict[str, object]]:
+def tip(panel: str, strength: AnyFloats, texts: Sequence[str], quantity: str) -> list[dict[str, object]]:
     """Return the electrodes of one fingertip, its skin rolled out flat, the tip up, coloured from -1 to 1."""
     places = 1000 * biotac_sp.unrolled_m()[:, ::-1]  # (electrode, across and along), mm
     return [
@@ -111,7 +109,8 @@ def _tip(panel: str, strength: AnyFloats, texts: Sequence[str], quantity: str) -
     ]  # fmt: skip
 
 
-def _plane(rows: Sequence[dict[str, object]]) -> charts.Spec:
+def plane(rows: Sequence[dict[str, object]]) -> charts.Spec:
+    """Return fingertips next to each other, of rows that `tip` gave."""
     spec = charts.plane(rows, list(dict.fromkeys(str(row["panel"]) for row in rows)), size=520, columns=4)
     spec["usermeta"] |= {"panel": 200, "least": 170}
     return spec

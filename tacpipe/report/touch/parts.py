@@ -12,7 +12,18 @@ from tacpipe.metrics import headline
 from tacpipe.report import blocks, screen
 from tacpipe.report.blocks import NONE, Cell, Charts, Fold
 from tacpipe.report.context import Context
-from tacpipe.report.touch import clouds, curves, electrodes, forms, generalisation, pressure, scores, tables, wording
+from tacpipe.report.touch import (
+    clouds,
+    curves,
+    electrodes,
+    forms,
+    generalisation,
+    pressure,
+    scores,
+    tables,
+    uncertainty,
+    wording,
+)
 from tacpipe.report.touch import methods as by_method
 from tacpipe.report.touch.scores import Score
 from tacpipe.tasks.touch import headline as headlines
@@ -57,6 +68,7 @@ def folds(context: Context) -> list[Fold]:
     return [
         *pressure.folds(first),
         *electrodes.folds(first),
+        *uncertainty.folds(methods),
         *clouds.folds(context.others, chosen),
         *blocks.fold("The paper's tables and figures" if published else "What settings change", *paper),
         *found,

@@ -10,6 +10,7 @@ import numpy as np
 from tacpipe.channels import biotac_sp
 from tacpipe.comparison.runs import Errors, Question, Run
 from tacpipe.metrics import regression
+from tacpipe.report.contents import counted_once
 from tacpipe.report.touch import methods, wording
 from tacpipe.report.touch.methods import Result
 from tacpipe.tasks.touch import headline
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 
 def read(results: Sequence[Dataset]) -> list[Run]:
     """Return the runs of results that hold predictions of grasps which the model has not seen."""
-    every = [Result(one) for one in results if PREDICTIONS in one.recordings]
+    every = [Result(one) for one in counted_once(results) if PREDICTIONS in one.recordings]
     held = [one for one in every if len(one.predictions.recordings)]
     splits = methods.splits(held)
     return [_run(*pair, splits) for pair in zip(held, methods.names(held), strict=True)]

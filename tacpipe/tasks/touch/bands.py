@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from tacpipe.arrays import Bools
+from tacpipe.io.parquet import to_parquet
 from tacpipe.metrics import quantiles
 from tacpipe.metrics.quantiles import Sums
 from tacpipe.tasks.touch.grasps import Grasps
@@ -38,6 +39,43 @@ def tree(
                 if MEAN in values:
                     found.setdefault(predictor, {}).setdefault(measure, {})[target] = values[MEAN]
     return {"n": int(mask.sum()), **found}
+
+
+def coverage(
+    uncertainty: Uncertainty, grasps: Grasps, predicted: Mapping[str, Readings], mask: Bools, known: Bools
+) -> bytes:
+    """Return ``coverage.parquet``: of grasps that a mask (grasp,) chooses a row a predictor and value.
+
+    It states whether the true value lies in the band from the lowest to the highest quantile, how wide that is and the
+    pinball loss, both in device counts; ``known`` (grasp,) is whether the model knows the object.
+    """
+    import pyarrow as pa
+
+    names, objects = (np.asarray(one)[mask] for one in (grasps.names, grasps.objects))
+    parts = []
+    for predictor in (MODEL, CONSTANT, OBJECT_MEAN):
+        for target, values in predicted[predictor].items():
+            bands = uncertainty.quantiles({target: values[mask]}, predictor)[target]  # (grasp, value, level)
+            truth = grasps.readings[target][mask]
+            above = truth[..., None] - bands
+            lost = np.maximum(uncertainty.levels * above, (uncertainty.levels - 1) * above).mean(axis=2)
+            count = truth.shape[1]
+            parts.append(
+                pa.table(
+                    {
+                        "recording": np.repeat(names, count),
+                        "object": np.repeat(objects, count),
+                        "known": np.repeat(known[mask], count),
+                        "predictor": [predictor] * truth.size,
+                        "target": [target] * truth.size,
+                        "value": np.tile(np.arange(1, count + 1, dtype=np.int32), len(truth)),
+                        "covered": ((above[..., 0] >= 0) & (above[..., -1] <= 0)).ravel(),
+                        "width": (bands[..., -1] - bands[..., 0]).astype(np.float32).ravel(),
+                        "pinball": lost.astype(np.float32).ravel(),
+                    }
+                )
+            )
+    return to_parquet(pa.concat_tables(parts))
 
 
 def _sums(

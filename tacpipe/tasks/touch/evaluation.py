@@ -24,7 +24,16 @@ from tacpipe.tasks.touch import headline as headlines
 from tacpipe.tasks.touch.grasps import Grasps
 from tacpipe.tasks.touch.metrics import Readings, Tree
 from tacpipe.tasks.touch.predictor import CONFIG, HISTORY, Predictor
-from tacpipe.tasks.touch.result_names import CONSTANT, GRASPS, MODEL, NEAREST_IN_TIME, OBJECT_MEAN, PREDICTIONS, TRUE
+from tacpipe.tasks.touch.result_names import (
+    CONSTANT,
+    COVERAGE,
+    GRASPS,
+    MODEL,
+    NEAREST_IN_TIME,
+    OBJECT_MEAN,
+    PREDICTIONS,
+    TRUE,
+)
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
@@ -74,6 +83,8 @@ def _evaluated(
         "by_object.csv": _by_object_csv(tree),
         **{name: model[name] for name in (CONFIG, HISTORY) if name in model},
     }
+    if predictor.uncertainty is not None:
+        files[COVERAGE] = bands.coverage(predictor.uncertainty, grasps, predicted, ~seen, known)
     streams[GRASPS] = _about(grasps, seen, known)
     attributes = origin.together(shard.attributes for shard in recordings.recordings.values())
     return Result({PREDICTIONS: RecordingOutput(streams, attributes)}, files)

@@ -9,6 +9,7 @@ import pyarrow as pa
 
 from tacpipe.io.parquet import to_parquet
 from tacpipe.report.blocks import Charts, Fold, Table
+from tacpipe.report.forward import reading
 from tests.fake_recordings import FakeDataset
 from tests.report import parts
 from tests.report.forward.result_fakes import STEPS, WINDOWS, result
@@ -59,3 +60,13 @@ def test_coverage_is_drawn_by_step_and_a_forecast_with_its_band() -> None:
 
 def test_results_without_quantiles_have_no_such_part() -> None:
     assert uncertainty(result("raw")) == []
+
+
+def test_a_model_that_was_evaluated_before_and_after_its_calibration_counts_once() -> None:
+    plain, one = result("raw"), calibrated()
+    config = {**json.loads(one.files["config.json"]), "quantiles": {}, "trained_on": {"r9": "00"}}
+    copy = FakeDataset(one.recordings, {**one.files, "config.json": json.dumps(config).encode()}, one.manifest)
+    other = result("raw", seed=1)
+    for several in ([plain, copy, other], [copy, other, plain], [copy, other]):
+        assert [run.dataset for run in reading.read(several)] == [one for one in several if one is not plain]
+    assert [run.dataset for run in reading.read([plain, other])] == [plain, other]

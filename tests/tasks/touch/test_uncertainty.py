@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
 from tacpipe.errors import TacpipeError
@@ -64,8 +66,14 @@ def test_evaluation_reports_quantiles_of_known_and_novel_objects(model: dict[str
         *recordings(80, 3).recordings.values(),
         *(recording(n, kind) for kind in ("egg", "shoe") for n in (30, 31)),
     ]
-    tree, _ = evaluated(model, dataset(*shards))
+    tree, result = evaluated(model, dataset(*shards))
     found = tree["quantiles"]
+    rows = pq.read_table(io.BytesIO(result.files["coverage.parquet"])).to_pandas()
+    assert len(rows) == 3 * 50 * (found["known"]["n"] + found["novel"]["n"])  # a predictor, value and grasp
+    for (known, predictor, target), one in rows.groupby(["known", "predictor", "target"]):
+        measured = found["known" if known else "novel"][predictor]
+        for name, column in (("coverage", "covered"), ("width", "width"), ("pinball", "pinball")):
+            assert one[column].mean() == pytest.approx(measured[name][target], rel=1e-5)
     assert found["levels"] == [10, 50, 90] and set(found["known"]) >= {"model", "constant", "object_mean"}
     for part in ("known", "novel"):
         for predictor in ("model", "constant", "object_mean"):
@@ -77,8 +85,8 @@ def test_evaluation_reports_quantiles_of_known_and_novel_objects(model: dict[str
 
 
 def test_a_model_without_quantiles_is_evaluated_as_before_and_has_none_to_give(plain: dict[str, bytes]) -> None:
-    tree, _ = evaluated(plain, recordings(80, 2))
-    assert "quantiles" not in tree
+    tree, result = evaluated(plain, recordings(80, 2))
+    assert "quantiles" not in tree and "coverage.parquet" not in result.files
     with pytest.raises(TacpipeError, match="tacpipe calibrate"):
         touch.predict(plain, recordings(80, 1), (), [10])
 
