@@ -17,7 +17,7 @@ from tacpipe.engine import execution
 from tacpipe.errors import StorageError, TacpipeError, UsageError
 from tacpipe.io import regular
 from tacpipe.io.hashing import DIGEST, bytes_digest
-from tacpipe.maintenance import cache, pushed, transfer
+from tacpipe.maintenance import cache, copying, pushed, transfer
 from tacpipe.maintenance.pushed import AnyStore
 from tacpipe.printable import plain
 from tacpipe.store import projects
@@ -136,7 +136,7 @@ def checkout(name: str, output: Path, *, replace: bool = False, source: AnyStore
             replacing.refuse_losses(replacing.occupant(store, output), output, manifest)
         read = execution.reader(store, (str(output.absolute()),), dict(manifest.sizes()))
         if source is not None:
-            transfer.bring(source, store, manifest_of.Found(output, content), transfer.Transferred())
+            transfer.bring(source, store, manifest_of.Found(output, content), copying.Transferred())
         for first in (True, False):
             try:
                 directory_of.publish(store, manifest, output)

@@ -25,9 +25,9 @@ from tacpipe.io.hashing import DIGEST
 from tacpipe.maintenance.garbage import GRACE_DAYS, Collected, ancestors
 from tacpipe.maintenance.repair import Soundness
 from tacpipe.store import layout
-from tacpipe.store.backend import Entry
+from tacpipe.store.backend import AT_ONCE, Entry
 from tacpipe.store.records import named
-from tacpipe.store.remote import AT_ONCE, SNAPSHOTS, RemoteStore
+from tacpipe.store.remote import SNAPSHOTS, RemoteStore
 from tacpipe.store.store import AbsentError, MissingError
 
 Item = TypeVar("Item")

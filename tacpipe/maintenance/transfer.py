@@ -3,42 +3,29 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 from tacpipe.datasets import directory as directory_of
 from tacpipe.datasets import manifest as manifest_of
 from tacpipe.datasets import paths, replacing
-from tacpipe.engine import execution
 from tacpipe.errors import DamagedError, StorageError, TacpipeError, UsageError
-from tacpipe.io import places, progress, regular, threads
+from tacpipe.io import places, regular
 from tacpipe.io.files import may_not_write
 from tacpipe.io.hashing import digest
-from tacpipe.maintenance import garbage, pushed
+from tacpipe.maintenance import copying, pushed
+from tacpipe.maintenance.copying import Transferred
 from tacpipe.maintenance.pushed import AnyStore
 from tacpipe.printable import plain
-from tacpipe.store import addresses, layout, projects, records
+from tacpipe.store import addresses, layout, projects
 from tacpipe.store.bucket import Bucket
 from tacpipe.store.location import locate
 from tacpipe.store.projects import Project
 from tacpipe.store.remote import RemoteStore
 from tacpipe.store.roots import Root, project_id
-from tacpipe.store.store import MissingError, Store
+from tacpipe.store.store import Store
 
 _LOOKS = 100  # pushes of one name that may come first
-
-
-@dataclass
-class Transferred:
-    """How much went over, and how much was there already."""
-
-    objects: int = 0
-    bytes: int = 0
-    there: int = 0
-    replaced: int = 0  # of the objects that went over: those that were there and damaged
-    datasets: list[str] = field(default_factory=list)  # as they are named in the other store
 
 
 def named_store(remote: Path | str) -> AnyStore:
@@ -105,7 +92,7 @@ def push(
             lock = digest(["pushed", owner.id, name])
             with there.exclusively(lock, f"the pushed dataset {name}"):
                 before = _before(there, here, found, owner, name, replace=replace)
-                _copy(
+                copying.copy(
                     here,
                     there,
                     found,
@@ -151,7 +138,7 @@ def bring(
     there: AnyStore, here: Store, found: manifest_of.Found, done: Transferred, *, ancestors: bool = False
 ) -> None:
     """Copy what a dataset of another store needs into this one, which is at work on it. Raises as `push` does."""
-    _copy(there, here, found, done, beside=(), ancestors=ancestors, verify=False)
+    copying.copy(there, here, found, done, beside=(), ancestors=ancestors, verify=False)
 
 
 @contextlib.contextmanager
@@ -257,190 +244,3 @@ def _wanted(path: Path, there: AnyStore) -> tuple[manifest_of.Found, str]:
         directory = folder / root["path"]
     content = there.read(root["manifest"], regular.JSON_BYTES)
     return manifest_of.Found(directory, content), pushed.label(root, pushed.roots(there))
-
-
-@dataclass
-class _Plan:
-    """What is to be copied."""
-
-    manifests: dict[str, bytes] = field(default_factory=dict)  # content by digest
-    objects: dict[str, tuple[str, int]] = field(default_factory=dict)  # path within the dataset and bytes, by digest
-
-    def sizes(self) -> dict[str, int]:
-        """Return the bytes of all of it."""
-        return {name: size for name, (_, size) in self.objects.items()} | {
-            name: len(content) for name, content in self.manifests.items()
-        }
-
-
-def _planned(source: AnyStore, target: AnyStore, found: manifest_of.Found, *, ancestors: bool) -> _Plan:
-    """Return what a dataset needs: its manifest and objects, the manifests it descends from, perhaps their objects too."""
-    plan = _Plan()
-    todo, seen = [found.digest], set()
-    while todo:
-        name = todo.pop()
-        if name in seen:
-            continue
-        seen.add(name)
-        try:
-            content = found.content if name == found.digest else _manifest(source, target, name)
-        except MissingError:
-            continue
-        plan.manifests[name] = content
-        manifest = manifest_of.parse(content, name, verified=True)
-        todo += garbage.ancestors(manifest)
-        if ancestors or name == found.digest:
-            sizes = dict(manifest.sizes())
-            plan.objects.update({one: (path, sizes[one]) for path, one in manifest.objects()})
-    return plan
-
-
-def _copy(
-    source: AnyStore,
-    target: AnyStore,
-    found: manifest_of.Found,
-    done: Transferred,
-    *,
-    beside: tuple[str, ...],
-    ancestors: bool,
-    verify: bool,
-    before: str = "",
-) -> None:
-    """Copy objects, then manifests, then records: what names something comes after it.
-
-    ``before`` is a manifest of the target that has much in common with what is copied, as the last one of that name.
-    """
-    plan = _planned(source, target, found, ancestors=ancestors)
-    sizes = plan.sizes()
-    target.announce(sizes)  # before looking what is there
-    there = target.sizes(sizes)
-    absent = [name for name in plan.objects if there.get(name) != sizes[name]]
-    _expect_room(target, sum(sizes[name] for name in absent))
-    absent += _damaged(target, [name for name in plan.objects if there.get(name) == sizes[name]], sizes, verify=verify)
-    _send(source, target, plan, absent, beside)
-    target.settle(layout.object_name(name) for name in absent)
-    fresh = [name for name in plan.manifests if there.get(name) != sizes[name]]
-    fresh += _damaged(target, [name for name in plan.manifests if name not in fresh], sizes, verify=verify)
-    for name in fresh:
-        target.take(name, [plan.manifests[name]])
-    target.settle(layout.object_name(name) for name in fresh)
-    moved = {*absent, *fresh}
-    done.objects += len(moved)
-    done.bytes += sum(sizes[name] for name in moved)
-    done.there += len(sizes) - len(moved)
-    done.replaced += sum(name in there for name in moved)
-    _copy_records(source, target, found, sizes, before)
-
-
-def _damaged(target: AnyStore, names: Iterable[str], sizes: Mapping[str, int], *, verify: bool) -> list[str]:
-    """Return those objects whose bytes are not what their names state, none unless they are to be verified."""
-
-    def is_sound(name: str) -> bool:
-        try:
-            for _ in target.blocks(name, sizes[name]):
-                pass
-        except MissingError:
-            return False
-        return True
-
-    names = list(names) if verify else []
-    return [name for name, sound in zip(names, threads.each(is_sound, names, target.at_once), strict=True) if not sound]
-
-
-def _send(source: AnyStore, target: AnyStore, plan: _Plan, names: Sequence[str], beside: tuple[str, ...]) -> None:
-    """Copy objects, several at once where another computer is asked. Raises `DamagedError` for what is nowhere sound."""
-    sizes = plan.sizes()
-
-    def send(name: str) -> tuple[str, MissingError | None]:
-        path, size = plan.objects[name]
-        try:
-            target.take(name, _Counted(source, name, size, path))
-        except MissingError as error:
-            return name, error
-        return name, None
-
-    failed = []
-    total = sum(sizes[name] for name in names)
-    went = 0
-    with progress.bar("copying", len(names)) as advance:
-        for name, error in threads.each(send, names, max(source.at_once, target.at_once)):
-            failed += [] if error is None else [(name, error)]
-            went += sizes[name]
-            advance(note=f"{went / 1e6:,.1f} of {total / 1e6:,.1f} MB")
-    for name, error in failed:  # a copy next to the manifest or the stage that made it may bring it back
-        path, size = plan.objects[name]
-        if isinstance(source, RemoteStore):
-            raise DamagedError(f"{path}: {error}") from error
-        target.take(name, _counted([execution.reader(source, beside, sizes)(name, path)], size, path))
-
-
-def _copy_records(
-    source: AnyStore, target: AnyStore, found: manifest_of.Found, moved: Collection[str], before: str
-) -> None:
-    """Copy the records of what was copied, and note in ``target`` which those are."""
-    there = target.noted(found.digest) | (target.noted(before) if before else set())
-
-    def commit(one: tuple[str, dict[str, Any]]) -> str:
-        key, record = one
-        if key not in there:
-            target.commit(record["identity"], record["result"], record["provenance"])
-        return key
-
-    names = set(moved)
-    several = (
-        (key, one) for key, one in source.records_of(found.digest) if _named(one) & names and _named(one) <= names
-    )
-    keys = list(threads.each(commit, several, max(source.at_once, target.at_once)))
-    target.settle(layout.record_name(key) for key in keys)
-    target.note_records(found.digest, keys)
-
-
-def _manifest(source: AnyStore, target: AnyStore, name: str) -> bytes:
-    try:
-        return source.read(name, regular.JSON_BYTES)
-    except MissingError:
-        return target.read(name, regular.JSON_BYTES)
-
-
-class _Counted:
-    """The blocks of an object, as often as they are asked for; raises as `_counted` does."""
-
-    def __init__(self, source: AnyStore, name: str, size: int, path: str) -> None:
-        self._source, self._name, self._size, self._path = source, name, size, path
-
-    def __iter__(self) -> Iterator[bytes]:
-        return _counted(self._source.blocks(self._name, self._size), self._size, self._path)
-
-
-def _counted(blocks: Iterable[bytes], size: int, path: str) -> Iterator[bytes]:
-    """Yield blocks. Raises `DamagedError` after the last where they are not as many bytes as their manifest declares."""
-    count = 0
-    for block in blocks:
-        count += len(block)
-        yield block
-    if count != size:
-        raise DamagedError(
-            f"{path} has {count:,} bytes, and its manifest declares {size:,}: the manifest was edited or made up. Run the "
-            f"stage that made it again."
-        )
-
-
-def _expect_room(target: AnyStore, needed: int) -> None:
-    """Raise `StorageError` where the disk of a store has less room than what is to be copied there takes."""
-    room = target.room()
-    if room is not None and needed > room:
-        raise StorageError(
-            f"{needed / 1e9:,.1f} GB are to be copied to {target.place}, and its disk has {room / 1e9:,.1f} GB left; "
-            f"nothing was copied. If that is what you expect, free some space; if it came from an untrusted store, do not."
-        )
-
-
-def _named(record: Mapping[str, Any]) -> set[str]:
-    """Return the digests of what a record names; none where it has not the form of a record: a store may hold anything."""
-    identity, provenance = record["identity"], record["provenance"]
-    try:
-        formed = isinstance(provenance, dict) and isinstance(identity.get("stage", ""), str)
-        named = set(records.named(record["result"])) if formed else set()
-    except (TypeError, KeyError, AttributeError):
-        return set()
-    return named if all(isinstance(name, str) for name in named) else set()

@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from typing import NamedTuple, Protocol
 
+AT_ONCE = 16  # requests on their way at once
+
 
 class Entry(NamedTuple):
     """What a place states of one name."""

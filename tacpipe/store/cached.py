@@ -21,8 +21,9 @@ from tacpipe.io.files import present
 from tacpipe.io.hashing import digest
 from tacpipe.store import addresses, layout, records
 from tacpipe.store.addresses import Address
+from tacpipe.store.backend import AT_ONCE
 from tacpipe.store.bucket import Bucket
-from tacpipe.store.remote import AT_ONCE, RemoteStore
+from tacpipe.store.remote import RemoteStore
 from tacpipe.store.store import AbsentError, MissingError, Object, Store
 
 VARIABLE = "TACPIPE_CACHE"

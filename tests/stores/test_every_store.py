@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 import tacpipe
-from tacpipe.maintenance import repair, transfer
+from tacpipe.maintenance import copying, repair
 from tacpipe.store import roots
 from tacpipe.store.store import Store
 from tests.conftest import Lab
@@ -188,7 +188,7 @@ def test_of_two_pushes_of_a_name_that_both_looked_before_either_wrote_one_is_ref
 ) -> None:
     lab.run(f"store push {pushed.address} data/r")
     first, second = two_clones(lab, pushed, monkeypatch)
-    honest = transfer._copy
+    honest = copying.copy
     meanwhile: list[int] = []
 
     def copy(*given: Any, **more: Any) -> None:
@@ -200,7 +200,7 @@ def test_of_two_pushes_of_a_name_that_both_looked_before_either_wrote_one_is_ref
                 there.setenv("TACPIPE_LOCK_TIMEOUT_S", "0.05")
                 meanwhile.append(lab.call(f"store push {pushed.address} data/r").code)
 
-    monkeypatch.setattr(transfer, "_copy", copy)
+    monkeypatch.setattr(copying, "copy", copy)
     monkeypatch.chdir(first)
     code = lab.call(f"store push {pushed.address} data/r").code
     assert (code, meanwhile[1]) in ((0, 6), (2, 0)), "where there are locks the second waits, else the first is refused"

@@ -9,7 +9,7 @@ import pytest
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import threads
 from tacpipe.io.hashing import bytes_digest
-from tacpipe.maintenance import remote_upkeep, transfer
+from tacpipe.maintenance import copying, remote_upkeep, transfer
 from tacpipe.store.bucket import Bucket
 from tacpipe.store.remote import RemoteStore
 from tests.conftest import Lab
@@ -196,14 +196,14 @@ def test_a_push_whose_announcement_was_removed_says_so(
     lab: Lab, monkeypatch: pytest.MonkeyPatch, abandoned: dict[str, bytes]
 ) -> None:
     files = Stepping(abandoned)
-    honest = transfer._send
+    honest = copying._send
 
     def send(*given: Any) -> None:
         honest(*given)
         for entry in files.list("leases"):
             files.delete(entry.name)
 
-    monkeypatch.setattr(transfer, "_send", send)
+    monkeypatch.setattr(copying, "_send", send)
     with pytest.raises(TacpipeError, match="again"):
         push(monkeypatch, files, "data/s")
 

@@ -1,0 +1,217 @@
+"""Arguments and options of a stage's command, from its signature and its params, and its help."""
+
+from __future__ import annotations
+
+import inspect
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal, get_args, get_origin
+
+import typer
+
+from tacpipe.io import terminal
+from tacpipe.plugins import fields as fields_of
+from tacpipe.plugins import params as params_of
+from tacpipe.plugins import registry
+from tacpipe.plugins.requirements import Requirements
+from tacpipe.plugins.stage import AnyStage
+from tacpipe.training.devices import Device
+
+EXAMPLE = "Example: "  # begins the last paragraph of a stage's docstring
+
+
+def of(stage: AnyStage, fields: dict[str, Any]) -> list[inspect.Parameter]:
+    """Return the parameters of a stage's command; ``fields`` are those of its params, by name."""
+    return [*_arguments(stage), *_shared(stage), *_options(stage, fields), *_looks(stage)]
+
+
+def _arguments(stage: AnyStage) -> list[inspect.Parameter]:
+    kinds = set(stage.arguments.values())
+    found = []
+    if "Files" in kinds:
+        found.append(_parameter("source", Path, typer.Argument(help="Folder of the recordings.")))
+    if stage.reads_model:
+        found.append(_parameter("model", Path, typer.Argument(help="A trained model.")))
+    if kinds & {"Recording", "Dataset", "Datasets"}:
+        found.append(
+            _parameter("datasets", list[Path], typer.Argument(help="Datasets to read; several are read as one."))
+        )
+    return found
+
+
+def _shared(stage: AnyStage) -> list[inspect.Parameter]:
+    kinds = set(stage.arguments.values())
+    found = [_parameter("output", Path | None, typer.Option(None, "-o", "--output", help="Where to write."))]
+    if stage.needs_split or stage.reads_model:
+        found += [
+            _parameter(
+                "split", Path | None, typer.Option(None, "--split", help="Which recordings train, validate, test.")
+            ),
+            _parameter(
+                "fold",
+                str | None,
+                typer.Option(
+                    None, "--fold", help="Fold of the split; several as 0-4, with {fold} in paths such as -o."
+                ),
+            ),
+        ]
+    if stage.reads_model and not stage.needs_split:
+        found.append(
+            _parameter("role", str | None, typer.Option(None, "--role", help="Role to read: train, val or test."))
+        )
+    if stage.fit is not None:
+        text = "A dataset whose fitted codec to apply."
+        found.append(_parameter("codec", Path | None, typer.Option(None, "--codec", help=text)))
+    if "init" in stage.arguments:
+        text = "A model to begin with."
+        found.append(_parameter("init", Path | None, typer.Option(None, "--init", help=text)))
+    if stage.trains:
+        text = "What to train on; auto: cuda where there is one, else cpu."
+        option = typer.Option(None, "--device", help=text, metavar=f"[{'|'.join(get_args(Device))}]")
+        found.append(_parameter("device", str | None, option))
+        text = "Devices that train one network together, each in a process [1]."
+        found.append(_parameter("devices", int | None, typer.Option(None, "--devices", help=text)))
+    if stage.tracked:
+        text = f"Tracker of experiments, NAME or NAME:PLACE: {', '.join(registry.trackers())}."
+        found.append(_parameter("track", list[str] | None, typer.Option(None, "--track", help=text)))
+    if "Roles" in kinds:
+        text = "An older split whose roles to keep."
+        found.append(_parameter("extend", Path | None, typer.Option(None, "--extend", help=text)))
+    return found
+
+
+def _options(stage: AnyStage, fields: dict[str, Any]) -> list[inspect.Parameter]:
+    helps = params_of.comments(stage) if {"--help", "-h"} & set(sys.argv) else {}
+    panels = params_of.panels(stage)
+    found = []
+    for name, wanted in fields.items():
+        kind = fields_of.bare(wanted)
+        many = get_origin(kind) is tuple
+        flag = f"--{name.replace('_', '-')}"
+        flags = [f"{flag}/--no-{name.replace('_', '-')}"] if kind is bool else [flag]
+        annotation = bool | None if kind is bool else list[str] | None if many else str | None  # parsed as --set is
+        text = _about(stage, name, helps.get(name, ""))
+        metavar = None if kind is bool else _metavar(wanted)
+        option = typer.Option(
+            None, *flags, help=text, show_default=False, metavar=metavar, rich_help_panel=panels.get(name)
+        )
+        found.append(_parameter(name, annotation, option))
+    more: list[tuple[str, Any, Any]] = [
+        (
+            "preset",
+            str | None,
+            typer.Option(None, "--preset", help=f"Preset of params: {', '.join(params_of.presets(stage)) or 'none'}."),
+        ),
+        (
+            "params_file",
+            Path | None,
+            typer.Option(None, "--params", help="File of params [params.yaml if there is one]."),
+        ),
+        ("block", str | None, typer.Option(None, "--block", help="Block of the params file, as forward.synchronize.")),
+        ("set_", list[str] | None, typer.Option(None, "--set", help="Set a param: --set name=value.")),
+        (
+            "print_params",
+            bool,
+            typer.Option(False, "--print-params", help="Print the params that would count, and stop."),
+        ),
+        ("jobs", int, typer.Option(0, "--jobs", help="Processes to use; 0: one a core.")),
+        (
+            "executor",
+            str | None,
+            typer.Option(
+                None, "--executor", help="Where to compute: local, dask, dask://localhost:PORT, tls://HOST:PORT, slurm."
+            ),
+        ),
+        ("skip_bad", bool, typer.Option(False, "--skip-bad", help="Skip recordings that cannot be read.")),
+        ("check", bool, typer.Option(False, "--check", help="Do nothing; exit with 3 if something would change.")),
+        (
+            "compare",
+            bool,
+            typer.Option(False, "--recompute-and-compare", help="Run again what is stored and name what differs."),
+        ),
+        ("rerun", bool, typer.Option(False, "--rerun", help="Compute what is stored too, and keep the new result.")),
+        (
+            "replace",
+            bool,
+            typer.Option(False, "--replace", help="Replace what -o holds: another dataset, recordings, labels."),
+        ),
+        ("json_", bool, typer.Option(False, "--json", help="Print one JSON object.")),
+        ("quiet", bool, typer.Option(False, "--quiet", help="No progress, no summary.")),
+    ]
+    return [*found, *(_parameter(*item) for item in more)]
+
+
+def _looks(stage: AnyStage) -> list[inspect.Parameter]:
+    """Return the options that print something of a source and write nothing."""
+    found = []
+    if stage.guess is not None:
+        text = "Print a first layout file for this folder, and stop."
+        found.append(_parameter("guess", bool, typer.Option(False, "--guess", help=text)))
+    if stage.preview is not None:
+        text = "Describe what would be read, and stop."
+        found.append(_parameter("dry_run", bool, typer.Option(False, "--dry-run", help=text)))
+    if stage.requirements is not None:
+        text = "Print what recordings must hold, and stop."
+        show = typer.Option(False, "--requirements", help=text, is_eager=True, callback=_shows(stage.requirements))
+        found.append(_parameter("requirements", bool, show))
+    return found
+
+
+def _shows(requirements: Requirements) -> Callable[[bool], None]:
+    """Return what prints the requirements of a task, before the arguments of its command are missed."""
+
+    def show(given: bool) -> None:
+        if given:
+            terminal.result(requirements.to_text())
+            raise typer.Exit
+
+    return show
+
+
+def _about(stage: AnyStage, name: str, comment: str) -> str:
+    """Return the help of an option: its comment, what it may be, which choices have it, and its default."""
+    wanted = params_of.fields(stage)[name]
+    parts = [comment] if comment else []
+    if fields_of.constraints(wanted):
+        parts.append(fields_of.describe(wanted))
+    if owners := params_of.having(stage, name):
+        parts.append(f"only with {params_of.tag(stage)} {', '.join(owners)}")
+    return f"{'; '.join(parts)} [{' or '.join(map(str, params_of.defaults(stage, name)))}]".strip()
+
+
+def _metavar(wanted: Any) -> str:
+    """Return what represents an option's value in its help: the choices, or the type."""
+    kind = fields_of.bare(wanted)
+    if get_origin(kind) is tuple:
+        return f"{_metavar(get_args(kind)[0])}..."
+    if get_origin(kind) is Literal:
+        return f"[{'|'.join(map(str, get_args(kind)))}]"
+    return {int: "INTEGER", float: "NUMBER"}.get(kind, "TEXT")
+
+
+def _parameter(name: str, annotation: Any, default: Any) -> inspect.Parameter:
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+
+
+def summary(name: str, stage: AnyStage) -> str:
+    """Return the docstring of a stage: that of its module where the command is the stage alone, else of its function.
+
+    Its last paragraph is an example; one is made of the stage's arguments where it has none.
+    """
+    own, module = stage.function.__doc__, sys.modules[stage.function.__module__].__doc__
+    text = inspect.cleandoc((own or module if "." in name else module or own) or "")
+    return text if EXAMPLE in text else f"{text}\n\n{EXAMPLE}{example(name, stage)}"
+
+
+def example(name: str, stage: AnyStage) -> str:
+    """Return a command line that shows the stage at work, as its arguments allow."""
+    kinds = set(stage.arguments.values())
+    words = ["tacpipe", *name.split(".")]
+    words += ["published/recordings"] if "Files" in kinds else []
+    words += ["models/model"] if stage.reads_model else []
+    words += ["data/recordings"] if kinds & {"Recording", "Dataset"} else []
+    words += ["results/one", "results/two"] if "Datasets" in kinds else []
+    words += ["--split", "data/split"] if stage.needs_split or stage.reads_model else []
+    output = "data/recordings" if kinds & {"Files", "Trial"} else f"data/{name.rpartition('.')[2]}"
+    return " ".join([*words, "-o", output])
