@@ -158,6 +158,26 @@ def test_of_a_dataset_of_which_one_recording_changed_no_other_group_is_asked_for
     assert len(keys) < max(sizes) + 10 < count / 2
 
 
+def test_while_results_are_taken_over_a_collection_sees_the_manifests_that_name_them(
+    lab: Lab, taken: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lab.run(f"simulate toy --rows 3 --trials {TRIALS} -o data/r --jobs 1")
+    lab.run(NAMED)
+    before = {file_digest(lab.folder / place / "manifest.json") for place in ("data/r", "data/s")}
+    lab.run("label data/r trial-003 --set material=felt")
+    named: list[set[str]] = []
+    holds = presence.Look.holds
+
+    def looked(self: presence.Look, *given: Any, **how: Any) -> bool:
+        named.append({name for run in lab.store.leases.runs() for name in run.manifests})
+        return holds(self, *given, **how)
+
+    monkeypatch.setattr(presence.Look, "holds", looked)
+    lab.run(NAMED)
+    assert taken[-1] > 0
+    assert named and before <= named[-1]
+
+
 def test_what_records_state_of_results_is_the_same_with_and_without_a_previous_run(lab: Lab, taken: list[int]) -> None:
     lab.run(f"simulate toy --rows 3 --trials {TRIALS} -o data/r --jobs 1")
     lab.run(NAMED)
