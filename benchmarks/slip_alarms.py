@@ -147,6 +147,15 @@ def worth(setting: list[Trial], counted: list[Trial], name: str, horizon: int, p
     return found
 
 
+def interval(several: list[Leads]) -> tuple[float, float]:
+    """Return the middle 95 % of the fraction of slips that are led, of 2,000 resamples of trials."""
+    rng = np.random.default_rng(0)
+    led, count = (np.array(each) for each in zip(*((len(one.leads_ms), one.events) for one in several), strict=True))
+    chosen = rng.integers(len(several), size=(2000, len(several)))
+    low, high = np.percentile(led[chosen].sum(axis=1) / count[chosen].sum(axis=1), [2.5, 97.5])
+    return float(low), float(high)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
@@ -177,6 +186,8 @@ def main() -> None:
         early = sum(lead >= 60 for each in found for lead in each.leads_ms)
         cells = (f"{one['led']} of {one['events']}", early, one["median_lead_ms"], one["false_alarms_per_hour"])
         print(" | ".join(map(str, (name, *cells, quiet["false_alarms_per_hour"]))))
+    low, high = interval(several["model"])
+    print(f"95 % interval of the fraction that the model leads, over trials: {low:.3f} to {high:.3f}")
     minutes = [summed(several["model"])["minutes"], summed(holding["model"])["minutes"]]
     print(f"{minutes[0]:.1f} minutes without a slip near, and {minutes[1]:.1f} where nothing slips")
 

@@ -32,7 +32,7 @@ from tacpipe.simulation.emulation.world import World
 TRIALS, EPOCHS, STRIDE = 60, 8, 2
 SETTING, SETTING_SEED = 24, 1  # further trials, which the levels of the alarms are set on
 EFFORT = 1.15  # the largest load of the plan over the limit of friction: each trial slips because of its plan
-LIVE_S = 30.0
+LIVE_S = 60.0
 PER_HOUR = 60.0  # false alarms: one a minute, as `tacpipe evaluate` allows
 SEED = 7
 AHEAD_S, EVERY_S, POINT_S = 0.5, 0.1, 0.02  # of the plan: reach, from one to the next, between points
