@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
 
@@ -91,47 +92,14 @@ def train(
         _windows(part, params, stride, device, aside) for part, stride in zip(parts, (params.stride, 1), strict=True)
     )
     _check_channels(codec, parts[0])
-
-    def build() -> nn.Module:
-        model = networks.build(params, codec).to(device)
-        if len(known.starts):
-            some = known.pick(known.some(CALIBRATED))
-            networks.check(model, params, some[0], len(codec.latents))
-            if not start:
-                model.calibrate(*some)  # type: ignore[operator]
-        if start:
-            _take_over(model, start)
-        return model
-
-    schedule = loop.Schedule(
-        epochs=params.epochs,
-        batch=params.batch,
-        learning_rate=params.learning_rate,
-        patience=params.patience,
-        gradient_clip=params.gradient_clip,
-        seed=params.seed,
-        cycle=params.cycle,
-        precision=params.precision,
-    )
-    trained = loop.train(build, loop.Windows(known.part, watched.part, schedule.batch), schedule, workspace)
+    build = partial(_built, params, codec, known, start, device)
+    trained = loop.train(build, loop.Windows(known.part, watched.part, params.batch), _schedule(params), workspace)
     weights = completion.completed(trained.weights, params, codec, known, watched)
     best = min(trained.history, key=lambda line: line["val_loss"])
     config: Config = {
-        "task": TASK,
-        "architecture": params.architecture,
-        "params": params_of.to_json(params),
-        "codec": _described(codec),
-        "context": params.context,
-        "horizon": params.horizon,
+        **_description(params, codec, pose, unit, reference),
         "rate_hz": rate_hz,
         "timeline": parts[0][0].timeline,
-        "inputs": {
-            "tactile": list(codec.channels),
-            "layout": [dict(one) for one in codec.layout],
-            "orientation_reference": reference.tolist(),
-            **({} if unit == units.COUNT else {"unit": unit}),
-            **({} if pose == NAMED else {"pose": {"position": pose.position, "orientation": pose.orientation}}),
-        },
         "scaling": _scaling(parts[0], aside),
         "largest_level": max(largest_level(one.tactile[some]) for one, some in _usable(parts[0], aside)),
         "validation": {"loss": best["val_loss"], "epoch": best["epoch"]},
@@ -151,6 +119,51 @@ def train(
     if params.baselines:
         config["anticipation"] = _alarms(Forecaster.load(files), parts[1])
     return {**files, CONFIG: _json(config), HISTORY: trained.history_lines}
+
+
+def _built(params: Params, codec: codecs.Codec, known: Rows, start: Forecaster | None, device: str) -> nn.Module:
+    """Return the network as training begins: with the scales of some training windows, or with all of ``start``."""
+    model = networks.build(params, codec).to(device)
+    if len(known.starts):
+        some = known.pick(known.some(CALIBRATED))
+        networks.check(model, params, some[0], len(codec.latents))
+        if not start:
+            model.calibrate(*some)  # type: ignore[operator]
+    if start:
+        _take_over(model, start)
+    return model
+
+
+def _schedule(params: Params) -> loop.Schedule:
+    return loop.Schedule(
+        epochs=params.epochs,
+        batch=params.batch,
+        learning_rate=params.learning_rate,
+        patience=params.patience,
+        gradient_clip=params.gradient_clip,
+        seed=params.seed,
+        cycle=params.cycle,
+        precision=params.precision,
+    )
+
+
+def _description(params: Params, codec: codecs.Codec, pose: Pose, unit: str, reference: AnyFloats) -> Config:
+    """Return what a model states of its architecture and of what it reads."""
+    return {
+        "task": TASK,
+        "architecture": params.architecture,
+        "params": params_of.to_json(params),
+        "codec": _described(codec),
+        "context": params.context,
+        "horizon": params.horizon,
+        "inputs": {
+            "tactile": list(codec.channels),
+            "layout": [dict(one) for one in codec.layout],
+            "orientation_reference": reference.tolist(),
+            **({} if unit == units.COUNT else {"unit": unit}),
+            **({} if pose == NAMED else {"pose": {"position": pose.position, "orientation": pose.orientation}}),
+        },
+    }
 
 
 def _alarms(forecaster: Forecaster, part: Sequence[Track]) -> dict[str, Any]:
