@@ -2,24 +2,31 @@
 
 from __future__ import annotations
 
-import csv
 import functools
-import io
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tacpipe.arrays import AnyFloats
 from tacpipe.comparison.engine import Comparison, Row
 from tacpipe.comparison.runs import MODEL, Method, Question, Run
 from tacpipe.metrics import pairing
 from tacpipe.metrics.forecast import Interval
-from tacpipe.report import blocks, charts, learning
+from tacpipe.report import blocks, charts
 from tacpipe.report.blocks import NONE, Cell, Chart, Charts, Fold, Note, Table, fold, number, table
 from tacpipe.report.charts import Line
-from tacpipe.report.context import Context, median_run
-from tacpipe.report.forward import bands, live, reading, representations, single_run, situations, traces
+from tacpipe.report.context import Context
+from tacpipe.report.forward import (
+    anticipation,
+    bands,
+    live,
+    reading,
+    representations,
+    shown,
+    single_run,
+    situations,
+    skill,
+)
 from tacpipe.report.forward import methods as by_method
 from tacpipe.tasks.forward import headline, units
 from tacpipe.tasks.forward.headline import BASELINE
@@ -27,13 +34,10 @@ from tacpipe.tasks.forward.headline import BASELINE
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from tacpipe.metrics.pairing import Sums
 
 Tree = Mapping[str, Any]
 LINES = 4  # methods in a figure of skill, the paper's not counted
 FLOOR = -1.0  # skill at which figures end
-TRACE_STEPS = (1, 5, 10)
-LOSSES = {"training": "train_loss", "validation": "val_loss"}
 SETTINGS = ("preset", "epochs", "stride", "hidden", "batch", "seed")
 
 
@@ -46,13 +50,13 @@ def folds(context: Context) -> list[Fold]:
         *_channels(context),
         *_ablations(context),
         *bands.folds(context),
-        *_anticipation(context),
+        *anticipation.folds(context),
         *situations.folds(context),
         *live.folds(context),
         *representations.folds(context),
-        *_predictions(context),
-        *_training(context),
-        *_single(context),
+        *shown.predictions(context),
+        *shown.training(context),
+        *shown.single(context),
     ]
 
 
@@ -63,14 +67,14 @@ def columns(context: Context, comparison: Comparison) -> list[tuple[str, Callabl
 
     @functools.cache
     def skills(row: Row, group: str) -> Interval | None:
-        sums = _sums(row, steps, known, group)
-        return _skills(sums) if sums else None
+        sums = skill.sums_of(row, steps, known, group)
+        return skill.skills(sums) if sums else None
 
     def squared(group: str) -> Callable[[Row], Cell]:
-        return lambda row: number(_mse(_sums(row, _all_steps(context), known, group)))
+        return lambda row: number(skill.mse(skill.sums_of(row, _all_steps(context), known, group)))
 
     def at(place: int) -> Callable[[Row], Cell]:
-        return lambda row: _cell(skills(row, "both"), place)
+        return lambda row: skill.cell(skills(row, "both"), place)
 
     def windows(row: Row) -> Cell:
         most: dict[str, int] = {}
@@ -83,7 +87,7 @@ def columns(context: Context, comparison: Comparison) -> list[tuple[str, Callabl
 
     return [
         *((f"skill over persistence t+{step}", at(place)) for place, step in enumerate(steps)),
-        ("skill over persistence, channels standardised", lambda row: _cell(skills(row, "standard"), -1)),
+        ("skill over persistence, channels standardised", lambda row: skill.cell(skills(row, "standard"), -1)),
         (f"MSE ({unit}²)", squared("both")),
         ("MSE (standardised)", squared("standard")),
         ("windows", windows),
@@ -129,11 +133,6 @@ def about_run(run: Run) -> dict[str, Cell | str]:
     return {"epochs": str(epochs) if epochs else NONE}
 
 
-def paper(context: Context) -> Method | None:
-    """Return the paper's method where the recordings are the paper's."""
-    return by_method.papers(context.methods) if context.published else None
-
-
 def _ahead(context: Context) -> list[Fold]:
     """Return skill over the time ahead of the best methods, the paper's and the best baseline, a chart a part."""
     drawn, order = [], list[str]()
@@ -147,7 +146,7 @@ def _ahead(context: Context) -> list[Fold]:
         x = [1000 * step / rate_hz if rate_hz else float(step) for step in steps]
         several, cut = [], []
         for row in rows:
-            found = _skills(_sums(row, steps, _known(one.question)))
+            found = skill.skills(skill.sums_of(row, steps, _known(one.question)))
             mean, low, high = (getattr(found, name)[:-1] for name in ("mean", "low", "high"))
             several.append(Line(row.name, x, mean, low, high, dashed=row.kind != "model"))
             cut += [row.name] if float(np.nanmin(mean)) < FLOOR else []
@@ -163,7 +162,7 @@ def _ahead(context: Context) -> list[Fold]:
 
 def _shown(context: Context, one: Comparison) -> list[Row]:
     found = one.models[:LINES]
-    other = context.row(one, paper(context))
+    other = context.row(one, shown.paper(context))
     found += [other] if other and other not in found else []
     return found + [row for row in one.of("baseline") if row.predictor != BASELINE][:1]
 
@@ -173,7 +172,7 @@ def _channels(context: Context) -> list[Fold]:
     tables: list[Table] = []
     steps = _steps(context)
     for one in context.comparisons:
-        chosen = [row for row in dict.fromkeys([one.best, context.row(one, paper(context))]) if row]
+        chosen = [row for row in dict.fromkeys([one.best, context.row(one, shown.paper(context))]) if row]
         if not chosen:
             continue
         known = _known(one.question)
@@ -181,18 +180,18 @@ def _channels(context: Context) -> list[Fold]:
         groups = chosen[0].method.runs[0].details.errors.groups
         for group in (name for name in groups if name not in ("both", "standard", "feature", "latent")):
             for row in chosen:
-                sums = _sums(row, steps, known, group)
+                sums = skill.sums_of(row, steps, known, group)
                 if sums:
-                    found = _skills(sums)
+                    found = skill.skills(sums)
                     cells = [
-                        _cell(found, -1),
-                        *map(number, _mae(sums)),
-                        *(_cell(found, at) for at in range(len(steps))),
+                        skill.cell(found, -1),
+                        *map(number, skill.mae(sums)),
+                        *(skill.cell(found, at) for at in range(len(steps))),
                     ]
                     rows.append([f"{group}, {row.name}", *cells])
-            still = _of(chosen[0].method, BASELINE, steps, known, group)
+            still = skill.sums(chosen[0].method, BASELINE, steps, known, group)
             if still:
-                rows.append([f"{group}, {BASELINE}", NONE, *map(number, _mae(still)), *[NONE] * len(steps)])
+                rows.append([f"{group}, {BASELINE}", NONE, *map(number, skill.mae(still)), *[NONE] * len(steps)])
         ahead = [f"t+{step}" for step in steps]
         heads = [
             "",
@@ -224,11 +223,11 @@ def _actions(context: Context, steps: Sequence[int], parts: Sequence[bool | None
             label = method.name if method is planned or planned is None else f"… {method.settings['actions']}"
             row: list[str | Cell] = [label]
             for known in parts:
-                own = _of(method, MODEL, steps, known)
-                row.append(_cell(_skills(own), -1) if own else NONE)
-                other = _of(planned, MODEL, steps, known) if planned and planned is not method else {}
-                lost = pairing.paired_intervals(other, own, _skill_of(len(steps))) if other and own else None
-                row += [_cell(lost, -1), _cell(lost, -2)] if lost else [NONE, NONE]
+                own = skill.sums(method, MODEL, steps, known)
+                row.append(skill.cell(skill.skills(own), -1) if own else NONE)
+                other = skill.sums(planned, MODEL, steps, known) if planned and planned is not method else {}
+                lost = pairing.paired_intervals(other, own, skill.skill_at(len(steps))) if other and own else None
+                row += [skill.cell(lost, -1), skill.cell(lost, -2)] if lost else [NONE, NONE]
             rows.append([*row, str(len(method.runs))])
     heads = [""]
     for known in parts:
@@ -247,8 +246,8 @@ def _timelines(context: Context, steps: Sequence[int], parts: Sequence[bool | No
                 f"{1000 / rate_hz:.0f}" if rate_hz else NONE,
             ]
             for known in parts:
-                sums = _of(method, MODEL, steps, known)
-                row += [_cell(_skills(sums), -1), number(_mae(sums)[-1])] if sums else [NONE, NONE]
+                sums = skill.sums(method, MODEL, steps, known)
+                row += [skill.cell(skill.skills(sums), -1), number(skill.mae(sums)[-1])] if sums else [NONE, NONE]
             rows.append([*row, str(len(method.runs))])
     heads, unit = ["", "a step (ms)"], units.common(run.details.config for run in context.runs)
     for known in parts:
@@ -256,125 +255,6 @@ def _timelines(context: Context, steps: Sequence[int], parts: Sequence[bool | No
         heads += [f"{where}: mean skill", f"{where}: MAE t+{steps[-1]} ({unit})"]
     title = "Timelines: a step lasts differently, so rows cannot be compared"
     return [table(title, [*heads, "runs"], rows)] if rows else []
-
-
-def _anticipation(context: Context) -> list[Fold]:
-    """Return how often and how early a method sees a change come; nothing where no result states it."""
-    source = max(context.methods, key=lambda one: len(one.runs))
-    described = [(one.name, anticipation(one, MODEL)) for one in context.methods]
-    names = {name for run in source.runs for name in run.details.metrics.get("anticipation", {})} - {MODEL}
-    described += [(single_run.spelled(name), anticipation(source, name)) for name in sorted(names)]
-    measures = ("median_lead_rows", "median_lead_frames", "false_alarms_per_minute")
-    rows: list[Sequence[str | Cell]] = [
-        [name, f"{found['events']:,.0f}", number(100 * found["recall"]), *(number(found[key]) for key in measures)]
-        for name, found in sorted(described, key=lambda one: -one[1]["recall"] if one[1] else 0.0)
-        if found
-    ]
-    heads = ["", "events", "seen coming (%)", "median lead (rows)", "median lead (frames)", "false alarms a minute"]
-    return (
-        fold("Anticipation", table("Changes that a forecast announces before they come", heads, rows)) if rows else []
-    )
-
-
-def anticipation(method: Method, predictor: str) -> dict[str, float] | None:
-    """Return recall, leads and false alarms of a predictor, averaged over runs by their numbers of events."""
-    described = [run.details.metrics.get("anticipation", {}).get(predictor) for run in method.runs]
-    held = [one for one in described if one and one.get("events")]
-    if not held:
-        return None
-    found: dict[str, float] = {"events": sum(float(one["events"]) for one in held)}
-    for name in ("recall", "median_lead_rows", "median_lead_frames", "false_alarms_per_minute"):
-        pairs = [(float(one[name]), float(one["events"])) for one in held if one.get(name) is not None]
-        values, weights = zip(*pairs, strict=True) if pairs else ((float("nan"),), (1.0,))
-        found[name] = float(np.average(values, weights=weights))
-    return found
-
-
-def _representatives(context: Context) -> list[tuple[Method, Run]]:
-    """Return a median run of the best method of the last part, and of the paper's: those that are shown singly."""
-    held = [one for one in context.comparisons if one.best]
-    last = next((one for one in reversed(held) if one.question.place < 2), next(iter(held), None))  # the main timeline
-    if last is None or last.best is None:
-        return []
-    chosen = [one for one in (last.best.method, paper(context)) if one]
-    if len(context.runs) <= 2:
-        chosen += list(context.methods)
-    found = {
-        one.name: (one, median_run(one, next(each for each in context.comparisons if one.of(each.question))))
-        for one in chosen
-    }
-    return list(found.values())
-
-
-def _predictions(context: Context) -> list[Fold]:
-    """Return what was predicted next to what came, of recordings of median, lowest and highest skill, and the paper's."""
-    drawn = []
-    for method, run in _representatives(context):
-        ranked = ranked_trials(run)
-        places = {"median": len(ranked) // 2, "lowest": 0, "highest": len(ranked) - 1}
-        named = {ranked[at][1]: (rank, ranked[at][0]) for rank, at in reversed(places.items()) if ranked}
-        for name, (rank, skill) in list(reversed(named.items()))[: context.traces]:
-            caption = f"The recording of {rank} skill ({blocks.signed(skill)}) of {method.name}."
-            drawn += traces.draw(run.dataset.recordings[name], (0, 1), TRACE_STEPS, name, caption)
-    return fold(
-        "Predictions next to the truth", *drawn, *_paper_traces(context), Note(traces.UNSHIFTED) if drawn else None
-    )
-
-
-def _paper_traces(context: Context) -> list[Chart]:
-    """Return Figures 5 and 6 of the paper: the first two components, and the second and fourth latent of AE-C1."""
-    wanted = (
-        ("PCA", (0, 1), "Figure 5 in the paper's form: the first two principal components"),
-        ("AE-C1", (1, 3), "Figure 6 in the paper's form: the second and the fourth latent of AE-C1"),
-    )
-    drawn: list[Chart] = []
-    for row, latents, title in wanted if context.published else ():
-        found = [
-            one
-            for one in context.methods
-            if by_method.recurrent(one) and by_method.paper_row(one.runs[0].details.config["codec"]) == row
-        ]
-        for method in found[:1]:
-            held = next((one for one in context.comparisons if method.of(one.question)), None)
-            run = median_run(method, held) if held else method.runs[0]
-            ranked = ranked_trials(run)
-            if ranked:
-                name = ranked[len(ranked) // 2][1]
-                caption = f"{name}, the recording of median skill of {method.name}."
-                drawn += traces.draw(run.dataset.recordings[name], latents, (3, 5, 10), title, caption)
-    return drawn
-
-
-def ranked_trials(run: Run) -> list[tuple[float, str]]:
-    """Return skill and name of the recordings that the model has not seen, of the predictions that a result holds."""
-    text = run.dataset.files.get("trials.csv", b"").decode()
-    return sorted(
-        (float(one["skill"]), one["recording"])
-        for one in csv.DictReader(io.StringIO(text))
-        if one["seen"] == "false" and one["skill"] and one["recording"] in run.dataset.recordings
-    )
-
-
-def _training(context: Context) -> list[Fold]:
-    """Return training and validation loss by epoch of the representative runs."""
-    drawn = []
-    for method, run in _representatives(context):
-        history = run.details.history
-        if not history:
-            continue
-        best = min(history, key=lambda line: line["val_loss"])
-        curves = {name: [[one[key] for one in history]] for name, key in LOSSES.items()}
-        spec = {**learning.by_epoch(curves, "loss (scaled latents)", log=True), "height": 190}
-        kept = (
-            f"{len(history)} epochs; the weights of epoch {best['epoch']} were kept, whose validation loss is lowest."
-        )
-        drawn.append(Chart(f"Loss by epoch: {method.name}", spec, kept))
-    return fold("Training", Charts(drawn)) if drawn else []
-
-
-def _single(context: Context) -> list[Fold]:
-    """Return the errors of representative runs in full, by predictor and step."""
-    return [one for method, run in _representatives(context) for one in single_run.folds(method.name, run)]
 
 
 def _predictors(context: Context) -> list[str]:
@@ -392,59 +272,6 @@ def _all_steps(context: Context) -> list[int]:
 
 def _known(question: Question) -> bool | None:
     return next((known for known, name in headline.PARTS.items() if name and question.part.startswith(name)), None)
-
-
-def _sums(row: Row, steps: Sequence[int], known: bool | None, group: str = "both") -> Sums:
-    """Return the sums of a row's predictor at some steps in a group of channels, by seed and recording."""
-    return _of(row.method, row.predictor.split(" ")[0], steps, known, group)
-
-
-def _of(method: Method, predictor: str, steps: Sequence[int], known: bool | None, group: str = "both") -> Sums:
-    return pairing.added(
-        ((run.seed, name), one)
-        for run in method.runs
-        for name, one in reading.sums(run.details, predictor, steps, known, group).items()
-    )
-
-
-def _skill_of(steps: int) -> Callable[[AnyFloats], AnyFloats]:
-    """Return what gives the skill over persistence at each step and its mean, from sums (draw, part)."""
-
-    def skill(found: AnyFloats) -> AnyFloats:
-        squared, still = found[:, :steps], found[:, steps : 2 * steps]
-        one = np.where(still > 0, 1 - squared / np.where(still > 0, still, 1), np.nan)
-        return np.hstack([one, one.mean(axis=1, keepdims=True)])
-
-    return skill
-
-
-def _skills(sums: Sums) -> Interval:
-    width = len(next(iter(sums.values())))
-    return pairing.intervals(sums, _skill_of((width - 1) // 3))
-
-
-def _total(sums: Sums) -> AnyFloats:
-    found: AnyFloats = np.sum(list(sums.values()), axis=0)
-    return found
-
-
-def _mae(sums: Sums) -> list[float]:
-    total = _total(sums)
-    steps = (len(total) - 1) // 3
-    return [float(value) for value in total[2 * steps : 3 * steps] / total[-1]]
-
-
-def _mse(sums: Sums) -> float:
-    if not sums:
-        return float("nan")
-    total = _total(sums)
-    return float((total[: (len(total) - 1) // 3] / total[-1]).mean())
-
-
-def _cell(found: Interval | None, at: int) -> Cell:
-    if found is None:
-        return Cell(NONE)
-    return blocks.interval(float(found.mean[at]), float(found.low[at]), float(found.high[at]))
 
 
 def _families(methods: Sequence[Method], what: str) -> list[list[Method]]:

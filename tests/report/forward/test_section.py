@@ -11,7 +11,7 @@ import pytest
 
 from tacpipe.comparison.runs import grouped
 from tacpipe.report.blocks import Section
-from tacpipe.report.forward import parts as own
+from tacpipe.report.forward import anticipation
 from tacpipe.report.forward import reading, representations
 from tests.fake_recordings import FakeDataset
 from tests.report import parts
@@ -159,8 +159,8 @@ def test_anticipation_is_weighted_by_events_and_leaves_out_what_was_never_seen_c
         content = {"anticipation": {"model": dict(zip(names, row, strict=True))}}
         one.files["metrics.json"] = json.dumps(content).encode()
     (method,) = grouped(reading.read(given))
-    assert own.anticipation(method, "model") == pytest.approx(dict(zip(names, (16, 0.875, 3.0, 1.0, 2.5), strict=True)))
-    assert own.anticipation(method, "ridge") is None
+    assert anticipation.of(method, "model") == pytest.approx(dict(zip(names, (16, 0.875, 3.0, 1.0, 2.5), strict=True)))
+    assert anticipation.of(method, "ridge") is None
 
 
 def test_in_full_are_the_median_run_of_the_best_method_and_of_the_papers() -> None:

@@ -1,0 +1,78 @@
+"""Errors and skill of a method, pooled over its runs and their recordings, with intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tacpipe.arrays import AnyFloats
+from tacpipe.comparison.engine import Row
+from tacpipe.comparison.runs import Method
+from tacpipe.metrics import pairing
+from tacpipe.metrics.forecast import Interval
+from tacpipe.report import blocks
+from tacpipe.report.blocks import NONE, Cell
+from tacpipe.report.forward import reading
+
+if TYPE_CHECKING:
+    from tacpipe.metrics.pairing import Sums
+
+
+def sums_of(row: Row, steps: Sequence[int], known: bool | None, group: str = "both") -> Sums:
+    """Return the sums of a row's predictor at some steps in a group of channels, by seed and recording."""
+    return sums(row.method, row.predictor.split(" ")[0], steps, known, group)
+
+
+def sums(method: Method, predictor: str, steps: Sequence[int], known: bool | None, group: str = "both") -> Sums:
+    """Return the sums of a method's predictor at some steps in a group of channels, by seed and recording."""
+    return pairing.added(
+        ((run.seed, name), one)
+        for run in method.runs
+        for name, one in reading.sums(run.details, predictor, steps, known, group).items()
+    )
+
+
+def skill_at(steps: int) -> Callable[[AnyFloats], AnyFloats]:
+    """Return what gives the skill over persistence at each step and its mean, from sums (draw, part)."""
+
+    def skill(found: AnyFloats) -> AnyFloats:
+        squared, still = found[:, :steps], found[:, steps : 2 * steps]
+        one = np.where(still > 0, 1 - squared / np.where(still > 0, still, 1), np.nan)
+        return np.hstack([one, one.mean(axis=1, keepdims=True)])
+
+    return skill
+
+
+def skills(sums: Sums) -> Interval:
+    """Return the skill over persistence at each step, and its mean, with intervals."""
+    width = len(next(iter(sums.values())))
+    return pairing.intervals(sums, skill_at((width - 1) // 3))
+
+
+def _total(sums: Sums) -> AnyFloats:
+    found: AnyFloats = np.sum(list(sums.values()), axis=0)
+    return found
+
+
+def mae(sums: Sums) -> list[float]:
+    """Return the mean absolute error at each step."""
+    total = _total(sums)
+    steps = (len(total) - 1) // 3
+    return [float(value) for value in total[2 * steps : 3 * steps] / total[-1]]
+
+
+def mse(sums: Sums) -> float:
+    """Return the mean squared error over all steps; NaN without sums."""
+    if not sums:
+        return float("nan")
+    total = _total(sums)
+    return float((total[: (len(total) - 1) // 3] / total[-1]).mean())
+
+
+def cell(found: Interval | None, at: int) -> Cell:
+    """Return a value with its interval; a dash where there is none."""
+    if found is None:
+        return Cell(NONE)
+    return blocks.interval(float(found.mean[at]), float(found.low[at]), float(found.high[at]))
