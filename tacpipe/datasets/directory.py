@@ -319,7 +319,9 @@ def _matches(path: str, store: Store, name: str) -> Literal["", "files", "links"
 def _current(directory: Path, manifest: Manifest) -> bool:
     try:
         file = directory / NAME
-        if file.stat().st_size != len(manifest.content):
+        there = file.stat()
+        regular.require(file, there.st_mode)
+        if len(manifest.content) != there.st_size <= regular.JSON_BYTES:  # what is larger is refused below
             return False
         return regular.content(file, regular.JSON_BYTES) == manifest.content
     except (FileNotFoundError, NotADirectoryError):
