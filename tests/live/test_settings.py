@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -102,6 +103,12 @@ def test_the_examples_of_the_pages_are_read(page: str) -> None:
         assert settings(stated).model == stated["model"]
         if "[[stream]]" in text:
             assert rigs.parse(text).live == stated
+
+
+def test_the_page_of_the_rig_file_names_every_key() -> None:
+    table = (ROOT / "docs" / "rig.md").read_text().split("| key of `[live]` |")[1].split("\n\n")[0]
+    known = {field.name for field in dataclasses.fields(Settings)} - {"places"}
+    assert all(f"`{name}`" in table for name in known)
 
 
 @pytest.mark.long
