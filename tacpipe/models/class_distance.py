@@ -3,7 +3,9 @@
 Slides are described by statistics of each channel (`tacpipe.models.statistics_classifier`), standardised and reduced to
 their principal components. There each class is a mean, all with one covariance, shrunk as by Ledoit and Wolf (2004). The
 score is minus half the squared Mahalanobis distance to the nearest mean (Lee, Lee, Lee and Shin, A simple unified framework
-for detecting out-of-distribution samples, NeurIPS 2018).
+for detecting out-of-distribution samples, NeurIPS 2018), less the same to the mean of all slides, with the covariance of
+all: the relative Mahalanobis distance (Ren et al., A simple fix to Mahalanobis distance for improving near-OOD detection,
+2021). What is unusual for every class alike then does not count.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ from tacpipe.arrays import AnyArray, AnyFloats, Float32s, Floats, Int32s, Ints
 from tacpipe.models.statistics_classifier import statistics
 
 COMPONENTS = 40  # at most, and no more than a third of the slides
+NAMES = ("classes", "centre", "projection", "means", "middle", "overall")
 STEADY = 1e-6  # standard deviation below which a feature is constant
 
 
@@ -29,6 +32,8 @@ class ClassDistance:
     centre: AnyFloats  # (feature,)
     projection: AnyFloats  # (feature, component), into a space in which the covariance within classes is the identity
     means: AnyFloats  # (class, component)
+    middle: AnyFloats  # (component,), the mean of all slides
+    overall: AnyFloats  # (component, component), into a space in which the covariance of all slides is the identity
 
     @classmethod
     def fit(cls, frames: Float32s, labels: Ints) -> Self:
@@ -50,23 +55,30 @@ class ClassDistance:
         covariance, _ = ledoit_wolf(placed - means[index], assume_centered=True)
         values, vectors = np.linalg.eigh(covariance)
         whiten = vectors / np.sqrt(np.maximum(values, STEADY * values.max() or 1.0))
-        return cls(classes.astype(np.int32), centre, gain[:, None] * (basis @ whiten), means @ whiten)
+        within = placed @ whiten
+        spread, axes = np.linalg.eigh(np.atleast_2d(np.cov(within, rowvar=False)))
+        overall = axes / np.sqrt(np.maximum(spread, 0) + STEADY)
+        projection = gain[:, None] * (basis @ whiten)
+        return cls(classes.astype(np.int32), centre, projection, means @ whiten, within.mean(axis=0), overall)
 
     def scores(self, frames: Float32s) -> Floats:
-        """Return minus half the squared distance of slides (slide, time, channel) to each class (slide, class)."""
+        """Return minus half the squared relative distance of slides (slide, time, channel) to each class (slide, class)."""
         placed = (statistics(frames).astype(np.float64) - self.centre) @ self.projection
-        found: Floats = -np.square(placed[:, None] - self.means[None]).sum(axis=2) / 2
+        away = np.square((placed - self.middle) @ self.overall).sum(axis=1)  # (slide,), from all slides
+        found: Floats = (away[:, None] - np.square(placed[:, None] - self.means[None]).sum(axis=2)) / 2
         return found
 
     def to_tensors(self) -> dict[str, AnyArray]:
         """Return all that `from_tensors` needs."""
-        return {name: getattr(self, name) for name in ("classes", "centre", "projection", "means")}
+        return {name: getattr(self, name) for name in NAMES}
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, AnyArray]) -> Self:
         """Return what `to_tensors` described. Raises `ValueError` where shapes do not fit one another."""
-        made = cls(tensors["classes"], tensors["centre"], tensors["projection"], tensors["means"])
+        made = cls(*(tensors[name] for name in NAMES))
         sizes = (len(made.centre), made.means.shape[1])
         if made.projection.shape != sizes or len(made.means) != len(made.classes):
             raise ValueError(f"the projection of slides is {made.projection.shape}, not {sizes}")
+        if made.overall.shape != (sizes[1], sizes[1]) or made.middle.shape != (sizes[1],):
+            raise ValueError(f"the space of all slides is {made.overall.shape}, not of {sizes[1]} components")
         return made

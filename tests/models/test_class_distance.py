@@ -6,6 +6,7 @@ import numpy as np
 
 from tacpipe.metrics import calibration
 from tacpipe.models.class_distance import ClassDistance
+from tacpipe.models.statistics_classifier import statistics
 
 
 def slides(kinds: tuple[int, ...], count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -25,11 +26,16 @@ def test_the_nearest_class_is_the_slides_own_and_other_textures_are_far() -> Non
     assert calibration.auroc(scores.max(axis=1), fitted.scores(others).max(axis=1)) > 0.95
 
 
-def test_whitened_training_slides_have_about_as_many_dimensions_of_squared_distance() -> None:
+def test_the_distance_is_that_to_a_class_less_that_to_all_slides() -> None:
     frames, labels = slides((0, 2, 5), 60, 0)
     fitted = ClassDistance.fit(frames, labels)
-    own = fitted.scores(frames)[np.arange(len(labels)), np.searchsorted(fitted.classes, labels)]
-    assert 0.5 < -2 * own.mean() / fitted.means.shape[1] < 1.2
+    placed = (statistics(frames) - fitted.centre) @ fitted.projection  # (slide, component), whitened within classes
+    apart = placed - placed.mean(axis=0)
+    overall = np.einsum("ij,jk,ik->i", apart, np.linalg.inv(np.cov(placed.T)), apart)
+    own = np.square(placed - fitted.means[np.searchsorted(fitted.classes, labels)]).sum(axis=1)
+    assert 0.5 < own.mean() / placed.shape[1] < 1.2  # about as much as there are components
+    found = fitted.scores(frames)[np.arange(len(labels)), np.searchsorted(fitted.classes, labels)]
+    np.testing.assert_allclose(found, (overall - own) / 2, rtol=1e-3, atol=1e-3)
 
 
 def test_tensors_give_back_the_distance() -> None:
