@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from tacpipe.io import parquet
 from tacpipe.io.hashing import bytes_digest
@@ -38,6 +39,7 @@ def recorded(store: Store, seconds: int, output: str = "rec") -> Spooled:
     return Spooled(spool.folder)
 
 
+@pytest.mark.long
 def test_a_long_stream_is_decoded_and_stored_without_being_in_memory(tmp_path: Path) -> None:
     """Peaks of memory of sealing 20 s and 320 s of an arm: the rows of the longer one alone would be 100 MB."""
     short, long = (sealed_alone(tmp_path / str(seconds), seconds) for seconds in (20, 320))
