@@ -23,8 +23,8 @@ from typing import Any
 import timing
 
 from tacpipe.store.addresses import Address, parsed, settings
+from tacpipe.store.backend import AT_ONCE
 from tacpipe.store.bucket import Bucket
-from tacpipe.store.remote import AT_ONCE
 
 KINDS = {
     "small": ("small_stages", "simulate.small = small_stages:make", "simulate small --trials 1000 --rows 200"),

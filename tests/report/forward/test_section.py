@@ -11,8 +11,7 @@ import pytest
 
 from tacpipe.comparison.runs import grouped
 from tacpipe.report.blocks import Section
-from tacpipe.report.forward import anticipation
-from tacpipe.report.forward import reading, representations
+from tacpipe.report.forward import anticipation, reading, representations
 from tests.fake_recordings import FakeDataset
 from tests.report import parts
 from tests.report.forward.result_fakes import codec, errors, result
