@@ -64,7 +64,7 @@ def test_whatever_is_read_as_parquet_lies_in_memory_of_arrow_s_own() -> None:
                 given = ast.unparse(call.args[0])  # `self._content` is what `ParquetTable` got from `owned`
                 assert given.startswith("owned(") or given == "self._content", f"{file}:{call.lineno}"
                 found += 1
-    assert found == 7
+    assert found == 8
 
 
 @given(tables(), st.data())

@@ -1,12 +1,15 @@
-"""What a live session is asked for is compared with what its model has, before the rig is looked at."""
+"""What a live session is asked for is compared with what its model has, before the session begins."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import pytest
 
 from tacpipe.live.session import Described, Surfaces
 from tests.conftest import Lab
 
+RIG = Path(__file__).parents[2] / "rigs/first-paper.toml"
 CALIBRATED, PLAIN = Described(("skin_taxel01_x",), 3, "count", (10, 50, 90)), Described(("skin_taxel01_x",), 3, "count")
 
 
@@ -23,5 +26,6 @@ def test_quantiles_that_a_model_does_not_have_are_refused_before_the_session_beg
     about: Described | Surfaces, asked: str, named: str, lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("tacpipe.live.description.described", lambda model: (about, "0" * 64))
+    Path("rig.toml").write_text(RIG.read_text())
     ran = lab.call(f"live rig.toml --model models/f --quantiles {asked}")
     assert ran.code == 2 and named in ran.err.replace("\n", " ")
