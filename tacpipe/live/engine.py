@@ -180,9 +180,9 @@ class Engine:
 
     def due_ns(self, now_ns: int) -> int:
         """Return when `step` is to be called next, on the monotonic clock: early, to decode, then when a row is due."""
-        if self._point_ns is None or self._offset_ns is None:
+        due_ns = self._row_ns
+        if due_ns is None:
             return now_ns + round(STARTING_S * 1e9)
-        due_ns = self._point_ns + self.period_ns - self._offset_ns + self.settle_ns
         if due_ns <= now_ns:
             return now_ns + round(STARTING_S * 1e9) // 5
         return max(due_ns - EARLY_NS, now_ns) if due_ns - EARLY_NS - now_ns > LITTLE_NS else due_ns
@@ -196,7 +196,8 @@ class Engine:
             return []
         began_s = time.perf_counter()
         until_ns = now_ns - self.settle_ns
-        self._decode(self._offset_ns, until_ns if self._is_due(until_ns) else None)
+        row_ns = self._row_ns
+        self._decode(self._offset_ns, until_ns if row_ns is not None and row_ns <= now_ns else None)
         found = self.chain.advance(until_ns + self._offset_ns, newest_only=True)
         if not found:
             return self._silence(now_ns)
@@ -215,11 +216,12 @@ class Engine:
         heard_ns = self._decoders[self.chain.master].heard_ns if self.chain.master in self._decoders else None
         message.age_ms = math.nan if heard_ns is None else (now_ns - heard_ns) / 1e6
 
-    def _is_due(self, until_ns: int) -> bool:
-        """Return whether there is a row to make of what came by a moment."""
+    @property
+    def _row_ns(self) -> int | None:
+        """When the next row is due, on the monotonic clock; None where that is not known."""
         if self._point_ns is None or self._offset_ns is None:
-            return False
-        return until_ns + self._offset_ns >= self._point_ns + self.period_ns
+            return None
+        return self._point_ns + self.period_ns - self._offset_ns + self.settle_ns
 
     def _decode(self, offset_ns: int, until_ns: int | None) -> None:
         """Decode what came and give it to the chain; where a row is due, only what may hold samples up to ``until_ns``."""

@@ -51,18 +51,20 @@ class Parting:
 
 def up_to(tables: Tables, t_ns: int) -> dict[str, pa.Table]:
     """Return the rows of each stream up to a time; streams without any are left out."""
-    rows = {
-        name: int(np.searchsorted(table.column("t_ns").to_numpy(), t_ns, "right")) for name, table in tables.items()
-    }
-    return {name: tables[name].slice(0, count) for name, count in rows.items() if count}
+    return {name: tables[name].slice(0, count) for name, count in _counts(tables, t_ns).items() if count}
 
 
 def after(tables: Tables, t_ns: int) -> dict[str, pa.Table]:
     """Return the rows of each stream behind a time; streams without any are left out."""
-    rows = {
+    counts = _counts(tables, t_ns)
+    return {name: tables[name].slice(count) for name, count in counts.items() if count < tables[name].num_rows}
+
+
+def _counts(tables: Tables, t_ns: int) -> dict[str, int]:
+    """Return how many rows each stream has up to a time."""
+    return {
         name: int(np.searchsorted(table.column("t_ns").to_numpy(), t_ns, "right")) for name, table in tables.items()
     }
-    return {name: tables[name].slice(count) for name, count in rows.items() if count < tables[name].num_rows}
 
 
 def parts(slide: SlideSoFar, finger: str, pause_ns: int, tables: Tables) -> Iterator[tuple[int, dict[str, pa.Table]]]:

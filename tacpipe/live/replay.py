@@ -14,7 +14,7 @@ from tacpipe.live.chain import BLOCKING, Cause, Chain, Forecast
 from tacpipe.plugins.stage import RecordingOutput, Result
 from tacpipe.sensors.plan import NAME as PLAN
 from tacpipe.tasks.forward.forecaster import Forecaster
-from tacpipe.tasks.forward.prediction import prediction_table
+from tacpipe.tasks.forward.prediction import check_steps, prediction_table
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -60,11 +60,7 @@ def _predicted(
     """Return the predictions of a recording, and how many grid points each cause had."""
     tables = recorded(recording)
     chain = chain_of(forecaster, model.source.chain, recording, tables, quantiles)
-    for step in steps:
-        if not 1 <= step <= chain.horizon:
-            raise TacpipeError(
-                f"The model predicts 1 to {chain.horizon} steps ahead, not {step}. Give --steps of these."
-            )
+    check_steps(steps, chain.horizon)
     t_ns, counts, bands, causes = [], [], [], Counter[Cause]()
     wanted = [step - 1 for step in steps]
     for one in replayed(chain, tables):

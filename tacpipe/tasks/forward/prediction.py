@@ -50,11 +50,7 @@ def _gathered(
     forecaster: Forecaster, recordings: Dataset, steps: Sequence[int], quantiles: Sequence[int]
 ) -> dict[str, Gathered]:
     """Return the predictions of each recording, put aside some windows at a time."""
-    for step in steps:
-        if not 1 <= step <= forecaster.horizon:
-            raise TacpipeError(
-                f"The model predicts 1 to {forecaster.horizon} steps ahead, not {step}. Give --steps of these."
-            )
+    check_steps(steps, forecaster.horizon)
     levels = forecaster.quantiles_of(quantiles)[1] if quantiles else []
     check_codec(forecaster.codec_files, recordings.files)
     wanted, channels = [step - 1 for step in steps], len(forecaster.codec.channels)
@@ -79,6 +75,13 @@ def _gathered(
             del some, counts, bands, rows  # before the next ones are made
         del track
     return found
+
+
+def check_steps(steps: Sequence[int], horizon: int) -> None:
+    """Raise `TacpipeError` for a step ahead that a model does not reach."""
+    for step in steps:
+        if not 1 <= step <= horizon:
+            raise TacpipeError(f"The model predicts 1 to {horizon} steps ahead, not {step}. Give --steps of these.")
 
 
 def inputs(forecaster: Forecaster, recordings: Dataset) -> WindowArrays:
