@@ -22,7 +22,7 @@ from tacpipe.report.forward import (
     live,
     reading,
     representations,
-    shown,
+    representatives,
     single_run,
     situations,
     skill,
@@ -54,9 +54,9 @@ def folds(context: Context) -> list[Fold]:
         *situations.folds(context),
         *live.folds(context),
         *representations.folds(context),
-        *shown.predictions(context),
-        *shown.training(context),
-        *shown.single(context),
+        *representatives.predictions(context),
+        *representatives.training(context),
+        *representatives.single(context),
     ]
 
 
@@ -162,7 +162,7 @@ def _ahead(context: Context) -> list[Fold]:
 
 def _shown(context: Context, one: Comparison) -> list[Row]:
     found = one.models[:LINES]
-    other = context.row(one, shown.paper(context))
+    other = context.row(one, representatives.paper(context))
     found += [other] if other and other not in found else []
     return found + [row for row in one.of("baseline") if row.predictor != BASELINE][:1]
 
@@ -172,7 +172,7 @@ def _channels(context: Context) -> list[Fold]:
     tables: list[Table] = []
     steps = _steps(context)
     for one in context.comparisons:
-        chosen = [row for row in dict.fromkeys([one.best, context.row(one, shown.paper(context))]) if row]
+        chosen = [row for row in dict.fromkeys([one.best, context.row(one, representatives.paper(context))]) if row]
         if not chosen:
             continue
         known = _known(one.question)

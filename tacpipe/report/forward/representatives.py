@@ -1,4 +1,4 @@
-"""What is shown of single runs: predictions next to the truth, training, and errors in full."""
+"""The runs that are shown singly: predictions next to the truth, training, and errors in full."""
 
 from __future__ import annotations
 
