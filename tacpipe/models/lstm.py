@@ -18,7 +18,6 @@ How many they are is chosen so that they stay in a core's cache: over all steps,
 
 from __future__ import annotations
 
-import contextlib
 import math
 import warnings
 from collections import deque
@@ -30,7 +29,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from tacpipe.arrays import Bytes
-from tacpipe.models.recurrent_layer import in_float16
+from tacpipe.models import recurrent_layer
 
 # weights that are computed lie apart, so cuDNN copies them together in every call
 warnings.filterwarnings("ignore", message="RNN module weights are not part of single contiguous chunk")
@@ -46,7 +45,7 @@ def lstm(inputs: Tensor, state: State | None, weights: Weights, lead: Lead | Non
     The state before the first step is zero where none is given. ``lead`` adds inputs that exist in the first step only.
     """
     if inputs.device.type != "cpu" or not torch.is_grad_enabled():
-        return _of_torch(inputs, state, weights, lead)
+        return recurrent_layer.through(_of_torch, inputs, state, weights, lead)
     first = None if lead is None else lead[0] @ lead[1].t()
     hidden, cell = (None, None) if state is None else state
     from_input, from_state, bias = weights
@@ -68,12 +67,9 @@ def _of_torch(inputs: Tensor, state: State | None, weights: Weights, lead: Lead 
         zero = inputs.new_zeros(inputs.shape[1], from_state.shape[1])
         state = zero, zero
     flat = [from_input, from_state, bias, torch.zeros_like(bias)]
-    begun = [state[0][None], state[1][None]]
-    exact = in_float16(inputs)
-    if exact:
-        inputs, begun, flat = inputs.float(), [one.float() for one in begun], [one.float() for one in flat]
-    with torch.autocast("cuda", enabled=False) if exact else contextlib.nullcontext():
-        states, hidden, cell = torch.lstm(inputs, begun, flat, True, 1, 0.0, torch.is_grad_enabled(), False, False)
+    states, hidden, cell = torch.lstm(
+        inputs, (state[0][None], state[1][None]), flat, True, 1, 0.0, torch.is_grad_enabled(), False, False
+    )
     return states, (hidden[0], cell[0])
 
 

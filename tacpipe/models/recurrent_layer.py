@@ -6,22 +6,30 @@ there, and no loss is scaled to keep them from it.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any, TypeVar
+
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-State = Tensor | tuple[Tensor, Tensor]  # of a GRU, or of an LSTM
+T = TypeVar("T")
 
 
-def through(layer: nn.GRU | nn.LSTM, inputs: Tensor, state: State | None = None) -> tuple[Tensor, State]:
-    """Return the states (time, window, hidden) of a layer and its last one, which begins at zero where none is given."""
+def through(layer: Callable[..., T], inputs: Tensor, *given: Any) -> T:
+    """Return what a layer returns for ``inputs`` and more tensors, tuples of tensors or None; on a GPU in float32."""
     if not in_float16(inputs):
-        return layer(inputs, state)  # type: ignore[no-any-return]
+        return layer(inputs, *given)
     with torch.autocast(inputs.device.type, enabled=False):
-        if isinstance(state, tuple):
-            state = state[0].float(), state[1].float()
-        return layer(inputs.float(), state if state is None or isinstance(state, tuple) else state.float())  # type: ignore[no-any-return]
+        return layer(inputs.float(), *map(_whole, given))
 
 
 def in_float16(inputs: Tensor) -> bool:
     """Return whether a recurrent layer would be computed in float16 for such inputs."""
     return inputs.device.type == "cuda" and torch.is_autocast_enabled("cuda")
+
+
+def _whole(given: Any) -> Any:
+    """Return tensors, and those of tuples, in float32."""
+    if isinstance(given, tuple):
+        return tuple(map(_whole, given))
+    return given if given is None else given.float()
