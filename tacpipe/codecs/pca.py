@@ -113,23 +113,6 @@ class PCA:
 
 
 def fit(
-    inputs: Floats,
-    channels: Sequence[str],
-    layout: Sequence[Mapping[str, str]],
-    *,
-    components: int = 20,
-    variance: float = 0.0,
-    representation: str = frame_stacking.LEVELS,
-) -> PCA:
-    """Return the codec fitted on ``inputs`` (row, channel), counts above rest or their increments (``representation``).
-
-    Raises as `of_moments`.
-    """
-    found = Moments.of([inputs], inputs.shape[1])
-    return of_moments(found, channels, layout, components=components, variance=variance, representation=representation)
-
-
-def of_moments(
     rows: Moments,
     channels: Sequence[str],
     layout: Sequence[Mapping[str, str]],
@@ -138,7 +121,7 @@ def of_moments(
     variance: float = 0.0,
     representation: str = frame_stacking.LEVELS,
 ) -> PCA:
-    """Return the codec of training rows of which these are the moments.
+    """Return the codec fitted on training rows, counts above rest or their increments (``representation``).
 
     It keeps ``components`` latents or, where ``variance`` is above 0, as many as hold this fraction of the variance.
     A channel that never moves gets the scale 1. The sign of each component is such that its largest weight is positive.
@@ -192,7 +175,7 @@ def fit_and_measure(
     if everything.count > 1:
         still = [name for name, moves in zip(rows.channels, everything.moves, strict=True) if not moves]
         warn_of_still(still, width)
-    made = functools.partial(of_moments, channels=rows.channels, layout=rows.layout, representation=representation)
+    made = functools.partial(fit, channels=rows.channels, layout=rows.layout, representation=representation)
     codec = made(everything, components=components, variance=variance)
     evaluated = codec
     if val.count and train.count > len(codec.components):

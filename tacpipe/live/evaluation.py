@@ -25,7 +25,7 @@ from tacpipe.live.worth import LIVE, LIVE_STILL, OFFLINE, STILL, Session, Sums, 
 from tacpipe.metrics import headline
 from tacpipe.plugins.stage import Result
 from tacpipe.signals import anticipation
-from tacpipe.signals.leads import events, leads
+from tacpipe.signals.leads import Leads, events, leads
 from tacpipe.signals.loads import loads
 from tacpipe.tasks.forward import evaluation, tracks, units
 from tacpipe.tasks.forward import headline as headlines
@@ -200,7 +200,7 @@ def _alarms(
     tables: Mapping[str, Any],
     track: Track,
     predicted: _Offline,
-) -> dict[str, dict[str, dict[str, Any]]]:
+) -> dict[str, dict[str, Leads]]:
     """Return what alarms were worth: by alarm, by event, live and offline."""
     stream = tables["alarm"]
     states = {name: stream.column(f"{name}_state").to_numpy().astype(np.int64) for name in NAMES}
@@ -210,18 +210,12 @@ def _alarms(
     if LEVELS in recording.attributes and len(predicted.now):
         series[OFFLINE] = (track.t_ns[predicted.now], _offline_states(forecaster, recording, track, predicted))
     period_ns = round(1e9 / float(forecaster.config["rate_hz"]))
-    found: dict[str, dict[str, dict[str, Any]]] = {}
+    found: dict[str, dict[str, Leads]] = {}
     for event, times_ns in _events(forecaster, track).items():
         for name in NAMES:
             for who, (t_ns, each) in series.items():
                 one = leads(t_ns, each[name], times_ns, forecaster.horizon * period_ns, period_ns)
-                found.setdefault(f"{name} alarm, {event}", {})[who] = {
-                    "events": one.events,
-                    "led": len(one.leads_ms),
-                    "leads_ms": list(one.leads_ms),
-                    "false_alarms": one.false_alarms,
-                    "hours": one.hours,
-                }
+                found.setdefault(f"{name} alarm, {event}", {})[who] = one
     return found
 
 

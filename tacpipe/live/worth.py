@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -10,6 +9,8 @@ import numpy as np
 
 from tacpipe.arrays import Floats
 from tacpipe.live import truth
+from tacpipe.signals import leads
+from tacpipe.signals.leads import Leads
 
 LIVE, LIVE_STILL, OFFLINE, STILL = "live", "live_persistence", "offline", "persistence"
 PREDICTORS = (LIVE, LIVE_STILL, OFFLINE, STILL)
@@ -23,7 +24,7 @@ class Session(NamedTuple):
     explained: int  # published rows that differ after a sample that came too late
     rows: int  # that errors are of
     sums: Sums
-    alarms: dict[str, dict[str, dict[str, Any]]]  # alarm and event, to live and offline
+    alarms: dict[str, dict[str, Leads]]  # alarm and event, to live and offline
     latency_ms: Floats
     skipped: int
     late: int
@@ -59,23 +60,13 @@ def summed(sessions: Sequence[Session], steps: Sequence[int], channels: int) -> 
     }
 
 
-def _pooled(several: Sequence[Mapping[str, Mapping[str, Mapping[str, Any]]]]) -> dict[str, Any]:
+def _pooled(several: Sequence[Mapping[str, Mapping[str, Leads]]]) -> dict[str, Any]:
     """Return what alarms were worth over sessions."""
     found: dict[str, Any] = {}
     for kind in dict.fromkeys(kind for one in several for kind in one):
         for who in dict.fromkeys(who for one in several for who in one.get(kind, {})):
             parts = [one[kind][who] for one in several if who in one.get(kind, {})]
-            led = [lead for part in parts for lead in part["leads_ms"]]
-            hours = sum(part["hours"] for part in parts)
-            false = sum(part["false_alarms"] for part in parts)
-            found.setdefault(kind, {})[who] = {
-                "events": sum(part["events"] for part in parts),
-                "led": len(led),
-                "median_lead_ms": round(float(np.median(led)), 3) if led else None,
-                "false_alarms": false,
-                "false_alarms_per_hour": round(false / hours, 3) if hours > 0 and math.isfinite(hours) else None,
-                "minutes": round(60 * hours, 4),
-            }
+            found.setdefault(kind, {})[who] = leads.summed(parts)
     return found
 
 

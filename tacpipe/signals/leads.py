@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -67,3 +69,22 @@ def leads(t_ns: Times, states: Int64s, found: Times, horizon_ns: int, period_ns:
             false, until_ns = false + 1, at_ns + horizon_ns
     hours = float(((states >= 0) & quiet).sum()) * period_ns / 3.6e12
     return Leads(counted, tuple(led), false, hours)
+
+
+def summed(several: Sequence[Leads]) -> dict[str, Any]:
+    """Return what alarms were worth together; None where there is nothing to divide by.
+
+    >>> both = summed([Leads(3, (40.0, 120.0), 1, 0.25), Leads(1, (), 0, 0.25)])
+    >>> both["events"], both["led"], both["median_lead_ms"], both["false_alarms_per_hour"], both["minutes"]
+    (4, 2, 80.0, 2.0, 30.0)
+    """
+    leads_ms = [lead for one in several for lead in one.leads_ms]
+    false, hours = sum(one.false_alarms for one in several), sum(one.hours for one in several)
+    return {
+        "events": sum(one.events for one in several),
+        "led": len(leads_ms),
+        "median_lead_ms": round(float(np.median(leads_ms)), 3) if leads_ms else None,
+        "false_alarms": false,
+        "false_alarms_per_hour": round(false / hours, 3) if hours else None,
+        "minutes": round(60 * hours, 4),
+    }

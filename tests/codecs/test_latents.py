@@ -9,6 +9,7 @@ import pyarrow as pa
 import pytest
 
 from tacpipe.codecs import latents, pca, stored, tactile
+from tacpipe.codecs.moments import Moments
 from tacpipe.errors import TacpipeError
 from tacpipe.io.parquet import ParquetTable
 from tests.any_table import bits
@@ -36,7 +37,13 @@ def test_a_long_recording_gets_the_latents_of_the_whole(
 ) -> None:
     shard = recording()
     counts = tactile.above_rest(shard.content, tuple(CHANNELS))
-    fitted = pca.fit(counts[:300], CHANNELS, [{}] * len(CHANNELS), components=3, representation=representation)
+    fitted = pca.fit(
+        Moments.of([counts[:300]], len(CHANNELS)),
+        CHANNELS,
+        [{}] * len(CHANNELS),
+        components=3,
+        representation=representation,
+    )
     files = stored.to_files(fitted)
     whole = latents.added(shard, files)  # type: ignore[arg-type]
     assert isinstance(whole, pa.Table) and np.isnan(whole.column("z00").to_numpy()[300])
@@ -55,6 +62,6 @@ def test_a_long_recording_gets_the_latents_of_the_whole(
 
 def test_latents_of_other_channels_are_refused_with_the_name_of_the_recording() -> None:
     counts = tactile.above_rest(recording().content, tuple(CHANNELS))
-    fitted = pca.fit(counts[:300, :5], CHANNELS[:5], [{}] * 5, components=3)
+    fitted = pca.fit(Moments.of([counts[:300, :5]], 5), CHANNELS[:5], [{}] * 5, components=3)
     with pytest.raises(TacpipeError, match="a: The codec does not fit this table"):
         latents.added(recording(), stored.to_files(fitted))  # type: ignore[arg-type]

@@ -29,6 +29,7 @@ from tacpipe.clouds import files as cloud_files
 from tacpipe.clouds import pcd, ply
 from tacpipe.clouds.depth_frame import DepthFrame
 from tacpipe.codecs import stored
+from tacpipe.codecs.moments import Moments
 from tacpipe.codecs.pca import fit
 from tacpipe.datasets import manifest
 from tacpipe.io.hashing import digest
@@ -204,7 +205,7 @@ def _descriptors() -> list[bytes]:
 def _codec_files() -> dict[str, bytes]:
     names = [f"taxel{number}" for number in range(5)]
     rows = np.random.default_rng(0).normal(size=(40, 5))
-    return dict(sorted(fit(rows, names, [{"stream": "xela1"}] * 5, components=2).to_files().items()))
+    return dict(sorted(fit(Moments.of([rows], 5), names, [{"stream": "xela1"}] * 5, components=2).to_files().items()))
 
 
 def _codec(data: bytes) -> object:

@@ -11,7 +11,7 @@ import numpy as np
 
 from tacpipe.arrays import AnyFloats, Bools, Floats, Int64s, Times
 from tacpipe.signals import anticipation
-from tacpipe.signals.leads import Leads, events, leads, near
+from tacpipe.signals.leads import Leads, events, leads, near, summed
 from tacpipe.signals.shear import Layout, floors, rise_and_fall
 from tacpipe.tasks.forward.alarms import WATCHED
 from tacpipe.tasks.forward.tracks import Track
@@ -106,7 +106,8 @@ class SlipAlarms:
             for part in parts:
                 level = self.level(name, per_hour, [place for place in known if place not in part])
                 several += [self._worth(self.recordings[place], name, level) for place in part]
-            found[name] = summed(several)
+            worth = summed(several)
+            found[name] = {**worth, "recall": round(worth["led"] / worth["events"], 9) if worth["events"] else None}
         return found
 
     def _worth(self, one: Rows, name: str, level: float) -> Leads:
@@ -114,23 +115,3 @@ class SlipAlarms:
         known = np.isfinite(scores) & math.isfinite(level)
         states = np.where(known, (scores > level).astype(np.int64), -1)
         return leads(one.t_ns, states, one.events(), self.horizon * one.period_ns, one.period_ns)
-
-
-def summed(several: Sequence[Leads]) -> dict[str, Any]:
-    """Return what alarms were worth together; None where there is nothing to divide by.
-
-    >>> summed([Leads(3, (40.0, 120.0), 1, 0.25), Leads(1, (), 0, 0.25)])["recall"]
-    0.5
-    """
-    leads_ms = [lead for one in several for lead in one.leads_ms]
-    count, hours = sum(one.events for one in several), sum(one.hours for one in several)
-    false = sum(one.false_alarms for one in several)
-    return {
-        "events": count,
-        "led": len(leads_ms),
-        "recall": round(len(leads_ms) / count, 9) if count else None,
-        "median_lead_ms": round(float(np.median(leads_ms)), 3) if leads_ms else None,
-        "false_alarms": false,
-        "false_alarms_per_hour": round(false / hours, 3) if hours else None,
-        "minutes": round(60 * hours, 4),
-    }
