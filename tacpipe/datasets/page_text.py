@@ -63,7 +63,8 @@ def described(text: bytes | memoryview, *, keyed: bool = False) -> bytes | None:
     """
     begin, end = (b'{"digest": ', b"}") if keyed else (b"", b"")
     found = _SHARD_END.sub(end, _SHARD_BEGIN.sub(begin, bytes(text)))
-    if b'\\": ' in found or b"\n     " in found:  # `": ` may be within a text, or a shard has another form
+    # a text that holds `": `, or begins with `: `, looks like the end of a name; or a shard has another form
+    if b'\\": ' in found or b' ": ' in found or b"\n     " in found:
         return None
     for beginning in _BEGINNINGS:
         found = found.replace(beginning, b"")
