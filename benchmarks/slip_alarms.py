@@ -26,12 +26,11 @@ import numpy as np
 import tacpipe
 from tacpipe.arrays import AnyFloats, Floats
 from tacpipe.signals import anticipation
-from tacpipe.signals.leads import Leads, events, leads, near
+from tacpipe.signals.leads import Leads, events, leads, near, summed
 from tacpipe.signals.loads import axes, loads
 from tacpipe.signals.shear import floors, pressing, rise_and_fall, shear
 from tacpipe.tasks.forward import predictors, tracks
 from tacpipe.tasks.forward.forecaster import Forecaster
-from tacpipe.tasks.forward.slip_alarms import summed
 from tacpipe.tasks.forward.tracks import Track
 
 TRAINED, SET, COUNTED = 30, 24, 24  # trials
