@@ -6,23 +6,19 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from tacpipe.comparison.runs import MODEL, Method
+from tacpipe.comparison.runs import Method
 from tacpipe.report.blocks import Cell, Fold, fold, number, table
 from tacpipe.report.context import Context
-from tacpipe.report.forward import single_run
+from tacpipe.report.forward import by_predictor
 
 
 def folds(context: Context) -> list[Fold]:
     """Return how often and how early a method sees a change come; nothing where no result states it."""
-    source = max(context.methods, key=lambda one: len(one.runs))
-    described = [(one.name, of(one, MODEL)) for one in context.methods]
-    names = {name for run in source.runs for name in run.details.metrics.get("anticipation", {})} - {MODEL}
-    described += [(single_run.spelled(name), of(source, name)) for name in sorted(names)]
+    described = by_predictor.described(context.methods, "anticipation", of)
     measures = ("median_lead_rows", "median_lead_frames", "false_alarms_per_minute")
     rows: list[Sequence[str | Cell]] = [
         [name, f"{found['events']:,.0f}", number(100 * found["recall"]), *(number(found[key]) for key in measures)]
-        for name, found in sorted(described, key=lambda one: -one[1]["recall"] if one[1] else 0.0)
-        if found
+        for name, found in sorted(described, key=lambda one: -one[1]["recall"])
     ]
     heads = ["", "events", "seen coming (%)", "median lead (rows)", "median lead (frames)", "false alarms a minute"]
     return (

@@ -26,6 +26,7 @@ from tacpipe.report.forward import (
     single_run,
     situations,
     skill,
+    slips,
 )
 from tacpipe.report.forward import methods as by_method
 from tacpipe.tasks.forward import headline, units
@@ -51,6 +52,7 @@ def folds(context: Context) -> list[Fold]:
         *_ablations(context),
         *bands.folds(context),
         *anticipation.folds(context),
+        *slips.folds(context),
         *situations.folds(context),
         *live.folds(context),
         *representations.folds(context),
