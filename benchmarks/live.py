@@ -16,8 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
-from tacpipe.live import messages, opening, session, wire
-from tacpipe.live.description import described
+from tacpipe.live import messages, opening, own_streams, wire
+from tacpipe.live.description import Described, described
 from tacpipe.live.engine import EARLY_NS, Engine
 from tacpipe.live.options import OWN, Options
 from tacpipe.recording import rig as rigs
@@ -54,9 +54,9 @@ class Replay:
     def __init__(self, model: Path, seconds: float, quantiles: tuple[int, ...] = ()) -> None:
         rig = rigs.read(RIG)
         about, _ = described(model)
-        assert isinstance(about, session.Described), "a model of forward"
+        assert isinstance(about, Described), "a model of forward"
         about = replace(about, quantiles=quantiles)
-        own = session.with_own(rig, about, tuple(range(1, about.horizon + 1)))
+        own = own_streams.added(rig, about, tuple(range(1, about.horizon + 1)))
         self.sensors = {name: own.streams[name].sensor for name in OWN if name in own.streams}
         engine = opening.engine(Options(str(model), own.text, tuple(rig.streams), quantiles=quantiles))
         assert isinstance(engine, Engine)

@@ -26,7 +26,7 @@ import numpy as np
 
 import tacpipe
 from tacpipe.live.demo import EFFORT, SEED, SWITCH_S, send_plans
-from tacpipe.live.session import free_ports
+from tacpipe.live.own_streams import free_ports
 from tacpipe.recording import rig as rigs
 from tacpipe.recording import rig_text
 from tacpipe.simulation import pick_and_move

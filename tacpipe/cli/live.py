@@ -15,8 +15,6 @@ from tacpipe.io import terminal
 if TYPE_CHECKING:
     from tacpipe.io.termination import Ended
     from tacpipe.live.options import Options
-    from tacpipe.live.session import Described
-    from tacpipe.live.settings import Settings
     from tacpipe.live.supervisor import Supervisor
     from tacpipe.recording import trials as trials_of
     from tacpipe.recording.recorder import Recorder
@@ -129,6 +127,7 @@ def add(program: typer.Typer, summary: str) -> None:
         quiet: Annotated[bool, typer.Option("--quiet", help="Print only errors on stderr.")] = False,
         as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
     ) -> None:
+        from tacpipe.live import preparation
         from tacpipe.live.settings import Settings
         from tacpipe.recording import rig as rigs
 
@@ -153,72 +152,24 @@ def add(program: typer.Typer, summary: str) -> None:
             "realtime": realtime,
         }
         asked = Settings.of(read.live, str(rig), given)
-        found, options, digest = _asked(read, asked)
+        prepared = preparation.prepared(read, asked)
         attributes = {
-            "live_model": digest,
+            "live_model": prepared.model_digest,
             "live_plan": asked.plan,
             "live_alarms_per_hour": asked.alarms_per_hour,
             **({"live_pause_s": asked.pause_s, "live_least": asked.least} if asked.pause_s else {}),
         }
-        _run(found, options, output, name, duration, label or [], attributes, quiet=quiet, as_json=as_json)
-
-
-def _asked(read: Rig, asked: Settings) -> tuple[Rig, Options, str]:
-    """Return the rig with the session's own streams, what the model's process is asked for, and the model's digest."""
-    from tacpipe.live import description, publishing, scheduling, session
-    from tacpipe.live.options import Options
-    from tacpipe.live.settings import MEASURED
-    from tacpipe.recording import completing
-
-    if asked.realtime:
-        with asked.naming("realtime"):
-            scheduling.check()
-    with asked.naming("publish"):
-        for address in asked.publish:
-            publishing.check(address)
-    with asked.naming("model"):
-        about, digest = description.described(Path(asked.model))
-    if isinstance(about, session.Described):
-        with asked.naming("steps"):
-            wanted = asked.steps_of(about.horizon)
-        with asked.naming("quantiles"):
-            _check_quantiles(asked.quantiles, about)
-        about = replace(about, quantiles=tuple(sorted(set(asked.quantiles))))
-    elif asked.steps or asked.quantiles or asked.plan != MEASURED or asked.alarms_per_hour:
-        raise UsageError(
-            f"{asked.model} is of the kind {about.kind}; "
-            f"--steps, --quantiles, --plan and --alarms-per-hour are for forecasts."
+        _run(
+            prepared.rig,
+            prepared.options,
+            output,
+            name,
+            duration,
+            label or [],
+            attributes,
+            quiet=quiet,
+            as_json=as_json,
         )
-    else:
-        wanted = ()
-    with asked.naming("plan"):
-        with_plans = session.with_plan(read, asked.plan)
-    found = session.with_own(completing.completed(with_plans), about, wanted)
-
-    def absolute(path: str) -> str:
-        return str(Path(path).absolute()) if path else ""
-
-    options = Options(
-        absolute(asked.model),
-        found.text,
-        tuple(with_plans.streams),
-        wanted,
-        about.quantiles if isinstance(about, session.Described) else (),
-        asked.publish,
-        asked.alarms_per_hour,
-        absolute(asked.alarms_on),
-        absolute(asked.split),
-        asked.settle_ms,
-        plan_from=session.targets_of(with_plans, asked.plan),
-        kind=about.kind,
-        sensor=asked.sensor,
-        every_ms=asked.every_ms,
-        least=asked.least,
-        pause_s=asked.pause_s,
-        rank=asked.rank,
-        realtime=asked.realtime,
-    )
-    return found, options, digest
 
 
 def _run(
@@ -320,19 +271,6 @@ def _report(
         raise typer.Exit(failed.exit_code)
     if failed is not None:
         raise failed
-
-
-def _check_quantiles(percents: tuple[int, ...], about: Described) -> None:
-    """Raise `UsageError` for quantiles that the model does not have."""
-    from tacpipe.errors import TacpipeError
-    from tacpipe.tasks import calibrated
-
-    if not percents:
-        return
-    try:
-        calibrated.quantiles_of(about if about.percents else None, percents)
-    except TacpipeError as error:
-        raise UsageError(str(error)) from error
 
 
 def _percents(text: str) -> tuple[int, ...]:

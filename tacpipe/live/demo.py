@@ -19,7 +19,7 @@ import numpy as np
 from tacpipe.errors import TacpipeError
 from tacpipe.io import terminal
 from tacpipe.live import demo_picture
-from tacpipe.live.session import free_ports
+from tacpipe.live.own_streams import free_ports
 from tacpipe.recording import rig as rigs
 from tacpipe.recording import rig_text
 from tacpipe.sensors import plan as plans

@@ -1,16 +1,65 @@
-"""What a model predicts, read from its description alone: the recording process must not import torch."""
+"""What a model predicts live, read from its description alone: the recording process must not import torch."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, ClassVar
 
 from tacpipe.errors import UsageError
-from tacpipe.live.session import Described, Grasped, Surfaces
+from tacpipe.live.alarms import NAMES
 from tacpipe.live.touch_messages import COLUMNS
 from tacpipe.printable import plain
 
 CONFIG = "config.json"
 READ = ("horizon", "inputs")  # of the description of a model of future signals
+
+
+@dataclass(frozen=True)
+class Described:
+    """What the model predicts, which the session's own streams must state before it runs."""
+
+    channels: tuple[str, ...]
+    horizon: int
+    unit: str
+    percents: tuple[int, ...] = ()  # levels of the quantiles that it has
+    quantiles: tuple[int, ...] = ()  # those of them that are asked for
+    kind: ClassVar[str] = "forecast"  # of its messages
+
+    def own(self, steps: Sequence[int]) -> dict[str, Mapping[str, Any]]:
+        """Return the session's own streams, with the options of the sensor ``live``."""
+        forecast = {"output": "forecast", "channels": list(self.channels), "steps": list(steps), "unit": self.unit}
+        levels = {"quantiles": list(self.quantiles)} if self.quantiles else {}
+        return {
+            "forecast": {**forecast, **levels},
+            "alarm": {"output": "alarm", "alarms": list(NAMES)},
+            "latency": {"output": "latency"},
+        }
+
+
+@dataclass(frozen=True)
+class Surfaces:
+    """The materials that the model names."""
+
+    names: tuple[str, ...]
+    kind: ClassVar[str] = "material"
+
+    def own(self, steps: Sequence[int]) -> dict[str, Mapping[str, Any]]:
+        """Return the session's own streams, with the options of the sensor ``live``."""
+        return {"material": {"output": "material", "channels": list(self.names)}, "latency": {"output": "latency"}}
+
+
+@dataclass(frozen=True)
+class Grasped:
+    """What the model predicts of a grasp."""
+
+    columns: tuple[str, ...]
+    kind: ClassVar[str] = "touch"
+
+    def own(self, steps: Sequence[int]) -> dict[str, Mapping[str, Any]]:
+        """Return the session's own streams, with the options of the sensor ``live``."""
+        return {"touch": {"output": "touch", "channels": list(self.columns)}, "latency": {"output": "latency"}}
 
 
 def described(model: Path) -> tuple[Described | Surfaces | Grasped, str]:

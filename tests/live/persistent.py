@@ -21,9 +21,9 @@ from tacpipe.errors import UsageError
 from tacpipe.live import process, supervisor
 from tacpipe.live.alarms import Alarms
 from tacpipe.live.chain import Beginning, Cause, Forecast
+from tacpipe.live.description import Described
 from tacpipe.live.engine import Engine
 from tacpipe.live.options import Options
-from tacpipe.live.session import Described
 from tacpipe.recording import rig as rigs
 from tacpipe.signals.loads import axes
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tacpipe.live.session import Described, Surfaces
+from tacpipe.live.description import Described, Surfaces
 from tests.conftest import Lab
 
 RIG = Path(__file__).parents[2] / "rigs/first-paper.toml"

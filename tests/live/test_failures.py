@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tacpipe.live.session import free_ports
+from tacpipe.live.own_streams import free_ports
 from tacpipe.live.supervisor import DIED, RESTARTED
 from tacpipe.simulation.emulation.byte_faults import Faults
 from tests.conftest import Lab

@@ -15,7 +15,7 @@ import tacpipe
 from tacpipe.clouds import ply
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
-from tacpipe.live.session import free_ports
+from tacpipe.live.own_streams import free_ports
 from tacpipe.live.supervisor import DIED, RESTARTED
 from tacpipe.live.touch_messages import COLUMNS
 from tests.conftest import Lab
