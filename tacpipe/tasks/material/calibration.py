@@ -17,7 +17,7 @@ from tacpipe.tasks.material.readouts import config_file
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
     from tacpipe.tasks.calibrated import Asked
-    from tacpipe.tasks.material.slides import Slides
+    from tacpipe.tasks.material.slides import BySensor, Slides
 
 
 def calibrate(model: Mapping[str, bytes], asked: Asked, training: Dataset, validation: Dataset) -> dict[str, bytes]:
@@ -65,7 +65,7 @@ def _of_classes(classifier: Classifier, slides: Slides, held: set[int]) -> Slide
     return slides.some(np.isin(slides.materials, [one for one in classifier.classes if one not in held]))
 
 
-def _check(classifier: Classifier, learned: Mapping[str, Slides], watched: Mapping[str, Slides]) -> None:
+def _check(classifier: Classifier, learned: BySensor, watched: BySensor) -> None:
     """Refuse sensors without slides, and validation slides that the model learned from."""
     for part, role in ((learned, "train"), (watched, "val")):
         missing = sorted(set(classifier.layouts) - set(part))

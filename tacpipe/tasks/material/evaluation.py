@@ -21,9 +21,9 @@ from tacpipe.tasks.material import headline as headlines
 from tacpipe.tasks.material import metrics, naming
 from tacpipe.tasks.material.classifier import CONFIG, MEAN_LEVEL, Classifier, NetworkReader, ReaderOutput, SpectraReader
 from tacpipe.tasks.material.metrics import LAST_EPOCH, MODEL, SWAPPED, Tree
+from tacpipe.tasks.material.network_training import HISTORY
 from tacpipe.tasks.material.params import XLSTM, Raec
 from tacpipe.tasks.material.slides import Slides
-from tacpipe.tasks.material.training import HISTORY
 from tacpipe.tasks.material.unknown import Answers
 
 if TYPE_CHECKING:

@@ -32,9 +32,8 @@ from tacpipe.tasks.material.estimators import Fitted
 from tacpipe.tasks.material.estimators import packed as packed_estimators
 from tacpipe.tasks.material.naming import Naming
 from tacpipe.tasks.material.params import Estimator, Minirocket, Params, Spectra, Statistics
-from tacpipe.tasks.material.slides import Slides
+from tacpipe.tasks.material.slides import BySensor, Slides
 
-BySensor = Mapping[str, Slides]
 Arrays = dict[str, np.ndarray]
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -77,6 +77,9 @@ class Slides:
             tuple(self.digests[i] for i in at),
             self.speeds_m_s[at],
         )
+
+
+BySensor = Mapping[str, Slides]
 
 
 def read(

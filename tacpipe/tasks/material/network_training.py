@@ -1,0 +1,293 @@
+"""Train networks that name materials: one a sensor, alone or jointly, or aligned to one that is frozen."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import torch
+from safetensors.torch import save as save_tensors
+from torch import nn
+
+from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.models import headers
+from tacpipe.models.level import Level
+from tacpipe.models.recurrent_autoencoder import Shape
+from tacpipe.printable import listed
+from tacpipe.tasks.material import held_out, networks, readouts
+from tacpipe.tasks.material.classifier import (
+    BASELINES,
+    CONFIG,
+    LAST,
+    MEAN_LEVEL,
+    PERMUTED_LABELS,
+    WEIGHTS,
+    Classifier,
+    Config,
+    NetworkReader,
+)
+from tacpipe.tasks.material.losses import JointWork, ScaledSlides, Weights
+from tacpipe.tasks.material.naming import Naming
+from tacpipe.tasks.material.pairs import NONE, Pairs, permuted_classes
+from tacpipe.tasks.material.params import Network as NetworkParams
+from tacpipe.tasks.material.params import Params, Raec
+from tacpipe.tasks.material.slides import BySensor, Slides
+from tacpipe.tasks.seen import seen
+from tacpipe.training import devices, loop
+from tacpipe.training.scaling import Affine
+
+HISTORY = "history.jsonl"
+RAEC = "raec"
+MAPPED_RECONSTRUCTION = 0.05  # weight of a network that is aligned to a frozen one: that of the published script
+
+
+def train(
+    params: NetworkParams,
+    config: Config,
+    known: BySensor,
+    watched: BySensor,
+    workspace: Path,
+    init: Mapping[str, bytes] | None,
+) -> dict[str, bytes]:
+    """Return the files of networks, one a sensor, trained on ``known`` slides and chosen on those ``watched``.
+
+    ``config`` is completed. Raises `TacpipeError` where a sensor has no slide to choose by or, learned jointly, lacks
+    materials, and `UsageError` for a model to begin with that does not fit.
+    """
+    missing = sorted(set(known) - set(watched))
+    if missing:
+        raise TacpipeError(
+            f"No recording of {missing[0]} has the role val, and a network is chosen by its validation slides. "
+            f"Make a split that has some of every sensor."
+        )
+    device = devices.kind()
+    start = Classifier.load(init) if init else None
+    joint = isinstance(params, Raec) and params.joint and len(known) > 1
+    mapped_to = frozen(params)
+    if joint:
+        _same_materials(known, Naming.from_json(config))
+    kinds = headers.chosen(params.headers, {name: len(some.layout.channels) for name, some in known.items()})
+    shapes = {name: _shape(params, some, kinds[name], len(config["classes"])) for name, some in known.items()}
+    scalings = {name: Affine.fit(some.frames, params.scaling) for name, some in known.items()}
+    held = held_out.materials(params.hold_out, config["classes"], known, Naming.from_json(config))
+    if start:
+        _same_space(start, mapped_to, config, known)
+        shapes[mapped_to] = Shape(**start.config["shapes"][mapped_to])
+        scalings[mapped_to] = _reader(start, mapped_to).scaling
+        config["trained_on"] = seen(config["trained_on"], start.config["trained_on"])
+    learned, chosen_on = (
+        {
+            name: _scaled(params, config, some, scalings[name], held, device, place)
+            for place, (name, some) in enumerate(part.items())
+        }
+        for part in (known, watched)
+    )
+    partners = _partners(params, len(config["classes"]))
+    config |= _described(config["classes"], shapes, scalings, held, partners, joint=joint)
+    pairs = _pairs(params, learned, partners)
+    work = JointWork(learned, chosen_on, pairs, _weights(params, joint), mapped_to, params.drop_last)
+
+    def build() -> nn.Module:
+        made = _built(params, shapes, start, mapped_to).to(device)
+        for name, network in made.items():
+            networks.check(network, params, learned[name].frames, shapes[name].classes)
+        return made
+
+    trained = loop.train(build, work, _schedule(params), workspace)
+    config["validation"] = _validation(trained.history, work.joint)
+    files = _files(trained, config, params)
+    if params.baselines:
+        files[BASELINES] = _network_baselines(Classifier.load(files), known, params)
+    return files
+
+
+def frozen(params: Params) -> str:
+    """Return the sensor whose network is frozen; the empty text where none is."""
+    return params.frozen_sensor if isinstance(params, Raec) else ""
+
+
+def _partners(params: NetworkParams, classes: int) -> dict[int, int] | None:
+    """Return the class that each is paired with across sensors, where that is another one."""
+    if isinstance(params, Raec) and params.pairing == "permuted":
+        return permuted_classes(range(classes), params.seed)
+    return None
+
+
+def _described(
+    classes: Sequence[int],
+    shapes: Mapping[str, Shape],
+    scalings: Mapping[str, Affine],
+    held: Mapping[str, set[int]],
+    partners: Mapping[int, int] | None,
+    *,
+    joint: bool,
+) -> dict[str, Any]:
+    """Return what the description of a model states of networks."""
+    found: dict[str, Any] = {
+        "shapes": {name: dataclasses.asdict(shape) for name, shape in shapes.items()},
+        "scaling": {
+            name: {key: value.tolist() for key, value in one.to_tensors().items()} for name, one in scalings.items()
+        },
+        "joint": joint,
+        "held_out": {name: sorted(materials) for name, materials in held.items()},
+    }
+    if partners is not None:
+        found["partners"] = {str(classes[one]): classes[other] for one, other in sorted(partners.items())}
+    return found
+
+
+def _files(trained: loop.Trained, config: Config, params: NetworkParams) -> dict[str, bytes]:
+    """Return the files of trained networks: the weights that were selected, and the last ones next to them."""
+    best, last = (trained.weights, trained.last) if params.select == "best" else (trained.last, trained.weights)
+    files = {CONFIG: readouts.config_file(config), WEIGHTS: save_tensors(best), HISTORY: trained.history_lines}
+    if params.select == "best":
+        files[LAST] = save_tensors(last)
+    return files
+
+
+def _pairs(params: NetworkParams, slides: Mapping[str, ScaledSlides], partners: Mapping[int, int] | None) -> Pairs:
+    return Pairs(
+        {name: some.classes.cpu() for name, some in slides.items()},
+        params.batch,
+        pairing=params.pairing if isinstance(params, Raec) else Pairs.pairing,
+        shuffle=params.shuffle,
+        drop_last=params.drop_last,
+        subsample_sensor=params.subsample_sensor,
+        subsample_percent=params.subsample_percent,
+        partners=partners,
+        seed=params.seed,
+    )
+
+
+def _schedule(params: NetworkParams) -> loop.Schedule:
+    return loop.Schedule(
+        epochs=params.epochs,
+        batch=params.batch,
+        learning_rate=params.learning_rate,
+        patience=params.patience or params.epochs,
+        gradient_clip=math.inf,
+        seed=params.seed,
+        cycle=params.cycle,
+        precision=params.precision,
+    )
+
+
+def _shape(params: NetworkParams, some: Slides, header: str, classes: int) -> Shape:
+    shape = Shape(channels=len(some.layout.channels), classes=classes, header=header, hidden=params.hidden)
+    if not isinstance(params, Raec):
+        return shape
+    return dataclasses.replace(
+        shape, decoder=params.decoder, latents=params.latents, unpool=params.unpool, dropout=params.dropout
+    )
+
+
+def _scaled(
+    params: NetworkParams,
+    config: Config,
+    some: Slides,
+    scaled: Affine,
+    held: Mapping[str, set[int]],
+    device: str,
+    place: int,
+) -> ScaledSlides:
+    """Return slides as networks read them; what is held out or not among the training slides' classes has no label."""
+    name = some.layout.sensor
+    numbers = {material: number for number, material in enumerate(config["classes"]) if material not in held[name]}
+    materials = readouts.permuted(params, some.materials, place)
+    classes = torch.tensor([numbers.get(int(material), NONE) for material in materials])
+    if not (classes != NONE).any():
+        raise TacpipeError(f"hold_out leaves {name} no material to learn; leave at least one.")
+    return ScaledSlides(torch.from_numpy(scaled.apply(some.frames)).to(device), classes.to(device))
+
+
+def _same_materials(known: BySensor, naming: Naming) -> None:
+    """Refuse joint learning where a sensor lacks a material that another has."""
+    materials = {name: {int(one) for one in some.materials} for name, some in known.items()}
+    every = set().union(*materials.values())
+    for name, own in materials.items():
+        if own != every:
+            lacking = ", ".join(map(naming.name, sorted(every - own)))
+            raise TacpipeError(
+                f"{name} has no training slide of {naming.key} {lacking}, which other sensors have, so they cannot be "
+                f"learned jointly. Exclude those slides, record the material, or train with --no-joint."
+            )
+
+
+def _same_space(start: Classifier, known: str, config: Config, slides: BySensor) -> None:
+    """Refuse a model of --init that does not know the sensor or the same materials."""
+    if known not in slides:
+        raise UsageError(f"frozen_sensor is {known}; the recordings are of {', '.join(slides)}.")
+    if start.architecture != RAEC:
+        raise TacpipeError(
+            f"The model of --init is of the architecture {start.architecture}; its space must be of {RAEC}."
+        )
+    start.check(slides[known])
+    if list(start.classes) != config["classes"] or start.naming != Naming.from_json(config):
+        raise TacpipeError(
+            f"The model of --init names {listed(map(start.naming.name, start.classes))} and the recordings have "
+            f"{listed(map(Naming.from_json(config).name, config['classes']))}; "
+            f"a known space is that of the same ones."
+        )
+
+
+def _reader(start: Classifier, sensor: str) -> NetworkReader:
+    reader = start.readers[sensor]
+    assert isinstance(reader, NetworkReader)
+    return reader
+
+
+def _weights(params: NetworkParams, joint: bool) -> Weights:
+    if not isinstance(params, Raec):
+        return Weights(alignment=0.0)
+    return Weights(
+        reconstruction=MAPPED_RECONSTRUCTION if params.frozen_sensor else params.reconstruction_weight,
+        classification=params.classification_weight,
+        alignment=params.alignment_weight if joint else 0.0,
+        align_from=params.align_from,
+        alignment_loss=params.alignment_loss,
+    )
+
+
+def _built(params: NetworkParams, shapes: Mapping[str, Shape], start: Classifier | None, frozen: str) -> nn.ModuleDict:
+    """Return the networks by sensor; that of ``frozen`` is taken over and frozen, with its classifier in all others."""
+    built = nn.ModuleDict({name: cast(nn.Module, networks.build(params, one)) for name, one in shapes.items()})
+    if start:
+        known = _reader(start, frozen).network
+        for name, network in built.items():
+            if name == frozen:
+                network.load_state_dict(known.state_dict())
+                network.requires_grad_(False)
+            else:
+                network.get_submodule("classifier").load_state_dict(known.classifier.state_dict())
+                network.get_submodule("classifier").requires_grad_(False)
+    return built
+
+
+def _validation(history: Sequence[loop.Line], joint: bool) -> dict[str, Any]:
+    """Return the epoch that each sensor's weights are of, and its accuracy there."""
+
+    def chosen(sensor: str) -> loop.Line:
+        of = list(history[0]["val"]) if joint else [sensor]
+        return max(history, key=lambda line: (sum(line["val"][one]["accuracy"] for one in of), line["epoch"]))
+
+    found = {sensor: chosen(sensor) for sensor in history[0]["val"]}
+    return {
+        "epoch": {sensor: line["epoch"] for sensor, line in found.items()},
+        "accuracy": {sensor: line["val"][sensor]["accuracy"] for sensor, line in found.items()},
+    }
+
+
+def _network_baselines(trained: Classifier, known: BySensor, params: Params) -> bytes:
+    """Return the mean-level baseline, and a readout of the networks' own latents fitted to shuffled labels."""
+    found: dict[str, np.ndarray] = {}
+    for place, (name, some) in enumerate(known.items()):
+        latents = trained.readers[name].read(some.frames).latents
+        assert latents is not None
+        shuffled = np.random.default_rng([params.seed, 3, place]).permutation(some.materials)
+        found |= readouts.stored(MEAN_LEVEL, name, Level.fit(some.frames, some.materials))
+        found |= readouts.stored(PERMUTED_LABELS, name, Level.fit(latents[:, None], shuffled))
+    return readouts.packed(found)
