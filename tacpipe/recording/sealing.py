@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
-import numpy as np
-
-from tacpipe.arrays import Int64s, Times
 from tacpipe.errors import TacpipeError
 from tacpipe.recording.decoded import UNCERTAIN as UNCERTAIN
 from tacpipe.recording.decoded import Decoded, Stamping
 from tacpipe.recording.ending import COMPLETED
-from tacpipe.recording.pace import MOST_CATCH_UP_NS, parsed
 from tacpipe.recording.reading import SILENT, SILENT_PERIODS, Batch, Event, Reading
 from tacpipe.recording.rig import Rig
 from tacpipe.recording.spool_blocks import Note
 from tacpipe.recording.spooled import Spooled
+from tacpipe.recording.stalls import Stalls
 from tacpipe.recording.station import CAUGHT_UP, LOST, OPENED, OVERRUN, STALLED
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Sensor
@@ -54,48 +51,6 @@ class Sealed:
         return self.batches().read_all()
 
 
-class _Stalls:
-    """Where this program was held up while it recorded a stream, and what that did to stamps."""
-
-    def __init__(self) -> None:
-        self._windows: list[tuple[int, int, int]] = []  # stamps from, to, and when the link was last known to be empty
-        self._suspended: list[tuple[int, int]] = []  # stamps from, and for how long the clock had stood still
-
-    def take(self, note: Note) -> Event | None:
-        """Take a note; return the event of one that gives a stall."""
-        stall = parsed(note.detail) if note.what == STALLED else None
-        if note.what == CAUGHT_UP and self._windows:
-            begin_ns, end_ns, empty_ns = self._windows[-1]
-            self._windows[-1] = begin_ns, min(end_ns, note.t_ns), empty_ns
-        if stall is None:
-            return None
-        if stall.late_ns:
-            self._windows.append((note.t_ns, note.t_ns + MOST_CATCH_UP_NS, note.t_ns - stall.late_ns))
-        self._suspended += [(note.t_ns, stall.suspended_ns)] if stall.suspended_ns else []
-        facts = [f"nothing was read for {stall.lasted_ns / 1e9:.3f} s"]
-        facts += (
-            [f"the computer was suspended for {stall.suspended_ns / 1e9:.3f} s of it"] if stall.suspended_ns else []
-        )
-        facts += [f"what came meanwhile is stamped up to {stall.late_ns / 1e9:.3f} s late"] if stall.late_ns else []
-        return Event(note.t_ns, STALLED, detail="; ".join(facts))
-
-    def __bool__(self) -> bool:
-        """Whether any stamp may be late."""
-        return bool(self._windows)
-
-    def uncertain_ns(self, t_ns: Times) -> Int64s:
-        """Return by how much samples may have come earlier than these stamps (sample,); 0 where they are certain."""
-        found = np.zeros_like(t_ns)
-        for begin_ns, end_ns, empty_ns in self._windows:
-            rows = (t_ns >= begin_ns) & (t_ns < end_ns)
-            found[rows] = t_ns[rows] - empty_ns
-        return found
-
-    def awake_ns(self, t_ns: Any) -> Any:
-        """Return stamps with the time added for which the computer was suspended before them."""
-        return t_ns + sum((t_ns >= since_ns) * lasted_ns for since_ns, lasted_ns in self._suspended)
-
-
 def seal(spooled: Spooled, rig: Rig) -> dict[str, Sealed]:
     """Return every stream of a spool."""
     from tacpipe.io.spill import Spill
@@ -114,40 +69,11 @@ def stream(spooled: Spooled, rig: Rig, name: str, end_ns: int = 0, spill: Spill 
     from tacpipe.io.spill import Spill
 
     sensor = rig.streams[name].sensor
-    reading, stalls = Reading(sensor), _Stalls()
-    decoded, events = Decoded(sensor.fields(), spill or Spill(IN_MEMORY)), list[Event]()
-
-    def add(batch: Batch) -> None:
-        events.extend(batch.events)
-        decoded.add(batch)
-
-    chunks = size = undecoded = 0
-    away = False
-    for block in _gathered(spooled, name):
-        if isinstance(block, Note):
-            away |= block.what == LOST
-            if block.what == LOST:
-                add(reading.broken())
-            if block.what in (STALLED, CAUGHT_UP):
-                stall = stalls.take(block)
-                events += [] if stall is None else [stall]
-            elif block.what != OPENED or away:  # that it opened before it was recorded is not an event
-                events.append(_event_of(block, sensor))
-            continue
-        chunks += len(block.size)
-        size += len(block.data)
-        try:
-            add(reading.feed(block))
-        except Exception as error:  # of a driver: the other streams, and what came before and after, are sealed
-            undecoded += len(block.data)
-            why = str(error) if isinstance(error, TacpipeError) else f"{type(error).__name__}: {error}"
-            events.append(Event(int(block.t_ns[-1]), UNDECODED, bytes=len(block.data), detail=why))
-            reading = Reading(sensor)
-        decoded.put_aside()
-    add(reading.finish())
+    decoded, stalls = Decoded(sensor.fields(), spill or Spill(IN_MEMORY)), Stalls()
+    read = _read(_gathered(spooled, name), sensor, decoded, stalls)
     last_ns = decoded.last_ns if decoded.count else end_ns
-    events += _silent_end(sensor, last_ns, end_ns)
-    crashed = _crashed(spooled, name, chunks, size)
+    events = read.events + _silent_end(sensor, last_ns, end_ns)
+    crashed = _crashed(spooled, name, read.chunks, read.bytes)
     if crashed[0]:
         last_ns, detail = spooled.tallied()[name].last_ns, f"{crashed[0]} reads were never written"
         events.append(Event(last_ns, CRASH, bytes=crashed[1], detail=detail))
@@ -160,11 +86,55 @@ def stream(spooled: Spooled, rig: Rig, name: str, end_ns: int = 0, spill: Spill 
         (stamping.utc_ns(decoded.first_ns), stamping.utc_ns(decoded.last_ns)) if decoded.count else None,
         events,
         sum(event.frames for event in events),
-        received=size,
-        undecoded=undecoded,
+        received=read.bytes,
+        undecoded=read.undecoded,
         crashed=crashed,
         uncertain=late,
     )
+
+
+@dataclass
+class _Read:
+    """What was read of a stream next to its samples."""
+
+    events: list[Event] = field(default_factory=list)
+    chunks: int = 0
+    bytes: int = 0
+    undecoded: int = 0  # bytes of them
+
+
+def _read(blocks: Iterable[Chunks | Note], sensor: Sensor, decoded: Decoded, stalls: Stalls) -> _Read:
+    """Decode the blocks of a stream: samples go to ``decoded``, what held the program up to ``stalls``."""
+    found, reading = _Read(), Reading(sensor)
+
+    def add(batch: Batch) -> None:
+        found.events.extend(batch.events)
+        decoded.add(batch)
+
+    away = False
+    for block in blocks:
+        if isinstance(block, Note):
+            away |= block.what == LOST
+            if block.what == LOST:
+                add(reading.broken())
+            if block.what in (STALLED, CAUGHT_UP):
+                stall = stalls.take(block)
+                found.events += [] if stall is None else [stall]
+            elif block.what != OPENED or away:  # that it opened before it was recorded is not an event
+                found.events.append(_event_of(block, sensor))
+            continue
+        found.chunks += len(block.size)
+        found.bytes += len(block.data)
+        try:
+            add(reading.feed(block))
+        except Exception as error:  # of a driver: the other streams, and what came before and after, are sealed
+            found.undecoded += len(block.data)
+            why = str(error) if isinstance(error, TacpipeError) else f"{type(error).__name__}: {error}"
+            found.events.append(Event(int(block.t_ns[-1]), UNDECODED, bytes=len(block.data), detail=why))
+            reading = Reading(sensor)
+        decoded.put_aside()
+    add(reading.finish())
+    return found
 
 
 def _crashed(spooled: Spooled, name: str, chunks: int, size: int) -> tuple[int, int]:

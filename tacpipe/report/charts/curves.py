@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -47,81 +47,107 @@ def lines(
     Charts with the same ``order`` of names give a name the same colour.
     """
     names = list(order) or list(dict.fromkeys(one.name for one in several if not one.thin))
-    held = [name for name in names if any(one.name == name for one in several)]
     values = [row for number, one in enumerate(several) for row in _rows(one, number)]
-    scale: Spec = {"zero": False, **({"type": "log"} if log else {})}
-    if floor is not None:
-        described = [row[key] for row in values for key in ("y", "low", "high") if row.get(key) is not None]
-        scale["domain"] = [max(floor, min([0.0, *described])), max([0.05, *described])]
-    across: Spec = {"zero": False, "nice": False}
-    if diagonal:  # what lies on its ends is drawn whole
-        room = ROOM * (diagonal[1] - diagonal[0])
-        scale |= {"nice": False, "domain": [short(diagonal[0] - room), short(diagonal[1] + room)]}
-        across["domain"] = scale["domain"]
-    colour: Spec = {
-        "field": "name",
-        "type": "nominal",
-        "scale": {"domain": held, "range": [COLOURS[names.index(name) % len(COLOURS)] for name in held]},
-        "legend": legend_of(len(held)),
-    }
+    across, up = _scales(values, log=log, floor=floor, diagonal=diagonal)
     base: Spec = {
         "x": {"field": "x", "type": "quantitative", "title": x, "scale": across},
-        "y": {"field": "y", "type": "quantitative", "title": y, "scale": scale},
-        "color": colour,
+        "y": {"field": "y", "type": "quantitative", "title": y, "scale": up},
+        "color": _colour(names, {one.name for one in several}),
         "detail": {"field": "run", "type": "nominal"},
-        "opacity": {"condition": {"param": "shown", "value": 1, "empty": True}, "value": 0.07},
+        "opacity": _opacity(1, 0.07),
     }
-    mark: Spec = {"type": "line", "clip": True, "strokeWidth": {"expr": "datum.thin ? 0.6 : 1.8"}}
-    layers: list[Spec] = []
-    if shade:
-        span = {
-            "data": {"values": [{"a": shade[0], "b": shade[1]}]},
-            "mark": {"type": "rect", "opacity": 0.12, "fill": INK},
-        }
-        layers.append({**span, "encoding": {"x": {"field": "a", "type": "quantitative"}, "x2": {"field": "b"}}})
-    if diagonal:
-        layers.append(diagonal_of(diagonal))
-    if level:
-        rule = {"type": "rule", "stroke": QUIET, "strokeDash": [4, 3], "strokeWidth": 1.5, "tooltip": level[0]}
-        layers.append({"data": {"values": [{"y": level[1]}]}, "mark": rule, "encoding": {"y": y_of("y")}})
-    if any(one.low is not None for one in several):
-        band = {**base, "y": {**base["y"], "field": "low"}, "y2": {"field": "high"}}
-        band["opacity"] = {"condition": {"param": "shown", "value": 0.16, "empty": True}, "value": 0.02}
-        band.pop("detail")
-        # bands are drawn of what has bounds alone
-        layers.append(
-            {"transform": [{"filter": "isValid(datum.low)"}], "mark": {"type": "area", "clip": True}, "encoding": band}
-        )
-    tip = [tip_of("name", ""), tip_of("x", x), tip_of("y", y)]
-    params: list[Spec] = [
+    layers = [
+        *([_span(shade)] if shade else []),
+        *([diagonal_of(diagonal)] if diagonal else []),
+        *([_rule(*level)] if level else []),
+        *([_bands(base)] if any(one.low is not None for one in several) else []),
+        *(_strokes(base, thin=thin) for thin in (True, False) if any(one.thin is thin for one in several)),
+    ]
+    if points:
+        layers.append(_dots(base))
+    layers[-1]["params"] = [
         {"name": "shown", "select": {"type": "point", "fields": ["name"]}, "bind": "legend"},
         *([] if log else [zoom()]),
     ]
-    for thin in (True, False):
-        chosen = [{"filter": f"datum.thin === {str(thin).lower()}"}]
-        if any(one.thin is thin for one in several):
-            drawn = {**mark, "strokeWidth": 0.7 if thin else 1.9}
-            encoding = {**base, "strokeDash": {"field": "dashed", "type": "nominal", "legend": None,
-                                               "scale": {"domain": [False, True], "range": [[1, 0], [5, 3]]}}}  # fmt: skip
-            layer: Spec = {"transform": chosen, "mark": drawn, "encoding": encoding}
-            if thin:
-                encoding["opacity"] = {"condition": {"param": "shown", "value": 0.4, "empty": True}, "value": 0.03}
-            layers.append(layer)
-    if points:
-        dots = {**base, "tooltip": tip}
-        dots.pop("detail")
-        layers.append(
-            {
-                "transform": [{"filter": "datum.thin === false"}],
-                "params": params,
-                "mark": {"type": "circle", "size": 28, "clip": True},
-                "encoding": dots,
-            }
-        )
-    else:
-        layers[-1]["params"] = params
-        layers[-1]["encoding"]["tooltip"] = tip
+    layers[-1]["encoding"]["tooltip"] = [tip_of("name", ""), tip_of("x", x), tip_of("y", y)]
     return {"data": {"values": values}, "height": height, "layer": layers}
+
+
+def _scales(values: Sequence[Spec], *, log: bool, floor: float | None, diagonal: Sequence[float]) -> tuple[Spec, Spec]:
+    """Return the scales of x and y."""
+    across: Spec = {"zero": False, "nice": False}
+    up: Spec = {"zero": False, **({"type": "log"} if log else {})}
+    if floor is not None:
+        described = [row[key] for row in values for key in ("y", "low", "high") if row.get(key) is not None]
+        up["domain"] = [max(floor, min([0.0, *described])), max([0.05, *described])]
+    if diagonal:  # what lies on its ends is drawn whole
+        room = ROOM * (diagonal[1] - diagonal[0])
+        up |= {"nice": False, "domain": [short(diagonal[0] - room), short(diagonal[1] + room)]}
+        across["domain"] = up["domain"]
+    return across, up
+
+
+def _colour(names: Sequence[str], drawn: Container[str]) -> Spec:
+    """Return the colours of the names that are drawn, each by its place among all."""
+    held = [name for name in names if name in drawn]
+    colours = [COLOURS[names.index(name) % len(COLOURS)] for name in held]
+    return {
+        "field": "name",
+        "type": "nominal",
+        "scale": {"domain": held, "range": colours},
+        "legend": legend_of(len(held)),
+    }
+
+
+def _opacity(shown: float, hidden: float) -> Spec:
+    """Return the opacity of what is chosen in the legend, all where nothing is, and of the rest."""
+    return {"condition": {"param": "shown", "value": shown, "empty": True}, "value": hidden}
+
+
+def _span(shade: tuple[float, float]) -> Spec:
+    return {
+        "data": {"values": [{"a": shade[0], "b": shade[1]}]},
+        "mark": {"type": "rect", "opacity": 0.12, "fill": INK},
+        "encoding": {"x": {"field": "a", "type": "quantitative"}, "x2": {"field": "b"}},
+    }
+
+
+def _rule(name: str, at: float) -> Spec:
+    mark = {"type": "rule", "stroke": QUIET, "strokeDash": [4, 3], "strokeWidth": 1.5, "tooltip": name}
+    return {"data": {"values": [{"y": at}]}, "mark": mark, "encoding": {"y": y_of("y")}}
+
+
+def _bands(base: Spec) -> Spec:
+    """Return the layer of bands, of what has bounds."""
+    encoding = {name: value for name, value in base.items() if name != "detail"}
+    encoding |= {"y": {**base["y"], "field": "low"}, "y2": {"field": "high"}, "opacity": _opacity(0.16, 0.02)}
+    return {
+        "transform": [{"filter": "isValid(datum.low)"}],
+        "mark": {"type": "area", "clip": True},
+        "encoding": encoding,
+    }
+
+
+def _strokes(base: Spec, *, thin: bool) -> Spec:
+    """Return the layer of lines: of single runs where ``thin``, else of all others."""
+    dashes = {"domain": [False, True], "range": [[1, 0], [5, 3]]}
+    encoding = {**base, "strokeDash": {"field": "dashed", "type": "nominal", "legend": None, "scale": dashes}}
+    if thin:
+        encoding["opacity"] = _opacity(0.4, 0.03)
+    return {
+        "transform": [{"filter": f"datum.thin === {str(thin).lower()}"}],
+        "mark": {"type": "line", "clip": True, "strokeWidth": 0.7 if thin else 1.9},
+        "encoding": encoding,
+    }
+
+
+def _dots(base: Spec) -> Spec:
+    """Return the layer of points, which a pointer finds."""
+    return {
+        "transform": [{"filter": "datum.thin === false"}],
+        "mark": {"type": "circle", "size": 28, "clip": True},
+        "encoding": {name: value for name, value in base.items() if name != "detail"},
+    }
 
 
 def decimated(x: Floats, y: Floats, count: int = POINTS) -> tuple[Floats, Floats]:
