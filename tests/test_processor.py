@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from tacpipe.engine import processor, provenance
+from tacpipe.errors import UsageError
 
 CPUINFO = """processor\t: 0
 model name\t: Zen 4
@@ -89,3 +90,23 @@ def test_each_of_several_processes_gets_its_part_of_the_cores_unless_the_environ
 
     monkeypatch.setenv("OMP_NUM_THREADS", "3")
     assert processor.each_of(2) == {}
+
+
+def test_a_command_starts_as_many_processes_as_the_environment_states_else_one_a_core(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(processor, "usable_cores", lambda: 8)
+    monkeypatch.delenv(processor.JOBS, raising=False)
+    assert processor.jobs() == 8
+    assert [processor.jobs_of(commands) for commands in (1, 3, 16)] == [{processor.JOBS: n} for n in ("8", "2", "1")]
+
+    monkeypatch.setenv(processor.JOBS, "3")
+    assert processor.jobs() == 3
+    assert processor.jobs_of(2) == {}
+
+
+@pytest.mark.parametrize("stated", ["0", "-1", "two", "1.5"])
+def test_a_number_of_processes_that_is_none_is_refused(stated: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(processor.JOBS, stated)
+    with pytest.raises(UsageError, match=f"TACPIPE_JOBS is '{stated}'"):
+        processor.jobs()

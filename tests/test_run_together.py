@@ -93,6 +93,21 @@ def test_each_process_gets_its_part_of_the_cores(lab: Lab, monkeypatch: pytest.M
     assert "OMP_NUM_THREADS" not in os.environ
 
 
+def test_commands_that_begin_together_share_the_cores_and_one_alone_has_them_all(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(processor, "usable_cores", lambda: 8)
+    monkeypatch.delenv(processor.JOBS, raising=False)
+    shown = {name: {"cmd": f"echo $TACPIPE_JOBS > {name}"} for name in ("first", "second", "last")}
+    shown["first"]["cmd"] = f"touch a && {WAITS.format('b', 'b')}; echo $TACPIPE_JOBS > first"
+    shown["second"]["cmd"] = f"touch b && {WAITS.format('a', 'a')}; echo $TACPIPE_JOBS > second"
+    outs: dict[str, dict[str, object]] = {name: {**stage, "outs": [name]} for name, stage in shown.items()}
+    written({**outs, "last": {**outs["last"], "deps": ["first", "second"]}})
+    lab.run("run dvc.yaml --jobs 4")
+
+    assert [Path(name).read_text() for name in shown] == ["4\n", "4\n", "8\n"]
+
+
 @pytest.mark.long
 def test_an_interrupt_ends_all_stages_at_work(lab: Lab) -> None:
     work = "import os, pathlib, time; pathlib.Path('pid-{n}').write_text(str(os.getpid())); time.sleep(600)"

@@ -14,7 +14,7 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -139,8 +139,11 @@ class _Together:
 
     def _ready(self) -> ChainStage | None:
         """Return the next stage of which everything that it depends on is done."""
+        return next(self._ready_stages(), None)
+
+    def _ready_stages(self) -> Iterator[ChainStage]:
         done = self.became.keys()
-        return next((stage for stage in self._waiting if self._chain.after[stage.name] <= done), None)
+        return (stage for stage in self._waiting if self._chain.after[stage.name] <= done)
 
     def _advance(self, stage: ChainStage, commands: list[str], became: Became) -> None:
         """Go through the commands of a stage up to the first that has something to do, and start that one."""
@@ -151,7 +154,8 @@ class _Together:
                 continue
             self._announce(f"{stage.name} begins: {command}")
             self._at_work[stage.name] = stage, commands
-            self._processes.start(stage.name, command if words is None else words[1:])
+            together = min(self._processes.jobs, len(self._at_work) + sum(1 for _ in self._ready_stages()))
+            self._processes.start(stage.name, command if words is None else words[1:], together)
             return
         self.became[stage.name] = became
 

@@ -28,7 +28,16 @@ if TYPE_CHECKING:
     from multiprocessing.context import ForkServerProcess as Process
 
 Command = str | Sequence[str]  # a text for the shell, or the words of a command of tacpipe without its name
-MODULES = ("tacpipe.cli.main", "tacpipe.cli.stages", "tacpipe.engine.pipeline", "tacpipe.io.parquet")
+MODULES = (
+    *(
+        "tacpipe.cli.main",
+        "tacpipe.cli.commands",
+        "tacpipe.cli.stages",
+        "tacpipe.engine.pipeline",
+        "tacpipe.io.parquet",
+    ),
+    *("yaml", "pydantic.type_adapter", "pandas"),  # by params, by typer, and by pyarrow where it converts a column
+)
 _LEARNS = re.compile(r"\btacpipe (train|evaluate|predict|compress autoencoder) ")
 
 
@@ -45,12 +54,13 @@ def modules(commands: Iterable[str]) -> tuple[str, ...]:
 class StageProcesses:
     """At most ``jobs`` commands at the same time, in the block of a ``with``; what still runs at its end is interrupted.
 
-    Each computes with as many threads as there are cores for each, unless the environment states another number.
+    Each computes with as many threads as there are cores for each, unless the environment states another number, and on as
+    many recordings at a time as there are cores for those that begin together.
     """
 
     def __init__(self, jobs: int, folder: Path, modules: Sequence[str]) -> None:
         """Take how many, 0 for one a usable core, a folder for what they print, and the modules that they import."""
-        self.jobs = jobs or processor.usable_cores()
+        self.jobs = jobs or processor.jobs()
         self._folder, self._modules = folder, modules
         self._running: dict[str, Process] = {}  # by the name of the stage
         self._context: ForkServerContext | None = None
@@ -78,13 +88,14 @@ class StageProcesses:
         """Whether a command runs."""
         return bool(self._running)
 
-    def start(self, name: str, command: Command) -> None:
-        """Start a command of the stage ``name``, of which none runs."""
+    def start(self, name: str, command: Command, together: int) -> None:
+        """Start a command of the stage ``name``, of which none runs; it is one of ``together`` that share the cores."""
         if self._context is None:
             with processor.shared_by(self.jobs):  # the process that forks hands its environment on
                 self._context = forking.context(self._modules)
         words = command if isinstance(command, str) else list(command)
-        given = words, str(Path.cwd()), processor.each_of(self.jobs), *map(str, self._printed(name))
+        variables = processor.each_of(self.jobs) | processor.jobs_of(together)
+        given = words, str(Path.cwd()), variables, *map(str, self._printed(name))
         process = self._context.Process(target=_run, args=given)
         with termination.deferred(), forking.without_main():
             process.start()

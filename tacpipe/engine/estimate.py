@@ -6,8 +6,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-from tacpipe.engine import pipeline
-from tacpipe.engine.processor import threads, usable_cores
+from tacpipe.engine import pipeline, processor
 from tacpipe.engine.request import Inputs, Request
 from tacpipe.errors import TacpipeError
 from tacpipe.io import progress
@@ -52,8 +51,8 @@ def of(requests: Sequence[Request], jobs: int) -> Estimate | None:
             return None
     if each_s is None:
         return None
-    at_once = min(jobs or usable_cores(), len(missing))
-    hours = total_s(each_s, len(missing), at_once, threads(), usable_cores()) / _HOUR_S
+    at_once = min(jobs or processor.jobs(), len(missing))
+    hours = total_s(each_s, len(missing), at_once, processor.threads(), processor.usable_cores()) / _HOUR_S
     return Estimate(len(missing), at_once, each_s, hours)
 
 

@@ -15,11 +15,14 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from tacpipe.errors import UsageError
+
 _CPUINFO = Path("/proc/cpuinfo")
 # those that the kernels of OpenBLAS, oneDNN, torch and numpy are chosen by
 _INSTRUCTIONS = ("avx", "avx2", "fma", "avx512f", "avx512bw", "avx512_bf16", "amx_tile", "asimd", "sve", "sve2")
 # variables that choose kernels by name
 _CHOSEN = ("OPENBLAS_CORETYPE", "ATEN_CPU_CAPABILITY", "ONEDNN_MAX_CPU_ISA", "MKL_CBWR", "NPY_DISABLE_CPU_FEATURES")
+JOBS = "TACPIPE_JOBS"  # processes of a command that is given no --jobs, or 0
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -58,6 +61,24 @@ def each_of(processes: int) -> dict[str, str]:
     if any(name in os.environ for name in THREADS):
         return {}
     return dict.fromkeys(THREADS, str(max(1, usable_cores() // max(1, processes))))
+
+
+def jobs() -> int:
+    """Return how many processes a command starts that is not given a number: as `JOBS` states, else one a usable core.
+
+    Raises `UsageError` where `JOBS` is no number above 0.
+    """
+    stated = os.environ.get(JOBS, "")
+    if not stated:
+        return usable_cores()
+    if not stated.isdecimal() or not int(stated):
+        raise UsageError(f"{JOBS} is {stated!r}; it must be a number of processes, 1 or more.")
+    return int(stated)
+
+
+def jobs_of(commands: int) -> dict[str, str]:
+    """Return the variable that gives each of so many commands its part of the cores; none where the environment has it."""
+    return {} if JOBS in os.environ else {JOBS: str(max(1, usable_cores() // max(1, commands)))}
 
 
 def usable_cores() -> int:

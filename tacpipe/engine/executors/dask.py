@@ -23,9 +23,8 @@ from pathlib import Path
 from queue import Queue
 from typing import TYPE_CHECKING, Any
 
-from tacpipe.engine import execution, provenance
+from tacpipe.engine import execution, processor, provenance
 from tacpipe.engine.executors import agreement, chunks
-from tacpipe.engine.processor import usable_cores
 from tacpipe.engine.task import Done, Task
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import progress, termination
@@ -53,7 +52,7 @@ def connected(address: str, jobs: int) -> Iterator[Dask]:
     without Dask.
     """
     if not address:
-        with _started(jobs or usable_cores()) as found:
+        with _started(jobs or processor.jobs()) as found:
             yield found
         return
     if not _is_here(address):

@@ -6,8 +6,8 @@ import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from tacpipe.engine import processor
 from tacpipe.engine.executors import chunks, forking
-from tacpipe.engine.processor import usable_cores
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import processes, termination
 
@@ -24,7 +24,7 @@ class Local:
 
     def __init__(self, jobs: int, pool_from: int = _POOL_FROM) -> None:
         """Take the number of processes, 0 for one a usable core, and how many tasks are worth starting them."""
-        self.jobs, self._pool_from = jobs or usable_cores(), pool_from
+        self.jobs, self._pool_from = jobs or processor.jobs(), pool_from
 
     def run(self, compute: Callable[[Task], Done], tasks: Sequence[Task], preload: Sequence[str]) -> Iterator[Done]:
         """Yield ``compute(task)`` of every task, in any order.
