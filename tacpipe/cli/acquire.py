@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import re
 import time
@@ -144,44 +143,27 @@ def _record(rig: Rig, store: Store, plan: Any, *, quiet: bool) -> tuple[list[Rec
 
 
 def _recovered(store: Store, output: Path | None, *, quiet: bool) -> tuple[list[Recorded], int]:
-    """Seal what earlier processes of this user left behind; what cannot be sealed is reported and stays.
+    """Seal what earlier processes of this user left behind; return that, and how many spools stay as they are."""
+    from tacpipe.recording import recovery
 
-    It keeps nobody from recording. ``output`` is the dataset that this command was given.
-    """
-    from tacpipe.printable import plain
-    from tacpipe.recording import spool_folders, trials
-    from tacpipe.recording.appending import NothingError
-
-    sealed, left = [], 0
-    for folder in spool_folders.abandoned(store.root):
-        try:
-            with spool_folders.locked(folder) as ours:
-                if not ours:
-                    continue
-                one = trials.recover(store, folder, output)
-        except NothingError:
-            continue  # it ended before a sample came
-        except Exception as error:  # whatever a damaged spool or another version's driver may raise
-            why = error if isinstance(error, TacpipeError) else plain(f"{type(error).__name__}: {error}", 300)
-            terminal.note(f"tacpipe: The spool {folder} stays as it is. {why}")
+    sealed, left = list[Any](), 0
+    for found in recovery.recovered(store, output):
+        if isinstance(found, recovery.Stayed):
+            terminal.note(f"tacpipe: {found.line()}")
             left += 1
             continue
-        sealed.append(one)
+        sealed.append(found)
         if not quiet:
-            terminal.note(f"recovered {one.line()}")
+            terminal.note(f"recovered {found.line()}")
     return sealed, left
 
 
 def _report_others(store: Store) -> None:
     """Print whose the spools are that another user recorded, in a store that is shared."""
-    from tacpipe.recording import spool_folders
+    from tacpipe.recording import recovery
 
-    with contextlib.suppress(OSError):  # of a disk that failed, which was stated already
-        others = spool_folders.owners(store.root)
-        ours = spool_folders.users(store.root / spool_folders.FOLDER, others.values())
-        for folder in [folder for folder, owner in others.items() if owner not in ours]:
-            owner = others[folder]
-            terminal.note(f"The spool {folder} belongs to {spool_folders.user(owner)}, who alone can seal it.")
+    for folder, owner in recovery.of_others(store).items():
+        terminal.note(f"The spool {folder} belongs to {owner}, who alone can seal it.")
 
 
 def _dry_run(rig: Rig, *, as_json: bool) -> str:
