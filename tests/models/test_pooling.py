@@ -161,3 +161,11 @@ def test_points_that_are_not_finite_are_not_passed_over() -> None:
     found = largest(layer, points)
     assert torch.isfinite(found[0]).all()
     assert torch.isnan(found[1]).all()
+
+
+@pytest.mark.parametrize("clouds", [1, 2, pooling.FEW, pooling.FEW + 1, 40])
+def test_rows_of_few_clouds_and_of_many_are_weighed_and_added_up(clouds: int) -> None:
+    torch.manual_seed(clouds)
+    weights, rows = torch.randn(clouds, 50), torch.randn(clouds, 50, 7)
+    wanted = torch.einsum("co,coi->oi", weights.double(), rows.double())
+    torch.testing.assert_close(pooling._weighed(weights, rows).double(), wanted, rtol=1e-5, atol=1e-5)
