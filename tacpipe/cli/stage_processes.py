@@ -28,16 +28,15 @@ if TYPE_CHECKING:
     from multiprocessing.context import ForkServerProcess as Process
 
 Command = str | Sequence[str]  # a text for the shell, or the words of a command of tacpipe without its name
-MODULES = (
-    *(
-        "tacpipe.cli.main",
-        "tacpipe.cli.commands",
-        "tacpipe.cli.stages",
-        "tacpipe.engine.pipeline",
-        "tacpipe.io.parquet",
-    ),
-    *("yaml", "pydantic.type_adapter", "pandas"),  # by params, by typer, and by pyarrow where it converts a column
+OWN = (
+    "tacpipe.cli.main",
+    "tacpipe.cli.commands",
+    "tacpipe.cli.stages",
+    "tacpipe.engine.pipeline",
+    "tacpipe.io.parquet",
 )
+OTHERS = ("yaml", "pydantic.type_adapter", "pandas")  # by params, by typer, and by pyarrow where it converts a column
+MODULES = OWN + OTHERS
 _LEARNS = re.compile(r"\btacpipe (train|evaluate|predict|compress autoencoder) ")
 
 
