@@ -1,12 +1,13 @@
 """Measure what more recordings are worth to ``forward``: `make learning-curve DATA=FOLDER`.
 
 Trains on 8, 16, 33 and all training recordings of a random split, each smaller set being part of the larger ones, evaluates
-on the same test recordings, and prints a table of skill over persistence with its interval over recordings. Each model makes
-about as many steps, so fewer recordings have more epochs, and the best epoch on the validation recordings counts. Results
-lie in ``.cache/learning-curve``: what is there is not computed again. The table is ``docs/tasks/forward-learning.csv``.
+on the same test recordings, and prints a table of skill over persistence, with its interval over recordings and its
+standard deviation over draws of the split. Each model makes about as many steps, so fewer recordings have more epochs, and
+the best epoch on the validation recordings counts. Results lie in ``.cache/learning-curve``: what is there is not computed
+again. The table is ``docs/tasks/forward-learning.csv``.
 
-``DATA`` is a dataset of segments (`tacpipe segment contacts`). Options are ``--sizes 8,16,33,0``, 0 being all, ``--draws 2``
-of the split, and those of `tacpipe train forward` behind ``--``, as ``-- --architecture mixed``.
+``DATA`` is a dataset of segments (`tacpipe segment contacts`). Options are ``--sizes 8,16,33,0``, 0 being all, ``--draws
+10``, and those of `tacpipe train forward` behind ``--``, as ``-- --architecture mixed``.
 """
 
 from __future__ import annotations
@@ -40,6 +41,7 @@ class Point(NamedTuple):
     tested: int  # recordings tested on, each counted once
     skill: Sequence[tuple[float, float, float]]  # of each of `STEPS`: mean, low, high
     mae: Sequence[float]  # of the model, in the channels' unit
+    spread: Sequence[float]  # standard deviation of the skill over draws, NaN of one draw
 
 
 def point(draws: Sequence[Sums], trained: float) -> Point:
@@ -54,13 +56,17 @@ def point(draws: Sequence[Sums], trained: float) -> Point:
     found = forecast.skill_interval(pooled[:, 0, :-1], pooled[:, 1, :-1])
     skill = [(float(found.mean[at]), float(found.low[at]), float(found.high[at])) for at in range(len(STEPS))]
     total = pooled.sum(axis=0)
-    return Point(trained, len(names), skill, [float(one) for one in total[2, :-1] / total[2, -1]])
+    mae = [float(one) for one in total[2, :-1] / total[2, -1]]
+    by_draw = [sum(one.values(), np.zeros((3, len(STEPS) + 1)))[:, :-1] for one in draws]
+    skills = [forecast.skill(one[0], one[1]) for one in by_draw]
+    spread = np.std(skills, axis=0, ddof=1) if len(draws) > 1 else np.full(len(STEPS), np.nan)
+    return Point(trained, len(names), skill, mae, [float(one) for one in spread])
 
 
 def per_doubling(points: Sequence[Point], step: int) -> float:
     """Return by how much skill rises with each doubling of recordings at a place in `STEPS`: least squares on the logarithm.
 
-    >>> curve = [Point(size, 10, [(skill, 0, 0)], [0]) for size, skill in ((8, 0.1), (16, 0.15), (32, 0.2))]
+    >>> curve = [Point(size, 10, [(skill, 0, 0)], [0], [0]) for size, skill in ((8, 0.1), (16, 0.15), (32, 0.2))]
     >>> round(per_doubling(curve, 0), 3)
     0.05
     """
@@ -138,6 +144,7 @@ def rows(points: Sequence[Point]) -> list[Mapping[str, str]]:
                 f"skill t+{step}": f"{mean:+.3f} ({low:+.3f} to {high:+.3f})"
                 for step, (mean, low, high) in zip(STEPS, one.skill, strict=True)
             },
+            **{f"over draws t+{step}": f"{value:.3f}" for step, value in zip(STEPS, one.spread, strict=True)},
             **{f"MAE t+{step}": f"{value:.2f}" for step, value in zip(STEPS, one.mae, strict=True)},
         }
         for one in points
@@ -150,7 +157,7 @@ def main(given: Sequence[str]) -> None:
     parser = argparse.ArgumentParser(description="Measure what more recordings are worth to forward.")
     parser.add_argument("data", type=Path, help="dataset of segments")
     parser.add_argument("--sizes", default="8,16,33,0", help="training recordings, with commas between; 0: all")
-    parser.add_argument("--draws", type=int, default=2, help="draws of the split")
+    parser.add_argument("--draws", type=int, default=10, help="draws of the split")
     asked = parser.parse_args(own.split())
     sizes = [int(one) for one in asked.sizes.split(",")]
     points = [measured(asked.data, size, asked.draws, options.split()) for size in sizes]

@@ -24,6 +24,9 @@ def test_draws_are_pooled_by_recording_and_intervals_are_over_recordings() -> No
     assert (found.trained, found.tested) == (8.5, 4)
     assert found.skill[1] == pytest.approx((wanted.mean[1], wanted.low[1], wanted.high[1]))
     assert found.mae[2] == pytest.approx(pooled[:, 2, 2].sum() / pooled[:, 2, 3].sum())
+    alone = [made.point([one], 8.5).skill[1][0] for one in draws]
+    assert found.spread[1] == pytest.approx(np.std(alone, ddof=1))
+    assert np.isnan(made.point(draws[:1], 8.5).spread).all()
     (row,) = made.rows([found])
     assert list(row)[:3] == ["trained", "tested", "skill t+1"]
     assert row["trained"] == "8.5"
