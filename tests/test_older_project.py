@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import tarfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,9 +10,9 @@ import numpy as np
 import pytest
 
 import tacpipe
+from tests import older as older_project
 from tests.conftest import Ran
 
-ARCHIVE = Path(__file__).parent / "older" / "project.tar.xz"
 HITS = {  # commands whose results are in the store, under the keys that they had then
     "data/recordings": "simulate forward --trials 3 --duration-s 4 --tactile-rate-hz 25 --robot-rate-hz 50",
     "data/synced": "synchronize data/recordings --rate-hz 25",
@@ -25,8 +24,7 @@ HITS = {  # commands whose results are in the store, under the keys that they ha
 
 @pytest.fixture
 def older(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    with tarfile.open(ARCHIVE) as archive:
-        archive.extractall(tmp_path, filter="data")
+    older_project.unpack(tmp_path)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

@@ -6,7 +6,6 @@ import csv
 import dataclasses
 import io
 import json
-import tarfile
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,9 +20,9 @@ from tacpipe.comparison.runs import Question, Run
 from tacpipe.comparison.specification import Task
 from tacpipe.engine import pipeline
 from tacpipe.metrics import headline
+from tests import older
 from tests.comparison.comparison_fakes import run
 from tests.conftest import Ran
-from tests.test_older_project import ARCHIVE
 
 BASE = [4.0, 4.0, 4.0, 4.0, 4.0, 4.0, 4.0, 4.0]
 SMALL, LARGE = [1.0, 1.5, 1.0, 1.5, 1.0, 1.5, 1.0, 1.5], [2.0, 2.5, 2.0, 2.5, 2.0, 2.5, 2.0, 2.5]
@@ -121,8 +120,7 @@ def test_json_holds_every_row_with_its_results_and_csv_a_line_for_each() -> None
 def test_a_result_of_an_older_version_compares_as_its_headline_says(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: Callable[[str], Ran]
 ) -> None:
-    with tarfile.open(ARCHIVE) as archive:
-        archive.extractall(tmp_path, filter="data")
+    older.unpack(tmp_path)
     monkeypatch.chdir(tmp_path)
     done = call("compare results/forward --json")
     assert done.code == 0, done.err

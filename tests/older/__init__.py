@@ -1,0 +1,17 @@
+"""A project as an older version of tacpipe left it."""
+
+from __future__ import annotations
+
+import tarfile
+from pathlib import Path
+
+ARCHIVE = Path(__file__).parent / "project.tar.xz"
+
+
+def unpack(folder: Path) -> None:
+    """Unpack the project into a folder."""
+    with tarfile.open(ARCHIVE) as archive:
+        if hasattr(tarfile, "data_filter"):
+            archive.extractall(folder, filter="data")
+        else:  # Python before 3.11.4, as Debian 12 has it
+            archive.extractall(folder)
