@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
+import functools
+import io
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from tacpipe.engine import execution
 from tacpipe.io.hashing import digest
-from tacpipe.plugins.stage import AnyStage, Stage
+from tacpipe.plugins.stage import AnyStage, Result, Stage
 
 
 class Replay:
@@ -74,6 +77,7 @@ class Replay:
             start, identity = len(self._events), self._identity
             returned = run()
             if self.listening and not stage.source:
+                returned = _repeatable(returned)
                 self._known[identity] = self._events[start:], returned
             return returned
         events, returned = known
@@ -86,6 +90,23 @@ class Replay:
             else:
                 self._resume(place)
         return returned
+
+
+def _repeatable(returned: Any) -> Any:
+    """Return a result whose files can be written more than once, as those of a stage need not."""
+    if not isinstance(returned, Result) or not returned.written:
+        return returned
+    contents = {}
+    for name, write in returned.written.items():
+        sink = io.BytesIO()
+        write(sink)
+        contents[name] = sink.getvalue()
+    written = {name: functools.partial(_write, content) for name, content in contents.items()}
+    return dataclasses.replace(returned, written=written)
+
+
+def _write(content: bytes, sink: Any) -> None:
+    sink.write(content)
 
 
 def _nothing(name: str, path: str) -> bytes:
