@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Protocol, Self
 
 from tacpipe.errors import TacpipeError
 from tacpipe.training.devices import Precision
@@ -24,6 +25,28 @@ def learning_rate(peak: float, progress: float, *, cycle: bool) -> float:
     return peak * (1 + math.cos(math.pi * (progress - RISE) / (1 - RISE))) / 2
 
 
+class Trainable(Protocol):
+    """The params of a network that a schedule is made of."""
+
+    @property
+    def epochs(self) -> int: ...  # noqa: D102
+
+    @property
+    def batch(self) -> int: ...  # noqa: D102
+
+    @property
+    def learning_rate(self) -> float: ...  # noqa: D102
+
+    @property
+    def patience(self) -> int: ...  # noqa: D102
+
+    @property
+    def cycle(self) -> bool: ...  # noqa: D102
+
+    @property
+    def precision(self) -> Precision: ...  # noqa: D102
+
+
 @dataclass(frozen=True)
 class Schedule:
     """How long and how fast to train."""
@@ -37,6 +60,20 @@ class Schedule:
     cycle: bool = False  # whether the rate rises over the first part of all epochs and falls over the rest
     # bfloat16: of products in forward and backward passes; weights, their sums and what is validated stay in float32
     precision: Precision = "float32"
+
+    @classmethod
+    def of(cls, params: Trainable, seed: int, gradient_clip: float = math.inf) -> Self:
+        """Return the schedule of a network's params; with a patience of 0 it trains for all epochs."""
+        return cls(
+            epochs=params.epochs,
+            batch=params.batch,
+            learning_rate=params.learning_rate,
+            patience=params.patience or params.epochs,
+            gradient_clip=gradient_clip,
+            seed=seed,
+            cycle=params.cycle,
+            precision=params.precision,
+        )
 
     def __post_init__(self) -> None:
         """Refuse what cannot be trained with."""

@@ -93,7 +93,8 @@ def train(
     )
     _check_channels(codec, parts[0])
     build = partial(_built, params, codec, known, start, device)
-    trained = loop.train(build, loop.Windows(known.part, watched.part, params.batch), _schedule(params), workspace)
+    schedule = loop.Schedule.of(params, params.seed, params.gradient_clip)
+    trained = loop.train(build, loop.Windows(known.part, watched.part, params.batch), schedule, workspace)
     weights = completion.completed(trained.weights, params, codec, known, watched)
     best = min(trained.history, key=lambda line: line["val_loss"])
     config: Config = {
@@ -132,19 +133,6 @@ def _built(params: Params, codec: codecs.Codec, known: Rows, start: Forecaster |
     if start:
         _take_over(model, start)
     return model
-
-
-def _schedule(params: Params) -> loop.Schedule:
-    return loop.Schedule(
-        epochs=params.epochs,
-        batch=params.batch,
-        learning_rate=params.learning_rate,
-        patience=params.patience,
-        gradient_clip=params.gradient_clip,
-        seed=params.seed,
-        cycle=params.cycle,
-        precision=params.precision,
-    )
 
 
 def _description(params: Params, codec: codecs.Codec, pose: Pose, unit: str, reference: AnyFloats) -> Config:

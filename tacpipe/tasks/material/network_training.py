@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
@@ -97,7 +96,7 @@ def train(
             networks.check(network, params, learned[name].frames, shapes[name].classes)
         return made
 
-    trained = loop.train(build, work, _schedule(params), workspace)
+    trained = loop.train(build, work, loop.Schedule.of(params, params.seed), workspace)
     config["validation"] = _validation(trained.history, work.joint)
     files = _files(trained, config, params)
     if params.baselines:
@@ -160,19 +159,6 @@ def _pairs(params: NetworkParams, slides: Mapping[str, ScaledSlides], partners: 
         subsample_percent=params.subsample_percent,
         partners=partners,
         seed=params.seed,
-    )
-
-
-def _schedule(params: NetworkParams) -> loop.Schedule:
-    return loop.Schedule(
-        epochs=params.epochs,
-        batch=params.batch,
-        learning_rate=params.learning_rate,
-        patience=params.patience or params.epochs,
-        gradient_clip=math.inf,
-        seed=params.seed,
-        cycle=params.cycle,
-        precision=params.precision,
     )
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import json
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -187,7 +186,7 @@ def _learn(
         work = _work(params, scale, (learned, followed), group, device)
         for number in range(params.networks):
             place = workspace / f"{'-'.join(group)}-{number}"
-            schedule = _schedule(params, params.seed + 1000 * number)
+            schedule = loop.Schedule.of(params, params.seed + 1000 * number)
             build = functools.partial(_built, params, group, device)
             whose = {"target": "all" if params.multi_target else group[0], "network": number}
             trained = loop.train(
@@ -256,16 +255,3 @@ def _weights(group: Sequence[str]) -> Tensor:
     shares = [1 / biotac_sp.width(target) for target in group for _ in range(biotac_sp.width(target))]
     weights = torch.tensor(shares)
     return weights / weights.mean()
-
-
-def _schedule(params: NetworkParams, seed: int) -> loop.Schedule:
-    return loop.Schedule(
-        epochs=params.epochs,
-        batch=params.batch,
-        learning_rate=params.learning_rate,
-        patience=params.patience or params.epochs,
-        gradient_clip=math.inf,
-        seed=seed,
-        cycle=params.cycle,
-        precision=params.precision,
-    )
