@@ -101,7 +101,6 @@ def run(
     jobs: int = 0,
     executor: str = "",
     device: Literal["auto", "cpu", "cuda", "mps"] = "auto",
-    devices: int = 1,
     skip_bad: bool = False,
     rerun: bool = False,
     replace: bool = False,
@@ -128,8 +127,7 @@ def run(
     :param preset: a preset of params. A file of params is read only if ``params_file`` names one (``block``: its block).
     :param jobs: processes to use; 0: one a core. ``skip_bad`` leaves out recordings that cannot be read, ``rerun``
         computes what is stored too, ``replace`` lets the output replace what it must not lose otherwise.
-    :param device: what networks are trained on: cpu, cuda or mps; auto is cuda where there is one. ``devices``: how many of
-        them train one network.
+    :param device: what networks are trained on: cpu, cuda or mps; auto is cuda where there is one.
     :param progress: show progress on a terminal, and print what a command prints while it runs.
     :param track: trackers that follow a training, as ``("tensorboard", "mlflow:http://127.0.0.1:5000")``.
     :param params: params of the stage, checked as on the command line.
@@ -157,7 +155,6 @@ def run(
             jobs=jobs,
             executor=executor,
             device=device,
-            devices=devices,
             skip_bad=skip_bad,
             rerun=rerun,
             replace=replace,

@@ -70,8 +70,6 @@ def _shared(stage: AnyStage) -> list[inspect.Parameter]:
         text = "What to train on; auto: cuda where there is one, else cpu."
         option = typer.Option(None, "--device", help=text, metavar=f"[{'|'.join(get_args(Device))}]")
         found.append(_parameter("device", str | None, option))
-        text = "Devices that train one network together, each in a process [1]."
-        found.append(_parameter("devices", int | None, typer.Option(None, "--devices", help=text)))
     if stage.tracked:
         text = f"Tracker of experiments, NAME or NAME:PLACE: {', '.join(registry.trackers())}."
         found.append(_parameter("track", list[str] | None, typer.Option(None, "--track", help=text)))

@@ -22,6 +22,7 @@ from tacpipe.engine import processor
 from tacpipe.engine.executors import forking
 from tacpipe.io import termination
 from tacpipe.plugins import registry
+from tacpipe.training import devices
 
 if TYPE_CHECKING:
     from multiprocessing.context import ForkServerContext
@@ -54,7 +55,7 @@ class StageProcesses:
     """At most ``jobs`` commands at the same time, in the block of a ``with``; what still runs at its end is interrupted.
 
     Each computes with as many threads as there are cores for each, unless the environment states another number, and on as
-    many recordings at a time as there are cores for those that begin together.
+    many recordings at a time as there are cores for those that begin together. Each sees one GPU where there are several.
     """
 
     def __init__(self, jobs: int, folder: Path, modules: Sequence[str]) -> None:
@@ -62,6 +63,7 @@ class StageProcesses:
         self.jobs = jobs or processor.jobs()
         self._folder, self._modules = folder, modules
         self._running: dict[str, Process] = {}  # by the name of the stage
+        self._slots: dict[str, int] = {}  # number from 0 of each running stage, which chooses its GPU
         self._context: ForkServerContext | None = None
 
     def __enter__(self) -> StageProcesses:
@@ -93,7 +95,9 @@ class StageProcesses:
             with processor.shared_by(self.jobs):  # the process that forks hands its environment on
                 self._context = forking.context(self._modules)
         words = command if isinstance(command, str) else list(command)
-        variables = processor.each_of(self.jobs) | processor.jobs_of(together)
+        self._slots[name] = min(set(range(self.jobs)) - set(self._slots.values()))
+        gpu = devices.gpu_for(self._slots[name])
+        variables = processor.each_of(self.jobs) | processor.jobs_of(together) | gpu
         given = words, str(Path.cwd()), variables, *map(str, self._printed(name))
         process = self._context.Process(target=_run, args=given)
         with termination.deferred(), forking.without_main():
@@ -114,6 +118,7 @@ class StageProcesses:
 
     def _taken(self, name: str) -> int:
         process = self._running.pop(name)
+        del self._slots[name]
         process.join()
         for path, stream in zip(self._printed(name), (sys.stdout, sys.stderr), strict=True):
             with contextlib.suppress(FileNotFoundError):  # of one that was killed at once

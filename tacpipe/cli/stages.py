@@ -13,16 +13,16 @@ from typing import Any, get_args
 import typer
 
 from tacpipe.cli import stage_options
-from tacpipe.engine import by_recording, estimate, grid, pipeline, rank_processes
+from tacpipe.engine import by_recording, estimate, grid, pipeline
 from tacpipe.engine.outcome import Outcome
 from tacpipe.engine.request import OPTIONS, PATHS, Request
-from tacpipe.errors import FAILED, TacpipeError, UsageError
+from tacpipe.errors import FAILED, TacpipeError
 from tacpipe.io import progress, terminal
 from tacpipe.plugins import fields as fields_of
 from tacpipe.plugins import given_params, registry
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins.stage import AnyStage
-from tacpipe.training.devices import AUTO, Compute
+from tacpipe.training import devices
 
 _answering: ContextVar[bool] = ContextVar("answering", default=False)
 
@@ -108,8 +108,6 @@ def _call(name: str, stage: AnyStage, given: dict[str, Any], named: Sequence[str
     how = {"as_json": given["json_"], "quiet": given["quiet"]}
     if answering:
         _report_answers(requests, shown, **how)
-    elif stage.trains and rank_processes.launched():
-        _run_launched(requests, shown, **how)
     elif len(requests) == 1:
         _report(pipeline.run(requests[0]), shown, **how)
     else:
@@ -129,7 +127,7 @@ def _request(name: str, stage: AnyStage, params: Any, given: Mapping[str, Any]) 
         role=given.get("role"),
         jobs=given["jobs"],
         executor=given["executor"] or "",
-        compute=Compute(given.get("device") or AUTO, rank_processes.asked(given.get("devices")) if stage.trains else 1),
+        device=given.get("device") or devices.AUTO,
         skip_bad=given["skip_bad"],
         check=given["check"],
         compare=given["compare"],
@@ -154,19 +152,6 @@ def _estimate(requests: Sequence[Request]) -> None:
     found = estimate.of(requests, requests[0].jobs)
     if found is not None:
         terminal.note(f"tacpipe: {found}")
-
-
-def _run_launched(requests: Sequence[Request], headline: str | None, *, as_json: bool, quiet: bool) -> None:
-    """Run a request as one of the processes of ``torchrun``: the first one does, and others train along."""
-    if len(requests) > 1:
-        raise UsageError(f"torchrun has started processes to train one network together, not {len(requests)} folds.")
-    if rank_processes.first():
-        with rank_processes.leading():
-            _report(pipeline.run(requests[0]), headline, as_json=as_json, quiet=quiet)
-    else:
-        from tacpipe.engine import rank
-
-        rank.follow()
 
 
 def _run_folds(requests: Sequence[Request], headline: str | None, *, as_json: bool, quiet: bool) -> None:

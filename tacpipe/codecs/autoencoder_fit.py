@@ -25,7 +25,6 @@ from tacpipe.codecs.autoencoder import Autoencoder, scaled
 from tacpipe.codecs.standard import standard
 from tacpipe.codecs.training_rows import TrainingRows
 from tacpipe.errors import TacpipeError
-from tacpipe.models.batch import Rows
 from tacpipe.training import devices, loop
 
 if TYPE_CHECKING:
@@ -130,8 +129,6 @@ def fit(
 
 class _Mirrored(nn.Module):
     """Encoder and decoder whose layers mirror each other."""
-
-    ROWS = Rows(given=0, returned=(0,))
 
     def __init__(self, widths: Sequence[int], *, bias: bool) -> None:
         super().__init__()

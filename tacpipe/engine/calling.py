@@ -16,7 +16,7 @@ from tacpipe.errors import ResultWarning, UsageError
 from tacpipe.io import progress
 from tacpipe.plugins import fields, given_params, registry
 from tacpipe.plugins.stage import AnyStage
-from tacpipe.training.devices import AUTO, Compute, Device
+from tacpipe.training.devices import AUTO, Device
 
 Given = str | PathLike[str] | Dataset
 _STACK = 3  # frames from a warning to who called `tacpipe.run`
@@ -34,7 +34,6 @@ class How:
     jobs: int = 0
     executor: str = ""
     device: Device = AUTO
-    devices: int = 1
     skip_bad: bool = False
     rerun: bool = False
     replace: bool = False
@@ -74,7 +73,7 @@ def call(
         role=how.role,
         jobs=how.jobs,
         executor=how.executor,
-        compute=Compute(how.device, how.devices),
+        device=how.device,
         skip_bad=how.skip_bad,
         rerun=how.rerun,
         replace=how.replace,
@@ -101,9 +100,9 @@ def _refuse_unread(name: str, stage: AnyStage, datasets: Sequence[Given], named:
         "extend": "Roles" in kinds,
     }
     given = {**dict.fromkeys(named, True), "fold": how.fold != 0, "role": how.role is not None}
-    given |= {"track": bool(how.track), "device": how.device != AUTO, "devices": how.devices != 1}
+    given |= {"track": bool(how.track), "device": how.device != AUTO}
     reads |= {"fold": reads["split"], "role": stage.reads_model and not stage.needs_split, "track": stage.tracked}
-    reads |= {"device": stage.trains, "devices": stage.trains}
+    reads |= {"device": stage.trains}
     for key in given:
         if given[key] and not reads[key]:
             raise UsageError(f"The stage {name} does not read {key}; leave it out.")

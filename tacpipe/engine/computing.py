@@ -15,9 +15,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from tacpipe.datasets.manifest import VALUES, Manifest
-from tacpipe.engine import execution, provenance, rank_processes
+from tacpipe.engine import execution, provenance
 from tacpipe.engine.execution import Scratch
-from tacpipe.engine.rank_processes import Crew
 from tacpipe.engine.task import Done, Task
 from tacpipe.errors import FAILED, MissingModuleError, StorageError, TacpipeError
 from tacpipe.io.hashing import digest
@@ -32,7 +31,6 @@ if TYPE_CHECKING:
 
 AT_ONCE = 8  # tasks that wait for a distant store while one is computed
 _MANY = 4  # tasks for which threads are started
-ALONE = "no network was trained, so one process computed it, whatever --devices is"
 
 
 class _Computing:
@@ -104,11 +102,10 @@ def _overlapped(tasks: Sequence[tuple[Task, Store]]) -> Iterator[Done]:
 def _begun(task: Task, store: Store) -> Callable[[], Done]:
     """Compute the task where its record is not stored; return what stores the result and returns what became of it."""
     key = digest(task.identity)
-    text = task.to_text() if task.compute.devices > 1 else ""
     try:
         with ExitStack() as leases:
-            with devices.given(task.compute), rank_processes.available(text, task.compute) as crew:
-                found = _computed(task, store, key, crew, leases)
+            with devices.chosen(task.device):
+                found = _computed(task, store, key, leases)
             if isinstance(found, _Made):
                 return _Sending(task, store, found, leases.pop_all())
     except TacpipeError as error:
@@ -156,7 +153,7 @@ class _Sending:
         return Done(task.recording, record)
 
 
-def _computed(task: Task, store: Store, key: str, crew: Crew | None, leases: ExitStack) -> Done | _Made:
+def _computed(task: Task, store: Store, key: str, leases: ExitStack) -> Done | _Made:
     if task.dry:
         result, _ = execution.execute(task, store, Scratch())
         return Done(task.recording, {"result": result, "provenance": provenance.of(0.0)})
@@ -170,8 +167,6 @@ def _computed(task: Task, store: Store, key: str, crew: Crew | None, leases: Exi
     stage = execution.stage_of(task.name)
     made = {**provenance.of(round(time.perf_counter() - started, 4)), "irreplaceable": stage.source}
     made |= {"code": provenance.code(stage), "notes": notes}
-    if crew is not None:
-        made |= {"devices": task.compute.devices} if crew.started else {"notes": [*notes, ALONE]}
     if stage.source:  # the record alone would mark this as a recording, until a dataset's manifest does
         store.put(_manifest_of(task, stage, result).content, durable=True)
     return _Made(result, made, replace, stage.source)

@@ -349,7 +349,7 @@ class _Run:
             replace=record is not None,
             dry=self.request.compare,
             rerun=self.request.rerun,
-            compute=self.request.compute,
+            device=self.request.device,
             run=self.store.run,
         )
         (done,) = self.chosen.opened().run(computing.compute, [task], [])

@@ -67,7 +67,7 @@ def unlike(stored: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
     ['threads: 1, now 2']
     """
     found = []
-    for name in ("device", "devices", "processor", "libraries"):
+    for name in ("device", "processor", "libraries"):
         before, after = stored.get(name), now.get(name)
         if isinstance(before, Mapping) and isinstance(after, Mapping):
             there = [(part, before.get(part), after.get(part)) for part in sorted({*before, *after})]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
@@ -16,17 +16,16 @@ from tacpipe.errors import UsageError
 from tacpipe.io.hashing import digest, remembered_file_digest
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
-from tacpipe.plugins.constraints import NonNegativeInt, PositiveInt
+from tacpipe.plugins.constraints import NonNegativeInt
 from tacpipe.plugins.stage import AnyStage, Source
 from tacpipe.store.store import Store
-from tacpipe.training.devices import Compute, Device
+from tacpipe.training.devices import AUTO, Device
 
 # what options of a run may be that are no params
 OPTIONS = {
     "jobs": NonNegativeInt,
     "executor": str,
     "device": Device,
-    "devices": PositiveInt,
     "fold": NonNegativeInt,
     "role": Literal["train", "val", "test"] | None,
 }
@@ -54,7 +53,7 @@ class Request:
     init: Path | None = None
     jobs: int = 0
     executor: str = ""  # NAME or NAME://ADDRESS; empty: that of the environment, or this computer
-    compute: Compute = field(default_factory=Compute)  # what networks are trained on
+    device: Device = AUTO  # what networks are trained on
     skip_bad: bool = False
     check: bool = False
     compare: bool = False

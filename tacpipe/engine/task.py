@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
-from tacpipe.io.hashing import canonical
-from tacpipe.training.devices import Compute
+from tacpipe.training.devices import AUTO, Device
 
 
 @dataclass(frozen=True)
@@ -24,20 +22,8 @@ class Task:
     replace: bool = False  # the old record names objects that are gone
     dry: bool = False  # compute and compare, store nothing
     rerun: bool = False  # compute although a result is stored
-    compute: Compute = field(default_factory=Compute)  # what networks are trained on
+    device: Device = AUTO  # what networks are trained on
     run: str = ""  # the lease of the run that it is part of
-
-    def to_text(self) -> str:
-        """Return what `task_of` reads."""
-        return canonical(
-            {**vars(self), "compute": asdict(self.compute)}
-        ).decode()  # an identity may name all recordings
-
-
-def task_of(text: str) -> Task:
-    """Return the task that `Task.to_text` wrote."""
-    given = json.loads(text)
-    return Task(**{**given, "beside": tuple(given["beside"]), "compute": Compute(**given["compute"])})
 
 
 @dataclass(frozen=True)

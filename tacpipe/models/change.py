@@ -12,7 +12,6 @@ import torch
 from torch import Tensor, nn
 
 from tacpipe.models import recurrent_layer
-from tacpipe.models.batch import Dropout, Rows
 from tacpipe.models.windows import MOTION, Shape, Windows, held, motion
 
 CELLS = ("gru", "lstm", "tcn")
@@ -25,8 +24,6 @@ class ChangeForecast(nn.Module):
     ``increments`` means that features are changes from row to row already; then the change itself is predicted.
     """
 
-    ROWS = Rows(given=1, returned=(1,))
-    DROPPED = 0  # dimension of the windows in what dropout is given
     change_only = True
     change_scale: Tensor
     touch_mean: Tensor
@@ -41,7 +38,7 @@ class ChangeForecast(nn.Module):
         super().__init__()
         self.features, self.context, self.horizon = features, context, horizon
         self.kind, self.increments = loss, increments
-        self.drop = Dropout(dropout, rows=self.DROPPED)
+        self.drop = nn.Dropout(dropout)
         self.register_buffer("change_scale", torch.ones(()))
         self.register_buffer("touch_mean", torch.zeros(features))
         self.register_buffer("touch_scale", torch.ones(features))
@@ -112,8 +109,6 @@ class SequenceForecast(ChangeForecast):
     convolutions over both (Bai, Kolter and Koltun, 2018), touch being zero where it is to come. Each step's prediction
     rests on the plan up to that step.
     """
-
-    DROPPED = 1
 
     def __init__(self, features: int, *, cell: str, hidden: int, **shared: object) -> None:
         """Make a model of random weights that begins at persistence."""

@@ -46,7 +46,6 @@ class Size(NamedTuple):
 class MixedForecast(nn.Module):
     """Reads raw channels; begins at persistence. Its trees are computed by numpy, so it cannot be traced."""
 
-    # no ROWS: several processes share the batches of each network within, which is what computes the loss
     change_only = True
     blend: Tensor
     scale: Tensor

@@ -15,8 +15,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from tacpipe.models.batch import Dropout, Rows
-
 BACKBONES = ("points", "edges")
 NEIGHBOURS = 12
 WIDTHS = (64, 128, 256)
@@ -34,8 +32,6 @@ class Shape:
 class PatchNetwork(nn.Module):
     """From patches (cloud, patch, point, channel) and the grasp's numbers (cloud, number) to touch (cloud, value)."""
 
-    ROWS = Rows(given=0, returned=(0,))
-
     def __init__(
         self, channels: int, numbers: int, outputs: int, *, backbone: str, hidden: int, dropout: float
     ) -> None:
@@ -47,10 +43,10 @@ class PatchNetwork(nn.Module):
             nn.Linear(3 * 2 * WIDTHS[-1] + numbers, hidden),
             nn.LayerNorm(hidden),
             nn.ReLU(),
-            Dropout(dropout),
+            nn.Dropout(dropout),
             nn.Linear(hidden, hidden // 2),
             nn.ReLU(),
-            Dropout(dropout),
+            nn.Dropout(dropout),
             nn.Linear(hidden // 2, outputs),
         )
 

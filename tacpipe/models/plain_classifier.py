@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from torch import Tensor, nn
 
-from tacpipe.models.batch import Rows
 from tacpipe.models.recurrent_autoencoder import NetworkOutput
 
 
 class PlainClassifier(nn.Module):
     """Its scores are its latents too: there is nothing before them that another sensor's classifier could read."""
-
-    ROWS = Rows(given=1, returned=(0, 0))
 
     def __init__(self, network: nn.Module) -> None:
         """Take a network from slides (time, slide, channel) to scores (slide, class)."""

@@ -13,7 +13,6 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
-from tacpipe.models.batch import BatchNorm1d, Rows
 from tacpipe.models.pooling import NormalisedLinear, largest
 
 FEATURES = 1024
@@ -24,8 +23,6 @@ HEADS = {f"fc{depth}": (1024, 512, 256, 128, 64, 32)[:depth] for depth in range(
 
 class PointNet(nn.Module):
     """From points (cloud, point, channel) and numbers of the grasp (cloud, number) to values of touch (cloud, value)."""
-
-    ROWS = Rows(given=0, returned=(0,))
 
     def __init__(
         self, channels: int, grasp: int, outputs: int, *, head: Sequence[int] = HEADS["fc3"], transform: bool = True
@@ -81,6 +78,6 @@ def _connected(inputs: int, hidden: Sequence[int], outputs: int) -> nn.Sequentia
     """Return fully connected layers with batch normalisation and ReLU, and a plain one at the end."""
     layers: list[nn.Module] = []
     for width in hidden:
-        layers += [nn.Linear(inputs, width), BatchNorm1d(width), nn.ReLU()]
+        layers += [nn.Linear(inputs, width), nn.BatchNorm1d(width), nn.ReLU()]
         inputs = width
     return nn.Sequential(*layers, nn.Linear(inputs, outputs))

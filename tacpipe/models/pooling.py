@@ -14,8 +14,6 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from tacpipe.models import batch
-
 EPSILON = 1e-5  # added to a variance, as in torch
 MOMENTUM = 0.1  # weight of a batch in the running mean and variance, as in torch
 FEW = 16  # clouds, which a plain sum adds up in the order of einsum
@@ -55,9 +53,9 @@ class NormalisedLinear(nn.Module):
 
     def _moments(self, given: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean and variance (output,) over rows (row, input), and let the running ones follow."""
-        centre, rows = batch.mean(given), batch.count(len(given))
+        centre, rows = given.mean(dim=0), len(given)
         centred = given - centre
-        covariance = batch.total(centred.T @ centred) / rows  # (input, input)
+        covariance = centred.T @ centred / rows  # (input, input)
         mean = self.weight @ centre
         variance = ((self.weight @ covariance) * self.weight).sum(dim=1).clamp_min(0)
         with torch.no_grad():

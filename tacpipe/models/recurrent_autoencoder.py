@@ -15,8 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from tacpipe.errors import TacpipeError
-from tacpipe.models import batch, headers
-from tacpipe.models.batch import Rows
+from tacpipe.models import headers
 from tacpipe.models.lstm import lstm
 
 HIDDEN = 90
@@ -38,9 +37,6 @@ class Shape:
     dropout: float = 0.0  # fraction of the latents left out before the classifier in each training step
 
 
-_ROWS = Rows(given=1, returned=(0, 0, 1))
-
-
 class NetworkOutput(NamedTuple):
     """The output of a network for slides."""
 
@@ -52,7 +48,6 @@ class NetworkOutput(NamedTuple):
 class RecurrentAutoencoder(nn.Module):
     """Header, LSTM, latents, classifier, and the decoder's LSTM and header."""
 
-    ROWS = _ROWS
     ANY_LENGTH = True  # reads slides of any number of frames
 
     def __init__(self, shape: Shape) -> None:
@@ -77,7 +72,7 @@ class RecurrentAutoencoder(nn.Module):
 
     def classify(self, latents: Tensor) -> Tensor:
         """Return the scores (slide, class) of latents (slide, latent), of this sensor or of another."""
-        scores: Tensor = self.classifier(batch.dropout(latents, self.shape.dropout, self.training))
+        scores: Tensor = self.classifier(nn.functional.dropout(latents, self.shape.dropout, self.training))
         return scores
 
     def _decoded(self, latents: Tensor, steps: int) -> Tensor:
@@ -93,7 +88,6 @@ class RecurrentAutoencoder(nn.Module):
 class RecurrentClassifier(nn.Module):
     """The paper's X-LSTM: header, LSTM, and a linear layer that classifies its last state, which are its latents."""
 
-    ROWS = _ROWS
     ANY_LENGTH = True
 
     def __init__(self, shape: Shape) -> None:

@@ -11,14 +11,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from tacpipe.models.batch import Rows
 from tacpipe.models.lstm import lstm
 
 
 class RecurrentForward(nn.Module):
     """Encoder and decoder LSTM of one layer each and a linear head; always free running, in training too."""
-
-    ROWS = Rows(given=1, returned=(1,))
 
     def __init__(self, latents: int, states: int, hidden: int = 200) -> None:
         """Make a model of random weights; sizes are numbers of features and of recurrent units."""

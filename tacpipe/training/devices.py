@@ -1,4 +1,7 @@
-"""What networks are trained on: the processor or accelerators, one or several. No part of any key; records state it."""
+"""Choose the device that networks are trained on: the processor or one accelerator.
+
+The device is part of no key; records state it. One training uses one device.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,7 @@ import os
 import sys
 from collections.abc import Iterator
 from contextvars import ContextVar
-from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 from tacpipe.errors import UsageError
@@ -16,61 +19,68 @@ Device = Literal["auto", "cpu", "cuda", "mps"]
 AUTO: Device = "auto"
 CPU, CUDA, MPS = "cpu", "cuda", "mps"
 Precision = Literal["float32", "bfloat16"]
+VISIBLE_GPUS = "CUDA_VISIBLE_DEVICES"  # CUDA's variable: which GPUs a process sees, separated by commas
+_GPUS = Path("/proc/driver/nvidia/gpus")  # NVIDIA's driver has one folder here per GPU
 
-
-@dataclass(frozen=True)
-class Compute:
-    """What was asked for: a kind of device, ``auto`` for CUDA where there is one, and how many of it."""
-
-    device: Device = AUTO
-    devices: int = 1
-
-
-_chosen: ContextVar[Compute] = ContextVar("compute", default=Compute())  # noqa: B039  (it is frozen)
-
-
-def current() -> Compute:
-    """Return what the work at hand was given."""
-    return _chosen.get()
+_chosen: ContextVar[Device] = ContextVar("device", default=AUTO)
 
 
 @contextlib.contextmanager
-def given(compute: Compute) -> Iterator[None]:
-    """Have networks in the block trained on this. Raises `UsageError` where this computer does not have it."""
-    if compute.device != AUTO or compute.devices > 1:
-        _check(compute)
-    before = _chosen.set(compute)
+def chosen(device: Device) -> Iterator[None]:
+    """Train networks in the block on ``device``; ``auto`` is CUDA where there is a GPU.
+
+    Raises `UsageError` where this computer lacks the device, and under ``torchrun``.
+    """
+    _refuse_torchrun()
+    if device != AUTO:
+        _check(device)
+    token = _chosen.set(device)
     try:
         yield
     finally:
-        _chosen.reset(before)
+        _chosen.reset(token)
 
 
 def kind() -> str:
     """Return the kind of device that networks are trained on: cpu, cuda or mps; it is cpu as long as torch is not loaded."""
-    asked = current().device
-    if asked != AUTO:
-        return asked
+    device = _chosen.get()
+    if device != AUTO:
+        return device
     torch = sys.modules.get("torch")
     return CUDA if torch is not None and torch.cuda.is_available() else CPU
 
 
-def _check(compute: Compute) -> None:
-    """Raise `UsageError` where this computer has no such device, or not as many."""
+def gpu_for(worker: int) -> dict[str, str]:
+    """Return the variable that shows worker process ``worker``, counted from 0, one GPU; empty with fewer than two GPUs.
+
+    Workers take the visible GPUs in turn, so trainings that run at the same time do not share one while another is idle.
+    """
+    stated = os.environ.get(VISIBLE_GPUS)
+    if stated is None:
+        names = [str(number) for number in range(len(list(_GPUS.iterdir())))] if _GPUS.is_dir() else []
+    else:
+        names = [name.strip() for name in stated.split(",") if name.strip()]
+    return {VISIBLE_GPUS: names[worker % len(names)]} if len(names) > 1 else {}
+
+
+def _check(device: Device) -> None:
+    """Raise `UsageError` where this computer has no such device."""
     import torch
 
-    has = {CPU: True, CUDA: torch.cuda.is_available(), MPS: torch.backends.mps.is_available()}
-    if not has.get(compute.device, True):
-        there = ", ".join(name for name, found in has.items() if found)
+    available = {CPU: True, CUDA: torch.cuda.is_available(), MPS: torch.backends.mps.is_available()}
+    if not available[device]:
+        names = ", ".join(name for name, is_available in available.items() if is_available)
         raise UsageError(
-            f"device is {compute.device}, and this computer or this build of torch has none; it has {there}. "
+            f"device is {device}, and this computer or this build of torch has none; it has {names}. "
             f"Leave --device out to use what there is."
         )
-    asked = CUDA if compute.device == AUTO and has[CUDA] else compute.device
-    counts = {CUDA: torch.cuda.device_count(), MPS: 1}  # the processor takes any number of processes
-    here = int(os.environ.get("LOCAL_WORLD_SIZE", compute.devices))  # torchrun counts those of all computers
-    if here > counts.get(asked, here):
+
+
+def _refuse_torchrun() -> None:
+    """Raise `UsageError` in one of several processes that ``torchrun`` has started."""
+    size = os.environ.get("WORLD_SIZE", "1")
+    if "TORCHELASTIC_RUN_ID" in os.environ and size != "1":
         raise UsageError(
-            f"--devices is {compute.devices}, and this computer has {counts[asked]} of {asked}. "
-            f"Give --devices {counts[asked]}, or --device cpu to train in {compute.devices} processes of the processor."
+            f"torchrun has started {size} processes, and one training uses one process and one device. Run the command "
+            f"without torchrun; --jobs trains several folds at the same time, each on a GPU of its own."
         )

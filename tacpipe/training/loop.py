@@ -3,8 +3,7 @@
 What is learned comes as `Work`: its batches, its loss, and what is watched after each epoch. Batches are rows of tensors
 picked by index, so no loader stands between the data and the step. All randomness (initial weights, dropout, shuffles)
 comes from torch's generator under one seed, whose state is part of the checkpoint: a run that was killed and resumed
-gives the same bits as one that was not, on a CPU; a GPU adds in another order each time. Several
-processes may share each batch (`tacpipe.training.ranks`): all run this loop, draw alike and take the same steps.
+gives the same bits as one that was not, on a CPU; a GPU adds in another order each time.
 """
 
 from __future__ import annotations
@@ -23,11 +22,10 @@ from torch import Tensor, nn
 
 from tacpipe.errors import TacpipeError
 from tacpipe.models.tensors import under
-from tacpipe.training import checkpoint, following, ranks
+from tacpipe.training import checkpoint, following
 from tacpipe.training.adam import Adam
 from tacpipe.training.following import Followers, Network
 from tacpipe.training.following import Line as Line
-from tacpipe.training.ranks import Alone
 from tacpipe.training.schedule import Schedule as Schedule
 
 Loss = Callable[[nn.Module, Tensor], Tensor]  # mean loss of the windows with these indices
@@ -118,11 +116,8 @@ class _Run:
     optimiser: Adam
     best: dict[str, Tensor]
     history: list[Line]
-    rank: Alone
 
     def save(self, folder: Path) -> None:
-        if self.rank.rank:
-            return
         slots = self.optimiser.state()
         tensors = {f"model.{name}": value for name, value in self.model.state_dict().items()}
         tensors |= {f"best.{name}": value for name, value in self.best.items()}
@@ -131,10 +126,10 @@ class _Run:
         checkpoint.write(folder, tensors, {"history": self.history})
 
     def resume(self, folder: Path) -> None:
-        found = self.rank.agreed(lambda: checkpoint.read(folder))
-        if found is None:
+        saved = checkpoint.read(folder)
+        if saved is None:
             return
-        tensors, state = found
+        tensors, state = saved
         self.model.load_state_dict(under("model.", tensors))
         self.best = under("best.", tensors)
         slots: dict[int, dict[str, Tensor]] = {}
@@ -172,14 +167,11 @@ def train(
     """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(schedule.seed)
-        rank = ranks.current()
         model = build()
         learned = [weight for weight in model.parameters() if weight.requires_grad]
-        run = _Run(model, Adam(learned, schedule.learning_rate, weight_decay), {}, [], rank)
+        run = _Run(model, Adam(learned, schedule.learning_rate, weight_decay), {}, [])
         run.resume(workspace)
-        model.load_state_dict(rank.agreed(lambda: {name: value.cpu() for name, value in model.state_dict().items()}))
-        with rank.sharing(model):
-            _follow(run, work, schedule, workspace, Network(schedule.epochs, number, count, labels or {}))
+        _follow(run, work, schedule, workspace, Network(schedule.epochs, number, count, labels or {}))
     return Trained(
         {name: value.cpu() for name, value in run.best.items()},
         run.history,
@@ -205,7 +197,6 @@ def _epoch(run: _Run, work: Work, schedule: Schedule, followers: Followers) -> L
     """Train for one epoch, add its line to the history and return it."""
     run.model.train()
     epoch = len(run.history)
-    torch.set_rng_state(run.rank.agreed(torch.get_rng_state))
     total: Tensor | float = 0.0
     count = 0
     batches = work.batches(epoch)
@@ -216,7 +207,6 @@ def _epoch(run: _Run, work: Work, schedule: Schedule, followers: Followers) -> L
             loss, weight = work.loss(run.model, batch, epoch)
         run.optimiser.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
-        run.rank.sum_gradients(run.model.parameters())
         if math.isfinite(schedule.gradient_clip):
             nn.utils.clip_grad_norm_(run.model.parameters(), schedule.gradient_clip)
         run.optimiser.step()
@@ -226,7 +216,7 @@ def _epoch(run: _Run, work: Work, schedule: Schedule, followers: Followers) -> L
     run.model.eval()
     with torch.no_grad():
         watched = work.watch(run.model)
-    line: Line = run.rank.agreed(lambda: {"epoch": epoch + 1, "train_loss": _mean(total, count), **watched})
+    line: Line = {"epoch": epoch + 1, "train_loss": _mean(total, count), **watched}
     if not math.isfinite(line["train_loss"]) or not math.isfinite(line["val_loss"]):
         raise TacpipeError(
             f"The loss is {line['train_loss']} in epoch {line['epoch']}: training diverged. Lower the learning rate."

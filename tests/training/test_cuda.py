@@ -1,4 +1,4 @@
-"""Trainings on a GPU: what the processor learns, to be used and resumed on either, and by ranks that meet through NCCL."""
+"""Train on a GPU: it learns what the processor learns, and a model can be used and resumed on either."""
 
 from __future__ import annotations
 
@@ -8,18 +8,16 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
-from torch import distributed as dist
 from torch import nn
 
 from tacpipe.models import recurrent_layer
 from tacpipe.store.store import Store
-from tacpipe.training import ranks
-from tacpipe.training.devices import Compute, given
+from tacpipe.training.devices import chosen
 from tests.conftest import tacpipe
 from tests.training.networks import NETWORKS, losses
 
 pytestmark = [pytest.mark.long, pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")]
-NOISY = ("touch pointnet",)  # magnifies what is rounded (test_ranks)
+NOISY = ("touch pointnet",)  # magnifies what is rounded
 CLOSE = 0.05  # of losses: a GPU draws other numbers for dropout
 PREPARE = """
 simulate forward -o data/rec --trials 6 --duration-s 6 --tactile-rate-hz 25 --robot-rate-hz 50
@@ -42,9 +40,9 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize("precision", ["float32", "bfloat16"])
 @pytest.mark.parametrize("name", NETWORKS)
 def test_a_gpu_learns_what_the_processor_does(name: str, precision: str, tmp_path: Path) -> None:
-    with given(Compute("cpu")):
+    with chosen("cpu"):
         expected = losses(NETWORKS[name](tmp_path / "cpu"))
-    with given(Compute("cuda")):
+    with chosen("cuda"):
         found = losses(NETWORKS[name](tmp_path / "cuda", precision=precision))
     assert found != expected
     compared = slice(1) if name in NOISY else slice(None)
@@ -75,33 +73,13 @@ def test_recurrent_layers_stay_in_float32_under_autocast(kind: type[nn.GRU | nn.
 @pytest.mark.parametrize(("first", "second"), [("cpu", "cuda"), ("cuda", "cpu")])
 def test_a_checkpoint_of_one_device_is_resumed_on_the_other(first: str, second: str, tmp_path: Path) -> None:
     train = NETWORKS["forward gru"]
-    with given(Compute("cpu")):
+    with chosen("cpu"):
         whole = losses(train(tmp_path / "whole", epochs=4))
-    with given(Compute(first)):  # type: ignore[arg-type]
+    with chosen(first):  # type: ignore[arg-type]
         train(tmp_path / "cut", epochs=2)
-    with given(Compute(second)):  # type: ignore[arg-type]
+    with chosen(second):  # type: ignore[arg-type]
         found = losses(train(tmp_path / "cut", epochs=4))
     assert found == pytest.approx(whole, rel=CLOSE)
-
-
-def test_ranks_that_meet_through_nccl_learn_what_a_training_without_ranks_does(tmp_path: Path) -> None:
-    """One rank, as NCCL refuses two on one GPU: each batch is still cut into parts, gathered and summed."""
-    for name, train in NETWORKS.items():
-        with given(Compute("cuda")):
-            alone = losses(train(tmp_path / f"{name} alone"))
-            with ranks.available(lambda: ranks.join(ranks.folder_store(tmp_path / "store", 1), 0, 1, "cuda", 0)):
-                shared = losses(train(tmp_path / f"{name} shared"))
-                assert dist.get_backend(), name
-        (tmp_path / "store").unlink(missing_ok=True)
-        compared = slice(1) if name in NOISY else slice(None)
-        assert shared[compared] == pytest.approx(alone[compared], rel=1e-5), name
-
-
-def test_more_gpus_than_there_are_are_refused_with_a_sentence(project: Path) -> None:
-    count = torch.cuda.device_count()
-    done = tacpipe(project, f"{TRAIN} -o models/many --devices {count + 1}")
-    assert done.returncode == 2
-    assert f"has {count} of cuda" in done.stderr and "Traceback" not in done.stderr
 
 
 def test_stages_of_a_chain_that_run_at_the_same_time_train_on_a_gpu_each(project: Path) -> None:

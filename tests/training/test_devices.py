@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 
 import pytest
 import torch
+import yaml
 
 from tacpipe.engine import provenance
 from tacpipe.errors import UsageError
 from tacpipe.training import devices
-from tacpipe.training.devices import AUTO, Compute, Device
 from tests.conftest import Lab
 
 
@@ -18,14 +19,13 @@ from tests.conftest import Lab
 def test_auto_is_cuda_where_there_is_one(found: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: found)
     assert devices.kind() == ("cuda" if found else "cpu")
-    with devices.given(Compute("cpu")):
+    with devices.chosen("cpu"):
         assert devices.kind() == "cpu"
         assert provenance.of(0.0)["device"] == "cpu"
 
 
 def test_without_torch_the_device_is_the_processor(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delitem(sys.modules, "torch")
-    assert devices.current().device == AUTO
     assert devices.kind() == "cpu"
 
 
@@ -35,28 +35,44 @@ def test_a_device_that_is_not_there_is_refused_with_those_that_are(
 ) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(torch.backends.mps, "is_available", lambda: False)
-    with pytest.raises(UsageError, match=f"{wanted}.*it has cpu"), devices.given(Compute(wanted)):  # type: ignore[arg-type]
+    with pytest.raises(UsageError, match=f"{wanted}.*it has cpu"), devices.chosen(wanted):  # type: ignore[arg-type]
         raise AssertionError
 
 
-@pytest.mark.parametrize("device", ["auto", "cuda"])
-def test_more_gpus_than_there_are_are_refused_and_processes_of_the_processor_are_not(
-    device: Device, monkeypatch: pytest.MonkeyPatch
+def test_torchrun_is_refused_with_what_to_do_instead(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TORCHELASTIC_RUN_ID", "none")
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    with pytest.raises(UsageError, match=r"torchrun has started 2 processes.*--jobs"), devices.chosen("auto"):
+        raise AssertionError
+
+
+@pytest.mark.parametrize(
+    ("visible", "expected"),
+    [("0,1,2", ["0", "1", "2", "0"]), ("GPU-a, GPU-b", ["GPU-a", "GPU-b", "GPU-a", "GPU-b"]), ("3", []), ("", [])],
+)
+def test_workers_take_the_visible_gpus_in_turn(
+    visible: str, expected: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
-    with pytest.raises(UsageError, match=r"--devices is 3.* 2 of cuda"), devices.given(Compute(device, 3)):
-        raise AssertionError
-    with devices.given(Compute(device, 2)), devices.given(Compute("cpu", 3)):
-        assert devices.current().devices == 3
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
+    variables = [devices.gpu_for(worker) for worker in range(4)]
+    assert variables == ([{"CUDA_VISIBLE_DEVICES": gpu} for gpu in expected] or [{}] * 4)
 
 
-def test_of_torchrun_the_processes_of_this_computer_count(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
-    monkeypatch.setenv("LOCAL_WORLD_SIZE", "2")
-    with devices.given(Compute("cuda", 8)):
-        assert devices.current().devices == 8
+def test_without_the_variable_the_gpus_of_the_driver_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    monkeypatch.setattr(devices, "_GPUS", tmp_path)
+    for address in ("0000:17:00.0", "0000:65:00.0"):
+        (tmp_path / address).mkdir()
+    assert [devices.gpu_for(worker)["CUDA_VISIBLE_DEVICES"] for worker in range(3)] == ["0", "1", "0"]
+
+
+def test_stages_that_run_at_the_same_time_see_a_gpu_each(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "4,5")
+    wait = "while [ ! -e seen-a ] || [ ! -e seen-b ]; do sleep 0.01; done"
+    stages = {name: {"cmd": f"echo $CUDA_VISIBLE_DEVICES > seen-{name}; {wait}"} for name in ("a", "b")}
+    (lab.folder / "chain.yaml").write_text(yaml.safe_dump({"stages": stages}))
+    lab.run("run chain.yaml --jobs 2")
+    assert {(lab.folder / f"seen-{name}").read_text().strip() for name in ("a", "b")} == {"4", "5"}
 
 
 def test_only_stages_that_train_take_a_device(lab: Lab) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -10,6 +11,7 @@ from tacpipe.engine import processor
 from tacpipe.engine.executors import chunks, forking
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import processes, termination
+from tacpipe.training import devices
 
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection
@@ -71,19 +73,20 @@ def _run(compute: Callable[[Task], Done], tasks: Sequence[Task], jobs: int, prel
 def _start(jobs: int, preload: Sequence[str], workers: dict[Connection, Connection]) -> None:
     """Start ``jobs`` workers; add the connection to each, and the one that keeps it alive, to ``workers``."""
     context = forking.context(preload)
-    for _ in range(jobs):
+    for number in range(jobs):
         ours, theirs = context.Pipe()
         alive, life = context.Pipe(duplex=False)
         workers[ours] = life
         # a worker that received half of its task would report that
         with termination.deferred(), _death_told(), forking.without_main():
-            context.Process(target=_work, args=(theirs, alive)).start()
+            context.Process(target=_work, args=(theirs, alive, devices.gpu_for(number))).start()
         theirs.close()
         alive.close()
 
 
-def _work(tasks: Connection, alive: Connection) -> None:
+def _work(tasks: Connection, alive: Connection, variables: dict[str, str]) -> None:
     """Compute what comes over ``tasks`` for as long as the process at the other end of ``alive`` lives."""
+    os.environ.update(variables)
     processes.end_with(alive.fileno())
     while True:
         try:

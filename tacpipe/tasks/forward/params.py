@@ -88,11 +88,10 @@ class Forward(ABC):
         features to come in theirs. `tacpipe.models.change.ChangeForecast` has all but ``forward``.
 
         Of either kind, a prediction depends on its own window alone (so no normalisation over the batch), and each step on
-        the plan up to it, or evaluation of shuffled and missing plans means nothing. With ``ROWS = Rows(1, (1,))``
-        (`tacpipe.models.batch`) a network that scales itself can be trained on several devices; plain ones can always.
+        the plan up to it, or evaluation of shuffled and missing plans means nothing.
 
         The task makes the windows, fits scales on training recordings, trains (Adam, early stopping, checkpoints that
-        resume, ranks and devices, bfloat16), stores weights as safetensors, fits the baselines, and evaluates. A plain
+        resume, bfloat16), stores weights as safetensors, fits the baselines, and evaluates. A plain
         network learns the absolute error, of latents of increments Huber's. Raise `TacpipeError` for what cannot be read.
         """
 

@@ -176,7 +176,7 @@ class Network(Material, ABC):
         Of either kind, what is returned for a slide depends on that slide alone.
 
         The task reads and scales slides, trains (Adam, epochs chosen by validation accuracy, checkpoints that resume,
-        ranks and devices, bfloat16), stores weights as safetensors, fits the baselines and permuted labels, and evaluates.
+        bfloat16), stores weights as safetensors, fits the baselines and permuted labels, and evaluates.
         """
 
     def check(self) -> None:

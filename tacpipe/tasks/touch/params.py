@@ -125,9 +125,8 @@ class PointNetwork(Touch, ABC):
         - ``numbers`` (cloud, ``shape.numbers``) describe the grasp.
 
         The task draws points anew at each visit, scales the readings, trains (Adam, the loss and epoch that params choose,
-        checkpoints that resume, bfloat16; several devices for networks with ``ROWS = Rows(0, (0,))`` of
-        `tacpipe.models.batch`), averages over ``networks`` and ``draws``, stores weights as safetensors, and evaluates next
-        to the baselines.
+        checkpoints that resume, bfloat16), averages over ``networks`` and ``draws``, stores weights as safetensors, and
+        evaluates next to the baselines.
         """
 
 
