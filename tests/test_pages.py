@@ -17,7 +17,6 @@ from tacpipe.datasets.dataset_digest import DatasetDigest
 from tacpipe.datasets.described import Described
 from tacpipe.datasets.manifest import Manifest
 from tacpipe.engine import keys
-from tacpipe.engine.task import Task, task_of
 from tacpipe.errors import DamagedError, TacpipeError
 from tacpipe.io import hashing
 from tests.conftest import Lab
@@ -287,8 +286,6 @@ def test_a_key_made_of_text_is_the_key_made_of_what_was_parsed(
     assert hashing.digest(by_text) == hashing.digest(by_value)
     assert dict(kept) == by_value["recordings"]
     assert dict(pickle.loads(pickle.dumps(kept))) == by_value["recordings"]
-    text = Task("place", "stage", {"inputs": by_text}, "").to_text()
-    assert task_of(text).to_text() == Task("place", "stage", {"inputs": by_value}, "").to_text()
 
 
 def test_of_text_that_tacpipe_would_not_write_a_key_is_made_of_what_was_parsed(few_are_many: None) -> None:
