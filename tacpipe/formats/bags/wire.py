@@ -193,6 +193,7 @@ class _Walk:
     content: bytes
     types: Types
     shape: Shape
+    messages: int = 0  # that were walked, with those that have no fields
 
     def message(self, name: str, path: Path, within: tuple[tuple[int, str], ...], at: int) -> int:
         """Walk the fields of a message that begins at ``at``; return where it ends."""
@@ -200,13 +201,23 @@ class _Walk:
             at = self._aligned(at, 4)
             self._add(Leaf(path, "stamp", at, None, within))
             return at + 8
+        self.messages += 1
+        if self.messages > MOST_LEAVES:
+            raise WireError(f"a message has more than {MOST_LEAVES} messages in it")
         within = (*within, (len(path), name))
-        for field_name, description in self.types[name]:
-            if field_name == "structure_needs_at_least_one_member":
-                at += self.shape.encoding.aligned  # ROS 1 writes nothing for an empty message
-                continue
+        fields = [field for field in self.types[name] if field[0] != "structure_needs_at_least_one_member"]
+        if not fields:
+            return self._padding(at)
+        for field_name, description in fields:
             at = self._field(description, (*path, field_name), within, at)
         return at
+
+    def _padding(self, at: int) -> int:
+        """Pass the byte that CDR has for a message without fields, also where its definition has only constants."""
+        end = at + self.shape.encoding.aligned  # ROS 1 writes nothing
+        if end > len(self.content):
+            raise struct.error
+        return end
 
     def _field(self, description: Any, path: Path, within: tuple[tuple[int, str], ...], at: int) -> int:
         node, inner = int(description[0]), description[1]
@@ -227,7 +238,7 @@ class _Walk:
                 raise struct.error
             self._add(Leaf(path, kind, at, count, within))
             return at + width * count
-        if count > len(self.content):
+        if count > max(len(self.content), MOST_LEAVES):  # elements without fields take no bytes in ROS 1
             raise struct.error
         for position in range(count):
             at = self._field(element, (*path, position), within, at)

@@ -126,3 +126,17 @@ def test_a_message_that_does_not_fit_its_type_is_an_error(cut: int) -> None:
 def test_an_encapsulation_that_ros_does_not_write_is_refused() -> None:
     with pytest.raises(WireError, match="0009"):
         wire.encoding_of(b"\x00\x09\x00\x00")
+
+
+def test_a_message_without_fields_takes_one_byte_in_cdr_and_none_in_ros1() -> None:
+    from rosbags.typesys import get_types_from_msg
+
+    text = "Limits[3] limits\nint16 after\n" + "=" * 80 + "\nMSG: lab_msgs/Limits\nbool ON=true\n"
+    types = {name: fields for name, (_, fields) in get_types_from_msg(text, "lab_msgs/msg/Arrays").items()}
+    cdr = b"\0\1\0\0" + bytes(3) + b"\0" + (-7).to_bytes(2, "little", signed=True)  # three bytes, one to align
+    for message, encoding in ((cdr, wire.encoding_of(cdr)), (cdr[-2:], ROS1)):
+        shape = wire.walked(message, types, "lab_msgs/msg/Arrays", encoding)
+        (leaf,) = shape.leaves
+        assert (leaf.path, shape.value(leaf, None)) == (("after",), -7)
+    with pytest.raises(WireError, match="ends early"):
+        wire.walked(cdr[:6], types, "lab_msgs/msg/Arrays", wire.encoding_of(cdr))
