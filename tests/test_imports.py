@@ -7,9 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from tests import chain
+from tests import chain, commands
 
 HEAVY = {"torch", "pyarrow", "pandas", "sklearn", "open3d", "numpy", "scipy", "matplotlib"}
+COMPILERS = {"torch._dynamo", "torch._inductor", "torch.onnx", "sympy"}  # each takes as long as a small evaluation
 PROBE = """
 import json, sys
 from tacpipe.cli import main as cli
@@ -18,15 +19,21 @@ try:
     cli.main()
 except SystemExit as stop:
     assert not stop.code, stop.code
-print(json.dumps(sorted({name.partition(".")[0] for name in sys.modules})))
+print(json.dumps(sorted(sys.modules)))
 """
 
 
-def imported(folder: Path, words: str) -> set[str]:
+def imported_modules(folder: Path, words: str) -> set[str]:
+    """Return the full names of all modules that a command imports."""
     done = subprocess.run(
         [sys.executable, "-c", PROBE, *words.split()], cwd=folder, capture_output=True, text=True, check=True
     )
     return set(json.loads(done.stdout.splitlines()[-1]))
+
+
+def imported(folder: Path, words: str) -> set[str]:
+    """Return the packages that a command imports."""
+    return {name.partition(".")[0] for name in imported_modules(folder, words)}
 
 
 @pytest.fixture(scope="module")
@@ -53,3 +60,16 @@ def test_explaining_and_looking_after_the_store_import_nothing_heavy(lab: Path) 
 
 def test_ingest_does_not_import_torch(tmp_path: Path, lab: Path) -> None:
     assert "torch" not in imported(lab, "synchronize data/recordings -o data/other --rate-hz 20 --jobs 1")
+
+
+def test_using_the_default_forecaster_imports_only_what_models_need(lab: Path) -> None:
+    commands.run(
+        lab, ["train forward data/segments --split data/split --epochs 1 --hidden 8 --stride 4 -o models/default"]
+    )
+    for words in (
+        "evaluate models/default data/segments --split data/split -o results/default",
+        "predict models/default data/segments --split data/split --role test -o data/predicted",
+    ):
+        modules = imported_modules(lab, f"{words} --jobs 1")
+        assert modules & COMPILERS == set()
+        assert {name.partition(".")[0] for name in modules} & HEAVY <= {"numpy", "pandas", "pyarrow", "torch"}
