@@ -1,16 +1,15 @@
-"""Synchronized recordings as arrays (frame, channel), one a stream and quantity, as replay buffers have them."""
+"""Arrange synchronized recordings as arrays (frame, channel), one per stream and quantity, as replay buffers have them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from tacpipe.arrays import AnyArray
 from tacpipe.channels.masks import GRID
-from tacpipe.channels.streams import TRUTH
-from tacpipe.exports import frames
-from tacpipe.exports.contents import TIME
+from tacpipe.exports import contents, frames
+from tacpipe.exports.contents import TIME, Loss
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -30,43 +29,53 @@ class Array:
     units: Sequence[str]
 
 
-def of(table: pa.Table, actions: str = "") -> list[Array]:
-    """Return the arrays of a synchronized table: the time, one a stream and quantity, one a mask, and the actions.
+def from_table(table: pa.Table, actions: str = "") -> list[Array]:
+    """Return the arrays of a synchronized table: the time, one per stream and quantity, one per mask, and the actions.
 
-    Each has the type of its columns, the widest where they differ. Text is left out (see `losses`).
+    Each has the type of its columns, the widest where they differ. Columns of other types than numbers are left out.
     """
-    every = frames.channels(table)
+    channels = frames.channels(table)
     groups: dict[str, list[frames.Channel]] = {}
-    for one in every:
-        if one.type != "string":
-            groups.setdefault(_name(one), []).append(one)
-    made = [Array(TIME, table.column(TIME).to_numpy(), [TIME], ["ns"])]
-    for name, chosen in groups.items():
-        values = frames.matrix(table, chosen)
+    for channel in channels:
+        if channel.number:
+            groups.setdefault(_name(channel), []).append(channel)
+    arrays = [Array(TIME, table.column(TIME).to_numpy(), [TIME], ["ns"])]
+    for name, members in groups.items():
+        values = frames.matrix(table, members)
         flat = values[:, 0] if values.shape[1] == 1 else values
-        made.append(Array(name, flat, [one.name for one in chosen], [one.unit for one in chosen]))
+        arrays.append(Array(name, flat, [channel.name for channel in members], [channel.unit for channel in members]))
     if actions:
-        chosen, values = frames.action_of(table, every, actions)
-        made.append(Array(ACTIONS, values, [one.name for one in chosen], [one.unit for one in chosen]))
-    return made
+        members, values = frames.action_of(table, channels, actions)
+        names, units = [channel.name for channel in members], [channel.unit for channel in members]
+        arrays.append(Array(ACTIONS, values, names, units))
+    return arrays
 
 
-def losses(recording: Recording) -> Iterator[str]:
-    """Yield what of a synchronized recording these arrays do not hold."""
+def describe(recording: Recording) -> dict[str, pa.Table]:
+    """Return the tables that describe a synchronized recording and what these arrays do not hold of it."""
     table = frames.table(recording)
-    yield "rates of the streams and what happened between frames: one frame rate for all"
-    yield "stream events and types of the recorded streams"
-    for one in frames.channels(table):
-        if one.type == "string":
-            yield f"column {one.name}: arrays hold numbers"
+    losses = [
+        Loss("rates of the streams and what happened between frames: one frame rate for all"),
+        Loss("stream events and types of the recorded streams"),
+    ]
+    unsupported = [channel for channel in frames.channels(table) if not channel.number]
+    losses += [
+        Loss(f"arrays hold numbers, not {channel.type}", channel.stream, channel.short) for channel in unsupported
+    ]
     if recording.attributes[GRID] != "uniform":
-        yield f"one distance between frames: the grid is {recording.attributes[GRID]}; {TIME} has the times"
+        losses.append(
+            Loss(f"one distance between frames: the grid is {recording.attributes[GRID]}; {TIME} has the times")
+        )
+    carried = [("", column) for array in from_table(table) for column in array.columns]
+    return contents.part(recording, losses, [*carried, *(("", channel.name) for channel in unsupported)])
 
 
-def _name(one: frames.Channel) -> str:
-    """Return the name of the array that a channel belongs to: stream and quantity; a mask or a label is one of its own."""
-    if one.name.startswith(TRUTH):
+def _name(channel: frames.Channel) -> str:
+    """Return the name of the array of a channel: its stream and quantity; masks and labels have arrays of their own."""
+    if channel.truth:
         return "truth"
-    if not one.signal:
-        return one.name
-    return one.stream if one.quantity in ("", one.stream) else f"{one.stream}_{one.quantity}"
+    if not channel.signal:
+        return channel.name
+    if channel.quantity in ("", channel.stream):
+        return channel.stream
+    return f"{channel.stream}_{channel.quantity}"

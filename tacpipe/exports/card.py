@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from tacpipe.exports import contents, croissant, readme
-from tacpipe.exports.contents import Contents, shown
+from tacpipe.exports.contents import Contents, Loss, shown
 from tacpipe.exports.files import Content, Files
 from tacpipe.plugins.constraints import Names
 from tacpipe.plugins.stage import RecordingName, RecordingOutput, Result, stage
@@ -47,18 +47,20 @@ class Params:
     cite_as: str = ""  # how to cite it
 
 
-@stage(version=1)
+@stage(version=2)
 def part(params: Params, recording: Recording, name: RecordingName) -> Result:
     """Return the Parquet files of one recording, with its name in each row."""
     from tacpipe.io.parquet import to_parquet
 
-    files = {
-        f"data/{shown(one)}/{name}.parquet": to_parquet(_named(recording.table(one), name)) for one in recording.streams
-    }
-    return Result({"": RecordingOutput(contents.part(recording))}, files)
+    files, losses = {}, []
+    for stream in recording.streams:
+        table = recording.table(stream)
+        files[f"data/{shown(stream)}/{name}.parquet"] = to_parquet(_named(table, name))
+        losses += list(_losses(stream, table.schema))
+    return Result({"": RecordingOutput(contents.part(recording, losses))}, files)
 
 
-@stage(version=1, part=part)
+@stage(version=2, part=part)
 def card(params: Params, recordings: Dataset, parts: Parts) -> Result:
     """Write a dataset card: Parquet, README.md, Croissant.
 
@@ -90,6 +92,16 @@ def card(params: Params, recordings: Dataset, parts: Parts) -> Result:
     ]
     licence = [] if params.license else ["no licence is stated: give --license, as cc-by-4.0"]
     return Result(files=Files(files), notes=[*licence, *differing, *readme.notes(recordings, found)])
+
+
+def _losses(stream: str, schema: pa.Schema) -> Iterator[Loss]:
+    """Yield what of a stream the card does not hold."""
+    for field in schema:
+        if not croissant.type_of(str(field.type)):
+            what = f"{croissant.NAME} has no type for {field.type}; the Parquet files have the column"
+            yield Loss(what, stream, field.name)
+    if RECORDING in schema.names:
+        yield Loss("the recording's name, as the stream has a column of this name", stream, RECORDING)
 
 
 def _named(table: pa.Table, name: str) -> pa.Table:

@@ -1,17 +1,21 @@
-"""What the recordings of an export hold: streams, columns, rates, and what the format could not carry of each.
+"""Describe what the recordings of an export hold: streams, columns, rates, and what the format does not carry.
 
-Each part of an export returns it of its own recording as small tables, which are stored; `of_parts` puts them together,
-so that the whole of an export is described without opening the recordings again.
+Each part of an export returns the description of its recording as small tables, which are stored. `of_parts` puts them
+together, so an export is described without opening the recordings again.
+
+A writer states which columns it wrote, and `part` adds a `Loss` for every other column of the recording: a format that
+leaves something out cannot do so silently.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from tacpipe.channels import streams
+from tacpipe.printable import plain
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -21,6 +25,16 @@ if TYPE_CHECKING:
 TABLE = "data"  # how the only table of a recording is named where a name is needed
 TIME = "t_ns"
 COLUMNS, STREAMS, LOSSES = "columns", "streams", "losses"  # tables of a part
+Name = tuple[str, str]  # stream and column
+
+
+@dataclass(frozen=True)
+class Loss:
+    """A loss of a format: a column, a stream (``column`` is empty), or a property of the whole recording."""
+
+    reason: str
+    stream: str | None = None  # None: of the whole recording
+    column: str = ""
 
 
 @dataclass(frozen=True)
@@ -54,6 +68,7 @@ class Stream:
     others: Sequence[str] = ()  # recordings in which it has other columns
     shared: Sequence[str] = ()  # columns that it has in all of its recordings, of one type
     nan: bool = False  # whether a float is NaN somewhere
+    all_columns: Sequence[str] = ()  # those that it has in any of its recordings
 
 
 @dataclass(frozen=True)
@@ -63,7 +78,7 @@ class Contents:
     streams: Mapping[str, Stream]
     seconds: float  # from first to last stamp, over all recordings
     first_ns: int | None
-    losses: Mapping[str, Sequence[str]] = field(default_factory=dict)  # what is lost to the recordings that lose it
+    losses: Mapping[str, Sequence[str]] = field(default_factory=dict)  # sentence, names of the recordings that lose it
 
 
 def shown(stream: str) -> str:
@@ -71,8 +86,14 @@ def shown(stream: str) -> str:
     return stream or TABLE
 
 
-def part(recording: Recording, losses: Iterable[str] = ()) -> dict[str, pa.Table]:
-    """Return the tables that describe one recording, and ``losses``, of which each is what the format does not carry."""
+def part(
+    recording: Recording, losses: Iterable[Loss] = (), carried: Collection[Name] | None = None
+) -> dict[str, pa.Table]:
+    """Return the tables that describe one recording.
+
+    ``losses`` is what the format does not carry, ``carried`` the columns that it does (None: all of them). Each column
+    that is in neither becomes a loss.
+    """
     import numpy as np
     import pyarrow as pa
 
@@ -80,13 +101,18 @@ def part(recording: Recording, losses: Iterable[str] = ()) -> dict[str, pa.Table
     for name in recording.streams:
         table = recording.columns(name)
         described = _columns(table.schema)
-        columns += [(name, one.name, one.type, json.dumps(dict(one.about), sort_keys=True)) for one in described]
+        columns += [
+            (name, column.name, column.type, json.dumps(dict(column.about), sort_keys=True)) for column in described
+        ]
         t_ns = table.column(TIME).to_numpy() if TIME in table.column_names and table.num_rows else None
         rate_hz = streams.rate_hz(table)
-        floats = (table.column(one.name).to_numpy() for one in table.schema if pa.types.is_floating(one.type))
+        floats = (table.column(field.name).to_numpy() for field in table.schema if pa.types.is_floating(field.type))
         nan = any(bool(np.isnan(values).any()) for values in floats)
         ends = (int(t_ns[0]), int(t_ns[-1])) if t_ns is not None else (None, None)
         rows.append((name, table.num_rows, *ends, rate_hz, nan))
+    all_losses = list(losses)
+    if carried is not None:
+        all_losses += unwritten([(stream, column) for stream, column, *_ in columns], carried, all_losses)
     return {
         COLUMNS: _table(columns, stream=pa.string(), column=pa.string(), type=pa.string(), about=pa.string()),
         STREAMS: _table(
@@ -98,53 +124,103 @@ def part(recording: Recording, losses: Iterable[str] = ()) -> dict[str, pa.Table
             rate_hz=pa.float64(),
             nan=pa.bool_(),
         ),
-        LOSSES: _table([(one,) for one in dict.fromkeys(losses)], what=pa.string()),
+        LOSSES: _table(
+            [(loss.reason, loss.stream, loss.column) for loss in dict.fromkeys(all_losses)],
+            reason=pa.string(),
+            stream=pa.string(),
+            column=pa.string(),
+        ),
     }
+
+
+def unwritten(
+    names: Sequence[Name],
+    carried: Collection[Name],
+    losses: Iterable[Loss] = (),
+    reason: str = "the format has no place for it",
+) -> list[Loss]:
+    """Return a loss for each column of ``names`` that is neither carried nor named in ``losses``.
+
+    A stream of which only the time is carried becomes one loss.
+    """
+    named = {(loss.stream, loss.column) for loss in losses}
+    carried_streams = {stream for stream, column in carried if column != TIME}
+    missing = [name for name in names if name not in carried and not {name, (name[0], "")} & named]
+    empty = {stream for stream, _ in names} - carried_streams - {stream for stream, _ in named}
+    empty &= {stream for stream, _ in missing}
+    return list(dict.fromkeys(Loss(reason, stream, "" if stream in empty else column) for stream, column in missing))
+
+
+def sentences(losses: Iterable[tuple[str, Loss]]) -> dict[str, list[str]]:
+    """Return a sentence for each thing that is lost, with the recordings that lose it.
+
+    ``losses`` are pairs of a recording and a loss. Columns of a stream that share a reason share a sentence, which names
+    all of them.
+
+    >>> sentences([("a", Loss("no type", "cam", "x")), ("b", Loss("no type", "cam", "y")), ("b", Loss("rates"))])
+    {'columns x, y of stream cam: no type': ['a', 'b'], 'rates': ['b']}
+    """
+    groups: dict[tuple[str | None, bool, str], tuple[dict[str, None], dict[str, None]]] = {}
+    for recording, loss in losses:
+        columns, recordings = groups.setdefault((loss.stream, bool(loss.column), loss.reason), ({}, {}))
+        columns[loss.column] = recordings[recording] = None
+    return {_sentence(stream, columns, reason): list(names) for (stream, _, reason), (columns, names) in groups.items()}
+
+
+def _sentence(stream: str | None, columns: Collection[str], reason: str) -> str:
+    if stream is None:
+        return reason
+    place = f"stream {plain(shown(stream))}"
+    names = [plain(column) for column in columns if column]
+    return f"column{'s' * (len(names) > 1)} {', '.join(names)} of {place}: {reason}" if names else f"{place}: {reason}"
 
 
 def of_parts(parts: Dataset) -> Contents:
     """Return what all recordings hold together."""
     columns: dict[str, tuple[Column, ...]] = {}
-    found: dict[str, dict[str, Any]] = {}
-    losses: dict[str, list[str]] = {}
+    totals: dict[str, dict[str, Any]] = {}
+    losses: list[tuple[str, Loss]] = []
     seconds, starts = 0.0, []
-    known: dict[str, Any] = {}  # tables of columns by digest: nearly all recordings have the same
-    for one in parts:
-        key = one.digests[COLUMNS]
-        if key not in known:
-            known[key] = _by_stream(one.table(COLUMNS).to_pylist())
-        for row in one.table(STREAMS).to_pylist():
+    tables: dict[str, Any] = {}  # tables of columns by digest: nearly all recordings have the same
+    for part in parts:
+        key = part.digests[COLUMNS]
+        if key not in tables:
+            tables[key] = _by_stream(part.table(COLUMNS).to_pylist())
+        for row in part.table(STREAMS).to_pylist():
             name = row["stream"]
-            mine = columns.setdefault(name, known[key][name])
-            kept = found.setdefault(name, {**_none(), "shared": mine})
-            kept["recordings"].append(one.name)
-            kept["rows"] += row["rows"]
-            kept["nan"] |= row["nan"]
-            kept["rates"] += [row["rate_hz"]] if row["rate_hz"] else []
-            if known[key][name] != mine:
-                kept["others"].append(one.name)
-                alike = {(column.name, column.type) for column in known[key][name]}
-                kept["shared"] = [column for column in kept["shared"] if (column.name, column.type) in alike]
-        stamps = [row for row in one.table(STREAMS).to_pylist() if row["first_ns"] is not None]
+            first = columns.setdefault(name, tables[key][name])
+            total = totals.setdefault(
+                name, {**_none(), "shared": first, "all_columns": dict.fromkeys(c.name for c in first)}
+            )
+            total["recordings"].append(part.name)
+            total["rows"] += row["rows"]
+            total["nan"] |= row["nan"]
+            total["rates"] += [row["rate_hz"]] if row["rate_hz"] else []
+            if tables[key][name] != first:
+                total["others"].append(part.name)
+                alike = {(column.name, column.type) for column in tables[key][name]}
+                total["shared"] = [column for column in total["shared"] if (column.name, column.type) in alike]
+                total["all_columns"] |= dict.fromkeys(column.name for column in tables[key][name])
+        stamps = [row for row in part.table(STREAMS).to_pylist() if row["first_ns"] is not None]
         if stamps:
             starts.append(min(row["first_ns"] for row in stamps))
             seconds += (max(row["last_ns"] for row in stamps) - starts[-1]) / 1e9
-        for what in one.table(LOSSES)["what"].to_pylist():
-            losses.setdefault(what, []).append(one.name)
-    made = {
+        losses += [(part.name, Loss(**row)) for row in part.table(LOSSES).to_pylist()]
+    merged = {
         name: Stream(
             name,
             columns[name],
-            kept["recordings"],
-            kept["rows"],
-            [min(kept["rates"]), max(kept["rates"])] if kept["rates"] else [],
-            kept["others"],
-            [column.name for column in kept["shared"]],
-            kept["nan"],
+            total["recordings"],
+            total["rows"],
+            [min(total["rates"]), max(total["rates"])] if total["rates"] else [],
+            total["others"],
+            [column.name for column in total["shared"]],
+            total["nan"],
+            list(total["all_columns"]),
         )
-        for name, kept in sorted(found.items())
+        for name, total in sorted(totals.items())
     }
-    return Contents(made, seconds, min(starts, default=None), losses)
+    return Contents(merged, seconds, min(starts, default=None), sentences(losses))
 
 
 def _none() -> dict[str, Any]:

@@ -78,16 +78,18 @@ def _files(stream: str, pattern: str) -> dict[str, Any]:
 
 
 def _records(stream: str, columns: Sequence[Column]) -> dict[str, Any]:
-    own = [one for one in columns if one.name != "recording"]
     recording = Column("recording", "string", {"quantity": "name of the recording"})
-    every = [one for one in (recording, *own) if _type(one)]
-    ids = identifiers([one.name for one in every])
+    described_columns = [
+        recording,
+        *(column for column in columns if column.name != recording.name and type_of(column.type)),
+    ]
+    ids = identifiers([column.name for column in described_columns])
     return {
         "@type": "cr:RecordSet",
         "@id": stream,
         "name": stream,
         "description": f"Rows of the stream {stream}, of all recordings.",
-        "field": [_field(stream, one, ids[one.name]) for one in every],
+        "field": [_field(stream, column, ids[column.name]) for column in described_columns],
     }
 
 
@@ -113,7 +115,7 @@ def _field(stream: str, column: Column, identifier: str) -> dict[str, Any]:
         "@id": f"{stream}/{identifier}",
         "name": f"{stream}/{identifier}",
         "description": described(column),
-        "dataType": _type(column),
+        "dataType": type_of(column.type),
         "source": {"fileSet": {"@id": f"{stream}-files"}, "extract": {"column": column.name}},
     }
 
@@ -129,6 +131,6 @@ def described(column: Column) -> str:
     return ", ".join([f"{column.quantity or column.name}{unit}", *rest])
 
 
-def _type(column: Column) -> str:
-    """Return the type in Croissant; empty for one that it does not have."""
-    return "sc:Integer" if column.type.lstrip("u").startswith("int") else _TYPES.get(column.type, "")
+def type_of(arrow_type: str) -> str:
+    """Return the name of a type in Croissant; empty for one that it does not have."""
+    return "sc:Integer" if arrow_type.lstrip("u").startswith("int") else _TYPES.get(arrow_type, "")

@@ -10,12 +10,12 @@ from __future__ import annotations
 
 import functools
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from tacpipe.exports import contents, readme
-from tacpipe.exports.contents import TIME, Contents, Stream, shown
+from tacpipe.exports.contents import TIME, Contents, Loss, Stream, shown
 from tacpipe.exports.files import Content, Files
 from tacpipe.plugins.stage import RecordingName, RecordingOutput, Result, stage
 
@@ -47,17 +47,18 @@ class Params:
     """CSV has no options."""
 
 
-@stage(version=1)
+@stage(version=2)
 def part(params: Params, recording: Recording, name: RecordingName) -> Result:
-    """Return a file a stream."""
-    written, losses = {}, []
+    """Return one file per stream."""
+    written: dict[str, Callable[[Any], object]] = {}
+    losses: list[Loss] = []
     for stream in recording.streams:
         losses += list(_losses(stream, recording.columns(stream)))
         written[f"{name}/{shown(stream)}.csv"] = functools.partial(_write, recording, stream)
     return Result({"": RecordingOutput(contents.part(recording, losses))}, written=written)
 
 
-@stage(version=1, part=part)
+@stage(version=2, part=part)
 def csv(params: Params, recordings: Dataset, parts: Parts) -> Result:
     """Write recordings as CSV files that can be read back.
 
@@ -146,28 +147,27 @@ def _written(column: pa.ChunkedArray) -> pa.ChunkedArray:
     return column.cast(column.type.value_type) if pa.types.is_dictionary(column.type) else column
 
 
-def _losses(stream: str, table: Columns) -> Iterator[str]:
+def _losses(stream: str, table: Columns) -> Iterator[Loss]:
     """Yield what of a stream CSV and the layout do not give back."""
     import numpy as np
     import pyarrow as pa
     import pyarrow.compute as pc
 
-    where = f"stream {shown(stream)}"
     if not stream:
-        yield "that the recordings are one table of several streams: they are read back as one stream, data"
+        yield Loss("that the recordings are one table of several streams: they are read back as one stream, data")
     if TIME not in table.column_names:
-        yield f"{where} has no time, so {LAYOUT} leaves it out"
+        yield Loss(f"it has no time, so {LAYOUT} leaves it out", stream)
         return
     about: Mapping[str, str] = contents.about(table.schema.field(TIME))
     if "made" in about:
-        yield f"how the stamps of {where} were made ({about['made']})"
+        yield Loss(f"how its stamps were made ({about['made']})", stream)
     for field in table.schema:
         column = table.column(field.name)
         if str(field.type) not in READ:
-            yield f"column {field.name} of {where}, of the type {field.type}: {LAYOUT} leaves it out"
+            yield Loss(f"{LAYOUT} leaves out the type {field.type}", stream, field.name)
         elif column.null_count and not pa.types.is_string(field.type):
-            yield f"missing values in column {field.name} of {where}: their cells are empty, and ingest refuses or reads NaN"
+            yield Loss("missing values are empty cells, which ingest refuses or reads as NaN", stream, field.name)
         elif pa.types.is_floating(field.type) and bool(np.isinf(column.to_numpy()).any()):
-            yield f"infinite values in column {field.name} of {where}: ingest refuses them"
+            yield Loss("it has infinite values, which ingest refuses", stream, field.name)
         elif pa.types.is_string(field.type) and pc.any(pc.match_substring_regex(column, r"[\r\n]")).as_py():
-            yield f"line ends in the text of column {field.name} of {where}: ingest refuses them"
+            yield Loss("its text has line ends, which ingest refuses", stream, field.name)

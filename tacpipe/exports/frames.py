@@ -1,4 +1,4 @@
-"""A synchronized recording as frames of arrays: which columns belong together, what the robot's state and actions are."""
+"""Read a synchronized recording as frames of arrays: which columns belong together, what state and actions are."""
 
 from __future__ import annotations
 
@@ -12,20 +12,24 @@ from tacpipe.arrays import AnyArray
 from tacpipe.channels.masks import GRID
 from tacpipe.channels.streams import TRUTH
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.exports.contents import TIME, Contents, about
+from tacpipe.exports import contents
+from tacpipe.exports.contents import TIME, Contents, Loss
 from tacpipe.printable import listed, plain
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from tacpipe.datasets.dataset import Recording
+    from tacpipe.datasets.dataset import Dataset, Recording
+    from tacpipe.io.columns import Columns
 
 RATE = "grid_rate_hz"  # attribute of a synchronized recording
+LEFT_OUT = "not_synchronized"  # attribute: streams that `synchronize` left out
 SYNCHRONIZE = "synchronize"
 ROBOT = ("joint_position", "position", "orientation")  # a stream with one of these is a robot's
 TARGETS = "target_"  # begins the quantities of what a robot was asked to do
 CLOCKS = ("time", "sequence", "mask", "label", "status", "text")  # quantities that are no signals
 TACTILE = "tactile"
+_NO_FRAMES = "it has no value in each frame, as images, text and single rows have none"
 
 
 @dataclass(frozen=True)
@@ -41,13 +45,24 @@ class Channel:
     @property
     def short(self) -> str:
         """Its name as it was recorded, without the stream before it."""
-        return self.name.removeprefix(f"{self.stream}_") if self.stream else self.name
+        return self.name.removeprefix(f"{self.stream}_") if self.stream and not self.truth else self.name
+
+    @property
+    def number(self) -> bool:
+        """True for a type that arrays hold."""
+        return self.type.startswith(("int", "uint", "float", "double", "half", "bool"))
+
+    @property
+    def truth(self) -> bool:
+        """True for ground truth, which keeps its name."""
+        return self.name.startswith(TRUTH)
 
     @property
     def signal(self) -> bool:
         """Whether it is a number that a sensor or a robot measured."""
-        number = self.type.startswith(("int", "uint", "float", "double", "half"))
-        return bool(self.stream) and number and self.quantity not in CLOCKS and not self.name.startswith(TRUTH)
+        return (
+            bool(self.stream) and self.number and self.type != "bool" and self.quantity not in CLOCKS and not self.truth
+        )
 
 
 def synchronized(rate_hz: float | None, master: str) -> dict[str, dict[str, Any]]:
@@ -67,39 +82,57 @@ def table(recording: Recording) -> pa.Table:
     return recording.table()
 
 
-def columns(found: Contents, *, common: bool) -> tuple[list[str], Contents]:
-    """Return the columns of the frames, and what the recordings hold with what of it is left out.
+def columns(described: Contents, *, common: bool) -> tuple[list[str], Contents]:
+    """Return the columns of the frames, and ``described`` with the columns that are left out among its losses.
 
     Recordings whose columns differ are refused, or, where ``common``, those that all have are kept. Raises `UsageError`.
     """
-    (stream,) = found.streams.values()
+    (stream,) = described.streams.values()
     if not stream.others:
-        return list(stream.shared), found
-    lost = [one.name for one in stream.columns if one.name not in stream.shared]
+        return list(stream.shared), described
     if not common:
-        what = f"lacks {listed(lost, 3)}" if lost else "has more columns than"
+        missing = [column.name for column in stream.columns if column.name not in stream.shared]
+        difference = f"lacks {listed(missing, 3)}" if missing else "has more columns than"
         raise UsageError(
-            f"Recording {stream.others[0]} {what}{', unlike' if lost else ''} the first one ({len(stream.others)} of "
-            f"{len(stream.recordings)} recordings differ), and the format has the same in all. Export recordings of one rig "
-            f"at a time, or give --common to leave out what not all of them have."
+            f"Recording {stream.others[0]} {difference}{', unlike' if missing else ''} the first one "
+            f"({len(stream.others)} of {len(stream.recordings)} recordings differ), and the format has the same in all. "
+            f"Export recordings of one rig at a time, or give --common to leave out what not all of them have."
         )
-    what = (
-        f"columns that not all recordings have, as {listed(lost, 3)}"
-        if lost
-        else "columns that not all recordings have"
-    )
-    return list(stream.shared), replace(found, losses={**found.losses, what: list(stream.recordings)})
+    uncommon = [plain(name) for name in stream.all_columns if name not in stream.shared]
+    sentence = f"columns that not all recordings have: {', '.join(uncommon)}"
+    return list(stream.shared), replace(described, losses={**described.losses, sentence: list(stream.recordings)})
 
 
-def channels(table: pa.Table) -> list[Channel]:
+def without_frames(described: Contents, recordings: Dataset, originals: Dataset, retained: str = "") -> Contents:
+    """Return ``described`` with the streams and columns that the frames lack among its losses.
+
+    ``originals`` are the recordings before this export synchronized them; ``retained`` ends each sentence.
+    """
+    losses = []
+    for recording in recordings:
+        original = originals[recording.name]
+        if set(original.streams) == {""}:  # synchronized by the user
+            names = str(recording.attributes.get(LEFT_OUT) or "").split(", ")
+            losses += [(recording.name, Loss(_NO_FRAMES, stream)) for stream in names if stream]
+            continue
+        columns = [(stream, name) for stream in original.streams for name in original.columns(stream).schema.names]
+        carried = [(channel.stream, channel.short) for channel in channels(recording.columns())]
+        carried += [(stream, TIME) for stream in original.streams]
+        losses += [
+            (recording.name, loss) for loss in contents.unwritten(columns, carried, reason=_NO_FRAMES + retained)
+        ]
+    return replace(described, losses={**described.losses, **contents.sentences(losses)})
+
+
+def channels(table: pa.Table | Columns) -> list[Channel]:
     """Return the columns but the time."""
-    found = []
+    result = []
     for field in table.schema:
         if field.name != TIME:
-            given = about(field)
-            about_ = (given.get("stream", ""), given.get("quantity", ""), given.get("unit", ""))
-            found.append(Channel(field.name, *about_, str(field.type)))
-    return found
+            metadata = contents.about(field)
+            described = (metadata.get("stream", ""), metadata.get("quantity", ""), metadata.get("unit", ""))
+            result.append(Channel(field.name, *described, str(field.type)))
+    return result
 
 
 def state_of(every: Sequence[Channel], streams: Sequence[str]) -> list[Channel]:

@@ -17,7 +17,7 @@ from typing import IO, TYPE_CHECKING, Any, Literal
 
 from tacpipe.errors import UsageError
 from tacpipe.exports import contents, readme
-from tacpipe.exports.contents import TIME, shown
+from tacpipe.exports.contents import TIME, Loss, Name, shown
 from tacpipe.exports.files import Files, copied
 from tacpipe.plugins.constraints import Rate
 from tacpipe.plugins.stage import ALL, Attribute, RecordingName, RecordingOutput, Result, stage
@@ -80,20 +80,22 @@ def first(params: Params) -> Mapping[str, Mapping[str, Any]]:
     return frames.synchronized(params.rate_hz, params.master)
 
 
-@stage(version=1, reads=ALL)
+@stage(version=2, reads=ALL)
 def part(params: Params, recording: Recording, name: RecordingName) -> Result:
     """Return the file of one recording, or nothing where all are in one."""
     if params.structure == "robomimic":
         from tacpipe.exports import arrays
 
-        return Result({"": RecordingOutput(contents.part(recording, arrays.losses(recording)))})
-    losses: list[str] = []
-    content = _recording(recording, losses)
-    return Result({"": RecordingOutput(contents.part(recording, losses))}, written={f"{name}.h5": copied(content)})
+        return Result({"": RecordingOutput(arrays.describe(recording))})
+    losses: list[Loss] = []
+    columns: list[Name] = []
+    content = _recording(recording, losses, columns)
+    tables = contents.part(recording, losses, columns)
+    return Result({"": RecordingOutput(tables)}, written={f"{name}.h5": copied(content)})
 
 
-@stage(version=1, part=part, first=first)
-def hdf5(params: Params, recordings: Dataset, parts: Parts) -> Result:
+@stage(version=2, part=part, first=first)
+def hdf5(params: Params, recordings: Dataset, parts: Parts, originals: Dataset) -> Result:
     """Write recordings as HDF5 files.
 
     One file a recording with a group a stream at its own rate; or ``--structure robomimic``, one file of demonstrations.
@@ -107,13 +109,17 @@ def hdf5(params: Params, recordings: Dataset, parts: Parts) -> Result:
         from tacpipe.exports import frames
 
         columns, found = frames.columns(found, common=params.common)
+        found = frames.without_frames(found, recordings, originals)
         opening, written[DEMOS] = _DEMOS, copied(_demos(params, recordings, columns))
     text = readme.text("Tactile recordings as HDF5", opening, recordings, found)
     return Result(files=Files({readme.NAME: text}), notes=readme.notes(recordings, found), written=written)
 
 
-def _recording(recording: Recording, losses: list[str]) -> IO[bytes]:
-    """Return a temporary file with a recording, as HDF5 goes back and forth in what it writes."""
+def _recording(recording: Recording, losses: list[Loss], columns: list[Name]) -> IO[bytes]:
+    """Return a temporary file with a recording, as HDF5 goes back and forth in what it writes.
+
+    What it does not carry is added to ``losses``, what it carries to ``columns``.
+    """
     import h5py
 
     sink = tempfile.TemporaryFile()  # noqa: SIM115  (closed by whoever copies it)
@@ -123,46 +129,46 @@ def _recording(recording: Recording, losses: list[str]) -> IO[bytes]:
             group = file.create_group(shown(stream), track_order=True)
             table = recording.columns(stream)
             for field in table.schema:
-                losses += _column(group, field, table.column(field.name), shown(stream))
+                losses += _column(group, field, table.column(field.name), stream)
+            columns += [(stream, name) for name in group]
     return sink
 
 
-def _attributes(group: h5py.Group, values: Mapping[str, Attribute]) -> Iterator[str]:
+def _attributes(group: h5py.Group, values: Mapping[str, Attribute]) -> Iterator[Loss]:
     """Set the attributes of a recording; yield those that HDF5 has no value for."""
-    empty = [name for name, value in values.items() if value is None]
     for name, value in values.items():
         if value is not None:
             group.attrs[name] = value
-    if empty:
-        yield "attributes without a value (null): HDF5 has none, so they are left out"
+    if any(value is None for value in values.values()):
+        yield Loss("attributes without a value (null): HDF5 has none, so they are left out")
 
 
-def _column(group: h5py.Group, field: pa.Field, column: pa.ChunkedArray, stream: str) -> Iterator[str]:
+def _column(group: h5py.Group, field: pa.Field, column: pa.ChunkedArray, stream: str) -> Iterator[Loss]:
     """Write a column; yield what of it is lost."""
     import h5py
     import numpy as np
     import pyarrow as pa
 
-    kind, where = field.type, f"column {field.name} of stream {stream}"
+    kind = field.type
     if pa.types.is_string(kind):
-        values = np.array([one or "" for one in column.to_pylist()], dtype=object)
-        made = group.create_dataset(field.name, data=values, dtype=h5py.string_dtype())
+        values = np.array([value or "" for value in column.to_pylist()], dtype=object)
+        dataset = group.create_dataset(field.name, data=values, dtype=h5py.string_dtype())
     elif pa.types.is_binary(kind):
         values = np.empty(len(column), dtype=object)
-        values[:] = [np.frombuffer(one or b"", np.uint8) for one in column.to_pylist()]
-        made = group.create_dataset(field.name, data=values, dtype=h5py.vlen_dtype(np.uint8))
+        values[:] = [np.frombuffer(value or b"", np.uint8) for value in column.to_pylist()]
+        dataset = group.create_dataset(field.name, data=values, dtype=h5py.vlen_dtype(np.uint8))
     elif pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind):
         from tacpipe.exports import ros
 
         values = ros.numbers(column)
-        made = group.create_dataset(field.name, data=values, **_storage(values))
+        dataset = group.create_dataset(field.name, data=values, **_storage(values))
     else:
-        yield f"{where}: HDF5 has no type for {kind}"
+        yield Loss(f"HDF5 has no type for {kind}", stream, field.name)
         return
     for key, value in contents.about(field).items():
-        made.attrs[key] = value
+        dataset.attrs[key] = value
     if column.null_count:
-        yield f"missing values in {where}: they are written as NaN, 0 or empty text"
+        yield Loss("missing values are written as NaN, 0 or empty text", stream, field.name)
 
 
 def _storage(values: AnyArray) -> dict[str, Any]:
@@ -187,7 +193,7 @@ def _demos(params: Params, recordings: Dataset, columns: Sequence[str]) -> IO[by
         for number, one in enumerate(every):
             demo = data.create_group(f"demo_{number}", track_order=True)
             table = frames.table(one).select(columns)
-            for array in arrays.of(table, params.actions):
+            for array in arrays.from_table(table, params.actions):
                 # robomimic reads actions next to obs
                 name = array.name if array.name in ("actions", TIME) else f"obs/{array.name}"
                 made = demo.create_dataset(name, data=array.values, **_storage(array.values))

@@ -1,4 +1,4 @@
-"""Write recordings as a LeRobot dataset (v3.0): frames at one rate, with the recorded shards beside them.
+"""Write recordings as a LeRobot dataset (v3.0): frames at one rate, together with the recorded shards.
 
 Synchronized recordings, or any with ``--rate-hz``. The robot's streams are ``observation.state``, tactile streams
 ``observation.tactile.STREAM``; clocks and masks are ``tacpipe.*``, which policies leave out. ``--actions`` names the stream
@@ -21,7 +21,7 @@ from tacpipe.channels.masks import GRID
 from tacpipe.errors import UsageError
 from tacpipe.exports import contents, readme
 from tacpipe.exports import lerobot_statistics as statistics
-from tacpipe.exports.contents import TIME
+from tacpipe.exports.contents import TIME, Loss
 from tacpipe.exports.files import Content, Files
 from tacpipe.exports.lerobot_features import ACTION, ORIGINALS, Feature, features
 from tacpipe.plugins.constraints import Names, Rate
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from tacpipe.datasets.dataset import Dataset, Recording
+    from tacpipe.exports.frames import Channel
 
     Parts = Dataset
 
@@ -83,7 +84,7 @@ def shards(params: Params) -> str:
     return ORIGINALS if params.originals else ""
 
 
-@stage(version=1, reads=("grid", "grid_rate_hz"))
+@stage(version=2, reads=("grid", "grid_rate_hz"))
 def part(params: Params, recording: Recording) -> RecordingOutput:
     """Return the statistics of each feature of one recording."""
     import pyarrow as pa
@@ -93,18 +94,21 @@ def part(params: Params, recording: Recording) -> RecordingOutput:
     table = frames.table(recording)
     losses = list(_losses(params, table, str(recording.attributes[GRID])))
     params = params if not params.actions or _has(table, params.actions) else replace(params, actions="")
+    frame_features = features(params, table)
     rows = [
-        (one.name == ACTION, column, *values)
-        for one in features(params, table)
-        for column, values in statistics.by_column(one)
+        (feature.name == ACTION, column, *values)
+        for feature in frame_features
+        for column, values in statistics.by_column(feature)
     ]
     columns = list(zip(*rows, strict=True))
     names = [ACTION, "column", *statistics.STATISTICS]
-    made = pa.Table.from_arrays([pa.array(column) for column in columns], names=names)
-    return RecordingOutput({**contents.part(recording, losses), statistics.TABLE: made})
+    rows_of_statistics = pa.Table.from_arrays([pa.array(column) for column in columns], names=names)
+    carried = [("", column) for feature in frame_features for column in feature.columns]
+    carried += [("", channel.name) for channel in _without_feature(frames.channels(table))]  # named above
+    return RecordingOutput({**contents.part(recording, losses, carried), statistics.TABLE: rows_of_statistics})
 
 
-@stage(version=1, part=part, first=first, originals=shards)
+@stage(version=2, part=part, first=first, originals=shards)
 def lerobot(params: Params, recordings: Dataset, parts: Parts, originals: Dataset) -> Result:
     """Write recordings as a LeRobot dataset (v3.0).
 
@@ -117,8 +121,8 @@ def lerobot(params: Params, recordings: Dataset, parts: Parts, originals: Datase
 
     every = list(recordings)
     fps = frames.rate_hz(every)
-    found = contents.of_parts(parts)
-    columns, found = frames.columns(found, common=params.common)
+    columns, described = frames.columns(contents.of_parts(parts), common=params.common)
+    described = frames.without_frames(described, recordings, originals, _retained(params))
     made = features(params, frames.table(every[0]).select(columns).slice(0, 2))
     tasks = _tasks(params, every)
     lengths = {one.name: _rows(parts, one.name) for one in every}
@@ -144,24 +148,38 @@ def lerobot(params: Params, recordings: Dataset, parts: Parts, originals: Datase
     order = _task_order(tasks)
     indices = {name: order[task] for name, task in tasks.items()}
     files["meta/stats.json"] = _json(statistics.of_all(parts, made, starts, lengths, indices, fps))
-    files["meta/tacpipe.json"] = _json(_about(made, found))
-    files[readme.NAME] = readme.text("Tactile recordings as a LeRobot dataset", _OPENING, recordings, found)
-    return Result(files=Files(files), notes=readme.notes(recordings, found))
+    files["meta/tacpipe.json"] = _json(_about(made, described))
+    files[readme.NAME] = readme.text("Tactile recordings as a LeRobot dataset", _OPENING, recordings, described)
+    return Result(files=Files(files), notes=readme.notes(recordings, described))
 
 
-def _losses(params: Params, table: pa.Table, grid: str) -> Iterator[str]:
+def _losses(params: Params, table: pa.Table, grid: str) -> Iterator[Loss]:
+    """Yield what the features do not hold of a synchronized table."""
     from tacpipe.exports import frames
 
-    every = frames.channels(table)
-    kept = f"; the shards under {ORIGINALS}/ keep them" if params.originals else ""
-    yield f"rates of the streams and what happened between frames: one frame rate for all{kept}"
+    channels = frames.channels(table)
+    place = _retained(params)
+    yield Loss(f"rates of the streams and what happened between frames: one frame rate for all{place}")
     if not params.originals:
-        yield "stream events, and types and units of the recorded streams (with --originals they are carried)"
+        yield Loss("stream events, and types and units of the recorded streams (with --originals they are carried)")
     if grid != "uniform":
-        yield f"distances between frames: timestamp is frame / fps, and the grid is {grid}; {ORIGINALS}.{TIME} has the times"
-    lossy = frames.rounded(table, [one for one in every if one.signal])
-    for stream in dict.fromkeys(one.stream for one in lossy):
-        yield f"digits beyond float32 of stream {stream}{kept}"
+        times = f"{ORIGINALS}.{TIME} has the times"
+        yield Loss(f"distances between frames: timestamp is frame / fps, and the grid is {grid}; {times}")
+    lossy = frames.rounded(table, [channel for channel in channels if channel.signal])
+    for stream in dict.fromkeys(channel.stream for channel in lossy):
+        yield Loss(f"digits beyond float32{place}", stream)
+    for channel in _without_feature(channels):
+        yield Loss(f"features have no type for {channel.type}{place}", channel.stream, channel.short)
+
+
+def _without_feature(channels: Sequence[Channel]) -> list[Channel]:
+    """Return the channels whose type no feature has."""
+    return [channel for channel in channels if not channel.number and channel.type != "string"]
+
+
+def _retained(params: Params) -> str:
+    """Return the end of a loss where the recorded shards are part of the export."""
+    return f"; the shards under {ORIGINALS}/ keep it" if params.originals else ""
 
 
 def _has(table: pa.Table, stream: str) -> bool:

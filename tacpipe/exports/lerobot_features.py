@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from tacpipe.channels.streams import TRUTH
 from tacpipe.exports.contents import TIME
 
 if TYPE_CHECKING:
@@ -47,46 +46,44 @@ def features(params: Params, table: pa.Table) -> list[Feature]:
 
     from tacpipe.exports import frames
 
-    every = frames.channels(table)
-    state = frames.state_of(every, [one.strip() for one in params.state.split(",") if one.strip()])
-    taxels = [one for one in every if one.signal and one.quantity == frames.TACTILE]
-    state = [one for one in state if one not in taxels]
+    channels = frames.channels(table)
+    state = frames.state_of(channels, [name.strip() for name in params.state.split(",") if name.strip()])
+    taxels = [channel for channel in channels if channel.signal and channel.quantity == frames.TACTILE]
+    state = [channel for channel in state if channel not in taxels]
 
-    def vector(name: str, chosen: Sequence[frames.Channel], values: AnyArray | None = None) -> Feature:
-        values = frames.matrix(table, chosen, np.dtype(np.float32)) if values is None else values
-        several = {one.stream for one in chosen}
-        names = [one.short if len(several) == 1 else one.name for one in chosen]
-        flat = values[:, 0] if values.shape[1] == 1 else values
+    def vector(name: str, members: Sequence[frames.Channel], values: AnyArray | None = None) -> Feature:
+        values = frames.matrix(table, members, np.dtype(np.float32)) if values is None else values
+        one_stream = len({channel.stream for channel in members}) == 1
         return Feature(
             name,
-            flat,
-            names,
-            [one.name for one in chosen],
-            [one.unit for one in chosen],
-            [one.quantity for one in chosen],
+            values[:, 0] if values.shape[1] == 1 else values,
+            [channel.short if one_stream else channel.name for channel in members],
+            [channel.name for channel in members],
+            [channel.unit for channel in members],
+            [channel.quantity for channel in members],
         )
 
-    found: list[Feature] = []
-    whole = [*state, *taxels] if params.tactile_in_state else state
-    found += [vector("observation.state", whole)] if whole else []
+    vectors: list[Feature] = []
+    observed = [*state, *taxels] if params.tactile_in_state else state
+    vectors += [vector("observation.state", observed)] if observed else []
     if params.actions:
-        found.append(vector(ACTION, *frames.action_of(table, every, params.actions)))
-    rest = [one for one in every if one.signal and one not in state]
-    for stream in dict.fromkeys(one.stream for one in rest):
-        touch = [one for one in rest if one.stream == stream and one in taxels]
-        other = [one for one in rest if one.stream == stream and one not in taxels]
-        found += [vector(f"observation.tactile.{stream}", touch)] if touch else []
-        found += [vector(f"observation.{stream}", other)] if other else []
-    latents = [one for one in every if one.quantity == "latent"]
-    found += [vector("observation.latents", latents)] if latents else []
-    truth = [one for one in every if one.name.startswith(TRUTH) and one.type in ("float", "double")]
-    found += [vector(f"{ORIGINALS}.truth", truth)] if truth else []
-    found.append(Feature(f"{ORIGINALS}.{TIME}", table.column(TIME).to_numpy(), [TIME], [TIME], ["ns"], ["time"]))
-    taken = {one.name for one in (*state, *rest, *latents, *truth)}
-    for one in every:
-        if one.name not in taken:
-            name = f"{one.short}.{one.stream}" if one.stream else one.short
-            values = table.column(one.name).to_numpy()
+        vectors.append(vector(ACTION, *frames.action_of(table, channels, params.actions)))
+    signals = [channel for channel in channels if channel.signal and channel not in state]
+    for stream in dict.fromkeys(channel.stream for channel in signals):
+        touch = [channel for channel in signals if channel.stream == stream and channel in taxels]
+        remaining = [channel for channel in signals if channel.stream == stream and channel not in taxels]
+        vectors += [vector(f"observation.tactile.{stream}", touch)] if touch else []
+        vectors += [vector(f"observation.{stream}", remaining)] if remaining else []
+    latents = [channel for channel in channels if channel.quantity == "latent"]
+    vectors += [vector("observation.latents", latents)] if latents else []
+    truth = [channel for channel in channels if channel.truth and channel.type in ("float", "double")]
+    vectors += [vector(f"{ORIGINALS}.truth", truth)] if truth else []
+    vectors.append(Feature(f"{ORIGINALS}.{TIME}", table.column(TIME).to_numpy(), [TIME], [TIME], ["ns"], ["time"]))
+    placed = {channel.name for channel in (*state, *signals, *latents, *truth)}
+    for channel in channels:
+        if channel.name not in placed and (channel.number or channel.type == "string"):
+            name = f"{channel.short}.{channel.stream}" if channel.stream else channel.short
             name = f"{ORIGINALS}.{name.replace('/', '_')}"
-            found.append(Feature(name, values, [one.name], [one.name], [one.unit], [one.quantity]))
-    return found
+            values = table.column(channel.name).to_numpy()
+            vectors.append(Feature(name, values, [channel.name], [channel.name], [channel.unit], [channel.quantity]))
+    return vectors

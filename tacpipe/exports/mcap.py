@@ -1,8 +1,9 @@
 """Write recordings as MCAP files, one a recording, for Foxglove and ROS 2.
 
 Each stream is a topic of ROS 2 messages with one field a column in its own type, at its own rate; events are a topic too,
-labels a metadata record. Streams that make up a pose, a wrench, a twist, joint states or tactile states are written as
-these messages besides (``--no-usual-messages`` leaves them out). Log time and header stamp are the stamps of the stream.
+labels a metadata record. Columns that make up a pose, a wrench, a twist, joint states, tactile states or an encoded image
+are written as these messages too (``--no-usual-messages`` leaves them out). Log time and header stamp are the stamps of the
+stream.
 
 Example: tacpipe export mcap data/recordings -o exports/mcap
 """
@@ -19,7 +20,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from tacpipe.exports import contents, readme
-from tacpipe.exports.contents import TIME, shown
+from tacpipe.exports.contents import TIME, Loss, Name
 from tacpipe.exports.files import Files
 from tacpipe.plugins.stage import ALL, RecordingName, RecordingOutput, Result, stage
 
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
     import pyarrow as pa
     from mcap.writer import Writer
 
-    from tacpipe.arrays import Int64s
     from tacpipe.datasets.dataset import Dataset, Recording
     from tacpipe.exports.ros import Topic
     from tacpipe.io.columns import Columns
@@ -40,28 +40,31 @@ One MCAP file a recording (profile `ros2`, messages in CDR with their definition
 `ros2 bag play FILE.mcap`, or read it in Python with `rosbags` or `mcap`.
 
 The topic `/STREAM` has messages of the type `tacpipe_msgs/msg/Stream`, a field a column; the metadata of its channel name
-stream, columns and units (`tacpipe`, JSON). Topics below it (`/STREAM/pose`) repeat some columns as usual messages. Labels
-are in the metadata record `tacpipe`. tacpipe reads the files back with `tacpipe ingest mcap`.
+stream, columns and units (`tacpipe`, JSON). Topics below it repeat some columns as usual messages: `/STREAM/pose`, and
+encoded images as `sensor_msgs/msg/CompressedImage` in `/STREAM/image`. Labels are in the metadata record `tacpipe`. tacpipe
+reads the files back with `tacpipe ingest mcap`.
 """
 
 
 @dataclass(frozen=True)
 class Params:
-    """What is written besides the streams themselves."""
+    """What is written in addition to the streams."""
 
-    usual_messages: bool = True  # poses, wrenches, twists, joint and tactile states as messages of these types too
+    # poses, wrenches, twists, joint and tactile states and encoded images as messages of these types too
+    usual_messages: bool = True
 
 
-@stage(version=1, reads=ALL)
+@stage(version=2, reads=ALL)
 def part(params: Params, recording: Recording, name: RecordingName) -> Result:
     """Return the MCAP file of one recording."""
-    losses: list[str] = []
+    losses: list[Loss] = []
     streams = list(_streams(params, recording, losses))
     write = functools.partial(_write, recording, name, streams)
-    return Result({"": RecordingOutput(contents.part(recording, losses))}, written={f"{name}.mcap": write})
+    columns = [name for stream in streams for name in stream.columns]
+    return Result({"": RecordingOutput(contents.part(recording, losses, columns))}, written={f"{name}.mcap": write})
 
 
-@stage(version=1, part=part)
+@stage(version=2, part=part)
 def mcap(params: Params, recordings: Dataset, parts: Parts) -> Result:
     """Write recordings as MCAP files for Foxglove and ROS 2.
 
@@ -77,11 +80,12 @@ def mcap(params: Params, recordings: Dataset, parts: Parts) -> Result:
 
 @dataclass(frozen=True)
 class _Stream:
-    """A stream that becomes topics: what makes them of its rows, which come in blocks, in the order of time or not."""
+    """A stream that becomes topics: the function that makes them of its rows, which come in blocks."""
 
-    topics: Callable[[pa.Table], Sequence[tuple[Topic, Int64s]]]
+    topics: Callable[[pa.Table], Sequence[Topic]]
     name: str
-    ordered: bool
+    columns: Sequence[Name]  # carried by the messages
+    ordered: bool  # True: the rows are in the order of time
 
 
 def _write(recording: Recording, name: str, streams: Sequence[_Stream], sink: Any) -> None:
@@ -98,7 +102,8 @@ def _write(recording: Recording, name: str, streams: Sequence[_Stream], sink: An
     writer.finish()  # type: ignore[no-untyped-call]
 
 
-def _streams(params: Params, recording: Recording, losses: list[str]) -> Iterator[_Stream]:
+def _streams(params: Params, recording: Recording, losses: list[Loss]) -> Iterator[_Stream]:
+    """Yield the streams that become topics; add to ``losses`` what the messages do not carry."""
     import numpy as np
 
     from tacpipe.exports import ros
@@ -106,41 +111,52 @@ def _streams(params: Params, recording: Recording, losses: list[str]) -> Iterato
     starts = [start for stream in recording.streams if (start := _start(recording, stream)) is not None]
     for stream in recording.streams:
         table = recording.columns(stream)
-        losses += _losses(stream, table)
         if TIME not in table.column_names:
             if set(ros.POINT) <= set(table.column_names) and starts and min(starts) >= 0:
-                yield _Stream(functools.partial(_cloud, stream, min(starts)), stream, ordered=False)
-                losses.append(
-                    f"stream {shown(stream)} has no time: its one message is stamped with the recording's start"
-                )
+                columns = [(stream, name) for name in ros.cloud_columns(table.schema)]
+                yield _Stream(functools.partial(_cloud, stream, min(starts)), stream, columns, ordered=False)
+                losses.append(Loss("it has no time: its one message is stamped with the recording's start", stream))
+                losses += contents.unwritten([(stream, name) for name in table.column_names], columns)
             else:
-                losses.append(f"stream {shown(stream)}: it has no time, and a message needs one")
+                losses.append(Loss("it has no time, and a message needs one", stream))
             continue
         t_ns = table.column(TIME).to_numpy()
         if table.num_rows and not 0 <= t_ns.min() <= t_ns.max() <= ros.LATEST_S * 10**9:
-            losses.append(
-                f"stream {shown(stream)}: its stamps lie before 1970 or after 2038, which ROS has no stamps for"
-            )
+            losses.append(Loss("its stamps lie before 1970 or after 2038, which ROS has no stamps for", stream))
             continue
-        yield _Stream(functools.partial(_topics, params, stream), stream, ordered=not np.any(np.diff(t_ns) < 0))
+        losses += _losses(stream, table)
+        head = ros.stream_topic(stream, table.schema.empty_table())
+        columns = [(stream, name) for name in (TIME, *(column["name"] for column in head.metadata["columns"]))]
+        images = [name for name in table.column_names if _holds_images(table, name)] if params.usual_messages else []
+        topics = functools.partial(_topics, params, stream, images)
+        yield _Stream(topics, stream, columns, ordered=not np.any(np.diff(t_ns) < 0))
 
 
-def _cloud(stream: str, start_ns: int, table: pa.Table) -> list[tuple[Topic, Int64s]]:
+def _holds_images(table: Columns, name: str) -> bool:
+    """Return whether the first entry of a column of bytes is an encoded image."""
+    import pyarrow as pa
+
+    from tacpipe.formats.arrays.frames import encoding
+
+    if not pa.types.is_binary(table.schema.field(name).type):
+        return False
+    first = next((value.as_py() for value in table.column(name) if value.is_valid and len(value.as_buffer())), b"")
+    return bool(encoding(first))
+
+
+def _cloud(stream: str, start_ns: int, table: pa.Table) -> list[Topic]:
     """Return the topic of a cloud of points, whose one message has all rows."""
-    import numpy as np
-
     from tacpipe.exports import ros
 
-    return [(ros.cloud(stream, table, start_ns), np.array([start_ns]))]
+    return [ros.cloud(stream, table, start_ns)]
 
 
-def _topics(params: Params, stream: str, table: pa.Table) -> list[tuple[Topic, Int64s]]:
+def _topics(params: Params, stream: str, images: Sequence[str], table: pa.Table) -> list[Topic]:
     """Return the topics of some rows of a stream."""
     from tacpipe.exports import ros
 
-    t_ns = table.column(TIME).to_numpy()
-    usual = ros.usual(stream, table, t_ns) if params.usual_messages else []
-    return [(topic, t_ns) for topic in [ros.own(stream, table, t_ns), *usual]]
+    usual = ros.usual_topics(stream, table, images) if params.usual_messages else []
+    return [ros.stream_topic(stream, table), *usual]
 
 
 def _start(recording: Recording, stream: str) -> int | None:
@@ -162,7 +178,7 @@ def _messages(writer: Writer, recording: Recording, stream: _Stream) -> list[Ite
     first = stream.topics(head)
     blocks = _shared(itertools.chain([first], map(stream.topics, tables)), len(first))
     channels = []
-    for topic, _ in first:
+    for topic in first:
         schema = writer.register_schema(topic.type, "ros2msg", topic.definition.encode())
         metadata = {"tacpipe": json.dumps(topic.metadata, sort_keys=True)}
         channels.append(writer.register_channel(topic.name, "cdr", schema, metadata))
@@ -190,16 +206,15 @@ def _shared(values: Iterator[Any], readers: int) -> list[Iterator[Any]]:
     return [read(mine) for mine in waiting]
 
 
-def _of_topic(
-    number: int, channel: int, blocks: Iterable[Sequence[tuple[Topic, Int64s]]]
-) -> Iterator[tuple[int, int, bytes]]:
+def _of_topic(number: int, channel: int, blocks: Iterable[Sequence[Topic]]) -> Iterator[tuple[int, int, bytes]]:
     """Yield log time, channel and content of the messages of the topic of this number."""
     import numpy as np
 
     from tacpipe.exports import cdr
 
     for topics in blocks:
-        topic, t_ns = topics[number]
+        topic = topics[number]
+        t_ns = topic.t_ns
         stamps, messages = t_ns.tolist(), cdr.packed(topic.parts, len(t_ns))
         del topics, topic
         if np.any(np.diff(t_ns) < 0):  # events come stream by stream
@@ -209,21 +224,17 @@ def _of_topic(
             yield from zip(stamps, (channel for _ in stamps), messages, strict=True)
 
 
-def _losses(stream: str, table: Columns) -> Iterator[str]:
+def _losses(stream: str, table: Columns) -> Iterator[Loss]:
     """Yield what of a stream its messages do not hold."""
     import pyarrow as pa
 
     from tacpipe.exports import ros
 
-    where = f"stream {shown(stream)}"
-    if TIME not in table.column_names:
-        return
     for field in table.schema:
         column = table.column(field.name)
         if str(field.type) not in ros.TYPES:
-            yield f"column {field.name} of {where}: messages have no type for {field.type}"
+            yield Loss(f"messages have no type for {field.type}", stream, field.name)
         elif column.null_count:
-            written: Any = (
-                "NaN" if pa.types.is_floating(field.type) else "empty" if pa.types.is_string(field.type) else 0
-            )
-            yield f"missing values in column {field.name} of {where}: they are written as {written}"
+            value: Any = "NaN" if pa.types.is_floating(field.type) else 0
+            value = "empty" if pa.types.is_string(field.type) or pa.types.is_binary(field.type) else value
+            yield Loss(f"missing values are written as {value}", stream, field.name)

@@ -1,11 +1,13 @@
-"""Streams as ROS 2 messages: one of their own type with each column in its own, and the usual types where columns fit.
+"""Write streams as ROS 2 messages: one type per stream with all columns, and the usual types where columns fit.
 
-A stream's own message has a field a column, so values keep their bits. Where quantities make up a usual message (joint
-states, a pose, a wrench, a twist, tactile states), these are written besides, for programs that read nothing else.
+The message of a stream has one field per column, so values keep their bits. Where columns make up a usual message (joint
+states, a pose, a wrench, a twist, tactile states, an encoded image), that is written too, for programs that read nothing
+else.
 """
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -18,6 +20,7 @@ from tacpipe.channels.schema import AXES, COMPONENTS
 from tacpipe.exports import cdr
 from tacpipe.exports.cdr import Constant, Part, Texts, Values
 from tacpipe.exports.contents import TIME, about, shown
+from tacpipe.formats.arrays.frames import encoding
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -51,22 +54,24 @@ _DEFINITIONS = {
         f"{_HEADER}uint32 height\nuint32 width\nsensor_msgs/PointField[] fields\nbool is_bigendian\nuint32 point_step\n"
         "uint32 row_step\nuint8[] data\nbool is_dense\n"
     ),
+    "sensor_msgs/CompressedImage": f"{_HEADER}string format\nuint8[] data\n",
     "tactile_msgs/TactileState": f"{_HEADER}sensor_msgs/ChannelFloat32[] sensors\n",
 }
 
 
 @dataclass(frozen=True)
 class Topic:
-    """One topic of a recording: the type of its messages, and their parts for all rows."""
+    """One topic of a recording: the type of its messages, their stamps (message,) and their parts."""
 
     name: str
     type: str  # package/msg/Name
     definition: str
+    t_ns: Int64s
     parts: Sequence[Part]
     metadata: Mapping[str, Any] = field(default_factory=dict)  # of JSON
 
 
-def own(stream: str, table: pa.Table, t_ns: Int64s) -> Topic:
+def stream_topic(stream: str, table: pa.Table) -> Topic:
     """Return the topic of a stream with all columns in their own types; the header has the stamps.
 
     Its metadata name stream and columns as they were, with their own metadata. Columns of types that no message has are
@@ -74,7 +79,8 @@ def own(stream: str, table: pa.Table, t_ns: Int64s) -> Topic:
     """
     import pyarrow as pa
 
-    names = [one.name for one in table.schema if one.name != TIME and str(one.type) in TYPES]
+    t_ns = table.column(TIME).to_numpy()
+    names = [field.name for field in table.schema if field.name != TIME and str(field.type) in TYPES]
     fields = field_names(names)
     parts: list[Part] = list(cdr.header(t_ns, shown(stream)))
     lines = []
@@ -87,50 +93,67 @@ def own(stream: str, table: pa.Table, t_ns: Int64s) -> Topic:
         )
         if pa.types.is_string(kind) or pa.types.is_binary(kind):
             empty: Any = "" if pa.types.is_string(kind) else b""
-            parts.append(Texts([empty if one is None else one for one in column.to_pylist()]))
+            parts.append(Texts([empty if value is None else value for value in column.to_pylist()]))
         else:
             parts.append(Values(numbers(column)))
-    made = f"{PACKAGE}/{_camel(shown(stream))}"
-    definitions = {**_DEFINITIONS, made: _HEADER + "".join(lines)}
+    message = f"{PACKAGE}/{_camel(shown(stream))}"
+    definitions = {**_DEFINITIONS, message: _HEADER + "".join(lines)}
     metadata = {"stream": stream, "columns": columns, "time": about(table.schema.field(TIME))}
-    return Topic(f"/{topic_part(shown(stream))}", _full(made), _definition(made, definitions), parts, metadata)
+    name = f"/{topic_part(shown(stream))}"
+    return Topic(name, _full(message), _definition(message, definitions), t_ns, parts, metadata)
 
 
-def usual(stream: str, table: pa.Table, t_ns: Int64s) -> list[Topic]:
-    """Return the topics of usual messages that the quantities of a stream make up."""
-    found = []
+def usual_topics(stream: str, table: pa.Table, images: Sequence[str] = ()) -> list[Topic]:
+    """Return the topics of usual messages that the columns of a stream make up.
+
+    ``images`` are the columns of encoded images. Rows without an image have no message.
+    """
+    topics = []
     top = f"/{topic_part(shown(stream))}"
+    t_ns = table.column(TIME).to_numpy()
 
-    def add(name: str, kind: str, parts: Sequence[Part]) -> None:
-        head = cdr.header(t_ns, shown(stream))
+    def add(name: str, kind: str, stamps_ns: Int64s, parts: Sequence[Part]) -> None:
+        every = [*cdr.header(stamps_ns, shown(stream)), *parts]
         metadata = {"derived_from": top}
-        found.append(Topic(f"{top}/{name}", _full(kind), _definition(kind, _DEFINITIONS), [*head, *parts], metadata))
+        topics.append(Topic(f"{top}/{name}", _full(kind), _definition(kind, _DEFINITIONS), stamps_ns, every, metadata))
 
+    for column in images:
+        values = [value or b"" for value in table.column(column).to_pylist()]
+        encodings = list(map(encoding, values))
+        rows = [row for row, name in enumerate(encodings) if name]
+        image: list[Part] = [Texts([encodings[row] for row in rows]), Texts([values[row] for row in rows])]
+        name = "image" if len(images) == 1 else f"image/{topic_part(column)}"
+        add(name, "sensor_msgs/CompressedImage", t_ns[rows], image)
     place, turn = vector(table, "position", AXES), vector(table, "orientation", COMPONENTS)
     if place and turn:
-        add("pose", "geometry_msgs/PoseStamped", [*place, *turn])
+        add("pose", "geometry_msgs/PoseStamped", t_ns, [*place, *turn])
     force, torque = vector(table, "force", AXES), vector(table, "torque", AXES)
     if force:
-        add("wrench", "geometry_msgs/WrenchStamped", [*force, *(torque or [Values(np.zeros(len(t_ns)))] * 3)])
+        add("wrench", "geometry_msgs/WrenchStamped", t_ns, [*force, *(torque or [Values(np.zeros(len(t_ns)))] * 3)])
     linear, angular = vector(table, "velocity", AXES), vector(table, "angular_velocity", AXES)
     if linear and angular:
-        add("twist", "geometry_msgs/TwistStamped", [*linear, *angular])
+        add("twist", "geometry_msgs/TwistStamped", t_ns, [*linear, *angular])
     joints = [of_quantity(table, f"joint_{name}") for name in ("position", "velocity", "torque")]
     if joints[0]:
         names = [_joint(name) for name in joints[0]]
-        several = [cdr.sequence([numbers(table.column(name)) for name in columns]) for columns in joints]
+        sequences = [cdr.sequence([numbers(table.column(name)) for name in columns]) for columns in joints]
         texts = [cdr.count(len(names)), *(cdr.text(name) for name in names)]
-        add("joint_states", "sensor_msgs/JointState", [*texts, *(part for parts in several for part in parts)])
+        add("joint_states", "sensor_msgs/JointState", t_ns, [*texts, *itertools.chain(*sequences)])
     taxels = of_quantity(table, "tactile")
     if taxels:
-        values = cdr.sequence([numbers(table.column(name)) for name in taxels], "<f4")
-        add("tactile", "tactile_msgs/TactileState", [cdr.count(1), cdr.text(shown(stream)), *values])
-    return found
+        readings = cdr.sequence([numbers(table.column(name)) for name in taxels], "<f4")
+        add("tactile", "tactile_msgs/TactileState", t_ns, [cdr.count(1), cdr.text(shown(stream)), *readings])
+    return topics
+
+
+def cloud_columns(schema: pa.Schema) -> list[str]:
+    """Return the columns of a cloud of points that its message carries."""
+    return [*POINT, *(COLOURS if set(COLOURS) <= set(schema.names) else ())]
 
 
 def cloud(stream: str, table: pa.Table, t_ns: int) -> Topic:
     """Return the topic of a cloud of points: one message with x, y, z and, where there are colours, rgb, as float32."""
-    coloured = set(COLOURS) <= set(table.column_names)
+    coloured = len(cloud_columns(table.schema)) > len(POINT)
     names = ["x", "y", "z", *(["rgb"] if coloured else [])]
     made = np.zeros((table.num_rows, len(names)), "<f4")  # (point, field)
     for place, name in enumerate(POINT):
@@ -148,9 +171,8 @@ def cloud(stream: str, table: pa.Table, t_ns: int) -> Topic:
         *(Texts([made.tobytes()]), Constant(b"\1")),
     ]
     kind = "sensor_msgs/PointCloud2"
-    return Topic(
-        f"/{topic_part(shown(stream))}", _full(kind), _definition(kind, _DEFINITIONS), parts, {"stream": stream}
-    )
+    name = f"/{topic_part(shown(stream))}"
+    return Topic(name, _full(kind), _definition(kind, _DEFINITIONS), np.array([t_ns]), parts, {"stream": stream})
 
 
 def vector(table: pa.Table, quantity: str, components: Sequence[str]) -> list[Part]:

@@ -59,16 +59,16 @@ def first(params: Params) -> Mapping[str, Mapping[str, Any]]:
     return frames.synchronized(params.rate_hz, params.master)
 
 
-@stage(version=1, reads=("grid", "grid_rate_hz"))
+@stage(version=2, reads=("grid", "grid_rate_hz"))
 def part(params: Params, recording: Recording) -> RecordingOutput:
     """Return what one recording holds."""
     from tacpipe.exports import arrays
 
-    return RecordingOutput(contents.part(recording, arrays.losses(recording)))
+    return RecordingOutput(arrays.describe(recording))
 
 
-@stage(version=1, part=part, first=first)
-def zarr(params: Params, recordings: Dataset, parts: Parts) -> Result:
+@stage(version=2, part=part, first=first)
+def zarr(params: Params, recordings: Dataset, parts: Parts, originals: Dataset) -> Result:
     """Write recordings as a Zarr replay buffer, as UMI does.
 
     Synchronized recordings, or any with ``--rate-hz``, one after another, with meta/episode_ends.
@@ -81,22 +81,24 @@ def zarr(params: Params, recordings: Dataset, parts: Parts) -> Result:
 
     every = list(recordings)
     rate_hz = frames.rate_hz(every)
-    found = contents.of_parts(parts)
-    columns, found = frames.columns(found, common=params.common)
-    made = [arrays.of(frames.table(one).select(columns), params.actions) for one in every]
+    columns, described = frames.columns(contents.of_parts(parts), common=params.common)
+    described = frames.without_frames(described, recordings, originals)
+    episodes = [arrays.from_table(frames.table(recording).select(columns), params.actions) for recording in every]
     files: dict[str, Content] = {}
-    for several in zip(*made, strict=True):
-        attributes = {"columns": list(several[0].columns), "units": list(several[0].units)}
-        files |= _array(f"data/{several[0].name}", np.concatenate([one.values for one in several]), attributes)
-    files |= _array(ENDS, np.cumsum([len(one[0].values) for one in made], dtype=np.int64), {})
-    names = [one.name for one in every]
+    for episode_arrays in zip(*episodes, strict=True):
+        first_array = episode_arrays[0]
+        attributes = {"columns": list(first_array.columns), "units": list(first_array.units)}
+        values = np.concatenate([array.values for array in episode_arrays])
+        files |= _array(f"data/{first_array.name}", values, attributes)
+    files |= _array(ENDS, np.cumsum([len(episode[0].values) for episode in episodes], dtype=np.int64), {})
+    names = [recording.name for recording in every]
     files |= {".zgroup": _GROUP, "data/.zgroup": _GROUP, "meta/.zgroup": _GROUP}
     files["meta/.zattrs"] = _json(
-        {"rate_hz": rate_hz, "recordings": names, "labels": {one.name: dict(one.attributes) for one in every}}
+        {"rate_hz": rate_hz, "recordings": names, "labels": {each.name: dict(each.attributes) for each in every}}
     )
     files = {f"{STORE}/{name}": content for name, content in files.items()}
-    files[readme.NAME] = readme.text("Tactile recordings as a Zarr replay buffer", _OPENING, recordings, found)
-    return Result(files=Files(files), notes=readme.notes(recordings, found))
+    files[readme.NAME] = readme.text("Tactile recordings as a Zarr replay buffer", _OPENING, recordings, described)
+    return Result(files=Files(files), notes=readme.notes(recordings, described))
 
 
 def _array(path: str, values: AnyArray, attributes: Mapping[str, Any]) -> dict[str, Content]:

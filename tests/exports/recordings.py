@@ -70,6 +70,34 @@ def trial(seed: int) -> tuple[dict[str, pa.Table], dict[str, Any]]:
     return {"skin": skin(seed), "arm": arm(seed), "odd": odd(seed)}, attributes
 
 
+def camera(seed: int, rows: int = 20) -> pa.Table:
+    """Return a stream of encoded images, one of them missing, and an exposure; its pixels are not read by anything."""
+    chance = np.random.default_rng(seed + 300)
+    t_ns = START_NS + np.arange(rows) * 40_000_000
+    images = [b"\xff\xd8\xff\xe0" + chance.bytes(50 + row) for row in range(rows)]
+    fields = [
+        schema.time_field(),
+        pa.field("data", pa.binary(), metadata={"quantity": "image", "encoding": "jpeg"}),
+        pa.field("exposure_us", pa.int32(), metadata={"unit": "us"}),
+    ]
+    data = pa.array([None if row == 3 else image for row, image in enumerate(images)], pa.binary())
+    return pa.table([pa.array(t_ns), data, pa.array(np.arange(rows), pa.int32())], pa.schema(fields))
+
+
+def varied(*, timeless: bool = True) -> dict[str, pa.Table]:
+    """Return streams of which each format leaves something out: images, text, lists, events; and what has no time."""
+    t_ns = pa.array(START_NS + np.arange(3) * 300_000_000)
+    lists = pa.table({"t_ns": t_ns, "values": [[1], [2, 3], []], "load": [1.5, 2.5, 3.5]})
+    remarks = pa.table({"t_ns": t_ns, "remark": ["a", "b", "c"]})
+    events = pa.table({"t_ns": t_ns, "stream": ["skin"] * 3, "cause": ["link"] * 3, "frames": [1, 2, 3]})
+    late = skin(1).append_column("t_uncertain_ns", pa.array(np.zeros(40, np.int64)))
+    streams = {"cam": camera(1), "skin": late, "odd": odd(1), "lists": lists, "remarks": remarks, "events": events}
+    if timeless:
+        cloud = {name: [0.5, 1.5] for name in ("x_m", "y_m", "z_m", "intensity")}
+        streams |= {"scale": pa.table({"mass_kg": [0.5, 1.5]}), "cloud": pa.table(cloud)}
+    return streams
+
+
 def write(folder: Path, given: Mapping[str, tuple[Tables, Mapping[str, Any]]]) -> Path:
     """Write recordings as a dataset of the project in the working directory; return its directory."""
     store = Store(Path(".tacpipe").absolute())

@@ -28,7 +28,7 @@ def store(topic: ros.Topic) -> Any:
     "table", [recordings.skin(1), recordings.arm(1), recordings.odd(1)], ids=["skin", "arm", "odd"]
 )
 def test_a_stream_s_own_messages_are_those_that_rosbags_would_write(table: pa.Table) -> None:
-    topic = ros.own("Skin 1", table, table.column("t_ns").to_numpy())
+    topic = ros.stream_topic("Skin 1", table)
     types = store(topic)
     names = ros.field_names(table.column_names[1:])
     messages = list(cdr.packed(topic.parts, table.num_rows))
@@ -45,13 +45,12 @@ def test_usual_messages_are_those_that_rosbags_would_write() -> None:
     joints = {f"joint{n}_rad": pa.array([0.1 * n, 0.2, 0.3]) for n in (1, 2)}
     fields = [pa.field(name, pa.float64(), metadata={"quantity": "joint_position"}) for name in joints]
     table = pa.table([pa.array(T_NS), *joints.values()], pa.schema([pa.field("t_ns", pa.int64()), *fields]))
-    for given in (table, recordings.arm(2), recordings.skin(2)):
-        t_ns = given.column("t_ns").to_numpy()
-        topics = ros.usual("arm", given, t_ns)
+    for stream in (table, recordings.arm(2), recordings.skin(2)):
+        topics = ros.usual_topics("arm", stream)
         assert topics
         for topic in topics:
             types = store(topic)
-            for message in list(cdr.packed(topic.parts, len(t_ns)))[:2]:
+            for message in list(cdr.packed(topic.parts, len(topic.t_ns)))[:2]:
                 assert bytes(types.serialize_cdr(types.deserialize_cdr(message, topic.type), topic.type)) == message
 
 
@@ -61,18 +60,18 @@ def test_joint_states_name_each_joint_and_hold_its_angle() -> None:
         [pa.array(T_NS), pa.array([1.0, 2, 3]), pa.array([4.0, 5, 6])],
         pa.schema([pa.field("t_ns", pa.int64()), *fields]),
     )
-    (topic,) = ros.usual("arm", table, T_NS)
+    (topic,) = ros.usual_topics("arm", table)
     message = store(topic).deserialize_cdr(list(cdr.packed(topic.parts, 3))[1], topic.type)
     assert (message.name, list(message.position), list(message.velocity)) == (["joint1", "joint2"], [2.0, 5.0], [])
 
 
 def test_a_pose_needs_each_component_once() -> None:
     table = recordings.arm(1)
-    assert [topic.type for topic in ros.usual("arm", table, table["t_ns"].to_numpy())] == [
+    assert [topic.type for topic in ros.usual_topics("arm", table)] == [
         "geometry_msgs/msg/PoseStamped",
         "geometry_msgs/msg/WrenchStamped",
     ]
-    assert ros.usual("arm", table.drop_columns(["position_x_m", "force_x_n"]), table["t_ns"].to_numpy()) == []
+    assert ros.usual_topics("arm", table.drop_columns(["position_x_m", "force_x_n"])) == []
 
 
 def test_names_of_fields_are_those_that_ros_allows() -> None:

@@ -11,6 +11,7 @@ import pyarrow as pa
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
+import tacpipe
 from tests.conftest import Lab
 from tests.exports import recordings
 
@@ -123,3 +124,28 @@ def test_a_cloud_of_points_is_one_message_with_its_colours(lab: Lab) -> None:
     made = message.data.view([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<u4")])
     assert made["z"].tolist() == [0.5, -1.5]
     assert made["rgb"].tolist() == [0x010101, 0xFFFFFF]
+
+
+def test_encoded_images_are_messages_that_viewers_know_and_come_back_to_the_bit(lab: Lab) -> None:
+    recordings.write(lab.folder / "rec", {"a": ({"cam": recordings.camera(1), "skin": recordings.skin(1)}, {})})
+    lab.run("export mcap rec -o mcap")
+    table = recordings.camera(1)
+    images = {
+        t_ns: image
+        for t_ns, image in zip(*(table[name].to_pylist() for name in ("t_ns", "data")), strict=True)
+        if image
+    }
+    messages = read(lab.folder / "mcap/a.mcap")["/cam/image"]
+    assert {t_ns: bytes(message.data) for t_ns, message in messages} == images
+    assert {message.format for _, message in messages} == {"jpeg"}
+    with (lab.folder / "mcap/a.mcap").open("rb") as file:
+        for schema, _, message in make_reader(file).iter_messages(topics=["/cam/image"]):
+            assert schema is not None
+            assert schema.name == "sensor_msgs/msg/CompressedImage"
+            assert images[message.log_time] in message.data
+    lab.run("ingest mcap mcap -o back")
+    back = tacpipe.open("back")["a"]
+    assert set(back.streams) == {"cam", "skin"}
+    assert back.table("cam")["data"].to_pylist() == [image or b"" for image in table["data"].to_pylist()]
+    lab.run("export mcap rec -o bare --no-usual-messages")
+    assert set(read(lab.folder / "bare/a.mcap")) == {"/cam", "/skin"}
