@@ -85,7 +85,7 @@ def answered(request: Request) -> Outcome | None:
 
 
 def _concluded(outcome: Outcome, inputs: Inputs, made: Manifest | Unread, started: float) -> Outcome:
-    outcome.notes = [*sorted(set(inputs.notes)), *outcome.describe_results(), *outcome.notes]
+    outcome.notes = [*sorted(set(inputs.notes)), *inputs.describe_unread(), *outcome.describe_results(), *outcome.notes]
     outcome.rows = made.rows
     outcome.seconds = round(time.perf_counter() - started, 3)
     return outcome

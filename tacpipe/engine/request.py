@@ -13,6 +13,7 @@ from tacpipe.datasets.manifest import VALUES, Entry, Found, Manifest
 from tacpipe.datasets.replacing import Plan
 from tacpipe.engine import execution
 from tacpipe.errors import UsageError
+from tacpipe.formats import unread
 from tacpipe.io.hashing import digest, remembered_file_digest
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
@@ -104,6 +105,18 @@ class Inputs:
             "fold": self.request.fold,
             "role": self.request.role,
         }
+
+    def describe_unread(self) -> list[str]:
+        """Return sentences about the files below the source that no recording is read from."""
+        if self.request.source is None or not self.sources:
+            return []
+        read = {path for one in self.sources.values() for path in one.files.values()}
+        if self.stage.why_unread is not None:
+            reason = self.stage.why_unread(self.request.params, self.request.source)
+        else:
+            command = self.request.name.replace(".", " ")
+            reason = f"`tacpipe {command}` reads no recording from it".format  # of any path
+        return unread.describe(self.request.source, read, reason, self.request.output)
 
     def plan(self) -> Plan:
         """Return what is known of the result before anything is computed."""

@@ -30,7 +30,9 @@ def opened(path: Path) -> ArrayContainer:
     return ArrayContainer(path, lambda: hdf5.opened(path))
 
 
-@stage(version=1, discover=COMMAND.discover, preview=COMMAND.preview, guess=COMMAND.guess)
+@stage(
+    version=1, discover=COMMAND.discover, preview=COMMAND.preview, guess=COMMAND.guess, why_unread=COMMAND.why_unread
+)
 def hdf5(params: Params, files: Files, values: Values) -> RecordingOutput:
     """Read HDF5 files of robomimic, ALOHA or a lab's own.
 

@@ -27,7 +27,9 @@ def opened(path: Path) -> Container:
     return XdfFile(path)
 
 
-@stage(version=1, discover=COMMAND.discover, preview=COMMAND.preview, guess=COMMAND.guess)
+@stage(
+    version=1, discover=COMMAND.discover, preview=COMMAND.preview, guess=COMMAND.guess, why_unread=COMMAND.why_unread
+)
 def xdf(params: Params, files: Files, values: Values) -> RecordingOutput:
     """Read recordings of Lab Streaming Layer (XDF).
 

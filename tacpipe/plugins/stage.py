@@ -99,6 +99,9 @@ class Source:
 
 
 Discover = Callable[[Any, Path], Mapping[str, Mapping[str, Path] | Source]]
+# Of params and a source: a function from the path of a file within it to the reason why no recording is read from the
+# file, "" for a file that is read in another way, as labels are.
+WhyUnread = Callable[[Any, Path], Callable[[str], str]]
 First = Callable[[Any], Mapping[str, Mapping[str, Any]]]  # of params: stages by name, each with params of its own
 
 
@@ -133,6 +136,7 @@ class Stage(Generic[P, R]):
     headline: str | None = None  # the file of the result that holds its headlines, which the command prints
     preview: Callable[[Any, Path], str] | None = None  # of a source: describes what would be read (--dry-run)
     guess: Callable[[Path], str] | None = None  # of a source: a first layout file (--guess)
+    why_unread: WhyUnread | None = None
     requirements: Requirements | None = None  # of recordings to train a task on (--requirements)
     # whether recordings are read as they were given, rather than behind the stages that the model was trained behind
     as_given: Callable[[Any], bool] | None = None
@@ -224,6 +228,7 @@ def stage(
     headline: str | None = None,
     preview: Callable[[Any, Path], str] | None = None,
     guess: Callable[[Path], str] | None = None,
+    why_unread: WhyUnread | None = None,
     requirements: Requirements | None = None,
     as_given: Callable[[Any], bool] | None = None,
 ) -> Callable[[Callable[P, R]], Stage[P, R]]:
@@ -233,6 +238,7 @@ def stage(
     ``part`` is keyed recording by recording, with the same params; its files become files of the result, and an argument
     ``Parts`` holds its tables. ``first`` names stages that the recordings go through before, with params of their own.
     ``preview`` returns what ``discover`` and the stage would read of a source, in words; ``guess`` a first layout of one.
+    ``why_unread`` explains which files of a source are left out.
     ``requirements`` describe what recordings must hold. ``as_given`` states by the params whether recordings are not taken
     through the stages of a ``Model`` first.
     """
@@ -248,6 +254,7 @@ def stage(
         headline,
         preview,
         guess,
+        why_unread,
         requirements,
         as_given,
     )

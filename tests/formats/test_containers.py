@@ -159,3 +159,16 @@ def test_what_holds_no_container_is_refused(tmp_path: Path, name: str) -> None:
     for look in (lambda: COMMAND.discover(NONE, tmp_path / name), lambda: COMMAND.guess(tmp_path / name)):
         with pytest.raises(UsageError, match=name if name == "gone" else r"\.fake"):
             look()
+
+
+def test_a_guess_and_a_dry_run_go_on_past_a_container_without_streams(tmp_path: Path) -> None:
+    (tmp_path / "a.fake.json").write_text(json.dumps({"streams": {}}))
+    fake_container.write(tmp_path / "b.fake")
+    (tmp_path / "notes.txt").write_text("none")
+    guessed = COMMAND.guess(tmp_path)
+    assert "[streams.skin]" in guessed and "What b.fake itself declares" in guessed
+    assert "a.fake.json holds no stream" in guessed and "notes.txt" in guessed
+    assert "skin: 2 rows" in COMMAND.preview(NONE, tmp_path)
+    (tmp_path / "b.fake").unlink()
+    with pytest.raises(TacpipeError, match="holds no stream"):
+        COMMAND.guess(tmp_path)

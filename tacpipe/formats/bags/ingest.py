@@ -8,7 +8,9 @@ from tacpipe.plugins.stage import Files, RecordingOutput, Values, stage
 _ROSBAG, _MCAP = Command("rosbag"), Command("mcap")
 
 
-@stage(version=2, discover=_ROSBAG.discover, preview=_ROSBAG.preview, guess=_ROSBAG.guess)
+@stage(
+    version=2, discover=_ROSBAG.discover, preview=_ROSBAG.preview, guess=_ROSBAG.guess, why_unread=_ROSBAG.why_unread
+)
 def rosbag(params: Params, files: Files, values: Values) -> RecordingOutput:
     """Read ROS bags (ROS 1, ROS 2 with SQLite or MCAP).
 
@@ -20,7 +22,7 @@ def rosbag(params: Params, files: Files, values: Values) -> RecordingOutput:
     return _ROSBAG.read(params, files, values)
 
 
-@stage(version=2, discover=_MCAP.discover, preview=_MCAP.preview, guess=_MCAP.guess)
+@stage(version=2, discover=_MCAP.discover, preview=_MCAP.preview, guess=_MCAP.guess, why_unread=_MCAP.why_unread)
 def mcap(params: Params, files: Files, values: Values) -> RecordingOutput:
     """Read MCAP files (ROS, JSON or protobuf messages).
 

@@ -52,6 +52,11 @@ def is_one(kind: str, path: Path) -> bool:
     return path.name.lower().endswith(KINDS[kind].endings)
 
 
+def has_ending(kind: str, name: str) -> bool:
+    """Return whether a file's name ends as those of containers of this kind do."""
+    return bool(KINDS[kind].endings) and name.lower().endswith(KINDS[kind].endings)
+
+
 def _marks(path: Path, content: bytes) -> bool:
     if not content or not path.is_file():
         return path.is_file()

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from tacpipe.errors import FAILED, MissingModuleError, StorageError, TacpipeError
 from tacpipe.formats.table import layout as layouts
+from tacpipe.formats.table import pattern
 from tacpipe.plugins.constraints import TomlFile
 from tacpipe.plugins.stage import Files, RecordingOutput, Shared, Source, Values
 
@@ -31,13 +32,19 @@ class Params:
 
 @dataclass(frozen=True)
 class Command:
-    """The four functions of a stage that ingests a format of containers.
+    """The functions of a stage that ingests a format of containers.
 
     ::
 
         COMMAND = Command("xdf")
 
-        @stage(version=1, discover=COMMAND.discover, preview=COMMAND.preview, guess=COMMAND.guess)
+        @stage(
+            version=1,
+            discover=COMMAND.discover,
+            preview=COMMAND.preview,
+            guess=COMMAND.guess,
+            why_unread=COMMAND.why_unread,
+        )
         def xdf(params: Params, files: Files, values: Values) -> RecordingOutput:
             \"\"\"Read recordings of LSL's LabRecorder (XDF).\"\"\"
             return COMMAND.read(params, files, values)
@@ -56,16 +63,18 @@ class Command:
 
     def preview(self, params: Params, source: Path) -> str:
         """Return what would be read, in words."""
-        from tacpipe.formats.table import preview
-
         layout = self.parsed(params)
-        return preview.text(layout, source, self._found(layout, source), self.kind)
+        return preview_text(layout, source, self._found(layout, source), self.kind)
 
     def guess(self, source: Path) -> str:
         """Return the text of the layout that states what the first file itself declares."""
         from tacpipe.formats.table import declared
 
         return declared.layout(self.kind, source)
+
+    def why_unread(self, params: Params, source: Path) -> Callable[[str], str]:
+        """Return a function from the path of a file below ``source`` to the reason why no recording is read from it."""
+        return why_unread(self.parsed(params), source, self.kind)
 
     def read(self, params: Params, files: Files, values: Values) -> RecordingOutput:
         """Return one recording."""
@@ -138,6 +147,38 @@ class _Shares:
             if error.exit_code != FAILED or isinstance(error, StorageError | MissingModuleError):
                 raise
             return None  # reading it shows what is wrong, of this recording alone
+
+
+def preview_text(
+    layout: layouts.Layout, source: Path, found: Sequence[recordings.Source], kind: layouts.Format | None = None
+) -> str:
+    """Return what would be read of a source, and what would not, in words."""
+    from tacpipe.formats import unread
+    from tacpipe.formats.table import preview
+
+    paths = [path for recording in found for path in recording.files.values()]
+    left_out = unread.describe(source, paths, why_unread(layout, source, kind))
+    return "\n".join([preview.text(layout, source, found, kind), *left_out])
+
+
+def why_unread(layout: layouts.Layout, source: Path, kind: layouts.Format | None = None) -> Callable[[str], str]:
+    """Return a function from the path of a file below ``source`` to the reason why the layout reads nothing from it.
+
+    The reason is "" for a file of labels, and for a file within a container.
+    """
+    from tacpipe.formats.containers import kinds
+
+    formats = {str(stream.format) for stream in layout.streams if stream.contained} or {str(kind)} & set(kinds.KINDS)
+    folders = [path for name in formats for path in kinds.found(name, source) if path.is_dir()]
+
+    def reason(path: str) -> str:
+        if any(pattern.match(labels.file, path) is not None for labels in layout.labels):
+            return ""
+        if any((source / path).is_relative_to(folder) for folder in folders):
+            return ""
+        return layouts.why_unreadable(path, "no `files` of the layout matches" if layout.streams else "", kind)
+
+    return reason
 
 
 def recording(

@@ -9,35 +9,62 @@ from pathlib import Path
 
 import pyarrow as pa
 
+from tacpipe.errors import FAILED, MissingModuleError, StorageError, TacpipeError
+from tacpipe.formats import unread
 from tacpipe.formats.containers import kinds
 from tacpipe.formats.containers.container import Contents, SourceStream, Time
 from tacpipe.formats.table import pattern
 from tacpipe.formats.table.columns import TYPES
+from tacpipe.formats.table.layout import why_unreadable
 from tacpipe.printable import plain
 
 _KINDS = {kind: name for name, kind in TYPES.items()}
 
 
 def layout(kind: str, source: Path) -> str:
-    """Return the text of the layout that states what the first container at or below ``source`` declares.
+    """Return the text of the layout that states what the first container at or below ``source`` with a stream declares.
 
-    Given back with ``--layout`` it reads the same. Raises `UsageError` where there is no container.
+    Given back with ``--layout`` it reads the same. Comments name the containers before it, and files that are no container.
+    Raises `UsageError` where there is no container, `TacpipeError` where none holds a stream.
     """
     paths = kinds.found(kind, source)
     if not paths:
         raise kinds.none(kind, source)
-    file = kinds.opened(kind, paths[0])
-    return of(file.look(next(iter(file.episodes()), None)), f"tacpipe ingest {kind}", paths[0])
+    passed_over: list[str] = []
+    for path in paths:
+        try:
+            file = kinds.opened(kind, path)
+            contents = file.look(next(iter(file.episodes()), None))
+        except TacpipeError as error:
+            if error.exit_code != FAILED or isinstance(error, StorageError | MissingModuleError):
+                raise
+            passed_over.append(plain(str(error), 400))
+            continue
+        if contents.streams:
+            others = unread.describe(source, paths, lambda within: _why_unread(kind, source / within, paths))
+            return _text(contents, f"tacpipe ingest {kind}", path, [*passed_over, *others])
+        reasons = [f"{plain(name)}: {why}" for name, why in contents.skipped.items()]
+        passed_over.append(f"{path} holds no stream that can be read. {'; '.join(reasons)}".rstrip())
+    raise TacpipeError(" ".join([f"No recording of ingest {kind} at {source} holds a stream.", *passed_over[:3]]))
 
 
-def of(contents: Contents, command: str, path: Path) -> str:
-    """Return the text of the layout that states what a container declares; ``command`` is the one that reads it."""
+def _why_unread(kind: str, path: Path, containers: Sequence[Path]) -> str:
+    """Return why a file is no container, "" where it lies in one."""
+    inside = any(path.is_relative_to(container) for container in containers)
+    return "" if inside else why_unreadable(path.name, "", kind)
+
+
+def _text(contents: Contents, command: str, path: Path, remarks: Sequence[str] = ()) -> str:
+    """Return the text of the layout that states what a container declares; ``command`` is the one that reads it.
+
+    ``remarks`` are sentences about other files, which become comments.
+    """
     parts = [
         f"# What {plain(path.name)} itself declares. Change what is wrong, remove streams that are not wanted, then look:\n"
         f"#   {command} FOLDER --layout THIS --dry-run"
     ]
     parts += [f"# {plain(source)} is left out: {why}" for source, why in contents.skipped.items()]
-    parts += [f"# {plain(one, 400)}" for one in contents.notes]
+    parts += [f"# {plain(one, 400)}" for one in [*contents.notes, *remarks]]
     parts += [_stream(one) for one in contents.streams]
     return "\n\n".join(parts) + "\n"
 

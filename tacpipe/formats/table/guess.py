@@ -17,13 +17,14 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
-from tacpipe.errors import UsageError
-from tacpipe.formats.table import binary, compressed, dialect
+from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.formats import unread
+from tacpipe.formats.table import binary, compressed, dialect, label_table, pattern
 from tacpipe.formats.table.dialect import Dialect
-from tacpipe.formats.table.layout import EXTENSIONS, UNKNOWN, extension
+from tacpipe.formats.table.layout import EXTENSIONS, TREES, UNKNOWN, extension, why_unreadable
 from tacpipe.formats.table.text import LONGEST_LINE
 from tacpipe.io import files as file_system
-from tacpipe.printable import plain
+from tacpipe.printable import plain, shown
 
 LINES = 200  # of a text file that are looked at
 _TIME = re.compile(
@@ -35,7 +36,6 @@ VOCABULARY = (  # for who replaces a "?"
     "unit: as count, m, mm, 1 (of a quaternion), rad, N, kPa, V; of time s, ms, us, ns",
     '{taxel} and {axis} in match state where a tactile column lies; component = "x" which part of a vector it is',
 )
-RECORDING = re.compile(r"(recording|trial|episode|run|session)(_?(id|name|nr|no|number))?", re.IGNORECASE)
 _ISO = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d.*")
 _MEANINGS = (  # how a name ends, and the quantity; the first that matches
     (r"(txl|tax|taxel|skin|tactile|cell|electrode|pad|sensel|touch)\w*", "tactile"),
@@ -87,42 +87,89 @@ def layout(folder: Path) -> str:
     data = [path for path in every if extension(path) in EXTENSIONS]
     if not data:
         raise UsageError(f"{folder} holds no file of {', '.join(EXTENSIONS)}; there is nothing to guess from.")
-    groups, labels = _grouped(folder, data)
-    parts = [
+    groups, labels, damaged = _grouped(folder, data)
+    if not groups:
+        raise UsageError(f"{folder} holds no table with rows and stamps. {' '.join(damaged.values())}".rstrip())
+    trees = _label_files(folder, [path for path in every if path.suffix.lower() in TREES], groups)
+    in_groups = [*(group.paths for group in [*groups, *labels]), *trees.values()]
+    read = [folder / path for paths in in_groups for path in paths]
+
+    def reason(path: str) -> str:
+        return damaged.get(path) or why_unreadable(
+            path, "it is no stream, and no file of labels that each recording has"
+        )
+
+    parts = [_stream(group) for group in groups]
+    parts += [_labels_of(group) for group in labels]
+    parts += [f"[[labels]]\nfile = {_quoted(text)}" for text in trees]
+    parts.append('[attributes]\nsensor = "?"  # the product, as xela-uskin or the lab\'s own name for it')
+    head = [
         '# A first layout, guessed from the files. Replace each "?", check the rest, then look at what it reads:',
         "#   tacpipe ingest table FOLDER --layout THIS --dry-run",
         *(f"# {line}" for line in VOCABULARY),
+        *(f"# {shown(line)}" for line in unread.describe(folder, read, reason)),
     ]
-    parts += [_stream(group) for group in groups]
-    described = [path for path in every if path.suffix.lower() in (".yaml", ".yml", ".json")]
-    parts += [_labels_of(group) for group in labels]
-    if described:
-        parts.append(f"[[labels]]\nfile = {_quoted(_pattern(described))}")
-    parts.append('[attributes]\nsensor = "?"  # the product, as xela-uskin or the lab\'s own name for it')
-    head = "\n".join(parts[: 2 + len(VOCABULARY)])
-    return "\n\n".join([head, *parts[2 + len(VOCABULARY) :]]) + "\n"
+    return "\n\n".join(["\n".join(head), *parts]) + "\n"
 
 
-def _grouped(folder: Path, data: Sequence[Path]) -> tuple[list[_Group], list[_Group]]:
-    """Return files that are one stream of several recordings each, and files that hold labels."""
+def _grouped(folder: Path, data: Sequence[Path]) -> tuple[list[_Group], list[_Group], dict[str, str]]:
+    """Return files that are one stream of several recordings each, files that hold labels, and why others are neither."""
     by_template: dict[str, list[Path]] = {}
     for path in sorted(data):
         by_template.setdefault(_template(path), []).append(path)
     streams: list[_Group] = []
     labels: list[_Group] = []
+    damaged: dict[str, str] = {}
     used: set[str] = set()
     for paths in itertools.chain.from_iterable(map(_apart, by_template.values())):
-        looked = _look(folder / paths[0])
+        try:
+            looked = _look(folder / paths[0])
+        except TacpipeError as error:
+            damaged |= {path.as_posix(): str(error).rstrip(".") for path in paths}
+            continue
         shared = len(paths) == 1 < len(data) and _is_labels(looked)
-        stem = re.sub(r"[^a-z0-9]+", "_", _pattern([Path(path.name) for path in paths]).partition(".")[0].lower())
-        name = stem.replace("trial", "").strip("_")
-        name = name if name.isidentifier() else "table"
-        name = name if name not in used else next(f"{name}{n}" for n in itertools.count(2) if f"{name}{n}" not in used)
-        used.add(name)
-        group = _Group(name, _pattern(paths), tuple(paths), looked)
+        group = _Group(_stream_name(paths, used), pattern.generalize(paths), tuple(paths), looked)
         single = looked.text is not None and looked.text.header and len(looked.text.rows) == 1 and len(paths) > 1
         (labels if shared or single else streams).append(group)
-    return streams, labels
+    return streams, labels, damaged
+
+
+def _stream_name(paths: Sequence[Path], used: set[str]) -> str:
+    """Return a name for the stream of these files that is not in ``used``, and add it there."""
+    stem = re.sub(r"\{\w+\}", "", pattern.generalize([Path(path.name) for path in paths])).partition(".")[0].lower()
+    name = re.sub(r"[^a-z0-9]+", "_", stem).replace("trial", "").strip("_")
+    name = name if name.isidentifier() else "table"
+    name = name if name not in used else next(f"{name}{n}" for n in itertools.count(2) if f"{name}{n}" not in used)
+    used.add(name)
+    return name
+
+
+def _label_files(folder: Path, paths: Sequence[Path], streams: Sequence[_Group]) -> dict[str, list[Path]]:
+    """Return YAML and JSON files with labels by their pattern: one file of each recording, or one of all recordings."""
+    by_template: dict[str, list[Path]] = {}
+    for path in paths:
+        by_template.setdefault(_template(path), []).append(path)
+    shared = set.intersection(*(set(pattern.placeholders(group.pattern)) for group in streams))
+    recordings = [pattern.match(streams[0].pattern, path.as_posix()) or {} for path in streams[0].paths]
+    labels = {}
+    for same in by_template.values():
+        text, names = pattern.generalize(same), {path.as_posix() for path in same}
+        placeholders = set(pattern.placeholders(text))
+        if not placeholders:
+            is_labels = _is_table_of_labels(folder / same[0])
+        else:
+            is_labels = placeholders <= shared and {pattern.filled(text, values) for values in recordings} <= names
+        if is_labels:
+            labels[text] = same
+    return labels
+
+
+def _is_table_of_labels(path: Path) -> bool:
+    """Return whether a YAML or JSON file holds labels by the name of their recording."""
+    try:
+        return bool(label_table.read(path).rows)
+    except TacpipeError:
+        return False
 
 
 def _apart(paths: Sequence[Path]) -> list[list[Path]]:
@@ -139,33 +186,6 @@ def _apart(paths: Sequence[Path]) -> list[list[Path]]:
 def _template(path: Path) -> str:
     """Return what files of one stream share: the depth, and the file's name without its numbers."""
     return "/".join(["{}"] * (len(path.parts) - 1) + [re.sub(r"\d+", "{}", path.name)])
-
-
-def _pattern(paths: Sequence[Path]) -> str:
-    """Return a pattern for files: parts that differ are placeholders, with what all share kept around them.
-
-    Of a single file within a folder the folder is the recording, as others may come.
-    """
-    parts = list(zip(*(path.parts for path in paths), strict=False))
-    varying = [level for level, found in enumerate(parts) if len(set(found)) > 1]
-    if not varying and len(parts) > 1:
-        return "/".join([*(found[0] for found in parts[:-2]), "{trial}", parts[-1][0]])
-    made = []
-    for level, found in enumerate(parts):
-        if level not in varying:
-            made.append(found[0])
-            continue
-        name = "trial" if level == varying[-1] else f"folder{level + 1}"
-        before = re.sub(r"\d+$", "", _shared(found))
-        after = re.sub(r"^\d+", "", _shared([one[len(before) :][::-1] for one in found])[::-1])
-        made.append(f"{before}{{{name}}}{after}")
-    return "/".join(made)
-
-
-def _shared(texts: Sequence[str]) -> str:
-    return "".join(
-        letters[0] for letters in itertools.takewhile(lambda found: len(set(found)) == 1, zip(*texts, strict=False))
-    )
 
 
 def _look(path: Path) -> Looked:
@@ -211,7 +231,7 @@ def _labels_of(group: _Group) -> str:
     if len(group.paths) == 1:
         found = group.first
         keys = [name for name, values in found.values.items() if len(set(values)) == len(values)]
-        named = next((name for name in keys if RECORDING.fullmatch(name)), keys[0] if keys else UNKNOWN)
+        named = next((name for name in keys if label_table.RECORDING.fullmatch(name)), keys[0] if keys else UNKNOWN)
         lines.append(f"key = {_quoted(named)}  # the column that names recordings")
     return "\n".join(lines)
 
@@ -226,7 +246,7 @@ def _stream(group: _Group) -> str:
     ]
     if found.text is not None:
         lines += _written(found.text, group.paths[0])
-    several = next((name for name in found.names if RECORDING.fullmatch(name)), None)
+    several = next((name for name in found.names if label_table.RECORDING.fullmatch(name)), None)
     if several is not None and len(group.paths) == 1:
         lines.append(f"recording = {_quoted(several)}  # the column that names the recording of a row")
         apart.add(several)
@@ -256,7 +276,7 @@ def _written(found: Dialect, path: Path) -> list[str]:
 def _time_column(found: Looked) -> str | None:
     """Return the column that holds stamps: one so named, else the first whose numbers always rise."""
     named = [name for name in found.names if _TIME.fullmatch(name)]
-    rising = [name for name in found.names if _rises(found.values[name]) and not RECORDING.fullmatch(name)]
+    rising = [name for name in found.names if _rises(found.values[name]) and not label_table.RECORDING.fullmatch(name)]
     both = [name for name in named if name in rising or any(isinstance(value, str) for value in found.values[name])]
     return next(iter(both), None) or (rising[0] if rising and rising[0] == found.names[0] else None)
 

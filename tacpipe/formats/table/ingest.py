@@ -9,6 +9,7 @@ Example: tacpipe ingest table my-lab --layout layout.toml -o data/recordings
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -46,10 +47,10 @@ def discover(params: Params, source: Path) -> dict[str, Source]:
 
 def preview(params: Params, source: Path) -> str:
     """Return what would be read, in words."""
-    from tacpipe.formats.table import preview, recordings
+    from tacpipe.formats.table import contained, recordings
 
     layout = params.parsed()
-    return preview.text(layout, source, recordings.found(layout, source))
+    return contained.preview_text(layout, source, recordings.found(layout, source))
 
 
 def guess(source: Path) -> str:
@@ -59,7 +60,14 @@ def guess(source: Path) -> str:
     return guess.layout(source)
 
 
-@stage(version=1, discover=discover, preview=preview, guess=guess)
+def why_unread(params: Params, source: Path) -> Callable[[str], str]:
+    """Return a function from the path of a file below ``source`` to the reason why no recording is read from it."""
+    from tacpipe.formats.table import contained
+
+    return contained.why_unread(params.parsed(), source)
+
+
+@stage(version=1, discover=discover, preview=preview, guess=guess, why_unread=why_unread)
 def table(params: Params, files: Files, values: Values, shared: Shared | None = None) -> RecordingOutput:
     """Read a lab's own tables (CSV, Parquet, NPZ, JSON lines).
 

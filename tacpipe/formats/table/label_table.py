@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import json
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,13 +12,13 @@ from typing import Any
 
 from tacpipe.errors import DamagedError, TacpipeError, UsageError
 from tacpipe.formats.table import label_texts
-from tacpipe.formats.table.guess import RECORDING
+from tacpipe.formats.table.layout import TREES
 from tacpipe.io import yaml_text
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import excerpt, listed, plain
 
-TREES = (".json", ".yaml", ".yml")
 EXTENSIONS = (".csv", ".tsv", ".parquet", *TREES)
+RECORDING = re.compile(r"(recording|trial|episode|run|session)(_?(id|name|nr|no|number))?", re.IGNORECASE)
 NAME = "recording"  # what the names of a YAML or JSON mapping are
 
 

@@ -12,13 +12,12 @@ from typing import Any
 from tacpipe.errors import TacpipeError
 from tacpipe.formats.table import label_table, pattern
 from tacpipe.formats.table.label_texts import plain_value, read_rows, read_text
-from tacpipe.formats.table.layout import Labels, Layout
+from tacpipe.formats.table.layout import TREES, Labels, Layout
 from tacpipe.formats.table.recordings import Source
 from tacpipe.io import yaml_text
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import excerpt, listed, plain
 
-TREES = label_table.TREES  # of files that hold a mapping of recordings to labels, or a list
 RECORDING = "recording"  # the placeholder of a recording's name
 
 

@@ -47,6 +47,7 @@ EXTENSIONS: Mapping[str, Format] = {
     ".jsonl": "jsonl",
     ".ndjson": "jsonl",
 }
+TREES = (".json", ".yaml", ".yml")  # of files that hold labels by name
 GZIP = ".gz"
 FILE = "file"  # the placeholder of a container's name, where containers are found by their format
 UNKNOWN = "?"  # what a guessed layout could not know
@@ -128,6 +129,21 @@ def extension(path: Path) -> str:
     """
     suffixes = [suffix.lower() for suffix in path.suffixes]
     return suffixes[-2] if suffixes[-1:] == [GZIP] and len(suffixes) > 1 else "".join(suffixes[-1:])
+
+
+def why_unreadable(path: str, unmatched: str, kind: str | None = None) -> str:
+    """Return why a file is not read: ``unmatched`` where its format is one that the command could read.
+
+    >>> why_unreadable("a/b.csv", "no pattern matches"), why_unreadable("a.mcap", "no pattern matches")
+    ('no pattern matches', '`tacpipe ingest mcap` reads such files')
+    """
+    readable = [name for name in kinds.KINDS if kinds.has_ending(name, path)]
+    if unmatched and (kind in readable or extension(Path(path)) in (*EXTENSIONS, *TREES)):
+        return unmatched
+    if readable and kind not in readable:
+        return f"`tacpipe ingest {readable[0]}` reads such files"
+    reads = kinds.described(kind) if kind is not None else ", ".join(f"*{ending}" for ending in EXTENSIONS)
+    return f"the command reads {reads}"
 
 
 @dataclass(frozen=True)
@@ -316,7 +332,7 @@ def _labels(value: Any, where: str) -> Labels:
     if isinstance(values.get("columns"), list):
         values["columns"] = tuple(values["columns"])
     made: Labels = fields.filled(Labels, values, where, "entry")
-    is_tree = made.file.lower().endswith((".json", ".yaml", ".yml"))  # whose names are those of recordings
+    is_tree = made.file.lower().endswith(TREES)  # whose names are those of recordings
     if not pattern.placeholders(made.file) and not made.key and not is_tree:
         raise UsageError(
             f"{where}: {plain(made.file)} is one file for all recordings. Set key to the column that names them."

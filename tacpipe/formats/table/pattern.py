@@ -7,12 +7,25 @@ placeholder that comes twice has the same text both times.
 from __future__ import annotations
 
 import functools
+import itertools
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from pathlib import PurePath
 
 from tacpipe.errors import UsageError
 from tacpipe.printable import plain
 
+TRIAL = "trial"  # the placeholder that distinguishes the recordings of a folder
+_ISO_DATE = r"(?:19|20)\d\d(?P<mark>[-_.]?)[01]\d(?P=mark)[0-3]\d"
+_DATE = rf"(?<!\d)(?:{_ISO_DATE}|[0-3]\d(?P<point>[-_.])[01]\d(?P=point)(?:19|20)\d\d)"
+_CLOCK = r"(?:[-_ T]{1,3}[0-2]\d(?P<colon>[-_.h]?)[0-5]\d(?:(?P=colon)[0-5]\d)?(?!\d))?"
+_SLOT = re.compile(rf"(?P<date>{_DATE}{_CLOCK})|\d+")
+_COUNTED = (  # words before numbers that count recordings rather than parts of a sensor
+    "trial|run|session|take|episode|day|subject|participant|person|user|object|obj|item|grasp|slide|press|contact|exp|"
+    "experiment|test|rep|repetition|set|series|recording|rec|sample|demo|sequence|seq|log|measurement|file|cycle"
+)
+_COUNTER = re.compile(rf"(?:^|[^a-z])({_COUNTED})[-_ #.]*$", re.IGNORECASE)
+_Token = tuple[str, str]  # its kind (a letter of a name is of its own kind), and its text
 _PART = re.compile(r"\{(\w+)\}|(\*\*/?)|(\*)|([^{}*]+)|(.)", re.DOTALL)
 
 
@@ -70,3 +83,98 @@ def filled(pattern: str, values: Mapping[str, str]) -> str:
         known = ", ".join(values) or "none"
         raise UsageError(f"{plain(pattern)} names {{{missing[0]}}}, which no file pattern has; there are {known}.")
     return re.sub(r"\{(\w+)\}", lambda found: values[found[1]], pattern)
+
+
+def generalize(paths: Sequence[PurePath]) -> str:
+    """Return a pattern that matches relative paths of one depth, and those of later recordings.
+
+    Dates, numbers that differ and numbers that count recordings become placeholders. So does text that differs; the last
+    that differs is the trial. Other numbers stay: ``skin1.csv`` is a sensor.
+
+    >>> generalize([PurePath("2026-05-01 cork/trial_1/skin1.csv"), PurePath("2026-05-01 cork/trial_2/skin1.csv")])
+    '{date} cork/trial_{trial}/skin1.csv'
+    >>> generalize([PurePath("2026-05-01 cork.csv"), PurePath("2026-05-02 felt.csv")])
+    '{date} {trial}.csv'
+    >>> generalize([PurePath("object1/cork/skin.csv")]), generalize([PurePath("skin2.csv")])
+    ('object{object}/{trial}/skin.csv', 'skin2.csv')
+    """
+    levels = list(zip(*(path.parts for path in paths), strict=True))
+    differing = [level for level, names in enumerate(levels) if len(set(names)) > 1]
+    last = differing[-1] if differing else len(levels) - 2  # of a single file the folder is the recording
+    names_in_use: dict[str, tuple[str, ...]] = {}
+    made = []
+    for level, names in enumerate(levels):
+        text = _level([_tokens(name) for name in names], level, names_in_use, is_last=level == last)
+        made.append(f"{{{TRIAL}}}" if level == last and "{" not in text else text)
+    return "/".join(made)
+
+
+def _tokens(name: str) -> list[_Token]:
+    """Return the dates, the numbers and the other characters of a name."""
+    tokens: list[_Token] = []
+    end = 0
+    for match in _SLOT.finditer(name):
+        tokens += [(letter, letter) for letter in name[end : match.start()]]
+        tokens.append(("date" if match["date"] else "number", match[0]))
+        end = match.end()
+    return tokens + [(letter, letter) for letter in name[end:]]
+
+
+def _level(names: Sequence[list[_Token]], level: int, in_use: dict[str, tuple[str, ...]], *, is_last: bool) -> str:
+    """Return the pattern of one level of paths; ``in_use`` maps placeholders to their texts and grows by this level's."""
+    parts = _parts(names)
+    differing = [index for index, (_, texts) in enumerate(parts) if len(set(texts)) > 1]
+    pattern = ""
+    for index, (kind, texts) in enumerate(parts):
+        counted = _COUNTER.search(pattern)
+        word = re.search(r"([A-Za-z]{2,})[-_ #.]*$", pattern)
+        if kind not in ("date", "number", "text"):
+            pattern += kind
+            continue
+        if kind == "number" and index not in differing and not counted:
+            pattern += texts[0]
+            continue
+        if kind == "date":
+            name = "date"
+        elif kind == "number" and counted:
+            name = counted[1].lower()
+        elif is_last and index == differing[-1]:
+            name = TRIAL
+        else:
+            name = word[1].lower() if kind == "number" and word else f"folder{level + 1}"
+        same = [other for other, found in in_use.items() if found == texts and (other == name or len(set(texts)) > 1)]
+        unique = (f"{name}{number}" if number > 1 else name for number in itertools.count(1))
+        name = same[0] if same else next(one for one in unique if one not in in_use)
+        in_use[name] = texts
+        pattern += f"{{{name}}}"
+    return pattern
+
+
+def _parts(names: Sequence[list[_Token]]) -> list[tuple[str, tuple[str, ...]]]:
+    """Return what names have in common, with the texts of each part: what is not in common is one part, ``text``."""
+    kinds = [[kind for kind, _ in tokens] for tokens in names]
+    before = _common(kinds)
+    after = 0
+    if any(one != kinds[0] for one in kinds):
+        while before and kinds[0][before - 1] in ("date", "number"):  # next to differing text they have no end
+            before -= 1
+        after = _common([one[before:][::-1] for one in kinds])
+        while after and kinds[0][-after] in ("date", "number"):
+            after -= 1
+    while (
+        before
+        and any(len(tokens) == before + after for tokens in names)
+        and any(len(tokens) > before + after for tokens in names)
+    ):
+        before -= 1  # a placeholder is at least one character
+    parts = [(kinds[0][place], tuple(tokens[place][1] for tokens in names)) for place in range(before)]
+    if any(len(tokens) > before + after for tokens in names):
+        middles = tuple("".join(text for _, text in tokens[before : len(tokens) - after]) for tokens in names)
+        parts.append(("text", middles))
+    parts += [(kinds[0][-place], tuple(tokens[-place][1] for tokens in names)) for place in range(after, 0, -1)]
+    return parts
+
+
+def _common(sequences: Sequence[Sequence[str]]) -> int:
+    """Return how many of their first elements all sequences share."""
+    return sum(1 for _ in itertools.takewhile(lambda elements: len(set(elements)) == 1, zip(*sequences, strict=False)))

@@ -12,6 +12,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from tacpipe.errors import FAILED, MissingModuleError, StorageError, TacpipeError
 from tacpipe.formats.table import labels, recorded
 from tacpipe.formats.table.columns import TIME, TYPES
 from tacpipe.formats.table.layout import Layout
@@ -87,7 +88,7 @@ def _measured(schema: pa.Schema) -> list[pa.Field]:
 
 
 def text(layout: Layout, folder: Path, sources: Sequence[Source], kind: str | None = None) -> str:
-    """Return what would be read as lines: all recordings and labels, and the first recording's streams in full.
+    """Return what would be read as lines: all recordings and labels, and the streams of the first that can be read.
 
     ``kind`` is the format of containers whose streams are read as they declare them where the layout has none.
     """
@@ -95,19 +96,30 @@ def text(layout: Layout, folder: Path, sources: Sequence[Source], kind: str | No
     count = f"{len(sources)} recording{'s' * (len(sources) != 1)}"
     lines = [f"{count}: {listed([one.name for one in sources], 6)}"]
     lines += _labels(labelled)
-    first = sources[0]
-    lines.append(f"\n{first.name}, the first:")
+    for source in sources:
+        try:
+            return "\n".join([*lines, *_first(layout, source, kind)])
+        except TacpipeError as error:
+            if error.exit_code != FAILED or isinstance(error, StorageError | MissingModuleError):
+                raise
+            lines.append(f"\n{source.name} cannot be read: {error}")
+    raise TacpipeError("\n".join([*lines, "\nNo recording can be read."]))
+
+
+def _first(layout: Layout, source: Source, kind: str | None) -> list[str]:
+    """Return the streams, attributes and notes of a recording as lines."""
+    lines = [f"\n{source.name}, the first:"]
     if layout.streams:
-        found = recorded.of(layout.streams, first.files, first.within)
+        found = recorded.of(layout.streams, source.files, source.within)
     else:
-        found = recorded.all_of(str(kind), first.files[CONTAINER], first.within)
+        found = recorded.all_of(str(kind), source.files[CONTAINER], source.within)
     for name in [one.name for one in layout.streams] or found.streams:
         if name not in found.streams:
             lines.append(f"  {name}: not there")
             continue
-        lines += _stream(name, found.streams[name], first.files[name if layout.streams else CONTAINER])
+        lines += _stream(name, found.streams[name], source.files[name if layout.streams else CONTAINER])
     lines += [f"  attribute {name}: {value}" for name, value in found.attributes.items()]
-    return "\n".join([*lines, *(f"  {one}" for one in found.notes)])
+    return [*lines, *(f"  {note}" for note in found.notes)]
 
 
 def _labels(labelled: Mapping[str, Mapping[str, Attribute]]) -> list[str]:

@@ -1,13 +1,15 @@
 from __future__ import annotations
 
-from pathlib import Path
+from pathlib import Path, PurePath
 
 import numpy as np
 import pandas as pd
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from tacpipe.errors import UsageError
-from tacpipe.formats.table import dialect, guess, labels, layout, reading, recordings
+from tacpipe.formats.table import dialect, guess, labels, layout, pattern, reading, recordings
 from tests.formats.table import labs
 
 
@@ -133,3 +135,47 @@ def test_a_guess_lists_quantities_and_units_to_choose_from(tmp_path: Path) -> No
     assert all(line.startswith("#") for line in head.splitlines() if line)
     for word in ("tactile", "position", "orientation", "count", "kPa", "--requirements", "{taxel}"):
         assert word in head
+
+
+@pytest.mark.parametrize(
+    ("paths", "later"),
+    [
+        (["2026-05-01 cork/run 1/skin.csv", "2026-05-02 felt/run 1/skin.csv"], "2026-06-11 tile/run 2/skin.csv"),
+        (["2026-05-01/trial_1/skin.csv"], "2026-06-02/trial_12/skin.csv"),
+        (["20260501_1430/skin.csv", "20260501_1502/skin.csv"], "20270101_0900/skin.csv"),
+        (["object1_trial1.csv", "object1_trial2.csv"], "object12_trial3.csv"),
+        (["day1/t1/skin.csv", "day1/t2/skin.csv"], "day2/t1/skin.csv"),
+    ],
+)
+def test_a_guessed_pattern_matches_the_files_of_a_later_day(tmp_path: Path, paths: list[str], later: str) -> None:
+    for path in paths:
+        (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
+        labs.frame().to_csv(tmp_path / path, index=False)
+    (stream,) = answered(guess.layout(tmp_path), unit="N", sensor="mine").streams
+    assert all(pattern.match(stream.files, path) is not None for path in [*paths, later])
+    assert pattern.match(stream.files, later.replace("skin", "arm").replace("trial", "arm")) is None
+
+
+@given(st.lists(st.from_regex(r"[a-c]{0,2}[0-9]{0,3}[-_ ]?[a-c0-9]{1,3}", fullmatch=True), min_size=1, unique=True))
+def test_a_generalized_pattern_matches_the_paths_that_it_is_from(names: list[str]) -> None:
+    paths = [PurePath(name) for name in names]
+    text = pattern.generalize(paths)
+    assert all(pattern.match(text, name) is not None for name in names)
+
+
+def test_a_guess_names_every_file_that_it_does_not_read_and_why(tmp_path: Path) -> None:
+    labs.write(tmp_path, 2)
+    (tmp_path / "trial_0" / "camera.mp4").write_bytes(b"video")
+    (tmp_path / "trial_0" / "bag.mcap").write_bytes(b"bag")
+    (tmp_path / "trial_1" / "broken.parquet").write_bytes(b"no table")
+    (tmp_path / "rig" / "deep" / "down").mkdir(parents=True)
+    (tmp_path / "rig" / "deep" / "down" / "calibration.yaml").write_text("gain: 2\n")
+    comments = [line for line in guess.layout(tmp_path).splitlines() if line.startswith("#") and "not read" in line]
+    for path, why in (
+        ("trial_0/camera.mp4", "*.csv"),
+        ("trial_0/bag.mcap", "tacpipe ingest mcap"),
+        ("trial_1/broken.parquet", "is not a Parquet file"),
+        ("rig/deep/down/calibration.yaml", "labels"),
+    ):
+        assert [line for line in comments if path in line and why in line], comments
+    assert not any("skin.csv" in line for line in comments)

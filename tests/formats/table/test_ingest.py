@@ -195,3 +195,18 @@ def test_a_mistake_is_one_sentence_with_its_place(
     ran = own.call(INGEST)
     assert ran.code == code and all(part in ran.err for part in parts), ran.err
     assert not (own.folder / "data/rec").exists()
+
+
+def test_files_that_no_recording_is_read_from_are_named_at_each_run(own: Lab) -> None:
+    (own.folder / "own" / "trial_0" / "camera.mp4").write_bytes(b"video")
+    (own.folder / "own" / "trial_1" / "tactile.npz").write_bytes(b"array")
+    (own.folder / "own" / "notes" / "later").mkdir(parents=True)
+    labs.frame().to_csv(own.folder / "own" / "notes" / "later" / "skin.csv", index=False)
+    (own.folder / "own" / ".DS_Store").write_bytes(b"")
+    for _ in range(2):  # the second run has nothing to compute
+        printed = own.run(INGEST).err
+        notes = [line for line in printed.splitlines() if "not read" in line]
+        assert [line.split(" file")[0] for line in notes] == ["tacpipe: 1 .csv", "tacpipe: 1 .mp4", "tacpipe: 1 .npz"]
+        assert "notes/later/skin.csv" in notes[0] and "no `files` of the layout matches" in notes[0]
+    assert "camera.mp4" in own.run("ingest table own --layout layout.toml --dry-run").out
+    assert "labels.csv" not in printed  # labels are read
