@@ -7,11 +7,16 @@ import os
 import signal
 import subprocess
 import sys
+from types import SimpleNamespace
 
+import numpy as np
 import pyarrow as pa
+import pytest
 
-from tacpipe.cli import show
-from tacpipe.datasets.dataset import Recording
+import tacpipe
+from tacpipe.channels import streams
+from tacpipe.cli import show, show_recording
+from tacpipe.io.columns import Columns
 from tacpipe.io.parquet import to_parquet
 from tests.conftest import Lab
 
@@ -68,23 +73,93 @@ def test_show_ends_when_nobody_reads_what_it_prints(lab: Lab) -> None:
     assert (done.returncode, done.stderr) == (-signal.SIGPIPE, b"")
 
 
-def test_the_numbers_of_a_stream_are_those_of_its_samples() -> None:
-    tactile = {b"quantity": b"tactile"}
+def _skin() -> pa.Table:
+    tactile = {b"quantity": b"tactile", b"unit": b"count"}
     rows = {
         pa.field("t_ns", pa.int64()): [0, 10**7, 2 * 10**7, 3 * 10**7, 9 * 10**7],
         pa.field("one", pa.uint16(), metadata=tactile): [0, 0, 65535, 7, 7],
         pa.field("other", pa.int8(), metadata=tactile): [5, 5, 5, None, 127],
-        pa.field("force", pa.float32(), metadata=tactile): [0.0] * 5,
+        pa.field("force", pa.float32(), metadata={b"quantity": b"force", b"unit": b"N"}): [0.0] * 5,
     }
-    content = to_parquet(pa.table(list(rows.values()), schema=pa.schema(list(rows))))
-    shard = Recording("a", {"attributes": {}, "shards": {"skin": {"digest": "d"}}}, lambda digest, path: content)
+    return pa.table(list(rows.values()), schema=pa.schema(list(rows)))
 
-    assert show._stream(shard, "skin") == {
-        "rows": 5,
-        "columns": 4,
-        "duration_s": 0.09,
-        "rate_hz": 100.0,
-        "gaps": 1,
-        "held_share": 0.25,  # of four steps one has both channels as before; where there is no value nothing is held
-        "saturated": 4,  # 65535, 127 and twice the 0 of an unsigned channel
-    }
+
+FIGURES = {
+    "rows": 5,
+    "columns": 4,
+    "duration_s": 0.09,
+    "rate_hz": 100.0,
+    "mean_hz": 44.444,  # four steps in 90 ms
+    "gaps": 1,
+    "held_share": 0.25,  # of four steps one has both channels as before; where there is no value nothing is held
+    "saturated": 4,  # 65535, 127 and twice the 0 of an unsigned channel
+}
+
+
+def test_the_numbers_of_a_stream_are_those_of_its_samples() -> None:
+    columns = Columns(to_parquet(_skin()))
+    assert show_recording.stream_figures(columns, streams.read_clocks(columns)) == FIGURES
+
+
+@pytest.mark.parametrize("counted", [False, True])
+def test_clocks_that_are_read_in_pieces_have_the_gaps_and_the_rate_of_the_whole(
+    monkeypatch: pytest.MonkeyPatch, counted: bool
+) -> None:
+    steps_ns = [10, 10, 10, 55, 10, 10, 80, 10, 10, 10, 70, 10, 41]
+    t_ns = np.cumsum([0, *steps_ns]) * 10**6
+    table = pa.table({"t_ns": t_ns, **({"seq": np.cumsum([0, *(step // 10 for step in steps_ns)])} if counted else {})})
+    monkeypatch.setattr(streams, "_PIECE_ROWS", 4)
+    clocks = streams.read_clocks(Columns(to_parquet(table)))
+    assert clocks is not None
+    gaps = [(place, place + 1) for place, step in enumerate(steps_ns) if step > 30]
+    assert list(zip(clocks.gap_starts_ns, clocks.gap_stops_ns, strict=True)) == [(t_ns[a], t_ns[b]) for a, b in gaps]
+    assert clocks.rate_hz == streams.rate_hz(table) and clocks.duration_s == sum(steps_ns) / 1000
+
+
+def test_a_recording_is_shown_with_streams_columns_rates_gaps_and_labels(lab: Lab) -> None:
+    lab.run("simulate forward --trials 1 --duration-s 4 -o data/r")
+    robot = tacpipe.open("data/r")["trial-000"].table("robot")
+    stamps = robot["t_ns"].to_numpy()
+    lost = np.diff(robot["seq"].to_numpy()) - 1
+    text = lab.run("show data/r trial-000").out
+    shown = json.loads(lab.run("show data/r trial-000 --json").out)
+
+    figures = shown["streams"]["robot"]
+    assert figures["mean_hz"] == round((len(stamps) - 1) / ((stamps[-1] - stamps[0]) / 1e9), 3)
+    assert figures["gaps"] == np.count_nonzero(lost) == sum(gap["name"] == "robot" for gap in shown["gaps"])
+    assert {"stream": "robot", "name": "finger_m", "quantity": "finger_width", "unit": "m", "type": "double"} in shown[
+        "columns"
+    ]
+    assert "taxel01_x … taxel16_z" in text and "median step" in text and "object: bottle" in text
+    assert f"robot: {np.count_nonzero(lost)} gaps" in text
+
+    synced = json.loads(lab.run("synchronize data/r -o data/s").out and lab.run("show data/s trial-000 --json").out)
+    assert {column["stream"] for column in synced["columns"]} >= {"robot", "xela1", "xela2"}
+    recorded_hz = synced["attributes"]["robot_rate_hz"]
+    assert abs(figures["mean_hz"] / recorded_hz - 1) < 1e-3  # the fitted clock has its own seconds
+    missing = lab.call("show data/r trial-009")
+    assert missing.code == 2 and "no recording 'trial-009'" in missing.err
+
+
+def test_events_and_labels_of_rows_are_shown_at_their_times(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    from tests.viewer import hand
+
+    recording = hand.recording()
+    recording.sizes = dict.fromkeys(recording.streams, 1)  # type: ignore[attr-defined]
+    opened = type("Opened", (dict,), {"source": SimpleNamespace(stage="acquire")})({recording.name: recording})
+    monkeypatch.setattr(show_recording, "_open", lambda path: opened)
+    text = show_recording.to_text(show_recording.overview(lab.folder, recording.name))
+
+    assert "contact: contact 0 1.000 to 3.000 s" in text and "slip: 2.500 to 3.000 s" in text
+    assert "2.000 s  xela1: cut, 1 frames, 7 bytes" in text
+    assert "from 2023-11-14 22:13:20 UTC" in text
+
+
+def test_of_streams_that_are_too_long_only_the_rows_are_listed(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    lab.run("simulate forward --trials 2 --duration-s 4 -o data/r")
+    monkeypatch.setattr(show, "READ_BYTES", 0)
+    text = lab.run("show data/r").out
+    assert "10 streams too long to read here" in text
+    (robot, _) = [line.split() for line in text.splitlines() if " robot " in line]
+    assert robot == ["trial-000", "robot", str(tacpipe.open("data/r")["trial-000"].table("robot").num_rows)]
+    assert "too long" not in lab.run("show data/r --full").out

@@ -88,25 +88,29 @@ def _show(program: typer.Typer) -> None:
         "show",
         help=SUMMARIES["show"]
         + "\n\nExample: tacpipe show data/recordings"
+        + "\n\nExample: tacpipe show data/recordings trial-003"
         + "\n\nExample: tacpipe show data/recordings trial-003 --plot trial-003.png",
     )
     def show(
         dataset: Annotated[Path, typer.Argument(help="A dataset.")],
-        recording: Annotated[str | None, typer.Argument(help="Name of the recording that --plot draws.")] = None,
+        recording: Annotated[str | None, typer.Argument(help="A recording of it.")] = None,
         plot: Annotated[
             Path | None, typer.Option("--plot", help="Draw one recording over time: .png, .svg or .pdf.")
         ] = None,
         as_json: AsJson = False,
         full: Annotated[
-            bool, typer.Option("--full", help="All recordings, labels and files, not the first ones.")
+            bool, typer.Option("--full", help="All recordings, columns, labels and files, not the first ones.")
         ] = False,
     ) -> None:
         from tacpipe.cli import show as overview
+        from tacpipe.cli import show_recording
 
-        if plot is not None or recording is not None:
-            from tacpipe.cli import plot as pictures
-
-            terminal.result(pictures.write(dataset, recording, plot))
+        if plot is not None:
+            terminal.result(show_recording.draw(dataset, recording, plot))
+            return
+        if recording is not None:
+            found = show_recording.overview(dataset, recording)
+            _print(found.to_json() if as_json else found, show_recording.to_text, as_json=as_json, full=full)
             return
         most = None if full or as_json else overview.SHOWN
         _print(overview.of(dataset, most=most), overview.to_text, as_json=as_json, full=full)

@@ -6,17 +6,18 @@ What is shown follows from what the dataset holds, whichever stage made it.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from tacpipe import printable
 from tacpipe.channels import streams
 from tacpipe.cli import model_overview
+from tacpipe.cli.show_recording import RATES, StreamFigures, stream_figures
 from tacpipe.datasets import manifest as manifest_of
 from tacpipe.datasets import pages
 from tacpipe.datasets.attributes import OfRecordings
-from tacpipe.datasets.dataset import Dataset, Recording
+from tacpipe.datasets.dataset import Dataset
 from tacpipe.engine import execution
 from tacpipe.metrics.headline import counted
 from tacpipe.plugins import params as params_of
@@ -24,10 +25,8 @@ from tacpipe.plugins.stage import ROLES
 from tacpipe.recording import ending
 from tacpipe.store.location import locate
 
-if TYPE_CHECKING:
-    import pyarrow as pa
-
 SHOWN = 20  # recordings listed before the rest is counted
+READ_BYTES = 1 << 28  # stored bytes that are read; further streams are listed with their rows only
 _TRUTH = "gt_"  # begins the labels that a simulator gives: what no lab knows of its recordings
 _SPLIT = ("recording", "fold", "role")  # columns of a split
 
@@ -60,7 +59,7 @@ def of(path: Path, *, most: int | None = None) -> dict[str, Any]:
     return {
         "kind": "recordings",
         **about,
-        "recordings": {name: _recording(opened.recordings[name]) for name in sorted(opened.recordings)[:most]},
+        "recordings": _figures(opened, sorted(opened.recordings)[:most], None if most is None else READ_BYTES),
         "attributes": {name: dict(shard.attributes) for name, shard in opened.recordings.items()}
         if most is None
         else OfRecordings(opened),
@@ -100,37 +99,21 @@ def _excluded(opened: Dataset) -> dict[str, str]:
     return {name: str(why) for part in some for name, one in part.items() if (why := one["attributes"].get("excluded"))}
 
 
-def _recording(shard: Recording) -> dict[str, Any]:
-    return {stream: _stream(shard, stream) for stream in shard.streams}
-
-
-def _stream(shard: Recording, stream: str) -> dict[str, Any]:
-    """Return the numbers of a stream; only its clocks and what an integer sensor measured are decoded, some at a time."""
-    import numpy as np
-    import pyarrow as pa
-
-    opened = shard.columns(stream)
-    rows = opened.num_rows
-    found: dict[str, Any] = {"rows": rows, "columns": len(opened.column_names)}
-    if "t_ns" in opened.column_names and rows > 1:
-        clocks = pa.table({name: opened.column(name) for name in ("t_ns", "seq") if name in opened.column_names})
-        found["duration_s"] = round(float(np.diff(clocks["t_ns"].to_numpy()).sum()) / 1e9, 3)
-        found["rate_hz"] = streams.rate_hz(clocks)
-        found["gaps"] = len(streams.gaps_before(clocks))
-    integers = [one for one in _measured(opened.schema) if pa.types.is_integer(one.type)]
-    if integers and rows > 1:
-        held, saturated = np.ones(rows - 1, dtype=bool), 0  # (time - 1,)
-        for field in integers:
-            values = opened.column(field.name).to_numpy()  # (time,), NaN where there is none
-            limits = np.iinfo(field.type.to_pandas_dtype())
-            held &= values[1:] == values[:-1]
-            saturated += int(((values == limits.max) | (values == limits.min)).sum())
-        found["held_share"], found["saturated"] = round(float(held.mean()), 4), saturated
-    return found
-
-
-def _measured(schema: pa.Schema) -> list[pa.Field]:
-    return [field for field in schema if (field.metadata or {}).get(b"quantity") == b"tactile"]
+def _figures(opened: Dataset, names: Sequence[str], most_bytes: int | None) -> dict[str, dict[str, StreamFigures]]:
+    """Return the figures of each stream by recording; of streams beyond ``most_bytes`` in all, only the rows."""
+    figures: dict[str, dict[str, StreamFigures]] = {}
+    for name in names:
+        recording = opened.recordings[name]
+        figures[name] = {}
+        for stream in recording.streams:
+            figures[name][stream] = {"rows": recording.rows[stream]}
+            if most_bytes is not None:
+                if recording.sizes[stream] > most_bytes:
+                    continue
+                most_bytes -= recording.sizes[stream]
+            columns = recording.columns(stream)
+            figures[name][stream] = stream_figures(columns, streams.read_clocks(columns))
+    return figures
 
 
 def to_text(value: dict[str, Any], *, full: bool = False) -> str:
@@ -156,14 +139,20 @@ def _recordings_text(value: dict[str, Any], full: bool) -> list[str]:
     ]
     for name in shown:
         cell = printable.padded(printable.shown(name), 24)
-        for stream, found in value["recordings"][name].items():
-            held = f"{found['held_share']:.0%}" if "held_share" in found else ""
+        for stream, figures in value["recordings"][name].items():
+            held = f"{figures['held_share']:.0%}" if "held_share" in figures else ""
             lines.append(
-                f"{cell} {stream or '-':<10} {found['rows']:>7} {found['columns']:>7} {found.get('duration_s', ''):>8} "
-                f"{found.get('rate_hz', '') or '':>8} {found.get('gaps', ''):>5} {held:>5} {found.get('saturated', ''):>9}"
+                f"{cell} {stream or '-':<10} {figures['rows']:>7} {figures.get('columns', ''):>7} "
+                f"{figures.get('duration_s', ''):>8} {figures.get('rate_hz', '') or '':>8} {figures.get('gaps', ''):>5} "
+                f"{held:>5} {figures.get('saturated', ''):>9}"
             )
     if count > len(shown):
         lines.append(f"… and {count - len(shown)} more (--full)")
+    every_stream = [figures for name in shown for figures in value["recordings"][name].values()]
+    if any("rate_hz" in figures for figures in every_stream):
+        lines.append(RATES)
+    if unread := sum("columns" not in figures for figures in every_stream):
+        lines.append(f"{counted(unread, 'streams')} too long to read here: `tacpipe show DATASET RECORDING`, or --full")
     lines += ["", *_labels(value["attributes"], full)]
     lines += [f"excluded: {name}: {why}" for name, why in value["excluded"].items()]
     lines += ending.lines(value["attributes"], value["recordings"])

@@ -69,6 +69,16 @@ class Recording:
         return {stream: shard["digest"] for stream, shard in self._shards.items()}
 
     @property
+    def sizes(self) -> dict[str, int]:
+        """The bytes of each stream as it is stored."""
+        return {stream: shard["bytes"] for stream, shard in self._shards.items()}
+
+    @property
+    def rows(self) -> dict[str, int]:
+        """The number of rows of each stream."""
+        return {stream: shard["rows"] for stream, shard in self._shards.items()}
+
+    @property
     def digest(self) -> str:
         """The digest of the recording's only stream, or of all of them."""
         digests = self.digests

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from tacpipe.channels.streams import EVENTS, TRUTH
@@ -19,9 +20,14 @@ def streams_of(recording: Recording) -> dict[str, pa.Table]:
 
     Ground truth and the masks of a synchronized table are left out.
     """
-    if set(recording.streams) != {""}:
-        return {name: recording.table(name) for name in recording.streams if name not in NO_SIGNALS}
-    table = recording.table()
+    return split_tables({name: recording.table(name) for name in recording.streams if name not in NO_SIGNALS})
+
+
+def split_tables(tables: Mapping[str, pa.Table]) -> dict[str, pa.Table]:
+    """Return the table of each stream of a recording as `streams_of` does, from the tables as they are stored."""
+    if set(tables) != {""}:
+        return {name: table for name, table in tables.items() if name not in NO_SIGNALS}
+    table = tables[""]
     columns: dict[str, list[str]] = {}
     for field in table.schema:
         metadata = field.metadata or {}

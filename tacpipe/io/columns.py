@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 
 import pyarrow as pa
 
-from tacpipe.io.parquet import ParquetTable
+from tacpipe.io.parquet import SOME_ROWS, ParquetTable
 
 BLOCK_BYTES = 1 << 24  # about as much is decoded at once
 _TEXT_BYTES = 16  # taken for a text, whose length is not known before it is read
@@ -45,9 +45,9 @@ class Columns:
             self._decoded = self._file.read(block)
         return self._decoded.column(name)
 
-    def batches(self, columns: Sequence[str] | None = None) -> Iterator[pa.Table]:
-        """Yield tables of some thousand rows each, in order, decoded as they are asked for; of ``columns`` alone."""
-        return self._file.batches(columns)
+    def batches(self, columns: Sequence[str] | None = None, rows: int = SOME_ROWS) -> Iterator[pa.Table]:
+        """Yield tables of up to ``rows`` rows each, in order, decoded as they are asked for; only ``columns``."""
+        return self._file.batches(columns, rows)
 
     def forget(self) -> None:
         """Let go of what was decoded last, unless it is the whole of a small stream."""

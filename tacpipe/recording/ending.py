@@ -25,12 +25,12 @@ def lines(attributes: Mapping[str, Mapping[str, Any]], recordings: Mapping[str, 
     for name in sorted(attributes):
         values = attributes[name]
         if values.get("ended") in REASONS:
-            lasts_s = max(
-                (figures.get("duration_s", 0.0) for figures in recordings.get(name, {}).values()), default=0.0
-            )
+            figures = recordings.get(name, {}).values()
+            durations_s = [stream["duration_s"] for stream in figures if "duration_s" in stream]
             requested_s = values.get("requested_duration_s")
-            of = f" of {requested_s:g}" if isinstance(requested_s, int | float) else ""
-            found.append(f"not completed: {plain(name)}: {REASONS[values['ended']]}, {lasts_s:.1f}{of} s")
+            part = f" of {requested_s:g}" if isinstance(requested_s, int | float) else ""
+            duration = f", {max(durations_s):.1f}{part} s" if durations_s else ""
+            found.append(f"not completed: {plain(name)}: {REASONS[values['ended']]}{duration}")
         late = {stream: count for stream, count in values.items() if stream.endswith(UNCERTAIN)}
         if late:
             described = ", ".join(

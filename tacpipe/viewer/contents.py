@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from tacpipe.arrays import Bytes, Float32s, Times
-from tacpipe.channels.streams import EVENTS, TRUTH, rate_hz
+from tacpipe.channels.streams import EVENTS, TRUTH, rate_hz, read_clocks
 from tacpipe.clouds.cloud import COLOUR, POSITION
-from tacpipe.datasets.streams import streams_of
+from tacpipe.datasets.streams import split_tables
 from tacpipe.formats.arrays.frames import encoding
 from tacpipe.traces import curves, forecasts, named, paths, spans, taxels
 from tacpipe.traces.curves import TIME, Curves, described
@@ -26,10 +26,13 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from tacpipe.datasets.dataset import Recording
+    from tacpipe.io.columns import Columns
     from tacpipe.plugins.stage import Attribute
 
 # quantities, in the order in which they are looked for
 FIRST = ("force", "static_pressure", "joint_position", "finger_width", "position", "speed", "velocity")
+MOST_VALUES = 1 << 24  # values of a stream, beyond which a picture shows some of its rows
+STRETCHES = 1200  # the image of all taxels has as many bins
 
 
 @dataclass(frozen=True)
@@ -114,12 +117,79 @@ def of(recording: Recording, predictions: pa.Table | None = None, row: pa.Table 
 
     ``predictions`` is its table in a dataset of predictions or results, ``row`` its row where that has one each.
     """
+    tables = {stream: recording.table(stream) for stream in recording.streams}
+    return _of_tables(recording.name, recording.attributes, tables, predictions, row)
+
+
+def for_picture(recording: Recording) -> Contents:
+    """Return what a picture shows of a recording; of a long stream, some rows of each of `STRETCHES` stretches.
+
+    These are the rows with the least and the largest touch, those with the least and the largest value of any other channel,
+    and those at which a label or a mask changes. Memory does not grow with the length of the recording.
+    """
+    columns = {stream: recording.columns(stream) for stream in recording.streams}
+    long = {stream for stream, stored in columns.items() if stored.num_rows * len(stored.column_names) > MOST_VALUES}
+    if not long:
+        return of(recording)
+    tables = {
+        stream: _thinned(stored) if stream in long else recording.table(stream) for stream, stored in columns.items()
+    }
+    contents = _of_tables(recording.name, recording.attributes, tables)
+    if set(tables) == {""}:  # a mask marks its gaps
+        return contents
+    gaps = [gap for gap in contents.gaps if gap.lane not in long]
+    for stream in sorted(long):
+        clocks = read_clocks(columns[stream])
+        if clocks is not None and not _is_cloud(tables[stream]):
+            stamps = zip(clocks.gap_starts_ns.tolist(), clocks.gap_stops_ns.tolist(), strict=True)
+            gaps += [Span(stream, "gap", start_ns, stop_ns) for start_ns, stop_ns in stamps]
+    return replace(contents, gaps=gaps)
+
+
+def _thinned(stored: Columns) -> pa.Table:
+    """Return some rows of a long stream, as `for_picture` chooses them, without columns of bytes."""
+    import pyarrow as pa
+
+    names = [channel.name for channel in stored.schema if not str(channel.type).endswith("binary")]
+    chosen: list[pa.Table] = []
+    rest: dict[str, float] = {}
+    for stretch in stored.batches(names, -(-stored.num_rows // STRETCHES)):
+        rows = {0, stretch.num_rows - 1}
+        touch = np.zeros(stretch.num_rows)
+        for channel, column in zip(stretch.schema, stretch.columns, strict=True):
+            quantity = described(channel).get("quantity", "")
+            if quantity in ("label", "mask"):
+                values = (
+                    column.combine_chunks().dictionary_encode().indices.fill_null(-1).to_numpy(zero_copy_only=False)
+                )
+                rows.update((np.flatnonzero(values[1:] != values[:-1]) + 1).tolist())
+            elif pa.types.is_integer(channel.type) or pa.types.is_floating(channel.type):
+                values = np.nan_to_num(column.to_numpy().astype(np.float64))
+                if quantity == "tactile":
+                    touch += np.abs(values - rest.setdefault(channel.name, float(values[0])))
+                elif quantity not in ("time", "sequence"):
+                    rows.update((int(values.argmin()), int(values.argmax())))
+        rows.update((int(touch.argmin()), int(touch.argmax())))
+        if not chosen and TIME in names:
+            t_ns = stretch[TIME].to_numpy()
+            rows.update(np.flatnonzero(t_ns <= t_ns[0] + taxels.REST_S * 1e9).tolist())
+        chosen.append(stretch.take(pa.array(sorted(rows))))
+    return pa.concat_tables(chosen)
+
+
+def _of_tables(
+    name: str,
+    attributes: Mapping[str, Attribute],
+    tables: Mapping[str, pa.Table],
+    predictions: pa.Table | None = None,
+    row: pa.Table | None = None,
+) -> Contents:
     predicted = {} if row is None else _values(row)
-    whole = recording.table() if recording.streams == ("",) else None
+    whole = tables[""] if set(tables) == {""} else None
     if whole is not None and TIME not in whole.column_names:  # of a split, or one row a recording
-        return Contents(recording.name, recording.attributes, {"": (whole.num_rows, None)})
-    streams = streams_of(recording)
-    truth = _truth(recording, whole)
+        return Contents(name, attributes, {"": (whole.num_rows, None)})
+    streams = split_tables(tables)
+    truth = _truth(tables)
     touched = taxels.of_streams(streams)
     marks = [span for table in streams.values() for span in spans.of_labels(table)]
     marks += [span for table in truth.values() for span in spans.of_labels(table)]
@@ -129,14 +199,14 @@ def of(recording: Recording, predictions: pa.Table | None = None, row: pa.Table 
         ]
     else:
         missing = spans.masked_gaps(whole)
-    happened = spans.events(recording.table(EVENTS)) if EVENTS in recording.streams else []
+    happened = spans.events(tables[EVENTS]) if EVENTS in tables else []
     clouds = {stream: table for stream, table in streams.items() if _is_cloud(table)}
     plotted = {stream: table for stream, table in streams.items() if stream not in clouds}
     ahead = [] if predictions is None else forecasts.of_table(predictions, touched)
     ahead += forecasts.of_values(predicted, touched)
     return Contents(
-        recording.name,
-        recording.attributes,
+        name,
+        attributes,
         {stream: (table.num_rows, None if stream in clouds else rate_hz(table)) for stream, table in streams.items()},
         curves.of_streams(plotted),
         curves.of_streams(truth),
@@ -149,7 +219,7 @@ def of(recording: Recording, predictions: pa.Table | None = None, row: pa.Table 
         [found for stream, table in streams.items() for found in _frames(stream, table)],
         ahead,
         predicted,
-        None if row is None else named.of_row(row, recording.attributes),
+        None if row is None else named.of_row(row, attributes),
     )
 
 
@@ -159,14 +229,14 @@ def _values(row: pa.Table) -> dict[str, Any]:
     return {name: row.column(name)[0].as_py() for name in kept if name != "recording"}
 
 
-def _truth(recording: Recording, whole: pa.Table | None) -> dict[str, pa.Table]:
+def _truth(tables: Mapping[str, pa.Table]) -> dict[str, pa.Table]:
     """Return the ground truth of a simulated recording as a stream."""
-    if "truth" in recording.streams:
-        return {"truth": recording.table("truth")}
-    if whole is None:
+    if "truth" in tables:
+        return {"truth": tables["truth"]}
+    if set(tables) != {""}:
         return {}
-    names = [name for name in whole.column_names if name.startswith(TRUTH)]
-    return {"truth": whole.select([TIME, *names])} if names and TIME in whole.column_names else {}
+    names = [name for name in tables[""].column_names if name.startswith(TRUTH)]
+    return {"truth": tables[""].select([TIME, *names])} if names and TIME in tables[""].column_names else {}
 
 
 def _is_cloud(table: pa.Table) -> bool:

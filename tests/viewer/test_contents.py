@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pytest
 
 import tacpipe
@@ -33,8 +34,6 @@ def test_a_recording_has_its_fingers_arm_labels_events_and_camera() -> None:
 
 
 def test_a_cloud_of_each_stamp_is_one_cloud() -> None:
-    import pyarrow as pa
-
     points = {f"{axis}_m": np.arange(6.0) for axis in "xyz"}
     table = pa.table({"t_ns": [hand.START_NS] * 2 + [hand.START_NS + 5] * 4, **points})
 
@@ -45,6 +44,25 @@ def test_a_cloud_of_each_stamp_is_one_cloud() -> None:
         (hand.START_NS + 5, [[n, n, n] for n in range(2, 6)]),
     ]
     assert {one.stream for one in found.curves} == {"robot"}
+
+
+def test_a_picture_of_a_long_recording_keeps_peaks_spans_and_gaps(monkeypatch: pytest.MonkeyPatch) -> None:
+    change = hand.pressed()
+    change[170] *= 3  # one row that a plot must not lose
+    touched = hand.finger(change)
+    lost = pa.concat_tables([touched.slice(0, 60), touched.slice(70)])
+    label = pa.table({"t_ns": touched["t_ns"], "contact": hand.labels()["contact"]}, hand.labels().schema.remove(2))
+    recording = hand.recording(xela1=lost, marks=label)
+    every_row = contents.of(recording)  # type: ignore[arg-type]
+    monkeypatch.setattr(contents, "MOST_VALUES", 100)
+    monkeypatch.setattr(contents, "STRETCHES", 10)
+    brief = contents.for_picture(recording)  # type: ignore[arg-type]
+
+    assert brief.spans == every_row.spans and brief.gaps == every_row.gaps and brief.ends_ns == every_row.ends_ns
+    for thin, full in zip(brief.taxels, every_row.taxels, strict=True):
+        assert len(thin.t_ns) < len(full.t_ns) / 2
+        assert thin.load.max() == full.load.max() and thin.rest.tolist() == full.rest.tolist()
+    assert np.ptp(brief.curves[0].values) == np.ptp(every_row.curves[0].values)
 
 
 def test_the_first_plot_is_the_touch_of_all_fingers_in_their_unit() -> None:
@@ -71,7 +89,6 @@ def test_what_is_no_picture_or_has_nothing_to_plot_is_a_usage_error(lab: Lab, tm
     with pytest.raises(UsageError, match=r"\.txt"):
         figure.draw(drawn(), tmp_path / "a.txt")
     lab.run("simulate toy -o data/r")
-    assert lab.call("show data/r trial-000").code == 2
     assert lab.call("show data/r --plot a.png").code == 2  # several recordings
     lab.run("show data/r trial-000 --plot a.png")
     assert (lab.folder / "a.png").read_bytes().startswith(b"\x89PNG")

@@ -1,0 +1,343 @@
+"""Describe or draw one recording for ``tacpipe show DATASET RECORDING``: streams, columns, gaps, events and labels."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from itertools import groupby
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypedDict
+
+from tacpipe.channels import streams
+from tacpipe.channels.masks import GAP
+from tacpipe.errors import UsageError
+from tacpipe.io.tables import Group, Row, Table
+from tacpipe.metrics.headline import counted
+from tacpipe.printable import listed, plain, shown
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from tacpipe.datasets.dataset import Dataset
+    from tacpipe.io.columns import Columns
+    from tacpipe.traces.spans import Span
+
+SAMPLED_ROWS = 1 << 20  # first rows of a stream, in which repeated rows and saturated values are counted
+_LISTED = 6  # gaps, spans and events before the remaining ones are counted
+_LABELS = 40  # labels of the recording
+_NAMED = 5  # recordings that an error names
+_WALL_CLOCK_NS = 10**18  # stamps above this, in 2001, count from 1970
+RATES = "Hz: by the device's counter `seq`, else by the median step, so lost samples do not lower it."
+_MEAN_RATES = (
+    "mean Hz: rows per second of the recorded stamps; the labels STREAM_rate_hz are the same on the clock that "
+    "`tacpipe synchronize` fits."
+)
+
+
+class StreamFigures(TypedDict, total=False):
+    """The figures of one stream; those after `rows` are absent where they are not read, or the stream has no clock."""
+
+    rows: int
+    columns: int
+    duration_s: float
+    rate_hz: float | None
+    mean_hz: float
+    gaps: int
+    held_share: float
+    saturated: int
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column, and the stream that it belongs to."""
+
+    stream: str
+    name: str
+    quantity: str
+    unit: str
+    type: str
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A gap of a stream, or a time in which a label of rows has one value; in seconds since the start of the recording."""
+
+    name: str  # the stream or the label
+    text: str
+    start_s: float
+    stop_s: float
+
+
+@dataclass(frozen=True)
+class Event:
+    """An event that was recorded, in seconds since the start of the recording."""
+
+    time_s: float
+    stream: str
+    text: str
+
+
+@dataclass(frozen=True)
+class RecordingOverview:
+    """The contents of one recording."""
+
+    name: str
+    stage: str
+    digest: str
+    bytes: int
+    start_ns: int | None
+    duration_s: float | None
+    streams: Mapping[str, StreamFigures]
+    columns: Sequence[Column]
+    gaps: Sequence[Interval]
+    label_spans: Sequence[Interval]
+    events: Sequence[Event]
+    attributes: Mapping[str, Any]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the overview as plain values."""
+        return {"kind": "recording", **dataclasses.asdict(self)}
+
+
+def draw(dataset: Path, recording: str | None, picture: Path) -> Path:
+    """Draw a recording, the only one where none is named, and return the picture's path.
+
+    Raises `UsageError` where the dataset has several recordings and none is named.
+    """
+    from tacpipe.viewer import contents, figure
+
+    opened = _open(dataset)
+    if recording is None and len(opened) != 1:
+        raise UsageError(
+            f"{dataset} has {len(opened)} recordings, and --plot draws one; name it: {listed(opened.recordings, _NAMED)}."
+        )
+    name = next(iter(opened.recordings)) if recording is None else recording
+    figure.draw(contents.for_picture(opened[name]), picture)
+    return picture
+
+
+def overview(dataset: Path, name: str) -> RecordingOverview:
+    """Return the contents of a recording. Raises `UsageError` where the dataset has none of this name."""
+    from tacpipe.traces import spans
+
+    opened = _open(dataset)
+    recording = opened[name]
+    figures: dict[str, StreamFigures] = {}
+    columns: list[Column] = []
+    clocks: list[streams.Clocks] = []
+    gaps: list[Span] = []
+    label_spans: list[Span] = []
+    for stream in recording.streams:
+        stored = recording.columns(stream)
+        stream_clocks = streams.read_clocks(stored)
+        figures[stream] = stream_figures(stored, stream_clocks)
+        columns += _columns(stream, stored.schema)
+        if stream_clocks is None:
+            continue
+        clocks.append(stream_clocks)
+        ends = zip(stream_clocks.gap_starts_ns.tolist(), stream_clocks.gap_stops_ns.tolist(), strict=True)
+        gaps += [spans.Span(stream or "rows", "gap", *stamps) for stamps in ends]
+        quantities = {column.name: column.quantity for column in _columns(stream, stored.schema)}
+        gaps += spans.masked_gaps(_select(stored, [name for name in quantities if name.endswith(GAP)]))
+        if stream != streams.EVENTS:
+            label_spans += spans.of_labels(
+                _select(stored, [name for name in quantities if quantities[name] == "label"])
+            )
+    events = spans.events(recording.table(streams.EVENTS)) if streams.EVENTS in recording.streams else []
+    start_ns = min((each.start_ns for each in clocks), default=None)
+    origin_ns = start_ns or 0
+    return RecordingOverview(
+        name,
+        opened.source.stage,
+        recording.digest,
+        sum(recording.sizes.values()),
+        start_ns,
+        (max(each.stop_ns for each in clocks) - origin_ns) / 1e9 if clocks else None,
+        figures,
+        columns,
+        _intervals(gaps, origin_ns),
+        _intervals(label_spans, origin_ns),
+        [Event((event.t_ns - origin_ns) / 1e9, event.stream, event.text) for event in events],
+        dict(recording.attributes),
+    )
+
+
+def _open(dataset: Path) -> Dataset:
+    import tacpipe
+
+    return tacpipe.open(dataset)
+
+
+def _columns(stream: str, schema: pa.Schema) -> list[Column]:
+    from tacpipe.traces.curves import described
+
+    about = {field.name: described(field) for field in schema}
+    return [
+        Column(
+            stream or about[field.name].get("stream", ""),
+            field.name,
+            about[field.name].get("quantity", ""),
+            about[field.name].get("unit", ""),
+            str(field.type),
+        )
+        for field in schema
+    ]
+
+
+def _select(stored: Columns, names: Sequence[str]) -> pa.Table:
+    """Return the stamps and some columns of a stream, with field metadata; an empty table where none is named."""
+    import pyarrow as pa
+
+    names = ["t_ns", *names] if names else []
+    return pa.table([stored.column(name) for name in names], pa.schema([stored.schema.field(name) for name in names]))
+
+
+def _intervals(found: Sequence[Span], origin_ns: int) -> list[Interval]:
+    return [
+        Interval(span.lane, span.text, (span.start_ns - origin_ns) / 1e9, (span.stop_ns - origin_ns) / 1e9)
+        for span in found
+    ]
+
+
+def stream_figures(columns: Columns, clocks: streams.Clocks | None) -> StreamFigures:
+    """Return the figures of a stream with these clocks."""
+    import pyarrow as pa
+
+    figures: StreamFigures = {"rows": columns.num_rows, "columns": len(columns.column_names)}
+    if clocks is not None:
+        figures["duration_s"] = round(clocks.duration_s, 3)
+        figures["rate_hz"] = clocks.rate_hz
+        figures["mean_hz"] = round((columns.num_rows - 1) / clocks.duration_s, 3) if clocks.duration_s > 0 else 0.0
+        figures["gaps"] = len(clocks.gap_starts_ns)
+    tactile = [field.name for field in columns.schema if (field.metadata or {}).get(b"quantity") == b"tactile"]
+    integers = [name for name in tactile if pa.types.is_integer(columns.schema.field(name).type)]
+    if integers and columns.num_rows > 1:
+        figures["held_share"], figures["saturated"] = _repeated_and_saturated(columns, integers)
+    return figures
+
+
+def _repeated_and_saturated(columns: Columns, names: Sequence[str]) -> tuple[float, int]:
+    """Return the fraction of rows that repeat the row before, and the count of values at a limit of their type.
+
+    Both are of the first `SAMPLED_ROWS` rows. A missing value repeats nothing.
+    """
+    import numpy as np
+
+    rows, repeated_rows, saturated = 0, 0, 0
+    last: dict[str, Any] = {}
+    for batch in columns.batches(names):
+        repeated = np.ones(batch.num_rows, dtype=bool)  # (time,)
+        for name in names:
+            values = batch[name].to_numpy()  # (time,), NaN where there is none
+            limits = np.iinfo(batch.schema.field(name).type.to_pandas_dtype())
+            saturated += int(((values == limits.max) | (values == limits.min)).sum())
+            repeated[1:] &= values[1:] == values[:-1]
+            repeated[:1] &= name in last and bool(values[0] == last[name])
+            last[name] = values[-1]
+        repeated_rows += int(repeated.sum())
+        rows += batch.num_rows
+        if rows >= SAMPLED_ROWS:
+            break
+    return round(repeated_rows / (rows - 1), 4), saturated
+
+
+def to_text(recording: RecordingOverview, *, full: bool = False) -> str:
+    """Return the overview as lines: streams, columns, gaps, labels of rows, events and labels of the recording."""
+    rows = sum(figures["rows"] for figures in recording.streams.values())
+    head = [shown(recording.name)]
+    if recording.duration_s is not None:
+        head.append(f"{recording.duration_s:.3f} s")
+    if recording.start_ns is not None and recording.start_ns > _WALL_CLOCK_NS:
+        head.append(f"from {datetime.fromtimestamp(recording.start_ns // 10**9, UTC):%Y-%m-%d %H:%M:%S} UTC")
+    head.append(f"{rows:,} rows, {recording.bytes / 1e6:.1f} MB, made by {recording.stage} [{recording.digest[:12]}]")
+    sections = [
+        ", ".join(head),
+        _streams_text(recording),
+        _columns_table(recording.columns, full).text(),
+        _gaps_text(recording, full),
+        _intervals_text(recording.label_spans, full),
+        _events_text(recording.events, full),
+        _attributes_text(recording.attributes, full),
+    ]
+    return "\n\n".join(section for section in sections if section)
+
+
+def _streams_text(recording: RecordingOverview) -> str:
+    heads = ("stream", "rows", "columns", "s", "Hz", "mean Hz", "gaps", "held", "saturated")
+    rows = []
+    for stream, figures in recording.streams.items():
+        held = f"{figures['held_share']:.0%}" if "held_share" in figures else ""
+        values = [figures.get(key) for key in ("rows", "columns", "duration_s", "rate_hz", "mean_hz", "gaps")]
+        cells = ["" if value is None else f"{value:,}" for value in values]
+        rows.append(Row((shown(stream) or "-", *cells, held, str(figures.get("saturated", "")))))
+    notes = [RATES, _MEAN_RATES] if recording.start_ns is not None else []
+    if any(figures["rows"] > SAMPLED_ROWS and "saturated" in figures for figures in recording.streams.values()):
+        notes.append(f"held and saturated are of the first {SAMPLED_ROWS:,} rows.")
+    return Table(heads, [Group("", rows)], caption=" ".join(notes)).text()
+
+
+def _columns_table(columns: Sequence[Column], full: bool) -> Table:
+    """Return a table of the columns by stream; neighbours that differ only in their names share a row."""
+    groups = []
+    for stream, members in groupby(columns, lambda column: column.stream):
+        rows = []
+        for about, alike in groupby(
+            members, lambda column: (column.quantity, column.unit, column.type, full and column.name)
+        ):
+            names = [shown(column.name) for column in alike]
+            text = names[0] if len(names) == 1 else f"{names[0]} … {names[-1]}"
+            rows.append(Row((text, str(len(names)), *(shown(value) for value in about[:3]))))
+        groups.append(Group(shown(stream) or "-", rows))
+    return Table(("column", "count", "quantity", "unit", "type"), groups, left=(0, 2, 3, 4))
+
+
+def _gaps_text(recording: RecordingOverview, full: bool) -> str:
+    """Return one line per stream with gaps: their count, their sum, and the longest of them."""
+    lines = []
+    for stream in sorted({gap.name for gap in recording.gaps}):
+        longest = sorted(
+            (gap for gap in recording.gaps if gap.name == stream),
+            key=lambda gap: (gap.start_s - gap.stop_s, gap.start_s),
+        )
+        total_s = sum(gap.stop_s - gap.start_s for gap in longest)
+        share = f" ({total_s / recording.duration_s:.1%})" if recording.duration_s else ""
+        places = [f"{gap.stop_s - gap.start_s:.3f} s at {gap.start_s:.3f} s" for gap in longest]
+        lines.append(f"{plain(stream)}: {counted(len(places), 'gaps')}, {total_s:.3f} s{share}: {_first(places, full)}")
+    return "\n".join(["gaps, the longest first", *(f"  {line}" for line in lines)]) if lines else ""
+
+
+def _intervals_text(label_spans: Sequence[Interval], full: bool) -> str:
+    lines = []
+    for label in dict.fromkeys(span.name for span in label_spans):
+        places = [
+            f"{span.text if span.text != label else ''} {span.start_s:.3f} to {span.stop_s:.3f} s".strip()
+            for span in label_spans
+            if span.name == label
+        ]
+        lines.append(f"{label}: {_first(places, full)}")
+    return "\n".join(["labels of rows", *(f"  {shown(line)}" for line in lines)]) if lines else ""
+
+
+def _events_text(events: Sequence[Event], full: bool) -> str:
+    lines = [f"  {event.time_s:.3f} s  {shown(f'{event.stream}: {event.text}')}" for event in events]
+    retained = lines if full else lines[:_LISTED]
+    more = [f"  … and {len(lines) - len(retained)} more (--full)"] if len(lines) > len(retained) else []
+    return "\n".join(["events", *retained, *more]) if lines else ""
+
+
+def _first(places: Sequence[str], full: bool) -> str:
+    return (
+        "; ".join(places)
+        if full or len(places) <= _LISTED
+        else f"{'; '.join(places[:_LISTED])}; and {len(places) - _LISTED} more"
+    )
+
+
+def _attributes_text(attributes: Mapping[str, Any], full: bool) -> str:
+    names = sorted(attributes)
+    listed_names = names if full else [name for name in names if not name.startswith(streams.TRUTH)][:_LABELS]
+    lines = [f"  {shown(name)}: {shown(str(attributes[name]))}" for name in listed_names]
+    more = [f"  … and {len(names) - len(lines)} more (--full)"] if len(names) > len(lines) else []
+    return "\n".join(["labels", *lines, *more]) if names else ""
