@@ -163,9 +163,3 @@ def test_of_streams_that_are_too_long_only_the_rows_are_listed(lab: Lab, monkeyp
     (robot, _) = [line.split() for line in text.splitlines() if " robot " in line]
     assert robot == ["trial-000", "robot", str(tacpipe.open("data/r")["trial-000"].table("robot").num_rows)]
     assert "too long" not in lab.run("show data/r --full").out
-
-
-def test_of_a_synchronized_recording_the_share_of_rows_in_gaps_is_shown_by_stream() -> None:
-    masks = {"a_gap": [False, True, True, True], "b_gap": [False] * 4}
-    figures = show_recording.stream_figures(Columns(to_parquet(pa.table({"t_ns": [0, 10, 20, 30], **masks}))), None)
-    assert figures.get("gap_shares") == {"a": 0.75, "b": 0.0} and show_recording.gaps_text(figures) == "75.0%"

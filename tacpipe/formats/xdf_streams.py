@@ -22,7 +22,7 @@ import pyarrow as pa
 
 from tacpipe.arrays import AnyArray, Floats, Int64s, Times
 from tacpipe.channels import lsl
-from tacpipe.errors import TacpipeError
+from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.formats import xdf_chunks
 from tacpipe.formats.containers import kinds
 from tacpipe.formats.containers.container import Batched, Contents, SourceStream, Time
@@ -109,6 +109,7 @@ class _Read:
 
     aside: Spill = field(default_factory=Spill)
     streams: dict[int, _Stream] = field(default_factory=dict)
+    headers: dict[int, bytes] = field(default_factory=dict)  # what describes each stream
     unknown: dict[int, str] = field(default_factory=dict)  # streams whose description cannot be read, with the reason
     header: bytes = b""
     damage: list[Damage] = field(default_factory=list)
@@ -185,7 +186,7 @@ class XdfFile:
             content = _content(self.path)
             passed = 0  # bytes
             for chunk in xdf_chunks.chunks(content):
-                _take(read, chunk)
+                _take(read, chunk, self.path)
                 if isinstance(content, mmap.mmap) and chunk.at >= passed + PASSED_BYTES:
                     content.madvise(
                         mmap.MADV_DONTNEED, passed, PASSED_BYTES
@@ -193,6 +194,8 @@ class XdfFile:
                     passed += PASSED_BYTES
         except (OSError, zlib.error) as error:
             raise TacpipeError(f"{self.path} cannot be read: {error}.") from error
+        except UsageError:
+            raise
         except TacpipeError as error:
             raise TacpipeError(f"{self.path} is not an XDF file: {error}.") from error
         return read
@@ -223,7 +226,7 @@ def _decompress(file: BinaryIO, unpacked: BinaryIO) -> None:
     unpacked.flush()
 
 
-def _take(read: _Read, chunk: Chunk | Damage) -> None:
+def _take(read: _Read, chunk: Chunk | Damage, path: Path) -> None:
     """Take a chunk into what was read."""
     if isinstance(chunk, Damage):
         read.damage.append(chunk)
@@ -235,10 +238,7 @@ def _take(read: _Read, chunk: Chunk | Damage) -> None:
     elif chunk.stream is None:
         return
     elif chunk.tag == xdf_chunks.STREAM_HEADER:
-        try:
-            read.streams[chunk.stream] = _Stream(lsl.parse(chunk.content), read.aside)
-        except TacpipeError as error:
-            read.unknown[chunk.stream] = str(error)
+        _describe(read, chunk.stream, chunk, path)
     elif chunk.stream not in read.streams:
         read.unknown.setdefault(chunk.stream, UNDESCRIBED)
     elif chunk.tag == xdf_chunks.SAMPLES:
@@ -249,6 +249,22 @@ def _take(read: _Read, chunk: Chunk | Damage) -> None:
         one.rows_before.append(one.rows)
     elif chunk.tag == xdf_chunks.STREAM_FOOTER:
         read.streams[chunk.stream].declared = _counted(chunk.content)
+
+
+def _describe(read: _Read, stream: int, chunk: Chunk, path: Path) -> None:
+    """Take the description of a stream. Raises `UsageError` for a second one that differs."""
+    before = read.headers.get(stream)
+    if before is None:
+        read.headers[stream] = chunk.content
+        try:
+            read.streams[stream] = _Stream(lsl.parse(chunk.content), read.aside)
+        except TacpipeError as error:
+            read.unknown[stream] = str(error)
+    elif before != chunk.content:
+        raise UsageError(
+            f"{path} describes the stream {stream} twice, again at byte {chunk.at:,} and otherwise, so its samples cannot "
+            f"be assigned. If files were joined to it, take them apart."
+        )
 
 
 def _counted(footer: bytes) -> int | None:

@@ -18,6 +18,7 @@ MEMINFO = Path("/proc/meminfo")
 STATM = Path("/proc/self/statm")
 GROUP = Path("/sys/fs/cgroup")  # of a container: its limit, and what is used of it
 AT_HAND = 1 << 26  # bytes that are not worth asking the system about
+MOST_BLOCK = 1 << 28  # bytes that a chunk, a page or a record of a file may unpack to
 KEPT = 0.9  # fraction of what is left that one file may declare
 SCARCE = 1 << 29  # bytes: a request that fails although so much is left was for more than a sound file needs
 LIBRARIES = {  # bytes of address space that loading each takes, and its threads; measured with 2 cores

@@ -150,8 +150,9 @@ def _texts(values: AnyArray) -> set[str]:
 def _names(found: Sequence[Part]) -> dict[str, str]:
     """Return a name for each stream by its source: the last part of it where no other has the same."""
     last = [part.source.rpartition("/")[2] for part in found]
+    root = "steps" if "steps" not in last else parts.ROOT
     called = {
-        part.source: "steps" if part.source == parts.ROOT else name if last.count(name) == 1 else part.source
+        part.source: root if part.source == parts.ROOT else name if last.count(name) == 1 else part.source
         for part, name in zip(found, last, strict=True)
     }
     names = kinds.identifiers(list(called.values()))

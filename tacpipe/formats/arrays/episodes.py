@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -46,12 +47,21 @@ def found(tree: Tree) -> list[Episode]:
     cut = _cut(tree)
     if cut:
         return cut
-    for group in _above(tree):
-        below = tree.members(group)[1]
-        chosen = [one for one in below if NUMBERED.fullmatch(one.rpartition("/")[2])]
-        if chosen:
-            return [Episode(one.rpartition("/")[2], one) for one in sorted(chosen, key=_order)]
-    return [Episode(None)]
+    groups: list[str] = []
+    for group in tree.members("")[1]:  # the groups of recordings lie here, or one level below
+        groups += [group] if _is_numbered(group) else filter(_is_numbered, tree.members(group)[1])
+    names = Counter(group.rpartition("/")[2] for group in groups)
+    return [Episode(_name(group, names), group) for group in sorted(groups, key=_order)] or [Episode(None)]
+
+
+def _is_numbered(group: str) -> bool:
+    return NUMBERED.fullmatch(group.rpartition("/")[2]) is not None
+
+
+def _name(group: str, names: Mapping[str, int]) -> str:
+    """Return the name of a recording's group, with the group above where two have the same last part."""
+    last = group.rpartition("/")[2]
+    return last if names[last] == 1 else group
 
 
 def named(tree: Tree, name: str | None) -> Episode:
@@ -65,16 +75,11 @@ def named(tree: Tree, name: str | None) -> Episode:
     for one in cut:
         if one.name == name:
             return one
-    for group in _above(tree) if not cut else ():
+    for group in ["", *(tree.members("")[1] if "/" not in name else ())] if not cut else ():
         path = f"{group}/{name}" if group else name
         if tree.is_group(path):
             return Episode(name, path)
     raise TacpipeError(f"{tree.path} holds no recording {plain(name)}.")
-
-
-def _above(tree: Tree) -> list[str]:
-    """Return the groups that the groups of recordings may lie in: the root, and those in it."""
-    return ["", *tree.members("")[1]]
 
 
 def _cut(tree: Tree) -> list[Episode]:

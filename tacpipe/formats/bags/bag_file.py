@@ -11,12 +11,12 @@ from typing import BinaryIO
 
 from tacpipe.errors import TacpipeError
 from tacpipe.formats.bags import ros
-from tacpipe.formats.bags.storages import Channel, Damage, Message, Record
+from tacpipe.formats.bags.storages import Channel, Damage, LostChunk, Message, Record
 from tacpipe.io import memory, regular
 from tacpipe.printable import excerpt, plain
 
 MAGIC = b"#ROSBAG V2.0\n"
-MESSAGE, BAG, CHUNK, CONNECTION = 2, 3, 5, 7
+MESSAGE, BAG, INDEX, CHUNK, CONNECTION = 2, 3, 4, 5, 7
 MOST_HEADER = 1 << 20  # bytes
 CUT_OFF = "the file ends within a record: it was cut off, and what came after is missing"
 
@@ -36,44 +36,67 @@ def records(path: Path) -> Iterator[Record]:
                     f"{path} is a bag of another version, {excerpt(version)}; 2.0 is read. Run `rosbag fix`."
                 )
             raise TacpipeError(f"{path} is not a bag: it {'is empty' if not magic else 'does not begin as one'}.")
-        seen: set[int] = set()
         try:
-            yield from _records(path, file, path.stat().st_size, seen)
+            yield from _records(path, file, path.stat().st_size)
         except _BrokenError as error:
             yield Damage(f"{path}: {error}.")
 
 
-def _records(path: Path, file: BinaryIO, size: int, seen: set[int], begin: int = 0) -> Iterator[Record]:
+def _records(path: Path, file: BinaryIO, size: int, *, within_chunk: bool = False) -> Iterator[Record]:
     """Yield the records of a file, or of what a chunk holds."""
+    lost: LostChunk | None = None
     while file.tell() < size:
         header = _header(_sized(file, size, MOST_HEADER))
         kind = header["op"][0] if header.get("op") else None
         if kind == BAG and header.get("encryptor"):
             raise _BrokenError(f"it is encrypted with {excerpt(header['encryptor'])}; decrypt it first")
+        if kind == INDEX and lost is not None:
+            _count_lost(lost, _sized(file, size))
+            continue
+        if lost is not None:
+            yield lost.damage(path)
+            lost = None
         if kind not in (MESSAGE, CHUNK, CONNECTION):
             _pass(file, size)
             continue
+        if kind == CHUNK and within_chunk:
+            raise _BrokenError("a chunk lies within a chunk")
         if kind == CHUNK:
-            content, whole = _content(path, file, size)
-            inside = _decompressed(header.get("compression", b"none"), content, _word(header, "size"), path)
+            content, whole = _content(file, size)
+            inside, problem = _decompressed(header.get("compression", b"none"), content, _word(header, "size"))
+            records = _records(path, io.BytesIO(inside), len(inside), within_chunk=True)
+            if not whole:
+                yield from records
+                raise _BrokenError(CUT_OFF)
             try:
-                yield from _records(path, io.BytesIO(inside), len(inside), seen)
+                yield from [] if problem else list(records)  # all or nothing: of a damaged one nothing can be trusted
             except _BrokenError:
-                if whole and len(inside) == _word(header, "size"):
-                    raise
-            if not whole or len(inside) < _word(header, "size"):
-                raise _BrokenError(CUT_OFF if not whole else f"a chunk of {len(content)} bytes is damaged")
+                problem = f"of {len(inside):,} bytes is damaged"
+            lost = LostChunk(problem) if problem else None
             continue
         content = _sized(file, size)
         number = _word(header, "conn")
         if kind == CONNECTION:
-            if number not in seen:
-                seen.add(number)
-                yield _channel(number, header, _header(content))
+            yield _channel(number, header, _header(content))
             continue
-        second, nanosecond = struct.unpack("<II", header.get("time", bytes(8))[:8])
-        log_ns = second * 10**9 + nanosecond
+        log_ns = _time_ns(header.get("time", bytes(8)))
         yield Message(number, log_ns, log_ns, content)
+    if lost is not None:
+        yield lost.damage(path)
+
+
+def _count_lost(lost: LostChunk, index: bytes) -> None:
+    """Add the messages of one connection that the index behind a chunk lists: times of 8 bytes, and where they lie."""
+    times = [_time_ns(index[at : at + 8]) for at in range(0, len(index) - 11, 12)]
+    lost.count += len(times)
+    if times:
+        lost.first_ns = min(*times, lost.first_ns or times[0], times[0])
+        lost.last_ns = max(*times, lost.last_ns, times[0])
+
+
+def _time_ns(content: bytes) -> int:
+    second, nanosecond = struct.unpack("<II", content[:8].ljust(8, b"\0"))
+    return int(second) * 10**9 + int(nanosecond)
 
 
 def _channel(number: int, header: dict[str, bytes], about: dict[str, bytes]) -> Channel:
@@ -112,11 +135,12 @@ def _sized(file: BinaryIO, size: int, most: int | None = None) -> bytes:
     return file.read(length)
 
 
-def _content(path: Path, file: BinaryIO, size: int) -> tuple[bytes, bool]:
+def _content(file: BinaryIO, size: int) -> tuple[bytes, bool]:
     """Return what follows its own length, or as much as is there, and whether it is all."""
     length = _length(file)
     there = min(length, size - file.tell())
-    memory.require(there, f"A chunk of {path}")
+    if there > memory.MOST_BLOCK:
+        raise _BrokenError(f"a chunk declares {length:,} bytes, more than the {memory.MOST_BLOCK:,} that are read")
     content = file.read(there)
     return content, len(content) == length
 
@@ -135,18 +159,21 @@ def _length(file: BinaryIO) -> int:
     return int.from_bytes(word, "little")
 
 
-def _decompressed(compression: bytes, content: bytes, size: int, path: Path) -> bytes:
-    """Return what a chunk holds, or as much of it as can be unpacked."""
-    memory.require(size, f"A chunk of {path}")
-    if compression == b"none":
-        return content
+def _decompressed(compression: bytes, content: bytes, size: int) -> tuple[bytes, str]:
+    """Return what a chunk holds, as much of it as can be unpacked, and what is wrong with it, as in "a chunk …"."""
+    if size > memory.MOST_BLOCK:
+        return b"", f"declares {size:,} bytes, more than the {memory.MOST_BLOCK:,} that are unpacked"
+    inside = content
     try:
         if compression == b"bz2":
-            return bz2.BZ2Decompressor().decompress(content, size)
-        if compression == b"lz4":
+            inside = bz2.BZ2Decompressor().decompress(content, size + 1)
+        elif compression == b"lz4":
             import lz4.frame
 
-            return bytes(lz4.frame.LZ4FrameDecompressor().decompress(content, size))
+            inside = bytes(lz4.frame.LZ4FrameDecompressor().decompress(content, size + 1))
+        elif compression != b"none":
+            name = plain(compression.decode(errors="replace"))
+            raise _BrokenError(f"its chunks are compressed with {name}, not bz2 or lz4")
     except (OSError, RuntimeError, EOFError):
-        return b""
-    raise _BrokenError(f"its chunks are compressed with {plain(compression.decode(errors='replace'))}, not bz2 or lz4")
+        inside = b""
+    return inside, "" if len(inside) == size else f"of {size:,} bytes is damaged"

@@ -12,12 +12,14 @@ from pathlib import Path
 from typing import Any
 
 from tacpipe.errors import TacpipeError
+from tacpipe.formats import unique_names
 from tacpipe.formats.bags import bag_file, json_messages, mcap_file, own, protobuf_messages, ros, sqlite_file
 from tacpipe.formats.bags.own import Own
 from tacpipe.formats.bags.storages import Channel, Damage, Message, Metadata, Record
 from tacpipe.formats.bags.topics import Decoder, Topic, TopicError
 from tacpipe.formats.containers import kinds
 from tacpipe.formats.containers.container import Contents, SourceStream
+from tacpipe.io import files as file_system
 from tacpipe.io import regular, yaml_text
 from tacpipe.io.spill import Spill
 from tacpipe.plugins import extras
@@ -54,7 +56,7 @@ class Bag:
     def _read(self, sources: Collection[str] | None, most: int | None) -> Contents:
         with contextlib.ExitStack() as stack:
             files, messages_compressed, notes = _files(self.path, stack)
-            reading = _Reading(sources, messages_compressed)
+            reading = _Reading(self.path, sources, messages_compressed)
             for number, file in enumerate(files):
                 reading.take(_records(file), number, most)
         contents = reading.contents()
@@ -74,10 +76,15 @@ def _files(path: Path, stack: contextlib.ExitStack) -> tuple[list[Path], bool, l
     about = _described(path / "metadata.yaml")
     listing = about.get("relative_file_paths")
     names = [Path(str(name)).name for name in listing] if isinstance(listing, list) else []
+    unique_names.by_name(((name, name) for name in names), path / "metadata.yaml", "file")
     missing = [name for name in names if not (path / name).is_file()]
     notes = [f"{path} lacks {listed(missing, 3)}, which its metadata.yaml names."] if missing else []
-    there = [path / name for name in names if name not in missing]
-    there = there or sorted(one for one in path.iterdir() if _ending(one) in READERS)  # renamed since
+    every = sorted(file for file in file_system.listed(path) if _ending(file) in READERS)
+    there = [path / name for name in names if name not in missing] or every  # renamed since
+    if unlisted := [file.name for file in every if file not in there]:
+        notes.append(
+            f"{path} holds {listed(unlisted, 3)}, which its metadata.yaml does not name and which are not read."
+        )
     if not there:
         raise TacpipeError(f"{path} holds no file of a bag; its metadata.yaml names {listed(names, 3) or 'none'}.")
     if unknown := [one.name for one in there if _ending(one) not in READERS]:
@@ -130,6 +137,7 @@ def _unpacked(path: Path, stack: contextlib.ExitStack) -> Path:
 class _Reading:
     """What is known of a bag while its records pass."""
 
+    path: Path
     sources: Collection[str] | None
     compressed: bool
     ended_early: bool = False
@@ -140,6 +148,8 @@ class _Reading:
     own: dict[str, Own] = field(default_factory=dict)  # topics that tacpipe itself exported
     notes: list[str] = field(default_factory=list)
     aside: Spill = field(default_factory=Spill)  # decoded messages
+    undescribed: int = 0  # messages of channels that no record describes
+    _described: dict[tuple[int, int], Channel] = field(default_factory=dict)  # by file and number
     _channels: dict[tuple[int, int], str] = field(default_factory=dict)  # file and number to topic
 
     def take(self, records: Iterator[Record], file: int, most: int | None) -> None:
@@ -159,6 +169,14 @@ class _Reading:
 
     def _channel(self, channel: Channel, file: int) -> None:
         topic = channel.topic
+        before = self._described.setdefault((file, channel.number), channel)
+        if before is not channel:  # chunks repeat the channels of their messages
+            if before != channel:
+                raise TacpipeError(
+                    f"{self.path} describes the channel {channel.number} twice, as {plain(before.topic)} and as "
+                    f"{plain(topic)}, so its messages cannot be assigned. Record it again, or repair it with `mcap recover`."
+                )
+            return
         if (found := own.described(channel.metadata)) is not None:
             if found.derived:
                 return
@@ -181,6 +199,7 @@ class _Reading:
     def _message(self, message: Message, file: int) -> None:
         topic = self.topics.get(self._channels.get((file, message.channel), ""))
         if topic is None:
+            self.undescribed += (file, message.channel) not in self._described
             return
         try:
             content = _unzipped(message.content) if self.compressed else message.content
@@ -228,6 +247,8 @@ class _Reading:
                 found.append((before, SourceStream(source, name, one.time, one.content, rows)))
                 if one.note:
                     self.notes.append(f"{plain(source)}: {one.note}; its log times are used.")
+        if self.undescribed:
+            self.notes.append(f"{self.path} has {self.undescribed:,} messages of channels that it does not describe.")
         if self.ended_early:
             self.notes.append(
                 f"The first {LOOK_MESSAGES} messages of each file were looked at; later ones may have other topics."

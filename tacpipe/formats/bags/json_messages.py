@@ -27,7 +27,9 @@ class Json:
         rows: list[dict[str, Any]] = []
         for message in messages:
             try:
-                value = json.loads(message)
+                value = json.loads(message, object_pairs_hook=_unique)
+            except TopicError:
+                raise
             except (ValueError, RecursionError) as error:
                 raise TopicError("a message is not JSON") from error
             if not isinstance(value, dict):
@@ -43,6 +45,14 @@ class Json:
             return {name for name, one in schema["properties"].items() if one.get("contentEncoding") == "base64"}
         except (ValueError, AttributeError, KeyError, TypeError, RecursionError):
             return set()
+
+
+def _unique(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
+    """Return an object of JSON. Raises `TopicError` where two of its entries have the same name."""
+    value = dict(pairs)
+    if len(value) < len(pairs):
+        raise TopicError("a message has two entries of the same name")
+    return value
 
 
 def flat(value: Mapping[str, Any], before: str = "") -> dict[str, Any]:

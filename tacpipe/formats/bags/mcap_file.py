@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
 from tacpipe.errors import TacpipeError
-from tacpipe.formats.bags.storages import Channel, Damage, Message, Metadata, Record
+from tacpipe.formats.bags.storages import Channel, Damage, LostChunk, Message, Metadata, Record, moment
 from tacpipe.io import memory, regular
 from tacpipe.printable import plain
 
 MAGIC = b"\x89MCAP0\r\n"
-HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, ATTACHMENT = 0x01, 0x02, 0x03, 0x04, 0x05, 0x06, 0x09
-METADATA, DATA_END = 0x0C, 0x0F
+FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, ATTACHMENT = 0x02, 0x03, 0x04, 0x05, 0x06, 0x07, 0x09
+STATISTICS, METADATA, DATA_END = 0x0B, 0x0C, 0x0F
+PIECE_BYTES = 1 << 20  # that are read at once
+INDEX_ENTRY = 16  # bytes of a message in the index of a chunk
 _RECORD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _CHUNK = struct.Struct("<QQQI")  # first and last time, size and check sum of what is inside
@@ -30,37 +33,95 @@ class _BrokenError(Exception):
 def records(path: Path) -> Iterator[Record]:
     """Yield what an MCAP file holds. Raises `TacpipeError` where it is not one."""
     with regular.failing(path), regular.opened(path) as file:
-        if file.read(len(MAGIC)) != MAGIC:
-            raise TacpipeError(f"{path} is not an MCAP file: it does not begin as one.")
-        size = path.stat().st_size
-        reader = _Reader(path)
-        ended = False
-        try:
-            while not ended:
-                head = file.read(_RECORD.size)
-                if len(head) < _RECORD.size:
-                    raise _BrokenError(CUT_OFF)
-                kind, length = _RECORD.unpack(head)
-                if kind not in (SCHEMA, CHANNEL, MESSAGE, CHUNK, METADATA):  # an index, an attachment, what is newer
-                    ended = kind in (FOOTER, DATA_END)
-                    if file.tell() + length > size:
-                        raise _BrokenError(CUT_OFF)
-                    end = file.tell() + length
-                    if kind == ATTACHMENT:
-                        yield Damage(f"{path}: the attachment {_attached(file.read(min(length, 4096)))} is not read.")
-                    file.seek(end)
-                    continue
-                there = min(length, size - file.tell())
-                memory.require(there, f"A record of {path}")
-                content = file.read(there)
-                if kind == CHUNK:
-                    yield from reader.chunk(content, whole=len(content) == length)
-                elif len(content) == length:
-                    yield from reader.record(kind, memoryview(content))
-                if len(content) < length:
-                    raise _BrokenError(CUT_OFF)
-        except _BrokenError as error:
-            yield Damage(f"{path}: {error}.")
+        yield from stream_records(path, file)
+
+
+def stream_records(path: Path, file: BinaryIO) -> Iterator[Record]:
+    """Yield what ``file``, the bytes of an MCAP file from the first on, holds. Raises as `records` does."""
+    if file.read(len(MAGIC)) != MAGIC:
+        raise TacpipeError(f"{path} is not an MCAP file: it does not begin as one.")
+    reader = _Reader(path)
+    try:
+        yield from _data(file, reader)
+    except _BrokenError as error:
+        until = f"; {reader.count:,} messages up to {moment(reader.last_ns)} were read" if reader.count else ""
+        yield Damage(f"{path}: {error}{until}.")
+        return
+    stated = _stated_messages(file)
+    lost = 0 if stated is None else stated - reader.count
+    if lost > 0:
+        yield Damage(f"{path} states that it has {stated:,} messages, and {lost:,} of them are missing.")
+
+
+def _data(file: BinaryIO, reader: _Reader) -> Iterator[Record]:
+    """Yield what stands before the summary at the end of a file."""
+    lost: LostChunk | None = None
+    while True:
+        kind, length = _head(file)
+        if lost is not None and kind != MESSAGE_INDEX:
+            yield lost.damage(reader.path)
+            lost = None
+        if kind in (FOOTER, DATA_END):
+            _pass(file, length)
+            return
+        if kind == ATTACHMENT:
+            name = _attached(beginning := file.read(min(length, 4096)))
+            yield Damage(f"{reader.path}: the attachment {name} is not read.")
+            _pass(file, length - len(beginning))
+        elif kind in (SCHEMA, CHANNEL, MESSAGE, CHUNK, METADATA) or (kind == MESSAGE_INDEX and lost is not None):
+            content = _content(file, length)
+            if kind == MESSAGE_INDEX and lost is not None:
+                lost.count += max(len(content) - 6, 0) // INDEX_ENTRY
+            elif kind == CHUNK:
+                lost = yield from reader.chunk(content, whole=len(content) == length)
+            elif len(content) == length:
+                yield from reader.record(kind, memoryview(content))
+            if len(content) < length:
+                raise _BrokenError(CUT_OFF)
+        else:  # an index, or what is newer
+            _pass(file, length)
+
+
+def _stated_messages(file: BinaryIO) -> int | None:
+    """Return how many messages the summary states; None where there is none, or where it is damaged."""
+    try:
+        while True:
+            kind, length = _head(file)
+            if kind == STATISTICS:
+                return int.from_bytes(_content(file, length)[:8], "little")
+            _pass(file, length)
+    except _BrokenError:
+        return None
+
+
+def _head(file: BinaryIO) -> tuple[int, int]:
+    """Return kind and length in bytes of the next record."""
+    head = file.read(_RECORD.size)
+    if len(head) < _RECORD.size:
+        raise _BrokenError(CUT_OFF)
+    kind, length = _RECORD.unpack(head)
+    return kind, length
+
+
+def _content(file: BinaryIO, length: int) -> bytes:
+    """Return the next ``length`` bytes, or as many as there are: what is declared takes no memory."""
+    if length > memory.MOST_BLOCK:
+        raise _BrokenError(f"a record declares {length:,} bytes, more than the {memory.MOST_BLOCK:,} that are read")
+    parts: list[bytes] = []
+    while length and (part := file.read(min(length, PIECE_BYTES))):
+        parts.append(part)
+        length -= len(part)
+    return parts[0] if len(parts) == 1 else b"".join(parts)
+
+
+def _pass(file: BinaryIO, length: int) -> None:
+    if not length:
+        return
+    if length >= 1 << 62:
+        raise _BrokenError(CUT_OFF)
+    file.seek(length - 1, io.SEEK_CUR)
+    if not file.read(1):
+        raise _BrokenError(CUT_OFF)
 
 
 class _Reader:
@@ -68,13 +129,14 @@ class _Reader:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self.count = 0  # messages so far
+        self.last_ns = 0  # log time of the last one
         self._schemas: dict[int, tuple[str, str, bytes]] = {0: ("", "", b"")}
-        self._channels: set[int] = set()
 
     def record(self, kind: int, content: memoryview) -> Iterator[Record]:
         """Yield what a record is, if it is one that counts."""
         if kind == MESSAGE:
-            yield _message(content, 0, len(content))
+            yield self._message(content, 0, len(content))
             return
         from mcap import records as mcap_records
         from mcap.data_stream import ReadDataStream
@@ -87,9 +149,6 @@ class _Reader:
                 self._schemas[schema.id] = (schema.name, schema.encoding, schema.data)
             elif kind == CHANNEL:
                 channel = mcap_records.Channel.read(stream)
-                if channel.id in self._channels:  # a chunk repeats those of its messages
-                    return
-                self._channels.add(channel.id)
                 name, encoding, data = self._schemas.get(channel.schema_id, ("", "", b""))
                 yield Channel(
                     channel.id, channel.topic, name, channel.message_encoding, encoding, data, channel.metadata
@@ -100,30 +159,53 @@ class _Reader:
         except (EndOfFile, struct.error, UnicodeDecodeError) as error:
             raise _BrokenError(f"a record of kind {kind} is damaged") from error
 
-    def chunk(self, content: bytes, whole: bool) -> Iterator[Record]:
-        """Yield the records of a chunk, of one that was cut off as many as are there."""
+    def chunk(self, content: bytes, whole: bool) -> Generator[Record, None, LostChunk | None]:
+        """Yield the records of a chunk, of one that was cut off as many as are there.
+
+        Return why a whole one is left out, if it is: nothing of it can be trusted then.
+        """
         if len(content) < _CHUNK.size + 4:
-            return
-        *_, size, check = _CHUNK.unpack_from(content)
+            return LostChunk("has no whole header") if whole else None
+        first_ns, last_ns, size, check = _CHUNK.unpack_from(content)
         (length,) = struct.unpack_from("<I", content, _CHUNK.size)
         begin = _CHUNK.size + 4 + length
         compression = bytes(content[_CHUNK.size + 4 : begin]).decode(errors="replace")
-        memory.require(size, f"A chunk of {self.path}")
+        if size > memory.MOST_BLOCK:
+            why = f"declares {size:,} bytes, more than the {memory.MOST_BLOCK:,} that are unpacked"
+            return LostChunk(why, first_ns, last_ns)
         inside = _decompressed(compression, content[begin + 8 :], size)
-        if whole and check and zlib.crc32(inside) != check:
-            yield Damage(f"{self.path}: the check sum of a chunk of {size} bytes is wrong; its messages are left out.")
-            return
-        view, at = memoryview(inside), 0
-        while at + _RECORD.size <= len(view):
-            kind, length = _RECORD.unpack_from(view, at)
-            at += _RECORD.size
-            if at + length > len(view):
-                break
+        view = memoryview(inside)
+        spans, end = _spans(view)
+        if whole and (len(inside) != size or end != size or (check and zlib.crc32(inside) != check)):
+            return LostChunk(f"of {size:,} bytes is damaged", first_ns, last_ns)
+        for kind, at, length in spans:
             if kind == MESSAGE:
-                yield _message(view, at, length)
+                yield self._message(view, at, length)
             elif kind in (SCHEMA, CHANNEL):
                 yield from self.record(kind, view[at : at + length])
-            at += length
+        return None
+
+    def _message(self, view: memoryview, at: int, length: int) -> Message:
+        if length < _MESSAGE.size:
+            raise _BrokenError("a message record is too short")
+        number, _, log_ns, publish_ns = _MESSAGE.unpack_from(view, at)
+        self.count += 1
+        self.last_ns = log_ns
+        return Message(number, log_ns, publish_ns, bytes(view[at + _MESSAGE.size : at + length]))
+
+
+def _spans(view: memoryview) -> tuple[list[tuple[int, int, int]], int]:
+    """Return kind, place and length of the whole records in a chunk, and where the last one ends."""
+    spans: list[tuple[int, int, int]] = []
+    end = 0
+    while end + _RECORD.size <= len(view):
+        kind, length = _RECORD.unpack_from(view, end)
+        at = end + _RECORD.size
+        if at + length > len(view) or (kind == MESSAGE and length < _MESSAGE.size):
+            break
+        spans.append((kind, at, length))
+        end = at + length
+    return spans, end
 
 
 def _attached(content: bytes) -> str:
@@ -131,33 +213,26 @@ def _attached(content: bytes) -> str:
     return plain(content[20 : 20 + int.from_bytes(content[16:20], "little")].decode(errors="replace"))
 
 
-def _message(view: memoryview, at: int, length: int) -> Message:
-    if length < _MESSAGE.size:
-        raise _BrokenError("a message record is too short")
-    number, _, log_ns, publish_ns = _MESSAGE.unpack_from(view, at)
-    return Message(number, log_ns, publish_ns, bytes(view[at + _MESSAGE.size : at + length]))
-
-
 def _decompressed(compression: str, content: bytes, size: int) -> bytes:
-    """Return what a chunk holds, or as much of it as can be unpacked."""
+    """Return what a chunk of ``size`` bytes holds, as much of it as can be unpacked, and of a longer one a byte more."""
     if compression == "":
-        return content[:size]
+        return content
     if compression == "zstd":
         import zstandard
 
         source: BinaryIO = zstandard.ZstdDecompressor().stream_reader(io.BytesIO(content))
+        damaged: tuple[type[Exception], ...] = (zstandard.ZstdError,)
     elif compression == "lz4":
         import lz4.frame
 
         source = lz4.frame.LZ4FrameFile(io.BytesIO(content))
+        damaged = (RuntimeError, EOFError, OSError)
     else:
         raise _BrokenError(f"its chunks are compressed with {plain(compression)}, not zstd or lz4")
     parts: list[bytes] = []
-    left = size
-    try:
-        while left and (part := source.read(min(left, 1 << 20))):
+    remaining = size + 1
+    with contextlib.suppress(*damaged):
+        while remaining and (part := source.read(min(remaining, PIECE_BYTES))):
             parts.append(part)
-            left -= len(part)
-    except Exception:
-        pass
+            remaining -= len(part)
     return b"".join(parts)

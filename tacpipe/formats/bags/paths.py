@@ -10,6 +10,7 @@ import pyarrow as pa
 
 from tacpipe.formats.bags.topic_rows import HEADER
 from tacpipe.formats.bags.topics import Block, TopicError
+from tacpipe.printable import plain
 
 MOST_COLUMNS = 4096  # of a message
 _STAMPS = ("header.stamp", "timestamp", "stamp")  # in nanoseconds, where they are whole numbers
@@ -30,7 +31,10 @@ def block(rows: Sequence[Mapping[str, Any]], types: Mapping[str, pa.DataType]) -
         if name == stamp:
             columns[HEADER] = pa.array([value if isinstance(value, int) else 0 for value in values], pa.int64())
         else:
-            columns[name.replace(".", "_")] = _array(values, types.get(name))
+            column = name.replace(".", "_")
+            if column in columns:
+                raise TopicError(f"its messages have two values that would both be named {plain(column)}")
+            columns[column] = _array(values, types.get(name))
     return Block("", np.arange(len(rows)), columns, {name: {} for name in columns if name != HEADER})
 
 

@@ -19,6 +19,7 @@ import pyarrow.parquet as pq
 
 from tacpipe.arrays import Int64s
 from tacpipe.errors import TacpipeError
+from tacpipe.formats import unique_names
 from tacpipe.formats.arrays import known
 from tacpipe.formats.arrays.frames import NAME as PICTURE
 from tacpipe.formats.containers import kinds
@@ -82,7 +83,17 @@ class LeRobotContainer:
 
     @functools.cached_property
     def _episodes(self) -> dict[str, Episode]:
-        return {one.name: one for one in self._about.episodes()}
+        episodes = self._about.episodes()
+        unique_names.by_name(((str(episode.index), episode) for episode in episodes), self.path, INDEX)
+        return unique_names.by_name(((episode.name, episode) for episode in episodes), self.path, "episode named")
+
+    def _notes(self, episode: Episode) -> list[str]:
+        """Return, with the first episode, whether there are as many as the dataset states."""
+        stated = self._about.info.get("total_episodes")
+        first = next(iter(self._episodes.values()))
+        if not isinstance(stated, int) or stated == len(self._episodes) or episode is not first:
+            return []
+        return [f"{self.path} describes {len(self._episodes)} episodes, and {description.INFO} states {stated}."]
 
     def _named(self, name: str | None) -> Episode:
         if name not in self._episodes:
@@ -99,7 +110,7 @@ class LeRobotContainer:
         native = self._native(episode)
         if native:
             streams = [self._exact(name, path) for name, path in native.items() if _wanted(name, sources)]
-            return Contents(streams, episode.original or {})
+            return Contents(streams, episode.original or {}, notes=self._notes(episode))
         attributes: dict[str, Attribute] = {**episode.attributes, "episode_index": episode.index}
         attributes |= episode.original or {}
         if episode.tasks:
@@ -109,7 +120,7 @@ class LeRobotContainer:
         skipped = {key: f"is a video, {path}, which is not read" for key, path in episode.videos.items()}
         attributes |= {f"video.{key}": path for key, path in episode.videos.items()}
         streams = self._streams(episode, sources, rows=rows)
-        return Contents(streams, attributes | {"fps": self._about.fps}, skipped)
+        return Contents(streams, attributes | {"fps": self._about.fps}, skipped, self._notes(episode))
 
     def _exact(self, name: str, path: Path) -> SourceStream:
         """Return a stream as it was before the export, to the bit; the rows of a long one are decoded as they are read."""
@@ -155,7 +166,7 @@ class LeRobotContainer:
         """Return the rows of an episode. Raises `TacpipeError` where its file is damaged or has other columns or rows."""
         path = self.path / episode.file
         with description.parquet_errors(path), regular.opened(path) as source:
-            file = pq.ParquetFile(source)
+            file = pq.ParquetFile(source, page_checksum_verification=True)
             there = set(file.schema_arrow.names)
             missing = [key for key in (INDEX, FRAME, STAMP, *keys) if key not in there]
             if missing:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -13,6 +12,7 @@ from typing import Any
 import pyarrow.parquet as pq
 
 from tacpipe.errors import TacpipeError
+from tacpipe.formats import unique_names
 from tacpipe.formats.arrays.tree import plain_attributes
 from tacpipe.io import files as file_system
 from tacpipe.io import regular
@@ -244,7 +244,7 @@ def _original(path: Path, text: Any) -> dict[str, Attribute] | None:
     if not isinstance(text, str):
         return None
     try:
-        found = json.loads(text)
+        found = unique_names.json_value(text, path)
     except (ValueError, RecursionError) as error:
         raise TacpipeError(f"{path}: {ATTRIBUTES} holds {excerpt(text)}, which is not JSON.") from error
     values = found.items() if isinstance(found, dict) else ()
@@ -259,7 +259,7 @@ def _json(path: Path) -> dict[str, Any]:
     with regular.failing(path):
         content = regular.content(path, MOST_BYTES)
     try:
-        found = json.loads(content)
+        found = unique_names.json_value(content, path)
     except (ValueError, RecursionError) as error:
         raise TacpipeError(f"{path} is not JSON: {plain(str(error), 200)}. Copy it again.") from error
     if not isinstance(found, dict):
@@ -275,7 +275,7 @@ def _lines(path: Path) -> Iterator[dict[str, Any]]:
         if not line.strip():
             continue
         try:
-            found = json.loads(line)
+            found = unique_names.json_value(line, path)
         except (ValueError, RecursionError) as error:
             raise TacpipeError(
                 f"{path}, line {number} is not JSON: {plain(str(error), 200)}. Copy the file again."

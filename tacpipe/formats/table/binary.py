@@ -21,6 +21,7 @@ import pyarrow.json as pj
 import pyarrow.parquet as pq
 
 from tacpipe.errors import TacpipeError
+from tacpipe.formats import unique_names
 from tacpipe.formats.table import compressed
 from tacpipe.io import memory, regular
 from tacpipe.io.parquet import BROKEN, owned
@@ -52,7 +53,7 @@ class ParquetFile:
         """Yield the columns that ``types`` names, some rows at a time, with the types that the file has."""
         try:
             with regular.opened(self.path) as file:
-                opened = pq.ParquetFile(file, buffer_size=READ_BYTES, pre_buffer=False)
+                opened = pq.ParquetFile(file, buffer_size=READ_BYTES, pre_buffer=False, page_checksum_verification=True)
                 rows = min(BATCH_ROWS, BLOCK_BYTES // max(1, len(types)))
                 for batch in opened.iter_batches(rows, columns=list(types)):
                     yield _flat(self.path, pa.Table.from_batches([batch]))
@@ -94,18 +95,20 @@ class NumpyArchive:
     @functools.cached_property
     def _places(self) -> dict[str, tuple[str, int | None]]:
         """The array that each column is of, and its position within a row of that."""
-        found: dict[str, tuple[str, int | None]] = {}
+        places: list[tuple[str, tuple[str, int | None]]] = []
         for name, array in self._arrays.items():
-            alone = {name: (name, None)}
-            found |= alone if array.width is None else {f"{name}_{one}": (name, one) for one in range(array.width)}
-        return found
+            if array.width is None:
+                places.append((name, (name, None)))
+            else:
+                places += [(f"{name}_{at}", (name, at)) for at in range(array.width)]
+        return unique_names.by_name(places, self.path, "column")
 
     @functools.cached_property
     def _arrays(self) -> dict[str, ArrayMember]:
         """The arrays that have rows, all of one length, by name."""
         with self._reading(), _archive(self.path) as archive:
             members = [ArrayMember.of(archive, one) for one in archive.infolist() if one.filename.endswith(".npy")]
-        found = {one.name: one for one in members if one.shape}
+        found = unique_names.by_name(((one.name, one) for one in members if one.shape), self.path, "array")
         lengths = {name: one.rows for name, one in found.items()}
         if len(set(lengths.values())) > 1:
             first, other = next((a, b) for a in lengths for b in lengths if lengths[a] != lengths[b])
@@ -279,17 +282,15 @@ class JsonLines:
 
     def _unfolded(self, block: pa.Table) -> pa.Table:
         """Return a table whose columns of lists of one length are columns of their own."""
-        made: dict[str, pa.ChunkedArray] = {}
+        columns: list[tuple[str, pa.ChunkedArray]] = []
         widths: dict[str, int] = {}
         self._widths(block, widths)
         for name, column in zip(block.column_names, block.columns, strict=True):
-            alone = {name: column}
-            made |= (
-                {f"{name}_{one}": pc.list_element(column, one) for one in range(widths[name])}
-                if name in widths
-                else alone
-            )
-        return pa.table(made)
+            if name in widths:
+                columns += [(f"{name}_{at}", pc.list_element(column, at)) for at in range(widths[name])]
+            else:
+                columns.append((name, column))
+        return pa.table(unique_names.by_name(columns, self.path, "column"))
 
 
 def _flat(path: Path, table: pa.Table) -> pa.Table:

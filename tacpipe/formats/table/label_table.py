@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime
-import json
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -11,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from tacpipe.errors import DamagedError, TacpipeError, UsageError
+from tacpipe.formats import unique_names
 from tacpipe.formats.table import label_texts
 from tacpipe.formats.table.layout import TREES
 from tacpipe.io import yaml_text
@@ -155,7 +155,7 @@ def _tree(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield the entries of a mapping of names to labels, or of a list of labels."""
     text = label_texts.read_text(path)
     try:
-        found = json.loads(text) if path.suffix.lower() == ".json" else yaml_text.load(text)
+        found = unique_names.json_value(text, path) if path.suffix.lower() == ".json" else yaml_text.load(text)
     except (ValueError, RecursionError) as error:
         raise TacpipeError(f"{path} cannot be read: {plain(str(error), 200)}. Correct it.") from error
     entries = (

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import datetime
-import json
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from tacpipe.errors import TacpipeError
+from tacpipe.formats import unique_names
 from tacpipe.formats.table import label_table, pattern
 from tacpipe.formats.table.label_texts import plain_value, read_rows, read_text
 from tacpipe.formats.table.layout import TREES, Labels, Layout
@@ -112,7 +112,7 @@ def _file(folder: Path, labels: Labels, source: Source) -> dict[str, Attribute]:
         return _only_row(path)
     text = read_text(path)
     try:
-        values = json.loads(text) if path.suffix.lower() == ".json" else yaml_text.load(text)
+        values = unique_names.json_value(text, path) if path.suffix.lower() == ".json" else yaml_text.load(text)
     except (ValueError, RecursionError) as error:
         raise TacpipeError(f"{path} cannot be read: {plain(str(error), 200)}. Correct it.") from error
     if not isinstance(values, dict):

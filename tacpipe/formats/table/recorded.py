@@ -9,6 +9,7 @@ from pathlib import Path
 import pyarrow as pa
 
 from tacpipe.errors import TacpipeError
+from tacpipe.formats import unique_names
 from tacpipe.formats.containers import kinds
 from tacpipe.formats.containers.container import Contents
 from tacpipe.formats.table import rows
@@ -50,7 +51,7 @@ def of(
             tables[stream.name] = batches(rows.opened(paths[stream.name], stream), stream, within, shared)
     for (kind, path), several in together.items():
         contents = kinds.opened(kind, path).read([one.source for one in several], within)
-        there = {one.source: one for one in contents.streams}
+        there = unique_names.by_name(((stream.source, stream) for stream in contents.streams), path, "stream")
         for stream in several:
             if stream.source in there:
                 tables[stream.name] = contained(path, there[stream.source], stream)
@@ -68,10 +69,12 @@ def all_of(kind: str, path: Path, within: str | None) -> Recorded:
     """
     contents = kinds.opened(kind, path).read(None, within)
     notes = [*contents.notes, *(f"{path}: {plain(one)} is left out: {why}." for one, why in contents.skipped.items())]
-    tables = {}
-    for found in contents.streams:
-        if found.rows is None or found.rows:
-            tables[found.name] = contained(path, found, Stream(found.name, source=found.source))
+    named = unique_names.by_name(((stream.name, stream) for stream in contents.streams), path, "stream")
+    tables = {
+        name: contained(path, stream, Stream(name, source=stream.source))
+        for name, stream in named.items()
+        if stream.rows is None or stream.rows
+    }
     if not tables:
         raise TacpipeError(" ".join([f"{path} holds no stream that can be read.", *notes]))
     skipped = "; ".join(f"{plain(one)}: {why}" for one, why in contents.skipped.items())

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from tacpipe.errors import TacpipeError
 from tacpipe.io import progress
 from tacpipe.metrics import conformal
 from tacpipe.metrics.quantiles import check_levels
@@ -70,8 +71,10 @@ def errors_of(forecaster: Forecaster, recordings: Dataset, most: int) -> Errors:
                 )
             advance(note=name)
     if not parts:
-        beginning = f"The {len(recordings.recordings)} recordings hold"
-        raise tracks.no_window(beginning, recordings, forecaster.context, forecaster.horizon)
+        raise TacpipeError(
+            f"None of the {len(recordings.recordings)} recordings holds a window of {forecaster.context} and "
+            f"{forecaster.horizon} rows without a gap. Give longer recordings."
+        )
     return Errors(*map(np.concatenate, zip(*parts, strict=True)))
 
 

@@ -1,0 +1,439 @@
+"""The same questions to every reader: two parts with one name, a damaged block, a declared size, a way out, a codec.
+
+A reader answers with all recordings, with a note that names the loss, or with an error; nothing is lost without a word.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import sqlite3
+import struct
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from mcap.writer import CompressionType
+from mcap.writer import Writer as McapWriter
+
+from tacpipe.plugins import registry
+from tests.conftest import Lab
+from tests.formats import grasp_files, slide_files, xdf_writer, xela_files
+from tests.formats.arrays import files as array_files
+from tests.formats.bags import writers
+from tests.formats.lerobot import files as lerobot_files
+from tests.promises.counts import count
+from tests.promises.limits import is_sentence
+
+LAYOUT = '[streams.a]\nfiles = "{trial}.%s"\ntime = { column = "t" }\ncolumns = [{ match = "a*", unit = "N" }]\n'
+RATE = '[streams.data]\nsource = "data"\ntime = { rate_hz = 60 }\n'
+
+
+@dataclass(frozen=True)
+class Case:
+    """A source that a function writes into an empty folder, and what ingest answers."""
+
+    write: Callable[[Path], object]
+    answer: str | int  # a pattern of the error or the note; or the number of recordings that are all read
+    layout: str = ""
+    option: str = ""
+
+
+def ask(lab: Lab, reader: str, case: Case, question: str) -> None:
+    """Ingest the source of a case and compare the answer."""
+    source = lab.folder / "source"
+    source.mkdir()
+    case.write(source)
+    command = f"ingest {reader} {source} -o out {case.option}"
+    if case.layout:
+        (lab.folder / "layout.toml").write_text(case.layout)
+        command += " --layout layout.toml"
+    ran = lab.call(command)
+    assert "Traceback" not in ran.err
+    if isinstance(case.answer, int):
+        assert ran.code == 0, ran.err
+        assert len(lab.manifest("out").recordings) == case.answer
+    else:
+        assert re.search(case.answer, ran.err), ran.err
+        assert all(is_sentence(line) for line in ran.err.splitlines() if len(line) > 60), ran.err
+    count(f"{reader}: {question}")
+
+
+def every_case(cases: dict[str, list[Case] | str]) -> list[Any]:
+    """Return the cases of all readers as params; a reader without one has a text that states why."""
+    return [
+        pytest.param(reader, case, id=f"{reader}-{number}")
+        for reader, several in cases.items()
+        if not isinstance(several, str)
+        for number, case in enumerate(several)
+    ]
+
+
+# ---- Two parts with one name
+
+
+def _episodes_with(value: dict[str, Any]) -> Callable[[Path], None]:
+    def write(folder: Path) -> None:
+        lerobot_files.write_v2(folder / "set")
+        path = folder / "set" / "meta" / "episodes.jsonl"
+        lines = [json.loads(line) | value for line in path.read_text().splitlines()]
+        path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+
+    return write
+
+
+def _features_twice(folder: Path) -> None:
+    lerobot_files.write_v2(folder / "set")
+    path = folder / "set" / "meta" / "info.json"
+    path.write_text(
+        path.read_text().replace('"action":', '"observation.state": {"dtype": "a", "shape": [1]}, "action":')
+    )
+
+
+def _channel_twice(folder: Path) -> None:
+    writers.mcap_json(folder / "a.mcap", {"/a": [(1, {"v": 1})], "/b": [(2, {"v": 2})]}, use_chunking=False)
+    content = (folder / "a.mcap").read_bytes()
+    channel = struct.pack("<HH", 2, 2) + struct.pack("<I", 2) + b"/b"
+    assert content.count(channel) == 2  # before the messages, and in the summary
+    other = struct.pack("<HH", 1, 2) + struct.pack("<I", 2) + b"/b"
+    (folder / "a.mcap").write_bytes(content.replace(channel, other))
+
+
+def _undescribed(folder: Path) -> None:
+    writers.mcap_json(folder / "a.mcap", {"/a": [(n, {"v": 1}) for n in range(3)]}, use_chunking=False)
+    content = (folder / "a.mcap").read_bytes()
+    message = struct.pack("<HIQQ", 1, 0, 1, 1)
+    assert content.count(message) == 1
+    (folder / "a.mcap").write_bytes(content.replace(message, struct.pack("<HIQQ", 9, 0, 1, 1)))
+
+
+def _entry_twice(folder: Path) -> None:
+    path = folder / "a.mcap"
+    with path.open("wb") as file:
+        writer = McapWriter(file)
+        writer.start()
+        channel = writer.register_channel("/a", "json", 0)
+        writer.add_message(channel, 1, b'{"v": 1, "v": 2}', 1)
+        writer.finish()  # type: ignore[no-untyped-call]
+
+
+def _connection_twice(folder: Path) -> None:
+    path = _bag(folder)
+    content = path.read_bytes()
+    number = b"conn=" + struct.pack("<I", 1)
+    assert number in content
+    path.write_bytes(content.replace(number, b"conn=" + struct.pack("<I", 0)))
+
+
+def _bag(folder: Path, compression: str | None = None) -> Path:
+    types = writers.store(ros1=True)
+    sent = [
+        (
+            topic,
+            "std_msgs/msg/Float64",
+            writers.START_NS + step,
+            writers.build(types, "std_msgs/msg/Float64", data=step),
+        )
+        for step in range(200)
+        for topic in ("/a", "/b")
+    ]
+    return writers.ros1(folder / "a.bag", sent, compression)
+
+
+def _topic_twice(folder: Path) -> None:
+    types = writers.store()
+    message = writers.build(types, "std_msgs/msg/Float64", data=1.5)
+    writers.ros2(folder / "a", [(topic, "std_msgs/msg/Float64", 1, message) for topic in ("/a", "/b")], "sqlite3")
+    with closing(sqlite3.connect(folder / "a" / "a.db3")) as connection, connection:
+        connection.execute("CREATE TABLE other AS SELECT * FROM topics")
+        connection.execute("DROP TABLE topics")
+        connection.execute("ALTER TABLE other RENAME TO topics")
+        connection.execute("UPDATE topics SET id = 1")
+
+
+def _file_twice(folder: Path) -> None:
+    types = writers.store()
+    message = writers.build(types, "std_msgs/msg/Float64", data=1.5)
+    writers.ros2(folder / "a", [("/a", "std_msgs/msg/Float64", 1, message)], "sqlite3")
+    about = folder / "a" / "metadata.yaml"
+    about.write_text(about.read_text().replace("- a.db3\n", "- a.db3\n  - other/a.db3\n"))
+
+
+def _stream_twice(folder: Path) -> None:
+    session = xdf_writer.Writer()
+    for name in ("force", "other"):
+        session.stream(1, name, "int16", 1)
+        session.numbers(1, "int16", [0.1, 0.2], [[1], [2]])
+    session.write(folder / "a.xdf")
+
+
+def _groups_twice(folder: Path) -> None:
+    with h5py.File(folder / "a.hdf5", "w") as file:
+        for group in ("train/demo_0", "train/demo_1", "test/demo_0"):
+            file[f"{group}/a"] = np.arange(5.0)
+            file[f"{group}/t_s"] = np.arange(5.0)
+
+
+def _episode_names_twice(folder: Path) -> None:
+    array_files.replay(folder / "a.zarr")
+    (folder / "a.zarr" / "meta" / ".zattrs").write_text(json.dumps({"recordings": ["a", "a", "b"]}))
+
+
+def _archive(**arrays: Any) -> Callable[[Path], None]:
+    return lambda folder: np.savez(folder / "a.npz", **arrays)
+
+
+def _parquet_twice(folder: Path) -> None:
+    table = pa.Table.from_arrays([pa.array([0.0, 1.0])] * 3, names=["t", "a", "a"])
+    pq.write_table(table, folder / "a.parquet")
+
+
+def _twice(write: Callable[[Path], object]) -> Callable[[Path], None]:
+    """Return a function that writes the same trial into two folders."""
+
+    def both(folder: Path) -> None:
+        for place in ("one", "two"):
+            write(folder / place)
+
+    return both
+
+
+def _nested(folder: Path) -> None:
+    xela_files.write_flat(folder / "trial")
+    xela_files.write_flat(folder / "trial" / "copy")
+
+
+T = np.arange(3.0)
+NAMED_TWICE: dict[str, list[Case] | str] = {
+    "lerobot": [
+        Case(_episodes_with({"tacpipe/recording": "cup"}), "more than one episode named cup"),
+        Case(_episodes_with({"episode_index": 0}), "more than one episode_index 0"),
+        Case(_features_twice, "more than one entry observation.state"),
+    ],
+    "mcap": [
+        Case(_channel_twice, "describes the channel 1 twice, as /a and as /b"),
+        Case(_undescribed, "1 messages of channels that it does not describe"),
+        Case(_entry_twice, "two entries of the same name"),
+    ],
+    "rosbag": [
+        Case(_connection_twice, "describes the channel 0 twice, as /a and as /b"),
+        Case(_topic_twice, "describes the channel 1 twice"),
+        Case(_file_twice, "more than one file a.db3"),
+    ],
+    "xdf": [Case(_stream_twice, "describes the stream 1 twice")],
+    "hdf5": [Case(_groups_twice, 3)],
+    "zarr": [Case(_episode_names_twice, 3, RATE)],
+    "table": [
+        Case(lambda folder: (folder / "x.csv").write_text("t,a,a\n0,1,2\n"), "more than one column a", LAYOUT % "csv"),
+        Case(_archive(t=T, a=np.ones((3, 2)), a_1=T), "more than one column a_1", LAYOUT % "npz"),
+        Case(_parquet_twice, "a", LAYOUT % "parquet"),
+        Case(
+            lambda folder: (folder / "x.jsonl").write_text('{"t": 0, "a": [1, 2], "a_1": 5}\n'),
+            "more than one column a_1",
+            LAYOUT % "jsonl",
+        ),
+    ],
+    "biotac-slide": [Case(_twice(slide_files.write_biotac), "are the same slide")],
+    "roboskin": [
+        Case(_twice(lambda place: slide_files.write_roboskin(place, slide_files.touched(1, 20))), "are the same block")
+    ],
+    "vision2tactile": [Case(_twice(grasp_files.write_grasp), "would both be named bleach")],
+    "xela-flat": [Case(_twice(lambda place: xela_files.write_flat(place / "trial")), 2), Case(_nested, 2)],
+    "xela-psc": [Case(_twice(lambda place: xela_files.write_psc(place / "trial")), 2)],
+}
+
+
+@pytest.mark.parametrize(("reader", "case"), every_case(NAMED_TWICE))
+def test_of_two_parts_with_one_name_none_is_lost_without_a_word(lab: Lab, reader: str, case: Case) -> None:
+    ask(lab, reader, case, "two parts with one name")
+
+
+# ---- A damaged block
+
+
+def _without_check_sums(content: bytes) -> bytes:
+    """Return an MCAP file whose chunks have no check sums."""
+    found, at = bytearray(content), 8
+    while at + 9 < len(found):
+        kind, length = struct.unpack_from("<BQ", found, at)
+        if kind == 6:
+            found[at + 9 + 24 : at + 9 + 28] = bytes(4)
+        at += 9 + length
+    return bytes(found)
+
+
+def _chunk_damaged(
+    compression: CompressionType, change: Callable[[bytearray, int, int], None]
+) -> Callable[[Path], None]:
+    """Return a function that writes 4,000 messages and changes the third chunk: where it begins, and its length."""
+
+    def write(folder: Path) -> None:
+        sent = {"/a": [(writers.START_NS + n, {"v": n}) for n in range(4000)]}
+        path = writers.mcap_json(folder / "a.mcap", sent, chunk_size=20_000, compression=compression)
+        content = bytearray(_without_check_sums(path.read_bytes()))
+        at, seen = 8, 0
+        while True:
+            kind, length = struct.unpack_from("<BQ", content, at)
+            seen += kind == 6
+            if seen == 3:
+                break
+            at += 9 + length
+        change(content, at + 9, length)
+        path.write_bytes(content)
+
+    return write
+
+
+def _flip(content: bytearray, at: int, length: int) -> None:
+    content[at + length // 2 : at + length // 2 + 40] = bytes(40)
+
+
+def _declare_less(content: bytearray, at: int, length: int) -> None:
+    content[at + 16 : at + 24] = struct.pack("<Q", 100)
+
+
+def _overlong_record(content: bytearray, at: int, length: int) -> None:
+    end, at = at + length, at + 40  # behind the header of a chunk that is not compressed
+    while at < end - 200:
+        at += 9 + int(struct.unpack_from("<Q", content, at + 1)[0])
+    content[at + 1 : at + 9] = struct.pack("<Q", 1 << 40)
+
+
+LOST = r"a chunk .*; its \d+ messages from 2023-11-14T\S+ to 2023-11-14T\S+ are left out"
+
+
+def _bag_damaged(compression: str | None) -> Callable[[Path], None]:
+    def write(folder: Path) -> None:
+        path = _bag(folder, compression)
+        content = bytearray(path.read_bytes())
+        at = content.index(b"op=\x05")
+        content[at + 200 : at + 240] = b"\xff" * 40
+        path.write_bytes(content)
+
+    return write
+
+
+def _database_damaged(folder: Path) -> None:
+    types = writers.store()
+    message = writers.build(types, "std_msgs/msg/Float64", data=1.5)
+    writers.ros2(folder / "a", [("/a", "std_msgs/msg/Float64", n, message) for n in range(2000)], "sqlite3")
+    content = bytearray((folder / "a" / "a.db3").read_bytes())
+    content[len(content) // 2 : len(content) // 2 + 20000] = b"\xa5" * 20000
+    (folder / "a" / "a.db3").write_bytes(content)
+
+
+def _changed(write: Callable[[Path], object], name: str, share: float = 0.5, width: int = 40) -> Callable[[Path], None]:
+    """Return a function that writes a source and puts other bytes into the middle of one of its files."""
+
+    def changed(folder: Path) -> None:
+        write(folder)
+        path = next(path for path in sorted(folder.rglob(name)) if path.is_file())
+        content = bytearray(path.read_bytes())
+        at = int(len(content) * share)
+        content[at : at + width] = b"\xa5" * width
+        path.write_bytes(content)
+
+    return changed
+
+
+def _session(folder: Path) -> None:
+    session = xdf_writer.Writer()
+    session.stream(1, "force", "int16", 1)
+    for start in range(20):
+        session.numbers(1, "int16", [start + 0.1, start + 0.2], [[1], [2]])
+        session.boundary()
+    session.footer(1, 40)
+    session.write(folder / "a.xdf")
+
+
+def _compressed(folder: Path) -> None:
+    with h5py.File(folder / "a.hdf5", "w") as file:
+        values = np.random.default_rng(0).normal(size=4000)
+        file.create_dataset("t", data=np.arange(4000.0))
+        file.create_dataset("a", data=values, compression="gzip", chunks=(4000,))
+
+
+def _table(kind: str) -> Callable[[Path], None]:
+    def write(folder: Path) -> None:
+        t, a = np.arange(3000.0), np.random.default_rng(0).normal(size=3000)
+        if kind == "npz":
+            np.savez_compressed(folder / "x.npz", t=t, a=a)
+        elif kind == "parquet":
+            pq.write_table(
+                pa.table({"t": t, "a": a}), folder / "x.parquet", use_dictionary=False, write_page_checksum=True
+            )
+        else:
+            rows = "".join(f"{x},{y}\n" for x, y in zip(t, a, strict=True))
+            (folder / "x.csv").write_text(f"t,a\n{rows}")
+
+    return write
+
+
+DAMAGED: dict[str, list[Case] | str] = {
+    "lerobot": [
+        Case(
+            _changed(lambda folder: lerobot_files.write_v2(folder / "set"), "episode_000001.parquet"), "episode_000001"
+        ),
+        Case(_episodes_with({"length": 5}), "holds 12 frames of episode 0, and the folder meta states 5"),
+    ],
+    "mcap": [
+        Case(_chunk_damaged(CompressionType.ZSTD, _flip), LOST),
+        Case(_chunk_damaged(CompressionType.LZ4, _flip), LOST),
+        Case(_chunk_damaged(CompressionType.ZSTD, _declare_less), LOST),
+        Case(_chunk_damaged(CompressionType.NONE, _overlong_record), LOST),
+    ],
+    "rosbag": [
+        Case(_bag_damaged("BZ2"), r"a chunk .*; its 400 messages from 2023-11-14T\S+ to 2023-11-14T\S+ are left out"),
+        Case(_bag_damaged("LZ4"), r"its 400 messages from 2023"),
+        Case(_bag_damaged(None), r"its 400 messages from 2023"),
+        Case(_database_damaged, "is damaged .*what came after is missing"),
+    ],
+    "xdf": [Case(_changed(_session, "a.xdf"), r"bytes .* are not XDF and were left out")],
+    "hdf5": [Case(_changed(_compressed, "a.hdf5", 0.9), "cannot be read")],
+    "zarr": [
+        Case(
+            _changed(lambda folder: array_files.replay(folder / "a.zarr"), "data/robot0_eef_pos/1.0", 0.0),
+            "cannot be read",
+            RATE,
+        )
+    ],
+    "table": [
+        Case(_changed(_table("csv"), "x.csv"), r"x\.csv", LAYOUT % "csv"),
+        Case(_changed(_table("npz"), "x.npz"), "is not an archive of arrays", LAYOUT % "npz"),
+        Case(_changed(_table("parquet"), "x.parquet"), r"x\.parquet", LAYOUT % "parquet"),
+    ],
+    "biotac-slide": [Case(_changed(slide_files.write_biotac, "*_bio.csv"), "_bio.csv")],
+    "roboskin": [
+        Case(
+            _changed(lambda place: slide_files.write_roboskin(place, slide_files.touched(1, 20)), "labels_*.npy", 0.95),
+            "labels_fold_0.npy",
+        )
+    ],
+    "vision2tactile": [Case(_changed(grasp_files.write_grasp, "tactile.tac"), "tactile.tac")],
+    "xela-flat": [
+        Case(_changed(lambda place: xela_files.write_flat(place / "trial"), "xela_sensor1.csv"), "xela_sensor1.csv")
+    ],
+    "xela-psc": [
+        Case(_changed(lambda place: xela_files.write_psc(place / "trial"), "xela_sensor1.csv"), "xela_sensor1.csv")
+    ],
+}
+
+
+@pytest.mark.parametrize(("reader", "case"), every_case(DAMAGED))
+def test_of_a_damaged_block_the_loss_is_stated(lab: Lab, reader: str, case: Case) -> None:
+    ask(lab, reader, case, "a damaged block")
+
+
+QUESTIONS = {"two parts with one name": NAMED_TWICE, "a damaged block": DAMAGED}
+
+
+@pytest.mark.parametrize("question", list(QUESTIONS))
+def test_every_reader_is_asked(question: str) -> None:
+    assert set(QUESTIONS[question]) == set(registry.entry_points()["tacpipe.formats"])
