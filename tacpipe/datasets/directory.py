@@ -5,10 +5,11 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+import shutil
 import stat
 import uuid
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -32,23 +33,25 @@ class Change:
 
     Shards at the paths ``may_lack`` stay as they are where they are damaged: a lost recording must not hinder the next one.
     Where a dataset was only ``relabelled`` nothing goes and no shard is looked at: a label costs what it changes. Where it
-    was found ``whole`` what it shows already is not looked at again.
+    was found ``whole`` what it shows already is not looked at again. Files of an export that somebody edited are refused
+    unless ``replace``: then their content stays in the store.
     """
 
     manifest: Manifest
     may_lack: Collection[str] = ()
     relabelled: bool = False
     whole: bool = False
+    replace: bool = False
 
 
-def publish(store: Store, manifest: Manifest, directory: Path) -> None:
+def publish(store: Store, manifest: Manifest, directory: Path, *, replace: bool = False) -> None:
     """Make ``directory`` show ``manifest``, as `change` does; where it does already, only its root is set again."""
     directory = directory.absolute()
     if shows(store, manifest, directory):
         deliver(store, directory, manifest)
         store.roots.set(directory, manifest.content_digest)
         return
-    change(store, directory, lambda: Change(manifest))
+    change(store, directory, lambda: Change(manifest, replace=replace))
 
 
 def shows(store: Store, manifest: Manifest, directory: Path) -> bool:
@@ -112,9 +115,17 @@ def _show(store: Store, wanted: Change, directory: Path) -> None:
         unlike, gone = _compared(_shown(directory), manifest, directory, whole=wanted.whole)
         stale = stale if manifest.exported else unlike
     refuse_links(directory, {*stale, *gone})
+    edited = []
+    if manifest.exported or wanted.replace:  # nothing else replaces an export
+        edited = _edited(store, manifest, directory, {*stale, *gone})
+    if edited and not wanted.replace:
+        raise replacing.edited(directory, edited)
     with writing(directory):
         before = None if current else replacing.outgoing(store, directory)
         lasting = before is not None and not relabelled and bool(replacing.losses(before, manifest))
+        if edited:
+            _keep_edited(store, manifest, directory, edited)
+            before, lasting = None, True
         if before is not None and lasting:
             adoption.adopt(store, directory, before)
         deliver(store, directory, manifest, lasting=lasting)
@@ -129,6 +140,38 @@ def _show(store: Store, wanted: Change, directory: Path) -> None:
             write_whole(str(directory / NAME), manifest.content, str(directory / f".{NAME}{_DRAFT}"))
         if manifest.recorded:
             _settle(store, directory, stale)
+
+
+def edited_files(store: Store, manifest: Manifest, directory: Path) -> list[str]:
+    """Return the files in ``directory`` that were edited, and that making it show the export ``manifest`` would replace."""
+    directory = directory.absolute()
+    stale = dict(_stale(store, manifest, directory))
+    _, gone = _compared(_shown(directory), manifest, directory, whole=False)
+    return _edited(store, manifest, directory, {*stale, *gone})
+
+
+def _edited(store: Store, manifest: Manifest, directory: Path, paths: Iterable[str]) -> list[str]:
+    """Return the files of an export that hold neither what was written there last nor an object of the store."""
+    shown = _shown(directory)
+    if not (shown or manifest).exported:  # shards are links: what differs is damage
+        return []
+    written = {} if shown is None else {path: file["digest"] for path, file in shown.files.items()}
+    present = [path for path in sorted(paths) if (directory / path).is_file()]
+    digests = {path: file_digest(directory / path) for path in present}
+    return [path for path, name in digests.items() if name != written.get(path) and not store.has(name)]
+
+
+def _keep_edited(store: Store, manifest: Manifest, directory: Path, paths: Iterable[str]) -> None:
+    """Have the store hold the export as it was edited, as the dataset that was last written in ``directory``."""
+    files = {}
+    for path in paths:
+        with regular.opened(directory / path) as file:
+            stored = store.put_written(lambda draft, file=file: shutil.copyfileobj(file, draft), durable=True)  # type: ignore[misc]
+        files[path] = vars(stored)
+    before = _shown(directory) or manifest
+    edited = replace(before, files=dict(sorted({**before.files, **files}.items())))
+    store.put(edited.content, durable=True)
+    store.roots.set(directory, edited.content_digest)
 
 
 def sweep(directory: Path, *, shards: bool = True, deep: bool = False) -> None:

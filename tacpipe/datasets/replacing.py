@@ -4,6 +4,7 @@ The rules, each with exit code 2:
 
 - an output that is one of the command's inputs is always refused;
 - a dataset of another stage, and recordings or hand-set labels that the new dataset would not hold, need ``--replace``;
+- files of an export that somebody edited need ``--replace``;
 - a stage may write its own dataset again: other params and other inputs are what it is for.
 
 What was replaced stays in the store and is listed by `tacpipe store list`.
@@ -223,6 +224,16 @@ def refuse_losses(before: Manifest | None, output: Path, after: Manifest) -> Non
             f"{output} holds labels that were set by hand on recordings that the new dataset does not have or labels "
             f"differently ({listed(lost.labels, _SHOWN)}). {_KEEP}"
         )
+
+
+def edited(output: Path, paths: Sequence[str]) -> UsageError:
+    """Return the error for files of an export that somebody edited."""
+    several = len(paths) > 1
+    return UsageError(
+        f"{output} holds {'files' if several else 'a file'} that {'were' if several else 'was'} edited after the export "
+        f"({listed(paths, _SHOWN)}). Move {'them' if several else 'it'} elsewhere, or give -o another directory, or "
+        f"--replace. {_BACK}"
+    )
 
 
 def appended(before: Manifest, made: Manifest) -> Manifest:

@@ -287,6 +287,9 @@ class _Directory(_Place):
 
     def check(self, made: Manifest) -> None:
         self._refuse_losses(made)
+        edited = directory.edited_files(self.store, made, self.path) if made.exported else []
+        if edited and not self.request.replace:
+            raise replacing.edited(self.request.output, edited)
         super().check(made)
 
     def publish(self, made: Manifest, previous: Previous | None = None) -> Manifest:
@@ -298,7 +301,8 @@ class _Directory(_Place):
         def decided() -> directory.Change:  # somebody may have labelled what is there
             wanted = self.settled(made)
             self._refuse_losses(wanted)
-            return directory.Change(wanted, whole=previous is not None and previous.stands())
+            whole = previous is not None and previous.stands()
+            return directory.Change(wanted, whole=whole, replace=self.request.replace)
 
         return directory.change(self.store, self.request.output, decided)
 

@@ -139,7 +139,7 @@ def checkout(name: str, output: Path, *, replace: bool = False, source: AnyStore
             transfer.bring(source, store, manifest_of.Found(output, content), copying.Transferred())
         for first in (True, False):
             try:
-                directory_of.publish(store, manifest, output)
+                directory_of.publish(store, manifest, output, replace=replace)
                 return manifest
             except MissingError:
                 if not first:

@@ -129,7 +129,7 @@ def pull(remote: Path | str, paths: Sequence[Path], *, ancestors: bool = False, 
             )
         with here.at_work([found.digest]):
             bring(there, here, found, done, ancestors=ancestors)
-            directory_of.publish(here, manifest, found.directory)
+            directory_of.publish(here, manifest, found.directory, replace=replace)
         done.datasets.append(name)
     return done
 

@@ -128,15 +128,60 @@ def test_another_stage_s_output_is_replaced_only_with_replace(rig: Lab) -> None:
     assert rig.call("export mcap rec -o rec").code == 2
 
 
-def test_the_files_are_copies_so_that_other_tools_may_write_in_them(rig: Lab) -> None:
+EDITED = {  # command of an export, and a file of it that people edit
+    "csv rec": ("README.md", "layout.toml", "trial-01/labels.json", "trial-00/skin.csv"),
+    "mcap rec": ("README.md",),
+    "hdf5 rec": ("README.md",),
+    "card rec": ("README.md", "croissant.json"),
+    "lerobot rec --rate-hz 100": ("meta/info.json",),
+    "zarr rec --rate-hz 100": ("replay.zarr/meta/.zattrs",),
+}
+
+
+@pytest.mark.parametrize(("export", "name"), [(export, name) for export, names in EDITED.items() for name in names])
+def test_an_edited_file_is_replaced_only_with_replace_and_comes_back_from_the_store(
+    rig: Lab, export: str, name: str
+) -> None:
+    rig.run(f"export {export} -o out")
+    path = rig.folder / "out" / name
+    written = path.read_bytes()
+    edited = written + b"by hand\n"
+    path.write_bytes(edited)
+    assert rig.run("store verify").code == 0  # the store has a copy of its own
+    before = {file: file.read_bytes() for file in (rig.folder / "out").rglob("*") if file.is_file()}
+    for options in ("", " --check"):
+        ran = rig.call(f"export {export} -o out{options}")
+        assert (ran.code, ran.err.count("\n")) == (2, 1 if not options else ran.err.count("\n"))
+        assert name in ran.err
+        assert "--replace" in ran.err
+        assert {file: file.read_bytes() for file in (rig.folder / "out").rglob("*") if file.is_file()} == before
+    rig.run(f"export {export} -o out --replace")
+    assert path.read_bytes() == written
+    assert rig.call(f"export {export} -o out --check").code == 0
+    rig.run("store gc --grace-days 0")
+    old = [one for one in json.loads(rig.run("store list --json").out)["manifests"] if one["state"] == "replaced"]
+    rig.run(f"store checkout {old[0]['manifest']} -o old")
+    assert (rig.folder / "old" / name).read_bytes() == edited
+
+
+def test_an_edited_file_of_a_recording_that_goes_is_not_deleted(rig: Lab) -> None:
     rig.run("export csv rec -o out")
-    path = rig.folder / "out/trial-00/skin.csv"
-    stored = path.read_bytes()
-    with path.open("ab") as file:
-        file.write(b"mine\n")
-    assert rig.run("store verify").code == 0
+    path = rig.folder / "out/trial-01/labels.json"
+    path.write_text("{}")
+    rig.run("label rec trial-01 --exclude broken")
+    assert rig.call("export csv rec -o out").code == 2
+    assert path.read_text() == "{}"
+
+
+def test_a_file_that_somebody_put_where_an_export_will_write_is_not_replaced(rig: Lab) -> None:
+    rig.run("label rec trial-01 --exclude later")
     rig.run("export csv rec -o out")
-    assert path.read_bytes() == stored
+    path = rig.folder / "out/trial-01/labels.json"
+    path.parent.mkdir()
+    path.write_text("mine")
+    rig.run("label rec trial-01 --include")
+    assert rig.call("export csv rec -o out").code == 2
+    assert path.read_text() == "mine"
 
 
 def test_a_lost_file_is_brought_back_without_running(rig: Lab) -> None:
