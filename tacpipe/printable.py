@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import reprlib
 import unicodedata
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 _WIDE = ("W", "F")  # of East Asian letters, which take two cells
@@ -44,6 +45,34 @@ def listed(names: Iterable[object], most: int = 8) -> str:
     every = [plain(str(name)) for name in names]
     more = f" and {len(every) - most} more" if len(every) > most else ""
     return (", ".join(every[:most]) or "none") + more
+
+
+def suggestion(name: str, names: Iterable[str]) -> str:
+    """Return a sentence, with a space before it, that asks for the most similar of ``names``; the empty text for none.
+
+    >>> suggestion("materail", ["sensor", "material"]), suggestion("xyz", ["sensor"])
+    (' Did you mean material?', '')
+    """
+    import difflib
+
+    similar = difflib.get_close_matches(name, list(names), n=1, cutoff=0.7)
+    return f" Did you mean {plain(similar[0])}?" if similar else ""
+
+
+def grouped_failures(failures: Mapping[str, str], most: int = 5) -> list[str]:
+    """Return one line per reason with the names that failed for it; reasons that differ only in these names are equal.
+
+    >>> grouped_failures({"a": "a.csv is empty", "b": "b.csv is empty", "c": "no clock"})
+    ['a, b: NAME.csv is empty', 'c: no clock']
+    """
+    names_by_reason: dict[str, list[str]] = {}
+    for name, reason in failures.items():
+        without_name = re.sub(rf"(?<!\w){re.escape(name)}(?!\w)", "NAME", reason)
+        names_by_reason.setdefault(without_name, []).append(name)
+    return [
+        f"{listed(names, most)}: {reason if len(names) > 1 else failures[names[0]]}"
+        for reason, names in names_by_reason.items()
+    ]
 
 
 def shown(text: str) -> str:

@@ -29,7 +29,7 @@ def test_the_lineage_goes_down_to_the_raw_files(lab: Lab) -> None:
     assert synced["params"]["factor"] == 4 and synced["path"].endswith("data/s")
     assert recordings["sources"] == {"a": {"a.txt": file_digest("src/a.txt")}}
     printed = lab.run("explain data/t").out
-    assert "factor=4" in printed and "1 raw files of 1 recordings" in printed and "numpy" in printed
+    assert "factor=4" in printed and "1 raw file of 1 recording" in printed and "numpy" in printed
 
 
 def test_the_part_of_the_key_that_changed_is_named(lab: Lab) -> None:

@@ -163,3 +163,66 @@ def test_of_streams_that_are_too_long_only_the_rows_are_listed(lab: Lab, monkeyp
     (robot, _) = [line.split() for line in text.splitlines() if " robot " in line]
     assert robot == ["trial-000", "robot", str(tacpipe.open("data/r")["trial-000"].table("robot").num_rows)]
     assert "too long" not in lab.run("show data/r --full").out
+
+
+def test_recordings_that_fail_for_the_same_reason_are_one_line(lab: Lab) -> None:
+    (lab.folder / "raw").mkdir()
+    for name, text in {"a": "1\n2\n", "b": "x\n", "c": "x\n", "d": "1\ny\n"}.items():
+        (lab.folder / "raw" / f"{name}.txt").write_text(text)
+    ran = lab.run("ingest numbers raw -o data/r --skip-bad")
+    for text in (ran.err, lab.run("show data/r").out):
+        (equal, other) = [line for line in text.splitlines() if "left out" in line]
+        assert "b, c: " in equal and "NAME" in equal and "d: " in other
+
+
+def test_explain_prints_a_layout_as_a_table_and_names_the_part_of_it_that_changed(lab: Lab) -> None:
+    (lab.folder / "raw" / "one").mkdir(parents=True)
+    (lab.folder / "raw" / "one" / "skin.csv").write_text("t,f_x,f_y\n0.0,1,2\n0.1,3,4\n0.2,3,4\n")
+    layout = """
+[streams.skin]
+files = "{trial}/skin.csv"
+time = { column = "t", unit = "s" }
+columns = [
+    { match = "f_x", quantity = "force", unit = "N", component = "x" },
+    { match = "f_y", quantity = "force", unit = "N" },
+]
+"""
+    path = lab.folder / "layout.toml"
+    path.write_text(layout)
+    lab.run("ingest table raw --layout layout.toml -o data/r")
+    text = lab.run("explain data/r").out
+    assert "{" not in text.replace("{trial}", "")
+    rows = [line.split() for line in text.splitlines()]
+    assert ["component", "match", "quantity", "unit"] in rows
+    assert ["x", "f_x", "force", "N"] in rows and ["f_y", "force", "N"] in rows
+    path.write_text(layout.replace('f_y", quantity = "force"', 'f_y", quantity = "torque"'))
+    lab.run("ingest table raw --layout layout.toml -o data/r --replace")
+    assert "params.layout.streams.skin.columns.1.quantity: force became torque" in lab.run("explain data/r").out
+
+
+def test_a_name_that_nearly_exists_is_suggested_wherever_labels_recordings_and_params_are_named(lab: Lab) -> None:
+    lab.run("simulate forward --trials 1 --duration-s 4 -o data/r")
+    for command, name in {
+        "split data/r -o x --stratify objekt": "object",
+        "show data/r trial-00": "trial-000",
+        "synchronize data/r -o x --set gap_m=3": "gap_ms",
+    }.items():
+        ran = lab.call(command)
+        assert ran.code in (1, 2) and f"Did you mean {name}?" in ran.err, command
+
+
+def test_print_params_needs_no_dataset(lab: Lab) -> None:
+    for command in ("train forward", "synchronize --rate-hz 20", "evaluate", "ingest xela-psc", "simulate toy"):
+        assert isinstance(json.loads(lab.run(f"{command} --print-params").out), dict)
+    assert lab.call("synchronize -o x").code == 2  # without it they are needed
+
+
+def test_each_task_names_what_the_recordings_of_another_lack(lab: Lab) -> None:
+    lab.run("simulate forward --trials 3 --duration-s 4 -o data/r")
+    lab.run("synchronize data/r -o data/s")
+    lab.run("split data/s -o data/split")
+    assert (
+        "is one table, not separate streams; a grasp has the streams"
+        in lab.call("train touch data/s --split data/split -o x").err
+    )
+    assert "has no label material" in lab.call("train material data/s --split data/split -o x").err

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from tacpipe.datasets import replacing
+from tacpipe.datasets.streams import describe_streams
 from tacpipe.errors import UsageError
 from tacpipe.io import terminal
 from tacpipe.printable import plain
@@ -108,7 +109,7 @@ def _cloud(path: Path, recording: str | None) -> Cloud:
         raise UsageError(f"{path} has no recording {name}; it has {_some(list(shards))}.")
     if "cloud" not in shards[name].streams:
         raise UsageError(
-            f"Recording {name} of {path} has no cloud, only {', '.join(map(repr, shards[name].streams))}. Give what "
+            f"Recording {name} of {path} has no cloud; it {describe_streams(shards[name].streams)}. Give what "
             f"`tacpipe ingest` or `tacpipe segment grasps` made of grasps."
         )
     return Cloud.of(shards[name].table("cloud"))

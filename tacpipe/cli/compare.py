@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from tacpipe import printable
 from tacpipe.comparison import engine
 from tacpipe.engine import pipeline
 from tacpipe.errors import UsageError
@@ -117,10 +118,11 @@ class Compared:
         return text.getvalue().rstrip("\n")
 
     def tables(self) -> list[Table]:
-        """Return a table a task and kind of errors: methods the best first, below them their best baseline."""
-        same: dict[tuple[str, tuple[str, ...], str], list[Comparison]] = {}
-        for one in self.comparisons:
-            same.setdefault((one.task, one.measure.columns, one.measure.name), []).append(one)
+        """Return one table per task, kind of errors and unit: methods the best first, below them their best baseline."""
+        same: dict[tuple[str, ...], list[Comparison]] = {}
+        for comparison in self.comparisons:
+            measure = comparison.measure
+            same.setdefault((comparison.task, *measure.columns, measure.name, measure.unit), []).append(comparison)
         return [self._table(several) for several in same.values()]
 
     def _table(self, several: Sequence[Comparison]) -> Table:
@@ -185,8 +187,9 @@ def run(paths: Sequence[Path], *, pool: bool) -> Compared:
             "None of these results holds the errors of single recordings. Run `tacpipe evaluate` again, or give "
             "results of recordings that the model has not seen."
         )
-    for left in found.unused():
-        terminal.note(f"tacpipe: left out {left}: it holds no errors of single recordings that the model has not seen.")
+    reason = "no errors of single recordings that the model has not seen are stored"
+    for line in printable.grouped_failures(dict.fromkeys(found.unused(), reason)):
+        terminal.note(f"tacpipe: left out {line}.")
     return found
 
 

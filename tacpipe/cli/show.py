@@ -154,9 +154,9 @@ def _recordings_text(value: dict[str, Any], full: bool) -> list[str]:
     if unread := sum("columns" not in figures for figures in every_stream):
         lines.append(f"{counted(unread, 'streams')} too long to read here: `tacpipe show DATASET RECORDING`, or --full")
     lines += ["", *_labels(value["attributes"], full)]
-    lines += [f"excluded: {name}: {why}" for name, why in value["excluded"].items()]
+    lines += [f"excluded: {line}" for line in printable.grouped_failures(value["excluded"])]
     lines += ending.lines(value["attributes"], value["recordings"])
-    lines += [f"left out: {name}: {why}" for name, why in value["skipped"].items()]
+    lines += [f"left out: {line}" for line in printable.grouped_failures(value["skipped"])]
     lines += model_overview.files_text(value["files"], full=full) if value["files"] else []
     lines.append(
         f"{counted(count, 'recordings')}, {value['rows']} rows, {value['bytes'] / 1e6:.1f} MB, "

@@ -18,6 +18,7 @@ from tacpipe.plugins.requirements import Requirements
 from tacpipe.plugins.stage import AnyStage
 from tacpipe.training.devices import Device
 
+PRINT_PARAMS = "--print-params"
 EXAMPLE = "Example: "  # begins the last paragraph of a stage's docstring
 
 
@@ -28,16 +29,15 @@ def of(stage: AnyStage, fields: dict[str, Any]) -> list[inspect.Parameter]:
 
 def _arguments(stage: AnyStage) -> list[inspect.Parameter]:
     kinds = set(stage.arguments.values())
-    found = []
+    default = None if PRINT_PARAMS in sys.argv else ...  # params are printed without any data
+    arguments: list[tuple[str, Any, str]] = []
     if "Files" in kinds:
-        found.append(_parameter("source", Path, typer.Argument(help="Folder of the recordings.")))
+        arguments.append(("source", Path, "Folder of the recordings."))
     if stage.reads_model:
-        found.append(_parameter("model", Path, typer.Argument(help="A trained model.")))
+        arguments.append(("model", Path, "A trained model."))
     if kinds & {"Recording", "Dataset", "Datasets"}:
-        found.append(
-            _parameter("datasets", list[Path], typer.Argument(help="Datasets to read; several are read as one."))
-        )
-    return found
+        arguments.append(("datasets", list[Path], "Datasets to read; several are read as one."))
+    return [_parameter(name, kind, typer.Argument(default, help=text)) for name, kind, text in arguments]
 
 
 def _shared(stage: AnyStage) -> list[inspect.Parameter]:
@@ -111,7 +111,7 @@ def _options(stage: AnyStage, fields: dict[str, Any]) -> list[inspect.Parameter]
         (
             "print_params",
             bool,
-            typer.Option(False, "--print-params", help="Print the params that would count, and stop."),
+            typer.Option(False, PRINT_PARAMS, help="Print the params that would count, and stop."),
         ),
         ("jobs", int, typer.Option(0, "--jobs", help="Processes to use; 0: one a core.")),
         (

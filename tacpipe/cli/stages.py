@@ -12,6 +12,7 @@ from typing import Any, get_args
 
 import typer
 
+from tacpipe import printable
 from tacpipe.cli import stage_options
 from tacpipe.engine import by_recording, estimate, grid, pipeline
 from tacpipe.engine.outcome import Outcome
@@ -171,8 +172,8 @@ def _run_folds(requests: Sequence[Request], headline: str | None, *, as_json: bo
 def _report(outcome: Outcome, headline: str | None, *, as_json: bool, quiet: bool) -> None:
     for note in outcome.notes:
         terminal.note(f"tacpipe: {note}")
-    for name, why in outcome.bad.items():
-        terminal.note(f"tacpipe: left out {name}: {why}")
+    for line in printable.grouped_failures(outcome.bad):
+        terminal.note(f"tacpipe: left out {line}")
     if not quiet:
         terminal.note(f"{outcome.ran} ran, {outcome.reused} reused, {outcome.seconds:.1f} s")
     extra: dict[str, Any] = {}

@@ -130,10 +130,21 @@ def compare(results: Sequence[Dataset], *, pool: bool = True) -> list[Comparison
 
 
 def comparisons(task: Task, methods: Sequence[Method]) -> list[Comparison]:
-    """Return how methods of one task compare, a question each, in the order in which runs have them."""
-    questions = questions_of([run for one in methods for run in one.runs])
-    made = (compare_on(task, methods, question) for question in questions)
-    return [one for one in made if one.rows]
+    """Return one comparison per question and unit of its errors, questions in the order in which runs have them."""
+    questions = questions_of([run for method in methods for run in method.runs])
+    answers = [
+        compare_on(task, alike, question) for question in questions for alike in _by_unit(methods, question).values()
+    ]
+    return [comparison for comparison in answers if comparison.rows]
+
+
+def _by_unit(methods: Sequence[Method], question: Question) -> dict[str, list[Method]]:
+    """Return the methods with a run on a question by the unit of its errors: errors in other units are not comparable."""
+    methods_by_unit: dict[str, list[Method]] = {}
+    for method in methods:
+        for run in method.of(question)[:1]:
+            methods_by_unit.setdefault(run.questions[question].measure.unit, []).append(method)
+    return methods_by_unit
 
 
 def questions_of(runs: Sequence[Run]) -> list[Question]:

@@ -118,8 +118,8 @@ class Method:
 def grouped(runs: Sequence[Run], usual: Collection[str | tuple[str, Any]] = ()) -> list[Method]:
     """Return the methods of runs, sorted by name.
 
-    Runs of one task whose method and settings are alike are one method. Names state the settings in which methods of the
-    same first name differ, but for empty ones and those in ``usual``: names, or names with values.
+    Runs of one task whose method, settings and units of errors are alike are one method. Names state the settings in which
+    methods of the same first name differ, but for empty ones and those in ``usual``: names, or names with values.
     """
     found: dict[str, list[Run]] = {}
     for run in runs:
@@ -147,4 +147,5 @@ def separate(runs: Sequence[Run]) -> list[Method]:
 
 
 def _key(run: Run) -> str:
-    return json.dumps([run.task, run.method, run.control, run.settings], sort_keys=True, default=str)
+    units = sorted({errors.measure.unit for errors in run.questions.values()})
+    return json.dumps([run.task, run.method, run.control, run.settings, units], sort_keys=True, default=str)

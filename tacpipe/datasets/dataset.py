@@ -16,7 +16,7 @@ from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io.hashing import digest
 from tacpipe.plugins import extras
 from tacpipe.plugins.stage import Attribute
-from tacpipe.printable import listed
+from tacpipe.printable import listed, suggestion
 
 if TYPE_CHECKING:
     import duckdb
@@ -130,6 +130,8 @@ class Recording:
         return self._read(self._shards[stream]["digest"], shard_path(self.name, stream))
 
     def _without(self, stream: str, within: Sequence[str]) -> UsageError:
+        if self.streams == ("",) and not within:
+            return UsageError(f"Recording {self.name} has no stream {stream!r}; it is one table.")
         there = ", ".join(map(repr, within or self.streams))
         if not stream and not within:
             return UsageError(
@@ -189,6 +191,7 @@ class Dataset:
         if name not in self.recordings:
             raise UsageError(
                 f"There is no recording {name!r} in {self._where}; it has {listed(self.recordings, _NAMED)}."
+                f"{suggestion(name, self.recordings)}"
             )
         return self.recordings[name]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,8 @@ from tacpipe.datasets import manifest as manifest_of
 from tacpipe.datasets import pages
 from tacpipe.datasets.manifest import Entry, Manifest
 from tacpipe.errors import StorageError, TacpipeError, UsageError
+from tacpipe.io.tables import WIDTH, Group, Row, Table
+from tacpipe.metrics.headline import counted
 from tacpipe.plugins import params as params_of
 from tacpipe.printable import listed
 from tacpipe.store import records
@@ -96,7 +99,7 @@ def changes(store: Store, before: Manifest, now: Manifest) -> list[str]:
         found.append(f"stage: {before.stage} became {now.stage}")
     if before.version != now.version:
         found.append(f"version: {before.version} became {now.version}")
-    old, new = (params_of.named(one.stage, one.params) for one in (before, now))
+    old, new = (_leaves(params_of.named(manifest.stage, manifest.params)) for manifest in (before, now))
     found += [
         f"params.{name}: {old.get(name)} became {new.get(name)}"
         for name in sorted({*old, *new})
@@ -178,6 +181,53 @@ def to_text(tree: dict[str, Any]) -> str:
     return printable.lines([*lines, "", *_lines(tree, 0, set())])
 
 
+def _nested(value: Any) -> Mapping[str, Any] | None:
+    """Return a param that has parts, such as a layout, which is stored as JSON; None for a plain value."""
+    if isinstance(value, str) and value.startswith("{"):
+        try:
+            value = json.loads(value)
+        except ValueError:
+            return None
+    return value if isinstance(value, Mapping) else None
+
+
+def _rows(value: Any) -> list[Mapping[str, Any]]:
+    """Return the rows of a list of mappings; nothing for any other value."""
+    return value if isinstance(value, list) and all(isinstance(row, Mapping) for row in value) else []
+
+
+def _leaves(params: Mapping[str, Any]) -> dict[str, Any]:
+    """Return plain values by dotted name.
+
+    >>> _leaves({"gap_ms": 50, "layout": '{"time": {"unit": "ns"}, "columns": [{"match": "x"}]}'})
+    {'gap_ms': 50, 'layout.time.unit': 'ns', 'layout.columns.0.match': 'x'}
+    """
+    leaves: dict[str, Any] = {}
+    for name, value in params.items():
+        parts = _nested(value) or {str(place): row for place, row in enumerate(_rows(value))}
+        leaves |= {f"{name}.{part}": leaf for part, leaf in _leaves(parts).items()} if parts else {name: value}
+    return leaves
+
+
+def _nested_lines(name: str, tree: Mapping[str, Any]) -> list[str]:
+    """Return the lines of a param with parts: plain values on one line, lists of columns as a table.
+
+    >>> _nested_lines("layout", {"unit": "ns", "columns": [{"match": "x", "unit": "N"}, {"match": "dx"}]})
+    ['layout: unit ns', 'layout.columns:', '  match  unit', '  x      N', '  dx']
+    """
+    plain = [f"{key} {value}" for key, value in tree.items() if not isinstance(value, Mapping) and not _rows(value)]
+    lines = [f"{name}: {', '.join(plain)}"] if plain else []
+    for key, value in tree.items():
+        if isinstance(value, Mapping):
+            lines += _nested_lines(f"{name}.{key}", value)
+        elif rows := _rows(value):
+            heads = list(dict.fromkeys(head for row in rows for head in row))
+            cells = [Row([str(row.get(head, "")) for head in heads]) for row in rows]
+            table = Table(heads, [Group("", cells)], left=range(len(heads)))
+            lines += [f"{name}.{key}:", *(f"  {line}" for line, _ in table.lines(WIDTH))]
+    return lines
+
+
 def _files(node: dict[str, Any]) -> str:
     """Return the names of a few files, or how many there are with the first of them."""
     names = list(node["files"])
@@ -196,18 +246,25 @@ def _lines(node: dict[str, Any], depth: int, described: set[str], argument: str 
     if node["manifest"] in described:
         return [f"{place}  as above"]
     described.add(node["manifest"])
-    what = f"{node['recordings']} recordings, {node['rows']} rows" if node["recordings"] else _files(node)
-    params = ", ".join(f"{name}={value}" for name, value in node["params"].items())
+    what = (
+        f"{counted(node['recordings'], 'recordings')}, {counted(node['rows'], 'rows')}"
+        if node["recordings"]
+        else _files(node)
+    )
+    nested = {name: tree for name, value in node["params"].items() if (tree := _nested(value)) is not None}
+    params = ", ".join(f"{name}={value}" for name, value in node["params"].items() if name not in nested)
     lines = [
         f"{place}  {what}",
         f"{pad}  {node['stage']} version {node['version']}" + (f" ({params})" if params else ""),
+        *(f"{pad}    {line}" for name, tree in nested.items() for line in _nested_lines(name, tree)),
     ]
     if node["sources"]:
         files = [digest for several in node["sources"].values() for digest in several.values()]
         first = next(iter(sorted(node["sources"])))
         name, digest = next(iter(sorted(node["sources"][first].items())))
         lines.append(
-            f"{pad}  from {len(files)} raw files of {len(node['sources'])} recordings, as {first}/{name}  [{digest[:12]}]"
+            f"{pad}  from {counted(len(files), 'raw files')} of {counted(len(node['sources']), 'recordings')}, as "
+            f"{first}/{name}  [{digest[:12]}]"
         )
     if node["labels"]:
         lines.append(f"{pad}  labelled by hand: {listed(sorted(node['labels']), _SHOWN)}")

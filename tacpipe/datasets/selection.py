@@ -10,7 +10,7 @@ from tacpipe.channels.streams import TRUTH
 from tacpipe.datasets import roles
 from tacpipe.errors import UsageError
 from tacpipe.plugins.stage import Attribute
-from tacpipe.printable import excerpt, listed, plain
+from tacpipe.printable import excerpt, listed, plain, suggestion
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset, Wanted
@@ -65,7 +65,9 @@ def chosen(
 def unknown_label(dataset: Dataset, label: str) -> UsageError:
     """Return the error for a label that no recording has, which lists those that recordings have."""
     known = sorted({one for recording in dataset for one in recording.attributes if not one.startswith(TRUTH)})
-    return UsageError(f"No recording has the label {plain(label)}; there are {listed(known, _LABELS)}.")
+    return UsageError(
+        f"No recording has the label {plain(label)}; there are {listed(known, _LABELS)}.{suggestion(label, known)}"
+    )
 
 
 def _labelled(dataset: Dataset, names: Sequence[str], label: str, wanted: Wanted) -> list[str]:

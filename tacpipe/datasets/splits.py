@@ -13,11 +13,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from tacpipe.channels.streams import TRUTH
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins.stage import ROLES, Attribute
+from tacpipe.printable import listed, plain, suggestion
 
 SCHEMES = ("random", "kfold", "blocked", "leave-one-out", "authors")
 SHARES = (0.2, 0.25, 0.3, 0.35, 0.4, 0.5, 0.6)  # of validation recordings, that are advised where there are too few
+_NAMED = 12  # attributes that an error names
 UNUSED = "unused"  # role of those that a few-shot split takes out of training
 Attributes = Mapping[str, Attribute]
 Roles = dict[tuple[str, int], str]  # (recording, fold) -> role
@@ -376,10 +379,10 @@ def _strata(
 def _value(name: str, attributes: Mapping[str, Attributes], attribute: str) -> str:
     value = attributes[name].get(attribute)
     if value is None:
-        known = ", ".join(sorted(attributes[name])) or "none"
+        labels = sorted(label for label in attributes[name] if not label.startswith(TRUTH))
         raise TacpipeError(
-            f"Recording {name} has no attribute {attribute}; it has {known}. Name another one or set it with "
-            f"`tacpipe label`."
+            f"Recording {name} has no attribute {plain(attribute)}; it has {listed(labels, _NAMED)}."
+            f"{suggestion(attribute, labels)} Name another one or set it with `tacpipe label`."
         )
     return str(value)
 

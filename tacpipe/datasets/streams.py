@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from tacpipe.channels.streams import EVENTS, TRUTH
@@ -13,6 +13,15 @@ if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Recording
 
 NO_SIGNALS = (EVENTS, "truth")  # streams of what went wrong, and of what a simulation knows
+
+
+def describe_streams(streams: Sequence[str]) -> str:
+    """Return the predicate of a sentence about a recording with these streams.
+
+    >>> describe_streams(["robot", "skin"]), describe_streams([""])
+    ('has the streams robot, skin', 'is one table, not separate streams')
+    """
+    return "is one table, not separate streams" if tuple(streams) == ("",) else f"has the streams {', '.join(streams)}"
 
 
 def streams_of(recording: Recording) -> dict[str, pa.Table]:

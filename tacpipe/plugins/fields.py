@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from typing import Annotated, Any, Literal, Protocol, get_args, get_origin, runtime_checkable
 
 from tacpipe.errors import UsageError
-from tacpipe.printable import excerpt, plain
+from tacpipe.printable import excerpt, plain, suggestion
 
 REFUSED = object()
 _EXPONENT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+")  # YAML 1.1 takes 1e-3 for text, and nobody else does
@@ -124,7 +124,8 @@ def filled(kind: type[Any], values: Mapping[str, Any], where: str, noun: str = "
 def unknown(key: Any, known: Mapping[str, Any], where: str, noun: str) -> UsageError:
     """Return the error for a name that is not among those known."""
     shown_key = plain(key) if isinstance(key, str) else excerpt(key)
-    return UsageError(f"{where}: there is no {noun} {shown_key}; there are {', '.join(known) or 'none'}.")
+    names = ", ".join(known) or "none"
+    return UsageError(f"{where}: there is no {noun} {shown_key}; there are {names}.{suggestion(str(key), known)}")
 
 
 def parsed(text: str, wanted: Any) -> Any:

@@ -149,3 +149,24 @@ def test_a_result_without_errors_of_recordings_is_left_out_by_name(
     found = compare.run([Path(path) for path in opened], pool=True)
     assert found.unused() == ["r/old"]
     assert "left out r/old" in capsys.readouterr().err
+
+
+def test_errors_in_other_units_are_other_comparisons_with_their_own_unit() -> None:
+    """The runs share method, settings and question, and one of them has ten times the error in another unit."""
+
+    def in_millinewton(path: str, errors: list[float]) -> tuple[str, Run]:
+        place, newton = weighed(errors, path)
+        question, of_question = next(iter(newton.questions.items()))
+        measure = dataclasses.replace(of_question.measure, unit="mN")
+        return place, dataclasses.replace(
+            newton, questions={question: dataclasses.replace(of_question, measure=measure)}
+        )
+
+    both = compared(weighed(SMALL, "r/n"), in_millinewton("r/mn", [10 * error for error in SMALL]))
+    first, second = both.tables()
+    assert "Units: N." in first.caption and "Units: mN." in second.caption
+    assert [[float(row.cells[1]) for row in table.groups[0].rows] for table in (first, second)] == [
+        [1.25, 4.0],
+        [12.5, 4.0],
+    ]
+    assert [one["unit"] for one in both.to_json()["comparisons"]] == ["N", "mN"]

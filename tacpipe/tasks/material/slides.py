@@ -102,6 +102,9 @@ def read(
     """
     found: dict[str, list[tuple[Recording, Layout, Float32s]]] = {}
     there: set[str] = set()
+    for shard in recordings.recordings.values() if labelled else ():  # before any frame is read
+        if not only or shard.attributes.get("sensor") in only:
+            _require_label(shard, naming.key)
     for name, shard in sorted(recordings.recordings.items()):
         sensor = shard.attributes.get("sensor")
         if not isinstance(sensor, str):
@@ -205,15 +208,19 @@ def difference(wanted: Layout, found: Layout) -> str:
     return f"has {found.rate_hz:g} frames a second, not {wanted.rate_hz:g}"
 
 
+def _require_label(shard: Recording, key: str) -> None:
+    """Raise `TacpipeError` for a slide without the label that names its class."""
+    if shard.attributes.get(key) is None:
+        raise TacpipeError(
+            f"Recording {shard.name} of the sensor {shard.attributes.get('sensor')} has no label {key} to learn from; set "
+            f"it with `tacpipe label RECORDINGS {shard.name} --set {key}=…` or `tacpipe label RECORDINGS --from TABLE`, or "
+            f"exclude it."
+        )
+
+
 def _material(shard: Recording, naming: Naming, labelled: bool) -> int:
     """Return the number of a slide's class; `UNKNOWN` without a label, and where none is needed also for another one."""
     label = shard.attributes.get(naming.key)
-    if labelled and label is None:
-        raise TacpipeError(
-            f"Recording {shard.name} of the sensor {shard.attributes.get('sensor')} has no label {naming.key} to learn "
-            f"from; set it with `tacpipe label RECORDINGS {shard.name} --set {naming.key}=…` or `tacpipe label RECORDINGS "
-            f"--from TABLE`, or exclude it."
-        )
     try:
         return naming.number(label)
     except TacpipeError as error:

@@ -12,6 +12,7 @@ from tacpipe.arrays import Floats, Times
 from tacpipe.channels import biotac_sp
 from tacpipe.clouds.cloud import Cloud, require_columns
 from tacpipe.clouds.grasp import Grasp
+from tacpipe.datasets.streams import describe_streams
 from tacpipe.errors import TacpipeError
 
 if TYPE_CHECKING:
@@ -108,8 +109,8 @@ def _geometry(shard: Recording) -> tuple[Cloud, Grasp, int]:
     missing = [stream for stream in STREAMS if stream not in shard.streams]
     if missing:
         raise TacpipeError(
-            f"Recording {shard.name} has the streams {', '.join(shard.streams)} and no {missing[0]}. Give grasps of "
-            f"`tacpipe ingest vision2tactile`; a camera's whole view goes through `tacpipe segment grasps` first."
+            f"Recording {shard.name} {describe_streams(shard.streams)}; a grasp has the streams {', '.join(STREAMS)}. Give "
+            f"grasps of `tacpipe ingest vision2tactile`; a camera's whole view goes through `tacpipe segment grasps` first."
         )
     table, points = shard.table("grasp"), shard.table("cloud")
     try:
