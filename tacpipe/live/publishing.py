@@ -12,6 +12,7 @@ from tacpipe.errors import UsageError
 from tacpipe.live import messages
 from tacpipe.live.messages import About, Published
 from tacpipe.live.options import OWN, Options
+from tacpipe.plugins import extras
 from tacpipe.printable import excerpt
 from tacpipe.recording import rig as rigs
 from tacpipe.sensors.live import Live
@@ -152,7 +153,8 @@ def publisher(address: str, about: About) -> Publisher:
 
 
 def _websocket(place: str, about: About) -> Publisher:
-    from tacpipe.live.publishers.websocket import WebsocketPublisher
+    with extras.named("--publish ws"):
+        from tacpipe.live.publishers.websocket import WebsocketPublisher
 
     return WebsocketPublisher(place, about)
 

@@ -21,6 +21,7 @@ from tacpipe.simulation.emulation.byte_faults import Faults
 from tests.conftest import Lab
 from tests.live.persistent import GAP_NS, PERIOD_NS
 from tests.live.sessions import ended, forecasts, model_process, started, subscriber, whole
+from tests.live.test_publishers import HANDSHAKE
 from tests.recording import live, patient
 
 pytestmark = pytest.mark.rig
@@ -101,10 +102,7 @@ def test_a_subscriber_that_never_reads_keeps_no_message_from_the_others(lab: Lab
         with socket.socket() as slow, connect(f"ws://127.0.0.1:{place}", max_size=None) as quick:
             slow.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
             slow.connect(("127.0.0.1", place))
-            key = "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n"
-            slow.sendall(
-                f"GET / HTTP/1.1\r\nHost: x\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n{key}\r\n".encode()
-            )
+            slow.sendall(HANDSHAKE)
 
             def listen() -> None:
                 while len(found) < 200:

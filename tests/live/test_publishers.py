@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import socket
 import threading
@@ -17,10 +18,14 @@ from tacpipe.live import publishing
 from tacpipe.live.material_messages import SLIDING, MaterialDescription, MaterialMessage
 from tacpipe.live.messages import Description, Message
 from tacpipe.live.publishers.udp import UdpPublisher
-from tacpipe.live.publishers.websocket import BEHIND, QUEUED, WebsocketPublisher
+from tacpipe.live.publishers.websocket import BEHIND, CONNECTIONS, QUEUED, TOKEN, WebsocketPublisher
 from tests.recording.live import awaited
 
 ABOUT = Description(("a", "b"), (1, 2), "count", 50.0, "models/forward")
+HANDSHAKE = (
+    b"GET / HTTP/1.1\r\nHost: x\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+    b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n"
+)
 VALUES = np.array([[1.5, -2.25], [3.0, 1e-3]], dtype=np.float32)
 
 
@@ -70,6 +75,105 @@ def free_port() -> int:
         return int(one.getsockname()[1])
 
 
+@pytest.fixture
+def served() -> Iterator[tuple[WebsocketPublisher, int]]:
+    """Yield a publisher and its port on this computer."""
+    port = free_port()
+    publisher = WebsocketPublisher(f":{port}", ABOUT)
+    yield publisher, port
+    publisher.close()
+
+
+@contextlib.contextmanager
+def subscribed(port: int, query: str = "", **options: Any) -> Iterator[Any]:
+    """Yield a client whose first message has come."""
+    from websockets.sync.client import connect
+
+    with connect(f"ws://127.0.0.1:{port}/{query}", **options) as client:
+        assert json.loads(client.recv(60))["channels"] == ["a", "b"]
+        yield client
+
+
+def ended_by_server(connection: socket.socket) -> bool:
+    """Wait until the server ends a connection; what it sends before is read."""
+    connection.settimeout(60)
+    with contextlib.suppress(ConnectionError):
+        while connection.recv(1 << 16):
+            pass
+    return True
+
+
+def test_a_server_without_a_host_is_reached_from_this_computer_only(served: tuple[WebsocketPublisher, int]) -> None:
+    _, port = served
+    with subscribed(port):
+        pass
+    with pytest.raises(ConnectionRefusedError):
+        socket.create_connection(("127.0.0.2", port))  # every other address of this computer
+
+
+def test_connections_beyond_the_limit_are_ended_and_neither_threads_nor_messages_depend_on_their_number(
+    served: tuple[WebsocketPublisher, int],
+) -> None:
+    publisher, port = served
+    with subscribed(port) as client, contextlib.ExitStack() as opened:
+        threads = threading.active_count()
+        others = [opened.enter_context(socket.create_connection(("127.0.0.1", port))) for _ in range(100)]
+        assert all(ended_by_server(other) for other in others[CONNECTIONS:])
+        assert threading.active_count() == threads
+        publisher.publish(message(1))
+        assert json.loads(client.recv(60))["seq"] == 1
+    awaited(lambda: publisher.subscribers == 0)
+
+
+@pytest.mark.parametrize(
+    "sent", [b"\x81\xff" + (900_000).to_bytes(8, "big") + bytes(900_004), b"\x89\x80\0\0\0\0" * 50_000]
+)
+def test_a_client_that_sends_more_than_a_subscriber_needs_is_ended(
+    served: tuple[WebsocketPublisher, int], sent: bytes
+) -> None:
+    publisher, port = served
+    with subscribed(port) as quiet, socket.create_connection(("127.0.0.1", port)) as loud:
+        loud.sendall(HANDSHAKE)
+        awaited(lambda: publisher.subscribers == 2)
+        with contextlib.suppress(ConnectionError):
+            loud.sendall(sent)
+        assert ended_by_server(loud)
+        awaited(lambda: publisher.subscribers == 1)
+        publisher.publish(message(1))
+        assert json.loads(quiet.recv(60))["seq"] == 1
+
+
+def test_a_web_page_is_refused_unless_the_address_lists_its_origin() -> None:
+    from websockets.exceptions import InvalidStatus
+
+    port = free_port()
+    publisher = WebsocketPublisher(f":{port}?origin=http://localhost:3000", ABOUT)
+    with subscribed(port):
+        pass
+    with subscribed(port, origin="http://localhost:3000"):
+        pass
+    for origin in ("http://evil.example", f"http://127.0.0.1:{port}", "null"):
+        with pytest.raises(InvalidStatus, match="403"), subscribed(port, origin=origin):
+            pass
+    publisher.close()
+
+
+def test_with_a_token_in_the_environment_only_clients_that_send_it_subscribe(monkeypatch: pytest.MonkeyPatch) -> None:
+    from websockets.exceptions import InvalidStatus
+
+    port = free_port()
+    monkeypatch.setenv(TOKEN, "open sesame")
+    publisher = WebsocketPublisher(f":{port}", ABOUT)
+    with subscribed(port, "?token=open%20sesame"):
+        pass
+    with subscribed(port, additional_headers={"Authorization": "Bearer open sesame"}):
+        pass
+    for query, headers in (("", {}), ("?token=", {}), ("?token=sesame", {}), ("", {"Authorization": "Bearer x"})):
+        with pytest.raises(InvalidStatus, match="401"), subscribed(port, query, additional_headers=headers):
+            pass
+    publisher.close()
+
+
 def test_each_websocket_client_gets_the_description_and_every_message() -> None:
     from websockets.sync.client import connect
 
@@ -95,8 +199,7 @@ def test_a_client_that_does_not_read_is_cut_off_and_others_get_everything() -> N
     count = BEHIND + QUEUED + 60
     slow = socket.create_connection(("127.0.0.1", port))
     slow.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-    key = "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n"
-    slow.sendall(f"GET / HTTP/1.1\r\nHost: x\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n{key}\r\n".encode())
+    slow.sendall(HANDSHAKE)
     awaited(lambda: publisher.subscribers == 1)
     with connect(f"ws://127.0.0.1:{port}", max_size=None) as quick:
         awaited(lambda: publisher.subscribers == 2)
@@ -146,7 +249,17 @@ def test_an_mcap_file_holds_each_message_at_its_time(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "address", ["ws", "ws:", "http:127.0.0.1:80", "udp:127.0.0.1", "udp:127.0.0.1:9?format=xml", "ws:127.0.0.1:0", ""]
+    "address",
+    [
+        "ws",
+        "ws:",
+        "http:127.0.0.1:80",
+        "udp:127.0.0.1",
+        "udp:127.0.0.1:9?format=xml",
+        "ws:127.0.0.1:0",
+        "ws::9?token=x",
+        "",
+    ],
 )
 def test_what_is_no_address_is_refused(address: str) -> None:
     with pytest.raises(UsageError):

@@ -1,109 +1,186 @@
-"""Messages as JSON over websockets: a server that any number of clients subscribe to, each with a queue of its own."""
+"""Serve messages as JSON over websockets; no subscriber can delay the session or take its memory."""
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
+import functools
+import hmac
 import logging
-import queue
+import os
 import socket
 import threading
-from typing import TYPE_CHECKING
+from collections.abc import Coroutine
+from typing import Any, cast
+from urllib.parse import parse_qs, parse_qsl, urlsplit
 
-from tacpipe.errors import DeviceError
+from websockets.asyncio.server import Server, ServerConnection, broadcast, serve
+from websockets.http11 import Request, Response
+from websockets.typing import Origin
+
+from tacpipe.errors import DeviceError, UsageError
 from tacpipe.links import network
 from tacpipe.live.messages import About, Published, to_json
-from tacpipe.plugins import extras
+from tacpipe.printable import excerpt
 
-if TYPE_CHECKING:
-    from websockets.sync.server import ServerConnection
-
-QUEUED = 16  # messages that wait for a client; a third of a second at 50 Hz
-BEHIND = 100  # messages dropped in a row, after which a client is cut off
+HOST = "127.0.0.1"  # default host of the server
+TOKEN = "TACPIPE_LIVE_TOKEN"  # variable of the environment; subscribers must send its value unless it is empty
+CONNECTIONS = 32  # open at a time, subscribed or not
+QUEUED = 16  # messages that wait for a subscriber; a third of a second at 50 Hz
+QUEUED_BYTES = 1 << 20  # limit of their size
+SENDING_BYTES = 1 << 18  # kernel's buffer of a connection
+BEHIND = 100  # messages dropped in a row, after which a subscriber is cut off
+RECEIVED_BYTES, RECEIVED_BYTES_S = (
+    1 << 14,
+    1 << 10,
+)  # a client may send: the first for its request, then so many a second
+OPEN_S = 2.0  # limit of a handshake
+END_S = 1.0  # limit of closing all connections
 SILENT = logging.getLogger("tacpipe.live.websocket")  # a client that goes is no error
 SILENT.addHandler(logging.NullHandler())
 SILENT.propagate = False
-END_S = 1.0  # in which the server's threads must have ended
-
-
-class _Client:
-    """One subscriber: what waits for it, and how many messages in a row it did not fetch in time."""
-
-    def __init__(self, connection: ServerConnection) -> None:
-        self.connection = connection
-        self.waiting: queue.Queue[str | None] = queue.Queue(QUEUED)
-        self.behind = 0
 
 
 class WebsocketPublisher:
-    """A server of websockets; what a slow client does not take is dropped for it, and then the client is."""
+    """A server of websockets in one thread. It drops messages for a slow subscriber, and then the subscriber.
+
+    `place` is ``HOST:PORT`` with an optional ``?origin=ORIGIN`` for each web page that may subscribe: browsers send where a
+    page comes from, and other pages are refused. Programs send no origin and are accepted.
+    """
 
     def __init__(self, place: str, about: About) -> None:
-        with extras.named("--publish ws"):
-            from websockets.sync.server import serve
-
-        host, port = network.place("ws", place)
+        place, _, options = place.partition("?")
+        origins = parse_qsl(options, keep_blank_values=True)
+        if any(name != "origin" or not value for name, value in origins):
+            raise UsageError(
+                f"--publish ws:{place}?{excerpt(options)}: the only option is origin, as in "
+                f"ws:{place}?origin=http://localhost:3000."
+            )
         self.dropped = 0
         self._about = to_json(about.to_dict()).decode()
-        self._clients: set[_Client] = set()
-        self._threads: set[threading.Thread] = set()  # of the server, one a connection
-        self._keeping = threading.Lock()
-        try:
-            self._server = serve(self._serve, host or None, port, compression=None, logger=SILENT)
-        except OSError as error:
-            raise DeviceError(f"--publish ws:{place}: {error.strerror or error}. Take another port.") from error
-        self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
+        self._token = os.environ.get(TOKEN, "")
+        self._connections: set[ServerConnection] = set()
+        self._subscribers: dict[ServerConnection, int] = {}  # messages in a row that each missed
+        listening = _listening_socket(place)
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._loop.run_forever, name="websocket", daemon=True)
         self._thread.start()
+        self._server = self._wait(self._serve(listening, [origin for _, origin in origins]))
 
     @property
     def subscribers(self) -> int:
-        """How many clients there are."""
-        return len(self._clients)
+        """How many subscribers there are."""
+        return len(self._subscribers)
 
     def publish(self, message: Published) -> None:
-        """Put a message into the queue of each client that has room."""
-        with self._keeping:
-            clients = list(self._clients)
-        if not clients:
-            return
-        text = to_json(message.to_dict()).decode()
-        for client in clients:
-            try:
-                client.waiting.put_nowait(text)
-                client.behind = 0
-            except queue.Full:
-                self.dropped += 1
-                client.behind += 1
-                if client.behind == BEHIND:
-                    self._cut_off(client)
+        """Send a message to each subscriber that keeps up."""
+        if self._subscribers:
+            self._loop.call_soon_threadsafe(self._send, to_json(message.to_dict()).decode())
 
     def close(self) -> None:
         """End the server and its connections."""
-        with self._keeping:
-            clients = list(self._clients)
-        for client in clients:
-            try:
-                client.waiting.put_nowait(None)
-            except queue.Full:
-                self._cut_off(client)
-        self._server.shutdown()
-        for thread in (self._thread, *list(self._threads)):
-            thread.join(END_S)
+        self._wait(self._end())
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join(END_S)
+        if not self._thread.is_alive():
+            self._loop.close()
 
-    def _cut_off(self, client: _Client) -> None:
-        with self._keeping:
-            self._clients.discard(client)
-        with contextlib.suppress(OSError):
-            client.connection.socket.shutdown(socket.SHUT_RDWR)  # also ends a write that waits for the client
+    def _wait(self, work: Coroutine[Any, Any, Any]) -> Any:
+        """Run a coroutine in the server's thread and return its result."""
+        return asyncio.run_coroutine_threadsafe(work, self._loop).result()
 
-    def _serve(self, connection: ServerConnection) -> None:
-        """Send one client what waits for it, until it goes; run by a thread of the server."""
-        client = _Client(connection)
-        self._threads.add(threading.current_thread())
-        with contextlib.suppress(Exception):  # of a client that goes, in any of the ways that one can
-            connection.send(self._about)
-            with self._keeping:
-                self._clients.add(client)
-            while (text := client.waiting.get()) is not None:
-                connection.send(text)
-        with self._keeping:
-            self._clients.discard(client)
+    async def _serve(self, listening: socket.socket, origins: list[str]) -> Server:
+        return await serve(
+            self._subscribe,
+            sock=listening,
+            origins=[None, *map(Origin, origins)],
+            process_request=self._check_token,
+            compression=None,
+            open_timeout=OPEN_S,
+            close_timeout=END_S,
+            max_size=RECEIVED_BYTES_S,
+            create_connection=cast(type[ServerConnection], functools.partial(BoundedConnection, self._connections)),
+            logger=SILENT,
+        )
+
+    async def _end(self) -> None:
+        self._server.close()
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(END_S):
+                await self._server.wait_closed()
+        for connection in self._connections:
+            connection.transport.abort()
+
+    def _check_token(self, connection: ServerConnection, request: Request) -> Response | None:
+        """Return a refusal for a client that does not send the token, as a header or in the address."""
+        sent = parse_qs(urlsplit(request.path).query).get("token", [""])[0]
+        header = request.headers.get("Authorization", f"Bearer {sent}")
+        if hmac.compare_digest(header.encode(errors="replace"), f"Bearer {self._token}".encode()) or not self._token:
+            return None
+        return connection.respond(401, f"Send the token of {TOKEN}.\n")
+
+    async def _subscribe(self, connection: ServerConnection) -> None:
+        """Send a client the description and then what is published, until it goes."""
+        broadcast([connection], self._about)
+        self._subscribers[connection] = 0
+        try:
+            await connection.wait_closed()
+        finally:
+            del self._subscribers[connection]
+
+    def _send(self, text: str) -> None:
+        """Send a message to the subscribers for which few others wait. Runs in the server's thread."""
+        most = min(QUEUED * len(text), QUEUED_BYTES)
+        ready = []
+        for connection, missed in self._subscribers.items():
+            late = connection.transport.get_write_buffer_size() > most
+            self._subscribers[connection] = missed + 1 if late else 0
+            self.dropped += late
+            if missed + late == BEHIND:
+                connection.transport.abort()
+            elif not late:
+                ready.append(connection)
+        broadcast(ready, text)
+
+
+def _listening_socket(place: str) -> socket.socket:
+    """Return a socket that listens at ``HOST:PORT``. Raises `UsageError` for no port, `DeviceError` for one in use."""
+    host, port = network.place("ws", place)
+    try:
+        family, *_, address = socket.getaddrinfo(host or HOST, port, type=socket.SOCK_STREAM)[0]
+        listening = socket.create_server(address, family=family)
+    except OSError as error:
+        raise DeviceError(f"--publish ws:{place}: {error.strerror or error}. Take another port.") from error
+    listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SENDING_BYTES)  # connections inherit it
+    return listening
+
+
+class BoundedConnection(ServerConnection):
+    """A connection that ends itself where its server has too many, or where the client sends too much."""
+
+    def __init__(self, connections: set[ServerConnection], *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self._all = connections
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Take a place among the connections of the server, or end."""
+        self._began_s, self._received = self.loop.time(), 0
+        super().connection_made(transport)
+        if len(self._all) < CONNECTIONS:
+            self._all.add(self)
+        else:
+            self.transport.abort()
+
+    def data_received(self, data: bytes) -> None:
+        """Take what the client sent, or end."""
+        self._received += len(data)
+        allowed = RECEIVED_BYTES + RECEIVED_BYTES_S * (self.loop.time() - self._began_s)
+        if self._received > allowed:
+            self.transport.abort()
+        else:
+            super().data_received(data)
+
+    def connection_lost(self, error: Exception | None) -> None:
+        """Leave the place."""
+        self._all.discard(self)
+        super().connection_lost(error)
