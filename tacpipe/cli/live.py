@@ -61,6 +61,10 @@ def add(program: typer.Typer, summary: str) -> None:
                 "set-points).",
             ),
         ] = None,
+        plan_from: Annotated[
+            str | None,
+            typer.Option("--plan-from", help="IP address whose plans are accepted, for --plan udp:HOST:PORT."),
+        ] = None,
         output: Annotated[Path | None, typer.Option("-o", "--output", help="Dataset to append recordings to.")] = None,
         publish: Annotated[
             list[str] | None,
@@ -137,6 +141,7 @@ def add(program: typer.Typer, summary: str) -> None:
         given = {
             "model": None if model is None else str(model),
             "plan": plan,
+            "plan_from": plan_from,
             "publish": tuple(publish) if publish else None,
             "steps": None if steps is None else _steps(steps),
             "quantiles": None if quantiles is None else _percents(quantiles),

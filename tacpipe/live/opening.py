@@ -60,7 +60,7 @@ def forecasts(options: Options, model: Dataset, rig: Rig, sensors: Mapping[str, 
     """Return the engine of a session with a model of future signals. Raises as `engine`."""
     forecaster = Forecaster.load(model.files)
     opened = functools.partial(
-        chain, forecaster, model.source.chain, rig.master, options.plan_from, quantiles=options.quantiles
+        chain, forecaster, model.source.chain, rig.master, options.plan_stream, quantiles=options.quantiles
     )
     first: list[Alarms] = []
 

@@ -23,7 +23,7 @@ class Options:
     alarms_on: str = ""  # recordings that their levels are set on
     split: str = ""  # whose validation recordings are meant; empty: all
     settle_ms: float = 2.0
-    plan_from: str = ""  # stream of an arm whose set-points are the planned motion; empty: none
+    plan_stream: str = ""  # stream of an arm whose set-points are the planned motion; empty: none
     kind: str = "forecast"  # of messages that the model makes: forecast, material or touch
     sensor: str = ""  # of a model of materials: which of those that it knows; empty: the only one
     every_ms: float = 100.0  # of a model of materials: from one answer to the next

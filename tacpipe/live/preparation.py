@@ -39,7 +39,7 @@ def prepared(rig: Rig, asked: Settings) -> Prepared:
         about, digest = description.described(Path(asked.model))
     about, steps = _forecast(about, asked) if isinstance(about, Described) else (_other(about, asked), ())
     with asked.naming("plan"):
-        planned = plans.with_plan(rig, asked.plan)
+        planned = plans.with_plan(rig, asked.plan, asked.plan_from)
     found = own_streams.added(completing.completed(planned), about, steps)
     options = Options(
         _absolute(asked.model),
@@ -52,7 +52,7 @@ def prepared(rig: Rig, asked: Settings) -> Prepared:
         _absolute(asked.alarms_on),
         _absolute(asked.split),
         asked.settle_ms,
-        plan_from=plans.targets_of(planned, asked.plan),
+        plan_stream=plans.targets_of(planned, asked.plan),
         kind=about.kind,
         sensor=asked.sensor,
         every_ms=asked.every_ms,

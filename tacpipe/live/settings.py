@@ -43,6 +43,7 @@ class Settings:
     least: Annotated[float, Range(above=0, most=1)] = 0.25
     pause_s: Annotated[float, Range(0, 60)] = 0.0  # after which a slide is over; 0: a recording is one slide
     rank: str = "contact"  # criterion of a model of touch
+    plan_from: str = ""  # IP address whose plans are accepted by UDP
     places: Mapping[str, str] = field(default_factory=dict, compare=False)  # file and table of what a file states
 
     @classmethod

@@ -25,7 +25,8 @@ TALKING = ("udp", "tcp+udp")
 OPENED, LOST, OVERRUN = "opened", "lost", "overrun"
 BEGAN, OVER = "began", "over"  # for listeners: what comes between is part of the recording
 FOREIGN = "foreign"  # packets of other senders than the one that counts
-FOREIGN_S = 1.0  # between two notes of such
+REFUSED = "refused"  # packets that the sensor does not accept
+LEFT_OUT_S = 1.0  # least time from one note on packets left out to the next
 STALLED, CAUGHT_UP = (
     "recorder_stalled",
     "caught_up",
@@ -59,8 +60,8 @@ class Station:
         self._thread = threading.Thread(target=self._run, name=stream.name, daemon=True)
         self._keeping = threading.Lock()
         self._orders: deque[Callable[[Link], None]] = deque()  # carried out by the thread, between two reads
-        self._chunks = self._bytes = self._overruns = self._foreign = 0
-        self._foreign_s = 0.0  # when such packets were noted last
+        self._chunks = self._bytes = self._overruns = self._foreign = self._refused = 0
+        self._left_out_s = 0.0  # when packets that were left out were noted last
         self._empty_ns = 0  # when the link was last known to hold nothing that waits to be read
         self._wait_s = AGAIN_S[0]
 
@@ -93,6 +94,7 @@ class Station:
             self._foreign = (
                 self._link.foreign if self._link is not None else 0
             )  # what came before is not of this recording
+            self._refused = 0
             for block in (Note(clock.now_ns(), self.stream.name, BEGAN), *(() if early is None else (*early, *found))):
                 self._inform(block)
             return found
@@ -102,7 +104,7 @@ class Station:
         with self._keeping:
             self._tally = None
             self._inform(Note(clock.now_ns(), self.stream.name, OVER))
-            self._note_foreign(self._link)
+            self._note_left_out(self._link)
             return self._taken()
 
     def drained(self, since_ns: int) -> bool:
@@ -209,9 +211,9 @@ class Station:
                         pace.resume(clock.now_ns())
             if link.overruns != self._overruns:
                 self._overran(link.overruns)
-            if link.foreign != self._foreign and time.monotonic() - self._foreign_s > FOREIGN_S:
+            if time.monotonic() - self._left_out_s > LEFT_OUT_S:
                 with self._keeping:
-                    self._note_foreign(link)
+                    self._note_left_out(link)
 
     def _paced(self, link: Link, timeout_s: float, pace: Pace) -> list[tuple[int, bytes]]:
         """Keep and return what came.
@@ -263,20 +265,30 @@ class Station:
             self._orders.popleft()(link)
             pace.resume(clock.now_ns())
 
-    def _note_foreign(self, link: Link | None) -> None:
+    def _note_left_out(self, link: Link | None) -> None:
+        """Note how many packets were left out since the last note. Called with the lock."""
+        self._left_out_s = time.monotonic()
         if link is not None and link.foreign > self._foreign:
             described = f"{link.foreign - self._foreign} packets of other senders were left out"
             self._notes.append(Note(clock.now_ns(), self.stream.name, FOREIGN, described))
-            self._foreign, self._foreign_s = link.foreign, time.monotonic()
+            self._foreign = link.foreign
+        if self._refused:
+            described = f"{self._refused} packets that {self.stream.kind} does not accept were left out"
+            self._notes.append(Note(clock.now_ns(), self.stream.name, REFUSED, described))
+            self._refused = 0
 
     def _overran(self, overruns: int) -> None:
         self._notes.append(Note(time.monotonic_ns(), self.stream.name, OVERRUN, str(overruns - self._overruns)))
         self._overruns = overruns
 
     def _keep(self, came: list[tuple[int, bytes]]) -> None:
-        if not came:
-            return
+        """Keep what came and is recorded, and hand it on."""
+        accepted = [packet for packet in came if self.stream.sensor.accepts(packet[1])]
         with self._keeping:
+            self._refused += len(came) - len(accepted)
+            came = accepted
+            if not came:
+                return
             self._came.extend(came)
             if self._tally is not None:
                 self._chunks += len(came)

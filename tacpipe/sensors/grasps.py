@@ -62,6 +62,10 @@ class Grasps(Sensor):
         ]
         return [*numbers, *map(number, (*POINTS, *WRIST))]
 
+    def accepts(self, packet: bytes) -> bool:
+        """Return whether a packet is a request: any program that reaches the port may send there."""
+        return is_request(packet)
+
     def framer(self) -> Framer:
         """Return a framer that takes packets that are requests."""
         return TextFramer(is_request)

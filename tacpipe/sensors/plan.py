@@ -57,6 +57,10 @@ class Plan(Sensor):
         target = pa.field("t_target_ns", pa.int64(), metadata={"unit": "ns", "quantity": "plan"})
         return [target, *map(number, POSE)]
 
+    def accepts(self, packet: bytes) -> bool:
+        """Return whether a packet is a plan: any program that reaches the port may send there."""
+        return is_plan(packet)
+
     def framer(self) -> Framer:
         """Return a framer that takes packets that are plans."""
         return TextFramer(is_plan)

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
+import socket
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from tacpipe.live.own_streams import free_ports
 from tacpipe.live.supervisor import DIED, RESTARTED
+from tacpipe.sensors import plan as plans
 from tests.conftest import Lab
 from tests.live.persistent import CHANNELS, HORIZON
 from tests.live.sessions import ended, forecasts, started, subscriber, whole
@@ -94,6 +99,34 @@ def test_a_rig_without_what_the_model_reads_is_refused_in_one_sentence(lab: Lab,
     _, err = process.communicate()
     assert process.returncode == 2 and "skin" in err and len(err.strip().splitlines()) == 1
     assert not (lab.folder / "rec").exists()
+
+
+def test_packets_that_are_no_plan_or_of_another_sender_are_counted_and_not_kept(lab: Lab) -> None:
+    (place,) = free_ports(1)
+    poses = np.tile([0.5, 0.0, 0.3, 0.0, 0.0, 0.0, 1.0], (4, 1))
+    garbage = b"x" * 20_000
+    with live.served(lab.folder, SKIN), subscriber() as (port, messages), contextlib.ExitStack() as opened:
+        process = started(
+            lab, f"-o rec --json --plan udp::{place} --plan-from 127.0.0.2 --publish udp:127.0.0.1:{port}"
+        )
+        live.awaited(lambda: len(forecasts(messages)) > 5)
+        named, other = (opened.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(2))
+        named.bind(("127.0.0.2", 0))
+        for _ in range(10):
+            plan = plans.packet((time.time_ns() + np.arange(4) * 10**8).tolist(), poses)
+            for sender, data in ((named, plan), (other, plan), *[(named, garbage)] * 100):
+                sender.sendto(data, ("127.0.0.1", place))
+            time.sleep(0.05)  # the kernel's queue holds 8 MB where it grants that
+        assert sum((path / "bytes").stat().st_size for path in live.spools(lab.folder)) < 1_000_000
+        ended(process, interrupt=True)
+    shard = live.only(lab.folder)
+    assert shard.table("plan").num_rows == 40
+    rows = [row for row in shard.table("events").to_pylist() if row["stream"] == "plan"]
+    counts = {
+        cause: sum(int(row["detail"].split()[0]) for row in rows if row["cause"] == cause)
+        for cause in ("foreign", "refused")
+    }
+    assert counts == {"foreign": 10, "refused": 1000}
 
 
 def test_without_an_output_nothing_is_kept_and_figures_are_printed(lab: Lab) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import pytest
 
 from tacpipe.cli import live as command
 from tacpipe.errors import UsageError
+from tacpipe.live import plans
 from tacpipe.live.settings import Settings
 from tacpipe.recording import rig as rigs
 from tacpipe.recording import rig_text
@@ -81,6 +83,43 @@ def test_steps_beyond_the_horizon_are_refused_and_none_are_all() -> None:
     assert settings({"model": "m", "steps": [5, 1, 5]}).steps_of(10) == (1, 5)
     with pytest.raises(UsageError, match="1 to 4 steps ahead"):
         settings({"model": "m", "steps": [5]}).steps_of(4)
+
+
+def planned(plan: str, sender: str = "") -> str:
+    """Return the address at which a session with this plan awaits plans."""
+    return str(plans.with_plan(rigs.parse(STREAM), plan, sender).streams["plan"].address)
+
+
+@pytest.mark.parametrize(
+    ("plan", "sender", "address"),
+    [
+        ("udp::9100", "", "udp:127.0.0.1:9100"),
+        ("udp:[::1]:9100", "", "udp:[::1]:9100"),
+        ("udp:localhost:9100", "", "udp:localhost:9100"),
+        ("udp::9100", "127.0.0.2", "udp:127.0.0.1:9100?sender=127.0.0.2"),
+        ("udp:0.0.0.0:9100", "192.168.1.20", "udp:0.0.0.0:9100?sender=192.168.1.20"),
+        ("udp:0.0.0.0:9100?sender=first", "", "udp:0.0.0.0:9100?sender=first"),
+        ("ws:planner:9100", "", "ws:planner:9100"),
+    ],
+)
+def test_plans_are_awaited_on_this_computer_unless_an_address_is_given(plan: str, sender: str, address: str) -> None:
+    assert planned(plan, sender) == address
+
+
+@pytest.mark.parametrize(
+    ("plan", "sender", "sentence"),
+    [
+        ("udp:0.0.0.0:9100", "", "give the address of the controller with --plan-from"),
+        ("udp:lab-pc:9100", "", "give the address of the controller with --plan-from"),
+        ("udp::9100", "controller", "--plan-from 'controller' is not an IP address"),
+        ("udp::9100?sender=first", "127.0.0.1", "leave ?sender=first of --plan out"),
+        ("ws:planner:9100", "127.0.0.1", "no effect without --plan udp"),
+        ("measured", "127.0.0.1", "no effect without --plan udp"),
+    ],
+)
+def test_plans_that_anybody_could_send_are_refused(plan: str, sender: str, sentence: str) -> None:
+    with pytest.raises(UsageError, match=re.escape(sentence)):
+        planned(plan, sender)
 
 
 def test_the_table_stays_in_the_text_of_a_rig_and_recorders_do_not_look_at_it() -> None:
