@@ -254,6 +254,7 @@ def test_the_chain_runs_on_published_recordings(
         (source / trial.name).symlink_to(trial)
     (tmp_path / ".tacpipe").mkdir()
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("TACPIPE_FOLLOW_LINKS", "1")
     monkeypatch.delenv("TACPIPE_STORE", raising=False)
     first = f"ingest xela-flat {source} -o data/recordings"
     split = "split data/segments -o data/split --scheme random --val 0.2 --test 0.2"

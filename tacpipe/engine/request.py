@@ -14,6 +14,7 @@ from tacpipe.datasets.replacing import Plan
 from tacpipe.engine import execution
 from tacpipe.errors import UsageError
 from tacpipe.formats import unread
+from tacpipe.io import regular
 from tacpipe.io.hashing import digest, remembered_file_digest
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
@@ -196,6 +197,7 @@ def _discover(stage: AnyStage, request: Request) -> dict[str, Source]:
         for name, one in sorted(stage.discover(request.params, request.source).items())
     }
     recording_names.refuse_shared((name, next(iter(one.files.values()), request.source)) for name, one in found.items())
+    regular.expect_inside(request.source, (path for source in found.values() for path in source.files.values()))
     return found
 
 

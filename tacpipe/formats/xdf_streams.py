@@ -27,6 +27,7 @@ from tacpipe.formats import xdf_chunks
 from tacpipe.formats.containers import kinds
 from tacpipe.formats.containers.container import Batched, Contents, SourceStream, Time
 from tacpipe.formats.xdf_chunks import Chunk, Damage
+from tacpipe.io import regular
 from tacpipe.io.spill import Piece, Spill
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import excerpt, plain
@@ -203,7 +204,7 @@ class XdfFile:
 
 def _content(path: Path) -> xdf_chunks.Content:
     """Return the bytes of a file, decompressed; of a compressed one that was cut off those that are there."""
-    with path.open("rb") as file, tempfile.TemporaryFile() as unpacked:
+    with regular.failing(path), regular.opened(path) as file, tempfile.TemporaryFile() as unpacked:
         head = file.read(2)
         if head == b"\x1f\x8b":
             file.seek(0)

@@ -3,6 +3,8 @@
 Every file of a store, of a remote store and of an untrusted dataset is opened here. A file of a store is never a symbolic
 link (``follow=False``), and none is read that is larger than what describes it declares (``most``), or than memory.
 
+What a file of a recording's source names is opened by `inside`: it cannot lead out of its folder, by ``..`` or by a link.
+
 What the system answers when a source file is read is not a property of the recording: `failing` raises it as `StorageError`,
 which ends the command, with ``--skip-bad`` too.
 """
@@ -15,12 +17,13 @@ import io
 import json
 import os
 import stat
-from collections.abc import Iterator
-from pathlib import Path
+from collections.abc import Iterable, Iterator
+from pathlib import Path, PurePosixPath
 from typing import Any
 
-from tacpipe.errors import StorageError, TacpipeError
+from tacpipe.errors import StorageError, TacpipeError, UsageError
 from tacpipe.io import memory
+from tacpipe.printable import excerpt
 
 KINDS = (
     (stat.S_ISDIR, "a folder"),
@@ -35,6 +38,9 @@ JSON_BYTES = 1 << 30  # the largest JSON file that is read: a manifest of a mill
 JSON_IN_MEMORY = 24  # bytes that a byte of JSON becomes at most when it is parsed: "[]," is an empty list
 _FLAGS = os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC  # a pipe without writers would block for ever
 _LINK = (errno.ELOOP, errno.EMLINK)  # what systems answer to O_NOFOLLOW
+
+
+FOLLOW_LINKS = "TACPIPE_FOLLOW_LINKS"  # the environment variable that allows links which lead out of a source
 
 
 class IrregularError(TacpipeError):
@@ -100,6 +106,35 @@ def source(path: Path | str) -> bytes:
     `failing`."""
     with failing(path):
         return content(path)
+
+
+def inside(folder: Path, name: str) -> Path:
+    """Return the path below ``folder`` that an untrusted file names. Raises `UsageError` for one that leads out of it."""
+    path = PurePosixPath(name)
+    if path.is_absolute() or ".." in path.parts or "\\" in name or "\0" in name:
+        raise UsageError(f"{folder} names the file {excerpt(name)}, which leads out of it. Nothing outside is read.")
+    expect_inside(folder, [folder / name])
+    return folder / name
+
+
+def expect_inside(folder: Path, paths: Iterable[Path]) -> None:
+    """Raise `UsageError` where one of the ``paths`` below a folder lies elsewhere, by a symbolic link.
+
+    With the environment variable `FOLLOW_LINKS` links are followed.
+    """
+    if os.environ.get(FOLLOW_LINKS):
+        return
+    top = os.path.realpath(folder)
+    parents: dict[Path, str] = {}  # where each folder lies
+    for path in paths:
+        if path.parent not in parents:
+            parents[path.parent] = os.path.realpath(path.parent)
+        real = os.path.realpath(path) if path == folder or path.is_symlink() else f"{parents[path.parent]}/{path.name}"
+        if real != top and not real.startswith(f"{top.rstrip('/')}/"):
+            raise UsageError(
+                f"{path} is, or lies in, a symbolic link that leads out of {folder}, to {real}. Copy what it leads to "
+                f"(cp -rL) or, if you trust the links of this source, set {FOLLOW_LINKS}=1."
+            )
 
 
 @contextlib.contextmanager

@@ -6,6 +6,7 @@ A reader answers with all recordings, with a note that names the loss, or with a
 from __future__ import annotations
 
 import json
+import pickle
 import re
 import sqlite3
 import struct
@@ -320,6 +321,17 @@ def _bag_damaged(compression: str | None) -> Callable[[Path], None]:
     return write
 
 
+def _changed_text(name: str, old: bytes, new: bytes) -> Callable[[Path], None]:
+    def write(folder: Path) -> None:
+        path = _bag(folder, "LZ4")
+        content = path.read_bytes()
+        assert path.name == name
+        assert old in content
+        path.write_bytes(content.replace(old, new))
+
+    return write
+
+
 def _database_damaged(folder: Path) -> None:
     types = writers.store()
     message = writers.build(types, "std_msgs/msg/Float64", data=1.5)
@@ -431,7 +443,202 @@ def test_of_a_damaged_block_the_loss_is_stated(lab: Lab, reader: str, case: Case
     ask(lab, reader, case, "a damaged block")
 
 
-QUESTIONS = {"two parts with one name": NAMED_TWICE, "a damaged block": DAMAGED}
+# ---- A path that leads out of the source
+
+
+def _linked(write: Callable[[Path], object], name: str) -> Callable[[Path], None]:
+    """Return a function that writes a source and puts a link to a copy elsewhere into the place of a file."""
+
+    def linked(folder: Path) -> None:
+        write(folder)
+        path = next(path for path in sorted(folder.rglob(name)) if path.is_file())
+        outside = folder.parent / "private"
+        outside.mkdir()
+        path.rename(outside / path.name)
+        path.symlink_to(outside / path.name)
+
+    return linked
+
+
+def _path_above(folder: Path) -> None:
+    lerobot_files.write_v2(folder / "set")
+    path = folder / "set" / "meta" / "info.json"
+    about = json.loads(path.read_text()) | {"data_path": "../../private/episode_{episode_index:06d}.parquet"}
+    path.write_text(json.dumps(about))
+    (folder.parent / "private").mkdir()
+    for path in (folder / "set" / "data").rglob("*.parquet"):
+        path.rename(folder.parent / "private" / path.name)
+
+
+def _name_above(folder: Path) -> None:
+    _episodes_with({"tacpipe/recording": "../../../private/other"})(folder)
+    path = folder / "set" / "meta" / "episodes.jsonl"
+    path.write_text(path.read_text().splitlines()[0])
+    (folder.parent / "private").mkdir()
+    pq.write_table(pa.table({"t_ns": [1, 2], "secret": [3, 4]}), folder.parent / "private" / "other.parquet")
+
+
+def _external_link(folder: Path) -> None:
+    outside = folder.parent / "private.hdf5"
+    with h5py.File(outside, "w") as file:
+        file["secret"] = np.arange(5.0)
+    with h5py.File(folder / "a.hdf5", "w") as file:
+        file["demo_0/t_s"] = file["demo_0/a"] = np.arange(5.0)
+        file["demo_0/other"] = h5py.ExternalLink(outside, "secret")
+
+
+def _log_elsewhere(folder: Path) -> None:
+    _database_damaged(folder)
+    (folder.parent / "private").write_bytes(b"secret")
+    (folder / "a" / "a.db3-wal").symlink_to(folder.parent / "private")
+
+
+OUT = "leads out of"
+LEADS_OUT: dict[str, list[Case] | str] = {
+    "lerobot": [
+        Case(_path_above, OUT),
+        Case(_name_above, OUT),
+        Case(_linked(lambda folder: lerobot_files.write_v2(folder / "set"), "info.json"), OUT),
+        Case(_linked(lambda folder: lerobot_files.write_v2(folder / "set"), "episode_000001.parquet"), OUT),
+    ],
+    "mcap": [
+        Case(_linked(lambda folder: writers.mcap_json(folder / "a.mcap", {"/a": [(1, {"v": 1})]}), "a.mcap"), OUT)
+    ],
+    "rosbag": [
+        Case(_linked(_database_damaged, "a.db3"), OUT),
+        Case(_linked(_database_damaged, "metadata.yaml"), OUT),
+        Case(_log_elsewhere, OUT),
+    ],
+    "xdf": [Case(_linked(_session, "a.xdf"), OUT)],
+    "hdf5": [Case(_linked(_compressed, "a.hdf5"), OUT), Case(_external_link, "lies in another file")],
+    "zarr": [
+        Case(_linked(lambda folder: array_files.replay(folder / "a.zarr"), "1.0"), OUT, RATE),
+        Case(_linked(lambda folder: array_files.replay(folder / "a.zarr"), ".zarray"), OUT, RATE),
+    ],
+    "table": [Case(_linked(_table("csv"), "x.csv"), OUT, LAYOUT % "csv")],
+    "biotac-slide": [Case(_linked(slide_files.write_biotac, "*_bio.csv"), OUT)],
+    "roboskin": [
+        Case(_linked(lambda place: slide_files.write_roboskin(place, slide_files.touched(1, 20)), "labels*"), OUT)
+    ],
+    "vision2tactile": [Case(_linked(grasp_files.write_grasp, "tactile.tac"), OUT)],
+    "xela-flat": [Case(_linked(lambda place: xela_files.write_flat(place / "trial"), "xela_sensor1.csv"), OUT)],
+    "xela-psc": [Case(_linked(lambda place: xela_files.write_psc(place / "trial"), "xela_sensor1.csv"), OUT)],
+}
+
+
+@pytest.mark.parametrize(("reader", "case"), every_case(LEADS_OUT))
+def test_nothing_outside_the_source_is_read(lab: Lab, reader: str, case: Case) -> None:
+    ask(lab, reader, case, "a path that leads out")
+
+
+def test_links_are_followed_where_their_user_allows_it(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TACPIPE_FOLLOW_LINKS", "1")
+    write = _linked(lambda folder: array_files.replay(folder / "a.zarr"), "1.0")
+    ask(lab, "zarr", Case(write, 3, RATE), "a path that leads out")
+
+
+# ---- A codec
+
+
+class Runs:
+    """What leaves a file behind where a pickle of it is opened."""
+
+    def __reduce__(self) -> Any:
+        return Path.touch, (Path("ran"),)
+
+
+def _zarr_array(about: dict[str, Any], chunk: bytes, zarr_format: int = 2) -> Callable[[Path], None]:
+    """Return a function that writes an array of 5 rows with these metadata beside a sound one."""
+
+    def write(folder: Path) -> None:
+        array_files.replay(folder / "a.zarr", zarr_format=zarr_format)
+        place = folder / "a.zarr" / "data" / "evil"
+        place.mkdir()
+        (place / (".zarray" if zarr_format == 2 else "zarr.json")).write_text(json.dumps(about))
+        (place / "0").write_bytes(chunk)
+
+    return write
+
+
+V2 = {"zarr_format": 2, "shape": [80], "chunks": [80], "order": "C", "fill_value": None, "compressor": None}
+V3 = {
+    **{"zarr_format": 3, "node_type": "array", "shape": [80], "data_type": "float64", "fill_value": 0.0},
+    "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": [80]}},
+    "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
+}
+SHARDS = {"chunk_shape": [80], "codecs": [{"name": "numcodecs.pickle"}], "index_codecs": [{"name": "bytes"}]}
+
+
+def _filtered(folder: Path) -> None:
+    with h5py.File(folder / "a.hdf5", "w") as file:
+        file["demo_0/t_s"] = np.arange(5.0)
+        file.create_dataset("demo_0/a", data=np.arange(5.0), chunks=(5,), shuffle=True)
+    content = (folder / "a.hdf5").read_bytes()
+    named = (
+        struct.pack("<HH", 2, 8) + struct.pack("<HH", 1, 1) + b"shuffle\0"
+    )  # number, length of the name, flags, values
+    assert content.count(named) == 1
+    (folder / "a.hdf5").write_bytes(content.replace(named, struct.pack("<H", 31999) + named[2:]))
+
+
+def _mcap_compressed(folder: Path) -> None:
+    writers.mcap_json(folder / "a.mcap", {"/a": [(1, {"v": 1})]}, compression=CompressionType.LZ4)
+    content = (folder / "a.mcap").read_bytes()
+    (folder / "a.mcap").write_bytes(content.replace(struct.pack("<I", 3) + b"lz4", struct.pack("<I", 3) + b"pkl"))
+
+
+TEXT = "its format has no codecs"
+RUNS_CODE: dict[str, list[Case] | str] = {
+    "lerobot": "the codecs of Parquet are those of pyarrow, none of which runs code",
+    "mcap": [Case(_mcap_compressed, "compressed with pkl, not zstd or lz4")],
+    "rosbag": [
+        Case(_changed_text("a.bag", b"compression=lz4", b"compression=pkl"), "compressed with pkl, not bz2 or lz4")
+    ],
+    "xdf": TEXT,
+    "hdf5": [Case(_filtered, "filter 31999, which is not read")],
+    "zarr": [
+        Case(
+            _zarr_array({**V2, "dtype": "|O", "filters": [{"id": "pickle"}]}, pickle.dumps(Runs())),
+            "codec 'pickle', which is not read",
+            RATE,
+        ),
+        Case(
+            _zarr_array({**V2, "dtype": "<f8", "filters": None, "compressor": {"id": "pickle"}}, pickle.dumps(Runs())),
+            "codec 'pickle', which is not read",
+            RATE,
+        ),
+        Case(
+            _zarr_array({**V3, "codecs": [{"name": "sharding_indexed", "configuration": SHARDS}]}, b"", 3),
+            "codec 'pickle', which is not read",
+            RATE,
+        ),
+    ],
+    "table": [Case(_archive(t=T, a=np.array([Runs()] * 3)), "holds Python objects", LAYOUT % "npz")],
+    "biotac-slide": TEXT,
+    "roboskin": [
+        Case(
+            lambda place: np.save(slide_files.write_roboskin(place, slide_files.touched(1, 20)), np.array([Runs()])),
+            "icub_fold_0.npy",
+        )
+    ],
+    "vision2tactile": TEXT,
+    "xela-flat": TEXT,
+    "xela-psc": TEXT,
+}
+
+
+@pytest.mark.parametrize(("reader", "case"), every_case(RUNS_CODE))
+def test_no_codec_of_a_file_runs_code(lab: Lab, reader: str, case: Case) -> None:
+    ask(lab, reader, case, "a codec that runs code")
+    assert not (lab.folder / "ran").exists()
+
+
+QUESTIONS = {
+    "two parts with one name": NAMED_TWICE,
+    "a damaged block": DAMAGED,
+    "a path that leads out": LEADS_OUT,
+    "a codec that runs code": RUNS_CODE,
+}
 
 
 @pytest.mark.parametrize("question", list(QUESTIONS))

@@ -29,6 +29,10 @@ BROKEN = (
     ValueError,
     TypeError,
 )  # what h5py raises for bytes that are not as they should
+FILTERS = {  # that are read, by HDF5's numbers; others could be libraries that a file's author had installed
+    *(1, 2, 3, 4, 5, 6),  # of HDF5 itself: deflate, shuffle, fletcher32, szip, nbit, scale-offset
+    *(307, 32000, 32001, 32004, 32008, 32013, 32015, 32026),  # bzip2, lzf, blosc, lz4, bitshuffle, zfp, zstd, blosc2
+}
 _TRUNCATED = re.compile(r"truncated file: eof = (\d+),.*stored_eof = (\d+)")
 
 
@@ -236,8 +240,17 @@ def _member(group: h5py.Group, name: str, path: str) -> Array | str:
         problem = "has its values in another file, which is not read"
     elif found.shape is None:
         problem = "holds nothing"
+    elif unknown := [number for number in _filters(found) if number not in FILTERS]:
+        problem = f"is stored with the filter {unknown[0]}, which is not read"
     chunk_rows = found.chunks[0] if found.chunks else 0
     return Array(path, found.shape or (), found.dtype, _attributes(found), chunk_rows, problem)
+
+
+def _filters(found: h5py.Dataset) -> Iterator[int]:
+    """Yield the numbers of the filters that the chunks of an array passed through."""
+    about = found.id.get_create_plist()
+    for place in range(about.get_nfilters()):
+        yield about.get_filter(place)[0]
 
 
 def _address(group: h5py.Group) -> Any:

@@ -39,6 +39,11 @@ BROKEN = (  # what zarr and its codecs raise for bytes that are not as they shou
     *(*BROKEN_ZIP, OSError, LookupError, TypeError, AttributeError, ArithmeticError, AssertionError, ImportError),
     SystemError,  # of blosc
 )
+CODECS = {  # of numcodecs and of zarr: none runs code that is stored with the values, as pickle does
+    *("adler32", "astype", "bitround", "blosc", "bytes", "bz2", "crc32", "crc32c", "delta", "fixedscaleoffset"),
+    *("fletcher32", "gzip", "jenkins_lookup3", "lz4", "lzma", "packbits", "quantize", "sharding_indexed", "shuffle"),
+    *("transpose", "vlen-utf8", "zlib", "zstd"),
+}
 _filled: ContextVar[bool] = ContextVar("filled", default=False)  # whether a chunk that is not there holds fill values
 _KINDS = re.compile(r"bool|u?int(8|16|32|64)|float(16|32|64)")
 
@@ -83,8 +88,9 @@ class ZarrTree:
         lost = [name for name in chunks if not self._has(name)]
         for name in chunks if self.names is None else ():
             if name not in lost:
-                with regular.failing(self.path / name):
-                    regular.require(self.path / name, (self.path / name).stat().st_mode)  # zarr would wait for a pipe
+                path = regular.inside(self.path, name)
+                with regular.failing(path):
+                    regular.require(path, path.stat().st_mode)  # zarr would wait for a pipe
         if lost and not _filled.get():
             raise TacpipeError(
                 f"{self.path} lacks {listed(lost, 2)}, which hold{'s' * (len(lost) == 1)} rows of {plain(array.path, 200)}. "
@@ -177,8 +183,9 @@ class ZarrTree:
 
     def _content(self, name: str) -> bytes:
         if self.names is None:
-            with regular.failing(self.path / name):
-                return regular.content(self.path / name, MOST_BYTES)
+            path = regular.inside(self.path, name)
+            with regular.failing(path):
+                return regular.content(path, MOST_BYTES)
         with _archive(self.path) as archive:
             if archive.getinfo(name).file_size > MOST_BYTES:
                 raise TacpipeError(f"{self.path}: {plain(name, 200)} has more than {MOST_BYTES:,} bytes.")
@@ -277,6 +284,14 @@ def _array(path: str, about: Mapping[str, Any], attributes: Mapping[str, Any]) -
         steps = []
     if len(steps) != len(shape) or not all(isinstance(step, int) and step > 0 for step in steps):
         problem, steps = "has chunks of no known shape", []
+    try:
+        unknown = sorted({str(codec) for codec in _codecs(about)} - CODECS)
+    except (TypeError, AttributeError):
+        unknown = ["unnamed"]
+    if unknown:
+        problem = f"is stored with the codec {excerpt(unknown[0])}"
+    elif kind.hasobject and kind.metadata is None:
+        problem = "holds Python objects"
     reason = f"{problem}, which is not read" if problem else ""
     return Array(path, tuple(shape), kind, attributes, steps[0] if steps else 0, reason)
 
@@ -295,6 +310,25 @@ def _dtype(about: Mapping[str, Any]) -> np.dtype[Any]:
         return np.dtype("O", metadata={"vlen": str} if "vlen-utf8" in texts else {})
     found: np.dtype[Any] = np.dtype([tuple(one) for one in kind] if isinstance(kind, list) else kind)
     return found
+
+
+def _codecs(about: Mapping[str, Any]) -> Iterator[Any]:
+    """Yield the names of the codecs of an array, without the prefix of those that zarr has from numcodecs."""
+    if about.get("zarr_format") != 3:
+        yield from (_entry(codec, "id") for codec in (about.get("compressor"), *(about.get("filters") or ())) if codec)
+        return
+    pending = list(about.get("codecs") or ())
+    while pending:
+        codec = pending.pop()
+        name = _entry(codec, "name")
+        yield str(name).removeprefix("numcodecs.")
+        inner = codec.get("configuration") if isinstance(codec, dict) else None
+        for key in ("codecs", "index_codecs"):
+            pending += (inner.get(key) or ()) if isinstance(inner, dict) else ()
+
+
+def _entry(codec: Any, key: str) -> Any:
+    return codec.get(key) if isinstance(codec, dict) else codec
 
 
 def _grid(about: Mapping[str, Any]) -> tuple[Sequence[int], Any]:

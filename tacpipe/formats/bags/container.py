@@ -80,7 +80,7 @@ def _files(path: Path, stack: contextlib.ExitStack) -> tuple[list[Path], bool, l
     missing = [name for name in names if not (path / name).is_file()]
     notes = [f"{path} lacks {listed(missing, 3)}, which its metadata.yaml names."] if missing else []
     every = sorted(file for file in file_system.listed(path) if _ending(file) in READERS)
-    there = [path / name for name in names if name not in missing] or every  # renamed since
+    there = [regular.inside(path, name) for name in names if name not in missing] or every  # renamed since
     if unlisted := [file.name for file in every if file not in there]:
         notes.append(
             f"{path} holds {listed(unlisted, 3)}, which its metadata.yaml does not name and which are not read."
@@ -107,7 +107,7 @@ def _ending(path: Path) -> str:
 
 def _described(path: Path) -> dict[str, Any]:
     try:
-        value = yaml_text.load(regular.content(path, MOST_BYTES).decode())
+        value = yaml_text.load(regular.content(regular.inside(path.parent, path.name), MOST_BYTES).decode())
         about = value["rosbag2_bagfile_information"]
         return dict(about)
     except (ValueError, KeyError, TypeError, RecursionError) as error:

@@ -46,7 +46,7 @@ def records(path: Path) -> Iterator[Record]:
 @contextlib.contextmanager
 def _connected(path: Path) -> Iterator[sqlite3.Connection]:
     """Open a file without changing it; what was not yet moved from its log (-wal) is read from a copy."""
-    log = path.with_name(f"{path.name}-wal")
+    log = regular.inside(path.parent, f"{path.name}-wal")
     with tempfile.TemporaryDirectory() if log.is_file() and log.stat().st_size else contextlib.nullcontext() as copies:
         if copies is None:
             address = f"file:{quote(str(path.absolute()))}?immutable=1"

@@ -69,7 +69,7 @@ class LeRobotContainer:
         """Return what an episode is read from: its file, its native streams, and what meta states of it alone."""
         one = self._named(episode)
         about = self._about
-        found = [self.path / one.file, *self._native(one).values()]
+        found = [regular.inside(self.path, one.file), *self._native(one).values()]
         with regular.failing(self.path):
             files = {path.relative_to(self.path).as_posix(): path for path in found if file_system.present(path)}
         stated = {"fps": about.fps, "robot": about.robot, "features": about.info["features"], "index": one.index}
@@ -102,7 +102,7 @@ class LeRobotContainer:
 
     def _native(self, episode: Episode) -> dict[str, Path]:
         """Return the files of the streams that an episode was exported from, by stream; "" where it was one table."""
-        folder, file = self.path / NATIVE / episode.name, self.path / NATIVE / f"{episode.name}.parquet"
+        folder, file = (regular.inside(self.path, f"{NATIVE}/{episode.name}{end}") for end in ("", ".parquet"))
         found = {path.stem: path for path in file_system.listed(folder, "*.parquet")}
         return {"": file} if file.is_file() and not found else found
 
@@ -164,7 +164,7 @@ class LeRobotContainer:
 
     def _frames(self, episode: Episode, keys: Sequence[str]) -> pa.Table:
         """Return the rows of an episode. Raises `TacpipeError` where its file is damaged or has other columns or rows."""
-        path = self.path / episode.file
+        path = regular.inside(self.path, episode.file)
         with description.parquet_errors(path), regular.opened(path) as source:
             file = pq.ParquetFile(source, page_checksum_verification=True)
             there = set(file.schema_arrow.names)

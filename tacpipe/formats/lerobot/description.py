@@ -6,7 +6,7 @@ import contextlib
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import pyarrow.parquet as pq
@@ -94,7 +94,7 @@ class Description:
 
     def _of_lines(self) -> Iterator[Episode]:
         path = self.root / "meta/episodes.jsonl"
-        for one in _lines(path):
+        for one in _lines(regular.inside(self.root, "meta/episodes.jsonl")):
             index, length = one.get("episode_index"), one.get("length")
             if not isinstance(index, int) or not isinstance(length, int):
                 raise TacpipeError(f"{path}: {excerpt(one)} has no whole numbers episode_index and length.")
@@ -117,6 +117,7 @@ class Description:
             raise TacpipeError(
                 f"{self.root / 'meta/episodes'} holds no Parquet file; a dataset of version 3.0 has one."
             )
+        regular.expect_inside(self.root, paths)
         for path in paths:
             names = [name for name in _schema(path) if not name.startswith("stats/")]
             for one in _table(path, names).to_pylist():
@@ -151,7 +152,7 @@ class Description:
         return [key for key, one in self.features.items() if one.dtype == "video"]
 
     def _place(self, key: str, usual: str, values: Mapping[str, object]) -> str:
-        """Return a path within the dataset, of a pattern in info.json. Raises `TacpipeError` for one that leads out."""
+        """Return a path within the dataset, of a pattern in info.json."""
         pattern = str(self.info.get(key) or usual)
         try:
             found = _PLACE.sub(lambda one: _filled(values[one[1]], one[2]), pattern)
@@ -160,16 +161,13 @@ class Description:
                 f"{self.root / INFO}: {key} is {excerpt(pattern)}, which names {plain(str(error))}; there are "
                 f"{', '.join(values)}."
             ) from error
-        parts = PurePosixPath(found)
-        if parts.is_absolute() or ".." in parts.parts or "\\" in found or "\0" in found:
-            raise TacpipeError(f"{self.root / INFO}: {key} is {excerpt(pattern)}, which leads out of the dataset.")
         return found
 
 
 def read(root: Path) -> Description:
     """Return what a dataset states of itself. Raises `TacpipeError`, naming file and entry, for what is not as it should."""
     path = root / INFO
-    info = _json(path)
+    info = _json(root, INFO)
     version, fps = info.get("codebase_version"), info.get("fps")
     if version not in VERSIONS:
         raise TacpipeError(
@@ -181,7 +179,7 @@ def read(root: Path) -> Description:
     features = info.get("features")
     if not isinstance(features, dict) or not features:
         raise TacpipeError(f"{path}: features is {excerpt(features)}; it must name the columns of the frames.")
-    about = _json(root / ABOUT).get("features") if (root / ABOUT).is_file() else None
+    about = _json(root, ABOUT).get("features") if (root / ABOUT).is_file() else None
     about = about if isinstance(about, dict) else {}
     made = {str(key): _feature(path, str(key), value, about.get(key)) for key, value in features.items()}
     return Description(root, version, float(fps), str(info.get("robot_type") or ""), made, info)
@@ -255,7 +253,8 @@ def _filled(value: object, width: str | None) -> str:
     return f"{int(value):0{int(width)}d}" if width else str(value)  # type: ignore[call-overload]
 
 
-def _json(path: Path) -> dict[str, Any]:
+def _json(root: Path, name: str) -> dict[str, Any]:
+    path = regular.inside(root, name)
     with regular.failing(path):
         content = regular.content(path, MOST_BYTES)
     try:

@@ -58,7 +58,9 @@ def of(
             elif not stream.optional:
                 raise _lacking(path, stream, contents, kinds.opened(kind, path).look(within))
         attributes |= contents.attributes
-        notes += contents.notes
+        asked = tuple(f"{stream.source}/" for stream in several)
+        inner = {source: why for source, why in contents.skipped.items() if source.startswith(asked)}
+        notes += [*contents.notes, *_left_out(path, inner)]
     return Recorded({one.name: tables[one.name] for one in streams if one.name in tables}, attributes, notes)
 
 
@@ -68,7 +70,7 @@ def all_of(kind: str, path: Path, within: str | None) -> Recorded:
     It is an attribute of the recording too: ``skipped``. Raises `TacpipeError` where nothing can be read.
     """
     contents = kinds.opened(kind, path).read(None, within)
-    notes = [*contents.notes, *(f"{path}: {plain(one)} is left out: {why}." for one, why in contents.skipped.items())]
+    notes = [*contents.notes, *_left_out(path, contents.skipped)]
     named = unique_names.by_name(((stream.name, stream) for stream in contents.streams), path, "stream")
     tables = {
         name: contained(path, stream, Stream(name, source=stream.source))
@@ -79,6 +81,10 @@ def all_of(kind: str, path: Path, within: str | None) -> Recorded:
         raise TacpipeError(" ".join([f"{path} holds no stream that can be read.", *notes]))
     skipped = "; ".join(f"{plain(one)}: {why}" for one, why in contents.skipped.items())
     return Recorded(tables, {**contents.attributes, **({SKIPPED: skipped} if skipped else {})}, notes)
+
+
+def _left_out(path: Path, skipped: Mapping[str, str]) -> list[str]:
+    return [f"{path}: {plain(source)} is left out: {why}." for source, why in skipped.items()]
 
 
 def _lacking(path: Path, stream: Stream, contents: Contents, look: Contents) -> TacpipeError:

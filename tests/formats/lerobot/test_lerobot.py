@@ -202,7 +202,6 @@ def _shorten(path: Path) -> None:
         ({"codebase_version": "v1.6"}, ("codebase_version", "v1.6", "v2.1")),
         ({"fps": 0}, ("fps", "0")),
         ({"features": {"action": [7]}}, ("action", "shape")),
-        ({"data_path": "../../{episode_index}"}, ("data_path", "leads out")),
         ({"data_path": "data/{episode}"}, ("data_path", "episode_index")),
     ],
 )
