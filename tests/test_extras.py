@@ -96,6 +96,7 @@ LACK = {  # and for each that does need one, with that extra
     "limits data/grasps": "learn",
     "candidates bottle.ply": "clouds",
     "candidates bottle.ply --picture {o}.png": "clouds",
+    "ingest table workbooks --guess": "xlsx",
     "ingest mcap bags -o {o}": "ros",
     "ingest rosbag bags -o {o}": "ros",
     "ingest rosbag bags --guess": "ros",
@@ -164,6 +165,8 @@ def prepare(folder: Path) -> None:
     (folder / "tables" / "a.csv").write_text("time,x\n0,1\n1,2\n")
     layout = '[streams.skin]\nfiles = "{trial}.csv"\ntime = { column = "time" }\ncolumns = [{ match = "x" }]\n'
     (folder / "tables" / "layout.toml").write_text(layout)
+    (folder / "workbooks").mkdir()
+    (folder / "workbooks" / "a.xlsx").write_bytes(b"")
     for name in ("arrays", "stores"):
         (folder / name).mkdir()
     array_files.lab(folder / "arrays" / "run.h5")

@@ -18,19 +18,26 @@ TimeUnit = Literal["s", "ms", "us", "ns", "iso8601"]
 
 @dataclass(frozen=True)
 class Time:
-    """Where the stamps of a stream come from: a column, or a rate."""
+    """Where the stamps of a stream come from: a column, a file next to the stream's own, or a rate."""
 
     column: str = ""
     unit: TimeUnit = "s"
     rate_hz: Rate | None = None
     origin: Literal["unix", "start"] = "unix"  # what a number counts from: 1970, or the start of the recording
     zone: str = "UTC"  # of ISO 8601 stamps that name none, as Europe/Berlin
-    start: str = ""  # UTC, ISO 8601: the first stamp of recordings that count from their start
+    start: str = ""  # UTC, ISO 8601: the first stamp of recordings that count from their start, the day of times of day
+    file: str = ""  # pattern of a file that holds the stamps of all rows, one after another
+    format: str = ""  # of stamps that are text, as strptime has it: %d.%m.%Y %H:%M:%S.%f; without %Y the time of day
+
+    @property
+    def is_text(self) -> bool:
+        """Whether stamps are text."""
+        return bool(self.format) or self.unit == "iso8601"
 
     @property
     def given(self) -> bool:
         """Whether it states where stamps come from."""
-        return bool(self.column) or self.rate_hz is not None
+        return bool(self.column or self.file) or self.rate_hz is not None
 
 
 @dataclass(frozen=True)

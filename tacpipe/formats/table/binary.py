@@ -1,4 +1,4 @@
-"""Tables that are not text: Parquet, NPZ archives of numpy, and JSON lines; blocks of columns as they hold them."""
+"""Tables that are not text: Parquet, arrays of numpy (NPY, NPZ), and JSON lines; blocks of columns as they hold them."""
 
 from __future__ import annotations
 
@@ -7,12 +7,13 @@ import functools
 import itertools
 import math
 import re
+import sys
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, Literal, Protocol
 
 import numpy as np
 import pyarrow as pa
@@ -23,6 +24,7 @@ import pyarrow.parquet as pq
 from tacpipe.errors import TacpipeError
 from tacpipe.formats import unique_names
 from tacpipe.formats.table import compressed
+from tacpipe.formats.table.layout import GZIP
 from tacpipe.io import memory, regular
 from tacpipe.io.parquet import BROKEN, owned
 from tacpipe.printable import plain
@@ -70,6 +72,7 @@ class NumpyArchive:
     """An NPZ archive: arrays (time,) are columns, one (time, n, …) is n columns NAME_0, NAME_1, …; pickles are refused."""
 
     path: Path
+    time_axis: int = 0  # the dimension of each array along which its rows follow one another
 
     def names(self) -> list[str]:
         """Return the names of the columns."""
@@ -80,8 +83,9 @@ class NumpyArchive:
         wanted = {self._places[name][0] for name in types}
         arrays = {name: array for name, array in self._arrays.items() if name in wanted}
         rows = max(1, BLOCK_BYTES // max(1, sum(array.row_bytes for array in arrays.values())))
+        self._expect_same_length(arrays)
         with contextlib.ExitStack() as stack, self._reading():
-            archive = stack.enter_context(_archive(self.path))
+            archive = stack.enter_context(self._archive())
             readers = {name: stack.enter_context(array.reading(archive)) for name, array in arrays.items()}
             count = next((array.rows for array in arrays.values()), 0)
             for start in range(0, count, rows) if count else (0,):
@@ -103,20 +107,32 @@ class NumpyArchive:
                 places += [(f"{name}_{at}", (name, at)) for at in range(array.width)]
         return unique_names.by_name(places, self.path, "column")
 
+    def arrays(self) -> Mapping[str, ArrayMember]:
+        """Return the arrays that have rows, by name."""
+        return self._arrays
+
     @functools.cached_property
     def _arrays(self) -> dict[str, ArrayMember]:
-        """The arrays that have rows, all of one length, by name."""
-        with self._reading(), _archive(self.path) as archive:
-            members = [ArrayMember.of(archive, one) for one in archive.infolist() if one.filename.endswith(".npy")]
-        found = unique_names.by_name(((one.name, one) for one in members if one.shape), self.path, "array")
-        lengths = {name: one.rows for name, one in found.items()}
+        with self._reading(), self._archive() as archive:
+            members = [
+                ArrayMember.of(archive, one, self.time_axis)
+                for one in archive.infolist()
+                if one.filename.endswith(".npy")
+            ]
+        return unique_names.by_name(((one.name, one) for one in members if one.shape), self.path, "array")
+
+    def _archive(self) -> contextlib.AbstractContextManager[Archive]:
+        return _zip_archive(self.path)
+
+    def _expect_same_length(self, arrays: Mapping[str, ArrayMember]) -> None:
+        """Raise `TacpipeError` where arrays of one stream have different numbers of rows."""
+        lengths = {name: array.rows for name, array in arrays.items()}
         if len(set(lengths.values())) > 1:
             first, other = next((a, b) for a in lengths for b in lengths if lengths[a] != lengths[b])
             raise TacpipeError(
                 f"{self.path}: {plain(first)} has {lengths[first]} rows and {plain(other)} has {lengths[other]}; arrays of "
-                f"one stream have one length. Write those of each rate into a file of their own."
+                f"one stream have one length. Skip those of another rate, and read them as a stream of their own."
             )
-        return found
 
     @contextlib.contextmanager
     def _reading(self) -> Iterator[None]:
@@ -124,6 +140,37 @@ class NumpyArchive:
             yield
         except _ZIP_ERRORS as error:
             raise TacpipeError(f"{self.path} is not an archive of arrays: {plain(str(error), 200)}.") from error
+
+
+class NumpyFile(NumpyArchive):
+    """An .npy file: as an archive that holds its array alone, called as the file."""
+
+    def _archive(self) -> contextlib.AbstractContextManager[Archive]:
+        return contextlib.nullcontext(_LoneArray(self.path))
+
+
+class Archive(Protocol):
+    """An opened archive of arrays."""
+
+    def infolist(self) -> list[zipfile.ZipInfo]:
+        """The files in it."""
+
+    def open(self, name: str, /) -> contextlib.AbstractContextManager[IO[bytes]]:
+        """A file in it, opened for reading."""
+
+
+@dataclass(frozen=True)
+class _LoneArray:
+    path: Path
+
+    def infolist(self) -> list[zipfile.ZipInfo]:
+        info = zipfile.ZipInfo(f"{self.path.name.partition('.')[0]}.npy")
+        is_packed = self.path.suffix.lower() == GZIP
+        info.file_size = sys.maxsize if is_packed else self.path.stat().st_size
+        return [info]
+
+    def open(self, name: str, /) -> contextlib.AbstractContextManager[IO[bytes]]:
+        return compressed.opened(self.path)
 
 
 @dataclass(frozen=True)
@@ -135,42 +182,52 @@ class ArrayMember:
     shape: tuple[int, ...]
     columnwise: bool  # Fortran's order: its rows are not one after another
     dtype: np.dtype[Any]
+    time_axis: int = 0
 
     @classmethod
-    def of(cls, archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> ArrayMember:
+    def of(cls, archive: Archive, member: zipfile.ZipInfo, time_axis: int = 0) -> ArrayMember:
         """Return what the header declares. Raises `ValueError` for what is not an array, or holds Python objects."""
-        with archive.open(member) as file:
+        with archive.open(member.filename) as file:
             shape, columnwise, dtype = _header(file)
         if dtype.hasobject:
             raise ValueError(f"{member.filename} holds Python objects, which are not read: they can run programs")
         if max(1, math.prod(shape)) * dtype.itemsize > member.file_size:
             raise ValueError(f"{member.filename} declares more values than it has bytes for")
-        return cls(member.filename.removesuffix(".npy"), member.filename, shape, columnwise and len(shape) > 1, dtype)
+        if shape and time_axis >= len(shape):
+            raise ValueError(f"{member.filename} has the shape {shape}, without a dimension {time_axis} (time_axis)")
+        name = member.filename.removesuffix(".npy")
+        return cls(name, member.filename, shape, columnwise and len(shape) > 1, dtype, time_axis)
 
     @property
     def rows(self) -> int:
         """How many rows it has."""
-        return self.shape[0]
+        return self.shape[self.time_axis]
+
+    @property
+    def row_shape(self) -> tuple[int, ...]:
+        """The shape of one row."""
+        return self.shape[: self.time_axis] + self.shape[self.time_axis + 1 :]
 
     @property
     def width(self) -> int | None:
         """How many values a row has, None where it is one value and no list of one."""
-        return math.prod(self.shape[1:]) if len(self.shape) > 1 else None
+        return math.prod(self.row_shape) if self.row_shape else None
 
     @property
     def row_bytes(self) -> int:
         """How many bytes a row takes."""
-        return math.prod(self.shape[1:]) * self.dtype.itemsize
+        return math.prod(self.row_shape) * self.dtype.itemsize
 
     @contextlib.contextmanager
-    def reading(self, archive: zipfile.ZipFile) -> Iterator[Callable[[int], np.ndarray]]:
+    def reading(self, archive: Archive) -> Iterator[Callable[[int], np.ndarray]]:
         """Yield a function that returns the next rows (time, value); raises `ValueError` where there are fewer."""
         with archive.open(self.member) as file:
             _header(file)
-            if self.columnwise:
-                memory.require(self.rows * self.row_bytes, f"{self.member}, which is in Fortran's order,")
-                whole = np.frombuffer(self._exactly(file, self.rows), self.dtype).reshape(self.shape, order="F")
-                flat, ends = whole.reshape(self.rows, -1), itertools.count()
+            if self.columnwise or self.time_axis:
+                memory.require(self.rows * self.row_bytes, f"{self.member}, whose rows are not one after another,")
+                order: Literal["F", "C"] = "F" if self.columnwise else "C"
+                full = np.frombuffer(self._exactly(file, self.rows), self.dtype).reshape(self.shape, order=order)
+                flat, ends = np.moveaxis(full, self.time_axis, 0).reshape(self.rows, -1), itertools.count()
                 yield lambda rows: flat[[next(ends) for _ in range(rows)]]
             else:
                 yield lambda rows: np.frombuffer(self._exactly(file, rows), self.dtype).reshape(rows, -1)
@@ -192,7 +249,7 @@ def _header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
 
 
 @contextlib.contextmanager
-def _archive(path: Path) -> Iterator[zipfile.ZipFile]:
+def _zip_archive(path: Path) -> Iterator[Archive]:
     with regular.opened(path) as file, zipfile.ZipFile(file) as archive:
         yield archive
 
@@ -302,8 +359,8 @@ def _flat(path: Path, table: pa.Table) -> pa.Table:
     return table
 
 
-def opened(path: Path, kind: str) -> ParquetFile | NumpyArchive | JsonLines:
-    """Return the reader of a file of this kind."""
-    readers: dict[str, type[ParquetFile | NumpyArchive | JsonLines]]
-    readers = {"parquet": ParquetFile, "npz": NumpyArchive, "jsonl": JsonLines}
-    return readers[kind](path)
+def opened(path: Path, kind: str, time_axis: int = 0) -> ParquetFile | NumpyArchive | JsonLines:
+    """Return the reader of a file of this kind; ``time_axis`` is that of arrays."""
+    if kind in ("npz", "npy"):
+        return (NumpyArchive if kind == "npz" else NumpyFile)(path, time_axis)
+    return ParquetFile(path) if kind == "parquet" else JsonLines(path)

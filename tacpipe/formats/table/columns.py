@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -75,6 +76,7 @@ def chosen(stream: Stream, names: Sequence[str], path: Path, declared: Declared 
         used.add(rule)
         if not rule.skip:
             found.append(Chosen(name, _field(rule, name, values, declared.get(name)), rule))
+    found = _places(found, path, stream)
     idle = [rule.match for rule in stream.columns if rule not in used]
     if idle:
         raise TacpipeError(
@@ -92,8 +94,59 @@ def chosen(stream: Stream, names: Sequence[str], path: Path, declared: Declared 
     return found
 
 
+def _places(columns_read: Sequence[Chosen], path: Path, stream: Stream) -> list[Chosen]:
+    """Return columns that are cells of an array with the metadata of their place in its shape, and named by it.
+
+    Raises `TacpipeError` where a rule matches another number of columns than its shape has cells.
+    """
+    by_rule: dict[Column, list[Chosen]] = {}
+    for column in columns_read:
+        by_rule.setdefault(column.rule, []).append(column)
+    for rule, cells in by_rule.items():
+        if rule.shape and len(cells) != math.prod(rule.shape):
+            raise TacpipeError(
+                f"{path}: {plain(rule.match)} of [streams.{stream.name}] matches {len(cells)} columns, and shape = "
+                f"{list(rule.shape)} has {math.prod(rule.shape)} cells. Correct shape or match."
+            )
+    cells_before = dict.fromkeys(by_rule, 0)
+    placed = []
+    for column in columns_read:
+        field = _placed(column, cells_before[column.rule]) if column.rule.shape else column.field
+        cells_before[column.rule] += 1
+        placed.append(replace(column, field=field))
+    return placed
+
+
+def _placed(column: Chosen, cell: int) -> pa.Field:
+    """Return the field of the cell with this number in the array of a rule's shape.
+
+    A tactile cell has a taxel and an axis, another one an index and a component; both count from 1.
+    """
+    rule = column.rule
+    index = list(np.unravel_index(cell, rule.shape))
+    sides = list(rule.shape)
+    axis = ""
+    if rule.axes:
+        along = len(sides) - 1 if sides[-1] == len(rule.axes) else 0
+        axis = rule.axes[int(index.pop(along))]
+        sides.pop(along)
+    number = int(np.ravel_multi_index(index, sides)) + 1 if sides else 1
+    count = math.prod(sides)
+    tactile = rule.quantity in ("", "tactile")
+    about = {"taxel": str(number)} if tactile else {"index": str(number)} if count > 1 else {}
+    about |= {"axis" if tactile else "component": axis} if axis else {}
+    padded = str(number).zfill(max(2, len(str(count))))
+    values = pattern.match(rule.match, column.name) or {}
+    stem = "taxel" if tactile else column.name.rstrip("0123456789").rstrip("_")
+    plain_name = f"{stem}{padded if tactile or count > 1 else ''}{f'_{axis}' if axis else ''}"
+    name = pattern.filled(rule.name, {**values, "taxel": padded, "axis": axis}) if rule.name else plain_name
+    stated = {key.decode(): value.decode() for key, value in (column.field.metadata or {}).items()}
+    kept = {key: value for key, value in stated.items() if key not in values}
+    return pa.field(name, column.field.type, metadata={**kept, **about, **dict(rule.about)})
+
+
 def _field(rule: Column, name: str, values: dict[str, str], declared: pa.Field | None) -> pa.Field:
-    made = pattern.filled(rule.name, values) if rule.name else name.strip()
+    made = pattern.filled(rule.name, values) if rule.name and not rule.shape else name.strip()
     about = {"unit": rule.unit, "quantity": rule.quantity, "component": rule.component, **values, **dict(rule.about)}
     about = {key: value for key, value in about.items() if value}
     if declared is None:

@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import codecs
 import csv
 import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
 
+from tacpipe.formats.table import compressed
+
+LINES = 200  # of a file that are looked at
+HEAD_BYTES = 1 << 20  # of a file that are looked at, at most
 SEPARATORS = (",", ";", "\t", "|", " ")
 COMMENTS = ("#", "%", "//")
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
@@ -21,13 +28,14 @@ class Dialect:
     """What `of` found, with the cells of the lines that it looked at."""
 
     separator: str
-    decimal: str
+    decimal: Literal[".", ","]
     comment: str
     skip_lines: int
     header: bool
     names: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...] = field(repr=False)  # below the header
     missing: tuple[str, ...] = ()  # cells of MISSING that are there
+    units: tuple[str, ...] = ()  # of the columns, where the row below the header holds them
 
     def number(self, cell: str) -> float | None:
         """Return the number that a cell holds, an int where it is written as one, None where it holds none.
@@ -41,6 +49,27 @@ class Dialect:
         if self.decimal == ",":
             return float(text.replace(",", ".")) if _COMMA_NUMBER.fullmatch(text) else None
         return float(text) if _NUMBER.fullmatch(text) else None
+
+
+def encoding(path: Path) -> str:
+    """Return the encoding of a text file, from its first bytes: UTF-16 by its mark, UTF-8, or else that of Windows."""
+    with compressed.opened(path) as file:
+        content = file.read(HEAD_BYTES)
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return "utf-16"
+    try:
+        codecs.getincrementaldecoder("utf-8")().decode(content)
+    except UnicodeDecodeError:
+        return "cp1252"
+    return "utf-8"
+
+
+def first_lines(path: Path, encoding: str = "utf-8") -> list[str]:
+    """Return the first lines of a text file, without one that is cut."""
+    with compressed.opened(path, encoding) as file:
+        content = file.read(HEAD_BYTES)
+    lines = content.decode(errors="replace").splitlines(keepends=True)
+    return lines[: min(LINES, len(lines) - (len(content) == HEAD_BYTES and len(lines) > 1))]
 
 
 def of(lines: Sequence[str]) -> Dialect:
@@ -63,12 +92,22 @@ def of(lines: Sequence[str]) -> Dialect:
     probe = Dialect(separator, decimal, comment, 0, False, (), ())
     header = bool(rows) and _is_header(rows, probe)
     names = rows[0] if header else tuple(f"column{number}" for number in range(1, width + 1))
+    units: tuple[str, ...] = ()
+    if header and len(rows) > 2 and _is_text(rows[1], probe) and not _is_text(rows[2], probe):
+        units, rows = rows[1], [rows[0], *rows[2:]]
     below = rows[1:] if header else rows
     missing = sorted({cell for row in below for cell in row if cell in MISSING})
     before = 0
-    if skip:  # lines of the file before the header, comments and blank ones among them
+    if units:  # the first row below them
+        before = next(number for number, text in enumerate(texts) if text == kept[skip + 1]) + 1
+    elif skip:  # lines of the file before the header, comments and blank ones among them
         before = next(number for number, text in enumerate(texts) if text == kept[skip])
-    return Dialect(separator, decimal, comment, before, header, tuple(names), tuple(below), tuple(missing))
+    return Dialect(separator, decimal, comment, before, header, tuple(names), tuple(below), tuple(missing), units)
+
+
+def _is_text(row: Sequence[str], probe: Dialect) -> bool:
+    """Return whether no cell of a row holds a number."""
+    return all(probe.number(cell) is None for cell in row)
 
 
 def _separator(kept: Sequence[str]) -> tuple[str, int]:
@@ -87,7 +126,7 @@ def _separator(kept: Sequence[str]) -> tuple[str, int]:
     return best[2], best[3]
 
 
-def _decimal(rows: Sequence[tuple[str, ...]], separator: str) -> str:
+def _decimal(rows: Sequence[tuple[str, ...]], separator: str) -> Literal[".", ","]:
     cells = [cell for row in rows for cell in row]
     commas = sum("," in cell and bool(_COMMA_NUMBER.fullmatch(cell)) for cell in cells)
     points = sum("." in cell and bool(_NUMBER.fullmatch(cell)) for cell in cells)

@@ -1,7 +1,7 @@
 """Read a lab's own tables, as a layout file describes them.
 
-CSV, TSV, Parquet, NPZ and JSON lines, one file or several a recording. ``--guess`` prints a first layout, ``--dry-run``
-describes what a layout would read.
+CSV, TSV, Excel, Parquet, NPY, NPZ and JSON lines, one file or several a recording. ``--guess`` prints a first layout,
+``--dry-run`` describes what a layout would read.
 
 Example: tacpipe ingest table my-lab --layout layout.toml -o data/recordings
 """
@@ -69,7 +69,7 @@ def why_unread(params: Params, source: Path) -> Callable[[str], str]:
 
 @stage(version=1, discover=discover, preview=preview, guess=guess, why_unread=why_unread)
 def table(params: Params, files: Files, values: Values, shared: Shared | None = None) -> RecordingOutput:
-    """Read a lab's own tables (CSV, Parquet, NPZ, JSON lines).
+    """Read a lab's own tables (CSV, Excel, Parquet, NPY, NPZ, JSON lines).
 
     A layout file names the files of each recording, their columns with quantity and unit, where time stamps and labels
     come from. Start with ``--guess``, replace each "?" in what it prints, look at the result with ``--dry-run``.

@@ -6,6 +6,7 @@ is opened.
 
 from __future__ import annotations
 
+import codecs
 import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -15,14 +16,14 @@ from typing import Any, Literal
 from tacpipe.errors import UsageError
 from tacpipe.formats.containers import kinds
 from tacpipe.formats.containers.container import Time
-from tacpipe.formats.table import pattern
+from tacpipe.formats.table import pattern, stamp_formats
 from tacpipe.io import regular
 from tacpipe.plugins import fields
-from tacpipe.plugins.constraints import NonNegativeInt
+from tacpipe.plugins.constraints import NonNegativeInt, PositiveInt
 from tacpipe.printable import excerpt, plain
 
 MOST_BYTES = 1 << 20  # of a layout file
-Format = Literal["csv", "parquet", "npz", "jsonl", "mcap", "rosbag", "hdf5", "zarr", "xdf", "lerobot"]
+Format = Literal["csv", "parquet", "npz", "npy", "xlsx", "jsonl", "mcap", "rosbag", "hdf5", "zarr", "xdf", "lerobot"]
 Kind = Literal[
     "int8",
     "uint8",
@@ -44,10 +45,14 @@ EXTENSIONS: Mapping[str, Format] = {
     ".txt": "csv",
     ".parquet": "parquet",
     ".npz": "npz",
+    ".npy": "npy",
+    ".xlsx": "xlsx",
+    ".xlsm": "xlsx",
     ".jsonl": "jsonl",
     ".ndjson": "jsonl",
 }
 TREES = (".json", ".yaml", ".yml")  # of files that hold labels by name
+STAMPS = ".stamps"  # behind a stream's name: the file of its stamps among the files of a recording
 GZIP = ".gz"
 FILE = "file"  # the placeholder of a container's name, where containers are found by their format
 UNKNOWN = "?"  # what a guessed layout could not know
@@ -68,6 +73,8 @@ class Column:
     type: Kind | None = None  # None: as a container declares it, else float64
     scale: float = 1.0  # a value is what the file holds times this
     component: str = ""
+    shape: tuple[PositiveInt, ...] = ()  # of the array that the columns are the cells of, as (taxel, axis)
+    axes: tuple[str, ...] = ()  # names along the last dimension of the shape, or else the first
     about: tuple[tuple[str, str], ...] = ()  # more metadata of the column; a table in the file
     skip: bool = False
 
@@ -93,7 +100,11 @@ class Stream:
     separator: str = ""  # empty: a comma, or a tab in a .tsv
     decimal: Literal[".", ","] = "."
     comment: str = ""  # what lines begin with that hold no row
-    header: bool = True  # without one, columns are named column1, column2, …
+    header: bool = True  # without one, columns are named by ``names``, or column1, column2, …
+    names: tuple[str, ...] = ()  # of the columns, where the layout's ``header`` is a list
+    encoding: str = "utf-8"  # of a text file
+    sheet: str = ""  # of a workbook; empty: the first
+    time_axis: NonNegativeInt = 0  # of arrays: the dimension along which rows follow one another
     skip_lines: NonNegativeInt = 0  # before the header
     missing: tuple[str, ...] = ()  # cells that hold no value: NaN
     recording: str = ""  # the column that names the recording, where a file holds many
@@ -272,6 +283,8 @@ def _stream(name: str, value: Any, where: str, container: Format | None) -> Stre
     values["columns"] = tuple(_column(one, f"{where}, columns {number}") for number, one in enumerate(columns, 1))
     if "long" in values:
         values["long"] = fields.filled(Long, _table(values["long"], where, "long"), f"{where}, long", "entry")
+    if isinstance(values.get("header"), list):
+        values["names"], values["header"] = values["header"], False
     if "missing" in values and isinstance(values["missing"], list):
         values["missing"] = tuple(values["missing"])
     made: Stream = fields.filled(Stream, {"name": name, **values}, where, "entry")
@@ -279,8 +292,21 @@ def _stream(name: str, value: Any, where: str, container: Format | None) -> Stre
         raise UsageError(f"{where}: separator is {excerpt(made.separator)}; it must be one character.")
     if made.separator and made.separator == made.decimal:
         raise UsageError(f"{where}: separator and decimal are both {made.decimal!r}; a number could not be read.")
-    pattern.placeholders(made.files)
+    _expect_encoding(made, where)
+    absent = set(pattern.placeholders(made.time.file)) - set(pattern.placeholders(made.files))
+    if absent:
+        raise UsageError(f"{where}: time.file names {{{min(absent)}}}, which files does not have.")
     return made
+
+
+def _expect_encoding(stream: Stream, where: str) -> None:
+    """Raise `UsageError` for an encoding that Python does not have."""
+    try:
+        codecs.lookup(stream.encoding)
+    except LookupError:
+        raise UsageError(
+            f"{where}: encoding is {excerpt(stream.encoding)}; it must be one of Python's, as utf-8, utf-16 or cp1252."
+        ) from None
 
 
 def _expect_given(values: Mapping[str, Any], where: str, container: Format | None) -> None:
@@ -290,6 +316,8 @@ def _expect_given(values: Mapping[str, Any], where: str, container: Format | Non
             raise UsageError(f"{where}: source must be given: the topic, group or stream inside the file.")
         if values.get("recording"):
             raise UsageError(f"{where}: recording is for tables; a container names the recordings in it itself.")
+        if isinstance(values.get("time"), dict) and values["time"].get("file"):
+            raise UsageError(f"{where}: time.file is for tables; a container holds its stamps. Name their column.")
         if "files" not in values and container is None:
             raise UsageError(f'{where}: files must be given, as files = "{{trial}}.{values["format"]}".')
         return
@@ -299,7 +327,8 @@ def _expect_given(values: Mapping[str, Any], where: str, container: Format | Non
         raise UsageError(f"{where}: entry files must be given.")
     if "time" not in values:
         raise UsageError(
-            f'{where}: time must be given, as time = {{ column = "t", unit = "s" }} or {{ rate_hz = 100 }}.'
+            f'{where}: time must be given, as time = {{ column = "t", unit = "s" }}, {{ file = "{{trial}}/stamps.npy" }} or '
+            "{ rate_hz = 100 }."
         )
     if not values.get("columns"):
         raise UsageError(f'{where}: columns must be given: a list of tables such as {{ match = "taxel{{taxel}}" }}.')
@@ -307,9 +336,11 @@ def _expect_given(values: Mapping[str, Any], where: str, container: Format | Non
 
 def _time(values: Mapping[str, Any], where: str) -> Time:
     made: Time = fields.filled(Time, values, where, "entry")
-    if bool(made.column) == (made.rate_hz is not None):
-        raise UsageError(f"{where}: give either the column with the stamps or rate_hz.")
-    if made.start and made.origin != "start" and made.rate_hz is None:
+    if bool(made.column or made.file) == (made.rate_hz is not None):
+        raise UsageError(f"{where}: give either the column or the file with the stamps, or rate_hz.")
+    if made.format:
+        stamp_formats.check(made.format, where)
+    elif made.start and made.origin != "start" and made.rate_hz is None:
         raise UsageError(
             f'{where}: start is for stamps that count from a recording\'s start. Set origin = "start" too.'
         )
@@ -321,7 +352,12 @@ def _column(value: Any, where: str) -> Column:
     if "about" in values:
         values["about"] = tuple(sorted(_table(values["about"], where, "about").items()))
     made: Column = fields.filled(Column, values, where, "entry")
-    pattern.filled(made.name, dict.fromkeys(pattern.placeholders(made.match), "x"))
+    places = ("taxel", "axis") if made.shape else ()
+    pattern.filled(made.name, dict.fromkeys((*pattern.placeholders(made.match), *places), "x"))
+    if made.axes and (not made.shape or len(made.axes) not in (made.shape[-1], made.shape[0])):
+        raise UsageError(
+            f"{where}: axes has {len(made.axes)} names, and shape is {list(made.shape)}. Its last dimension needs one each."
+        )
     if made.type in ("bool", "text", "binary") and made.scale != 1.0:
         raise UsageError(f"{where}: scale is {made.scale}; only numbers have one.")
     return made

@@ -156,17 +156,13 @@ def _parts(names: Sequence[list[_Token]]) -> list[tuple[str, tuple[str, ...]]]:
     before = _common(kinds)
     after = 0
     if any(one != kinds[0] for one in kinds):
-        while before and kinds[0][before - 1] in ("date", "number"):  # next to differing text they have no end
-            before -= 1
-        after = _common([one[before:][::-1] for one in kinds])
-        while after and kinds[0][-after] in ("date", "number"):
-            after -= 1
-    while (
-        before
-        and any(len(tokens) == before + after for tokens in names)
-        and any(len(tokens) > before + after for tokens in names)
-    ):
-        before -= 1  # a placeholder is at least one character
+        before = _without_slots(kinds[0], before)
+        after = _without_slots(kinds[0][::-1], _common([one[before:][::-1] for one in kinds]))
+        while any(len(one) == before + after for one in kinds):  # a placeholder is at least one character
+            if before:
+                before = _without_slots(kinds[0], before - 1)
+            else:
+                after = _without_slots(kinds[0][::-1], after - 1)
     parts = [(kinds[0][place], tuple(tokens[place][1] for tokens in names)) for place in range(before)]
     if any(len(tokens) > before + after for tokens in names):
         middles = tuple("".join(text for _, text in tokens[before : len(tokens) - after]) for tokens in names)
@@ -178,3 +174,13 @@ def _parts(names: Sequence[list[_Token]]) -> list[tuple[str, tuple[str, ...]]]:
 def _common(sequences: Sequence[Sequence[str]]) -> int:
     """Return how many of their first elements all sequences share."""
     return sum(1 for _ in itertools.takewhile(lambda elements: len(set(elements)) == 1, zip(*sequences, strict=False)))
+
+
+def _without_slots(kinds: Sequence[str], count: int) -> int:
+    """Return how many of the first ``count`` elements stay without the dates and numbers at their end.
+
+    Next to text that differs nothing would show where these end.
+    """
+    while count and kinds[count - 1] in ("date", "number"):
+        count -= 1
+    return count

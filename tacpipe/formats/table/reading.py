@@ -14,7 +14,7 @@ from tacpipe.arrays import Times
 from tacpipe.channels import schema
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.formats.containers.container import SourceStream
-from tacpipe.formats.table import columns, long_form, rows
+from tacpipe.formats.table import columns, long_form, rows, stamp_formats
 from tacpipe.formats.table.columns import CellError, Chosen, Declared
 from tacpipe.formats.table.layout import Stream
 from tacpipe.formats.table.rows import ContainedRows, Place, Rows
@@ -26,16 +26,22 @@ Block = tuple[Times | None, list[pa.Array]]  # stamps, if rows have some, and co
 
 
 def batches(
-    file: Rows, stream: Stream, recording: str | None = None, shared: Shared | None = None
+    file: Rows,
+    stream: Stream,
+    recording: str | None = None,
+    shared: Shared | None = None,
+    stamps_path: Path | None = None,
 ) -> pa.RecordBatchReader:
     """Return the rows of the stream with ``t_ns`` as they are read; ``recording`` is the one to pick of many.
 
-    With ``shared`` the file is then cut into its recordings once, and not read for each.
+    With ``shared`` the file is then cut into its recordings once, and not read for each. ``stamps_path`` is the file with
+    the stamps where the layout names one.
 
     Raises `TacpipeError`, naming file, row and column, for what is not as the layout states, for stamps that run backwards,
     and for a file without rows; also as batches are taken. One block is in memory; of a table in long form one run.
     """
-    return _batches(file, stream, recording, columns.NOTHING, {}, shared)
+    stamps_ns = None if stamps_path is None else rows.stamps_of_file(stamps_path, stream)
+    return _batches(file, stream, recording, columns.NOTHING, {}, shared, stamps_ns)
 
 
 def table(path: Path, stream: Stream, recording: str | None = None) -> pa.Table:
@@ -76,9 +82,11 @@ def _batches(
     declared: Declared,
     about_time: Mapping[str, str],
     shared: Shared | None = None,
+    stamps_ns: Times | None = None,
 ) -> pa.RecordBatchReader:
     path, names = file.path, file.names()
-    apart = [name for name in (stream.time.column, stream.recording) if name]
+    clock = "" if stream.time.file else stream.time.column
+    apart = [name for name in (clock, stream.recording) if name]
     if stream.long is not None:
         apart += [stream.long.channel, stream.long.value]
     missing = [name for name in apart if name not in names]
@@ -87,7 +95,8 @@ def _batches(
             f"{path} has no column {listed(missing, 3)}, which [streams.{stream.name}] names; it has {listed(names, 6)}."
         )
     blocks: Iterable[Block]
-    start_ns = _start_ns(stream) if stream.time.origin == "start" or not stream.time.column else 0
+    from_start = stream.time.origin == "start" or stream.time.rate_hz is not None
+    start_ns = _start_ns(stream) if from_start and not stream.time.format else 0
     if stream.long is not None:
         long = long_form.read(file, stream, recording, shared)
         wanted = columns.chosen(stream, long.channels, path) if long.channels else []
@@ -100,6 +109,8 @@ def _batches(
             _converted(stream, block, wanted, place, as_is)
             for block, _, place in rows.blocks(file, stream, types, recording, shared)
         )
+    if stamps_ns is not None:
+        blocks = _stamped_apart(blocks, stamps_ns, file, stream)
     made = pa.schema([_time_field(stream, about_time), *(one.field for one in wanted)])
     stamped = _stamps_checked(blocks, file, stream, recording, start_ns)
     return pa.RecordBatchReader.from_batches(
@@ -109,7 +120,7 @@ def _batches(
 
 def _time_field(stream: Stream, about: Mapping[str, str]) -> pa.Field:
     """Return the field of ``t_ns``, with what else is stated of it."""
-    if not stream.time.column:
+    if stream.time.rate_hz is not None:
         field = schema.time_field("from rate")
     elif stream.time.origin == "start":
         field = schema.time_field("from the start of the recording")
@@ -123,10 +134,13 @@ def _stamps_checked(
 ) -> Iterator[list[pa.Array]]:
     """Yield the columns of blocks behind their stamps, which must not run backwards, and must be there."""
     done, last_ns = 0, None
+    of_day = bool(stream.time.format) and not stamp_formats.has_date(stream.time.format)
     for t_ns, arrays in blocks:
         count = len(arrays[0])
         if not count:
             continue
+        if t_ns is not None and of_day:
+            t_ns = _past_midnight(t_ns, last_ns)
         if t_ns is None:
             assert stream.time.rate_hz is not None
             t_ns = resampling.uniform_offsets(done, count, stream.time.rate_hz)
@@ -138,6 +152,36 @@ def _stamps_checked(
     if not done:
         of = f" of recording {plain(recording)}" if recording else ""
         raise TacpipeError(f"{file.path} holds no row{of}. Take it away, or record it again.")
+
+
+def _past_midnight(t_ns: Times, last_ns: int | None) -> Times:
+    """Return times of day with a day added where they begin again; ``last_ns`` is the one above them.
+
+    >>> _past_midnight(np.array([86_399, 1]) * 10**9, None)
+    array([86399000000000, 86401000000000])
+    """
+    day_ns = stamp_formats.DAY_NS
+    above_ns = int(t_ns[0]) if last_ns is None else last_ns
+    first_ns = t_ns[0] + max(0, round((above_ns - int(t_ns[0])) / day_ns)) * day_ns
+    t_ns = t_ns - t_ns[0] + first_ns
+    return t_ns + np.cumsum(np.diff(t_ns, prepend=t_ns[0]) < -day_ns // 2) * day_ns
+
+
+def _stamped_apart(blocks: Iterable[Block], stamps_ns: Times, file: Rows, stream: Stream) -> Iterator[Block]:
+    """Yield blocks with the stamps of a file of their own. Raises `TacpipeError` where there are more or fewer than rows."""
+    done = 0
+    for _, arrays in blocks:
+        count = len(arrays[0])
+        if done + count > len(stamps_ns):
+            raise TacpipeError(_unequal(file, stream, "more rows", stamps_ns))
+        yield stamps_ns[done : done + count], arrays
+        done += count
+    if done < len(stamps_ns):
+        raise TacpipeError(_unequal(file, stream, f"{done} rows", stamps_ns))
+
+
+def _unequal(file: Rows, stream: Stream, rows_there: str, stamps_ns: Times) -> str:
+    return f"{file.path} has {rows_there}, and {plain(stream.time.file)} has {len(stamps_ns)} stamps. Copy both again."
 
 
 def _expect_rising(t_ns: Times, last_ns: int | None, before: int, file: Rows, recording: str | None) -> None:
@@ -158,7 +202,8 @@ def _expect_rising(t_ns: Times, last_ns: int | None, before: int, file: Rows, re
 
 def _converted(stream: Stream, block: pa.Table, wanted: list[Chosen], place: Place, as_is: bool) -> Block:
     """Return the stamps of a block, where it has some, and its columns as their declared types."""
-    t_ns = rows.stamped(block.column(stream.time.column), stream, place) if stream.time.column else None
+    clock = "" if stream.time.file else stream.time.column
+    t_ns = rows.stamped(block.column(clock), stream, place) if clock else None
     made = []
     for one in wanted:
         try:

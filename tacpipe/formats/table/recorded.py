@@ -13,7 +13,7 @@ from tacpipe.formats import unique_names
 from tacpipe.formats.containers import kinds
 from tacpipe.formats.containers.container import Contents
 from tacpipe.formats.table import rows
-from tacpipe.formats.table.layout import Stream
+from tacpipe.formats.table.layout import STAMPS, Stream
 from tacpipe.formats.table.reading import batches, contained
 from tacpipe.plugins.stage import Attribute, Shared
 from tacpipe.printable import listed, plain
@@ -48,7 +48,9 @@ def of(
         if stream.contained:
             together.setdefault((str(stream.format), paths[stream.name]), []).append(stream)
         else:
-            tables[stream.name] = batches(rows.opened(paths[stream.name], stream), stream, within, shared)
+            tables[stream.name] = batches(
+                rows.opened(paths[stream.name], stream), stream, within, shared, paths.get(f"{stream.name}{STAMPS}")
+            )
     for (kind, path), several in together.items():
         contents = kinds.opened(kind, path).read([one.source for one in several], within)
         there = unique_names.by_name(((stream.source, stream) for stream in contents.streams), path, "stream")

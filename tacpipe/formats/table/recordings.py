@@ -12,7 +12,7 @@ from tacpipe.errors import FAILED, MissingModuleError, StorageError, TacpipeErro
 from tacpipe.formats.containers import kinds
 from tacpipe.formats.containers.container import Naming
 from tacpipe.formats.table import pattern, rows
-from tacpipe.formats.table.layout import FILE, Format, Layout, Stream
+from tacpipe.formats.table.layout import FILE, STAMPS, Format, Layout, Stream
 from tacpipe.io import files as file_system
 from tacpipe.printable import listed, plain
 
@@ -44,12 +44,15 @@ def found(layout: Layout, folder: Path) -> list[Source]:
     _refuse_idle(layout, matched, every, folder)
     shared = layout.placeholders
     groups: dict[tuple[str, ...], dict[str, list[Path]]] = {}
+    stamps: dict[Path, Path] = {}  # by the file whose rows they are of
     for stream in layout.streams:
         for path, values in matched[stream.name]:
             if not set(shared) <= set(values):
                 raise UsageError(
                     f"[streams.{stream.name}] files has no {{{shared[0]}}}, by which files belong to a recording. Add it."
                 )
+            if stream.time.file:
+                stamps[path] = Path(pattern.filled(stream.time.file, values))
             groups.setdefault(tuple(values[one] for one in shared), {}).setdefault(stream.name, []).append(path)
     sources = []
     for key, by_stream in sorted(groups.items()):
@@ -67,6 +70,7 @@ def found(layout: Layout, folder: Path) -> list[Source]:
                 f"it, or set optional = true in [streams.{lacking[0]}]."
             )
         files = {name: folder / paths[0] for name, paths in by_stream.items()}
+        files |= {f"{name}{STAMPS}": folder / stamps[one] for name, (one,) in by_stream.items() if one in stamps}
         sources += _named(layout, files, dict(zip(shared, key, strict=True)))
     recording_names.refuse_shared((one.name, next(iter(one.files.values()))) for one in sources)
     return sorted(sources, key=lambda one: one.name)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -14,13 +14,14 @@ import pyarrow.compute as pc
 from tacpipe.arrays import Indices, Times
 from tacpipe.errors import TacpipeError
 from tacpipe.formats.containers.container import SourceStream
-from tacpipe.formats.table import ahead, binary, parted, stamps
-from tacpipe.formats.table.layout import Stream
+from tacpipe.formats.table import ahead, binary, dialect, parted, stamps
+from tacpipe.formats.table.layout import EXTENSIONS, Stream, extension
 from tacpipe.formats.table.text import TextTable
+from tacpipe.formats.table.workbook import Workbook
 from tacpipe.io.drafts import Draft
 from tacpipe.io.spill import Spill, in_order
 from tacpipe.plugins.stage import Shared
-from tacpipe.printable import excerpt, plain
+from tacpipe.printable import excerpt, listed, plain
 
 Place = Callable[[int], str]  # of a row in a block: how errors name it
 
@@ -74,14 +75,51 @@ def opened(path: Path, stream: Stream) -> Rows:
     kind = stream.format_of(path)
     if kind == "csv":
         return TextTable(path, stream)
-    return binary.opened(path, kind)
+    if kind == "xlsx":
+        return Workbook(path, stream)
+    return binary.opened(path, kind, stream.time_axis)
+
+
+def stamps_of_file(path: Path, stream: Stream) -> Times:
+    """Return the stamps in a file that holds those of all rows of ``stream``, in ns (row,).
+
+    They are in the column that the stream's time names, or in the only one of the file. Raises `TacpipeError` for a file
+    with several columns where none is named, and as `stamped` does.
+    """
+    kind = EXTENSIONS.get(extension(path), "csv")
+    clock = Stream(stream.name, format=kind, time=replace(stream.time, file=""), encoding=stream.encoding)
+    if kind == "csv":
+        lines = dialect.first_lines(path, stream.encoding)
+        written = dialect.of(lines)
+        clock = replace(
+            clock,
+            separator=written.separator,
+            decimal=written.decimal,
+            comment=written.comment,
+            header=written.header,
+            skip_lines=written.skip_lines,
+        )
+    file = opened(path, clock)
+    names = file.names()
+    column = stream.time.column or names[0]
+    if column not in names or (len(names) > 1 and not stream.time.column):
+        raise TacpipeError(
+            f"{path} has the columns {listed(names, 6)}. Name the one with the stamps of [streams.{stream.name}] as column "
+            f"in its time."
+        )
+    clock = replace(clock, time=replace(clock.time, column=column))
+    found = [
+        stamped(block.column(column), clock, place)
+        for block, _, place in blocks(file, clock, types(file, clock), None, None)
+    ]
+    return np.concatenate(found) if found else np.zeros(0, np.int64)
 
 
 def types(file: Rows, stream: Stream) -> dict[str, pa.DataType]:
     """Return as what the columns are parsed that are no channels."""
     found: dict[str, pa.DataType] = {}
-    if stream.time.column:
-        found[stream.time.column] = pa.string() if stream.time.unit == "iso8601" else stamps.DECIMAL
+    if stream.time.column and not stream.time.file:
+        found[stream.time.column] = pa.string() if stream.time.is_text else stamps.DECIMAL
     if stream.recording:
         found[stream.recording] = pa.string()
     return found
@@ -125,7 +163,7 @@ def _picked(
 def stamped(column: pa.ChunkedArray, stream: Stream, place: Place) -> Times:
     """Return the stamps of a column in ns (row,). Raises `TacpipeError`, naming the row, for what is not one."""
     try:
-        return stamps.nanoseconds(column, stream.time.unit, stream.time.zone)
+        return stamps.nanoseconds(column, stream.time)
     except stamps.StampError as error:
         raise TacpipeError(
             f"{place(error.row)}, column {plain(stream.time.column)} holds {excerpt(error.found)}; it must be "

@@ -13,7 +13,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from tacpipe.arrays import Bools, Int64s, Times
-from tacpipe.formats.containers.container import TimeUnit
+from tacpipe.formats.containers.container import Time
+from tacpipe.formats.table import stamp_formats
 
 IN_RANGE = "a time before the year 2262"  # where 64 bits of nanoseconds end
 DIGITS = {"s": 9, "ms": 6, "us": 3, "ns": 0}  # decimals of a unit that are nanoseconds
@@ -32,25 +33,30 @@ class StampError(ValueError):
         self.row, self.found, self.wanted = row, found, wanted
 
 
-def nanoseconds(column: pa.Array, unit: TimeUnit, zone: str = "UTC") -> Int64s:
-    """Return stamps as nanoseconds (time,); numbers as ``unit`` has them, rounded half to even.
+def nanoseconds(column: pa.Array, time: Time) -> Int64s:
+    """Return stamps as nanoseconds (time,); numbers as the unit of ``time`` has them, rounded half to even.
 
     Raises `StampError` for a missing stamp, one that is not a time, and one beyond what 64 bits hold (the year 2262).
 
-    >>> nanoseconds(pa.array(["1744849152.0161362"]).cast(DECIMAL), "s"), nanoseconds(pa.array([1.5]), "ms")
+    >>> nanoseconds(pa.array(["1744849152.0161362"]).cast(DECIMAL), Time()), nanoseconds(pa.array([1.5]), Time(unit="ms"))
     (array([1744849152016136200]), array([1500000]))
-    >>> nanoseconds(pa.array(["1970-01-01T01:00:00.5+01:00"]), "iso8601")
+    >>> nanoseconds(pa.array(["1970-01-01T01:00:00.5+01:00"]), Time(unit="iso8601"))
     array([500000000])
     """
     column = column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
     _refuse(column.is_null(), column, "a time; the cell is empty")
     if pa.types.is_timestamp(column.type):
-        if column.type.tz is None and zone != "UTC":
-            column = pc.assume_timezone(column, zone)
+        if column.type.tz is None and time.zone != "UTC":
+            column = pc.assume_timezone(column, time.zone)
         stamps = _cast(column, pa.timestamp("ns", column.type.tz), IN_RANGE).cast(pa.int64())
         return np.asarray(stamps.to_numpy(zero_copy_only=False), np.int64)
-    if unit == "iso8601":
-        return _of_text(column, zone)
+    if pa.types.is_time(column.type):
+        return _zoned(np.asarray(column.cast(pa.time64("ns")).cast(pa.int64()).to_numpy()) + _day_ns(time), time.zone)
+    if time.format:
+        return _of_format(column, time)
+    if time.unit == "iso8601":
+        return _of_text(column, time.zone)
+    unit = time.unit
     if pa.types.is_decimal(column.type):
         return _of_decimals(column, DIGITS[unit])
     if pa.types.is_integer(column.type):
@@ -69,6 +75,26 @@ def _of_text(column: pa.Array, zone: str) -> Int64s:
         stamps = pc.assume_timezone(_cast(text, pa.timestamp("ns"), wanted), zone)
     found: Int64s = stamps.cast(pa.int64()).to_numpy(zero_copy_only=False)
     return found
+
+
+def _of_format(column: pa.Array, time: Time) -> Int64s:
+    """Return stamps that are text in the format of ``time``."""
+    t_ns, valid = stamp_formats.nanoseconds(column.cast(pa.string()), time.format)
+    _refuse(pa.array(~valid), column, f"a time in the format {time.format}")
+    return _zoned(t_ns if stamp_formats.has_date(time.format) else t_ns + _day_ns(time), time.zone)
+
+
+def _day_ns(time: Time) -> int:
+    """Return when the day of times of day begins: that of ``start``, else 1970-01-01."""
+    return int(np.datetime64(time.start[:10], "D").astype("datetime64[ns]").astype(np.int64)) if time.start else 0
+
+
+def _zoned(t_ns: Int64s, zone: str) -> Int64s:
+    """Return nanoseconds that clocks in a zone show as those of UTC."""
+    if zone == "UTC":
+        return t_ns
+    stamps = pc.assume_timezone(pa.array(t_ns).cast(pa.timestamp("ns")), zone, ambiguous="earliest")
+    return np.asarray(stamps.cast(pa.int64()).to_numpy(zero_copy_only=False), np.int64)
 
 
 def _of_decimals(column: pa.Array, digits: int) -> Int64s:

@@ -43,10 +43,18 @@ class TextTable:
 
         Raises `TacpipeError` for a file without a row, and for a name that comes twice.
         """
-        for _, cells in self._rows():
+        for line, cells in self._rows():
+            if self.stream.names:
+                self._expect_width(line, cells)
+                return list(self.stream.names)
             if not self.stream.header:
                 return [f"column{number}" for number in range(1, len(cells) + 1)]
             names = [cell.strip() for cell in cells]
+            if any("\ufffd" in name for name in names):
+                raise TacpipeError(
+                    f"{self.path}, line {line}: the header is not {self.stream.encoding}. Set encoding in "
+                    f'[streams.{self.stream.name}], as encoding = "cp1252".'
+                )
             doubled = sorted(name for name, count in Counter(names).items() if count > 1)
             if doubled:
                 raise TacpipeError(
@@ -75,6 +83,14 @@ class TextTable:
                 fault = self._fault(names, types)
                 raise TacpipeError(fault or f"{self.path} cannot be read: {plain(str(error), 200)}.") from error
 
+    def _expect_width(self, line: int, cells: Sequence[str]) -> None:
+        """Raise `TacpipeError` where a row has another number of cells than the layout names columns."""
+        if len(cells) != len(self.stream.names):
+            raise TacpipeError(
+                f"{self.path}, line {line} has {len(cells)} cells, and header in [streams.{self.stream.name}] names "
+                f"{len(self.stream.names)} columns. Correct header."
+            )
+
     def place(self, index: int) -> str:
         """Return the line that holds the data row ``index`` (from 0), as errors name it."""
         for position, (line, _) in enumerate(self._rows()):
@@ -86,7 +102,7 @@ class TextTable:
         """Yield the bytes below the header, whole lines at a time, without comments; each in pieces."""
         comment = self.stream.comment.encode()
         drop = re.compile(rb"^[ \t]*" + re.escape(comment) + rb".*(?:\n|\Z)", re.MULTILINE) if comment else None
-        with compressed.opened(self.path) as file:
+        with compressed.opened(self.path, self.stream.encoding) as file:
             self._skip_header(file)
             rest = b""
             while new := file.read(BLOCK_BYTES):
@@ -110,7 +126,7 @@ class TextTable:
     def _skip_header(self, file: IO[bytes]) -> None:
         """Read up to the first line below the header."""
         if not (self.stream.header or self.stream.skip_lines):
-            if file.read(len(BOM)) != BOM:
+            if compressed.is_utf8(self.stream.encoding) and file.read(len(BOM)) != BOM:
                 file.seek(0)
             return
         comment, header = self.stream.comment.encode(), self.stream.header
@@ -128,7 +144,7 @@ class TextTable:
         """Yield the number and the cells of each line that holds some, the header among them."""
         comment = self.stream.comment
         separator = self.stream.separator_of(self.path)
-        with compressed.opened(self.path) as file:
+        with compressed.opened(self.path, self.stream.encoding) as file:
             try:
                 for number, line in enumerate(iter(partial(file.readline, LONGEST_LINE + 1), b""), 1):
                     if len(line) > LONGEST_LINE:

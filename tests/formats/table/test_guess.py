@@ -5,7 +5,7 @@ from pathlib import Path, PurePath
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from tacpipe.errors import UsageError
@@ -157,6 +157,8 @@ def test_a_guessed_pattern_matches_the_files_of_a_later_day(tmp_path: Path, path
 
 
 @given(st.lists(st.from_regex(r"[a-c]{0,2}[0-9]{0,3}[-_ ]?[a-c0-9]{1,3}", fullmatch=True), min_size=1, unique=True))
+@example(["0a", "a"])
+@example(["ab", "abc"])
 def test_a_generalized_pattern_matches_the_paths_that_it_is_from(names: list[str]) -> None:
     paths = [PurePath(name) for name in names]
     text = pattern.generalize(paths)

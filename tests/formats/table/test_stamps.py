@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tacpipe.formats.containers.container import TimeUnit
+from tacpipe.formats.containers.container import Time, TimeUnit
 from tacpipe.formats.table import stamps
 
 YEAR_2262_NS = 2**63 - 1
@@ -19,12 +19,12 @@ YEAR_2262_NS = 2**63 - 1
 def test_text_of_any_unit_is_read_to_the_nanosecond(t_ns: int, unit: TimeUnit) -> None:
     text = format(Decimal(t_ns).scaleb(-stamps.DIGITS[unit]), "f")
     column = pa.array([text]).cast(stamps.DECIMAL)
-    assert stamps.nanoseconds(column, unit).tolist() == [t_ns]
+    assert stamps.nanoseconds(column, Time(unit=unit)).tolist() == [t_ns]
 
 
 def test_more_decimals_than_nanoseconds_are_rounded() -> None:
     column = pa.array(["1.0000000004999", "1.0000000005001"]).cast(stamps.DECIMAL)
-    assert stamps.nanoseconds(column, "s").tolist() == [1_000_000_000, 1_000_000_001]
+    assert stamps.nanoseconds(column, Time()).tolist() == [1_000_000_000, 1_000_000_001]
 
 
 @given(
@@ -37,16 +37,16 @@ def test_seconds_of_eighteen_decimals_are_rounded_half_to_even(whole: int, ns: i
     wanted = int((Decimal(text) * 10**9).quantize(Decimal(1), ROUND_HALF_EVEN))
     column = pa.array(["0", text, "1.5"]).cast(stamps.DECIMAL).slice(1, 1)
     if abs(wanted) <= YEAR_2262_NS:
-        assert stamps.nanoseconds(column, "s").tolist() == [wanted]
+        assert stamps.nanoseconds(column, Time()).tolist() == [wanted]
     else:
         with pytest.raises(stamps.StampError):
-            stamps.nanoseconds(column, "s")
+            stamps.nanoseconds(column, Time())
 
 
 @given(st.integers(0, 2**33), st.integers(0, 2**20 - 1))
 def test_float_seconds_are_read_as_near_as_the_float_is(whole: int, part: int) -> None:
     value = whole + part / 2**20  # exact in float64
-    (found,) = stamps.nanoseconds(pa.array([value]), "s").tolist()
+    (found,) = stamps.nanoseconds(pa.array([value]), Time()).tolist()
     assert abs(found - Decimal(value).scaleb(9)) <= Decimal("0.5")
 
 
@@ -62,11 +62,11 @@ def test_float_seconds_are_read_as_near_as_the_float_is(whole: int, part: int) -
 def test_iso_stamps_are_read_in_their_zone(text: str, zone: str, hours: float) -> None:
     day = datetime.datetime(2024, 7, 1, tzinfo=datetime.UTC).timestamp()
     expected = int((day + hours * 3600) * 10**9)
-    assert stamps.nanoseconds(pa.array([text]), "iso8601", zone).tolist() == [expected]
+    assert stamps.nanoseconds(pa.array([text]), Time(unit="iso8601", zone=zone)).tolist() == [expected]
 
 
 def test_the_comma_of_pythons_logging_is_a_decimal_one() -> None:
-    found = stamps.nanoseconds(pa.array(["1970-01-01 00:00:01,250"]), "iso8601")
+    found = stamps.nanoseconds(pa.array(["1970-01-01 00:00:01,250"]), Time(unit="iso8601"))
     assert found.tolist() == [1_250_000_000]
 
 
@@ -83,5 +83,5 @@ def test_the_comma_of_pythons_logging_is_a_decimal_one() -> None:
 )
 def test_a_stamp_that_is_none_is_named_by_its_row(column: pa.Array, unit: TimeUnit, row: int) -> None:
     with pytest.raises(stamps.StampError) as found:
-        stamps.nanoseconds(column, unit)
+        stamps.nanoseconds(column, Time(unit=unit))
     assert found.value.row == row
