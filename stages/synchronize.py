@@ -34,8 +34,8 @@ class Params:
     # uniform; logged: at the master's own stamps; fresh: at those whose rows are not repeated samples
     grid: Literal["uniform", "logged", "fresh"] = "uniform"
     master: str = ""  # stream whose first sample starts the grid; empty: the rig file's, or the first tactile one
-    # longest time between samples without a gap; points in a longer one are marked
-    gap_ms: Annotated[PositiveFloat, Unit("ms")] = 50.0
+    # longest time between samples without a gap, marked in a mask; without it 50, below 20 Hz 2.5 periods of the stream
+    gap_ms: Annotated[PositiveFloat, Unit("ms")] | None = None
     # time of a sample: device: its own stamp; arrival: when it came; auto: the device's where there is one
     clock: Literal["auto", "device", "arrival"] = "auto"
     unwrap: bool = True  # undo the wrap-around of tactile counts of 16 bits; channels without any stay as they are
@@ -51,7 +51,7 @@ class Params:
             )
 
 
-@stage(version=2, reads=("master",))
+@stage(version=3, reads=("master",))
 def synchronize(params: Params, recording: Recording) -> RecordingOutput:
     """Bring the streams of each recording onto one clock.
 
@@ -60,7 +60,9 @@ def synchronize(params: Params, recording: Recording) -> RecordingOutput:
     """
     import pyarrow as pa
 
+    from tacpipe.channels import masks
     from tacpipe.signals.holds import fresh_rate_hz, mean_rate_hz
+    from tacpipe.signals.resampling import default_gap_ns
     from tacpipe.synchronization import grids, streams
     from tacpipe.synchronization.methods import listed
 
@@ -84,21 +86,25 @@ def synchronize(params: Params, recording: Recording) -> RecordingOutput:
         if params.unwrap:
             stream, wrapped = streams.without_wraps(stream)
             attributes |= {f"{name}_wrapped_channels": wrapped} if wrapped else {}
-        columns += _on_grid(params, stream, grid_ns, exact)
+        gap_ns = default_gap_ns(stream.t_ns) if params.gap_ms is None else round(params.gap_ms * 1e6)
+        columns += _on_grid(params, stream, grid_ns, exact, gap_ns)
         if not stream.truth:
+            attributes[f"{name}{masks.GAP_MS}"] = gap_ns / 1e6
             attributes[f"{name}_rate_hz"] = round(mean_rate_hz(stream.t_ns), 3)
             attributes[f"{name}_fresh_hz"] = round(fresh_rate_hz(stream.t_ns, stream.held), 3)
             attributes |= stream.attributes
         stream.columns.forget()
     arrays = [pa.array(values, kind.type) for kind, values in columns]
-    return RecordingOutput(pa.Table.from_arrays(arrays, schema=pa.schema([kind for kind, _ in columns])), attributes)
+    table = pa.Table.from_arrays(arrays, schema=pa.schema([kind for kind, _ in columns]))
+    return RecordingOutput(table, attributes, masks.describe_gaps(table))
 
 
-def _on_grid(params: Params, stream: Stream, grid_ns: Times, exact: Int64s | None) -> list[tuple[pa.Field, Any]]:
+def _on_grid(
+    params: Params, stream: Stream, grid_ns: Times, exact: Int64s | None, gap_ns: int
+) -> list[tuple[pa.Field, Any]]:
     """Return field and values of a stream's channels on the grid, and of its masks; ground truth has none."""
     from tacpipe.synchronization import columns
 
-    gap_ns = round(params.gap_ms * 1e6)
     if params.causal:
         masks = [] if stream.truth else columns.causal_masks(stream, grid_ns, gap_ns)
         return columns.causal_channels(stream, grid_ns) + masks

@@ -226,3 +226,9 @@ def test_each_task_names_what_the_recordings_of_another_lack(lab: Lab) -> None:
         in lab.call("train touch data/s --split data/split -o x").err
     )
     assert "has no label material" in lab.call("train material data/s --split data/split -o x").err
+
+
+def test_of_a_synchronized_recording_the_share_of_rows_in_gaps_is_shown_by_stream() -> None:
+    masks = {"a_gap": [False, True, True, True], "b_gap": [False] * 4}
+    figures = show_recording.stream_figures(Columns(to_parquet(pa.table({"t_ns": [0, 10, 20, 30], **masks}))), None)
+    assert figures.get("gap_shares") == {"a": 0.75, "b": 0.0} and show_recording.gaps_text(figures) == "75.0%"

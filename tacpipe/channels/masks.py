@@ -13,9 +13,12 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from tacpipe.arrays import Bools, Int64s
+    from tacpipe.io.columns import Columns
 
 GRID = "grid"  # attribute of a synchronized recording: uniform, logged or fresh
 GAP = "_gap"  # how the masks of gaps end
+GAP_MS = "_gap_ms"  # how the attributes of a synchronized recording end that hold the longest time without a gap
+MANY = 0.05  # fraction of rows in gaps of a stream, above which a user is warned
 _APART = {"logged": 3.0, "fresh": 3.0}  # times the median step, by grid: further apart, rows are missing between
 _UNIFORM = 1.5
 
@@ -27,6 +30,26 @@ def gaps(table: pa.Table) -> Bools:
         if name.endswith(GAP):
             gap |= table.column(name).to_numpy().astype(bool)
     return gap
+
+
+def gap_shares(table: pa.Table | Columns) -> dict[str, float]:
+    """Return the fraction of rows that lie in a gap of each stream, by the name of the stream."""
+    found = [name for name in table.column_names if name.endswith(GAP)]
+    return {name.removesuffix(GAP): float(np.mean(table.column(name).to_numpy())) for name in found if table.num_rows}
+
+
+def describe_gaps(*tables: pa.Table | Columns) -> list[str]:
+    """Return one sentence for each stream with more than 5 % of its rows in gaps, in any of some recordings."""
+    shares: dict[str, float] = {}
+    for table in tables:
+        for stream, share in gap_shares(table).items():
+            shares[stream] = max(share, shares.get(stream, 0.0))
+    return [
+        f"More than {MANY:.0%} of the rows lie in gaps of stream {stream}, and no window crosses a gap; `tacpipe show` "
+        f"prints the fraction. Synchronize with a longer --gap-ms if its samples come that slowly."
+        for stream, share in shares.items()
+        if share > MANY
+    ]
 
 
 def apart(attributes: Mapping[str, Any]) -> float:

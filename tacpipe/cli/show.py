@@ -13,7 +13,7 @@ from typing import Any
 from tacpipe import printable
 from tacpipe.channels import streams
 from tacpipe.cli import model_overview
-from tacpipe.cli.show_recording import RATES, StreamFigures, stream_figures
+from tacpipe.cli.show_recording import RATES, StreamFigures, gaps_text, stream_figures
 from tacpipe.datasets import manifest as manifest_of
 from tacpipe.datasets import pages
 from tacpipe.datasets.attributes import OfRecordings
@@ -143,7 +143,7 @@ def _recordings_text(value: dict[str, Any], full: bool) -> list[str]:
             held = f"{figures['held_share']:.0%}" if "held_share" in figures else ""
             lines.append(
                 f"{cell} {stream or '-':<10} {figures['rows']:>7} {figures.get('columns', ''):>7} "
-                f"{figures.get('duration_s', ''):>8} {figures.get('rate_hz', '') or '':>8} {figures.get('gaps', ''):>5} "
+                f"{figures.get('duration_s', ''):>8} {figures.get('rate_hz', '') or '':>8} {gaps_text(figures):>5} "
                 f"{held:>5} {figures.get('saturated', ''):>9}"
             )
     if count > len(shown):

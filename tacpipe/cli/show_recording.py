@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict
 
 from tacpipe.channels import streams
-from tacpipe.channels.masks import GAP
+from tacpipe.channels.masks import GAP, gap_shares
 from tacpipe.errors import UsageError
 from tacpipe.io.tables import Group, Row, Table
 from tacpipe.metrics.headline import counted
@@ -45,6 +45,7 @@ class StreamFigures(TypedDict, total=False):
     rate_hz: float | None
     mean_hz: float
     gaps: int
+    gap_shares: dict[str, float]
     held_share: float
     saturated: int
 
@@ -211,11 +212,20 @@ def stream_figures(columns: Columns, clocks: streams.Clocks | None) -> StreamFig
         figures["rate_hz"] = clocks.rate_hz
         figures["mean_hz"] = round((columns.num_rows - 1) / clocks.duration_s, 3) if clocks.duration_s > 0 else 0.0
         figures["gaps"] = len(clocks.gap_starts_ns)
+    if shares := gap_shares(columns):
+        figures["gap_shares"] = {stream: round(share, 4) for stream, share in shares.items()}
     tactile = [field.name for field in columns.schema if (field.metadata or {}).get(b"quantity") == b"tactile"]
     integers = [name for name in tactile if pa.types.is_integer(columns.schema.field(name).type)]
     if integers and columns.num_rows > 1:
         figures["held_share"], figures["saturated"] = _repeated_and_saturated(columns, integers)
     return figures
+
+
+def gaps_text(figures: StreamFigures) -> str:
+    """Return the gaps of a stream: of synchronized rows the share that lies in a gap of the worst stream, else a count."""
+    if "gap_shares" in figures:
+        return f"{max(figures['gap_shares'].values()):.1%}"
+    return f"{figures['gaps']:,}" if "gaps" in figures else ""
 
 
 def _repeated_and_saturated(columns: Columns, names: Sequence[str]) -> tuple[float, int]:
@@ -269,9 +279,9 @@ def _streams_text(recording: RecordingOverview) -> str:
     rows = []
     for stream, figures in recording.streams.items():
         held = f"{figures['held_share']:.0%}" if "held_share" in figures else ""
-        values = [figures.get(key) for key in ("rows", "columns", "duration_s", "rate_hz", "mean_hz", "gaps")]
+        values = [figures.get(key) for key in ("rows", "columns", "duration_s", "rate_hz", "mean_hz")]
         cells = ["" if value is None else f"{value:,}" for value in values]
-        rows.append(Row((shown(stream) or "-", *cells, held, str(figures.get("saturated", "")))))
+        rows.append(Row((shown(stream) or "-", *cells, gaps_text(figures), held, str(figures.get("saturated", "")))))
     notes = [RATES, _MEAN_RATES] if recording.start_ns is not None else []
     if any(figures["rows"] > SAMPLED_ROWS and "saturated" in figures for figures in recording.streams.values()):
         notes.append(f"held and saturated are of the first {SAMPLED_ROWS:,} rows.")

@@ -25,6 +25,7 @@ from tacpipe.models.windows import ARM
 from tacpipe.printable import listed
 from tacpipe.sensors.plan import NAME as PLAN
 from tacpipe.sensors.plan import POSE
+from tacpipe.signals.resampling import GAP_NS
 from tacpipe.synchronization.causal import Grid, Rows
 from tacpipe.tasks.forward import planned, units
 from tacpipe.tasks.forward.causal import Arm, Rolling
@@ -68,6 +69,12 @@ class Forecast:
     quantiles: Float32s | None = (
         None  # (horizon, channel, quantile), above rest, of those asked for; None without `count`
     )
+
+
+def _gap_ms(synchronize: Any, forecaster: Forecaster, stream: str) -> float:
+    """Return the age above which the newest sample of a stream is in a gap: as the model's recordings had it."""
+    stored: Mapping[str, float] = forecaster.config.get("gap_ms", {})
+    return float(stored.get(stream, GAP_NS / 1e6) if synchronize.gap_ms is None else synchronize.gap_ms)
 
 
 class Beginning(NamedTuple):
@@ -120,7 +127,7 @@ class Chain:
         stages = causal_stages(steps)
         self._forecaster, self._stages, self._layout = forecaster, stages, layout
         sync = stages.synchronize
-        gap_ns = round(sync.gap_ms * 1e6)
+        gap_ns = {stream: round(_gap_ms(sync, forecaster, stream) * 1e6) for stream in layout.readings}
         origin_ns = None if beginning is None else beginning.origin_ns
         self._grid = Grid(layout.readings, layout.master, sync.grid, sync.rate_hz, gap_ns, origin_ns)
         if beginning is not None:

@@ -13,6 +13,8 @@ from tacpipe.arrays import AnyArray, Bools, Floats, Indices, Times
 from tacpipe.errors import TacpipeError
 from tacpipe.signals.rotations import continuous
 
+GAP_NS = 50_000_000  # longest time between two samples without a gap, of sensors of 20 Hz or more
+GAP_PERIODS = 2.5  # the same of slower sensors, in their periods
 PARALLEL = 1e-6  # rad; below this angle the sine weights of slerp divide by zero and linear ones are exact to 1e-13
 
 
@@ -153,6 +155,18 @@ def median_before(t_ns: Times, values: AnyArray, grid_ns: Times, span_ns: int) -
     for point in np.flatnonzero(newest > first):
         found[point] = np.median(values[first[point] : newest[point] + 1].astype(np.float64), axis=0)
     return found
+
+
+def default_gap_ns(t_ns: Times) -> int:
+    """Return the longest time between two samples of a stream without a gap: 50 ms, below 20 Hz 2.5 of its periods.
+
+    The period is the median step between its stamps.
+
+    >>> default_gap_ns(np.arange(5) * 10_000_000), default_gap_ns(np.arange(5) * 73_000_000)
+    (50000000, 182500000)
+    """
+    period_ns = float(np.median(np.diff(t_ns))) if len(t_ns) > 1 else 0.0
+    return GAP_NS if period_ns <= GAP_NS else round(GAP_PERIODS * period_ns)
 
 
 def in_gap(t_ns: Times, grid_ns: Times, gap_ns: int) -> Bools:

@@ -50,11 +50,12 @@ class Grid:
         master: str,
         kind: str,
         rate_hz: float,
-        gap_ns: int,
+        gap_ns: Mapping[str, int],
         origin_ns: int | None = None,
     ) -> None:
         """Make a grid of ``kind`` uniform, logged or fresh; ``master`` is one of ``streams``.
 
+        ``gap_ns`` is the age by stream above which its newest sample is in a gap.
         ``origin_ns`` is the first point of a uniform grid that is continued; None: the master's first sample is.
         """
         self._origin_ns = origin_ns
@@ -114,7 +115,7 @@ class Grid:
             values[name] = np.full((len(grid_ns), source.reading.width), np.nan)
             if len(at_ns):
                 newest_ns[name][begun], values[name][begun] = source.at(at_ns)
-                gap[name][begun] = is_overdue(newest_ns[name][begun], at_ns, self._gap_ns)
+                gap[name][begun] = is_overdue(newest_ns[name][begun], at_ns, self._gap_ns[name])
             source.forget(self._until_ns)
         return Rows(grid_ns, begun, newest_ns, gap, values)
 

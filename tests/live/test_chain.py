@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,9 +19,11 @@ from tacpipe.codecs.frame_stacking import breaks
 from tacpipe.errors import TacpipeError
 from tacpipe.live.chain import BLOCKING, Beginning, Cause, Chain, Forecast
 from tacpipe.tasks.forward import prediction, tracks
+from tacpipe.tasks.forward import task as forward
 from tacpipe.tasks.forward.forecaster import Forecaster
 from tacpipe.tasks.forward.predictors import forecasts
-from tests.fake_recordings import dataset
+from tests.asked import fitting
+from tests.fake_recordings import FakeRecording, dataset
 from tests.live import rigs
 from tests.live.rigs import MS, T0, Made
 
@@ -39,6 +42,7 @@ KINDS |= {
     "mixed with quantiles": {**KINDS["mixed"], "calibrated": True},
 }
 QUANTILES = {kind: (10, 95) for kind, values in KINDS.items() if "calibrated" in values}
+GAPS = ("t_ns", "xela1_gap", "xela2_gap", "robot_gap")
 GIVEN = rigs.recording(20, gap_ms=200.0)
 
 
@@ -299,3 +303,23 @@ def test_counts_that_had_run_over_their_end_are_continued_at_the_turn_that_is_ne
         second.push(name, table.slice(table.filter(rigs.until(table, half_ns)).num_rows))
     found = [one for one in second.advance(T0 + 2900 * MS) if one.count is not None]
     assert len(found) > 40 and same(found, [wanted[one.t_ns] for one in found])
+
+
+def test_a_chain_takes_from_the_model_how_long_slow_streams_may_pause(tmp_path: Path) -> None:
+    """The rows of sensors at 9 Hz follow one another by the gap of the training recordings, not by that of the session."""
+    slow = {name: table.take(np.arange(0, table.num_rows, 5)) for name, table in rigs.recording(4, 20.0).tables.items()}
+    given = FakeRecording(slow, "slow")
+    shards = [rigs.segmented(given, causal=True) for _ in range(2)]
+    stages = [rigs.step("synchronize", causal=True), rigs.step("segment.contacts")]
+    files = forward.train(fitting("train.forward", rigs.SMALL), dataset(shards[0]), dataset(shards[1]), tmp_path)
+    gap_ms = json.loads(files["config.json"])["gap_ms"]
+    steps = np.diff(slow["xela1"]["t_ns"].to_numpy()) / MS
+    assert gap_ms["xela1"] == pytest.approx(2.5 * np.median(steps)) and gap_ms["robot"] == pytest.approx(50.0, abs=90)
+    forecasts = rigs.whole((files, stages), given)
+    gaps = {forecast.t_ns: bool(forecast.gaps) for forecast in forecasts if Cause.START not in forecast.cause}
+    masks = {
+        t_ns: any(row)
+        for t_ns, *row in zip(*(shards[0].content[name].to_pylist() for name in GAPS), strict=True)
+        if t_ns in gaps
+    }
+    assert gaps == masks and sum(gaps.values()) < len(gaps) / 10

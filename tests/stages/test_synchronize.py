@@ -378,3 +378,27 @@ def test_what_a_live_session_records_of_itself_is_no_signal(shard: Recording) ->
     table, attributes = run(shard(streams))
     assert attributes["not_synchronized"] == "alarm, latency, plan, prediction"
     assert table.num_rows == len(t_ms)
+
+
+@pytest.mark.parametrize(("period_ms", "gap_ms"), [(20, 50.0), (50, 50.0), (73, 182.5)])
+def test_without_a_gap_a_slow_stream_may_pause_for_two_and_a_half_periods(
+    shard: Recording, period_ms: int, gap_ms: float
+) -> None:
+    t_ms = np.arange(0, 4000, period_ms)
+    t_ms = t_ms[(t_ms < 2000) | (t_ms > 3000)]  # a gap whichever the period
+    given = shard({"xela1": uskin(t_ms)})
+    table, attributes = run(given)
+    spelled_out, _ = run(given, gap_ms=gap_ms)
+    assert attributes["xela1_gap_ms"] == gap_ms
+    assert table.equals(spelled_out)
+    grid_ms = (table["t_ns"].to_numpy() - T0) / MS
+    before, after = t_ms[t_ms < 2000][-1], t_ms[t_ms > 3000][0]
+    assert table["xela1_gap"].to_pylist() == ((grid_ms > before) & (grid_ms < after)).tolist()
+
+
+def test_a_stream_with_many_rows_in_gaps_is_named_and_others_are_not(shard: Recording) -> None:
+    slow, fast = uskin(np.arange(0, 4000, 73)), robot(np.arange(0, 4000, 10))
+    given = shard({"xela1": slow, "robot": fast})
+    assert not synchronize(params(), given).notes
+    (note,) = synchronize(params(gap_ms=50.0), given).notes
+    assert "stream xela1" in note and "--gap-ms" in note

@@ -15,6 +15,7 @@ from tests.fake_recordings import FakeRecording
 
 T0 = 1_637_771_974_778_354_001
 MS = 1_000_000
+GAPS = {"a": 50_000_000, "b": 50_000_000}  # ns, by stream
 synchronize = load("synchronize")
 
 
@@ -38,7 +39,7 @@ READINGS = {"xela1": Reading(3, wraps=(0, 1, 2), compared=(0, 1, 2)), "near": Re
 def test_rows_are_those_of_the_stage_to_the_last_bit(kind: str, cuts: list[int], turned: bool) -> None:
     result = synchronize(synchronize.params(causal=True, grid=kind, gap_ms=20.0), FakeRecording(STREAMS))
     wanted = result.streams[""]
-    grid = Grid(READINGS, "xela1", kind, 50.0, 20 * MS)
+    grid = Grid(READINGS, "xela1", kind, 50.0, dict.fromkeys(READINGS, 20 * MS))
     last = max(int(table["t_ns"][-1].as_py()) for table in STREAMS.values())
     parts, before = [], T0 - 1
     for until_ns in [*sorted(T0 + cut * MS for cut in cuts if T0 + cut * MS < last), last]:
@@ -65,7 +66,7 @@ def test_rows_are_those_of_the_stage_to_the_last_bit(kind: str, cuts: list[int],
 
 
 def test_buffers_stay_small_however_long_samples_come() -> None:
-    grid = Grid({"a": Reading(2)}, "a", "uniform", 50.0, 50 * MS)
+    grid = Grid({"a": Reading(2)}, "a", "uniform", 50.0, GAPS)
     for block in range(200):
         grid.push("a", T0 + (block * 100 + np.arange(100)) * MS, np.zeros((100, 2)))
         assert len(grid.rows(T0 + (block * 100 + 99) * MS).t_ns) in (5, 6)
@@ -73,7 +74,7 @@ def test_buffers_stay_small_however_long_samples_come() -> None:
 
 
 def test_before_a_stream_has_begun_rows_say_so_and_name_who_is_waited_for() -> None:
-    grid = Grid({"a": Reading(1), "b": Reading(1)}, "a", "uniform", 50.0, 50 * MS)
+    grid = Grid({"a": Reading(1), "b": Reading(1)}, "a", "uniform", 50.0, GAPS)
     grid.push("a", T0 + np.arange(0, 100, 10) * MS, np.zeros((10, 1)))
     assert grid.waiting == ("b",)
     rows = grid.rows(T0 + 90 * MS)

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tacpipe.errors import TacpipeError
 from tacpipe.io import progress
 from tacpipe.metrics import conformal
 from tacpipe.metrics.quantiles import check_levels
@@ -71,10 +70,8 @@ def errors_of(forecaster: Forecaster, recordings: Dataset, most: int) -> Errors:
                 )
             advance(note=name)
     if not parts:
-        raise TacpipeError(
-            f"None of the {len(recordings.recordings)} recordings holds a window of {forecaster.context} and "
-            f"{forecaster.horizon} rows without a gap. Give longer recordings."
-        )
+        beginning = f"The {len(recordings.recordings)} recordings hold"
+        raise tracks.no_window(beginning, recordings, forecaster.context, forecaster.horizon)
     return Errors(*map(np.concatenate, zip(*parts, strict=True)))
 
 

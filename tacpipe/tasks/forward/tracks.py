@@ -28,7 +28,7 @@ from tacpipe.tasks.forward.slip_labels import slips_of
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from tacpipe.datasets.dataset import Recording
+    from tacpipe.datasets.dataset import Dataset, Recording
     from tacpipe.io.columns import Columns
     from tacpipe.io.mapped import MappedArrays
 
@@ -111,6 +111,16 @@ class Track:
         same = np.concatenate([[0], np.cumsum(np.diff(self.contact) != 0)])[: len(self.contact)]
         groups = self.groups * (int(same.max(initial=0)) + 1) + same
         return window_starts(groups, self.usable & (self.contact >= 0), context, horizon, stride)
+
+
+def no_window(beginning: str, recordings: Dataset, context: int, horizon: int) -> TacpipeError:
+    """Return the error for recordings without a window; where gaps may be the cause, it names them.
+
+    ``beginning`` are its first words, such as ``The training recordings hold``.
+    """
+    gaps = masks.describe_gaps(*(recording.columns() for recording in recordings.recordings.values()))
+    advice = gaps or ["Give more or longer recordings, or shorten context and horizon."]
+    return TacpipeError(f"{beginning} no window of {context} and {horizon} rows without a gap. {' '.join(advice)}")
 
 
 def codec_of(table: pa.Table, files: Mapping[str, bytes], name: str = "") -> codecs.Codec:

@@ -15,6 +15,7 @@ from safetensors.torch import save as save_tensors
 from torch import nn
 
 from tacpipe.arrays import AnyFloats, Int64s
+from tacpipe.channels import masks
 from tacpipe.channels.pose import NAMED, Pose
 from tacpipe.codecs import codec as codecs
 from tacpipe.codecs.frame_stacking import INCREMENTS
@@ -91,6 +92,9 @@ def train(
     known, watched = (
         _windows(part, params, stride, device, aside) for part, stride in zip(parts, (params.stride, 1), strict=True)
     )
+    for role, dataset, windows in (("training", training, known), ("validation", validation, watched)):
+        if not len(windows.starts):
+            raise tracks.no_window(f"The {role} recordings hold", dataset, params.context, params.horizon)
     _check_channels(codec, parts[0])
     build = partial(_built, params, codec, known, start, device)
     schedule = loop.Schedule.of(params, params.seed, params.gradient_clip)
@@ -100,6 +104,7 @@ def train(
     config: Config = {
         **_description(params, codec, pose, unit, reference),
         "rate_hz": rate_hz,
+        "gap_ms": _gap_ms(training),
         "timeline": parts[0][0].timeline,
         "scaling": _scaling(parts[0], aside),
         "largest_level": max(largest_level(one.tactile[some]) for one, some in _usable(parts[0], aside)),
@@ -152,6 +157,16 @@ def _description(params: Params, codec: codecs.Codec, pose: Pose, unit: str, ref
             **({} if pose == NAMED else {"pose": {"position": pose.position, "orientation": pose.orientation}}),
         },
     }
+
+
+def _gap_ms(training: Dataset) -> dict[str, float]:
+    """Return the longest time without a gap by stream, the median over the recordings that state one."""
+    values: dict[str, list[float]] = {}
+    for recording in training.recordings.values():
+        for name, value in recording.attributes.items():
+            if name.endswith(masks.GAP_MS) and value is not None:
+                values.setdefault(name.removesuffix(masks.GAP_MS), []).append(float(value))
+    return {stream: float(np.median(several)) for stream, several in sorted(values.items())}
 
 
 def _alarms(forecaster: Forecaster, part: Sequence[Track]) -> dict[str, Any]:

@@ -298,6 +298,15 @@ def test_training_without_recordings_windows_or_touch_is_refused(tmp_path: Path)
         forward.train(params(), still, dataset(*VAL), tmp_path)
 
 
+def test_an_error_that_gaps_cause_names_the_stream_and_the_option(tmp_path: Path) -> None:
+    paused = [
+        dataclasses.replace(one, content=one.content.append_column("sole_gap", pa.array(np.arange(80) % 4 > 0)))
+        for one in TRAIN
+    ]
+    with pytest.raises(TacpipeError, match=r"training recordings hold no window.*stream sole.*--gap-ms"):
+        forward.train(params(), dataset(*paused), dataset(*VAL), tmp_path)
+
+
 def test_training_on_rows_of_another_rate_or_grid_than_validation_is_refused(tmp_path: Path) -> None:
     fresh = dataclasses.replace(VAL[0], attributes={"grid": "fresh"})
     with pytest.raises(TacpipeError, match="not of one grid"):
