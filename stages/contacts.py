@@ -13,6 +13,7 @@ from tacpipe.errors import UsageError
 from tacpipe.plugins.constraints import NonNegativeFloat, PositiveFloat, Unit
 from tacpipe.plugins.params import added
 from tacpipe.plugins.stage import Attribute, RecordingOutput, stage
+from tacpipe.plugins.stream_selection import StreamSelection
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Params:
+class Params(StreamSelection):
     """What counts as contact, and as the level without load.
 
     Thresholds in counts are for streams in counts, and stem from 52 published pick-and-move trials of a XELA uSkin: at

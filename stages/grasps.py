@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins.constraints import Fraction, NonNegativeFloat, PositiveFloat, PositiveInt, Seed, StoredAs, Unit
 from tacpipe.plugins.stage import RecordingOutput, stage
+from tacpipe.plugins.stream_selection import StreamSelection
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -18,7 +19,7 @@ FINISHED = ("cloud", "grasp")
 
 
 @dataclass(frozen=True)
-class Params:
+class Params(StreamSelection):
     """What counts as the grasped object in a camera's view, and as contact in the readings of two BioTac SP.
 
     Lengths suit a depth camera a metre or so above a table, whose noise is 2 mm there.

@@ -19,6 +19,7 @@ from tacpipe.plugins.constraints import (
 )
 from tacpipe.plugins.params import added
 from tacpipe.plugins.stage import Attribute, RecordingOutput, stage
+from tacpipe.plugins.stream_selection import StreamSelection
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -33,7 +34,7 @@ _KEPT_WHOLE = (
 
 
 @dataclass(frozen=True)
-class Params:
+class Params(StreamSelection):
     """Where a slide begins and ends, which of its frames are kept, and what the protocol of the recordings was.
 
     The defaults are those of the published BioTac slides: 25 mm/s over 0.2 m (one material 0.15 m), begun when the

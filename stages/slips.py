@@ -13,6 +13,7 @@ from tacpipe.channels.streams import COUNT, of_quantity, unit_of
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.plugins.constraints import NonNegativeFloat, PositiveFloat, PositiveInt, Unit
 from tacpipe.plugins.stage import stage
+from tacpipe.plugins.stream_selection import StreamSelection
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -24,7 +25,7 @@ EVEN = 0.01  # of a step between rows, by which it may differ from the others fo
 
 
 @dataclass(frozen=True)
-class Params:
+class Params(StreamSelection):
     """What counts as slip and as drop, in the readings of a proximity sensor that looks at the held object.
 
     Thresholds are in multiples of the noise of the readings' rate after the grasp. Readings in a unit of length are

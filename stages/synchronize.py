@@ -17,6 +17,7 @@ from tacpipe.errors import UsageError
 from tacpipe.plugins.constraints import PositiveFloat, Rate, Unit
 from tacpipe.plugins.params import added
 from tacpipe.plugins.stage import Attribute, RecordingOutput, stage
+from tacpipe.plugins.stream_selection import StreamSelection
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Params:
+class Params(StreamSelection):
     """The grid, the clock that places samples on it, and what counts as a gap."""
 
     rate_hz: Rate = 50.0  # rate of the uniform grid

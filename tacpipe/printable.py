@@ -6,8 +6,10 @@ import re
 import reprlib
 import unicodedata
 from collections.abc import Iterable, Mapping
+from datetime import UTC, datetime
 from typing import Any
 
+WALL_CLOCK_NS = 10**18  # stamps above this, in 2001, count from 1970
 _WIDE = ("W", "F")  # of East Asian letters, which take two cells
 _SHORT = reprlib.Repr()  # looks no deeper and no further than it prints, so that aliases of aliases cost nothing
 _SHORT.maxlevel = 2
@@ -84,6 +86,18 @@ def shown(text: str) -> str:
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() or unicodedata.category(c) == "Zs" else ascii(c)[1:-1] for c in text)
+
+
+def moment(t_ns: int) -> str:
+    """Return a stamp as a date in UTC where it counts from 1970, else as seconds.
+
+    >>> moment(1_396_293_889_366_115_136), moment(2_500_000_000)
+    ('2014-03-31 19:24:49.366 UTC', '2.500 s')
+    """
+    if t_ns < WALL_CLOCK_NS:
+        return f"{t_ns / 1e9:.3f} s"
+    at = datetime.fromtimestamp(t_ns // 10**9, UTC)
+    return f"{at:%Y-%m-%d %H:%M:%S}.{t_ns // 10**6 % 1000:03d} UTC"
 
 
 def lines(texts: Iterable[str]) -> str:

@@ -71,6 +71,9 @@ FREE = {  # params that are any text, and why
     "export.zarr.master": "the name of a stream",
 }
 
+SELECTING = [name for name in STAGES if name.startswith(("ingest.", "segment.", "synchronize"))]
+FREE |= {f"{name}.{field}": "names of streams" for name in SELECTING for field in ("streams", "without")}
+
 
 def each() -> Iterator[tuple[str, Any, str, Any]]:
     """Yield stage, kind of params, name and annotation of every field."""
@@ -122,6 +125,14 @@ def test_every_param_is_a_choice_a_range_a_list_a_truth_or_free_for_a_reason() -
     }
     assert free == set(FREE)
     assert len(RANGED) > 100 and len(CHOICES) > 40
+
+
+@pytest.mark.parametrize("name", SELECTING)
+def test_streams_are_selected_by_the_same_options_which_are_in_keys_only_where_they_are_given(name: str) -> None:
+    kind = params_of.kinds(registry.load(name))[0]
+    given = {"layout": json.dumps({"streams": {}})} if name == "ingest.table" else {}
+    assert not {"streams", "without"} & set(params_of.to_json(kind(**given)))
+    assert params_of.to_json(kind(**given, without="a"))["without"] == "a"
 
 
 @pytest.mark.parametrize("key", RANGED, ids=lambda key: f"{key[0]}.{key[1].__name__}.{key[2]}")

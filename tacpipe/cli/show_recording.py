@@ -15,7 +15,7 @@ from tacpipe.channels.masks import GAP, gap_shares
 from tacpipe.errors import UsageError
 from tacpipe.io.tables import Group, Row, Table
 from tacpipe.metrics.headline import counted
-from tacpipe.printable import listed, plain, shown
+from tacpipe.printable import WALL_CLOCK_NS, listed, plain, shown
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -28,7 +28,6 @@ SAMPLED_ROWS = 1 << 20  # first rows of a stream, in which repeated rows and sat
 _LISTED = 6  # gaps, spans and events before the remaining ones are counted
 _LABELS = 40  # labels of the recording
 _NAMED = 5  # recordings that an error names
-_WALL_CLOCK_NS = 10**18  # stamps above this, in 2001, count from 1970
 RATES = "Hz: by the device's counter `seq`, else by the median step, so lost samples do not lower it."
 _MEAN_RATES = (
     "mean Hz: rows per second of the recorded stamps; the labels STREAM_rate_hz are the same on the clock that "
@@ -259,7 +258,7 @@ def to_text(recording: RecordingOverview, *, full: bool = False) -> str:
     head = [shown(recording.name)]
     if recording.duration_s is not None:
         head.append(f"{recording.duration_s:.3f} s")
-    if recording.start_ns is not None and recording.start_ns > _WALL_CLOCK_NS:
+    if recording.start_ns is not None and recording.start_ns > WALL_CLOCK_NS:
         head.append(f"from {datetime.fromtimestamp(recording.start_ns // 10**9, UTC):%Y-%m-%d %H:%M:%S} UTC")
     head.append(f"{rows:,} rows, {recording.bytes / 1e6:.1f} MB, made by {recording.stage} [{recording.digest[:12]}]")
     sections = [

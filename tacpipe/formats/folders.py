@@ -12,12 +12,13 @@ from tacpipe.datasets import recording_names
 from tacpipe.errors import TacpipeError
 from tacpipe.io.files import walk
 from tacpipe.plugins.stage import Files
+from tacpipe.plugins.stream_selection import StreamSelection
 
 PREFIX = "data_sample_"
 
 
 @dataclass(frozen=True)
-class Params:
+class Params(StreamSelection):
     """How trials are read."""
 
     # part of the authors' split that this folder is; empty: none

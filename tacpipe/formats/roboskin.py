@@ -23,6 +23,7 @@ from tacpipe.io import regular
 from tacpipe.io.files import walk
 from tacpipe.plugins.constraints import Rate
 from tacpipe.plugins.stage import Attribute, Files, RecordingOutput, stage
+from tacpipe.plugins.stream_selection import StreamSelection
 from tacpipe.printable import excerpt, plain
 
 if TYPE_CHECKING:
@@ -43,7 +44,7 @@ KIND = re.compile(r"[<>|=]?[bfiu](\d)")  # of numbers, with the bytes of each
 
 
 @dataclass(frozen=True)
-class Params:
+class Params(StreamSelection):
     """How slides are read."""
 
     rate_hz: Rate = 50.0  # frames a second that stamps are made from; nominal, the set does not state

@@ -23,6 +23,7 @@ from tacpipe.io.files import walk
 from tacpipe.io.hashing import remembered_file_digest
 from tacpipe.plugins.constraints import NonNegativeFloat, Unit
 from tacpipe.plugins.stage import Files, RecordingOutput, stage
+from tacpipe.plugins.stream_selection import StreamSelection
 from tacpipe.printable import plain
 
 if TYPE_CHECKING:
@@ -38,7 +39,7 @@ POINTS, WITH_WRIST = 6, 15  # numbers of a grasp: two points, and with them the 
 
 
 @dataclass(frozen=True)
-class Params:
+class Params(StreamSelection):
     """What counts as a grasp of the cloud."""
 
     # largest distance of a grasp point from the nearest point of the cloud

@@ -31,7 +31,7 @@ import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic, ParamSpec, Protocol, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, ParamSpec, Protocol, TypeAlias, TypeVar, cast
 
 from tacpipe.errors import TacpipeError
 
@@ -142,8 +142,15 @@ class Stage(Generic[P, R]):
     as_given: Callable[[Any], bool] | None = None
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
-        """Return what the function returns: no store is involved."""
-        return self.function(*args, **kwargs)
+        """Return what the function returns, for the streams that its params select: no store is involved."""
+        params: Any = args[0] if args else kwargs.get("params")
+        if not hasattr(params, "narrow"):  # a `StreamSelection`
+            return self.function(*args, **kwargs)
+        bound = inspect.signature(self.function).bind(*args, **kwargs)
+        if name := self.argument("Recording"):
+            bound.arguments[name] = params.narrow(bound.arguments[name])
+        output = self.function(*bound.args, **bound.kwargs)
+        return cast("R", params.narrow_output(output)) if self.source else output
 
     @functools.cached_property
     def arguments(self) -> dict[str, str]:

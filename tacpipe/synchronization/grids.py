@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
+from tacpipe import printable
 from tacpipe.channels.absent import absent
 from tacpipe.errors import TacpipeError
 from tacpipe.synchronization.methods import listed
@@ -57,9 +58,12 @@ def grid(
         within &= np.append(np.diff(grid_ns) > 0, True)
     rows = np.flatnonzero(within)
     if not len(rows):
+        late = max(streams.values(), key=lambda stream: int(stream.t_ns[0]))
+        early = min(streams.values(), key=lambda stream: int(stream.t_ns[-1]))
         raise TacpipeError(
-            f"Recording {recording}: its streams have no time in common: the last to start does so at {first} ns and "
-            f"the first to end at {last} ns. Check their clocks, or exclude the recording."
+            f"Recording {recording}: its streams have no time in common, or no row of {master.name} lies in it. "
+            f"Stream {late.name} starts last, at {printable.moment(int(late.t_ns[0]))}, and {early.name} ends first, at "
+            f"{printable.moment(int(early.t_ns[-1]))}. Leave one of them out with --without, or check their clocks."
         )
     return grid_ns[rows], rows
 

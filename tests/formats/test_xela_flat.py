@@ -191,3 +191,10 @@ def test_the_published_trials_are_read_as_they_were_counted() -> None:
         assert {rows["robot"], rows["marker1"]} <= {rows["xela1"], rows["xela1"] - 1}
         rate_hz = recording.attributes["rate_hz"]
         assert isinstance(rate_hz, float) and 31.9 < rate_hz < 46.1
+
+
+def test_selected_streams_are_those_of_the_whole_recording(flat_trial: Trial) -> None:
+    folder = flat_trial()
+    whole, tactile = read(folder), read(folder, Params(streams="xela*"))
+    assert sorted(tactile.streams) == ["xela1", "xela2"] and tactile.attributes == whole.attributes
+    assert all(tactile.streams[name].equals(whole.streams[name]) for name in tactile.streams)

@@ -327,3 +327,15 @@ def test_each_published_trial_has_one_contact_that_begins_before_the_lift(shard:
         assert touched(found)[0] < lifted
         ends = touched(found)[-1] == synced.column("t_ns")[-1].as_py()
         assert ends or recording.attributes["dropped"]
+
+
+def test_contacts_of_selected_streams_are_those_of_a_recording_with_these_streams_only(shard: Recording) -> None:
+    first, second = table([0.0] * 50 + [500.0] * 50), table([0.0] * 20 + [500.0] * 80, "xela2")
+    both = first
+    for name in second.column_names[1:]:
+        both = both.append_column(second.schema.field(name), second.column(name))
+    given = shard({"": both})
+    alone = contacts(segment.params(), shard({"": second}))
+    assert contacts(segment.params(on_count=600.0), given).num_columns == 14
+    assert contacts(segment.params(streams="xela2"), given).equals(alone)
+    assert contacts(segment.params(without="xela1"), given).equals(alone)

@@ -402,3 +402,24 @@ def test_a_stream_with_many_rows_in_gaps_is_named_and_others_are_not(shard: Reco
     assert not synchronize(params(), given).notes
     (note,) = synchronize(params(gap_ms=50.0), given).notes
     assert "stream xela1" in note and "--gap-ms" in note
+
+
+def test_streams_without_a_common_time_are_named_with_dates_and_can_be_left_out(shard: Recording) -> None:
+    early, late = robot(np.arange(0, 100)), robot(np.arange(300, 400))
+    given = shard({"xela1": uskin(np.arange(0, 200)), "early": early, "late": late})
+    with pytest.raises(TacpipeError) as raised:
+        run(given)
+    stated = str(raised.value)
+    assert "late starts last, at 2021-11-24 16:39:35.078 UTC" in stated
+    assert "early ends first, at 2021-11-24 16:39:34.877 UTC" in stated and "--without" in stated
+    alone, _ = run(shard({"xela1": uskin(np.arange(0, 200)), "early": early}))
+    for values in ({"without": "late"}, {"streams": "xela1, early"}, {"streams": "*1,e*", "without": "l*"}):
+        assert run(given, **values)[0].equals(alone)
+
+
+def test_a_stream_that_is_selected_and_does_not_exist_is_refused_with_a_near_name(shard: Recording) -> None:
+    given = shard({"xela1": uskin(np.arange(0, 200)), "robot": robot(np.arange(0, 100))})
+    with pytest.raises(TacpipeError, match=r"no stream 'rob0t', which --without names; it has .*Did you mean robot"):
+        run(given, without="rob0t")
+    with pytest.raises(TacpipeError, match="no stream left"):
+        run(given, without="*")

@@ -13,6 +13,7 @@ from tacpipe.formats.table import layout as layouts
 from tacpipe.formats.table import pattern
 from tacpipe.plugins.constraints import TomlFile
 from tacpipe.plugins.stage import Files, RecordingOutput, Shared, Source, Values
+from tacpipe.plugins.stream_selection import StreamSelection
 
 if TYPE_CHECKING:
     from tacpipe.formats.containers.container import Share
@@ -24,7 +25,7 @@ STATED = "stated"  # what else a container states of the recording, where not al
 
 
 @dataclass(frozen=True)
-class Params:
+class Params(StreamSelection):
     """What the files do not state of themselves."""
 
     layout: Annotated[str, TomlFile()] = ""  # layout file, for what the files do not state; --guess prints one

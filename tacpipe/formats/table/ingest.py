@@ -18,10 +18,11 @@ from tacpipe.errors import UsageError
 from tacpipe.formats.table import layout as layouts
 from tacpipe.plugins.constraints import TomlFile
 from tacpipe.plugins.stage import Files, RecordingOutput, Shared, Source, Values, stage
+from tacpipe.plugins.stream_selection import StreamSelection
 
 
 @dataclass(frozen=True)
-class Params:
+class Params(StreamSelection):
     """How the tables are laid out."""
 
     layout: Annotated[str, TomlFile()] = ""  # layout file; docs/tutorials/own-data.md describes its entries

@@ -1,0 +1,99 @@
+"""Select streams of recordings by the options ``--streams`` and ``--without`` of stages."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from tacpipe.errors import TacpipeError
+from tacpipe.plugins.constraints import CommaList, Names
+from tacpipe.plugins.params import added
+from tacpipe.plugins.stage import RecordingOutput
+from tacpipe.printable import suggestion
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+WILDCARDS = "*?["
+
+
+@dataclass(frozen=True, kw_only=True)
+class StreamSelection:
+    """Params of a stage that reads or writes some streams of recordings; `Stage` calls the methods."""
+
+    PANELS: ClassVar[Mapping[str, Sequence[str]]] = {"Streams": ("streams", "without")}
+
+    streams: Names = added("")  # names of streams to read, with * as wildcard; empty: all
+    without: Names = added("")  # names of streams to leave out, with * as wildcard
+
+    def narrow(self, recording: Any) -> Any:
+        """Return a recording with the selected streams; of a synchronized one with the columns of these streams.
+
+        Raises `TacpipeError` where the recording has no stream of a name, or where no stream is left.
+        """
+        if not (self.streams or self.without):
+            return recording
+        if set(recording.streams) != {""}:
+            return _Narrowed(recording, self._select(recording.name, recording.streams))
+        table = recording.table()
+        owners = [(field.metadata or {}).get(b"stream", b"").decode() for field in table.schema]
+        selected = self._select(recording.name, sorted({owner for owner in owners if owner}))
+        names = [
+            field.name
+            for field, owner in zip(table.schema, owners, strict=True)
+            if not owner or owner in selected or field.name == "t_ns"
+        ]
+        return _Narrowed(recording, [""], table.select(names))
+
+    def narrow_output(self, output: RecordingOutput) -> RecordingOutput:
+        """Return the selected streams of a recording that was read from files; raises as `narrow`."""
+        if not (self.streams or self.without):
+            return output
+        selected = self._select("", output.streams)
+        return replace(output, tables={stream: output.streams[stream] for stream in selected})
+
+    def _select(self, recording: str, names: Iterable[str]) -> list[str]:
+        names = list(names)
+        requested = self._matching(recording, names, "--streams", self.streams) if self.streams else names
+        left_out = self._matching(recording, names, "--without", self.without)
+        selected = [name for name in names if name in requested and name not in left_out]
+        if not selected:
+            raise TacpipeError(f"{_described(recording)} has no stream left; it has {', '.join(names)}. Select others.")
+        return selected
+
+    @staticmethod
+    def _matching(recording: str, names: Sequence[str], option: str, text: str) -> set[str]:
+        matching: set[str] = set()
+        for pattern in CommaList().items(text):
+            matches = [name for name in names if fnmatchcase(name, pattern)]
+            if not matches and not any(sign in pattern for sign in WILDCARDS):
+                raise TacpipeError(
+                    f"{_described(recording)} has no stream {pattern!r}, which {option} names; it has "
+                    f"{', '.join(names)}.{suggestion(pattern, names)}"
+                )
+            matching.update(matches)
+        return matching
+
+
+def _described(recording: str) -> str:
+    return f"Recording {recording}" if recording else "The recording"
+
+
+class _Narrowed:
+    """A recording with some of its streams; ``table`` is the only one of a synchronized recording."""
+
+    def __init__(self, recording: Any, streams: Sequence[str], table: pa.Table | None = None) -> None:
+        self._recording, self._table = recording, table
+        self.streams = tuple(streams)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._recording, name)
+
+    def table(self, stream: str = "", columns: Sequence[str] | None = None) -> pa.Table:
+        """Return a stream, as `tacpipe.datasets.dataset.Recording.table` does."""
+        if self._table is None or stream:
+            table: pa.Table = self._recording.table(stream, columns)
+            return table
+        return self._table if columns is None else self._table.select(list(columns))
