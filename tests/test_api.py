@@ -386,6 +386,48 @@ def test_windows_go_through_a_loader_in_worker_processes_and_read_nothing_before
     assert torch.cat([batch["t_ns"] for batch in batches]).shape == (40, 3)
 
 
+def test_windows_separate_inputs_and_targets_by_names_and_patterns(four: Dataset) -> None:
+    windows = four.windows(2, 1, inputs=["arm_*", "left_?"], targets=["left_x"])
+    assert (windows.inputs, windows.targets) == (("arm_force_n", "left_x"), ("left_x",))
+    assert windows.columns == ("arm_force_n", "left_x")
+    window = windows[3]
+    assert window["past"].tolist() == [[1.5, 3.0], [2.0, 4.0]]
+    assert window["future"].tolist() == [[5.0]]
+    assert four.windows(2, 1, targets=["left_*"]).inputs == ("left_x", "arm_force_n")  # masks match no pattern
+    assert four.windows(2, 1, columns=["*_x"]).columns == ("left_x",)  # and neither does ground truth
+    with pytest.raises(tacpipe.UsageError, match=r"right_\*.*left_x"):
+        len(four.windows(2, 1, inputs=["right_*"]))
+    with pytest.raises(tacpipe.UsageError, match="columns"):
+        four.windows(2, 1, columns=["left_x"], inputs=["left_x"])
+
+
+def test_windows_subtract_the_level_at_rest_of_tactile_channels(four: Dataset) -> None:
+    windows = four.windows(2, 1, rest_s=0.08)  # rows 0 to 4, whose median is 2
+    assert windows[0]["past"].tolist() == [[-2.0, 0.0], [-1.0, 0.5]]
+    with pytest.raises(tacpipe.UsageError, match="tactile"):
+        len(four.windows(2, 1, columns=["arm_*"], rest_s=0.08))
+    with pytest.raises(tacpipe.UsageError, match="rest_s"):
+        four.windows(2, 1, rest_s=0)
+
+
+def test_windows_are_scaled_by_the_rows_that_they_hold_or_as_others_are(lab: Lab) -> None:
+    tables = {"a": synced(nan=11), "b": synced(7, gap=0)}  # the last row of a and the first of b are in no window
+    found = publish(lab, "data/w", {name: {"": table} for name, table in tables.items()})
+    rows = np.concatenate([np.arange(11.0), np.arange(1, 7.0)])  # of left_x
+    windows = found.windows(2, 1, inputs=["left_x"], targets=["arm_force_n"], scale=True, dtype="float64")
+    np.testing.assert_allclose(windows[4]["past"][:, 0], (np.array([4, 5]) - rows.mean()) / rows.std())
+    np.testing.assert_allclose(windows[4]["future"][0], (6 / 2 - rows.mean() / 2) / (rows.std() / 2))
+    np.testing.assert_allclose(windows.unscaled(windows[4]["future"]), [[3.0]])
+    one = found.select("b").windows(2, 1, columns=["left_x"], scale=windows, dtype="float64")
+    np.testing.assert_allclose(one[0]["past"][:, 0], (np.array([1, 2]) - rows.mean()) / rows.std())
+    sent = pickle.loads(pickle.dumps(one))
+    assert torch.equal(sent[0]["past"], one[0]["past"])
+    with pytest.raises(tacpipe.UsageError, match="not scaled"):
+        found.windows(2, 1, scale=found.windows(2, 1))[0]
+    with pytest.raises(tacpipe.UsageError, match="arm_force_n"):
+        found.windows(2, 1, scale=found.windows(2, 1, columns=["left_x"], scale=True))[0]
+
+
 def test_windows_refuse_unlike_channels_and_integers_that_they_would_round(lab: Lab) -> None:
     long = pa.table({"t_ns": [0, 1, 2], "x": [1 << 24, (1 << 24) + 1, 0]})
     one = publish(lab, "data/long", {"a": {"": long}})

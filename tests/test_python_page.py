@@ -1,4 +1,4 @@
-"""The Python of docs/python.md runs as printed, in a project in which the commands of the tutorial ran."""
+"""The Python of docs/python.md runs as printed, in the project that the first commands of the README make."""
 
 from __future__ import annotations
 
@@ -9,44 +9,35 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import tacpipe
-from tests.test_docs import blocks
+from tests.test_docs import PYTHON, ROOT, fenced, printed, section
 
-PAGE = Path(__file__).parents[1] / "docs" / "python.md"
-COMMANDS = (
-    "simulate forward --trials 12 --duration-s 5 -o data/recordings",
-    "label data/recordings * --set object=cup",
-    "synchronize data/recordings -o data/synced --rate-hz 25",
-    "segment contacts data/synced -o data/segments",
-    "split data/segments -o data/split",
-    "train forward data/segments --split data/split -o models/forward --epochs 1 --hidden 8 --stride 2",
-    "evaluate models/forward data/segments --split data/split -o results/forward",
-    "predict models/forward data/synced -o data/predicted",
-)
+FIRST_COMMANDS = "Sixty seconds on simulated recordings"  # section of the README
 CHECKS = """
 import html
 import pyarrow.compute as pc
-wanted = tacpipe.open("data/predicted")
-assert m.predict(d).equals(wanted.table()), "the whole dataset"
-table = wanted.table().filter(pc.equal(wanted.table()["recording"], "trial-003"))
-one = m.predict(d["trial-003"])
-assert one.num_rows and one.drop_columns("recording").equals(table.drop_columns("recording")), "one recording"
-assert len(d) == len(d.labels) == 12 and (d.labels["object"] == "cup").all()
+
+predicted = tacpipe.open("data/predicted").table()
+assert everything.equals(predicted), "the whole dataset"
+table = predicted.filter(pc.equal(predicted["recording"], "trial-003"))
+assert forecast.num_rows and forecast.drop_columns("recording").equals(table.drop_columns("recording")), "one recording"
+assert len(d) == len(d.labels) == 12
 text = repr(d)
-assert all(word in text for word in ("synchronize", "12", "25 Hz", "xela1", "cup")), text
-assert "<table" in d._repr_html_() and html.escape("cup") in d._repr_html_()
-train = d.select(split="data/split", role="train", object="cup")
+assert all(word in text for word in ("synchronize", "12", "50 Hz", "xela1", "bottle")), text
+assert "<table" in d._repr_html_() and html.escape("bottle") in d._repr_html_()
 roles = tacpipe.open("data/split").to_pandas()
-assert set(train.recordings) == set(roles.recording[roles.role == "train"])
-assert set(train.to_pandas()["recording"]) == set(train.recordings)
-assert (train.to_pandas(labels=["object"])["object"] == "cup").all()
+assert set(train.recordings) == set(roles.recording[roles.role == "train"]) == set(frame["recording"])
+assert (frame["object"] == frame["recording"].map(d.labels["object"]).astype(frame["object"].dtype)).all()
 assert train.to_polars().shape == train.to_arrow().shape == train.to_pandas().shape
-rows = train.duckdb().sql("select count(*) from data join labels using (recording) where object = 'cup'").fetchall()
-assert rows == [(len(train.to_pandas()),)]
-counts = sum(len(batch["recording"]) for batch in loader)
-assert counts == len(d.windows(10, 10)) > 100
+assert set(peaks.df()["object"]) == set(train.labels["object"])
+assert set(bottles.labels["object_class"]) == {"bottle"}
+names = [name for name in raw.table("xela1").column_names if name.startswith("taxel")]
+assert len(names) == 48 and set(names) < set(recording.table("xela1").column_names)
 batch = next(iter(loader))
-assert batch["past"].shape == batch["future"].shape == (64, 10, len(loader.dataset.columns))
-assert batch["t_ns"].shape == (64, 20)
+assert batch["past"].shape == (64, 10, 99) and batch["future"].shape == (64, 10, 96) and batch["t_ns"].shape == (64, 20)
+whole = torch.cat([window["past"] for window in windows])
+assert whole.mean(dim=0).abs().max() < 0.5 and (whole.std(dim=0) - 1).abs().max() < 0.5
+bare = test.windows(10, 10, inputs=windows.inputs, targets=windows.targets, rest_s=0.5)
+assert torch.allclose(counts, bare[0]["future"], atol=0.1)
 assert report.name == "report.html" and report.read_text().startswith("<!doctype html>") and len(segments) == 12
 """
 
@@ -54,9 +45,11 @@ assert report.name == "report.html" and report.read_text().startswith("<!doctype
 @pytest.mark.long
 def test_the_python_of_the_page_runs_as_printed_and_predicts_what_the_command_writes(tmp_path: Path) -> None:
     (tmp_path / ".tacpipe").mkdir()
-    for command in COMMANDS:
+    (block, *_) = (block for block in fenced(section((ROOT / "README.md").read_text(), FIRST_COMMANDS)))
+    commands = [command.removeprefix("tacpipe ") for command, _ in printed(block.text)]
+    for command in [*commands, "predict models/forward data/synced -o data/predicted"]:
         done = tacpipe(tmp_path, command, OMP_NUM_THREADS="1")
         assert done.returncode == 0, f"{command}: {done.stderr}"
-    code = "\n".join([*blocks(PAGE.read_text(), "python"), CHECKS])
+    code = "\n".join([*(block.text for block in fenced(PYTHON.read_text()) if not block.mark), CHECKS])
     ran = subprocess.run([sys.executable, "-W", "error", "-c", code], cwd=tmp_path, capture_output=True, text=True)
     assert ran.returncode == 0, ran.stderr

@@ -349,19 +349,39 @@ class Dataset:
         *,
         stream: str | None = None,
         columns: Sequence[str] | None = None,
+        inputs: Sequence[str] | None = None,
+        targets: Sequence[str] | None = None,
+        rest_s: float | None = None,
+        scale: bool | Windows = False,
         stride: int = 1,
         dtype: Literal["float32", "float64"] = "float32",
     ) -> Windows:
         """Return the windows of all recordings as a map-style torch dataset; see `tacpipe.datasets.windows.Windows`.
 
-        Each is ``context`` past rows and ``horizon`` future ones of the channels, or of ``columns``; the next one begins
-        ``stride`` rows later. None crosses a gap or the end of a recording.
+        Each is ``context`` past rows of the ``inputs`` and ``horizon`` future ones of the ``targets``; the next one begins
+        ``stride`` rows later. None crosses a gap or the end of a recording. Channels are given by names or patterns
+        (``"xela1_*"``); ``columns`` are inputs and targets at once, and without any of them all channels are both.
+
+        ``rest_s`` subtracts from each tactile channel its level at rest, the median over the first ``rest_s`` seconds of the
+        recording. ``scale`` subtracts each channel's mean and divides by its standard deviation: of these windows (True), or
+        of other ones, such as those to train on.
         """
         with extras.named("windows"):
             from tacpipe.datasets.windows import Windows
 
-        name = self._only_stream() if stream is None else stream
-        return Windows(self, context, horizon, stream=name, columns=columns, stride=stride, dtype=dtype)
+        return Windows(
+            self,
+            context,
+            horizon,
+            stream=self._only_stream() if stream is None else stream,
+            columns=columns,
+            inputs=inputs,
+            targets=targets,
+            rest_s=rest_s,
+            scale=scale,
+            stride=stride,
+            dtype=dtype,
+        )
 
     def to_numpy(self, stream: str | None = None, columns: Sequence[str] | None = None) -> dict[str, Arrays]:
         """Return the arrays of each recording by its name: ``values`` (time, channel), ``columns``, ``t_ns`` (time,).

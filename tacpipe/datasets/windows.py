@@ -4,36 +4,65 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Sequence
+from fnmatch import fnmatchcase
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypedDict
 
 import numpy as np
 import torch
 
-from tacpipe.arrays import AnyArray, Int64s
-from tacpipe.channels import masks
+from tacpipe.arrays import AnyArray, Bools, Floats, Int64s
+from tacpipe.channels import masks, streams
 from tacpipe.datasets import arrays
 from tacpipe.errors import UsageError
+from tacpipe.printable import listed, plain
+from tacpipe.signals.contact import rest_level
 from tacpipe.signals.windows import breaks, window_starts
 
 if TYPE_CHECKING:
+    import pyarrow as pa
+
     from tacpipe.datasets.dataset import Dataset, Recording
 
 KEPT_BYTES = 1 << 30  # of decoded recordings that stay in memory, in each process
+TACTILE = "tactile"  # quantity of the channels that have a level at rest
 
 
 class Window(TypedDict):
     """One window; a loader stacks the tensors of several along a first axis and lists their names."""
 
-    past: torch.Tensor  # (context, channel), in the unit of the recording
-    future: torch.Tensor  # (horizon, channel)
+    past: torch.Tensor  # (context, input)
+    future: torch.Tensor  # (horizon, target)
     t_ns: torch.Tensor  # int64 (context + horizon,), nanoseconds
     recording: str
 
 
-class _Read(NamedTuple):
+class Scaling(NamedTuple):
+    """Mean and standard deviation of each channel over the rows that windows may hold; 1 for a constant channel."""
+
+    mean: Floats  # (channel,)
+    std: Floats  # (channel,)
+
+
+class _Selection(NamedTuple):
+    """Some channels of rows, and how they are scaled."""
+
+    positions: list[int] | None  # None: all channels
+    scaling: Scaling | None
+
+    def apply(self, values: torch.Tensor) -> torch.Tensor:
+        """Return the channels of ``values`` (time, channel), scaled."""
+        selected = values if self.positions is None else values[:, self.positions]
+        if self.scaling is None:
+            return selected
+        mean, std = map(torch.from_numpy, self.scaling)
+        return ((selected.double() - mean) / std).to(values.dtype)
+
+
+class _Rows(NamedTuple):
     """The rows of one recording."""
 
-    values: torch.Tensor  # (time, channel)
+    values: torch.Tensor  # (time, channel), above rest where that is subtracted, not scaled
     t_ns: torch.Tensor  # (time,)
     starts: Int64s  # (window,), first rows of the windows
 
@@ -44,15 +73,16 @@ class Windows(torch.utils.data.Dataset[Window]):
     ``len(windows)`` counts them; ``windows[i]`` is a mapping:
 
     =============  ==========================================================================
-    ``past``       float32 or float64 ``(context, channel)``: counts, or what unit the column has
-    ``future``     the same type, ``(horizon, channel)``
+    ``past``       float32 or float64 ``(context, input)``: counts, or what unit the column has
+    ``future``     the same type, ``(horizon, target)``
     ``t_ns``       int64 ``(context + horizon,)``: times of the rows in nanoseconds
     ``recording``  the name of the recording
     =============  ==========================================================================
 
-    ``columns`` names the channels: those given, or all that were measured (`tacpipe.datasets.arrays.Arrays`). Rows that
-    follow one another without a gap, by the ``…_gap`` masks and by ``t_ns``, and that hold a finite number in every channel
-    make windows; no window crosses a gap or the end of a recording.
+    ``inputs`` and ``targets`` name the channels of the past and of the future, ``columns`` both. Without patterns these are
+    all channels that were measured (`tacpipe.datasets.arrays.Arrays`). Rows that follow one another without a gap, by the
+    ``…_gap`` masks and by ``t_ns``, and that hold a finite number in every channel make windows; no window crosses a gap or
+    the end of a recording.
 
     Nothing is read before the first ``len`` or item. That reads and verifies each recording once, to find its windows;
     decoded recordings of up to 1 GiB stay in memory. It can be pickled, and worker processes of a loader read for
@@ -67,19 +97,28 @@ class Windows(torch.utils.data.Dataset[Window]):
         *,
         stream: str = "",
         columns: Sequence[str] | None = None,
+        inputs: Sequence[str] | None = None,
+        targets: Sequence[str] | None = None,
+        rest_s: float | None = None,
+        scale: bool | Windows = False,
         stride: int = 1,
         dtype: Literal["float32", "float64"] = "float32",
     ) -> None:
         window_starts(np.zeros(0), np.zeros(0, dtype=bool), context, horizon, stride)  # refuses lengths below 1
         if dtype not in ("float32", "float64"):
             raise UsageError(f"The dtype of windows is float32 or float64, not {dtype!r}.")
+        if columns is not None and not (inputs is None and targets is None):
+            raise UsageError("columns are inputs and targets at once; give columns, or inputs and targets.")
+        if rest_s is not None and not rest_s > 0:
+            raise UsageError(f"rest_s is {rest_s}; it must be a number of seconds above 0.")
         self.dataset, self.context, self.horizon, self.stride = dataset, context, horizon, stride
-        self.stream, self.dtype = stream, dtype
-        self._asked = None if columns is None else tuple(dict.fromkeys(columns))
+        self.stream, self.dtype, self.rest_s, self.scale = stream, dtype, rest_s, scale
+        self._patterns = (inputs, targets) if columns is None else (columns, columns)
         self._names = list(dataset.recordings)
         self._ends: Int64s | None = None  # (recording,), windows up to the end of each
-        self._columns: tuple[str, ...] | None = None
-        self._kept: OrderedDict[str, _Read] = OrderedDict()
+        self._channels: tuple[tuple[str, ...], tuple[str, ...]] | None = None  # inputs and targets
+        self._scaling: Scaling | None = None
+        self._cache: OrderedDict[str, _Rows] = OrderedDict()
 
     def __len__(self) -> int:
         return int(self._index()[-1]) if self._names else 0
@@ -93,13 +132,13 @@ class Windows(torch.utils.data.Dataset[Window]):
         ends = self._index()
         number = int(np.searchsorted(ends, place, side="right"))
         name = self._names[number]
-        found = self._read(name)
-        first = int(found.starts[place - (int(ends[number - 1]) if number else 0)])
+        rows = self._rows(name)
+        first = int(rows.starts[place - (int(ends[number - 1]) if number else 0)])
         now, last = first + self.context, first + self.context + self.horizon
         return {
-            "past": found.values[first:now],
-            "future": found.values[now:last],
-            "t_ns": found.t_ns[first:last],
+            "past": self._past.apply(rows.values[first:now]),
+            "future": self._future.apply(rows.values[now:last]),
+            "t_ns": rows.t_ns[first:last],
             "recording": name,
         }
 
@@ -108,51 +147,171 @@ class Windows(torch.utils.data.Dataset[Window]):
         return f"Windows of {len(self._names)} recordings ({lengths}, {self.dtype})"
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**vars(self), "_kept": OrderedDict()}
+        return {**vars(self), "_cache": OrderedDict()}
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """The names of the channels."""
-        if self._columns is None:
+        """The names of the channels: the inputs, then the targets that are no inputs."""
+        return tuple(dict.fromkeys((*self.inputs, *self.targets)))
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """The names of the channels of ``past``."""
+        return self._names_of_channels()[0]
+
+    @property
+    def targets(self) -> tuple[str, ...]:
+        """The names of the channels of ``future``."""
+        return self._names_of_channels()[1]
+
+    @property
+    def scaling(self) -> Scaling | None:
+        """Mean and standard deviation of ``columns`` that windows are scaled by; None where they are not scaled."""
+        if self.scale is False:
+            return None
+        if self._scaling is None:
             self._index()
-        return self._columns or ()
+            self._scaling = self._statistics() if self.scale is True else self._from_other(self.scale)
+        return self._scaling
+
+    def unscaled(self, future: torch.Tensor) -> torch.Tensor:
+        """Return targets (…, target), such as predictions, in the unit of the windows before they were scaled."""
+        if self.scaling is None:
+            return future
+        at = self._positions(self.targets)
+        mean, std = (torch.from_numpy(values[at]).to(future) for values in self.scaling)
+        return future * std + mean
+
+    @cached_property
+    def _past(self) -> _Selection:
+        return self._selection(self.inputs)
+
+    @cached_property
+    def _future(self) -> _Selection:
+        return self._selection(self.targets)
+
+    def _selection(self, names: tuple[str, ...]) -> _Selection:
+        at = self._positions(names)
+        scaling = None if self.scaling is None else Scaling(self.scaling.mean[at], self.scaling.std[at])
+        return _Selection(None if names == self.columns else at, scaling)
+
+    def _positions(self, names: tuple[str, ...]) -> list[int]:
+        places = {name: place for place, name in enumerate(self.columns)}
+        return [places[name] for name in names]
+
+    def _statistics(self) -> Scaling:
+        """Return mean and standard deviation over all rows that are part of a window."""
+        count, mean, squares = 0, np.zeros(len(self.columns)), np.zeros(len(self.columns))
+        for name in self._names:
+            rows = self._rows(name)
+            inside = np.zeros(len(rows.values) + 1, dtype=np.int64)
+            np.add.at(inside, rows.starts, 1)
+            np.add.at(inside, rows.starts + self.context + self.horizon, -1)
+            values = rows.values.numpy()[np.cumsum(inside)[:-1] > 0].astype(np.float64)
+            if len(values):  # means and squares of two parts are those of the whole
+                difference = values.mean(axis=0) - mean
+                total = count + len(values)
+                squares += ((values - values.mean(axis=0)) ** 2).sum(axis=0) + difference**2 * count * len(
+                    values
+                ) / total
+                mean, count = mean + difference * len(values) / total, total
+        if not count:
+            raise UsageError("There is no window in these recordings, so there is nothing to scale by.")
+        std = np.sqrt(squares / count)
+        return Scaling(mean, np.where(std > 0, std, 1.0))
+
+    def _from_other(self, other: Windows) -> Scaling:
+        """Return the scaling of other windows for the channels of these."""
+        scaling = other.scaling
+        if scaling is None:
+            raise UsageError("scale is windows that are not scaled themselves; make them with scale=True.")
+        missing = [name for name in self.columns if name not in other.columns]
+        if missing:
+            raise UsageError(
+                f"The windows to scale by have no channel {plain(missing[0])}; give both the same channels."
+            )
+        at = other._positions(self.columns)
+        return Scaling(scaling.mean[at], scaling.std[at])
+
+    def _names_of_channels(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        if self._channels is None:
+            self._index()
+        return self._channels or ((), ())
 
     def _index(self) -> Int64s:
         if self._ends is None:
-            self._ends = np.cumsum([len(self._read(name).starts) for name in self._names], dtype=np.int64)
+            self._ends = np.cumsum([len(self._rows(name).starts) for name in self._names], dtype=np.int64)
         return self._ends
 
-    def _read(self, name: str) -> _Read:
-        found = self._kept.pop(name, None) or self._decoded(self.dataset[name])
-        self._kept[name] = found  # as the one used last
-        while len(self._kept) > 1 and sum(_bytes(one) for one in self._kept.values()) > KEPT_BYTES:
-            self._kept.popitem(last=False)
-        return found
+    def _rows(self, name: str) -> _Rows:
+        rows = self._cache.pop(name, None) or self._decoded(self.dataset[name])
+        self._cache[name] = rows  # as the one used last
+        while len(self._cache) > 1 and sum(_bytes(cached) for cached in self._cache.values()) > KEPT_BYTES:
+            self._cache.popitem(last=False)
+        return rows
 
-    def _decoded(self, recording: Recording) -> _Read:
+    def _decoded(self, recording: Recording) -> _Rows:
         table = recording.table(self.stream)
         t_ns = masks.times(table)
         read = arrays.of_table(table)
-        names = read.columns if self._asked is None else self._asked
-        if self._columns is None:
-            self._columns = names
-        missing = [name for name in names if name not in read.by_column]
-        if missing or names != self._columns:
-            odd = missing or sorted(set(names) ^ set(self._columns)) or list(names)
+        inputs, targets = (_matching(patterns, read, recording.name) for patterns in self._patterns)
+        if self._channels is None:
+            self._channels = inputs, targets
+        names = tuple(dict.fromkeys((*inputs, *targets)))
+        if (inputs, targets) != self._channels:
+            odd = sorted(set(names) ^ set(self.columns)) or list(names)
             raise UsageError(
                 f"Recording {recording.name} has not the same channels as the others, or lacks one: {odd[0]}. Name the "
                 f"columns to read, as in windows({self.context}, {self.horizon}, columns=[…])."
             )
-        values = _matrix(arrays.Arrays(read.by_column, names), self.dtype, recording.name)
-        usable = ~masks.gaps(table) & np.isfinite(values).all(axis=1)
+        matrix = arrays.Arrays(read.by_column, names)
+        if self.rest_s is None:
+            values = _matrix(matrix, self.dtype, recording.name)
+        else:
+            values = _above_rest(table, matrix, t_ns, self.rest_s).astype(self.dtype)
+        usable: Bools = ~masks.gaps(table) & np.isfinite(values).all(axis=1)
         groups = np.cumsum(breaks(t_ns, masks.apart(recording.attributes)))
         starts = window_starts(groups, usable, self.context, self.horizon, self.stride)
-        return _Read(torch.from_numpy(values), torch.from_numpy(t_ns.copy()), starts)
+        return _Rows(torch.from_numpy(values), torch.from_numpy(t_ns.copy()), starts)
 
 
-def _matrix(found: arrays.Arrays, dtype: str, name: str) -> AnyArray:
+def _matching(patterns: Sequence[str] | None, read: arrays.Arrays, recording: str) -> tuple[str, ...]:
+    """Return the columns of these names, and the channels that match these patterns; all channels without any.
+
+    Raises `UsageError` for a pattern that nothing matches.
+    """
+    if patterns is None:
+        return read.columns
+    names: list[str] = []
+    for pattern in [patterns] if isinstance(patterns, str) else patterns:
+        exact = [pattern] if pattern in read.by_column else []
+        matching = exact or [name for name in read.columns if fnmatchcase(name, pattern)]
+        if not matching:
+            raise UsageError(
+                f"Recording {recording} has no column {plain(pattern)}, and no channel matches it. Its channels are "
+                f"{listed(read.columns)}."
+            )
+        names += matching
+    return tuple(dict.fromkeys(names))
+
+
+def _above_rest(table: pa.Table, matrix: arrays.Arrays, t_ns: Int64s, rest_s: float) -> Floats:
+    """Return the channels (time, channel), tactile ones less their median over the first ``rest_s`` seconds."""
+    values = matrix.values.astype(np.float64)
+    touch = np.isin(matrix.columns, streams.of_quantity(table, TACTILE))  # (channel,)
+    if not touch.any():
+        raise UsageError(
+            f"None of these channels has the quantity {TACTILE}, so none has a level at rest; leave out rest_s."
+        )
+    finite = np.isfinite(values[:, touch]).all(axis=1)
+    if finite.any():
+        values[:, touch] -= rest_level(values[finite][:, touch], t_ns[finite], rest_s)
+    return values
+
+
+def _matrix(channels: arrays.Arrays, dtype: str, name: str) -> AnyArray:
     """Return the channels as (time, channel). Raises `UsageError` where ``dtype`` would round a whole number."""
-    exact = found.values
+    exact = channels.values
     values = exact.astype(dtype)
     if exact.dtype.kind in "iu" and exact.dtype.itemsize > 2 and not np.array_equal(values.astype(exact.dtype), exact):
         raise UsageError(
@@ -161,5 +320,5 @@ def _matrix(found: arrays.Arrays, dtype: str, name: str) -> AnyArray:
     return values
 
 
-def _bytes(one: _Read) -> int:
-    return one.values.nbytes + one.t_ns.nbytes
+def _bytes(rows: _Rows) -> int:
+    return rows.values.nbytes + rows.t_ns.nbytes
