@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -168,6 +169,94 @@ def test_a_chain_that_cannot_be_run_is_refused_before_anything_runs(lab: Lab, te
     refused = lab.call("run dvc.yaml")
 
     assert refused.code == 2 and named in refused.err
+
+
+def dvc_errors() -> Any:
+    return pytest.importorskip("dvc.exceptions")
+
+
+def stages_of_dvc(folder: Path) -> tuple[list[str], list[tuple[str, str]]]:
+    """Return the stages that DVC reads in a folder, and which depends on which."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of what DVC itself uses
+        index = pytest.importorskip("dvc.repo").Repo(str(folder), uninitialized=True).index
+        edges = sorted((after.name, before.name) for after, before in index.graph.edges)
+    return sorted(stage.name for stage in index.stages), edges
+
+
+@pytest.mark.parametrize(
+    ("definition", "named"),
+    [
+        ("outs: data", "its outs is 'data'; it must be a list of paths"),
+        ("outs: 5", "its outs is 5; it must be a list of paths"),
+        ("outs: [5]", "its outs is"),
+        ("outs: ", "its outs is None"),
+        ("deps: data", "its deps is 'data'; it must be a list of paths"),
+        ("deps: [{data: {}}]", "its deps is"),
+        ("outs: [{one: {cash: false}}]", "its outs is"),
+        ("outs: [{one: {cache: maybe}}]", "its outs is"),
+        ("outs: [{one: }]", "its outs is"),
+        ("plots: [{p.csv: [{x: a}]}]", "its plots is"),
+        ("params: [5]", "its params is"),
+        ("frozen: 'false'", "its frozen is 'false'; it must be true or false"),
+        ("dep: [p]", "there is no key 'dep'; there are cmd"),
+        ("deps: [p], deps: [q]", "the key deps stands twice"),
+        ("outs: [p], metrics: [p]", "it has p twice"),
+        ("deps: [p], outs: [./p]", "it has p twice"),
+        ("outs: [d], metrics: [d/f]", "writes d/f within d"),
+        ("outs: [.]", "the folder of dvc.yaml"),
+        ("outs: [..]", "the folder of dvc.yaml"),
+        ("desc: 5", "its desc is 5"),
+        ("do: {cmd: y}", "do"),
+        ("matrix: {1: [1]}", "its matrix is"),
+    ],
+)
+def test_a_stage_that_dvc_refuses_is_refused_with_what_is_wrong(lab: Lab, definition: str, named: str) -> None:
+    Path("dvc.yaml").write_text(f"stages: {{a: {{cmd: x, {definition}}}}}")
+    with pytest.raises((dvc_errors().DvcException, ValueError)):
+        stages_of_dvc(lab.folder)
+    refused = lab.call("run dvc.yaml")
+    assert refused.code == 2 and named in refused.err and len(refused.err.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("stages: {a: {cmd: x}, a: {cmd: y}}", "the key a stands twice"),
+        ("stages: {1: {cmd: x}, true: {cmd: y}}", "the key true stands twice"),
+        ("stages: {1: {cmd: x}}", "its stages is"),
+        ("stages: {a@b: {cmd: x}}", "without @"),
+        ("stages: {'': {cmd: x}}", "a name"),
+        ("stages: {a: }", "its stages is"),
+        ("stages: {a: {cmd: x}}\nstage: {}", "there is no key 'stage'"),
+        ("stages: {a: {cmd: '${l}'}}\nvars: [{l: [x, y]}]", "its cmd is"),
+    ],
+)
+def test_a_file_that_dvc_refuses_is_refused_with_what_is_wrong(lab: Lab, text: str, named: str) -> None:
+    Path("dvc.yaml").write_text(text)
+    with pytest.raises((dvc_errors().DvcException, ValueError)):
+        stages_of_dvc(lab.folder)
+    refused = lab.call("run dvc.yaml")
+    assert refused.code == 2 and named in refused.err and len(refused.err.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "stages: {a: {cmd: x, outs: [{p: {cache: false}, q: {push: true}}]}, b: {cmd: x, deps: [q]}}",
+        "stages: {a/b: {cmd: x, outs: [p]}, a_b: {cmd: y, deps: [p/q]}}",
+        "stages: {%s: {cmd: x}}" % ("a" * 300),
+        "stages: {a: {foreach: [u, u], do: {cmd: x}}, b: {cmd: x, deps: [./c/../d], wdir: ./}, c: {cmd: x, outs: [d]}}",
+        "stages: {a: {cmd: x, plots: [{p: {x: t, header: true}}], desc: d, meta: {a: 1}, always_changed: true}}",
+        "stages: {a: {cmd: x}}\nplots: [p]\nparams: [params.yaml]\nmetrics: [m]\nartifacts: {m: {path: m}}\ndatasets: []",
+    ],
+)
+def test_a_file_that_dvc_reads_has_the_same_stages_in_the_same_dependencies(lab: Lab, text: str) -> None:
+    Path("dvc.yaml").write_text(text)
+    Path("params.yaml").write_text("{}")
+    chain = chains.load(Path("dvc.yaml"))
+    edges = sorted((name, before) for name, several in chain.after.items() for before in several)
+    assert (sorted(stage.name for stage in chain.stages), edges) == stages_of_dvc(lab.folder)
 
 
 def test_an_unknown_stage_and_a_missing_file_are_refused(lab: Lab) -> None:

@@ -62,6 +62,13 @@ def test_a_failing_stage_keeps_back_what_depends_on_it_and_nothing_else_of_sever
     assert failed.err.splitlines()[-1] == "1 unchanged, 2 ran, 1 failed, 1 not run"
 
 
+def test_what_stages_print_is_kept_apart_whatever_their_names(lab: Lab) -> None:
+    names = ["a/b", "a_b", "l" * 300]
+    written({name: {"cmd": f"echo {number}; sleep 0.2; echo {number}"} for number, name in enumerate(names)})
+
+    assert sorted(lab.run("run dvc.yaml --jobs 3").out.splitlines()) == sorted("001122")
+
+
 def test_the_commands_of_a_stage_follow_each_other_and_what_they_print_is_printed_as_a_whole(lab: Lab) -> None:
     slow = "for i in 1 2 3; do echo {n}; echo {n} >&2; sleep 0.05; done"
     written({name: {"cmd": [slow.format(n=f"{name}1"), slow.format(n=f"{name}2")]} for name in ("a", "b")})

@@ -98,7 +98,7 @@ class StageProcesses:
         self._slots[name] = min(set(range(self.jobs)) - set(self._slots.values()))
         gpu = devices.gpu_for(self._slots[name])
         variables = processor.each_of(self.jobs) | processor.jobs_of(together) | gpu
-        given = words, str(Path.cwd()), variables, *map(str, self._printed(name))
+        given = words, str(Path.cwd()), variables, *map(str, self._printed(self._slots[name]))
         process = self._context.Process(target=_run, args=given)
         with termination.deferred(), forking.without_main():
             process.start()
@@ -118,9 +118,8 @@ class StageProcesses:
 
     def _taken(self, name: str) -> int:
         process = self._running.pop(name)
-        del self._slots[name]
         process.join()
-        for path, stream in zip(self._printed(name), (sys.stdout, sys.stderr), strict=True):
+        for path, stream in zip(self._printed(self._slots.pop(name)), (sys.stdout, sys.stderr), strict=True):
             with contextlib.suppress(FileNotFoundError):  # of one that was killed at once
                 stream.write(path.read_bytes().decode(errors="backslashreplace"))
                 stream.flush()
@@ -128,10 +127,9 @@ class StageProcesses:
         code = process.exitcode or 0
         return code if code >= 0 else 128 - code
 
-    def _printed(self, name: str) -> tuple[Path, Path]:
-        """Return the files that take standard output and error of a stage."""
-        place = self._folder / name.replace("/", "_")
-        return place.with_name(f"{place.name}.out"), place.with_name(f"{place.name}.err")
+    def _printed(self, slot: int) -> tuple[Path, Path]:
+        """Return the files that take standard output and error of the stage in a slot."""
+        return self._folder / f"{slot}.out", self._folder / f"{slot}.err"
 
 
 def _run(command: str | list[str], place: str, variables: dict[str, str], *printed: str) -> None:

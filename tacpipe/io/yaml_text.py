@@ -22,10 +22,26 @@ def load(content: str | bytes) -> Any:
 
     if len(content) > LONGEST:
         raise ValueError(f"it has {len(content)} characters, {LONGEST} are allowed")
-    fast = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+    fast: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+    class Loader(fast):  # type: ignore[misc]
+        """Refuses a mapping that names a key twice, of which YAML's loaders keep the last."""
+
+        def construct_mapping(self, node: Any, deep: bool = False) -> Any:
+            keys = set()
+            for key_node, _ in node.value:
+                if isinstance(key_node, yaml.ScalarNode) and key_node.tag != "tag:yaml.org,2002:merge":
+                    key = self.construct_object(key_node)
+                    if key in keys:
+                        raise yaml.constructor.ConstructorError(
+                            None, None, f"the key {key_node.value} stands twice", key_node.start_mark
+                        )
+                    keys.add(key)
+            return super().construct_mapping(node, deep)
+
     try:
         _count(yaml.parse(content, Loader=fast))
-        return yaml.load(content, Loader=fast)
+        return yaml.load(content, Loader=Loader)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
         where = f" in line {mark.line + 1}, column {mark.column + 1}" if mark is not None else ""

@@ -18,6 +18,37 @@ PARAMS = "params.yaml"  # whose values every text may use
 _OUTPUTS = ("outs", "metrics", "plots")
 _SHOWN = 8  # names of stages that an error lists
 
+# The schema of DVC 3: a type, a list of one schema, a mapping of keys, any of several in a tuple.
+_VARS = [(str, dict)]
+_OPTIONS = {
+    **dict.fromkeys(("cache", "persist", "checkpoint", "push"), bool),
+    **{"remote": str, "desc": str, "type": str, "labels": [str], "meta": object},
+}
+_PLOT = {**_OPTIONS, **dict.fromkeys(("template", "x", "y", "x_label", "y_label", "title"), str), "header": bool}
+_STAGE = {
+    **{"cmd": (str, list), "wdir": str, "deps": [str], "params": [(str, {str: object})], "vars": _VARS},
+    **{"outs": [(str, {str: _OPTIONS})], "metrics": [(str, {str: _OPTIONS})], "plots": [(str, {str: _PLOT})]},
+    **{"frozen": bool, "always_changed": bool, "meta": object, "desc": str},
+}
+_MATRIX = {**_STAGE, "matrix": {str: (str, list)}}
+_FOREACH = {"foreach": (dict, list, str), "do": _STAGE}
+_FILE = {
+    **{"stages": {str: dict}, "vars": _VARS, "params": [str], "metrics": [str], "plots": [(str, {str: object})]},
+    **{"datasets": object, "artifacts": {str: object}},
+}
+_EXPECTED = {
+    **{"deps": "a list of paths, as [data/raw]", "params": "a list of names, or of mappings from a file to names"},
+    **dict.fromkeys(
+        _OUTPUTS, "a list of paths, or of mappings from a path to its options, as [{model: {cache: false}}]"
+    ),
+    **{
+        "stages": "a mapping of names to stages: `dvc stage add` writes one",
+        "vars": "a list of mappings and YAML files",
+    },
+    **{"cmd": "a command or a list of them", "frozen": "true or false", "always_changed": "true or false"},
+    **{"foreach": "a list or a mapping", "do": "a mapping with a cmd", "matrix": "a mapping of lists"},
+}
+
 
 @dataclass(frozen=True)
 class ChainStage:
@@ -50,8 +81,11 @@ def load(file: Path, wanted: Sequence[str] = ()) -> Chain:
     they depend on. Raises `UsageError` for a file that is not such a one, for what DVC knows and this does not, for names
     that are not in it, and where stages depend on each other in a circle.
     """
-    found = list(_stages(file))
-    by_name = {stage.name: stage for stage in found}
+    by_name: dict[str, ChainStage] = {}
+    for stage in _stages(file):
+        if by_name.setdefault(stage.name, stage) != stage:
+            raise UsageError(f"{file} has two stages {plain(stage.name)}; give one of them another name.")
+    found = list(by_name.values())
     after = _dependencies(found, file)
     try:
         ordered = list(TopologicalSorter(after).static_order())
@@ -63,55 +97,97 @@ def load(file: Path, wanted: Sequence[str] = ()) -> Chain:
 
 def _stages(file: Path) -> Iterator[ChainStage]:
     content = _mapping(file)
-    values = _values(file, content.get("vars") or [], _mapping(file.with_name(PARAMS), missing=True), str(file))
-    stages = content.get("stages")
-    if not isinstance(stages, Mapping) or not stages:
+    _check(content, _FILE, str(file))
+    values = _values(file, content.get("vars", []), _mapping(file.with_name(PARAMS), missing=True), str(file))
+    if not content.get("stages"):
         raise UsageError(f"{file} has no stages; it must hold them as a dvc.yaml does: `dvc stage add` writes one.")
-    for name, definition in stages.items():
-        where = f"{file}, stage {plain(str(name))}"
-        if not isinstance(definition, Mapping):
-            raise UsageError(f"{where}: it is {excerpt(definition)}; it must be a mapping with a cmd.")
+    for name, definition in content["stages"].items():
+        where = f"{file}, stage {plain(name)}"
+        if not name or "@" in name:
+            raise UsageError(f"{where}: give it a name without @, which stands in names of foreach and matrix.")
+        several = "foreach" in definition or "do" in definition
+        _check(definition, _FOREACH if several else _MATRIX, where)
+        if several:
+            for key in _FOREACH:
+                if key not in definition:
+                    raise UsageError(f"{where}: foreach and do belong together, and it has no {key}.")
+            _check(definition["do"], _STAGE, f"{where}, do")
         for key, given, known in template.several(definition, values, where):
-            if not isinstance(given, Mapping):
-                raise UsageError(f"{where}: it has no `do` with a cmd.")
-            yield _stage(f"{name}@{key}" if key else str(name), given, known, file, where)
+            yield _stage(f"{name}@{key}" if key else name, given, known, file, where)
+
+
+def _check(content: Mapping[str, Any], schema: Mapping[str, Any], where: str) -> None:
+    """Raise `UsageError` for a key that a part of the file does not have, and for a value of the wrong form."""
+    for key, value in content.items():
+        if key not in schema:
+            raise UsageError(f"{where}: there is no key {excerpt(key)}; there are {listed(schema, len(schema))}.")
+        if not _fits(value, schema[key]) and not (
+            key == "do" and isinstance(value, Mapping)
+        ):  # its keys are checked next
+            expected = _EXPECTED.get(key, "a text")
+            raise UsageError(f"{where}: its {key} is {excerpt(value)}; it must be {expected}.")
+
+
+def _fits(value: Any, schema: Any) -> bool:
+    """Return whether a value has the form of a schema: a type, or a list, mapping or tuple of such."""
+    if isinstance(schema, tuple):
+        return any(_fits(value, choice) for choice in schema)
+    if isinstance(schema, list):
+        return isinstance(value, list) and all(_fits(item, schema[0]) for item in value)
+    if not isinstance(schema, dict):
+        return isinstance(value, schema)
+    if not isinstance(value, Mapping):
+        return False
+    if str in schema:
+        return all(isinstance(key, str) and _fits(item, schema[str]) for key, item in value.items())
+    return all(key in schema and _fits(item, schema[key]) for key, item in value.items())
 
 
 def _stage(name: str, given: Mapping[str, Any], values: template.Values, file: Path, where: str) -> ChainStage:
-    values = _values(file, given.get("vars") or [], values, where)
+    values = _values(file, given.get("vars", []), values, where)
     used = {key: given[key] for key in ("cmd", "deps", "params", *_OUTPUTS, "wdir") if key in given}
     made = template.filled(used, values, where)
-    commands = made.get("cmd")
-    commands = [commands] if isinstance(commands, str) else commands
-    if not isinstance(commands, list) or not commands or not all(isinstance(one, str) for one in commands):
-        raise UsageError(f"{where}: its cmd is {excerpt(commands)}; it must be a command or a list of them.")
-    if made.get("wdir", ".") != ".":
+    commands = made["cmd"] if isinstance(given.get("cmd"), list) else [made.get("cmd")]
+    if not commands or not all(isinstance(command, str) for command in commands):
+        raise UsageError(f"{where}: its cmd is {excerpt(made.get('cmd'))}; it must be {_EXPECTED['cmd']}.")
+    if posixpath.normpath(made.get("wdir", ".")) != ".":
         raise UsageError(
             f"{where}: it has the wdir {excerpt(made['wdir'])}, which `tacpipe run` does not know. Write the paths "
             f"relative to {file.name}, or run it with `dvc repro`."
         )
-    files = [one for one in made.get("params") or [] if isinstance(one, Mapping)]  # of params, but for params.yaml
-    reads = [*_paths(made.get("deps"), where), *(path for one in files for path in map(str, one))]
-    writes = [path for kind in _OUTPUTS for path in _paths(made.get(kind), where)]
-    return ChainStage(name, [one.strip() for one in commands], reads, writes, bool(given.get("frozen")))
+    folder = file.parent.absolute().as_posix()
+    files = [entry for entry in made.get("params", []) if isinstance(entry, Mapping)]  # of params, but for params.yaml
+    reads = _paths([*made.get("deps", []), *files], folder, where)
+    writes = [path for kind in _OUTPUTS for path in dict.fromkeys(_paths(made.get(kind, []), folder, where))]
+    for path in writes:
+        if path == "." or _is_within(folder, path):
+            raise UsageError(f"{where}: it writes {plain(path)}, the folder of {file.name}. Name what it writes there.")
+        if path in reads or writes.count(path) > 1:
+            raise UsageError(
+                f"{where}: it has {plain(path)} twice. Name a path once, under deps, outs, metrics or plots."
+            )
+    return ChainStage(name, [command.strip() for command in commands], reads, writes, given.get("frozen", False))
 
 
-def _paths(given: Any, where: str) -> list[str]:
-    """Return the paths of a list, whose entries are paths or mappings from one to its options."""
-    found = []
-    for one in given or []:
-        path = next(iter(one), None) if isinstance(one, Mapping) else one
-        if not isinstance(path, str):
-            raise UsageError(f"{where}: {excerpt(one)} is not a path.")
-        found.append(posixpath.normpath(path))
-    return found
+def _paths(entries: Sequence[Any], folder: str, where: str) -> list[str]:
+    """Return the paths of entries, which are paths or mappings from paths to options: from ``folder`` what lies in it."""
+    paths = []
+    for entry in entries:
+        for path in entry if isinstance(entry, Mapping) else [entry]:
+            if not isinstance(path, str) or not path:
+                raise UsageError(f"{where}: {excerpt(path)} is not a path.")
+            full = posixpath.normpath(posixpath.join(folder, path))
+            paths.append(posixpath.relpath(full, folder) if _is_within(full, folder) else full)
+    return paths
 
 
-def _values(file: Path, given: Any, before: template.Values, where: str) -> template.Values:
+def _is_within(path: str, folder: str) -> bool:
+    return posixpath.isabs(folder) and posixpath.commonpath([path, folder]) == folder
+
+
+def _values(file: Path, given: Sequence[Any], before: template.Values, where: str) -> template.Values:
     """Return the values that texts may use: those of ``before``, and over them those of ``vars``."""
     values = dict(before)
-    if not isinstance(given, list):
-        raise UsageError(f"{where}: vars is {excerpt(given)}; it must be a list.")
     for one in given:
         if isinstance(one, str) and one.endswith((".yaml", ".yml")):
             one = _mapping(file.with_name(one))
@@ -158,6 +234,12 @@ def _dependencies(stages: Sequence[ChainStage], file: Path) -> dict[str, frozens
                 raise UsageError(f"{file}: the stages {writers[path]} and {stage.name} both write {plain(path)}.")
             for folder in _above(path):
                 within.setdefault(folder, set()).add(stage.name)
+    for path, name in writers.items():
+        for folder in _above(path):
+            if folder in writers:
+                raise UsageError(
+                    f"{file}: the stage {name} writes {plain(path)} within {plain(folder)}, which {writers[folder]} writes."
+                )
     after = {}
     for stage in stages:
         found = {writers[one] for path in stage.reads for one in (path, *_above(path)) if one in writers}
