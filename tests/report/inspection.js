@@ -83,6 +83,20 @@
     if (!plot.querySelector("svg")) found.add(`a chart that is not drawn: ${title}`);
     else if (!plot.querySelector(".role-mark path[d], .role-mark text, .role-mark line")) found.add(`an empty chart: ${title}`);
     if (plot.scrollWidth > plot.clientWidth + SLACK) found.add(`a chart wider than its column: ${title}`);
+    for (const point of plot.querySelectorAll(".mark-symbol.role-mark path[d]")) {
+      const area = point.closest("[clip-path]") && point.closest(".mark-group")?.querySelector("path.background");
+      if (!area) continue;
+      const [frame, box] = [area.getBoundingClientRect(), point.getBoundingClientRect()];
+      const out = Math.max(frame.left - box.left, box.right - frame.right, frame.top - box.top, box.bottom - frame.bottom);
+      if (out > SLACK) found.add(`a point cut by its chart: ${title}`);
+    }
+    for (const text of plot.querySelectorAll("svg text")) {
+      if (text.textContent.endsWith("\u2026")) found.add(`a text cut in a chart (${title}): ${short(text.textContent)}`);
+    }
+    for (const axis of plot.querySelectorAll(`[aria-label^="X-axis titled 'epoch'"]`)) {
+      const ticks = [...axis.querySelectorAll(".role-axis-label text")].map((text) => text.textContent);
+      if (ticks.some((text) => text.includes("."))) found.add(`epochs that are not whole (${title}): ${ticks.join(" ")}`);
+    }
   }
   return [...found].sort();
 })()

@@ -210,6 +210,12 @@ def test_charts_drawn_for_a_wide_screen_fit_the_paper(chromium: Browser) -> None
         ("<div style='width: 40px; overflow: hidden; white-space: nowrap'>cut off text</div>", "cut by its box"),
         ("<svg width=80 height=20><text x=60 y=15>outside</text></svg>", "outside its figure"),
         ("<svg width=80 height=20><text x=5 y=15>one</text><text x=9 y=15>two</text></svg>", "over each other"),
+        ("<div class=plot><svg width=99 height=20><text y=15>long na…</text></svg></div>", "a text cut in a chart"),
+        (
+            """<div class=plot><svg width=99 height=20><g aria-label="X-axis titled 'epoch' for a scale">
+            <g class=role-axis-label><text y=15>1.5</text></g></g></svg></div>""",
+            "epochs that are not whole",
+        ),
     ],
 )
 def test_the_inspection_finds_what_is_wrong(chromium: Browser, content: str, told: str) -> None:

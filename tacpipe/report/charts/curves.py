@@ -8,7 +8,20 @@ from dataclasses import dataclass
 import numpy as np
 
 from tacpipe.arrays import AnyFloats, Floats
-from tacpipe.report.charts.grammar import COLOURS, INK, QUIET, Spec, diagonal_of, legend_of, short, tip_of, y_of, zoom
+from tacpipe.report.charts.grammar import (
+    COLOURS,
+    INK,
+    MARGIN,
+    QUIET,
+    Spec,
+    diagonal_of,
+    legend_of,
+    short,
+    tip_of,
+    whole_steps,
+    y_of,
+    zoom,
+)
 
 POINTS = 300  # of a line that are drawn
 ROOM = 0.02  # beyond the ends of a diagonal, as a fraction of it
@@ -49,8 +62,16 @@ def lines(
     names = list(order) or list(dict.fromkeys(one.name for one in several if not one.thin))
     values = [row for number, one in enumerate(several) for row in _rows(one, number)]
     across, up = _scales(values, log=log, floor=floor, diagonal=diagonal)
+    if points:
+        across["padding"] = up["padding"] = MARGIN
     base: Spec = {
-        "x": {"field": "x", "type": "quantitative", "title": x, "scale": across},
+        "x": {
+            "field": "x",
+            "type": "quantitative",
+            "title": x,
+            "scale": across,
+            **whole_steps(row["x"] for row in values),
+        },
         "y": {"field": "y", "type": "quantitative", "title": y, "scale": up},
         "color": _colour(names, {one.name for one in several}),
         "detail": {"field": "run", "type": "nominal"},

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 Spec = dict[str, Any]
 COLOURS = tuple(f"var(--c{number})" for number in range(8))
 QUIET, INK, BETTER, WORSE = "var(--faint)", "var(--text)", "var(--c0)", "var(--c1)"
 DIGITS = 5  # of a number: more cannot be seen
+FEW_STEPS = 12  # whole numbers on an axis, up to which each has a tick
+MARGIN = 8  # pixels between points and the ends of an axis, so that none is cut
 
 
 def colour_of(number: int, of: int) -> str:
@@ -30,6 +32,14 @@ def legend_of(count: int) -> Spec | None:
 def zoom() -> Spec:
     """Return what zooms with Shift and the wheel and moves by dragging."""
     return {"name": "zoom", "select": {"type": "interval", "zoom": "wheel![event.shiftKey]"}, "bind": "scales"}
+
+
+def whole_steps(values: Iterable[object]) -> Spec:
+    """Return the options of an axis: ticks at whole numbers where all values are whole, such as epochs and counts."""
+    numbers = sorted({value for value in values if isinstance(value, int | float)})
+    if not all(float(value).is_integer() for value in numbers):
+        return {}
+    return {"axis": {"tickMinStep": 1} if len(numbers) > FEW_STEPS else {"values": numbers, "format": ","}}
 
 
 def tip_of(name: str, title: str) -> Spec:

@@ -42,7 +42,7 @@ def plane(rows: Sequence[Mapping[str, Any]], panels: Sequence[str], *, size: int
         "data": {"values": values},
         "columns": columns,
         "facet": {"field": "panel", "type": "nominal", "sort": list(panels), "title": None,
-                  "header": {"labelFontWeight": 600, "labelPadding": 2}},
+                  "header": {"labelFontWeight": 600, "labelLimit": 0, "labelPadding": 2}},
         "spec": {"layer": layer, "view": {"stroke": None}},
         "spacing": 12,
         "usermeta": {"tall": short(tall), "columns": columns},

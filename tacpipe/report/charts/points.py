@@ -7,7 +7,20 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from tacpipe.arrays import AnyFloats
-from tacpipe.report.charts.grammar import INK, QUIET, Spec, colour_of, diagonal_of, legend_of, short, tip_of, y_of, zoom
+from tacpipe.report.charts.grammar import (
+    INK,
+    MARGIN,
+    QUIET,
+    Spec,
+    colour_of,
+    diagonal_of,
+    legend_of,
+    short,
+    tip_of,
+    whole_steps,
+    y_of,
+    zoom,
+)
 
 
 def scatter(
@@ -29,8 +42,9 @@ def scatter(
     values = [{key: short(value) if isinstance(value, float) else value for key, value in row.items()} for row in rows]
     names = list(order) or sorted({str(row["name"]) for row in values})
     encoding: Spec = {
-        "x": {"field": "x", "type": "quantitative", "title": x, "scale": {"zero": False}},
-        "y": {"field": "y", "type": "quantitative", "title": y, "scale": {"zero": False}},
+        "x": {"field": "x", "type": "quantitative", "title": x, "scale": {"zero": False, "padding": MARGIN},
+              **whole_steps(row["x"] for row in values)},
+        "y": {"field": "y", "type": "quantitative", "title": y, "scale": {"zero": False, "padding": MARGIN}},
         "color": {"field": "name", "type": "nominal", "legend": legend_of(len(names)) if legend else None,
                   "scale": {"domain": names, "range": [colour_of(names.index(name), len(names)) for name in names]}},
         "opacity": {"condition": {"param": "shown", "value": 0.8, "empty": True}, "value": 0.06},

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -10,6 +11,8 @@ import numpy as np
 
 from tacpipe.report.charts.grammar import QUIET, Spec, short, text_of, tip_of
 
+LABEL_CHARACTERS = 24  # a line of a predictor's name; longer names take several lines
+LINE_HEIGHT = 13  # pixels
 KINDS = {"model": "var(--c0)", "baseline": "var(--faint)", "oracle": "var(--c2)", "control": "var(--c3)"}
 
 
@@ -32,12 +35,14 @@ def ranking(dots: Sequence[Dot], x: str, *, level: Mapping[str, float] | None = 
     """
     low, high = _ends(dots)
     panels = list(dict.fromkeys(one.panel for one in dots))
+    lines_by_name = {one.name: textwrap.wrap(one.name, LABEL_CHARACTERS) or [""] for one in dots}
+    row = max(row, LINE_HEIGHT * max(map(len, lines_by_name.values()), default=1) + 5)
     values = []
     for place, one in enumerate(dots):
         off = one.mean < low or one.mean > high
         values.append(
             {
-                "name": one.name, "panel": one.panel, "place": place, "kind": one.kind,
+                "name": "\n".join(lines_by_name[one.name]), "panel": one.panel, "place": place, "kind": one.kind,
                 "x": short(min(max(one.mean, low), high)), "mean": short(one.mean),
                 "low": short(min(max(one.low, low), high)), "high": short(min(max(one.high, low), high)),
                 "off": ("left" if one.mean < low else "right") if off else "",
@@ -50,7 +55,13 @@ def ranking(dots: Sequence[Dot], x: str, *, level: Mapping[str, float] | None = 
         "type": "nominal",
         "sort": {"field": "place"},
         "title": None,
-        "axis": {"labelLimit": 180, "ticks": False, "domain": False, "labelPadding": 6},
+        "axis": {
+            "labelExpr": "split(datum.label, '\\n')",
+            "labelLimit": 0,
+            "ticks": False,
+            "domain": False,
+            "labelPadding": 6,
+        },
     }
     colour = {
         "field": "kind",
@@ -79,7 +90,7 @@ def ranking(dots: Sequence[Dot], x: str, *, level: Mapping[str, float] | None = 
         "data": {"values": values},
         "facet": {"row": {"field": "panel", "type": "nominal", "sort": panels, "title": None,
                           "header": {"labelAngle": 0, "labelOrient": "top", "labelAnchor": "start", "labelFontWeight": 600,
-                                     "labelPadding": 2}}},
+                                     "labelLimit": 0, "labelPadding": 2}}},
         "spec": {"height": {"step": row}, "layer": layer},
         "resolve": {"scale": {"y": "independent"}},
         "spacing": 6,

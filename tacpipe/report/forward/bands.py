@@ -14,6 +14,7 @@ from tacpipe.report import blocks, charts
 from tacpipe.report.blocks import Chart, Charts, Fold, fold, number, table
 from tacpipe.report.charts import Line
 from tacpipe.report.context import Context
+from tacpipe.tasks.forward import units
 from tacpipe.tasks.forward.headline import PARTS
 
 if TYPE_CHECKING:
@@ -124,6 +125,8 @@ def _examples(run: Run) -> list[Chart]:
             Line("measured", time_s, one["measured"]),
             Line(f"predicted {one['step']} rows before", time_s, middle, low, high, dashed=True),
         ]
-        spec = charts.lines(several, "time (s)", "counts above rest", points=False, height=190)
+        spec = charts.lines(
+            several, "time (s)", f"{units.of_model(run.details.config)} above rest", points=False, height=190
+        )
         drawn.append(Chart(f"{one['recording']}: {one['channel']}", spec, wide=True))
     return drawn

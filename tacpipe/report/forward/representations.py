@@ -104,6 +104,8 @@ def _table(context: Context) -> Table | None:
         if published:
             cells += [f"{value:.4f}" for value in PRINTED[paper]] if paper in PRINTED else [NONE, NONE]
         rows.append([method.name.split(" · ", 1)[-1], *cells, str(len(method.runs))])
+    if not rows:
+        return None
     heads = ["representation", "validation", "test", *(["test, known objects"] if named else [])]
     heads += [
         "persistence, test",
@@ -122,7 +124,7 @@ def _table(context: Context) -> Table | None:
         if published
         else "Mean squared error in each representation's own space"
     )
-    return table(f"{title}, mean ± sd over runs", heads, rows) if rows else None
+    return table(f"{title}, mean ± sd over runs", heads, rows)
 
 
 def _codecs(codecs: Sequence[sweep.Tree], published: bool) -> list[Charts | Table]:

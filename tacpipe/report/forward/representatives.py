@@ -11,6 +11,7 @@ from tacpipe.report.blocks import Chart, Charts, Fold, Note, fold
 from tacpipe.report.context import Context, median_run
 from tacpipe.report.forward import methods as by_method
 from tacpipe.report.forward import single_run, traces
+from tacpipe.tasks.forward import units
 
 TRACE_STEPS = (1, 5, 10)
 LOSSES = {"training": "train_loss", "validation": "val_loss"}
@@ -46,10 +47,16 @@ def predictions(context: Context) -> list[Fold]:
         named = {ranked[at][1]: (rank, ranked[at][0]) for rank, at in reversed(places.items()) if ranked}
         for name, (rank, skill) in list(reversed(named.items()))[: context.traces]:
             caption = f"The recording of {rank} skill ({blocks.signed(skill)}) of {method.name}."
-            drawn += traces.draw(run.dataset.recordings[name], (0, 1), TRACE_STEPS, name, caption)
+            drawn += traces.draw(run.dataset.recordings[name], (0, 1), TRACE_STEPS, name, caption, unit=_unit(run))
     return fold(
         "Predictions next to the truth", *drawn, *_paper_traces(context), Note(traces.UNSHIFTED) if drawn else None
     )
+
+
+def _unit(run: Run) -> str:
+    """Return the unit of the latents of a run: that of the channels where they are not compressed, else none."""
+    config = run.details.config
+    return units.of_model(config) if config["codec"]["kind"] == "raw" else "latent units"
 
 
 def _paper_traces(context: Context) -> list[Chart]:
@@ -72,7 +79,7 @@ def _paper_traces(context: Context) -> list[Chart]:
             if ranked:
                 name = ranked[len(ranked) // 2][1]
                 caption = f"{name}, the recording of median skill of {method.name}."
-                drawn += traces.draw(run.dataset.recordings[name], latents, (3, 5, 10), title, caption)
+                drawn += traces.draw(run.dataset.recordings[name], latents, (3, 5, 10), title, caption, unit=_unit(run))
     return drawn
 
 

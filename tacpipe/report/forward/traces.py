@@ -23,10 +23,13 @@ UNSHIFTED = (
 )
 
 
-def draw(shard: Recording, latents: Sequence[int], steps: Sequence[int], title: str, caption: str = "") -> list[Chart]:
+def draw(
+    shard: Recording, latents: Sequence[int], steps: Sequence[int], title: str, caption: str = "", *, unit: str = ""
+) -> list[Chart]:
     """Return the first seconds of some latents of a recording, by their place from 0, and what was predicted of them.
 
-    Latents and steps that the recording does not hold are left out.
+    ``unit`` is that of latents which are the channels themselves. Latents and steps that the recording does not hold are
+    left out.
     """
     table = shard.table()
     if not table.num_rows:
@@ -46,6 +49,7 @@ def draw(shard: Recording, latents: Sequence[int], steps: Sequence[int], title: 
         ahead = [step for step in steps if f"{latent}_t{step}" in table.column_names]
         several = [Line(TRUTH, time_s, values(latent))]
         several += [Line(f"t+{step}", time_s, values(f"{latent}_t{step}"), dashed=True) for step in ahead]
-        spec = charts.lines(several, "time at which the prediction is known (s)", latent, points=False, height=170)
+        quantity = f"{latent} ({unit})" if unit else latent
+        spec = charts.lines(several, "time at which the prediction is known (s)", quantity, points=False, height=170)
         drawn.append(Chart(f"{title}: {latent}", spec, caption, wide=True))
     return drawn

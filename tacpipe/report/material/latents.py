@@ -75,7 +75,11 @@ def _chart(method: Method) -> Chart | None:
         for name, recording, (x, y) in zip(part.named(part.materials), part.recordings, at, strict=True)
     ]
     spec = charts.scatter(
-        dots, "first principal component", "second", shapes=[shown(sensor) for sensor in sensors], legend=False
+        dots,
+        "first principal component",
+        "second principal component",
+        shapes=[shown(sensor) for sensor in sensors],
+        legend=False,
     )
     spec["layer"].append(charts.joined(_lines(points, parts, partners)))
     what = "the material that it was paired with" if partners else "the same material"
