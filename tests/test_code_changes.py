@@ -45,13 +45,57 @@ def times(params: Params, recording: Recording) -> RecordingOutput:
 @stage(version=1)
 def sums(params: Params, recordings: Dataset) -> dict:
     """Return the sum of all numbers."""
+    import lab_helper  # noqa: F401  (what is imported this late is code of the package too)
+
     total = sum(sum(shard.table()["x"].to_pylist()) for shard in recordings.recordings.values())
     return {"sum.txt": str(total).encode()}
+
+
+@stage(version=1)
+def fits(params: Params, recordings: Dataset, workspace: Workspace) -> dict:
+    """Return the weights that a training writes, which is killed after its first epoch."""
+    import lab_helper, os
+
+    checkpoint = workspace / "checkpoint"
+    if not checkpoint.exists():
+        checkpoint.write_text(lab_helper.WEIGHTS)
+        os._exit(9)
+    return {"model.txt": checkpoint.read_bytes()}
 
 
 NOTES = ()
 '''
 POINTS = "[tacpipe.stages]\nsimulate.numbers = lab_stages:made\ntimes = lab_stages:times\nsums = lab_stages:sums\n"
+POINTS += "train.numbers = lab_stages:fits\n"
+ESTIMATOR = '''
+"""An estimator of a lab."""
+
+from dataclasses import dataclass
+from typing import Any, Literal
+from tacpipe.tasks.material.params import Estimator
+
+
+@dataclass(frozen=True)
+class Nearest(Estimator):
+    """The nearest mean."""
+
+    architecture: Literal["nearest"] = "nearest"  # nearest: the nearest mean
+
+    def features(self, frames: Any) -> Any:
+        """Return means (slide, channel)."""
+        return frames.mean(axis=1)
+
+    def build(self, seed: int) -> Any:
+        """Return the estimator, not fitted."""
+        import lab_helper
+
+        return lab_helper.estimator()
+'''
+BAYES = """
+def estimator():
+    from sklearn.naive_bayes import GaussianNB
+    return GaussianNB()
+"""
 
 
 def prepared(folder: Path) -> None:
@@ -60,7 +104,9 @@ def prepared(folder: Path) -> None:
     package = folder / "package"
     (package / "lab.egg-info").mkdir(parents=True)
     (package / "lab.egg-info/entry_points.txt").write_text(POINTS)
+    (package / "lab.egg-info/top_level.txt").write_text("lab_stages\nlab_helper\n")
     (package / "lab_stages.py").write_text(STAGES)
+    (package / "lab_helper.py").write_text('WEIGHTS = "of ReLU"\n')
     ran(folder, "simulate numbers -o data/r")
     ran(folder, "times data/r -o data/t")
     ran(folder, "sums data/t -o data/s")
@@ -85,8 +131,8 @@ def ran(folder: Path, command: str) -> str:
     return out
 
 
-def edit(folder: Path, before: str, after: str) -> None:
-    path = folder / "package/lab_stages.py"
+def edit(folder: Path, before: str, after: str, module: str = "lab_stages") -> None:
+    path = folder / f"package/{module}.py"
     text = path.read_text()
     assert before in text
     path.write_text(text.replace(before, after))
@@ -117,6 +163,55 @@ def test_new_recordings_do_not_hide_that_others_are_of_older_code(own: Path) -> 
         (note,) = found["notes"]
         assert note.startswith("3 of these results were computed by other code of times")
     assert found["reused"] == 5
+
+
+def test_a_hit_names_the_package_of_which_a_module_was_edited_that_the_stage_imports_late(own: Path) -> None:
+    assert json.loads(ran(own, "sums data/t -o data/s2"))["notes"] == []
+    edit(own, "ReLU", "Tanh", "lab_helper")
+    for command, count in (("sums data/t -o data/s2", 1), ("times data/r -o data/t", 3)):
+        for _ in range(2):
+            outcome = json.loads(ran(own, command))
+            (note,) = outcome["notes"]
+            assert outcome["ran"] == 0 and note.startswith(
+                f"{count} of these results were computed by other code of the package lab than is installed now."
+            )
+    ran(own, "sums data/t -o data/s2 --rerun")
+    assert json.loads(ran(own, "sums data/t -o data/s2"))["notes"] == []
+
+
+@pytest.mark.long
+def test_a_model_and_its_evaluation_name_the_edited_package_of_their_architecture(own: Path) -> None:
+    package = own / "package"
+    (package / "lab_estimator.py").write_text(ESTIMATOR)
+    (package / "lab_helper.py").write_text(BAYES)
+    (package / "lab.egg-info/top_level.txt").write_text("lab_estimator\nlab_helper\n")
+    (package / "lab.egg-info/entry_points.txt").write_text(
+        "[tacpipe.models]\nmaterial.nearest = lab_estimator:Nearest\n"
+    )
+    ran(own, "simulate material --trials 12 --materials 2 -o data/m")
+    ran(own, "segment slides data/m -o data/slides")
+    ran(own, "split data/slides -o data/split --scheme random --stratify material")
+    train = "train material data/slides --split data/split -o models/m --architecture nearest"
+    evaluate = "evaluate models/m data/slides --split data/split -o results/m"
+    assert json.loads(ran(own, train))["notes"] == json.loads(ran(own, evaluate))["notes"] == []
+    edit(own, "GaussianNB()", "GaussianNB(var_smoothing=0.5)", "lab_helper")
+    for command in (train, evaluate):
+        assert any("other code of the package lab " in note for note in json.loads(ran(own, command))["notes"]), command
+    ran(own, f"{train} --rerun")
+    assert not any("other code" in note for note in json.loads(ran(own, train))["notes"])
+
+
+def test_a_training_never_resumes_a_checkpoint_that_other_code_wrote(own: Path) -> None:
+    train = "train numbers data/r -o models/m"
+    assert call(own, train)[0] == 9
+    assert ran(own, train) and (own / "models/m/model.txt").read_text() == "of ReLU"  # by the same code
+    assert call(own, f"{train}2 --factor 3")[0] == 9
+    edit(own, "ReLU", "Tanh", "lab_helper")
+    code, _, err = call(own, f"{train}2 --factor 3")
+    assert code == 9 and "was written by other code; training starts over" in err
+    ran(own, f"{train}2 --factor 3")
+    assert (own / "models/m2/model.txt").read_text() == "of Tanh"
+    assert not list((own / ".tacpipe/checkpoints").iterdir())
 
 
 def test_a_change_of_a_built_in_stage_is_not_named_where_it_is_installed(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -209,7 +209,7 @@ class ByRecording:
                 made_by = done.record["provenance"]
                 found[done.recording] = {  # what is needed of it: of a million there is no room for more
                     "result": done.record["result"],
-                    "provenance": {name: made_by[name] for name in ("notes", "code") if name in made_by},
+                    "provenance": {name: made_by[name] for name in ("notes", "code", "packages") if name in made_by},
                 }
                 if self.request.compare and done.recording in stored:
                     self.outcome.compare(stored[done.recording], done.record, done.recording)

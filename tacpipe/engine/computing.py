@@ -20,6 +20,7 @@ from tacpipe.engine.execution import Scratch
 from tacpipe.engine.task import Done, Task
 from tacpipe.errors import FAILED, MissingModuleError, StorageError, TacpipeError
 from tacpipe.io.hashing import digest
+from tacpipe.plugins import registry
 from tacpipe.plugins.stage import AnyStage
 from tacpipe.store import records
 from tacpipe.store.location import opened
@@ -115,8 +116,7 @@ def _begun(task: Task, store: Store) -> Callable[[], Done]:
 
 
 def _failed(task: Task, store: Store, error: TacpipeError) -> Done:
-    with contextlib.suppress(OSError):  # a workspace in which nothing was saved; one with a checkpoint stays
-        execution.workspace(store, digest(task.identity)).rmdir()
+    execution.remove_empty_workspace(store, digest(task.identity))
     at_fault = error.exit_code == FAILED and not isinstance(error, (StorageError, MissingModuleError))
     return Done(task.recording, None, str(error), error.exit_code, at_fault=at_fault)
 
@@ -163,10 +163,12 @@ def _computed(task: Task, store: Store, key: str, leases: ExitStack) -> Done | _
         return Done(task.recording, record, made=False)
     started = time.perf_counter()
     replace = task.replace or record is not None
-    result, notes = execution.execute(task, store, store)
-    stage = execution.stage_of(task.name)
+    with registry.collect_packages() as packages:
+        stage = execution.stage_of(task.name)
+        code = provenance.code(stage)  # before it runs: it may be edited meanwhile
+        result, notes = execution.execute(task, store, store)
     made = {**provenance.of(round(time.perf_counter() - started, 4)), "irreplaceable": stage.source}
-    made |= {"code": provenance.code(stage), "notes": notes}
+    made |= {"code": code, "packages": provenance.code_of_packages(task.identity, packages), "notes": notes}
     if stage.source:  # the record alone would mark this as a recording, until a dataset's manifest does
         store.put(_manifest_of(task, stage, result).content, durable=True)
     return _Made(result, made, replace, stage.source)

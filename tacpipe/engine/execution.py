@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import logging
+import shutil
+import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,8 +20,9 @@ from tacpipe.engine import provenance
 from tacpipe.engine.shared import SharedFiles
 from tacpipe.engine.task import Task
 from tacpipe.errors import FAILED, DamagedError, StorageError, TacpipeError
-from tacpipe.io import memory
+from tacpipe.io import memory, regular
 from tacpipe.io.drafts import Hashed
+from tacpipe.io.files import write_whole
 from tacpipe.io.hashing import bytes_digest, digest, remembered_file_digest
 from tacpipe.plugins import extras, failures, registry
 from tacpipe.plugins import params as params_of
@@ -27,6 +31,10 @@ from tacpipe.store import records
 from tacpipe.store.location import opened
 from tacpipe.store.store import MissingError, Object, Store
 from tacpipe.training import display, following
+
+
+_CODE = "code"  # the file of a workspace with the digest of the code that writes its checkpoints
+log = logging.getLogger(__name__)
 
 
 class Scratch:
@@ -254,7 +262,27 @@ def _begun_workspace(store: Store, key: str) -> Path:
     if folder.is_symlink():
         raise StorageError(f"{folder} is a symbolic link, and none is followed within a store. Remove it.")
     folder.mkdir(parents=True, exist_ok=True)
+    written_by, code = folder / _CODE, provenance.code_of_training().encode()
+    try:
+        stored = regular.content(written_by, follow=False)
+    except (FileNotFoundError, TacpipeError):
+        stored = b""
+    if stored != code:
+        checkpoints = [path for path in folder.iterdir() if path.name != _CODE]
+        if checkpoints:
+            log.warning("The checkpoint in %s was written by other code; training starts over.", folder)
+        for path in checkpoints:
+            path.unlink(missing_ok=True)
+        write_whole(str(written_by), code, str(folder / f"{_CODE}.{uuid.uuid4().hex}"))
     return folder
+
+
+def remove_empty_workspace(store: Store, key: str) -> None:
+    """Remove the folder of a training that saved nothing; one with a checkpoint stays."""
+    folder = workspace(store, key)
+    with contextlib.suppress(OSError):
+        if {path.name for path in folder.iterdir()} <= {_CODE}:
+            shutil.rmtree(folder)
 
 
 @contextmanager

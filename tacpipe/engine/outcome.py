@@ -9,10 +9,11 @@ from typing import Any
 
 from tacpipe.engine import execution, provenance
 from tacpipe.errors import TacpipeError
+from tacpipe.plugins import registry
 from tacpipe.printable import listed
 
 _NAMED = 5  # recordings that a note names
-_FROM_RECORDS = ("stated", "code", "unlike")  # fields that `describe_results` puts into words
+_FROM_RECORDS = ("stated", "code", "packages", "unlike")  # fields that `describe_results` puts into words
 
 
 @dataclass
@@ -30,6 +31,7 @@ class Outcome:
     notes: list[str] = field(default_factory=list)
     stated: dict[str, list[str]] = field(default_factory=dict)  # note of a stage to the recordings that it is about
     code: dict[str, dict[str, int]] = field(default_factory=dict)  # stage to digest of its code to number of results
+    packages: dict[str, dict[str, int]] = field(default_factory=dict)  # the same by plug-in package
     unlike: list[str] = field(default_factory=list)  # in what the computers of results that differ are not the same
 
     def begin(self) -> None:
@@ -43,17 +45,15 @@ class Outcome:
         for note in made.get("notes") or ():
             self.stated.setdefault(note, []).append(recording)
         if made.get("code"):
-            counts = self.code.setdefault(stage, {})
-            counts[made["code"]] = counts.get(made["code"], 0) + 1
+            _add_counts(self.code, {stage: {made["code"]: 1}})
+        _add_counts(self.packages, {package: {code: 1} for package, code in (made.get("packages") or {}).items()})
 
     def add_group(self, kept: Mapping[str, Any]) -> None:
         """Add what `of_results` returned for a group of recordings."""
         for note, recordings in (kept.get("notes") or {}).items():
             self.stated.setdefault(note, []).extend(recordings)
-        for stage, numbers in (kept.get("code") or {}).items():
-            counts = self.code.setdefault(stage, {})
-            for code, number in numbers.items():
-                counts[code] = counts.get(code, 0) + number
+        _add_counts(self.code, kept.get("code") or {})
+        _add_counts(self.packages, kept.get("packages") or {})
 
     def compare(self, stored: Mapping[str, Any], made: Mapping[str, Any], name: str) -> None:
         """Add what differs between two records of one result; ``name`` is that of the stage or of the recording."""
@@ -64,11 +64,12 @@ class Outcome:
 
     def of_results(self) -> dict[str, Any]:
         """Return what `add_record` added, as the record of a whole run keeps it."""
-        return {"code": self.code, "notes": self.stated}
+        return {"code": self.code, "packages": self.packages, "notes": self.stated}
 
     def restore(self, kept: Mapping[str, Any]) -> None:
         """Take over what `of_results` returned; nothing of an older record, which has none."""
-        self.code, self.stated = kept.get("code") or {}, kept.get("notes") or {}
+        self.code, self.packages = kept.get("code") or {}, kept.get("packages") or {}
+        self.stated = kept.get("notes") or {}
 
     def describe_differences(self) -> str:
         """Return what differs from what is stored, and whether another computer's rounding may be why."""
@@ -83,12 +84,35 @@ class Outcome:
             some = f"{len(names)} recordings ({listed(sorted(names), _NAMED)})"
             some = f"all {count} recordings" if len(names) == count else some
             found.append(f"{some}: {text}" if len(names) > 1 else f"{names[0]}: {text}" if names[0] else text)
-        return [*found, *(line for name, counts in self.code.items() if (line := _other_code(name, counts)))]
+        stages = {name: line for name, counts in self.code.items() if (line := _other_code(name, counts))}
+        packages = {name: line for name, counts in self.packages.items() if (line := _other_package(name, counts))}
+        described = {package for name in stages if (package := registry.package_of_stage(name)) is not None}
+        return [*found, *stages.values(), *(line for name, line in packages.items() if name not in described)]
 
     def to_json(self) -> dict[str, Any]:
         """Return the outcome as a command prints it."""
         value = {name: value for name, value in vars(self).items() if name not in _FROM_RECORDS}
         return {**value, "output": str(self.output)}
+
+
+def _add_counts(total: dict[str, dict[str, int]], counts: Mapping[str, Mapping[str, int]]) -> None:
+    """Add to ``total`` how many results were computed by each code, by stage or package."""
+    for name, numbers in counts.items():
+        added = total.setdefault(name, {})
+        for code, number in numbers.items():
+            added[code] = added.get(code, 0) + number
+
+
+def _other_package(package: str, counts: Mapping[str, int]) -> str:
+    """Return the warning for a plug-in package as `_other_code` does for a stage."""
+    now = registry.package_code(package)  # None: it is gone, and its results stay valid
+    others = sum(number for code, number in counts.items() if code != now)
+    if now is None or not others:
+        return ""
+    return (
+        f"{others} of these results were computed by other code of the package {package} than is installed now. Raise the "
+        f"version of the package or of the stage if they differ, or compute them again with --rerun."
+    )
 
 
 def _other_code(name: str, counts: Mapping[str, int]) -> str:

@@ -114,13 +114,16 @@ class Previous:
         """Return what records state of results of which ``others`` are left out; None where that is not known."""
         provenance = self.record["provenance"]
         codes: Mapping[str, int] = (provenance.get("code") or {}).get(stage) or {}
-        if codes and [*codes.values()] != [len(self.made.recordings)]:  # which were computed by other code is not known
-            return None
+        packages: Mapping[str, Mapping[str, int]] = provenance.get("packages") or {}
+        for counts in filter(None, (codes, *packages.values())):
+            if [*counts.values()] != [len(self.made.recordings)]:  # which were computed by other code is not known
+                return None
         left = {*others, ""}  # the last: of a stage over a whole dataset, which is asked again
         given: Mapping[str, Sequence[str]] = provenance.get("notes") or {}
         notes = {note: [name for name in names if name not in left] for note, names in given.items()}
         return {
             "code": {stage: dict.fromkeys(codes, count)} if codes and count else {},
+            "packages": {name: dict.fromkeys(counts, count) for name, counts in packages.items() if count},
             "notes": {note: names for note, names in notes.items() if names},
         }
 

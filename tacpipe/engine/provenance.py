@@ -6,13 +6,14 @@ import contextlib
 import functools
 import platform
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
 from tacpipe.engine import processor
-from tacpipe.io.hashing import remembered_file_digest
+from tacpipe.io.hashing import digest, remembered_file_digest
+from tacpipe.plugins import architectures, registry
 from tacpipe.plugins.stage import AnyStage
 from tacpipe.training import devices
 
@@ -97,3 +98,20 @@ def code(stage: AnyStage) -> str | None:
         return remembered_file_digest(file)
     except OSError:  # it was removed while it ran
         return None
+
+
+def code_of_packages(identity: Mapping[str, Any], used: Iterable[str] = ()) -> dict[str, str]:
+    """Return the digest of the code of each plug-in package that computes a result, by the package's name.
+
+    These are the packages ``used`` by the stage and those of the architectures that its ``identity`` names.
+    """
+    lineages = (value.get("lineage") or {} for value in identity["inputs"].values() if isinstance(value, Mapping))
+    params = [identity["params"], *(lineage.get("params") or {} for lineage in lineages)]
+    named = {str(values[architectures.PLUGIN]).partition(" ")[0] for values in params if architectures.PLUGIN in values}
+    codes = {package: registry.package_code(package) for package in sorted({*used, *named})}
+    return {package: code for package, code in codes.items() if code is not None}
+
+
+def code_of_training() -> str:
+    """Return the digest of all code that may take part in a training: tacpipe's own and that of every plug-in package."""
+    return digest({package: registry.package_code(package) for package in (registry.OWN, *registry.plugin_packages())})

@@ -8,13 +8,17 @@ import functools
 import importlib
 import importlib.util
 import sys
+from collections.abc import Iterator
 from configparser import ConfigParser
+from contextvars import ContextVar
+from importlib.machinery import EXTENSION_SUFFIXES, SOURCE_SUFFIXES
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import memory
 from tacpipe.io.files import listed
+from tacpipe.io.hashing import digest, file_digest
 from tacpipe.plugins import extras, failures
 from tacpipe.plugins.stage import AnyStage, Stage
 from tacpipe.printable import plain
@@ -31,6 +35,7 @@ MODELS = "tacpipe.models"  # TASK.NAME: params of an architecture of a task (`ta
 CODECS = "tacpipe.codecs"  # by the kind of a codec: its class (`tacpipe.codecs.codec.Codec`)
 GROUPS = (STAGES, FORMATS, EXPORTS, TASKS, REPORTS, DEMOS, COMMANDS, SENSORS, EXECUTORS, TRACKERS, MODELS, CODECS)
 FIT, PART = ".fit", ".part"  # end the names of what belongs to a stage and has a key of its own
+_used_packages: ContextVar[set[str] | None] = ContextVar("used_packages", default=None)
 
 
 class Package(NamedTuple):
@@ -92,6 +97,83 @@ def brought_by(group: str, name: str) -> Package | None:
     return Package(plain(about["Name"]), plain(about["Version"]))
 
 
+@functools.cache
+def plugin_packages() -> dict[str, Path]:
+    """Return the names of the installed packages that bring plug-ins, each with the file of its entry points."""
+    return {
+        package.name: file
+        for group, points in installed().items()
+        for name, (_, file) in points.items()
+        if (package := brought_by(group, name)) is not None
+    }
+
+
+def package_of_stage(name: str) -> str | None:
+    """Return the name of the plug-in package that brings a stage; None for tacpipe's own stages and unknown names."""
+    name = whole(name)
+    for group, prefix in ((FORMATS, "ingest."), (EXPORTS, "export."), (STAGES, "")):
+        if name.startswith(prefix) and name.removeprefix(prefix) in entry_points()[group]:
+            package = brought_by(group, name.removeprefix(prefix))
+            return None if package is None else package.name
+    return None
+
+
+@functools.cache
+def package_code(package: str) -> str | None:
+    """Return the digest of all code of a plug-in package, or of tacpipe itself; None where it is not installed.
+
+    The code is that of the first call: a process does not import a module again that was edited since.
+    """
+    modules = extras.OWN if package == OWN else _top_modules(plugin_packages().get(package))
+    files = {name: file for module in modules for name, file in _code_files(module)}
+    try:
+        return digest({name: file_digest(files[name]) for name in sorted(files)}) if files else None
+    except OSError:  # a file was removed meanwhile
+        return None
+
+
+def _top_modules(entry_points_file: Path | None) -> set[str]:
+    """Return the modules and packages that a distribution installs at the top level."""
+    if entry_points_file is None:
+        return set()
+    targets = (target for points in installed().values() for target, file in points.values() if file == entry_points_file)
+    modules = {target.partition(":")[0].partition(".")[0] for target in targets}
+    with contextlib.suppress(OSError):  # written by setuptools only
+        modules.update(entry_points_file.with_name("top_level.txt").read_text(encoding="utf-8").split())
+    with contextlib.suppress(OSError):  # absent from an egg-info
+        paths = [line.split(",")[0] for line in entry_points_file.with_name("RECORD").read_text("utf-8").splitlines()]
+        modules.update(path.partition("/")[0].removesuffix(".py") for path in paths if path.endswith(".py"))
+    return {module for module in modules if module.isidentifier()}
+
+
+def _code_files(module: str) -> Iterator[tuple[str, Path]]:
+    """Yield every file of code of a module or package at the top level, with its name from there. Nothing is imported."""
+    try:
+        spec = importlib.util.find_spec(module)
+    except (ImportError, ValueError):
+        return
+    if spec is None:
+        return
+    if spec.origin is not None and not spec.submodule_search_locations:
+        yield Path(spec.origin).name, Path(spec.origin)
+    suffixes = (*SOURCE_SUFFIXES, *EXTENSION_SUFFIXES)
+    for folder in spec.submodule_search_locations or ():
+        for file in Path(folder).rglob("*"):
+            if file.name.endswith(suffixes) and file.is_file():
+                yield f"{module}/{file.relative_to(folder).as_posix()}", file
+
+
+@contextlib.contextmanager
+def collect_packages() -> Iterator[set[str]]:
+    """Yield a set to which the packages of all plug-ins are added that are loaded by name in the block."""
+    packages: set[str] = set()
+    token = _used_packages.set(packages)
+    try:
+        yield packages
+    finally:
+        _used_packages.reset(token)
+
+
 def _entry_point_files(folder: str) -> list[Path]:
     """Return where the entry points of what is installed in a folder may be."""
     pattern = "*.dist-info" if folder.endswith("-packages") else "*.egg-info"
@@ -145,6 +227,9 @@ def load(name: str) -> AnyStage:
     if target is None:
         raise UsageError(f"There is no stage {name}; there are {', '.join(stages())}.")
     found = _import(name, target)
+    packages = _used_packages.get()
+    if packages is not None and (package := package_of_stage(name)) is not None:
+        packages.add(package)
     if not isinstance(found, Stage):
         raise TacpipeError(f"{target}, registered as stage {name}, is not a stage: decorate it with @stage(version=1).")
     return found
@@ -249,6 +334,9 @@ def _named(group: str, what: str, name: Any) -> Any:
     target = found.get(str(name))
     if target is None:
         raise UsageError(f"There is no {what} {plain(str(name))}; there are {', '.join(sorted(found))}.")
+    packages = _used_packages.get()
+    if packages is not None and group != MODELS:  # all architectures are loaded to know a task's params, which name theirs
+        packages.update(package.name for package in [brought_by(group, str(name))] if package is not None)
     return _import(name, target)
 
 
