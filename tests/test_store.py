@@ -3,17 +3,19 @@ import fcntl
 import json
 import os
 import threading
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tacpipe.errors import LockedError, TacpipeError
+from tacpipe.errors import LockedError, TacpipeError, UsageError
 from tacpipe.io.drafts import Draft
 from tacpipe.io.hashing import bytes_digest, digest
 from tacpipe.store.location import locate, project
 from tacpipe.store.store import MissingError, Store
+from tests.conftest import Ran
 
 IDENTITY = {"stage": "scale", "version": 1, "params": {}, "inputs": {}}
 EMPTY: dict[str, dict[str, object]] = {"recordings": {}, "files": {}}
@@ -223,6 +225,96 @@ def test_the_store_lies_beside_the_project_or_where_the_environment_says(
     assert project(deep) == tmp_path
     monkeypatch.setenv("TACPIPE_STORE", str(tmp_path / "elsewhere"))
     assert locate(deep).root == tmp_path / "elsewhere"
+
+
+def folders(root: Path, *paths: str) -> None:
+    """Make folders (``a/``) and empty files below ``root``."""
+    for path in paths:
+        (root / path).parent.mkdir(parents=True, exist_ok=True)
+        (root / path).mkdir(exist_ok=True) if path.endswith("/") else (root / path).touch()
+
+
+@pytest.mark.parametrize(
+    ("present", "here", "datasets", "expected"),
+    [
+        (["lab/.tacpipe/"], "lab/a", ["lab/a/data/r"], "lab/a"),  # a stray store above an unmarked folder
+        (["lab/.tacpipe/", "lab/a/.git/"], "lab/a/data", ["lab/a/data/r"], "lab/a"),
+        (["lab/.tacpipe/project"], "lab/a", ["lab/a/data/r"], "lab"),  # as `tacpipe store init` marks it
+        (["lab/.tacpipe/", "lab/pyproject.toml"], "lab/a", ["lab/a/data/r"], "lab"),
+        (["lab/.tacpipe/", "lab/params.yaml"], "", ["lab/a/data/r"], "lab"),
+        (["lab/.git/", "lab/a/.tacpipe/"], "lab", ["lab/a/data/r"], "lab/a"),
+        (["lab/.git/", "b/.git/"], "lab", ["b/data/s", "lab/data/r"], "b"),  # the output's project
+        (["lab/.git/", "b/"], "lab", ["b/data/s", "lab/data/r"], "lab"),  # the output lies in none
+        (["lab/.git/"], "b", ["b/data/s", "lab/data/r"], "b"),  # below the working directory
+        (["lab/.git/"], "b", [], "b"),
+        (["lab/.git/"], "lab/a", [], "lab"),
+    ],
+)
+def test_the_store_is_that_of_the_project_in_which_the_datasets_lie(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    present: list[str],
+    here: str,
+    datasets: list[str],
+    expected: str,
+) -> None:
+    folders(tmp_path, *present, f"{here}/.keep")
+    monkeypatch.chdir(tmp_path / here)
+    assert project(*(tmp_path / path for path in datasets)) == tmp_path / expected
+
+
+def test_a_store_above_the_project_is_used_with_a_notice_where_it_holds_a_dataset(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folders(tmp_path, "lab/a/.git/", "elsewhere/.tacpipe/")
+    stray = Store(tmp_path / "lab/.tacpipe")
+    stray.prepare()
+    recordings, synced = tmp_path / "lab/a/data/r", tmp_path / "lab/a/data/s"
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    assert project(synced, recordings) == tmp_path / "lab/a" and "is used" not in capsys.readouterr().err
+    stray.roots.set(recordings, "0" * 64)
+    assert project(synced, recordings) == tmp_path / "lab" and f"{stray.root} is used" in capsys.readouterr().err
+    assert project(synced) == tmp_path / "lab/a"
+    (tmp_path / "lab/a/.git").rmdir()  # no project is marked any more
+    assert project(synced, recordings) == tmp_path / "lab"
+    assert project(synced) == tmp_path / "elsewhere"
+
+
+def test_a_stray_store_captures_no_project_below_and_its_own_datasets_keep_it(
+    call: Callable[[str], Ran], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folders(tmp_path, "a/", "b/", "elsewhere/")
+    monkeypatch.chdir(tmp_path)
+    first = call("simulate forward --trials 1 --duration-s 4 -o a/r")
+    assert first.code == 0 and first.err.count("created the store") == 1
+    monkeypatch.chdir(tmp_path / "b")
+    assert f"created the store {tmp_path / 'b/.tacpipe'}" in call("simulate forward --trials 1 --duration-s 4 -o r").err
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    for reused in (0, 1):
+        ran = call(f"synchronize {tmp_path / 'a/r'} -o {tmp_path / 'a/s'} --json")
+        assert json.loads(ran.out)["reused"] == reused and "is used: it holds" in ran.err
+    assert not Path(".tacpipe").exists()
+    assert call("store init").code == 0
+    folders(tmp_path, "elsewhere/deep/")
+    monkeypatch.chdir(tmp_path / "elsewhere/deep")
+    assert json.loads(call("store status --json").out)["store"] == str(tmp_path / "elsewhere/.tacpipe")
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="gives a store to another user, which root alone may")
+def test_a_store_of_another_user_is_used_only_where_it_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = tmp_path / ".tacpipe"
+    Store(root).prepare()
+    Store(root).roots.set(tmp_path / "a/r", "0" * 64)
+    os.chown(root, 12345, -1)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UsageError, match=r"belongs to another user \(id 12345; yours is 0\).*TACPIPE_STORE="):
+        locate(tmp_path / "a/r")
+    folders(tmp_path, "a/.git/")
+    assert locate(tmp_path / "a/r").root == tmp_path / "a/.tacpipe"  # though the other holds it
+    monkeypatch.setenv("TACPIPE_STORE", str(root))
+    assert locate(tmp_path / "a/r").root == root
 
 
 def test_settling_syncs_each_folder_above_the_names_once_and_those_within_first(

@@ -77,7 +77,7 @@ def add(program: typer.Typer, summary: str) -> None:
         from tacpipe.recording import trials as trials_of
         from tacpipe.store.location import locate
 
-        store = locate()
+        store = locate(*([] if output is None else [output]))
         if rig is None and not recover:
             raise UsageError("acquire needs a rig file, as in `tacpipe acquire rig.toml -o data/recordings`.")
         found = rig_of.read(rig) if rig is not None else None

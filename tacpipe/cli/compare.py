@@ -181,7 +181,7 @@ def run(paths: Sequence[Path], *, pool: bool) -> Compared:
     for path, one in results.items():
         if METRICS not in one.files:
             raise UsageError(f"{path} was made by {one.source.stage}; give results of `tacpipe evaluate`.")
-    found = Compared(results, engine.compare(list(results.values()), pool=pool), pool, _places())
+    found = Compared(results, engine.compare(list(results.values()), pool=pool), pool, _places(paths))
     if not found.comparisons:
         raise UsageError(
             "None of these results holds the errors of single recordings. Run `tacpipe evaluate` again, or give "
@@ -217,9 +217,9 @@ def _style(row: engine.Row) -> str:
     return "green" if row.gain.low > 0 else "red" if row.gain.high < 0 else ""
 
 
-def _places() -> dict[str, str]:
+def _places(results: Sequence[Path]) -> dict[str, str]:
     """Return where the store's datasets lie, as seen from the working directory, by the digests of their manifests."""
-    paths = {str(root["manifest"]): Path(root["path"]) for root in locate().roots.all()}
+    paths = {str(root["manifest"]): Path(root["path"]) for root in locate(*results).roots.all()}
     here = Path.cwd()
     return {name: str(path.relative_to(here) if path.is_relative_to(here) else path) for name, path in paths.items()}
 

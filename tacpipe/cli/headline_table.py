@@ -20,7 +20,7 @@ EMPTY = "No recording was left to evaluate the model on: it has seen all of them
 def of_output(output: Path, file: str) -> list[Headline] | None:
     """Return the headlines that ``file`` of the dataset at ``output`` holds, whose bytes are verified; None without it."""
     found = manifest.find(output).manifest.files.get(file)
-    return read(locate().read(found["digest"])) if found else None
+    return read(locate(output).read(found["digest"])) if found else None
 
 
 def read(content: bytes) -> list[Headline]:

@@ -199,7 +199,7 @@ def _run(
     from tacpipe.recording.view import View
     from tacpipe.store import location
 
-    store = location.locate()
+    store = location.locate(*([] if output is None else [output]))
     plan: trials_of.Plan | None = None
     if output is not None:
         kept = {**acquire.attributes(labels, None), **attributes}

@@ -12,8 +12,9 @@ from tacpipe.errors import DAMAGED, FAILED, UsageError
 from tacpipe.io import progress, terminal
 from tacpipe.maintenance import garbage
 from tacpipe.printable import plain
+from tacpipe.store import layout
 from tacpipe.store.location import locate
-from tacpipe.store.roots import PUSHED
+from tacpipe.store.roots import BESIDE_NAME, PUSHED
 from tacpipe.store.store import Store
 
 if TYPE_CHECKING:
@@ -38,9 +39,24 @@ Ancestors = Annotated[bool, typer.Option("--ancestors", help="Include the shards
 def add(program: typer.Typer, summary: str) -> None:
     """Add the group ``store`` to ``program``."""
     group = typer.Typer(help=summary, no_args_is_help=True, rich_markup_mode=None)
-    for command in (status, list_, checkout, verify, repair, gc, link, push, pull):
+    for command in (init, status, list_, checkout, verify, repair, gc, link, push, pull):
         group.command(command.__name__.rstrip("_"))(command)
     program.add_typer(group, name="store")
+
+
+def init() -> None:
+    """Make this folder a project with a store of its own.
+
+    Datasets in the folders below use this store, unless a project among these
+    folders is marked by pyproject.toml, dvc.yaml, params.yaml or .git.
+
+    Example: tacpipe store init
+    """
+    store = Store(Path.cwd() / BESIDE_NAME)
+    store.prepare()
+    store.write_file(store.root / layout.PROJECT, b"")
+    store.sync(store.root / layout.PROJECT)
+    terminal.result(str(store.root))
 
 
 def status(as_json: AsJson = False) -> None:

@@ -165,7 +165,7 @@ def _computed(task: Task, store: Store, key: str, leases: ExitStack) -> Done | _
     replace = task.replace or record is not None
     with registry.collect_packages() as packages:
         stage = execution.stage_of(task.name)
-        code = provenance.code(stage)  # before it runs: it may be edited meanwhile
+        code = provenance.code(stage)  # The file may be edited while the stage runs
         result, notes = execution.execute(task, store, store)
     made = {**provenance.of(round(time.perf_counter() - started, 4)), "irreplaceable": stage.source}
     made |= {"code": code, "packages": provenance.code_of_packages(task.identity, packages), "notes": notes}

@@ -26,7 +26,7 @@ def continued(recordings: Dataset, model: Dataset) -> Dataset:
     source = recordings.source
     given = replace(source, recordings={name: source.recordings[name] for name in recordings.recordings})
     beside = (str(recordings.path), str(model.path))
-    store = locate(recordings.path)
+    store = locate(recordings.path, model.path)
     manifests = [source.content_digest, bytes_digest(model.source.content)]
     with Chosen("", 0) as chosen, store.at_work(manifests):
         mapping = ByRecording(store, Request("", None, Path()), Outcome(Path()), chosen)

@@ -68,7 +68,7 @@ def total_s(each_s: float, models: int, at_once: int, threads: int, cores: int) 
 
 def _is_missing(request: Request) -> bool:
     """Return whether the store has no answer to a request."""
-    store = locate()
+    store = locate(*request.locations)
     return request.rerun or store.record(digest(Inputs(request, store).identity())) is None
 
 

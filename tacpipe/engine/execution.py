@@ -32,7 +32,6 @@ from tacpipe.store.location import opened
 from tacpipe.store.store import MissingError, Object, Store
 from tacpipe.training import display, following
 
-
 _CODE = "code"  # the file of a workspace with the digest of the code that writes its checkpoints
 log = logging.getLogger(__name__)
 

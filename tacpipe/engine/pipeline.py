@@ -55,7 +55,7 @@ def run(request: Request) -> Outcome:
         raise UsageError("--track follows what is stored; it does not go with --check or --recompute-and-compare.")
     trackers = tracking.opened(request.track) if request.track else {}
     replacing.refuse_inputs(request.output, request.reads)
-    store = locate()
+    store = locate(*request.locations)
     inputs = Inputs(request, store)
     with Chosen(request.executor, request.jobs) as chosen:
         work = _Run(request, store, inputs, inputs.identity(), chosen)
@@ -76,7 +76,7 @@ def answered(request: Request) -> Outcome | None:
     if request.check or request.compare or request.rerun or request.track:  # each has a business of its own
         return None
     replacing.refuse_inputs(request.output, request.reads)
-    store = locate()
+    store = locate(*request.locations)
     inputs = Inputs(request, store)
     with Chosen(request.executor, request.jobs) as chosen:
         work = _Run(request, store, inputs, inputs.identity(), chosen)

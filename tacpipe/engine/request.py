@@ -74,6 +74,11 @@ class Request:
         return {name: path for name in PATHS if (path := getattr(self, name)) is not None}
 
     @property
+    def locations(self) -> list[Path]:
+        """Where the store is looked for: the output, then the datasets that are read; a published source has none."""
+        return [self.output, *self.datasets, *(path for name, path in self.named.items() if name in DATASETS)]
+
+    @property
     def single_file(self) -> bool:
         """Whether the output is one file, such as a report, and no dataset directory."""
         return self.output.suffix == ".html"

@@ -118,7 +118,7 @@ def pull(remote: Path | str, paths: Sequence[Path], *, ancestors: bool = False, 
     there, done = remote_store(remote), Transferred()
     for path in paths:
         found, name = _wanted(path, there)
-        here = locate(found.directory if found.directory.exists() else None)
+        here = locate(found.directory)
         manifest = found.manifest  # one edited by hand is refused before anything moves
         directory_of.check_output(here, found.directory)
         occupant = replacing.occupant(here, found.directory)
@@ -233,7 +233,7 @@ def _wanted(path: Path, there: AnyStore) -> tuple[manifest_of.Found, str]:
     if (directory / manifest_of.NAME).exists():
         return manifest_of.find(directory), str(directory)
     folder, name = projects.place(directory)
-    here = locate(directory if directory.exists() else None)
+    here = locate(directory)
     root = pushed.find(there, str(path), name, projects.known(here, folder))
     if root["path"] != name:  # PROJECT:PATH
         if not paths.safe_path(root["path"]):

@@ -136,7 +136,9 @@ def _top_modules(entry_points_file: Path | None) -> set[str]:
     """Return the modules and packages that a distribution installs at the top level."""
     if entry_points_file is None:
         return set()
-    targets = (target for points in installed().values() for target, file in points.values() if file == entry_points_file)
+    targets = (
+        target for points in installed().values() for target, file in points.values() if file == entry_points_file
+    )
     modules = {target.partition(":")[0].partition(".")[0] for target in targets}
     with contextlib.suppress(OSError):  # written by setuptools only
         modules.update(entry_points_file.with_name("top_level.txt").read_text(encoding="utf-8").split())
@@ -335,7 +337,9 @@ def _named(group: str, what: str, name: Any) -> Any:
     if target is None:
         raise UsageError(f"There is no {what} {plain(str(name))}; there are {', '.join(sorted(found))}.")
     packages = _used_packages.get()
-    if packages is not None and group != MODELS:  # all architectures are loaded to know a task's params, which name theirs
+    if (
+        packages is not None and group != MODELS
+    ):  # all architectures are loaded to know a task's params, which name theirs
         packages.update(package.name for package in [brought_by(group, str(name))] if package is not None)
     return _import(name, target)
 

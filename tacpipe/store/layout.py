@@ -20,6 +20,7 @@ from tacpipe.printable import listed, plain
 
 FORMAT = "1"
 MARK = "format"  # the file that makes a folder a store
+PROJECT = "project"  # the file that makes the folder of a store that of a project, written by `tacpipe store init`
 FOLDERS = ("objects", "records", "roots", "leases", "checkpoints", "quarantine", "tmp")
 SPOOL = "spool"  # made by the first recording
 KEPT = "kept-spools"  # made by the first recording whose raw bytes are kept
@@ -100,7 +101,7 @@ def entries(root: Path, name: str) -> Iterator[Path]:
 def foreign(root: Path) -> list[str]:
     """Return the paths within the store of all that is not of its form, sorted; symbolic links are among it."""
     found = [path for name in _FORMS for path, ours in _found(root, name) if not ours]
-    known = {MARK, *_FORMS, *_BESIDE}
+    known = {MARK, PROJECT, *_FORMS, *_BESIDE}
     found += [Path(entry.path) for entry in _scan(root, root) if entry.name not in known]
     return sorted(str(path.relative_to(root)) for path in found)
 

@@ -3,13 +3,26 @@
 from __future__ import annotations
 
 import errno
+import functools
 import os
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+from tacpipe.errors import UsageError
+from tacpipe.io import progress
 from tacpipe.io.files import present, unread
-from tacpipe.store import addresses
+from tacpipe.store import addresses, layout
 from tacpipe.store.roots import BESIDE_NAME
 from tacpipe.store.store import Store
+
+# Files and folders that mark the folder of a project
+MARKS = (
+    "pyproject.toml",
+    "dvc.yaml",
+    "params.yaml",
+    ".git",
+    f"{BESIDE_NAME}/{layout.PROJECT}",
+)
 
 
 def opened(place: str, run: str = "") -> Store:
@@ -22,35 +35,96 @@ def opened(place: str, run: str = "") -> Store:
     return CachedStore(found, run)
 
 
-def locate(start: Path | None = None) -> Store:
-    """Return the store to use: ``TACPIPE_STORE``, else ``.tacpipe`` next to the project that ``start`` lies in.
+def locate(*datasets: Path) -> Store:
+    """Return the store for a command that reads or writes ``datasets``, the output first.
 
-    That may be an address: the folder in front of the bucket is then used as a store is. Raises `UsageError` where something
-    else lies there, as `layout.check` does, and for an address that is not one of a bucket.
+    It is named by ``TACPIPE_STORE``, else it lies in `project`. The name may be an address: the folder in front of the
+    bucket is then used as a store is. Raises `UsageError` where something else lies there, as `layout.check` does, for an
+    address that is not one of a bucket, and for a store of another user that ``TACPIPE_STORE`` does not name.
     """
     named = os.environ.get("TACPIPE_STORE")
     if named:
-        found = addresses.parsed(named)
-        store = opened(str(found.absolute() if isinstance(found, Path) else found))
+        place = addresses.parsed(named)
+        store = opened(str(place.absolute() if isinstance(place, Path) else place))
     else:
-        store = Store(project(start) / BESIDE_NAME)
+        store = Store(project(*datasets) / BESIDE_NAME)
+        _refuse_other_owner(store.root)
     store.check()
     return store
 
 
-def project(start: Path | None = None) -> Path:
-    """Return the folder of the project: the nearest one upwards with a store, a ``dvc.yaml`` or a git repository."""
-    here = (start or Path.cwd()).absolute()
-    return marked(here) or here
+def project(*datasets: Path) -> Path:
+    """Return the folder whose ``.tacpipe`` is the store for ``datasets``, which need not exist.
+
+    It lies in the project of the first dataset that is in a project, else in that of the working directory. Within the
+    project the nearest store upwards is used, else a new one in the project's folder. A store outside of it is used only
+    where it holds one of the datasets already.
+    """
+    paths = [Path(os.path.abspath(path)) for path in datasets]  # noqa: PTH100  (a name holds no "..", and links stay)
+    start, top = next(((path, top) for path in paths if (top := project_folder(path)) is not None), (None, None))
+    if start is None or top is None:
+        folder = _holder({folder: None for path in paths for folder in path.parents}, paths)
+        if folder is not None:
+            return folder
+        start = Path.cwd()
+        top = project_folder(start) or start
+    for folder in (start, *start.parents):
+        if _marks(folder / BESIDE_NAME):
+            return folder
+        if folder == top:
+            break
+    return _holder(top.parents, paths) or top
 
 
-def marked(here: Path) -> Path | None:
-    """Return the nearest folder upwards that has the mark of a project, None where none has."""
-    for mark in (BESIDE_NAME, "dvc.yaml", ".git"):
-        for folder in (here, *here.parents):
-            if _marks(folder / mark):
-                return folder
+def project_folder(path: Path) -> Path | None:
+    """Return the nearest folder upwards with a mark of a project, else the working directory if it is above, else None."""
+    for folder in (path, *path.parents):
+        if any(_marks(folder / mark) for mark in MARKS):
+            return folder
+    here = Path.cwd()
+    return here if here in path.parents else None
+
+
+def _holder(folders: Iterable[Path], datasets: Sequence[Path]) -> Path | None:
+    """Return the first of ``folders``, which are in no project of the datasets, whose store holds one of them; else None."""
+    for folder in folders:
+        root = folder / BESIDE_NAME
+        if not _marks(root) or _other_owner(root) is not None:
+            continue
+        store = Store(root)
+        dataset = next((path for path in datasets if store.roots.get(path) is not None), None)
+        if dataset is not None:
+            _report_holder(root, dataset)
+            return folder
     return None
+
+
+@functools.cache
+def _report_holder(root: Path, dataset: Path) -> None:
+    """Report once that a store outside of the project is used."""
+    progress.report(
+        f"the store {root} is used: it holds {dataset}, though no project is marked from there to here. If all below "
+        f"{root.parent} is one project, run `tacpipe store init` there."
+    )
+
+
+def _other_owner(root: Path) -> int | None:
+    """Return the id of the user to whom a store belongs if that is another one; None without such an owner."""
+    try:
+        owner = os.stat(root).st_uid  # noqa: PTH116  (of what a link leads to)
+    except OSError:  # described by `layout.check`
+        return None
+    return None if owner == os.geteuid() else owner
+
+
+def _refuse_other_owner(root: Path) -> None:
+    """Raise `UsageError` for a store of another user: whoever owns it decides what its results are, and may change them."""
+    owner = _other_owner(root)
+    if owner is not None:
+        raise UsageError(
+            f"The store {root} belongs to another user (id {owner}; yours is {os.geteuid()}). Whoever owns a store can "
+            f"change the results in it. Set TACPIPE_STORE={root} to use it nevertheless."
+        )
 
 
 def _marks(path: Path) -> bool:

@@ -17,7 +17,7 @@ from tacpipe.io import regular
 from tacpipe.io.files import may_not_write, readable_errors
 from tacpipe.io.hashing import digest
 from tacpipe.printable import plain
-from tacpipe.store.location import marked
+from tacpipe.store.location import project, project_folder
 from tacpipe.store.store import Store
 
 FOLDER = "projects"  # within the store
@@ -41,9 +41,9 @@ def place(directory: Path) -> tuple[Path, str]:
     the folder itself has the folder's name.
     """
     here = Path(os.path.abspath(directory))  # noqa: PTH100  (a name holds no ".." and follows no link)
-    folder = marked(here if here.exists() else Path.cwd())
-    if folder is None:
-        folder = Path.cwd() if Path.cwd() in here.parents else here.parent
+    folder = project(here)
+    if project_folder(here) is None and folder not in here.parents:
+        folder = here.parent
     return folder, str(here.relative_to(folder)) if folder in here.parents else here.name or "dataset"
 
 

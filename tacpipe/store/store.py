@@ -15,14 +15,14 @@ from pathlib import Path
 from typing import Any
 
 from tacpipe.errors import DamagedError, StorageError, TacpipeError
-from tacpipe.io import drafts, memory, regular
+from tacpipe.io import drafts, memory, progress, regular
 from tacpipe.io.drafts import Draft
 from tacpipe.io.files import listed, move, present, readable_errors, sync_folder, sync_folders
 from tacpipe.io.hashing import bytes_digest, canonical, digest
 from tacpipe.store import layout
 from tacpipe.store.directory import Directory
 from tacpipe.store.leases import Announcing, Leases
-from tacpipe.store.roots import Roots
+from tacpipe.store.roots import BESIDE_NAME, Roots
 
 
 class MissingError(DamagedError):
@@ -86,6 +86,8 @@ class Store:
                 (self.root / name).mkdir(parents=True, exist_ok=True)
             self.write_file(self.root / layout.MARK, layout.FORMAT.encode() + b"\n")
             sync_folders(self._root, os.path.dirname(self._root))  # noqa: PTH120
+        if self.root.name == BESIDE_NAME:  # a store that was not named
+            progress.report(f"created the store {self._root}")
 
     # ---- runs
 

@@ -168,6 +168,7 @@ def test_a_spool_with_half_a_header_keeps_nobody_from_recording(
 
 def test_a_spool_without_a_sample_is_no_recording(lab: Lab) -> None:
     folder = spooled(lab, unread=100)
+    lab.store.prepare()
     ran = lab.run("acquire --recover")
 
     assert not folder.exists() and not (lab.folder / "rec").exists() and ran.err == ""
