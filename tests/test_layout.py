@@ -317,3 +317,28 @@ def test_an_emulated_port_replaces_and_removes_links_alone(tmp_path: Path) -> No
     write(tmp_path, {"left": "mine"})
     port.close()
     assert (tmp_path / "left").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    "output", [".tacpipe", ".tacpipe/objects", ".tacpipe/new/deep", "link/data", "other/new", "other/report.html"]
+)
+def test_no_output_lies_within_a_store(lab: Lab, output: str) -> None:
+    lab.run("simulate toy -o data/r --trials 1 --rows 3")
+    Store(lab.folder / "other").prepare()
+    Path("link").symlink_to(".tacpipe/tmp")
+    before = sorted(path for path in Path().rglob("*") if "presence" not in path.parts)
+    refused = lab.call(f"scale data/r -o {output}")
+    assert refused.code == 2 and "lies within the store" in refused.err and refused.err.count("\n") == 1
+    assert sorted(path for path in Path().rglob("*") if "presence" not in path.parts) == before
+
+
+@pytest.mark.parametrize("days", ["-5", "nan", "inf"])
+def test_a_collection_refuses_a_grace_that_is_no_number_of_days(lab: Lab, days: str) -> None:
+    lab.run("simulate toy -o data/r --trials 1 --rows 3")
+    refused = lab.call(f"store gc --grace-days {days}")
+    assert refused.code == 2 and f"--grace-days is {days}; it must be a number of days of 0 or more." in refused.err
+
+
+def test_a_simulation_refuses_more_trials_than_a_dataset_holds(lab: Lab) -> None:
+    refused = lab.call("simulate toy -o data/r --trials 99999999999")
+    assert refused.code == 2 and "--trials is 99999999999; a dataset holds at most 1,000,000 recordings." in refused.err

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -14,7 +15,7 @@ from tacpipe.maintenance import garbage
 from tacpipe.printable import plain
 from tacpipe.store import layout
 from tacpipe.store.location import locate
-from tacpipe.store.roots import BESIDE_NAME, PUSHED
+from tacpipe.store.roots import PUSHED
 from tacpipe.store.store import Store
 
 if TYPE_CHECKING:
@@ -52,7 +53,7 @@ def init() -> None:
 
     Example: tacpipe store init
     """
-    store = Store(Path.cwd() / BESIDE_NAME)
+    store = Store(Path.cwd() / layout.BESIDE_NAME)
     store.prepare()
     store.write_file(store.root / layout.PROJECT, b"")
     store.sync(store.root / layout.PROJECT)
@@ -187,6 +188,8 @@ def gc(
     """
     from tacpipe.maintenance import remote_upkeep, transfer
 
+    if not 0 <= grace_days < math.inf:  # false for nan
+        raise UsageError(f"--grace-days is {grace_days:g}; it must be a number of days of 0 or more.")
     store = locate() if remote is None else transfer.remote_store(remote)
     if isinstance(store, Store) and store.distant:
         found = _collect_distant(store, forget or [], dry_run, recordings, grace_days, cache=cache)

@@ -21,6 +21,7 @@ from tacpipe.errors import StorageError, TacpipeError, UsageError
 from tacpipe.io import regular
 from tacpipe.io.files import listed, sync_folder, sync_folders, walk, write_whole
 from tacpipe.io.hashing import digest, file_digest
+from tacpipe.store import layout
 from tacpipe.store.store import MissingError, Store
 
 _DRAFT = ".draft"
@@ -288,6 +289,7 @@ def _remove(directory: Path, paths: set[str]) -> None:
 def check_output(store: Store, directory: Path) -> None:
     """Refuse to write a dataset over something that tacpipe did not write."""
     directory = directory.absolute()
+    layout.refuse_within(directory)
     if directory.is_file():
         raise UsageError(f"{directory} is a file; give -o a directory.")
     if (directory / NAME).exists() or store.roots.get(directory) is not None:

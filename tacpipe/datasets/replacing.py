@@ -24,6 +24,7 @@ from tacpipe.errors import DamagedError, StorageError, TacpipeError, UsageError
 from tacpipe.io import places, regular
 from tacpipe.io.hashing import digest
 from tacpipe.printable import listed, plain
+from tacpipe.store import layout
 from tacpipe.store.store import Store
 
 _SHOWN = 5  # names listed before the rest is counted
@@ -53,8 +54,9 @@ class Plan:
 
 
 def refuse_inputs(output: Path, inputs: Iterable[Path]) -> None:
-    """Raise `UsageError` if ``output`` is one of the ``inputs`` of a command, or an address."""
+    """Raise `UsageError` if ``output`` is one of the ``inputs`` of a command, an address, or within a store."""
     places.local(output)
+    layout.refuse_within(output)
     for path in inputs:
         if _same(output, path.parent if path.name == manifest_of.NAME else path):
             raise UsageError(

@@ -9,10 +9,13 @@ from tacpipe.datasets import described
 from tacpipe.datasets.manifest import Entry, Manifest
 from tacpipe.engine import execution
 from tacpipe.engine.task import Task
+from tacpipe.errors import UsageError
 from tacpipe.io.hashing import digest
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins.stage import ALL, AnyStage, Source
 from tacpipe.store.store import Store
+
+_MOST_TRIALS = 1_000_000
 
 
 def identity(name: str, version: int, params: Any, inputs: Mapping[str, Any]) -> dict[str, Any]:
@@ -104,6 +107,8 @@ def trial_tasks(store: Store, name: str, stage: AnyStage, params: Any) -> list[T
     """Return one task a recording to simulate, named ``trial-000`` and so on."""
     (argument,) = (found for found, kind in stage.arguments.items() if kind == "Trial")
     count = int(params.trials)
+    if count > _MOST_TRIALS:
+        raise UsageError(f"--trials is {count}; a dataset holds at most {_MOST_TRIALS:,} recordings.")
     width = max(3, len(str(count - 1)))
     return [
         Task(

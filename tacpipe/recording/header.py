@@ -17,7 +17,7 @@ from tacpipe.datasets import manifest, paths
 from tacpipe.errors import TacpipeError
 from tacpipe.printable import excerpt
 from tacpipe.store import location
-from tacpipe.store.roots import BESIDE_NAME
+from tacpipe.store.layout import BESIDE_NAME
 from tacpipe.store.store import Store
 
 FILE = re.compile(r"rig-[0-9a-f]{8}\.toml")  # rig files next to the recordings

@@ -6,8 +6,11 @@ needs no more than that one of several that create a name wins: what has to chan
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from typing import NamedTuple, Protocol
+from collections.abc import Callable, Iterable, Iterator
+from typing import NamedTuple, Protocol, TypeVar
+
+from tacpipe.errors import StorageError
+from tacpipe.io import regular
 
 AT_ONCE = 16  # requests on their way at once
 
@@ -18,6 +21,9 @@ class Entry(NamedTuple):
     name: str
     bytes: int
     changed_s: float  # seconds of UTC since 1970, by the clock of the place
+
+
+T = TypeVar("T")
 
 
 class Backend(Protocol):
@@ -58,3 +64,27 @@ class Backend(Protocol):
 
     def delete(self, name: str) -> None:
         """Keep a name no longer; one that nothing has is no mistake."""
+
+
+def read_twice(files: Backend, name: str, most: int, parse: Callable[[bytes], T | None]) -> T | None:
+    """Return what ``parse`` makes of a file, which is read again where it makes nothing of the first answer.
+
+    Returns None only where a second answer agrees with the first one: an answer may be damaged on its way. Raises
+    `StorageError` where they differ, and `FileNotFoundError` where no such file exists.
+    """
+    answers: list[bytes | str] = []
+    for _ in range(2):
+        try:
+            answer: bytes | str = files.read(name, most)
+        except regular.IrregularError as error:
+            answer = str(error)
+        parsed = parse(answer) if isinstance(answer, bytes) else None
+        if parsed is not None:
+            return parsed
+        answers.append(answer)
+    if answers[0] != answers[1]:
+        raise StorageError(
+            f"{files.place} gives {name} with other content each time, so whether it is damaged is unknown. Check the "
+            f"connection and the server, then run the same command again."
+        )
+    return None

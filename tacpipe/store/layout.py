@@ -19,6 +19,7 @@ from tacpipe.io.hashing import DIGEST
 from tacpipe.printable import listed, plain
 
 FORMAT = "1"
+BESIDE_NAME = ".tacpipe"  # of a store that lies in its project's folder
 MARK = "format"  # the file that makes a folder a store
 PROJECT = "project"  # the file that makes the folder of a store that of a project, written by `tacpipe store init`
 FOLDERS = ("objects", "records", "roots", "leases", "checkpoints", "quarantine", "tmp")
@@ -88,6 +89,16 @@ def check(root: Path) -> bool:
                     f"disk, move the whole of {root} there and make that a link, or name it in TACPIPE_STORE."
                 )
     return found is not None
+
+
+def refuse_within(output: Path) -> None:
+    """Raise `UsageError` for an output within a store, whatever links lead there."""
+    path = Path(os.path.realpath(output))
+    for folder in (path, *path.parents):
+        if folder.name == BESIDE_NAME or ((folder / MARK).is_file() and (folder / "objects").is_dir()):
+            raise UsageError(
+                f"{output} lies within the store {folder}, which only tacpipe writes to. Give another place."
+            )
 
 
 def entries(root: Path, name: str) -> Iterator[Path]:

@@ -12,7 +12,7 @@ from tacpipe.errors import UsageError
 from tacpipe.io import progress
 from tacpipe.io.files import present, unread
 from tacpipe.store import addresses, layout
-from tacpipe.store.roots import BESIDE_NAME
+from tacpipe.store.layout import BESIDE_NAME
 from tacpipe.store.store import Store
 
 # Files and folders that mark the folder of a project

@@ -23,7 +23,7 @@ from tacpipe.io import regular, threads
 from tacpipe.io.hashing import DIGEST, bytes_digest, digest
 from tacpipe.printable import plain
 from tacpipe.store import layout, leases
-from tacpipe.store.backend import AT_ONCE, Backend, Entry
+from tacpipe.store.backend import AT_ONCE, Backend, Entry, read_twice
 from tacpipe.store.leases import LEASE_BYTES, Run
 from tacpipe.store.remote_roots import RemoteRoots
 from tacpipe.store.store import AbsentError, MissingError, Object, most, record_content, sound
@@ -54,6 +54,8 @@ class RemoteStore:
     def check(self) -> bool:
         """Return whether there is a store. Raises `UsageError` for one of another format."""
         try:
+            if read_twice(self.files, layout.MARK, regular.BLOCK_BYTES, _parse_format) is not None:
+                return True
             found = self.files.read(layout.MARK, regular.BLOCK_BYTES).strip().decode(errors="replace")
         except FileNotFoundError:
             return False
@@ -316,12 +318,18 @@ class RemoteStore:
                 yield key, record
 
     def _record(self, key: str) -> tuple[str, dict[str, Any] | None]:
-        with contextlib.suppress(
-            FileNotFoundError, ValueError, KeyError, TypeError, AttributeError, RecursionError, regular.IrregularError
-        ):
-            content = self.files.read(layout.record_name(key), regular.JSON_BYTES)
-            regular.expect_parsed(key, len(content))
-            record: dict[str, Any] = json.loads(content)
-            if sound(record, key):
-                return key, record
+        def parse(content: bytes) -> dict[str, Any] | None:
+            with contextlib.suppress(ValueError, KeyError, TypeError, AttributeError, RecursionError):
+                regular.expect_parsed(key, len(content))
+                record: dict[str, Any] = json.loads(content)
+                if sound(record, key):
+                    return record
+            return None
+
+        with contextlib.suppress(FileNotFoundError, regular.IrregularError):
+            return key, read_twice(self.files, layout.record_name(key), regular.JSON_BYTES, parse)
         return key, None
+
+
+def _parse_format(content: bytes) -> str | None:
+    return layout.FORMAT if content.strip() == layout.FORMAT.encode() else None

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from tacpipe.errors import DamagedError, TacpipeError
-from tacpipe.io import regular, threads
-from tacpipe.store.backend import AT_ONCE, Backend
+from tacpipe.io import threads
+from tacpipe.store.backend import AT_ONCE, Backend, read_twice
 from tacpipe.store.roots import PUSHED, ROOT_BYTES, Root, decoded, encoded, name_of, project_id, succeeding
 
 _OUTPUT = "output"  # whether a command wrote it, which worked on the bucket as its own store
@@ -49,7 +49,8 @@ class RemoteRoots:
         for one, root in self._read(wanted):
             if root is None:
                 raise DamagedError(
-                    f"The newest file in {self.files.place}/roots/{one} is damaged. Delete it, and the one before it counts."
+                    f"The newest file in {self.files.place}/roots/{one} is damaged: it was read twice, with the same bytes. "
+                    f"Delete it, and the one before it counts."
                 )
             return root
         return None
@@ -115,8 +116,8 @@ class RemoteRoots:
 
     def _at(self, version: tuple[int, str]) -> Root | None:
         number, file = version
-        with contextlib.suppress(FileNotFoundError, ValueError, RecursionError, regular.IrregularError):
-            root = decoded(json.loads(self.files.read(file, ROOT_BYTES)))
+        with contextlib.suppress(FileNotFoundError):
+            root = read_twice(self.files, file, ROOT_BYTES, _parse)
             return None if root is None else {**root, _NUMBER: number}
         return None
 
@@ -130,6 +131,12 @@ class RemoteRoots:
             if match is not None:
                 found.setdefault(match[1], []).append((int(match[2] or 0), entry.name))
         return {name: sorted(found[name]) for name in sorted(found)}
+
+
+def _parse(content: bytes) -> Root | None:
+    with contextlib.suppress(ValueError, RecursionError):
+        return decoded(json.loads(content))
+    return None
 
 
 def _name(root: Mapping[str, Any]) -> str:

@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 from tacpipe.io import regular
 from tacpipe.io.files import readable_errors
 from tacpipe.io.hashing import DIGEST, digest
+from tacpipe.store.layout import BESIDE_NAME
 
 if TYPE_CHECKING:
     from tacpipe.store.store import Store
 
-BESIDE_NAME = ".tacpipe"  # of a store that lies next to its project
 BESIDE, ABSOLUTE, PUSHED = "beside", "absolute", "pushed"  # kinds of roots
 # {"path", "kind", "manifest", "previous", "written_s", "history"}, and "missing_since_s" while out of reach. "pushed" are
 # manifests of this path that went to other stores, newest first; of what was pushed here, "project" states whose it is

@@ -22,7 +22,7 @@ from tacpipe.io.hashing import bytes_digest, canonical, digest
 from tacpipe.store import layout
 from tacpipe.store.directory import Directory
 from tacpipe.store.leases import Announcing, Leases
-from tacpipe.store.roots import BESIDE_NAME, Roots
+from tacpipe.store.roots import Roots
 
 
 class MissingError(DamagedError):
@@ -86,7 +86,7 @@ class Store:
                 (self.root / name).mkdir(parents=True, exist_ok=True)
             self.write_file(self.root / layout.MARK, layout.FORMAT.encode() + b"\n")
             sync_folders(self._root, os.path.dirname(self._root))  # noqa: PTH120
-        if self.root.name == BESIDE_NAME:  # a store that was not named
+        if self.root.name == layout.BESIDE_NAME:  # a store that was not named
             progress.report(f"created the store {self._root}")
 
     # ---- runs

@@ -6,7 +6,7 @@ from typing import Any, TypeVar
 
 import pytest
 
-from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.errors import DamagedError, StorageError, TacpipeError, UsageError
 from tacpipe.io import threads
 from tacpipe.io.hashing import bytes_digest
 from tacpipe.maintenance import copying, remote_upkeep, transfer
@@ -241,3 +241,55 @@ def test_a_server_that_writes_over_what_it_is_asked_to_keep_is_refused(
         with pytest.raises(UsageError, match="conditional"):
             push(monkeypatch, files, "data/r")
     assert not [*files.list("objects"), *files.list("roots")]
+
+
+def damaging(monkeypatch: pytest.MonkeyPatch, files: Stepping, name: str, answers: list[bytes]) -> None:
+    """Have the next reads of a file give ``answers``, and those after them what the file holds."""
+
+    def read(path: str, most: int | None = None) -> bytes:
+        if path.startswith(name) and answers:
+            return answers.pop(0)
+        return Bucket.read(files, path, most)
+
+    monkeypatch.setattr(files, "read", read)
+
+
+@pytest.fixture
+def pushed(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> Stepping:
+    """A bucket to which a dataset was pushed."""
+    lab.run("simulate toy -o data/r --trials 1 --rows 3")
+    files = Stepping({})
+    push(monkeypatch, files, "data/r")
+    return files
+
+
+@pytest.mark.parametrize("name", ["roots/", "records/", "format"])
+@pytest.mark.parametrize("answer", [b"", b"<html>Sign in</html>", b"{}", b"\xff" * 10])
+def test_one_bad_answer_of_a_server_is_no_damage(
+    pushed: Stepping, monkeypatch: pytest.MonkeyPatch, name: str, answer: bytes
+) -> None:
+    store, content = RemoteStore(pushed), pushed.content()
+    (expected,), count = store.roots.all(), len(list(store.records()))
+    damaging(monkeypatch, pushed, name, [answer])
+    assert store.check() and store.roots.pushed("data/r", expected["project"]["id"]) == expected
+    damaging(monkeypatch, pushed, name, [answer])
+    assert store.roots.damaged() == [] and len(list(store.records())) == count
+    damaging(monkeypatch, pushed, name, [answer])
+    _, record = next(store.records())
+    store.commit(record["identity"], record["result"], record["provenance"])
+    damaging(monkeypatch, pushed, name, [])
+    assert pushed.content() == content
+
+
+def test_answers_that_differ_are_an_error_of_the_server_and_two_alike_are_damage(
+    pushed: Stepping, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = RemoteStore(pushed)
+    (root,) = store.roots.all()
+    project = root["project"]["id"]
+    damaging(monkeypatch, pushed, "roots/", [b"<html>1</html>", b"<html>2</html>"])
+    with pytest.raises(StorageError, match=r"with other content each time.*run the same command again"):
+        store.roots.pushed("data/r", project)
+    damaging(monkeypatch, pushed, "roots/", [b"<html>"] * 2)
+    with pytest.raises(DamagedError, match=r"read twice, with the same bytes. Delete it"):
+        store.roots.pushed("data/r", project)
