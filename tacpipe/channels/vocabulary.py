@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Collection
+
+from tacpipe.printable import plain, suggestion
 
 _QUANTITIES = """
     acceleration analog angle angular_acceleration angular_velocity colour compliance count current curvature deflection
@@ -80,31 +81,26 @@ def unit_from_text(text: str) -> str:
     return ALIASES.get(text.lower()) or (text if is_unit(text) else "")
 
 
-def describe_unknown_quantity(word: str, known: Collection[str] = ()) -> str:
-    """Return a sentence about a quantity that is neither of the vocabulary nor in ``known``; '' for one that is.
+def describe_unknown_quantity(word: str, declared: Collection[str] = ()) -> str:
+    """Return a sentence about a quantity that is neither in the vocabulary nor ``declared``; '' for one that is.
 
-    >>> describe_unknown_quantity("tactle")
-    'there is no quantity \\'tactle\\'. Did you mean "tactile"?'
+    >>> describe_unknown_quantity("tactle"), describe_unknown_quantity("force")
+    ('There is no quantity tactle. Did you mean tactile?', '')
     """
-    if not word or word in QUANTITIES or word in known:
+    if not word or word in QUANTITIES or word in declared:
         return ""
-    return f"there is no quantity {word!r}.{_suggestion(word, [*QUANTITIES, *known])}"
+    return f"There is no quantity {plain(word)}.{suggestion(word, sorted({*QUANTITIES, *declared}))}"
 
 
-def describe_unknown_unit(word: str, known: Collection[str] = ()) -> str:
-    """Return a sentence about a unit that is neither of the vocabulary nor in ``known``; '' for one that is.
+def describe_unknown_unit(word: str, declared: Collection[str] = ()) -> str:
+    """Return a sentence about a unit that is neither known nor ``declared``; '' for one that is.
 
     >>> describe_unknown_unit("Newton"), describe_unknown_unit("kPa")
-    ('there is no unit \\'Newton\\'. Did you mean "N"?', '')
+    ('There is no unit Newton. Did you mean N?', '')
     """
-    if not word or is_unit(word) or word in known:
+    if not word or is_unit(word) or word in declared:
         return ""
     meant = ALIASES.get(word.lower())
-    return f"there is no unit {word!r}." + (
-        f' Did you mean "{meant}"?' if meant else _suggestion(word, [*ALIASES, *known])
+    return f"There is no unit {plain(word)}." + (
+        f" Did you mean {meant}?" if meant else suggestion(word, sorted(declared))
     )
-
-
-def _suggestion(word: str, words: Collection[str]) -> str:
-    close = difflib.get_close_matches(word.lower(), words, n=1, cutoff=0.6)
-    return f' Did you mean "{ALIASES.get(close[0], close[0])}"?' if close else ""

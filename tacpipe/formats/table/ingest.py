@@ -70,7 +70,7 @@ def why_unread(params: Params, source: Path) -> Callable[[str], str]:
 
 @stage(version=1, discover=discover, preview=preview, guess=guess, why_unread=why_unread)
 def table(params: Params, files: Files, values: Values, shared: Shared | None = None) -> RecordingOutput:
-    """Read a lab's own tables (CSV, Excel, Parquet, NPY, NPZ, JSON lines).
+    """Read a lab's own tables (CSV, Excel, Parquet, NumPy).
 
     A layout file names the files of each recording, their columns with quantity and unit, where time stamps and labels
     come from. Start with ``--guess``, replace each "?" in what it prints, look at the result with ``--dry-run``.

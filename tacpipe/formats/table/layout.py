@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+from tacpipe.channels import vocabulary
 from tacpipe.errors import UsageError
 from tacpipe.formats.containers import kinds
 from tacpipe.formats.containers.container import Time
@@ -52,6 +53,7 @@ EXTENSIONS: Mapping[str, Format] = {
     ".ndjson": "jsonl",
 }
 TREES = (".json", ".yaml", ".yml")  # of files that hold labels by name
+TABLES = ("recordings", "streams", "labels", "attributes", "vocabulary")
 STAMPS = ".stamps"  # behind a stream's name: the file of its stamps among the files of a recording
 GZIP = ".gz"
 FILE = "file"  # the placeholder of a container's name, where containers are found by their format
@@ -167,6 +169,14 @@ class Labels:
 
 
 @dataclass(frozen=True)
+class Vocabulary:
+    """Words that the layout declares in addition to those that tacpipe knows."""
+
+    quantities: tuple[str, ...] = ()
+    units: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
 class Layout:
     """Everything that a layout file states."""
 
@@ -219,10 +229,8 @@ def of(tables: Mapping[str, Any], where: str = "The layout", container: Format |
     """
     _refuse_unknown(tables, where)
     for key in tables:
-        if key not in ("recordings", "streams", "labels", "attributes"):
-            raise UsageError(
-                f"{where}: there is no table [{plain(key)}]; there are recordings, streams, labels, attributes."
-            )
+        if key not in TABLES:
+            raise UsageError(f"{where}: there is no table [{plain(key)}]; there are {', '.join(TABLES)}.")
     streams = _table(tables.get("streams", {}), where, "streams")
     if not streams and container is None:
         raise UsageError(f"{where} has no stream. Add a table such as [streams.skin] with files, time and columns.")
@@ -240,12 +248,29 @@ def of(tables: Mapping[str, Any], where: str = "The layout", container: Format |
         tuple(_labels(one, f"{where}, [[labels]] {number}") for number, one in enumerate(labels, 1)),
         _attributes(_table(tables.get("attributes", {}), where, "attributes"), where),
     )
+    _expect_known_words(made, _table(tables.get("vocabulary", {}), where, "vocabulary"), where)
     named = [one.name for one in made.streams if one.files]
     if named and len(named) < len(made.streams):
         raise UsageError(f"{where}: [streams.{named[0]}] has files and others have none. Give files to all of them.")
     known = [*made.placeholders, "recording", *((FILE,) if made.found_by_format else ())]
     pattern.filled(name, dict.fromkeys(known, "x"))
     return made
+
+
+def _expect_known_words(layout: Layout, vocabulary_table: Mapping[str, Any], where: str) -> None:
+    """Raise `UsageError` for a quantity or unit that is neither in the vocabulary nor declared in the layout."""
+    own: Vocabulary = fields.filled(Vocabulary, vocabulary_table, f"{where}, [vocabulary]", "entry")
+    for stream in layout.streams:
+        for number, column in enumerate(stream.columns, 1):
+            for kind, fault, word in (
+                ("quantities", vocabulary.describe_unknown_quantity(column.quantity, own.quantities), column.quantity),
+                ("units", vocabulary.describe_unknown_unit(column.unit, own.units), column.unit),
+            ):
+                if fault:
+                    raise UsageError(
+                        f"{where}, [streams.{stream.name}], columns {number}: {fault} To use a word of your own, add "
+                        f"[vocabulary] with {kind} = [{excerpt(word)}]."
+                    )
 
 
 def _refuse_unknown(value: Any, where: str) -> None:

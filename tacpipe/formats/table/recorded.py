@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
 import pyarrow as pa
 
 from tacpipe.errors import TacpipeError
@@ -13,11 +14,14 @@ from tacpipe.formats import unique_names
 from tacpipe.formats.containers import kinds
 from tacpipe.formats.containers.container import Contents
 from tacpipe.formats.table import rows
+from tacpipe.formats.table.columns import TIME
 from tacpipe.formats.table.layout import STAMPS, Stream
 from tacpipe.formats.table.reading import batches, contained
 from tacpipe.plugins.stage import Attribute, Shared
 from tacpipe.printable import listed, plain
 
+LOWEST_HZ, HIGHEST_HZ = 0.2, 20_000.0  # rates beyond these are probably stamps in another unit
+FEWEST_ROWS = 10  # that show a rate
 SKIPPED = "skipped"  # the attribute of a recording that names what could not be read
 
 
@@ -27,7 +31,7 @@ class Recorded:
 
     streams: Mapping[str, pa.Table | pa.RecordBatchReader]
     attributes: Mapping[str, Attribute] = field(default_factory=dict)  # that containers state
-    notes: Sequence[str] = ()  # what was left out or is missing
+    notes: Sequence[str] = ()  # what was left out or is missing; those on rates are added as streams are read
 
 
 def of(
@@ -63,7 +67,36 @@ def of(
         asked = tuple(f"{stream.source}/" for stream in several)
         inner = {source: why for source, why in contents.skipped.items() if source.startswith(asked)}
         notes += [*contents.notes, *_left_out(path, inner)]
-    return Recorded({one.name: tables[one.name] for one in streams if one.name in tables}, attributes, notes)
+    tables = {one.name: _with_rate_noted(tables[one.name], one.name, notes) for one in streams if one.name in tables}
+    return Recorded(tables, attributes, notes)
+
+
+def _with_rate_noted(
+    rows: pa.Table | pa.RecordBatchReader, name: str, notes: list[str]
+) -> pa.Table | pa.RecordBatchReader:
+    """Return the rows of a stream; as its first ones are read, a rate that no sensor has is added to ``notes``."""
+    if isinstance(rows, pa.Table):
+        if rows.num_rows:
+            _note_rate(rows, name, notes)
+        return rows
+
+    def read() -> Iterator[pa.RecordBatch]:
+        for number, batch in enumerate(rows):
+            if not number:
+                _note_rate(batch, name, notes)
+            yield batch
+
+    return pa.RecordBatchReader.from_batches(rows.schema, read())
+
+
+def _note_rate(rows: pa.Table | pa.RecordBatch, name: str, notes: list[str]) -> None:
+    measured = [field for field in rows.schema if field.name != TIME and not pa.types.is_string(field.type)]
+    step_ns = float(np.median(np.diff(rows.column(TIME).to_numpy()))) if rows.num_rows >= FEWEST_ROWS else 0.0
+    if measured and step_ns and not LOWEST_HZ <= 1e9 / step_ns <= HIGHEST_HZ:
+        notes.append(
+            f"The stamps of {name} are {step_ns / 1e9:g} s apart, {1e9 / step_ns:,.6g} Hz, which few sensors have. Check "
+            f"the unit of its time."
+        )
 
 
 def all_of(kind: str, path: Path, within: str | None) -> Recorded:
@@ -75,7 +108,7 @@ def all_of(kind: str, path: Path, within: str | None) -> Recorded:
     notes = [*contents.notes, *_left_out(path, contents.skipped)]
     named = unique_names.by_name(((stream.name, stream) for stream in contents.streams), path, "stream")
     tables = {
-        name: contained(path, stream, Stream(name, source=stream.source))
+        name: _with_rate_noted(contained(path, stream, Stream(name, source=stream.source)), name, notes)
         for name, stream in named.items()
         if stream.rows is None or stream.rows
     }

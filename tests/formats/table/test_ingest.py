@@ -210,3 +210,12 @@ def test_files_that_no_recording_is_read_from_are_named_at_each_run(own: Lab) ->
         assert "notes/later/skin.csv" in notes[0] and "no `files` of the layout matches" in notes[0]
     assert "camera.mp4" in own.run("ingest table own --layout layout.toml --dry-run").out
     assert "labels.csv" not in printed  # labels are read
+
+
+@pytest.mark.parametrize(("unit", "rate"), [("ms", "100,000 Hz"), ("us", "1e+08 Hz")])
+def test_stamps_in_a_wrong_unit_are_a_warning_with_the_rate_that_they_give(own: Lab, unit: str, rate: str) -> None:
+    assert "Hz" not in own.run(INGEST).err
+    (own.folder / "layout.toml").write_text(LAYOUT.replace('column = "time"', f'column = "time", unit = "{unit}"'))
+    printed = own.run(f"{INGEST} --replace").err
+    assert rate in printed and "unit" in printed and "all 3 recordings" in printed
+    assert rate in own.run("ingest table own --layout layout.toml --dry-run").out

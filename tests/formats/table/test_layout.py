@@ -19,6 +19,14 @@ WRONG = {  # a layout, and what the sentence about it must name
     STREAM.replace('match = "x"', 'match = "x", type = "uint12"'): ("columns 1", "uint12"),
     STREAM.replace('match = "x"', 'match = "x", name = "{taxel}"'): ("{taxel}",),
     STREAM.replace('match = "x"', 'match = "x", quantity = "?"'): ("quantity", "?"),
+    STREAM.replace('match = "x"', 'match = "x", quantity = "tactle"'): (
+        "columns 1",
+        "tactle",
+        "tactile",
+        "[vocabulary]",
+    ),
+    STREAM.replace('match = "x"', 'match = "x", unit = "Newton"'): ("columns 1", "Newton", "Did you mean N", "units"),
+    STREAM + '[vocabulary]\nquantity = ["x"]': ("[vocabulary]", "quantity", "quantities"),
     STREAM.replace("{trial}", "{trial"): ("{trial", "brace"),
     STREAM + 'separator = ",,"\n': ("separator", ",,"),
     STREAM + '[recordings]\nname = "{subject}"': ("{subject}", "trial"),
@@ -53,3 +61,12 @@ def test_the_format_follows_the_extension_unless_the_layout_names_one() -> None:
     assert labs.stream('format = "csv"').format_of(Path("a.log")) == "csv"
     with pytest.raises(UsageError, match=r"a\.log"):
         stream.format_of(Path("a.log"))
+
+
+def test_a_quantity_and_a_unit_of_ones_own_are_read_where_the_layout_declares_them() -> None:
+    own = STREAM.replace('match = "x"', 'match = "x", quantity = "glow", unit = "blink"')
+    for declared in ("", '[vocabulary]\nquantities = ["glow"]'):
+        with pytest.raises(UsageError, match="blink" if declared else "glow"):
+            layout.parse(own + declared)
+    made = layout.parse(own + '[vocabulary]\nquantities = ["glow"]\nunits = ["blink"]')
+    assert (made.streams[0].columns[0].quantity, made.streams[0].columns[0].unit) == ("glow", "blink")
