@@ -53,7 +53,7 @@ def test_ctrl_c_ends_the_command_and_what_waits(lab: Lab, cluster: Cluster, *, l
     _, printed = command.communicate(timeout=GIVE_UP_S)
     assert command.returncode == 130
     assert "Traceback" not in printed
-    assert f"{RECORDINGS} tasks" in printed
+    assert f"{RECORDINGS} tasks" in printed and "resource_tracker" not in printed
     if local:
         assert not workers_of(command.pid)
     finished = -1

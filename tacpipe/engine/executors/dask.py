@@ -14,11 +14,13 @@ import contextlib
 import functools
 import ipaddress
 import logging
+import multiprocessing
 import os
 import threading
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from multiprocessing import util
 from pathlib import Path
 from queue import Queue
 from typing import TYPE_CHECKING, Any
@@ -42,6 +44,7 @@ NO_PAGES: dict[str, list[str]] = {"distributed.scheduler.http.routes": [], "dist
 _MOST = 50  # tasks that one of Dask's holds: its own cost, 1.6 ms, is shared among them
 _CONNECT_S = 10
 _POLL_S = 1.0
+_abandoned: list[contextlib.ExitStack] = []  # clusters of an interrupted command, kept so that nothing closes them
 
 
 @contextlib.contextmanager
@@ -182,24 +185,32 @@ def _started(workers: int) -> Iterator[Dask]:
         from distributed import Client, LocalCluster, Security
 
     security = Security.temporary()  # type: ignore[no-untyped-call]
-    with (
-        quiet(),
-        dask.config.set(NO_PAGES),
-        LocalCluster(  # type: ignore[no-untyped-call]
-            n_workers=workers,
-            threads_per_worker=1,
-            processes=True,
-            protocol="tls",
-            host="127.0.0.1",
-            dashboard_address="127.0.0.1:0",
-            memory_limit=0,
-            scheduler_kwargs={"dashboard": False},
-            silence_logs=logging.CRITICAL,
-            security=security,
-        ) as cluster,
-        Client(cluster, security=security, set_as_default=False) as client,  # type: ignore[no-untyped-call]
-    ):
-        yield Dask(client)
+    with contextlib.ExitStack() as stack:
+        try:
+            stack.enter_context(quiet())
+            stack.enter_context(dask.config.set(NO_PAGES))
+            cluster = stack.enter_context(
+                LocalCluster(  # type: ignore[no-untyped-call]
+                    n_workers=workers,
+                    threads_per_worker=1,
+                    processes=True,
+                    protocol="tls",
+                    host="127.0.0.1",
+                    dashboard_address="127.0.0.1:0",
+                    memory_limit=0,
+                    scheduler_kwargs={"dashboard": False},
+                    silence_logs=logging.CRITICAL,
+                    security=security,
+                )
+            )
+            yield Dask(stack.enter_context(Client(cluster, security=security, set_as_default=False)))  # type: ignore[no-untyped-call]
+        except KeyboardInterrupt:
+            if termination.requested():  # closing the cluster takes seconds, and this process ends
+                _abandoned.append(stack.pop_all())
+                for process in multiprocessing.active_children():
+                    process.kill()
+                util._run_finalizers(0)  # type: ignore[attr-defined]  # else Python reports semaphores of the workers as leaked
+            raise
 
 
 @contextlib.contextmanager
