@@ -73,6 +73,20 @@ def encrypted(address: str, jobs: int) -> Iterator[Dask]:
     """Yield the workers of the scheduler at ``address``, reached with TLS; raises as `connected`."""
     if not address:
         raise UsageError("The executor tls needs the address of a scheduler: give tls://HOST:PORT.")
+    with extras.named("The executor tls"):
+        from distributed import Security
+
+    try:
+        certified = Security().get_connection_args("client")["ssl_context"]  # type: ignore[no-untyped-call]
+    except (OSError, ValueError) as error:
+        raise UsageError(
+            f"tls://{address}: the certificates of Dask's configuration cannot be read: {error}."
+        ) from error
+    if certified is None:
+        raise UsageError(
+            f"tls://{address} needs certificates, and Dask's configuration has none. Name them there under "
+            f"distributed.comm.tls: ca-file, client.cert and client.key."
+        )
     with _client(f"tls://{address}") as client:
         yield Dask(client)
 
@@ -215,6 +229,9 @@ def _started(workers: int) -> Iterator[Dask]:
 
 @contextlib.contextmanager
 def _client(address: str) -> Iterator[Client]:
+    host, _, port = address.partition("://")[2].rpartition(":")
+    if not host or not (port.isascii() and port.isdigit() and 0 < int(port) < 65536):
+        raise UsageError(f"{address} is not the address of a scheduler; it needs host and port, as localhost:8786.")
     with extras.named("The executor dask"):
         from distributed import Client
 
