@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tacpipe.arrays import AnyFloats
-from tacpipe.metrics import forecast
+from tacpipe.metrics import intervals
 
 ROOT = Path(__file__).parents[1]
 WORK, TABLE = ROOT / ".cache" / "learning-curve", ROOT / "docs" / "tasks" / "forward-learning.csv"
@@ -53,12 +53,12 @@ def point(draws: Sequence[Sums], trained: float) -> Point:
     pooled = np.stack(
         [sum((one[name] for one in draws if name in one), np.zeros((3, len(STEPS) + 1))) for name in names]
     )
-    found = forecast.skill_interval(pooled[:, 0, :-1], pooled[:, 1, :-1])
+    found = intervals.skill_interval(pooled[:, 0, :-1], pooled[:, 1, :-1])
     skill = [(float(found.mean[at]), float(found.low[at]), float(found.high[at])) for at in range(len(STEPS))]
     total = pooled.sum(axis=0)
     mae = [float(one) for one in total[2, :-1] / total[2, -1]]
     by_draw = [sum(one.values(), np.zeros((3, len(STEPS) + 1)))[:, :-1] for one in draws]
-    skills = [forecast.skill(one[0], one[1]) for one in by_draw]
+    skills = [intervals.skill(one[0], one[1]) for one in by_draw]
     spread = np.std(skills, axis=0, ddof=1) if len(draws) > 1 else np.full(len(STEPS), np.nan)
     return Point(trained, len(names), skill, mae, [float(one) for one in spread])
 

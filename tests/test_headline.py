@@ -29,6 +29,7 @@ ONE = Headline(
     "recordings",
     3,
     1,
+    9.5,
 )
 
 
@@ -61,7 +62,7 @@ def test_a_verdict_needs_an_interval_that_excludes_zero(low: float, high: float,
 def test_few_recordings_give_no_verdict_whatever_their_interval(clusters: int) -> None:
     found = of(clusters=clusters)
     assert found.verdict == ""
-    assert "too few for an interval" in headline.sentence(found)
+    assert "too few for a verdict" in headline.sentence(found)
     assert of(clusters=headline.FEWEST).verdict == "better"
 
 
@@ -100,7 +101,7 @@ def test_the_table_has_the_model_above_its_best_baseline_and_how_the_interval_wa
     said = " ".join(lines[7:])
     assert "n: recordings. vs: the best of 2 baselines." in said
     assert "1 − error / error of the best baseline; the error is the squared error" in said
-    assert "bootstrap over recordings or recordings and seeds" in said
+    assert "jackknife over recordings or recordings and seeds" in said
     assert headline_table.text([]) == headline_table.EMPTY
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tacpipe.metrics import forecast
+from tacpipe.metrics import intervals
 from tests.stages.learning_fakes import motion
 from tests.tasks.forward.trials import evaluated, trained
 from tests.test_docs import module
@@ -20,7 +20,7 @@ def test_draws_are_pooled_by_recording_and_intervals_are_over_recordings() -> No
     draws = [{name: rng.uniform(1, 2, (3, 4)) for name in names} for names in (("a", "b", "c"), ("b", "d"))]
     found = made.point(draws, 8.5)
     pooled = np.stack([draws[0]["a"], draws[0]["b"] + draws[1]["b"], draws[0]["c"], draws[1]["d"]])
-    wanted = forecast.skill_interval(pooled[:, 0, :3], pooled[:, 1, :3])
+    wanted = intervals.skill_interval(pooled[:, 0, :3], pooled[:, 1, :3])
     assert (found.trained, found.tested) == (8.5, 4)
     assert found.skill[1] == pytest.approx((wanted.mean[1], wanted.low[1], wanted.high[1]))
     assert found.mae[2] == pytest.approx(pooled[:, 2, 2].sum() / pooled[:, 2, 3].sum())

@@ -165,10 +165,13 @@ class Compared:
         points = f"Points are percentage points of {measure.ranked_by} above the best baseline."
         least = min(row.n for one in several for row in one.rows)
         few = f" With n below {headline.FEWEST} no interval proves a difference." if least < headline.FEWEST else ""
+        chosen = max(len(one.models) for one in several)
+        chosen_from = f" Intervals account for the choice among {chosen} methods." if chosen > 1 else ""
         pooled = "Runs that differ in seed or fold alone are pooled (--each lists them). " if self.pooled else ""
         return (
             f"n: {clusters}. Units: {measure.unit}. {points if measure.name == 'points' else skill} {pooled}Intervals: "
-            f"bootstrap over {clusters} and over seeds where there are several, method and baseline on the same ones.{few}"
+            f"jackknife over {clusters} and over seeds where there are several, method and baseline on the same ones."
+            f"{chosen_from}{few}"
         )
 
 
@@ -212,9 +215,7 @@ def _gain(row: engine.Row, measure: str) -> list[str]:
 
 
 def _style(row: engine.Row) -> str:
-    if row.n < headline.FEWEST or math.isnan(row.gain.low):
-        return ""
-    return "green" if row.gain.low > 0 else "red" if row.gain.high < 0 else ""
+    return {headline.BETTER: "green", headline.WORSE: "red"}.get(row.gain.verdict, "")
 
 
 def _places(results: Sequence[Path]) -> dict[str, str]:

@@ -15,7 +15,7 @@ from tacpipe.errors import UsageError
 from tacpipe.io import terminal
 
 if TYPE_CHECKING:
-    from tacpipe.metrics.regression import Interval
+    from tacpipe.metrics.intervals import Estimate
     from tacpipe.tasks.touch.limits import Limits
 
 ABOUT = (
@@ -118,7 +118,7 @@ def _bounds(low: float, high: float) -> str:
     return f"{low:g} or more" if math.isinf(high) else f"{low:g} to {high:g}"
 
 
-def _cell(one: Interval) -> str:
+def _cell(one: Estimate) -> str:
     if math.isnan(one.mean):
         return "-"
     bounds = "" if math.isnan(one.low) else f" ({_fixed(one.low)} to {_fixed(one.high)})"

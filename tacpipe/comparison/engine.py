@@ -1,13 +1,13 @@
 """Methods next to each other and to their baselines: errors, gain over the best baseline, and how sure that is.
 
-Runs of a method are pooled: its errors are summed by seed and recording, and intervals come from drawing clusters of
-recordings anew, the seeds too where there are several (`tacpipe.metrics.pairing`).
+Runs of a method are pooled: its errors are summed by seed and recording, and intervals are over clusters of recordings, and
+over seeds where there are several (`tacpipe.metrics.pairing`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -16,7 +16,8 @@ from tacpipe.comparison.specification import Kind, Task, by_task
 from tacpipe.comparison.spread import spread
 from tacpipe.metrics import pairing
 from tacpipe.metrics.headline import Headline
-from tacpipe.metrics.pairing import Estimate, Measure, Sums
+from tacpipe.metrics.intervals import Estimate
+from tacpipe.metrics.pairing import Gain, Measure, Pair, Sums
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -37,7 +38,7 @@ class Row:
     score: Estimate  # what charts draw
     spread: float  # standard deviation of the score over runs; NaN for a single one
     baseline: str  # the best baseline on the same recordings; empty where none was evaluated, and for baselines
-    gain: Estimate  # over it
+    gain: Gain  # over it
     p: float  # that both are alike (`pairing.swap_test`), not corrected for the number of methods
     n: int  # clusters
     recordings: int
@@ -162,7 +163,7 @@ def compare_on(task: Task, methods: Sequence[Method], question: Question) -> Com
     held = [one for one in methods if one.of(question)]
     measure = held[0].of(question)[0].questions[question].measure
     source = reference(task, held, question, measure)
-    rows: list[Row] = []
+    entries: list[tuple[str, Kind, str, Method]] = []
     sources: dict[str, Method] = {}
     for one in [source, *held]:
         for predictor in one.predictors(question):
@@ -171,12 +172,16 @@ def compare_on(task: Task, methods: Sequence[Method], question: Question) -> Com
         for predictor in one.predictors(question):
             kind = task.kind(predictor)
             if kind == "model" and one.control:
-                rows.append(_row(task, one.name, "control", predictor, one, source, question, measure))
+                entries.append((one.name, "control", predictor, one))
             elif kind == "model" or kind == "variant":
                 name = one.name if kind == "model" else f"{one.name} · {task.called(predictor)}"
-                rows.append(_row(task, name, kind, predictor, one, source, question, measure))
+                entries.append((name, kind, predictor, one))
             elif one is sources[predictor]:
-                rows.append(_row(task, task.called(predictor), kind, predictor, one, source, question, measure))
+                entries.append((task.called(predictor), kind, predictor, one))
+    ranked = [_ranked(task, method, source, question, predictor) for _, _, predictor, method in entries]
+    picked = [next(iter(pairs.values())) for (_, kind, *_), pairs in zip(entries, ranked, strict=True)
+              if kind == "model" and pairs]  # fmt: skip
+    rows = [_row(*entry, question, measure, pairs, picked) for entry, pairs in zip(entries, ranked, strict=True)]
     sign = -1 if measure.rises else 1
 
     def place(row: Row) -> tuple[bool, float, str]:
@@ -201,6 +206,8 @@ def headline(row: Row, comparison: Comparison) -> Headline | None:
     question, method = comparison.question, row.method
     source = next((one.method for one in comparison.rows if one.kind == "baseline"), method)
     task = Task(comparison.task)
+    others = [one for one in comparison.models if one is not row] if row.kind == "model" else []
+    ranked = [_ranked(task, one.method, source, question, one.predictor) for one in others]
     return pairing.headline(
         comparison.task,
         row.name,
@@ -211,37 +218,42 @@ def headline(row: Row, comparison: Comparison) -> Headline | None:
         target=question.target,
         clusters=_clusters(method, question),
         runs=row.runs,
+        rivals=[next(iter(pairs.values())) for pairs in ranked if pairs],
     )
 
 
 def difference(
     first: Method, second: Method, question: Question, predictors: tuple[str, str] = (MODEL, MODEL)
-) -> tuple[Estimate, float, int]:
-    """Return what one method gains over another on the recordings of both, the p of `pairing.swap_test`, and clusters."""
+) -> Gain:
+    """Return what one method gains over another on the recordings of both."""
     measure = first.of(question)[0].questions[question].measure
     one, other = first.sums(question, predictors[0]), second.sums(question, predictors[1])
     return pairing.difference(measure, one, other, _clusters(first, question))
 
 
+def _ranked(task: Task, method: Method, source: Method, question: Question, predictor: str) -> dict[str, Pair]:
+    """Return a method's own predictor next to each baseline, the best first; nothing for a predictor of another kind."""
+    if task.kind(predictor) not in ("model", "variant"):
+        return {}
+    measure, sums = method.of(question)[0].questions[question].measure, method.sums(question, predictor)
+    return pairing.rank(measure, sums, _baselines(task, method, source, question), _clusters(method, question))
+
+
 def _row(
-    task: Task,
     name: str,
     kind: Kind,
     predictor: str,
     method: Method,
-    source: Method,
     question: Question,
     measure: Measure,
+    pairs: Mapping[str, Pair],
+    picked: Sequence[Pair],
 ) -> Row:
+    """Return the row of a predictor; ``pairs`` are with its baselines, ``picked`` those of all methods with their best one."""
     sums, clusters = method.sums(question, predictor), _clusters(method, question)
     runs = [one for one in method.of(question) if one.questions[question].sums.get(predictor)]
     each = [measure.score_of(one.questions[question].sums[predictor].values()) for one in runs]
-    baseline, gain, p, n = "", Estimate(math.nan, math.nan, math.nan), math.nan, _counted(sums, clusters)
-    if task.kind(predictor) in ("model", "variant"):
-        baselines = _baselines(task, method, source, question)
-        baseline = pairing.best(measure, sums, baselines, clusters)
-        if baseline:
-            gain, p, n = pairing.difference(measure, sums, baselines[baseline], clusters)
+    gain = pairing.gain(measure, list(pairs.values()), picked if kind == "model" else ())
     return Row(
         name,
         kind,
@@ -251,10 +263,10 @@ def _row(
         measure.values(sum(sums.values())),  # type: ignore[arg-type]
         pairing.score(measure, sums, clusters),
         spread(each).sd,
-        baseline,
+        next(iter(pairs), ""),
         gain,
-        p,
-        n,
+        next((one.p(measure) for one in pairs.values()), math.nan),
+        gain.clusters or len({clusters[name] if clusters else name for _, name in sums}),
         len({recording for _, recording in sums}),
         len(runs),
         len({seed for seed, _ in sums}),
@@ -276,6 +288,3 @@ def _clusters(method: Method, question: Question) -> dict[str, str] | None:
         return None
     return {name: cluster for one in held if one for name, cluster in one.items()}
 
-
-def _counted(sums: Sums, clusters: dict[str, str] | None) -> int:
-    return len({clusters[name] if clusters else name for _, name in sums})

@@ -41,12 +41,14 @@ class Headline:
     baselines: tuple[Row, ...]  # the best first
     measure: str  # what the gain is: "skill" (1 − error / error of the best baseline) or "points" (of percent)
     gain: float  # of the model over the best baseline; NaN where it is not defined
-    low: float  # 95 % interval of the gain; NaN with fewer than two clusters
+    low: float  # 95 % interval of the gain; NaN with fewer than three clusters
     high: float
-    clusters: int  # that were resampled
-    cluster: str  # what was resampled: "recordings", "slides", "grasps", "objects"
+    clusters: int  # that the interval is over
+    cluster: str  # what these are: "recordings", "slides", "grasps", "objects"
     runs: int
-    seeds: int  # resampled too where there are several
+    seeds: int  # that the interval is over too where there are several
+    effective: float = float("nan")  # as many equal clusters would be as certain; NaN in results of older versions
+    methods: int = 1  # among which the model was picked as the best
 
     @property
     def best(self) -> Row | None:
@@ -55,13 +57,8 @@ class Headline:
 
     @property
     def verdict(self) -> str:
-        """``better`` or ``worse`` than the best baseline where the interval excludes 0, ``unclear`` where it does not.
-
-        Empty where no baseline was evaluated, or fewer than `FEWEST` clusters, whose interval proves nothing.
-        """
-        if self.clusters < FEWEST or math.isnan(self.low) or math.isnan(self.high):
-            return NO_VERDICT
-        return BETTER if self.low > 0 else WORSE if self.high < 0 else UNCLEAR
+        """How the model compares with the best baseline (`verdict_of`); empty where none was evaluated."""
+        return verdict_of(self.low, self.high, self.clusters, self.effective)
 
     @property
     def where(self) -> str:
@@ -74,6 +71,7 @@ class Headline:
         return (
             f"95 % interval over {counted(self.clusters, self.cluster)}"
             f"{f' and {self.seeds} seeds' if self.seeds > 1 else ''}"
+            f"{f', the best of {self.methods} methods' if self.methods > 1 else ''}"
         )
 
     def to_json(self) -> dict[str, Any]:
@@ -85,11 +83,10 @@ class Headline:
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> Headline:
         """Return the headline that `to_json` wrote."""
-        fields = {name: value[name] for name in cls.__dataclass_fields__}
-        model, baselines = _row(fields.pop("model")), tuple(_row(one) for one in fields.pop("baselines"))
-        gain, low, high = (_number(fields.pop(name)) for name in ("gain", "low", "high"))
-        columns = tuple(fields.pop("columns"))
-        return cls(**fields, columns=columns, model=model, baselines=baselines, gain=gain, low=low, high=high)
+        fields = {name: value[name] for name in cls.__dataclass_fields__ if name in value}
+        fields |= {name: _number(fields.get(name)) for name in ("gain", "low", "high", "effective")}
+        fields |= {"columns": tuple(value["columns"]), "model": _row(value["model"])}
+        return cls(**{**fields, "baselines": tuple(map(_row, value["baselines"]))})
 
 
 def write(headlines: Sequence[Headline]) -> bytes:
@@ -101,6 +98,28 @@ def write(headlines: Sequence[Headline]) -> bytes:
 def read(content: bytes) -> list[Headline]:
     """Return the headlines that ``headline.json`` holds."""
     return [Headline.from_json(one) for one in json.loads(content)["headlines"]]
+
+
+def verdict_of(low: float, high: float, clusters: int, effective: float) -> str:
+    """Return ``better`` or ``worse`` where the interval of a gain excludes 0, ``unclear`` where it does not.
+
+    Empty where an interval is not sure to hold 95 %: with fewer than `FEWEST` clusters, or where these are as certain as
+    fewer equal ones would be (``effective``), and without an interval.
+    """
+    if clusters < FEWEST or round(effective, 6) < FEWEST or math.isnan(low) or math.isnan(high):
+        return NO_VERDICT
+    return BETTER if low > 0 else WORSE if high < 0 else UNCLEAR
+
+
+def too_few(clusters: int, cluster: str, effective: float) -> str:
+    """Return why there is no verdict, as a clause.
+
+    >>> too_few(5, "recordings", 5.0), too_few(23, "recordings", 4.04)
+    ('5 recordings are too few for a verdict', '23 recordings count as 4.0 equal ones, too few for a verdict')
+    """
+    if clusters >= FEWEST and round(effective, 6) < FEWEST:
+        return f"{counted(clusters, cluster)} count as {effective:.1f} equal ones, too few for a verdict"
+    return f"{counted(clusters, cluster)} {'is' if clusters == 1 else 'are'} too few for a verdict"
 
 
 def verdict(headlines: Sequence[Headline]) -> str:
@@ -122,8 +141,7 @@ def clause(one: Headline) -> str:
     name = f"{best.name}, the best of {len(one.baselines)} baselines" if len(one.baselines) > 1 else best.name
     gain = f"{amount(one)}"
     if one.verdict == NO_VERDICT:
-        few = f"{counted(one.clusters, one.cluster)} {'is' if one.clusters == 1 else 'are'} too few for an interval"
-        return f"has {gain} over the baseline {name}; {few}"
+        return f"has {gain} over the baseline {name}; {too_few(one.clusters, one.cluster, one.effective)}"
     interval = f" ({bounds(one)}, {one.interval})"
     return {
         BETTER: f"is better than the baseline {name}: {gain}{interval}",
@@ -201,10 +219,10 @@ def caption(headlines: Sequence[Headline]) -> str:
     first = headlines[0]
     skill = f" Skill is 1 − error / error of the best baseline; the error is {first.ranked_by}."
     points = f" Points are percentage points of {first.ranked_by} above the best baseline."
-    resampled = {f"{one.cluster}{' and seeds' if one.seeds > 1 else ''}" for one in headlines}
+    over = {f"{one.cluster}{' and seeds' if one.seeds > 1 else ''}" for one in headlines}
     return (
-        f"Units: {first.unit}.{points if first.measure == 'points' else skill} Intervals: bootstrap over "
-        f"{' or '.join(sorted(resampled))}, model and baseline on the same ones, 2,000 resamples."
+        f"Units: {first.unit}.{points if first.measure == 'points' else skill} Intervals: jackknife over "
+        f"{' or '.join(sorted(over))}, model and baseline on the same ones."
     )
 
 

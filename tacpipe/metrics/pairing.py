@@ -1,27 +1,33 @@
 """A model and its baselines on the same recordings: which baseline is best, and the interval of the gain over it.
 
-Errors are sums by seed and recording. An interval comes from drawing clusters of recordings anew, model and baseline on
-the same ones (paired cluster bootstrap, `tacpipe.metrics.forecast`), and the seeds of training too where there are several.
+Errors are sums by seed and recording. An interval follows from leaving out clusters of recordings, of model and baseline the
+same ones, and seeds of training where there are several (`tacpipe.metrics.intervals`). Who picks the best of several
+methods or compares with the best of several baselines has chosen by chance too: the end of the interval that the choice
+moves is that of the largest of as many statistics.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Hashable, Iterable, Mapping
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
+from scipy.special import stdtrit
 
 from tacpipe.arrays import AnyArray, AnyFloats
-from tacpipe.metrics import forecast
-from tacpipe.metrics.forecast import Interval
-from tacpipe.metrics.headline import Headline, Row
+from tacpipe.metrics import intervals
+from tacpipe.metrics.headline import Headline, Row, verdict_of
+from tacpipe.metrics.intervals import Estimate, Interval, Jackknife
 
 Sums = Mapping[tuple[Hashable, str], AnyFloats]  # by seed and recording, (part,): what adds up over recordings
 ENUMERATED, SWAPS = 12, 9_999  # clusters that are exchanged in all ways; random ways of more
 Key = TypeVar("Key", bound=Hashable)
-_draws = functools.lru_cache(maxsize=16)(forecast.draws)
+
+
+def _equal(sums: AnyFloats) -> AnyFloats:
+    return np.ones(len(sums))
 
 
 @dataclass(frozen=True)
@@ -39,6 +45,7 @@ class Measure:
     score: Callable[[AnyFloats], AnyFloats] = lambda error: error  # what charts draw, from errors (draw,) to (draw,)
     scored: str = "error"  # what ``score`` is, with its unit
     rises: bool = False  # whether a higher score is better
+    weight: Callable[[AnyFloats], AnyFloats] = _equal  # a baseline's sums (cluster, part) to how much each counts (cluster,)
 
     def score_of(self, parts: Iterable[AnyFloats]) -> float:
         """Return the score of sums that are added up, each (part,)."""
@@ -46,12 +53,94 @@ class Measure:
 
 
 @dataclass(frozen=True)
-class Estimate:
-    """A value and its 95 % interval; NaN where it is not defined, bounds also with fewer than two clusters."""
+class Gain:
+    """What a predictor gains over another with its 95 % interval, and what that rests on; NaN where it is not defined."""
 
     mean: float
     low: float
     high: float
+    clusters: int = 0  # that were left out one by one
+    effective: float = 0.0  # as many equal clusters would be as certain
+
+    @property
+    def verdict(self) -> str:
+        """Whether the predictor is better or worse, as `tacpipe.metrics.headline.verdict_of` states it."""
+        return verdict_of(self.low, self.high, self.clusters, self.effective)
+
+
+NO_GAIN = Gain(float("nan"), float("nan"), float("nan"))
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """The errors of a predictor and a baseline on the recordings of both, and how certain the gain is."""
+
+    sums: AnyFloats  # (seed, cluster, part): those of the predictor, then those of the baseline
+    names: tuple[str, ...]  # of clusters
+    jackknife: Jackknife  # of the gain; of skill, of the negative logarithm of the ratio of errors
+    effective: float
+
+    @property
+    def totals(self) -> tuple[AnyFloats, AnyFloats]:
+        """The sums of the predictor and of the baseline, each (part,)."""
+        first, second = np.split(self.sums.sum(axis=(0, 1)), 2)
+        return first, second
+
+    def p(self, measure: Measure) -> float:
+        """Return the p of `swap_test`, not corrected for the number of methods."""
+        first, second = np.split(self.sums.sum(axis=0), 2, axis=1)
+        return swap_test(measure, first, second)
+
+
+def pair(measure: Measure, model: Sums, baseline: Sums, clusters: Mapping[str, str] | None = None) -> Pair | None:
+    """Return a predictor next to a baseline on the recordings that they share; None where they share none.
+
+    Where the baseline was not evaluated with a seed of the predictor, its mean over its own seeds counts. ``clusters`` maps a
+    recording to what it is left out with, by default itself.
+    """
+    sums, names = _side_by_side(model, baseline, clusters)
+    if not names:
+        return None
+    width = sums.shape[2] // 2
+
+    def statistic(found: AnyFloats) -> AnyFloats:
+        gain = measure.gain(*map(measure.error, (found[:, :width], found[:, width:])))
+        return (-np.log(np.maximum(1 - gain, intervals.SMALLEST)) if measure.name == "skill" else gain)[:, None]
+
+    weights = measure.weight(sums.sum(axis=0)[:, width:])[:, None]
+    effective = float(intervals.effective_number(weights)[0])
+    return Pair(sums, tuple(names), intervals.jackknife(sums, statistic, weights), effective)
+
+
+def gain(measure: Measure, pairs: Sequence[Pair], rivals: Sequence[Pair] = ()) -> Gain:
+    """Return what a predictor gains over the first of its baselines, from its `Pair` with each of them.
+
+    ``rivals`` are those of other predictors among which this one may have been picked: they move the lower end of the
+    interval. Further baselines move the upper end, because the first was picked as the best of them.
+    """
+    if not pairs:
+        return NO_GAIN
+    first = pairs[0]
+    found = first.jackknife
+    mean, error, freedom = (float(value[0]) for value in (found.mean, found.error, found.freedom))
+    low = mean - _reach([first, *rivals], freedom) * error
+    high = mean + _reach(pairs, freedom) * error
+    if measure.name == "skill":
+        mean, low, high = (float(-np.expm1(-value)) for value in (mean, low, high))
+    return Gain(mean, low, high, len(first.names), first.effective)
+
+
+def _reach(pairs: Sequence[Pair], freedom: float) -> float:
+    """Return how many standard errors an end lies off where the largest of several gains was picked."""
+    if np.isnan(freedom):
+        return float("nan")
+    several = {id(one): one for one in pairs if not np.isnan(one.jackknife.influence).any()}.values()
+    common = set.intersection(*(set(one.names) for one in pairs))
+    if len(common) < 2:  # whose correlation is not defined: Bonferroni
+        return float(stdtrit(freedom, 1 - (1 - intervals.COVERAGE) / 2 / len(pairs)))
+    chosen = ([at for at, name in enumerate(one.names) if name in common] for one in several)
+    influences = [one.jackknife.influence[at, 0] for one, at in zip(several, chosen, strict=True)]
+    return intervals.largest_quantile(influences, freedom)
 
 
 def headline(
@@ -65,25 +154,17 @@ def headline(
     target: str = "",
     clusters: Mapping[str, str] | None = None,
     runs: int = 1,
+    rivals: Sequence[Pair] = (),
 ) -> Headline | None:
     """Return how a model compares with the best of its baselines; None without a recording.
 
-    A baseline is compared on the recordings that it shares with the model; where it was not evaluated with a seed of the
-    model, its mean over its own seeds counts. ``clusters`` maps a recording to the cluster it is drawn with, by default
-    itself.
+    Baselines are compared as `pair` does, ``rivals`` count as in `gain`.
     """
-    if not model:
+    alone = pair(measure, model, model, clusters)
+    if alone is None:
         return None
-    width = len(next(iter(model.values())))
-    order, totals = _ranked(measure, {name: _beside(model, one, clusters)[0] for name, one in baselines.items()})
-    own, names = _beside(model, model, clusters)
-    seeds = len({seed for seed, _ in model})
-    gain = low = high = float("nan")
-    if order:
-        pairs, names = _beside(model, baselines[order[0]], clusters)
-        gain, low, high = _interval(
-            pairs, lambda sums: measure.gain(*map(measure.error, (sums[:, :width], sums[:, width:])))
-        )
+    ranked = rank(measure, model, baselines, clusters)
+    over = gain(measure, list(ranked.values()), rivals)
     return Headline(
         task,
         method,
@@ -92,61 +173,52 @@ def headline(
         measure.columns,
         measure.unit,
         measure.ranked_by,
-        Row(method, measure.values(own.sum(axis=(0, 1))[:width])),
-        tuple(Row(name, measure.values(totals[name][width:])) for name in order),
+        Row(method, measure.values(alone.totals[0])),
+        tuple(Row(name, measure.values(one.totals[1])) for name, one in ranked.items()),
         measure.name,
-        gain,
-        low,
-        high,
-        len(names),
+        over.mean,
+        over.low,
+        over.high,
+        len(next(iter(ranked.values()), alone).names),
         measure.cluster,
         runs,
-        seeds,
+        len(alone.sums),
+        effective=next(iter(ranked.values()), alone).effective,
+        methods=1 + len(rivals),
     )
 
 
-def best(
+def rank(
     measure: Measure, model: Sums, baselines: Mapping[str, Sums], clusters: Mapping[str, str] | None = None
-) -> str:
-    """Return the baseline of least error on the recordings that it shares with the model; empty where none shares any."""
-    ranked = _ranked(measure, {name: _beside(model, one, clusters)[0] for name, one in baselines.items()})[0]
-    return next(iter(ranked), "")
-
-
-def _ranked(measure: Measure, pairs: Mapping[str, AnyFloats]) -> tuple[list[str], dict[str, AnyFloats]]:
-    """Return baselines, the best first, and the totals of model and baseline of each, from their `_beside`."""
-    totals = {name: one.sum(axis=(0, 1)) for name, one in pairs.items() if one.size}
-    errors = {name: float(measure.error(one[None, len(one) // 2 :])[0]) for name, one in totals.items()}
-    names = list(totals)
-    return sorted(errors, key=lambda name: (np.isnan(errors[name]), errors[name], names.index(name))), totals
+) -> dict[str, Pair]:
+    """Return a model next to each baseline that shares recordings with it, by name, that of least error on them first."""
+    pairs = {name: one for name, sums in baselines.items() if (one := pair(measure, model, sums, clusters))}
+    errors = {name: float(measure.error(one.totals[1][None])[0]) for name, one in pairs.items()}
+    return {name: pairs[name] for name in sorted(pairs, key=lambda name: (np.isnan(errors[name]), errors[name]))}
 
 
 def score(measure: Measure, sums: Sums, clusters: Mapping[str, str] | None = None) -> Estimate:
     """Return the score of one predictor by itself, with the interval over clusters (and seeds where there are several)."""
-    own, names = _beside(sums, sums, clusters)
+    rows, names = _side_by_side(sums, sums, clusters)
     if not names:
         return Estimate(float("nan"), float("nan"), float("nan"))
-    width = own.shape[2] // 2
-    return Estimate(*_interval(own[:, :, :width], lambda drawn: measure.score(measure.error(drawn))))
+    rows = rows[:, :, : rows.shape[2] // 2]
+    relative = measure.name == "skill"  # errors of which ratios count
+
+    def statistic(found: AnyFloats) -> AnyFloats:
+        error = measure.error(found)
+        return (np.log(np.maximum(error, intervals.SMALLEST)) if relative else error)[:, None]
+
+    found = intervals.jackknife(rows, statistic, measure.weight(rows.sum(axis=0))[:, None]).interval()
+    ends = np.concatenate([found.low, found.high])
+    low, high = sorted(map(float, measure.score(np.exp(ends) if relative else ends)))
+    return Estimate(measure.score_of(rows.sum(axis=0)), low, high)
 
 
-def difference(
-    measure: Measure, first: Sums, second: Sums, clusters: Mapping[str, str] | None = None
-) -> tuple[Estimate, float, int]:
-    """Return what the first predictor gains over the second on the recordings of both, the p of `swap_test`, and clusters.
-
-    The gain is `Measure.gain` of their errors; all NaN where they share no recording.
-    """
-    pairs, names = _beside(first, second, clusters)
-    if not names:
-        return Estimate(float("nan"), float("nan"), float("nan")), float("nan"), 0
-    width = pairs.shape[2] // 2
-
-    def gain(sums: AnyFloats) -> AnyFloats:
-        return measure.gain(*map(measure.error, (sums[:, :width], sums[:, width:])))
-
-    totals = pairs.sum(axis=0)
-    return Estimate(*_interval(pairs, gain)), swap_test(measure, totals[:, :width], totals[:, width:]), len(names)
+def difference(measure: Measure, first: Sums, second: Sums, clusters: Mapping[str, str] | None = None) -> Gain:
+    """Return what the first predictor gains over the second on the recordings of both; NaN where they share none."""
+    one = pair(measure, first, second, clusters)
+    return gain(measure, [one] if one else [])
 
 
 def swap_test(measure: Measure, first: AnyFloats, second: AnyFloats) -> float:
@@ -182,7 +254,7 @@ def _swaps(clusters: int) -> AnyArray:
     return np.random.default_rng(0).integers(0, 2, (SWAPS, clusters), dtype=np.int8)
 
 
-def _beside(model: Sums, other: Sums, clusters: Mapping[str, str] | None) -> tuple[AnyFloats, list[str]]:
+def _side_by_side(model: Sums, other: Sums, clusters: Mapping[str, str] | None) -> tuple[AnyFloats, list[str]]:
     """Return sums of the model, then of another predictor, (seed, cluster, part), and the clusters' names."""
     elsewhere: dict[str, list[AnyFloats]] = {}
     for (_, recording), one in other.items():
@@ -199,13 +271,32 @@ def _beside(model: Sums, other: Sums, clusters: Mapping[str, str] | None) -> tup
     ]
     if not rows:
         return np.zeros((0, 0, 0)), []
-    seeds = {seed: at for at, seed in enumerate(dict.fromkeys(seed for seed, *_ in rows))}
+    repeats = _repeats([(seed, recording) for seed, recording, *_ in rows])
     held = [clusters[recording] if clusters else recording for _, recording, *_ in rows]
     places = {name: at for at, name in enumerate(sorted(set(held)))}
-    found = np.zeros((len(seeds), len(places), 2 * len(rows[0][2])))
-    spot = np.array([seeds[seed] for seed, *_ in rows]), np.array([places[name] for name in held])
+    found = np.zeros((max(repeats.values()) + 1, len(places), 2 * len(rows[0][2])))
+    spot = np.array([repeats[seed] for seed, *_ in rows]), np.array([places[name] for name in held])
     np.add.at(found, spot, np.array([np.concatenate([one, two]) for _, _, one, two in rows]))
     return found, list(places)
+
+
+def _repeats(keys: Iterable[tuple[Hashable, str]]) -> dict[Hashable, int]:
+    """Return the number of each seed among those that share recordings.
+
+    Seeds without a common recording are folds, each of which tests other recordings, and repeat nothing.
+
+    >>> _repeats([(3, "a"), (4, "a"), (5, "b"), (6, "b")])
+    {3: 0, 4: 1, 5: 0, 6: 1}
+    """
+    by_recording: dict[str, set[Hashable]] = {}
+    for seed, recording in keys:
+        by_recording.setdefault(recording, set()).add(seed)
+    groups: list[set[Hashable]] = []
+    for seeds in {frozenset(seeds) for seeds in by_recording.values()}:
+        joined = [group for group in groups if group & seeds]
+        groups = [group for group in groups if not group & seeds] + [set(seeds).union(*joined)]
+    order = {seed: at for at, seed in enumerate(dict.fromkeys(seed for seed, _ in keys))}
+    return {seed: at for group in groups for at, seed in enumerate(sorted(group, key=order.__getitem__))}
 
 
 def added(parts: Iterable[tuple[Key, AnyFloats]]) -> dict[Key, AnyFloats]:
@@ -220,39 +311,19 @@ def added(parts: Iterable[tuple[Key, AnyFloats]]) -> dict[Key, AnyFloats]:
     return found
 
 
-def intervals(sums: Sums, statistic: Callable[[AnyFloats], AnyFloats]) -> Interval:
+def value_intervals(sums: Sums, statistic: Callable[[AnyFloats], AnyFloats]) -> Interval:
     """Return several values of one predictor's sums and their 95 % intervals, from sums (draw, part) to (draw, value)."""
-    own, _ = _beside(sums, sums, None)
-    width = own.shape[2] // 2
-    return _intervals(own[:, :, :width], statistic)
+    rows, _ = _side_by_side(sums, sums, None)
+    return intervals.jackknife(rows[:, :, : rows.shape[2] // 2], statistic).interval()
 
 
 def paired_intervals(first: Sums, second: Sums, statistic: Callable[[AnyFloats], AnyFloats]) -> Interval | None:
     """Return by how much several values of one predictor exceed those of another on the recordings of both.
 
-    Each resample draws the same recordings for both. None where they share none.
+    None where they share none.
     """
-    pairs, names = _beside(first, second, None)
+    pairs, names = _side_by_side(first, second, None)
     width = pairs.shape[2] // 2
     if not names:
         return None
-    return _intervals(pairs, lambda drawn: statistic(drawn[:, :width]) - statistic(drawn[:, width:]))
-
-
-def _interval(sums: AnyFloats, statistic: Callable[[AnyFloats], AnyFloats]) -> tuple[float, float, float]:
-    """Return a statistic of sums (seed, cluster, part) and its 95 % interval; NaN bounds with fewer than two clusters."""
-    found = _intervals(sums, lambda drawn: statistic(drawn)[:, None])
-    return float(found.mean[0]), float(found.low[0]), float(found.high[0])
-
-
-def _intervals(sums: AnyFloats, statistic: Callable[[AnyFloats], AnyFloats]) -> Interval:
-    """Return values of sums (seed, cluster, part) and their intervals, each (value,)."""
-    mean = statistic(sums.sum(axis=(0, 1))[None])[0]
-    seeds, clusters, _ = sums.shape
-    if clusters < 2:
-        return Interval(mean, np.full(len(mean), np.nan), np.full(len(mean), np.nan))
-    weights = _draws(clusters).astype(np.float64)  # (draw, cluster)
-    by_seed = np.stack([weights @ one for one in sums])  # (seed, draw, part)
-    drawn = _draws(seeds, seed=1).astype(np.float64)  # (draw, seed); of a single seed, that one
-    totals = np.einsum("ds,sdp->dp", drawn, by_seed)
-    return Interval(mean, *forecast.bounds(statistic(totals)))
+    return intervals.jackknife(pairs, lambda found: statistic(found[:, :width]) - statistic(found[:, width:])).interval()

@@ -14,7 +14,7 @@ import numpy as np
 
 from tacpipe.arrays import AnyFloats
 from tacpipe.errors import TacpipeError
-from tacpipe.metrics import forecast
+from tacpipe.metrics import intervals
 
 
 def check_levels(percents: tuple[int, ...]) -> None:
@@ -67,7 +67,7 @@ def tree(recordings: list[Sums], percents: tuple[int, ...], baseline: list[Sums]
     """Return the measures over recordings by step, ``t1`` …, and over all steps, ``mean``.
 
     ``pinball`` is the mean over values and levels; ``coverage`` that of the band, with the 95 % interval of it over
-    resampled recordings as ``coverage_low`` and ``coverage_high``; ``width`` the band's mean; ``below_q10`` … the fraction
+    recordings as ``coverage_low`` and ``coverage_high``; ``width`` the band's mean; ``below_q10`` … the fraction
     of true values at or below each quantile. ``pinball_skill`` is 1 - pinball / pinball of ``baseline``, sums of the same
     recordings.
     """
@@ -87,7 +87,7 @@ def tree(recordings: list[Sums], percents: tuple[int, ...], baseline: list[Sums]
     if baseline is not None:
         other = np.sum([one.pinball.sum(axis=1) for one in baseline], axis=0)
         own = total.pinball.sum(axis=1)
-        gains = forecast.skill(np.append(own, own.sum()), np.append(other, other.sum()))
+        gains = intervals.skill(np.append(own, own.sum()), np.append(other, other.sum()))
         found["pinball_skill"] = _named(gains)
     return found
 
@@ -98,14 +98,13 @@ def _steps(sums: AnyFloats, values: AnyFloats) -> dict[str, float]:
 
 
 def _interval(recordings: list[Sums]) -> tuple[dict[str, float], dict[str, float]]:
-    """Return the ends of the 95 % interval of coverage over resampled recordings, by step and over all."""
+    """Return the ends of the 95 % interval of coverage over recordings, by step and over all."""
     covered, values = (
         np.stack([np.append(getattr(one, name), getattr(one, name).sum()) for one in recordings])
         for name in ("covered", "values")
     )
-    weights = forecast.draws(len(recordings))
-    low, high = forecast.bounds((weights @ covered) / (weights @ values))
-    return _named(low), _named(high)
+    found = intervals.share_interval(covered, values)
+    return _named(found.low), _named(found.high)
 
 
 def _named(values: AnyFloats) -> dict[str, float]:

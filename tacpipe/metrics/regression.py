@@ -7,25 +7,14 @@ Published figures are often means over batches instead, which are never larger a
 
 from __future__ import annotations
 
-import functools
-from typing import NamedTuple
-
 import numpy as np
 
 from tacpipe.arrays import AnyArray, AnyFloats
 from tacpipe.errors import TacpipeError
-from tacpipe.metrics import forecast
+from tacpipe.metrics import intervals
+from tacpipe.metrics.intervals import Estimate
 
 BATCH = 10  # grasps over which the letter (RA-L 2020) takes each RMSE before it averages them
-_draws = functools.lru_cache(maxsize=8)(forecast.draws)
-
-
-class Interval(NamedTuple):
-    """A skill on all grasps and the 95 % interval of it over resampled clusters."""
-
-    mean: float
-    low: float  # NaN, like ``high``, with fewer than two clusters
-    high: float
 
 
 def squared_sums(true: AnyFloats, predicted: AnyFloats) -> AnyFloats:
@@ -90,37 +79,18 @@ def rmse_by_value(true: AnyFloats, predicted: AnyFloats) -> AnyFloats:
     return np.array([_root_mean_square(column) for column in error.T])
 
 
-def skill(rmse: float, baseline: float) -> float:
-    """Return 1 - RMSE / RMSE of a baseline: 1 is perfect, 0 no better than it, below 0 worse. NaN where it never errs.
-
-    >>> skill(0.05, 0.1), skill(0.1, 0.0)
-    (0.5, nan)
-    """
-    return float(forecast.skill(np.asarray(rmse), np.asarray(baseline)))
-
-
-def skill_interval(model: AnyFloats, baseline: AnyFloats, clusters: AnyArray) -> Interval:
-    """Return the skill of a model over a baseline and its 95 % interval, from `squared_sums` of both, each (grasp,).
+def skill_interval(model: AnyFloats, baseline: AnyFloats, clusters: AnyArray) -> Estimate:
+    """Return 1 - RMSE / RMSE of a baseline with its 95 % interval, from `squared_sums` of both, each (grasp,).
 
     ``clusters`` (grasp,) groups the grasps that depend on each other: those of an object where the next object counts, a
-    grasp and what other runs predicted for it where objects are known. Each resample draws as many clusters as there are,
-    with replacement (cluster bootstrap; Davison and Hinkley, 1997, section 3.8). Raises `TacpipeError` for other shapes.
+    grasp and what other runs predicted for it where objects are known. Raises `TacpipeError` for other shapes.
     """
     if not len(model) == len(baseline) == len(clusters):
         raise TacpipeError(
             f"There are errors of {len(model)} and {len(baseline)} grasps and clusters of {len(clusters)}; give both errors "
             f"and the cluster of the same grasps."
         )
-    if not len(clusters):
-        return Interval(float("nan"), float("nan"), float("nan"))
-    names, codes = np.unique(clusters, return_inverse=True)
-    sums = np.column_stack([np.bincount(codes, one, len(names)) for one in (model, baseline)])  # (cluster, predictor)
-    mean = skill(*np.sqrt(sums.sum(axis=0)))  # the number of values is the same for both, and cancels
-    if len(names) < 2:
-        return Interval(mean, float("nan"), float("nan"))
-    drawn = np.sqrt(_draws(len(names)) @ sums)  # (resample, predictor)
-    low, high = forecast.bounds(forecast.skill(drawn[:, :1], drawn[:, 1:]))
-    return Interval(mean, float(low[0]), float(high[0]))
+    return intervals.skill_interval(model[:, None], baseline[:, None], clusters, power=0.5).first
 
 
 def _error(true: AnyFloats, predicted: AnyFloats) -> AnyFloats:

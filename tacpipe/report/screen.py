@@ -35,7 +35,7 @@ def sentence(context: Context) -> tuple[str, str]:
         # parts of other splits or timelines come behind a fold
         name = "it" if method.name == last else method.name
         last = method.name
-        verdicts += [verdict(one, row) for one, row in rows]
+        verdicts += [row.gain.verdict for _, row in rows]
         alike = (verdicts[-1], rows[0][1].baseline)
         if name == "it" and len(rows) == 1 and alike == held and verdicts[-1]:
             clauses.append(f"on {part} too: {_amount(*rows[0])}")
@@ -46,13 +46,6 @@ def sentence(context: Context) -> tuple[str, str]:
         return "", ""
     text = "; ".join(clauses[:2])
     return f"{text[:1].upper()}{text[1:]}.", verdicts[0] if len(set(verdicts)) == 1 else headline.UNCLEAR
-
-
-def verdict(comparison: Comparison, row: Row) -> str:
-    """Return whether a method is better or worse than its best baseline, as `Headline.verdict` states it."""
-    if not row.baseline or row.n < headline.FEWEST or math.isnan(row.gain.low):
-        return headline.NO_VERDICT
-    return headline.BETTER if row.gain.low > 0 else headline.WORSE if row.gain.high < 0 else headline.UNCLEAR
 
 
 def first_chart(context: Context) -> Chart | None:
@@ -196,7 +189,7 @@ def _clause(part: str, name: str, rows: Sequence[tuple[Comparison, Row]]) -> str
         return f"{where}{name} {_verb(one, row)}"
     found: dict[str, list[str]] = {}
     for one, row in rows:
-        found.setdefault(verdict(one, row), []).append(one.question.target)
+        found.setdefault(row.gain.verdict, []).append(one.question.target)
     counts = []
     for each in (headline.BETTER, headline.UNCLEAR, headline.WORSE):
         if each in found:
@@ -214,9 +207,9 @@ def _verb(one: Comparison, row: Row) -> str:
     size = counted(row.n, one.measure.cluster)
     if not row.baseline:
         return f"was evaluated without a baseline, on {size}"
-    said = verdict(one, row)
+    said = row.gain.verdict
     if said == headline.NO_VERDICT:
-        few = f"{size} {'is' if row.n == 1 else 'are'} too few for a verdict"
+        few = headline.too_few(row.n, one.measure.cluster, row.gain.effective)
         return f"has {_gained(one, row)} over the best baseline, {row.baseline}; {few}"
     return f"is {CLAUSES[said]} the best baseline, {row.baseline}: {_amount(one, row, '95 % interval ')}"
 

@@ -30,7 +30,10 @@ KINDS = {
     "oracle": "Oracles, which know what they predict",
     "control": "Controls",
 }
-PICKED = "The best of several methods was picked on these very recordings, which flatters it a little."
+PICKED = (
+    "The best of several methods was picked on these very recordings, which flatters it a little; the interval of its gain "
+    "accounts for that."
+)
 
 
 def section(task: Task, results: Sequence[Dataset], others: Sequence[Dataset], traces: int) -> Section:
@@ -92,8 +95,9 @@ def headline_caption(measure: Measure) -> str:
     skill = f"Skill is 1 − error / error of the best baseline; the error is {measure.ranked_by}."
     points = f"Points are percentage points of {measure.ranked_by} above the best baseline."
     return (
-        f"Units: {measure.unit}. {points if measure.name == 'points' else skill} Intervals are 95 %, from drawing "
-        f"{measure.cluster} anew (and seeds where there are several), method and baseline on the same ones, 2,000 resamples."
+        f"Units: {measure.unit}. {points if measure.name == 'points' else skill} Intervals are 95 %, over "
+        f"{measure.cluster} (and seeds where there are several), method and baseline on the same ones. They account for the "
+        f"choice of the best among several methods and baselines."
     )
 
 

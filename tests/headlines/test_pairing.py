@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 import pytest
+from scipy import stats
 
+from tacpipe.metrics import headline as headlines
 from tacpipe.metrics import pairing, regression
 from tacpipe.tasks.forward import headline as forward
 from tacpipe.tasks.material import headline as material
@@ -35,7 +38,7 @@ def test_the_best_baseline_is_that_of_least_error_and_controls_and_codecs_are_no
     assert found.model.values[-1] == pytest.approx(0.5)
 
 
-def test_the_interval_is_that_of_drawing_recordings_with_model_and_baseline_paired() -> None:
+def test_the_interval_is_that_of_students_t_for_the_logarithm_of_the_ratio_of_errors() -> None:
     rng = np.random.default_rng(3)
     ratios, still = rng.uniform(0.2, 1.0, (2, 12)), rng.uniform(1, 9, 12)
     model, ridge = (
@@ -44,10 +47,13 @@ def test_the_interval_is_that_of_drawing_recordings_with_model_and_baseline_pair
         for told in ratios
     )  # fmt: skip
     found = forward.headline("net", (1,), model, {"ridge": ridge}, None)
-    drawn = np.random.default_rng(0).multinomial(12, np.full(12, 1 / 12), size=2000)
-    gains = 1 - drawn @ (ratios[0] * still) / (drawn @ (ratios[1] * still))
+    errors = ratios * still
+    without = np.array([np.log(np.delete(errors, at, 1).sum(axis=1)) @ [1, -1] for at in range(12)])
+    error = math.sqrt(11 / 12 * np.square(without - without.mean()).sum())
+    reach = stats.t.ppf(0.975, still.sum() ** 2 / np.square(still).sum() - 1) * error
+    ratio = errors[0].sum() / errors[1].sum()
     assert found is not None
-    assert (found.low, found.high) == pytest.approx(tuple(np.quantile(gains, [0.025, 0.975])))
+    assert (found.low, found.high) == pytest.approx((1 - ratio * math.exp(reach), 1 - ratio * math.exp(-reach)))
     assert found.gain == pytest.approx(1 - (ratios[0] * still).sum() / (ratios[1] * still).sum())
 
 
@@ -97,13 +103,57 @@ def test_the_gain_on_touch_is_the_skill_that_the_metrics_have_over_the_same_base
         assert found.model.values[1] == pytest.approx(100 * regression.rmse(true, model))
 
 
-def test_seeds_are_drawn_as_recordings_are() -> None:
+def test_folds_that_have_seeds_of_their_own_are_no_repeats() -> None:
+    rng = np.random.default_rng(4)
+    ratios = dict(zip(RECORDINGS, rng.uniform(0.3, 0.9, 12), strict=True))
+    still = forecasts(dict.fromkeys(RECORDINGS, 1.0))
+    folds: Any = {}
+    for fold in range(3):
+        folds |= forecasts({name: ratios[name] for name in RECORDINGS[fold::3]}, seed=fold)
+    single, folded = (forward.headline("net", (1,), one, {"persistence": still}, None)
+                      for one in (forecasts(ratios), folds))  # fmt: skip
+    assert single is not None and folded is not None
+    assert (folded.low, folded.high, folded.seeds) == (single.low, single.high, 1)
+
+
+def test_a_few_recordings_that_carry_most_of_the_error_give_no_verdict() -> None:
+    sizes = dict(zip(RECORDINGS, [40.0, 30.0, 20.0, *[1.0] * 9], strict=True))
+    model, still = ({key: value for name, size in sizes.items()
+                     for key, value in forecasts({name: ratio}, persistence=size).items()} for ratio in (0.5, 1.0))  # fmt: skip
+    found = forward.headline("net", (1,), model, {"persistence": still}, None)
+    assert found is not None and found.low > 0
+    assert found.effective == pytest.approx(99**2 / (40**2 + 30**2 + 20**2 + 9))
+    assert found.verdict == ""
+    assert "12 recordings count as 3.4 equal ones, too few for a verdict" in headlines.sentence(found)
+
+
+def test_the_end_that_a_choice_moves_is_that_of_the_largest_of_several_statistics() -> None:
+    rng = np.random.default_rng(8)
+    still = forecasts(dict.fromkeys(RECORDINGS, 1.0))
+    methods = [forecasts(dict(zip(RECORDINGS, rng.uniform(0.5, 1.1, 12), strict=True))) for _ in range(5)]
+    measure = forward.measure((1,))
+    pairs = [one for sums in methods if (one := pairing.pair(measure, sums, still))]
+    alone, chosen = pairing.gain(measure, pairs[:1]), pairing.gain(measure, pairs[:1], pairs[1:])
+    influence = np.stack([one.jackknife.influence[:, 0] for one in pairs])
+    drawn = stats.multivariate_t(np.zeros(5), np.corrcoef(influence), df=11, allow_singular=True).rvs(
+        40_000, random_state=1
+    )
+    reach = np.quantile(drawn.max(axis=1), 0.975)
+    mean, error = (float(one[0]) for one in (pairs[0].jackknife.mean, pairs[0].jackknife.error))
+    assert (alone.mean, alone.high) == (chosen.mean, chosen.high)
+    assert chosen.low == pytest.approx(1 - math.exp(reach * error - mean), abs=0.01)
+    assert chosen.low < alone.low
+    other = pairing.gain(measure, [pairs[0], pairs[1]])  # of two baselines the best was chosen
+    assert other.low == alone.low and other.high > alone.high
+
+
+def test_seeds_are_left_out_as_recordings_are() -> None:
     model = {key: one for seed, ratio in enumerate((0.1, 0.9)) for key, one in
              forecasts(dict.fromkeys(RECORDINGS, ratio), seed=seed).items()}  # fmt: skip
     found = forward.headline("net", (1,), model, {"persistence": forecasts(dict.fromkeys(RECORDINGS, 1.0))}, None)
     assert found is not None
     assert found.seeds == 2
-    assert (found.gain, found.low, found.high) == pytest.approx((0.5, 0.1, 0.9))  # both draws are of one seed
+    assert found.gain == pytest.approx(0.5) and found.low < 0.1 and found.high > 0.9
 
 
 def test_a_model_without_recordings_has_no_headline() -> None:

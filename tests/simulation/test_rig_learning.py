@@ -16,7 +16,7 @@ import pytest
 import torch
 
 from tacpipe.arrays import AnyFloats, Bools, Int64s
-from tacpipe.metrics.forecast import skill
+from tacpipe.metrics.intervals import skill
 from tacpipe.plugins.registry import load
 from tacpipe.simulation import taxels, trajectory
 from tacpipe.tasks.forward import task as forward

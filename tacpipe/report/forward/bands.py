@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tacpipe.io.parquet import from_parquet
-from tacpipe.metrics import forecast
+from tacpipe.metrics import intervals
 from tacpipe.report import blocks, charts
 from tacpipe.report.blocks import Chart, Charts, Fold, fold, number, table
 from tacpipe.report.charts import Line
@@ -71,8 +71,9 @@ def _sums(runs: Sequence[Run]) -> dict[str, dict[bool, dict[str, dict[str, AnyFl
     found: dict[str, dict[bool, dict[str, dict[str, AnyFloats]]]] = {}
     for run in runs:
         read = from_parquet(run.details.dataset.files[COVERAGE]).to_pandas()
-        for (name, known, recording), one in read[~read.seen].groupby(["predictor", "known", "recording"]):
-            own = one.sort_values("step")
+        read["unit"] = read["recording"].where(read["known"] | read["object"].isna(), read["object"])
+        for (name, known, recording), one in read[~read.seen].groupby(["predictor", "known", "unit"]):
+            own = one.groupby("step", as_index=False)[["covered", "width", "pinball", "values"]].sum()
             added = {key: own[key].to_numpy(float) for key in ("covered", "width", "pinball", "values")}
             there = found.setdefault(str(name), {}).setdefault(bool(known), {})
             before = there.get(str(recording))
@@ -89,13 +90,10 @@ def _coverage(title: str, sums: Mapping[str, Mapping[str, Mapping[str, AnyFloats
     """Return coverage by step of each predictor, with its interval over recordings."""
     several = []
     for name in (one for one in NAMES if one in sums):
-        covered, values = _of(sums[name], "covered"), _of(sums[name], "values")
-        mean = covered.sum(axis=0) / values.sum(axis=0)
-        low, high = mean, mean
-        if len(covered) > 1:
-            weights = forecast.draws(len(covered))
-            low, high = forecast.bounds((weights @ covered) / (weights @ values))
-        several.append(Line(NAMES[name], np.arange(1.0, len(mean) + 1), mean, low, high, dashed=name != "model"))
+        found = intervals.share_interval(_of(sums[name], "covered"), _of(sums[name], "values"))
+        low, high = (np.where(np.isnan(ends), found.mean, ends) for ends in (found.low, found.high))
+        steps = np.arange(1.0, len(low) + 1)
+        several.append(Line(NAMES[name], steps, found.mean, low, high, dashed=name != "model"))
     spec = charts.lines(several, "rows ahead", "coverage", level=("asked for", level))
     return Chart(f"Coverage: {title}", spec)
 

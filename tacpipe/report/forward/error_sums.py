@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -44,6 +44,7 @@ class ErrorSums:
     squared: AnyFloats  # (predictor, group, recording, step)
     absolute: AnyFloats  # (predictor, group, recording, step)
     named: bool = True  # whether any recording names its object: else none is known or unseen
+    objects: Mapping[str, str] = field(default_factory=dict)  # by recording, where it names one
 
     def of(self, predictor: str, group: str) -> tuple[AnyFloats, AnyFloats] | None:
         """Return squared and absolute sums, both (recording, step); None where there are none."""
@@ -100,7 +101,14 @@ def read(content: bytes) -> ErrorSums:
         sums[0],
         sums[1],
         named,
+        _objects(table) if objects else {},
     )
+
+
+def _objects(table: pa.Table) -> dict[str, str]:
+    """Return the object that each recording names."""
+    pairs = zip(table["recording"].to_pylist(), table["object"].to_pylist(), strict=True)
+    return {recording: name for recording, name in pairs if name is not None}
 
 
 def _coded(column: pa.ChunkedArray) -> tuple[tuple[str, ...], Int64s]:

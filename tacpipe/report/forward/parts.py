@@ -11,7 +11,7 @@ import numpy as np
 from tacpipe.comparison.engine import Comparison, Row
 from tacpipe.comparison.runs import MODEL, Method, Question, Run
 from tacpipe.metrics import pairing
-from tacpipe.metrics.forecast import Interval
+from tacpipe.metrics.intervals import Interval
 from tacpipe.report import blocks, charts
 from tacpipe.report.blocks import NONE, Cell, Chart, Charts, Fold, Note, Table, fold, number, table
 from tacpipe.report.charts import Line
@@ -212,7 +212,7 @@ def _ablations(context: Context) -> list[Fold]:
     parts = list(dict.fromkeys(_known(one.question) for one in context.comparisons))
     tables = [*_actions(context, steps, parts), *_timelines(context, steps, parts)]
     note = Note(
-        "Differences are paired: each resample draws the same recordings. An interval above 0 shows that the plan helps."
+        "Differences are paired: both are on the same recordings. An interval above 0 shows that the plan helps."
     )
     return fold("What the plan and the timeline change", *tables, note)
 

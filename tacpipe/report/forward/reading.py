@@ -85,9 +85,16 @@ def sums(
     }  # fmt: skip
 
 
+def clusters(run: Result, known: bool | None) -> dict[str, str] | None:
+    """Return the object of each recording of unseen objects, which is what chance draws there; None of other recordings."""
+    errors = run.errors
+    if known is not False or not errors.objects:
+        return None
+    return {name: errors.objects.get(name, name) for name in errors.recordings}
+
+
 def _run(run: Result, steps: Sequence[int], usual: str) -> Run:
     config = run.config
-    measure = headline.measure(steps, units.of_model(config))
     elsewhere = run.timeline != usual
     other = f"{run.timeline} timeline" if elsewhere else ""
     questions = {}
@@ -99,7 +106,10 @@ def _run(run: Result, steps: Sequence[int], usual: str) -> Run:
         }
         if by_predictor:
             part = ", ".join(filter(None, (headline.PARTS[known], other)))
-            questions[Question(part, place=2 * elsewhere + (known is False))] = Errors(measure, by_predictor)
+            objects = clusters(run, known)
+            cluster = headline.OBJECTS if objects else headline.RECORDINGS
+            measure = headline.measure(steps, units.of_model(config), cluster)
+            questions[Question(part, place=2 * elsewhere + (known is False))] = Errors(measure, by_predictor, objects)
     return Run(
         run.dataset,
         headline.TASK,

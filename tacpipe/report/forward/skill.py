@@ -10,8 +10,8 @@ import numpy as np
 from tacpipe.arrays import AnyFloats
 from tacpipe.comparison.engine import Row
 from tacpipe.comparison.runs import Method
-from tacpipe.metrics import pairing
-from tacpipe.metrics.forecast import Interval
+from tacpipe.metrics import intervals, pairing
+from tacpipe.metrics.intervals import Interval
 from tacpipe.report import blocks
 from tacpipe.report.blocks import NONE, Cell
 from tacpipe.report.forward import reading
@@ -26,12 +26,16 @@ def sums_of(row: Row, steps: Sequence[int], known: bool | None, group: str = "bo
 
 
 def sums(method: Method, predictor: str, steps: Sequence[int], known: bool | None, group: str = "both") -> Sums:
-    """Return the sums of a method's predictor at some steps in a group of channels, by seed and recording."""
-    return pairing.added(
-        ((run.seed, name), one)
-        for run in method.runs
-        for name, one in reading.sums(run.details, predictor, steps, known, group).items()
-    )
+    """Return the sums of a method's predictor at some steps in a group of channels, by seed and recording.
+
+    Those of unseen objects are by seed and object.
+    """
+    every = []
+    for run in method.runs:
+        clusters = reading.clusters(run.details, known) or {}
+        sums = reading.sums(run.details, predictor, steps, known, group)
+        every += [((run.seed, clusters.get(name, name)), one) for name, one in sums.items()]
+    return pairing.added(every)
 
 
 def skill_at(steps: int) -> Callable[[AnyFloats], AnyFloats]:
@@ -48,7 +52,9 @@ def skill_at(steps: int) -> Callable[[AnyFloats], AnyFloats]:
 def skills(sums: Sums) -> Interval:
     """Return the skill over persistence at each step, and its mean, with intervals."""
     width = len(next(iter(sums.values())))
-    return pairing.intervals(sums, skill_at((width - 1) // 3))
+    skill = skill_at((width - 1) // 3)
+    logs = pairing.value_intervals(sums, lambda found: np.log(np.maximum(1 - skill(found), intervals.SMALLEST)))
+    return intervals.skill_of_log_ratio(logs)
 
 
 def _total(sums: Sums) -> AnyFloats:

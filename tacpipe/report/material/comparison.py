@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from tacpipe.comparison import engine
 from tacpipe.comparison.observations import PairedRuns, paired_runs
 from tacpipe.comparison.runs import Method
-from tacpipe.metrics.pairing import Estimate
+from tacpipe.metrics.pairing import Gain
 from tacpipe.metrics.proportions import mcnemar
 from tacpipe.report.material import accuracy, reading
 from tacpipe.report.material.methods import of, plain
@@ -20,7 +20,7 @@ class Difference:
     """What the first method has over the second on the slides that both were evaluated on."""
 
     slides: int
-    gain: Estimate  # percentage points
+    gain: Gain  # percentage points
     first_only: int  # slides that the first alone names right
     second_only: int
     mcnemar: float  # p
@@ -51,8 +51,8 @@ def difference(
     held = [of(one, sensor) for one in (first, second)]
     if not all(held) or (question := reading.question(held[0][0], sensor)) is None:
         return None
-    gain, _, slides = engine.difference(first, second, question, predictors)
-    if not slides:
+    gain = engine.difference(first, second, question, predictors)
+    if not gain.clusters:
         return None
     one, other = (
         accuracy.right(runs, sensor, name).groupby("recording").mean() >= 0.5
@@ -61,7 +61,7 @@ def difference(
     one, other = one.align(other, join="inner")
     p = mcnemar(one.to_numpy(), other.to_numpy())
     only = int((one & ~other).sum()), int((other & ~one).sum())
-    return Difference(slides, gain, *only, p, paired_runs(held[0], held[1], question, predictors))
+    return Difference(gain.clusters, gain, *only, p, paired_runs(held[0], held[1], question, predictors))
 
 
 def pairs(methods: Sequence[Method]) -> list[Pair]:

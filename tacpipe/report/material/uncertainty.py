@@ -10,7 +10,8 @@ import numpy as np
 
 from tacpipe.arrays import AnyFloats, Floats
 from tacpipe.comparison.runs import Method
-from tacpipe.metrics import calibration
+from tacpipe.metrics import calibration, headline
+from tacpipe.metrics.intervals import share_interval
 from tacpipe.metrics.proportions import wilson
 from tacpipe.report import blocks, charts
 from tacpipe.report.blocks import NONE, Block, Cell, Chart, Charts, Fold, fold, number, table
@@ -30,8 +31,8 @@ RELIABLE = (
 )
 TABLE = (
     "False unknown: slides of known materials answered unknown. False known: slides of materials that were left out, given "
-    "a name. Right: of the names given to slides of known materials. 95 % intervals (Wilson) over slides, each counted "
-    "once; calibration error, log loss and AUROC are means over runs."
+    "a name. Right: of the names given to slides of known materials. 95 % intervals are Wilson's over slides, each counted "
+    "once, and of false known over materials, where these are six or more; calibration error, log loss and AUROC are means over runs."
 )
 REFUSED = (
     "Each threshold answers some slides of known materials with unknown, and some of materials that were left out of "
@@ -88,7 +89,7 @@ def answers(method: Method, sensor: str) -> pd.DataFrame | None:
         files = run.details.dataset.files
         if ANSWERS not in files:
             continue
-        text = dict.fromkeys(("recording", "sensor", "named", "answer"), str)
+        text = dict.fromkeys(("recording", "sensor", "named", "answer", "label"), str)
         read = pd.read_csv(io.BytesIO(files[ANSWERS]), dtype=text, keep_default_na=False)
         read = read[(read.sensor == sensor) & ~read.seen]
         rows = run.details.predictions.of(sensor)
@@ -100,12 +101,23 @@ def answers(method: Method, sensor: str) -> pd.DataFrame | None:
 
 
 def rate(rows: pd.DataFrame, column: str) -> Rate:
-    """Return in which fraction of slides a column is true; NaN without slides."""
+    """Return in which fraction of slides a column is true, with Wilson's interval; NaN without slides."""
     if not len(rows):
         return Rate(float("nan"), float("nan"), float("nan"), 0)
     slides = rows.recording.nunique()
     fraction = float(rows[column].mean())
     return Rate(fraction, *wilson(round(fraction * slides), slides), slides)
+
+
+def rate_over_materials(rows: pd.DataFrame, column: str) -> Rate:
+    """Return in which fraction of slides of unknown materials a column is true, with its interval over materials.
+
+    Ends are NaN with fewer than `headline.FEWEST` materials, and in results that do not name them.
+    """
+    if "label" not in rows or rows.label.nunique() < headline.FEWEST:
+        return rate(rows, column)._replace(low=float("nan"), high=float("nan"))
+    found = share_interval(rows[[column]].to_numpy(float), np.ones((len(rows), 1)), rows.label.to_numpy(str)).first
+    return Rate(*found, rows.recording.nunique())
 
 
 def curve(known: AnyFloats, unknown: AnyFloats) -> Floats:
@@ -184,7 +196,7 @@ def _row(method: Method, sensor: str, read: pd.DataFrame) -> Sequence[str | Cell
         f"{known.recording.nunique():,}",
         *map(mean, ("calibration_error", "log_loss")),
         _percent(rate(known, "refused")),
-        _percent(rate(other.assign(named_known=~other.refused), "named_known")),
+        _percent(rate_over_materials(other.assign(named_known=~other.refused), "named_known")),
         number(float(np.mean(areas)), 3) if areas else Cell(NONE),
         _percent(rate(known[~known.refused], "right")),
     ]
@@ -194,5 +206,6 @@ def _percent(found: Rate) -> Cell:
     """Return a fraction in percent above its interval."""
     if not found.slides:
         return Cell(NONE)
-    below = f"{100 * found.low:.1f} to {100 * found.high:.1f} of {found.slides:,}"
+    ends = "" if np.isnan(found.low) else f"{100 * found.low:.1f} to {100 * found.high:.1f} "
+    below = f"{ends}of {found.slides:,}"
     return Cell(f"{100 * found.fraction:.1f}", below, found.fraction)

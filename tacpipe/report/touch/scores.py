@@ -13,7 +13,7 @@ from tacpipe.arrays import AnyFloats
 from tacpipe.channels import biotac_sp
 from tacpipe.comparison.spread import Spread, spread
 from tacpipe.metrics import regression
-from tacpipe.metrics.regression import Interval
+from tacpipe.metrics.intervals import Estimate
 from tacpipe.report.touch.predictions import Predictions
 from tacpipe.tasks.touch.result_names import CONSTANT, MODEL
 
@@ -28,7 +28,7 @@ class Score:
     batch_mean: float  # mean over runs of the mean RMSE of batches
     mae: float
     r2: float
-    skill: Interval  # over the constant
+    skill: Estimate  # over the constant
     grasps: int  # each counted once
     objects: int
     runs: int
@@ -108,7 +108,7 @@ def _pooled(parts: Sequence[_Rows]) -> _Rows:
     return _Rows(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
-def _skill(rows: _Rows, clusters: NDArray[np.str_]) -> Interval:
+def _skill(rows: _Rows, clusters: NDArray[np.str_]) -> Estimate:
     """Return the skill over the constant on rows where there is one."""
     held = ~np.isnan(rows.constant).any(axis=1)
     model, baseline = (regression.squared_sums(rows.true[held], one[held]) for one in (rows.predicted, rows.constant))

@@ -12,7 +12,7 @@ from tacpipe.arrays import AnyFloats, Floats
 from tacpipe.channels import biotac_sp
 from tacpipe.comparison.runs import Method
 from tacpipe.io.parquet import from_parquet
-from tacpipe.metrics import forecast
+from tacpipe.metrics import intervals
 from tacpipe.report import blocks, charts
 from tacpipe.report.blocks import NONE, Cell, Chart, Charts, Fold, fold, number, table
 from tacpipe.report.charts import Dot
@@ -88,25 +88,16 @@ def measured(rows: pd.DataFrame, known: bool) -> dict[tuple[str, str], Measured]
         for predictor, one in same.groupby("predictor"):
             own = sums.loc[predictor]
             lost, still = (each["pinball"].to_numpy(float)[:, None] for each in (own, constant))
-            gain = forecast.skill_interval(lost, still)
-            coverage = float(one.covered.mean()), *_bounds(own.covered.to_numpy(float), own["values"].to_numpy(float))
+            gain = intervals.skill_interval(lost, still).first
+            share = intervals.share_interval(*(own[[part]].to_numpy(float) for part in ("covered", "values"))).first
             found[str(target), str(predictor)] = Measured(
                 len(one),
-                coverage,
+                share,
                 float(one.width.mean()),
                 float(one.pinball.mean()),
-                (float(gain.mean[0]), float(gain.low[0]), float(gain.high[0])),
+                gain,
             )
     return found
-
-
-def _bounds(covered: Floats, values: Floats) -> tuple[float, float]:
-    """Return the ends of the 95 % interval of coverage over clusters (cluster,) that are drawn anew; NaN of one alone."""
-    if len(values) < 2:
-        return float("nan"), float("nan")
-    weights = forecast.draws(len(values))
-    low, high = forecast.bounds(((weights @ covered) / (weights @ values))[:, None])
-    return float(low[0]), float(high[0])
 
 
 def by_electrode(rows: pd.DataFrame, target: str) -> AnyFloats:

@@ -76,9 +76,13 @@ class Bands:
         return {**stated, **(self._tree(fresh, uncertainty.percents) if fresh else {}), **trees}
 
     def _tree(self, trials: Sequence[Trial], percents: tuple[int, ...]) -> dict[str, Any]:
-        each = [self.sums[one.name] for one in trials]
-        still = [one[BASELINE] for one in each]
-        return {name: quantiles.tree([one[name] for one in each], percents, still) for name in each[0]}
+        each: dict[str, dict[str, Sums]] = {}  # by what chance draws: recordings, and objects that are unseen
+        for trial in trials:
+            sums, unit = self.sums[trial.name], trial.name if trial.known else str(trial.object)
+            each[unit] = {name: each[unit][name] + one for name, one in sums.items()} if unit in each else sums
+        several = list(each.values())
+        still = [one[BASELINE] for one in several]
+        return {name: quantiles.tree([one[name] for one in several], percents, still) for name in several[0]}
 
     def files(self, trials: Sequence[Trial]) -> dict[str, bytes]:
         """Return ``coverage.parquet``, the sums by recording, predictor and step, and ``bands.json``, forecasts to draw."""

@@ -14,6 +14,7 @@ from tacpipe.tasks.forward.units import COUNTS
 
 TASK, MODEL, BASELINE = "forward", "model", "persistence"
 STEPS = (1, 3, 5, 10)  # those shown, as far as a model predicts them
+RECORDINGS, OBJECTS = "recordings", "objects"  # what chance draws: another recording, or another object
 PARTS = {True: "known objects", False: "unseen objects", None: ""}
 
 
@@ -51,16 +52,20 @@ def headline(
     part: bool | None,
     runs: int = 1,
     unit: str = COUNTS,
+    objects: Mapping[str, str] | None = None,
 ) -> Headline | None:
     """Return how a method compares with its baselines on known objects, unseen ones or all; `sums` by seed and recording.
 
-    ``unit`` is that of the mean absolute errors.
+    ``unit`` is that of the mean absolute errors. The interval is over ``objects``, by recording, where these are given.
     """
     compared = {name: one for name, one in baselines.items() if legitimate(name)}
-    return pairing.headline(TASK, method, measure(steps, unit), model, compared, part=PARTS[part], runs=runs)
+    cluster = OBJECTS if objects else RECORDINGS
+    return pairing.headline(
+        TASK, method, measure(steps, unit, cluster), model, compared, part=PARTS[part], clusters=objects, runs=runs
+    )
 
 
-def measure(steps: Sequence[int], unit: str = COUNTS) -> Measure:
+def measure(steps: Sequence[int], unit: str = COUNTS, cluster: str = RECORDINGS) -> Measure:
     """Return how `sums` at some steps become errors; ``unit`` is that of the mean absolute ones."""
     count, ahead = len(steps), [f"t+{step}" for step in steps]
 
@@ -84,11 +89,12 @@ def measure(steps: Sequence[int], unit: str = COUNTS) -> Measure:
         unit,
         f"the squared error as a fraction of persistence's, averaged over {over} (1 less that: vs persistence)",
         "skill",
-        "recordings",
+        cluster,
         error,
         gain,
         values,
         lambda found: 1 - found,
         "skill over persistence",
         rises=True,
+        weight=lambda found: found[:, count : 2 * count].sum(axis=1),
     )

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from tacpipe.arrays import AnyFloats, Bools, Int64s
+from tacpipe.arrays import AnyArray, AnyFloats, Bools, Int64s
 from tacpipe.io.parquet import to_parquet
-from tacpipe.metrics import forecast
+from tacpipe.metrics import forecast, intervals
 from tacpipe.metrics.headline import Headline
 from tacpipe.tasks.forward import headline as headlines
 from tacpipe.tasks.forward.headline import BASELINE, MODEL
@@ -108,7 +108,7 @@ def channel_groups(layout: Sequence[Mapping[str, str]]) -> dict[str, Bools]:
     return groups
 
 
-def summary(trials: Sequence[Trial], groups: Masks, horizon: int, channel_scale: AnyFloats, seed: int = 0) -> Tree:
+def summary(trials: Sequence[Trial], groups: Masks, horizon: int, channel_scale: AnyFloats) -> Tree:
     """Return the metrics of ``metrics.json``; ``channel_scale`` (channel,) is each channel's spread in training.
 
     Recordings that the model has not seen are at the top, and under ``known`` and ``unseen`` once more those of objects
@@ -119,8 +119,8 @@ def summary(trials: Sequence[Trial], groups: Masks, horizon: int, channel_scale:
     if not all(parts.values()):
         parts = {}
     parts["seen"] = [one for one in trials if one.seen]
-    tree = _summary(fresh, groups, horizon, channel_scale, seed)
-    return tree | {name: _summary(part, groups, horizon, channel_scale, seed) for name, part in parts.items() if part}
+    tree = _summary(fresh, groups, horizon, channel_scale)
+    return tree | {name: _summary(part, groups, horizon, channel_scale) for name, part in parts.items() if part}
 
 
 def headline(method: str, trials: Sequence[Trial], horizon: int, unit: str = COUNTS) -> list[Headline]:
@@ -148,7 +148,8 @@ def headline(method: str, trials: Sequence[Trial], horizon: int, unit: str = COU
         chosen = [one for one in fresh if part is None or one.known == part]
         names = [name for name in (chosen[0].errors if chosen else ()) if name != MODEL]
         others = {name: sums(name, chosen) for name in names}
-        one = headlines.headline(method, steps, sums(MODEL, chosen), others, part, unit=unit)
+        objects = {one.name: str(one.object) for one in chosen} if part is False else None
+        one = headlines.headline(method, steps, sums(MODEL, chosen), others, part, unit=unit, objects=objects)
         found += [one] if one else []
     return found
 
@@ -216,7 +217,7 @@ def trials_csv(trials: Sequence[Trial]) -> bytes:
         errors: list[float | str] = ["", "", ""]
         if one.windows:
             model, baseline = (float(one.errors[name].count_squared.mean()) for name in (MODEL, BASELINE))
-            gain = float(forecast.skill(np.array([model]), np.array([baseline]))[0])
+            gain = float(intervals.skill(np.array([model]), np.array([baseline]))[0])
             values = (model / one.windows, baseline / one.windows, gain)
             errors = [_rounded(value) if math.isfinite(value) else "" for value in values]
         rows.append(
@@ -227,7 +228,7 @@ def trials_csv(trials: Sequence[Trial]) -> bytes:
     )
 
 
-def _summary(trials: Sequence[Trial], groups: Masks, horizon: int, channel_scale: AnyFloats, seed: int) -> Tree:
+def _summary(trials: Sequence[Trial], groups: Masks, horizon: int, channel_scale: AnyFloats) -> Tree:
     """Return errors of each predictor, skill and counts over the recordings that hold windows."""
     held = [one for one in trials if one.windows]
     windows = np.array([one.windows for one in held], dtype=np.int64)
@@ -250,9 +251,10 @@ def _summary(trials: Sequence[Trial], groups: Masks, horizon: int, channel_scale
             if getattr(errors[0], kept) is not None:
                 tree[name][name_of] = _steps(np.stack([getattr(one, kept) for one in errors]), windows)
     if held:
+        units = np.array([one.name if one.known else one.object for one in held])
         kinds = {"mse_counts": "count_squared", "mae_counts": "count_absolute", "mse_feature": "feature_squared"}
         tree["skill"] = {
-            name_of: _intervals(_by_step(held, MODEL, kept), _by_step(held, BASELINE, kept), seed)
+            name_of: _intervals(_by_step(held, MODEL, kept), _by_step(held, BASELINE, kept), units)
             for name_of, kept in kinds.items()
         }
     return tree
@@ -274,10 +276,10 @@ def _by_step(trials: Sequence[Trial], predictor: str, kept: str) -> AnyFloats:
     return np.stack([getattr(one.errors[predictor], kept).sum(axis=1) for one in trials])
 
 
-def _intervals(model: AnyFloats, baseline: AnyFloats, seed: int) -> Tree:
-    """Return skill with its interval by step and over all; what is not defined is left out. Sums (recording, step)."""
+def _intervals(model: AnyFloats, baseline: AnyFloats, clusters: AnyArray) -> Tree:
+    """Return skill with its interval over clusters by step and over all, from sums (recording, step); undefined left out."""
     wide = [np.hstack([sums, sums.sum(axis=1, keepdims=True)]) for sums in (model, baseline)]  # (recording, step + 1)
-    found = forecast.skill_interval(wide[0], wide[1], seed=seed)
+    found = intervals.skill_interval(wide[0], wide[1], clusters)
     names = [f"t{step}" for step in range(1, model.shape[1] + 1)] + ["mean"]
     tree: Tree = {}
     for index, name in enumerate(names):

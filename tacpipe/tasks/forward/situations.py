@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from tacpipe.arrays import AnyFloats, Int64s
-from tacpipe.metrics import forecast
+from tacpipe.metrics import forecast, intervals
 from tacpipe.tasks.forward.headline import BASELINE, MODEL
 
 if TYPE_CHECKING:  # these import torch, and a report names situations without it
@@ -108,17 +108,17 @@ class BySituation:
                 chosen = situations == one
                 before[one] += of(predicted.count[chosen], truth.count[chosen]).sum(axis=1)
 
-    def summary(self, seed: int = 0) -> Tree:
+    def summary(self) -> Tree:
         """Return by situation the windows, recordings, mean absolute errors by predictor and step, and the model's skill.
 
         Skill is 1 - squared error / squared error of persistence, by step and over all, with its interval over recordings.
         """
-        return {name: self._of(at, seed) for at, name in enumerate(SITUATIONS) if self._recordings(at)}
+        return {name: self._of(at) for at, name in enumerate(SITUATIONS) if self._recordings(at)}
 
     def _recordings(self, situation: int) -> list[str]:
         return [name for name, windows in self.windows.items() if windows[situation]]
 
-    def _of(self, at: int, seed: int) -> Tree:
+    def _of(self, at: int) -> Tree:
         recordings = self._recordings(at)
         count = sum(int(self.windows[name][at]) for name in recordings)
         predictors = list(dict.fromkeys(name for _, name in self.absolute))
@@ -127,7 +127,7 @@ class BySituation:
             np.hstack([sums, sums.sum(axis=1, keepdims=True)])
             for sums in (self._sums(self.squared, recordings, name, at) for name in (MODEL, BASELINE))
         )
-        found = forecast.skill_interval(model, still, seed=seed)
+        found = intervals.skill_interval(model, still)
         skill = {
             step: {
                 part: _rounded(value)

@@ -59,4 +59,5 @@ MEASURE = Measure(
     lambda wrong: 100 * (1 - wrong),
     "accuracy (%)",
     rises=True,
+    weight=lambda found: found[:, 1],
 )

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from tacpipe.arrays import Bools, Float32s
+from tacpipe.arrays import AnyArray, Bools, Float32s
 from tacpipe.metrics import calibration
+from tacpipe.metrics.headline import FEWEST
+from tacpipe.metrics.intervals import share_interval
 from tacpipe.metrics.proportions import wilson
 from tacpipe.tasks.material.classifier import UNKNOWN_ANSWER, Classifier
 from tacpipe.tasks.material.slides import Slides
@@ -24,6 +27,7 @@ class Answers:
     """What a calibrated classifier answers of slides, by sensor; empty where it is not calibrated."""
 
     classifier: Classifier
+    labels: Mapping[str, str] = field(default_factory=dict)  # by recording, its label as text
     calibration: Tree = field(default_factory=dict)
     unknown: Tree = field(default_factory=dict)
     rows: list[tuple[Any, ...]] = field(default_factory=list)
@@ -64,7 +68,9 @@ class Answers:
         if own.any() or other.any():
             refused = score < bundle.threshold
             tree: Tree = {"rule": bundle.rule, "threshold": bundle.threshold}
-            tree |= _fraction("false_unknown", refused[own]) | _fraction("false_known", ~refused[other])
+            labels = np.array([self.labels.get(name, "") for name in slides.names])
+            tree |= _rate("false_unknown", refused[own])
+            tree |= _rate("false_known", ~refused[other], labels[other])
             if own.any() and other.any():
                 tree["auroc"] = {rule: calibration.auroc(one[own], one[other]) for rule, one in each.items()}
             if (own & ~refused).any():
@@ -75,7 +81,7 @@ class Answers:
         for at, name in enumerate(slides.names):
             answer = UNKNOWN_ANSWER if score[at] < bundle.threshold else str(names[at])
             flags = [str(bool(flag)).lower() for flag in (known[at], not fresh[at])]
-            self.rows.append((name, sensor, *flags, names[at], f"{best[at]:.6g}", f"{score[at]:.6g}", answer))
+            self.rows.append((name, sensor, *flags, names[at], f"{best[at]:.6g}", f"{score[at]:.6g}", answer, self.labels.get(name, "")))
 
     def trees(self) -> Tree:
         """Return what ``metrics.json`` holds more: ``calibration`` and ``unknown`` by sensor."""
@@ -83,19 +89,30 @@ class Answers:
         return {name: one for name, one in found.items() if one}
 
     def files(self) -> dict[str, bytes]:
-        """Return ``answers.csv``: a row a slide with the class named, its probability, the score of known and the answer."""
+        """Return ``answers.csv``: a row a slide: class named, its probability, score of known, answer, label."""
         if not self.classifier.known:
             return {}
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(("recording", "sensor", "known", "seen", "named", "probability", "score", "answer"))
+        writer.writerow(("recording", "sensor", "known", "seen", "named", "probability", "score", "answer", "label"))
         writer.writerows(self.rows)
         return {ANSWERS: text.getvalue().encode()}
 
 
-def _fraction(name: str, flags: Bools) -> Tree:
-    """Return the fraction of slides that are so, of how many, and its 95 % Wilson interval; nothing without slides."""
+def _rate(name: str, flags: Bools, materials: AnyArray | None = None) -> Tree:
+    """Return the fraction of slides that are so, of how many, and its 95 % interval; nothing without slides.
+
+    With ``materials`` (slide,) the interval is over materials, because the rate is about materials that nobody has seen,
+    and slides of one are alike: it is left out where these are fewer than `FEWEST`. Else it is Wilson's over slides.
+    """
     if not len(flags):
         return {}
-    low, high = wilson(int(flags.sum()), len(flags))
-    return {name: float(flags.mean()), f"{name}_n": len(flags), f"{name}_low": low, f"{name}_high": high}
+    tree: Tree = {name: float(flags.mean()), f"{name}_n": len(flags)}
+    if materials is None:
+        low, high = wilson(int(flags.sum()), len(flags))
+        return {**tree, f"{name}_low": low, f"{name}_high": high}
+    tree[f"{name}_materials"] = len(np.unique(materials))
+    if tree[f"{name}_materials"] < FEWEST:
+        return tree
+    found = share_interval(flags[:, None].astype(np.float64), np.ones((len(flags), 1)), materials).first
+    return {**tree, f"{name}_low": found.low, f"{name}_high": found.high}

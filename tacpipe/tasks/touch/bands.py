@@ -23,7 +23,7 @@ def tree(
 ) -> Tree:
     """Return measures of the quantiles of grasps that a mask (grasp,) chooses, by predictor, measure and target.
 
-    ``pinball`` and ``width`` are in device counts; the interval of ``coverage`` is over resampled ``clusters`` (grasp,), and
+    ``pinball`` and ``width`` are in device counts; the interval of ``coverage`` is over ``clusters`` (grasp,), and
     ``pinball_skill`` is over the constant with its empirical quantiles. Empty without grasps.
     """
     if not mask.any():

@@ -17,7 +17,7 @@ from tacpipe.arrays import Floats, Indices, Int64s
 from tacpipe.clouds import geometry
 from tacpipe.errors import TacpipeError
 from tacpipe.metrics import regression
-from tacpipe.metrics.regression import Interval
+from tacpipe.metrics.intervals import Estimate
 from tacpipe.models.forest import Forest
 from tacpipe.tasks.touch import repeatability
 from tacpipe.tasks.touch.grasps import Grasps
@@ -32,7 +32,7 @@ OTHER = {
     "e_mf": ("pdc_th", "e_th"),
 }
 Tree = dict[str, Any]
-Skills = dict[str, Interval]  # by target
+Skills = dict[str, Estimate]  # by target
 
 
 @dataclass(frozen=True)
@@ -188,5 +188,5 @@ def _by_target(skills: Skills) -> Tree:
     return {name: _numbers(one) for name, one in skills.items()}
 
 
-def _numbers(one: Interval) -> Tree:
+def _numbers(one: Estimate) -> Tree:
     return {name: None if math.isnan(value) else value for name, value in one._asdict().items()}

@@ -20,7 +20,7 @@ def tree(readings: Readings, predicted: Readings, constant: Readings, clusters: 
 
     ``rmse`` and ``mae`` are in fractions of each target's range (`biotac_sp.RANGES`), over grasps and electrodes at once;
     ``rmse_counts`` is in device counts; ``rmse_batch_mean`` is the letter's figure, the mean over batches of ten.
-    ``skill`` is 1 - RMSE / RMSE of ``constant``, its interval (95 %) over resampled ``clusters``.
+    ``skill`` is 1 - RMSE / RMSE of ``constant``, its interval (95 %) over ``clusters``.
     """
     names = ("rmse", "rmse_counts", "rmse_batch_mean", "mae", "r2", "skill", "skill_low", "skill_high")
     found: Tree = {name: {} for name in names}

@@ -18,11 +18,11 @@ from itertools import pairwise
 import numpy as np
 
 from tacpipe.arrays import Floats, Indices
-from tacpipe.metrics.regression import Interval
+from tacpipe.metrics.intervals import Estimate
 
 EDGES_MM = (0.0, 6.0, 10.0, 20.0, 40.0, math.inf)  # of the classes of distance
 RESAMPLES = 500
-NOTHING = Interval(math.nan, math.nan, math.nan)
+NOTHING = Estimate(math.nan, math.nan, math.nan)
 
 
 @dataclass(frozen=True)
@@ -50,9 +50,9 @@ class Repeatability:
 
     pairs: int
     likeness: (
-        Interval  # 1 - half the mean squared difference / variance within objects: 1 equal, 0 as unlike as any pair
+        Estimate  # 1 - half the mean squared difference / variance within objects: 1 equal, 0 as unlike as any pair
     )
-    ceiling: Interval  # skill over the constant of a predictor that errs by no more than such pairs differ
+    ceiling: Estimate  # skill over the constant of a predictor that errs by no more than such pairs differ
 
 
 def repeatability(
@@ -85,9 +85,9 @@ def repeatability(
     resampled = resampled[np.isfinite(resampled).all(axis=1)]
     means = found(np.ones(count))
     if not len(resampled):
-        return Repeatability(len(first), *(Interval(mean, math.nan, math.nan) for mean in means))
+        return Repeatability(len(first), *(Estimate(mean, math.nan, math.nan) for mean in means))
     low, high = np.quantile(resampled, (0.025, 0.975), axis=0)
-    return Repeatability(len(first), *(Interval(*map(float, one)) for one in zip(means, low, high, strict=True)))
+    return Repeatability(len(first), *(Estimate(*map(float, one)) for one in zip(means, low, high, strict=True)))
 
 
 def variances(values: Floats, kind: Indices, weight: Floats) -> tuple[Floats, float]:

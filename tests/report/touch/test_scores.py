@@ -57,9 +57,7 @@ def test_objects_are_drawn_where_they_are_novel_and_grasps_where_they_are_known(
     novel = scores.score(runs(result(off=apart, novel=NOVEL)), "pdc_th", False)
     known = scores.score(runs(result(off=apart, known=(*KNOWN, *NOVEL))), "pdc_th", True)
     assert novel is not None and known is not None
-    # of two objects, a resample holds one alone in half of the cases
-    assert novel.skill.low == pytest.approx(0.1, abs=1e-4)
-    assert novel.skill.high == pytest.approx(0.9, abs=1e-4)
+    assert math.isnan(novel.skill.low)  # two objects show nothing of how much objects vary
     assert known.skill.high - known.skill.low < 0.5
     assert novel.objects == 2
 

@@ -9,12 +9,12 @@ import pytest
 
 from tacpipe.cli import limits as command
 from tacpipe.errors import UsageError
-from tacpipe.metrics.regression import Interval
+from tacpipe.metrics.intervals import Estimate
 from tacpipe.tasks.touch.limits import Limits, Point
 from tacpipe.tasks.touch.repeatability import NOTHING, Repeatability
 
-SKILL = dict.fromkeys(command.TARGETS, Interval(0.31, 0.25, 0.38))
-NEAR = dict.fromkeys(command.TARGETS, Repeatability(19, Interval(0.6, -0.24, 0.93), Interval(0.55, 0.22, 0.82)))
+SKILL = dict.fromkeys(command.TARGETS, Estimate(0.31, 0.25, 0.38))
+NEAR = dict.fromkeys(command.TARGETS, Repeatability(19, Estimate(0.6, -0.24, 0.93), Estimate(0.55, 0.22, 0.82)))
 FAR = dict.fromkeys(command.TARGETS, Repeatability(0, NOTHING, NOTHING))
 FOUND = Limits({"cup": 9, "jar": 8}, [(0, 6, NEAR), (6, math.inf, FAR)], [Point(4, 8.0, SKILL)], SKILL, 2, 100)
 

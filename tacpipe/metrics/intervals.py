@@ -1,0 +1,199 @@
+"""95 % intervals of values that are computed from sums over recordings.
+
+Windows overlap, and those of one recording share object, grasp and drift, so recordings (or objects, grasps, slides: here
+clusters) are what chance draws. An interval follows from how much a value changes when one cluster is left out (jackknife;
+Tukey, Bias and confidence in not-quite large samples, 1958), and from Student's t. Ratios of errors are compared by their
+logarithm. Of clusters that count differently, the degrees of freedom follow from their effective number, because a value
+that rests on four clusters is as uncertain as if there were four. Several seeds are a second factor that is left out one
+by one; the freedom of both is combined by Satterthwaite's formula (Biometrics Bulletin, 1946).
+
+``docs/explanation/intervals.md`` has the coverage in simulations, next to that of bootstrap intervals.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import stdtrit
+
+from tacpipe.arrays import AnyArray, AnyFloats
+
+COVERAGE = 0.95
+LEAST = 3  # clusters of an interval; two show nothing of how much they vary
+DRAWS = 20_000  # of the largest of several statistics
+SMALLEST = 1e-12  # ratio of errors whose logarithm is taken
+Statistic = Callable[[AnyFloats], AnyFloats]  # sums (draw, part) to values (draw, value)
+
+
+class Estimate(NamedTuple):
+    """A value and its 95 % interval; NaN where it is not defined, ends also with fewer than `LEAST` clusters."""
+
+    mean: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Interval:
+    """Values with the ends of their 95 % intervals, each (value,); ends are NaN where they are not defined."""
+
+    mean: AnyFloats
+    low: AnyFloats
+    high: AnyFloats
+
+    @property
+    def first(self) -> Estimate:
+        """The first value."""
+        return Estimate(*(float(ends[0]) for ends in (self.mean, self.low, self.high)))
+
+
+@dataclass(frozen=True)
+class Jackknife:
+    """Values of all clusters and how uncertain they are, each (value,)."""
+
+    mean: AnyFloats
+    error: AnyFloats  # standard error
+    freedom: AnyFloats  # degrees of freedom of the standard error
+    influence: AnyFloats  # (cluster, value): by how much each cluster moves the value
+
+    def interval(self) -> Interval:
+        """Return the values with their intervals."""
+        reach = stdtrit(self.freedom, (1 + COVERAGE) / 2) * self.error
+        return Interval(self.mean, self.mean - reach, self.mean + reach)
+
+
+def effective_number(weights: AnyFloats) -> AnyFloats:
+    """Return how many equal clusters would be as certain as clusters of these weights (cluster, value), (value,).
+
+    >>> effective_number(np.array([[1.0, 9.0], [1.0, 1.0]])).round(2).tolist()
+    [2.0, 1.22]
+    """
+    squares = np.square(weights).sum(axis=0)
+    number: AnyFloats = np.square(weights.sum(axis=0)) / np.where(squares > 0, squares, 1)
+    return number
+
+
+def jackknife(sums: AnyFloats, statistic: Statistic, weights: AnyFloats | None = None) -> Jackknife:
+    """Return values of sums (seed, cluster, part) with their standard errors.
+
+    ``weights`` (cluster, value) state how much each cluster counts; without them all count the same. Errors are NaN with
+    fewer than `LEAST` clusters, freedom where these are as certain as fewer equal ones, and both where a value is not
+    defined without one of the clusters.
+    """
+    seeds, clusters, _ = sums.shape
+    total = sums.sum(axis=(0, 1))
+    mean = statistic(total[None])[0]
+    if clusters < LEAST:
+        undefined = np.full(len(mean), np.nan)
+        return Jackknife(mean, undefined, undefined, np.full((clusters, len(mean)), np.nan))
+    number = np.full(len(mean), float(clusters)) if weights is None else effective_number(weights)
+    influence = _influence(statistic, total, sums.sum(axis=0))
+    variance, freedom = _variance(influence), np.where(number < LEAST, np.nan, number - 1)
+    if seeds > 1:
+        few = seeds / (seeds - 1)  # of few seeds, the variance is uncertain itself
+        of_seeds = few * _variance(_influence(statistic, total, sums.sum(axis=1)))
+        both = variance + of_seeds
+        shares = np.square(variance) / freedom + np.square(of_seeds) / (seeds - 1)
+        freedom = np.where(shares > 0, np.square(both) / np.where(shares > 0, shares, 1), freedom)
+        variance = both
+    return Jackknife(mean, np.sqrt(variance), freedom, influence)
+
+
+def largest_quantile(several: Sequence[AnyFloats], freedom: float) -> float:
+    """Return the value that the largest of several t statistics exceeds in 2.5 % of cases where all true values are 0.
+
+    ``several`` are the influences of the same clusters (cluster,) on each value: their correlations are those of the
+    statistics (Hothorn, Bretz and Westfall, Simultaneous inference in general parametric models, 2008).
+
+    >>> round(largest_quantile([np.array([1.0, -1.0, 0.5])], 1e6), 2)
+    1.96
+    """
+    level = (1 + COVERAGE) / 2
+    if len(several) < 2:
+        return float(stdtrit(freedom, level))
+    centred = np.stack([one - one.mean() for one in several])
+    lengths = np.sqrt(np.square(centred).sum(axis=1))
+    units = centred[lengths > 0] / lengths[lengths > 0, None]  # (statistic, cluster)
+    if not len(units):
+        return float(stdtrit(freedom, level))
+    values, vectors = np.linalg.eigh(units @ units.T)
+    rng = np.random.default_rng(0)
+    largest = (rng.standard_normal((DRAWS, len(units))) @ (vectors * np.sqrt(np.maximum(values, 0))).T).max(axis=1)
+    spread = np.sqrt(rng.chisquare(freedom, DRAWS) / freedom)
+    return max(float(np.quantile(largest / spread, level)), float(stdtrit(freedom, level)))
+
+
+def skill(model: AnyFloats, baseline: AnyFloats) -> AnyFloats:
+    """Return 1 - model / baseline: 1 is perfect, 0 no better than the baseline, below 0 worse. NaN where it never errs.
+
+    >>> skill(np.array([1.0, 3.0]), np.array([2.0, 2.0])).tolist()
+    [0.5, -0.5]
+    """
+    errs = baseline > 0
+    return np.where(errs, 1 - model / np.where(errs, baseline, 1), np.nan)
+
+
+def log_ratio(model: AnyFloats, baseline: AnyFloats) -> AnyFloats:
+    """Return the logarithm of a ratio of errors, 1 - `skill`, bounded below; NaN where the baseline never errs."""
+    ratio: AnyFloats = np.log(np.maximum(1 - skill(model, baseline), SMALLEST))
+    return ratio
+
+
+def skill_of_log_ratio(found: Interval) -> Interval:
+    """Return skill with its interval from those of `log_ratio`."""
+    return Interval(*(-np.expm1(ends) for ends in (found.mean, found.high, found.low)))
+
+
+def skill_interval(
+    model: AnyFloats, baseline: AnyFloats, clusters: AnyArray | None = None, *, power: float = 1.0
+) -> Interval:
+    """Return the skill of sums of errors with its interval, each (value,), from ``model`` and ``baseline`` (item, value).
+
+    ``clusters`` (item,) name what chance draws, by default each item. ``power`` is 0.5 for the skill of root mean squared
+    errors, from sums of squares. Ends are NaN with fewer than `LEAST` clusters.
+    """
+    values = model.shape[1]
+    sums = _by_cluster(np.hstack([model, baseline]), clusters)
+
+    def statistic(found: AnyFloats) -> AnyFloats:
+        return power * log_ratio(found[:, :values], found[:, values:])
+
+    return skill_of_log_ratio(jackknife(sums[None], statistic, sums[:, values:]).interval())
+
+
+def share_interval(part: AnyFloats, whole: AnyFloats, clusters: AnyArray | None = None) -> Interval:
+    """Return the share that sums of ``part`` are of ``whole``, both (item, value), with its interval, each (value,).
+
+    ``clusters`` (item,) name what chance draws, by default each item. Ends are at most 1 and at least 0.
+    """
+    values = part.shape[1]
+    sums = _by_cluster(np.hstack([part, whole]), clusters)
+    shares = jackknife(sums[None], lambda found: 1 - skill(found[:, :values], found[:, values:]), sums[:, values:])
+    found = shares.interval()
+    return Interval(found.mean, np.maximum(found.low, 0), np.minimum(found.high, 1))
+
+
+def _by_cluster(rows: AnyFloats, clusters: AnyArray | None) -> AnyFloats:
+    """Return the sums of rows (item, part) by cluster, (cluster, part)."""
+    if clusters is None:
+        return rows
+    names, codes = np.unique(clusters, return_inverse=True)
+    sums = np.zeros((len(names), rows.shape[1]))
+    np.add.at(sums, codes, rows)
+    return sums
+
+
+def _influence(statistic: Statistic, total: AnyFloats, sums: AnyFloats) -> AnyFloats:
+    """Return the value of the total less that without each row of ``sums`` (row, part), about their mean, (row, value)."""
+    without = statistic(total - sums)
+    influence: AnyFloats = without.mean(axis=0) - without
+    return influence
+
+
+def _variance(influence: AnyFloats) -> AnyFloats:
+    count = len(influence)
+    variance: AnyFloats = (count - 1) / count * np.square(influence).sum(axis=0)
+    return variance
