@@ -41,7 +41,7 @@ def _as_given(params: Params) -> bool:
     return params.live
 
 
-@stage(version=6, headline=headline.FILE, as_given=_as_given)
+@stage(version=7, headline=headline.FILE, as_given=_as_given)
 def evaluate(params: Params, model: Model, recordings: Dataset) -> Result:
     """Evaluate a model on recordings, by the measures of the task it was trained for."""
     from tacpipe.datasets import model_files

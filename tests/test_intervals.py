@@ -32,9 +32,13 @@ def test_the_interval_is_students_over_values_that_leave_out_one_recording_each(
     model, baseline = RNG.uniform(0, 1, size=(12, 2)), RNG.uniform(1, 2, size=(12, 2))
     found = intervals.skill_interval(model, baseline)
     for step in range(2):
-        logs = [math.log(np.delete(model[:, step], at).sum() / np.delete(baseline[:, step], at).sum()) for at in range(12)]
+        logs = [
+            math.log(np.delete(model[:, step], at).sum() / np.delete(baseline[:, step], at).sum()) for at in range(12)
+        ]
         error = math.sqrt(11 / 12 * sum((one - np.mean(logs)) ** 2 for one in logs))
-        equal = baseline[:, step].sum() ** 2 / (baseline[:, step] ** 2).sum()  # recordings of one size that weigh as much
+        equal = (
+            baseline[:, step].sum() ** 2 / (baseline[:, step] ** 2).sum()
+        )  # recordings of one size that weigh as much
         ratio = model[:, step].sum() / baseline[:, step].sum()
         ends = [1 - ratio * math.exp(sign * stats.t.ppf(0.975, equal - 1) * error) for sign in (1, -1)]
         assert (found.mean[step], found.low[step], found.high[step]) == pytest.approx((1 - ratio, *ends))
@@ -47,6 +51,12 @@ def test_of_a_mean_of_equal_recordings_it_is_the_interval_of_students_t() -> Non
     assert (found.low, found.high) == pytest.approx(
         stats.t.interval(0.95, 8, float(values.mean()), float(stats.sem(values[:, 0])))
     )
+
+
+@pytest.mark.parametrize("freedom", [2.0, 2.7, 5.0, 38.0, 1000.0, 1e7])
+def test_quantiles_of_students_t_are_scipys(freedom: float) -> None:
+    for level in (0.6, 0.975, 0.9999):
+        assert intervals.student_quantile(freedom, level) == pytest.approx(stats.t.ppf(level, freedom), rel=1e-6)
 
 
 def test_two_recordings_give_no_interval() -> None:

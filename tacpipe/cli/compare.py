@@ -151,6 +151,9 @@ class Compared:
                 empty = [""] * (len(heads) - 1 - len(differing) - len(measure.columns))
                 cells = [f"vs {best.name}", *[""] * len(differing), *map(headline.number, best.values), *empty]
                 lines.append(Row(cells, "dim"))
+                for other in (row for row in one.of("baseline") if row.name == measure.reference and row is not best):
+                    cells = [other.name, *[""] * len(differing), *map(headline.number, other.values), *empty]
+                    lines.append(Row(cells, "dim"))
             groups.append(Group(one.question.where if len(several) > 1 or one.question.where else "", lines))
         first = 1 + len(differing)
         errors = list(range(first, first + len(measure.columns)))

@@ -222,9 +222,7 @@ def headline(row: Row, comparison: Comparison) -> Headline | None:
     )
 
 
-def difference(
-    first: Method, second: Method, question: Question, predictors: tuple[str, str] = (MODEL, MODEL)
-) -> Gain:
+def difference(first: Method, second: Method, question: Question, predictors: tuple[str, str] = (MODEL, MODEL)) -> Gain:
     """Return what one method gains over another on the recordings of both."""
     measure = first.of(question)[0].questions[question].measure
     one, other = first.sums(question, predictors[0]), second.sums(question, predictors[1])
@@ -249,7 +247,7 @@ def _row(
     pairs: Mapping[str, Pair],
     picked: Sequence[Pair],
 ) -> Row:
-    """Return the row of a predictor; ``pairs`` are with its baselines, ``picked`` those of all methods with their best one."""
+    """Return the row of a predictor; ``pairs`` are with its baselines, ``picked`` those of all methods with the best."""
     sums, clusters = method.sums(question, predictor), _clusters(method, question)
     runs = [one for one in method.of(question) if one.questions[question].sums.get(predictor)]
     each = [measure.score_of(one.questions[question].sums[predictor].values()) for one in runs]
@@ -287,4 +285,3 @@ def _clusters(method: Method, question: Question) -> dict[str, str] | None:
     if any(one is None for one in held):
         return None
     return {name: cluster for one in held if one for name, cluster in one.items()}
-

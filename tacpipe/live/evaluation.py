@@ -259,7 +259,7 @@ def _headline(
 
     def sums(name: str) -> Any:
         return {
-            (0, recording): headlines.sums(*one.sums[name], one.sums[LIVE_STILL][0], one.rows * channels)
+            (0, recording): headlines.sums(one.sums[name], one.sums[LIVE_STILL], one.rows * channels)
             for recording, one in held.items()
         }
 

@@ -43,17 +43,24 @@ class Headline:
     gain: float  # of the model over the best baseline; NaN where it is not defined
     low: float  # 95 % interval of the gain; NaN with fewer than three clusters
     high: float
-    clusters: int  # that the interval is over
-    cluster: str  # what these are: "recordings", "slides", "grasps", "objects"
+    clusters: int  # units of the interval
+    cluster: str  # the name of the units: "recordings", "slides", "grasps", "objects"
     runs: int
-    seeds: int  # that the interval is over too where there are several
-    effective: float = float("nan")  # as many equal clusters would be as certain; NaN in results of older versions
-    methods: int = 1  # among which the model was picked as the best
+    seeds: int  # several are units of the interval too
+    effective: float = float("nan")  # number of equal clusters that are as certain; NaN in older results
+    methods: int = 1  # number of methods from which the model was picked as the best
+    reference: str = ""  # the baseline that tables show next to the best one
+    left_out: int = 0  # recordings on which the reference makes no error, which have no ratio to it
 
     @property
     def best(self) -> Row | None:
         """The best baseline, None where none was evaluated."""
         return self.baselines[0] if self.baselines else None
+
+    @property
+    def shown(self) -> tuple[Row, ...]:
+        """The baselines that tables show: the best one, and the reference."""
+        return tuple(one for one in self.baselines if one is self.best or one.name == self.reference)
 
     @property
     def verdict(self) -> str:
@@ -211,6 +218,7 @@ def table(headlines: Sequence[Headline]) -> tuple[list[str], list[list[str]]]:
             told = {BETTER: "model is better", WORSE: "baseline is better", UNCLEAR: "no clear difference"}
             said = told.get(one.verdict, "too few for a verdict")
             rows.append(["", f"best baseline: {best.name}", *map(number, best.values), "", said, ""])
+            rows += [["", row.name, *map(number, row.values), "", "", ""] for row in one.shown if row is not best]
     return heads, rows
 
 
@@ -222,8 +230,13 @@ def caption(headlines: Sequence[Headline]) -> str:
     over = {f"{one.cluster}{' and seeds' if one.seeds > 1 else ''}" for one in headlines}
     return (
         f"Units: {first.unit}.{points if first.measure == 'points' else skill} Intervals: jackknife over "
-        f"{' or '.join(sorted(over))}, model and baseline on the same ones."
+        f"{' or '.join(sorted(over))}, model and baseline on the same ones.{_left_out(headlines)}"
     )
+
+
+def _left_out(headlines: Sequence[Headline]) -> str:
+    count = sum(one.left_out for one in headlines)
+    return f" Left out: {counted(count, 'recordings')} without an error of {headlines[0].reference}." if count else ""
 
 
 def _capital(words: str) -> str:

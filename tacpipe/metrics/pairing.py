@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
-from scipy.special import stdtrit
 
 from tacpipe.arrays import AnyArray, AnyFloats
 from tacpipe.metrics import intervals
@@ -45,7 +44,10 @@ class Measure:
     score: Callable[[AnyFloats], AnyFloats] = lambda error: error  # what charts draw, from errors (draw,) to (draw,)
     scored: str = "error"  # what ``score`` is, with its unit
     rises: bool = False  # whether a higher score is better
-    weight: Callable[[AnyFloats], AnyFloats] = _equal  # a baseline's sums (cluster, part) to how much each counts (cluster,)
+    weight: Callable[[AnyFloats], AnyFloats] = (
+        _equal  # a baseline's sums (cluster, part) to how much each counts (cluster,)
+    )
+    reference: str = ""  # the baseline that tables show next to the best one
 
     def score_of(self, parts: Iterable[AnyFloats]) -> float:
         """Return the score of sums that are added up, each (part,)."""
@@ -59,8 +61,8 @@ class Gain:
     mean: float
     low: float
     high: float
-    clusters: int = 0  # that were left out one by one
-    effective: float = 0.0  # as many equal clusters would be as certain
+    clusters: int = 0  # units that were left out one by one
+    effective: float = 0.0  # number of equal clusters that would be as certain
 
     @property
     def verdict(self) -> str:
@@ -76,9 +78,10 @@ class Pair:
     """The errors of a predictor and a baseline on the recordings of both, and how certain the gain is."""
 
     sums: AnyFloats  # (seed, cluster, part): those of the predictor, then those of the baseline
-    names: tuple[str, ...]  # of clusters
-    jackknife: Jackknife  # of the gain; of skill, of the negative logarithm of the ratio of errors
+    names: tuple[str, ...]  # names of clusters
+    jackknife: Jackknife  # its value is the gain, or for skill the negative logarithm of the ratio of errors
     effective: float
+    counted: int  # clusters of some weight
 
     @property
     def totals(self) -> tuple[AnyFloats, AnyFloats]:
@@ -95,8 +98,8 @@ class Pair:
 def pair(measure: Measure, model: Sums, baseline: Sums, clusters: Mapping[str, str] | None = None) -> Pair | None:
     """Return a predictor next to a baseline on the recordings that they share; None where they share none.
 
-    Where the baseline was not evaluated with a seed of the predictor, its mean over its own seeds counts. ``clusters`` maps a
-    recording to what it is left out with, by default itself.
+    Where the baseline was not evaluated with a seed of the predictor, its mean over its own seeds counts. ``clusters`` maps
+    a recording to what it is left out with, by default itself.
     """
     sums, names = _side_by_side(model, baseline, clusters)
     if not names:
@@ -109,7 +112,8 @@ def pair(measure: Measure, model: Sums, baseline: Sums, clusters: Mapping[str, s
 
     weights = measure.weight(sums.sum(axis=0)[:, width:])[:, None]
     effective = float(intervals.effective_number(weights)[0])
-    return Pair(sums, tuple(names), intervals.jackknife(sums, statistic, weights), effective)
+    counted = int((weights > 0).sum())
+    return Pair(sums, tuple(names), intervals.jackknife(sums, statistic, weights), effective, counted)
 
 
 def gain(measure: Measure, pairs: Sequence[Pair], rivals: Sequence[Pair] = ()) -> Gain:
@@ -127,7 +131,7 @@ def gain(measure: Measure, pairs: Sequence[Pair], rivals: Sequence[Pair] = ()) -
     high = mean + _reach(pairs, freedom) * error
     if measure.name == "skill":
         mean, low, high = (float(-np.expm1(-value)) for value in (mean, low, high))
-    return Gain(mean, low, high, len(first.names), first.effective)
+    return Gain(mean, low, high, first.counted, first.effective)
 
 
 def _reach(pairs: Sequence[Pair], freedom: float) -> float:
@@ -136,8 +140,8 @@ def _reach(pairs: Sequence[Pair], freedom: float) -> float:
         return float("nan")
     several = {id(one): one for one in pairs if not np.isnan(one.jackknife.influence).any()}.values()
     common = set.intersection(*(set(one.names) for one in pairs))
-    if len(common) < 2:  # whose correlation is not defined: Bonferroni
-        return float(stdtrit(freedom, 1 - (1 - intervals.COVERAGE) / 2 / len(pairs)))
+    if len(common) < 2:  # The correlation is not defined, so Bonferroni applies.
+        return intervals.student_quantile(freedom, 1 - (1 - intervals.COVERAGE) / 2 / len(pairs))
     chosen = ([at for at, name in enumerate(one.names) if name in common] for one in several)
     influences = [one.jackknife.influence[at, 0] for one, at in zip(several, chosen, strict=True)]
     return intervals.largest_quantile(influences, freedom)
@@ -179,12 +183,14 @@ def headline(
         over.mean,
         over.low,
         over.high,
-        len(next(iter(ranked.values()), alone).names),
+        next(iter(ranked.values()), alone).counted,
         measure.cluster,
         runs,
         len(alone.sums),
         effective=next(iter(ranked.values()), alone).effective,
         methods=1 + len(rivals),
+        reference=measure.reference,
+        left_out=len({name for (_, name), one in model.items() if not measure.weight(one[None])[0]}),
     )
 
 
@@ -326,4 +332,6 @@ def paired_intervals(first: Sums, second: Sums, statistic: Callable[[AnyFloats],
     width = pairs.shape[2] // 2
     if not names:
         return None
-    return intervals.jackknife(pairs, lambda found: statistic(found[:, :width]) - statistic(found[:, width:])).interval()
+    return intervals.jackknife(
+        pairs, lambda found: statistic(found[:, :width]) - statistic(found[:, width:])
+    ).interval()

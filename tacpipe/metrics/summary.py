@@ -20,7 +20,8 @@ def of(headlines: Sequence[Headline], names: Names = MappingProxyType({})) -> di
 
     ``gain``, ``low``, ``high`` and ``n`` are of the headline whose gain is least: a model is better than its baselines only
     where each of its headlines is. Errors are of the last column of each, and named by the target where there are several.
-    ``names`` are short names of parts and targets. What is not defined is left out.
+    ``names`` are short names of parts and targets. What is not defined is left out. Where tables show a reference, the mean
+    absolute errors of model and reference follow.
     """
     if not headlines:
         return {}
@@ -29,6 +30,12 @@ def of(headlines: Sequence[Headline], names: Names = MappingProxyType({})) -> di
     targets = len({one.target for one in headlines}) > 1  # their errors are of one measure, which no name repeats
     for one, place in zip(headlines, _places(headlines, names), strict=True):
         found["_".join(place if targets else [*place, _short(one.columns[-1])])] = one.model.values[-1]
+    for one, place in zip(headlines, _places(headlines, names), strict=True):
+        reference = next((row for row in one.baselines if row.name == one.reference), None)
+        for at, column in enumerate(one.columns if reference else ()):
+            if reference and column.startswith("MAE"):
+                found["_".join([*place, _short(column)])] = one.model.values[at]
+                found["_".join([*place, reference.name, _short(column)])] = reference.values[at]
     known = {name: value for name, value in found.items() if math.isfinite(value)}
     return {name: _rounded(value) for name, value in list(known.items())[: MOST - 1]}
 

@@ -90,7 +90,9 @@ def first_table(context: Context) -> Table | None:
         return _by_target(context, parts, targets)
     firsts = [compared[0] for compared in parts.values()]
     names = list(dict.fromkeys(row.name for one in firsts for row in _leaders(one)))[: MOST - 2]
-    baselines = list(dict.fromkeys(row.name for one in firsts for row in [one.best_baseline] if row))
+    baselines = [row.name for one in firsts for row in [one.best_baseline] if row]
+    baselines += [row.name for one in firsts for row in one.of("baseline") if row.name == one.measure.reference]
+    baselines = list(dict.fromkeys(baselines))
     baselines = baselines[: MOST - len(names)]
     single = len(firsts) == 1
     heads, kinds = [""], dict[int, str]()

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from tacpipe.cli import headline_table
 from tacpipe.metrics import headline as headlines
-from tacpipe.metrics import pairing, regression
+from tacpipe.metrics import pairing, regression, summary
 from tacpipe.tasks.forward import headline as forward
 from tacpipe.tasks.material import headline as material
 from tacpipe.tasks.touch import headline as touch
@@ -21,7 +22,7 @@ RECORDINGS = [f"r{index:02d}" for index in range(12)]
 def forecasts(ratios: dict[str, float], *, seed: int = 0, persistence: float = 1.0) -> Any:
     """Sums of one step: squared error of ``ratio`` times persistence's, a window of a value each."""
     one = np.array([persistence])
-    return {(seed, name): forward.sums(ratio * one, ratio * one, one, 1.0) for name, ratio in ratios.items()}
+    return {(seed, name): forward.sums((ratio * one, ratio * one), (one, one), 1.0) for name, ratio in ratios.items()}
 
 
 def test_the_best_baseline_is_that_of_least_error_and_controls_and_codecs_are_none() -> None:
@@ -47,14 +48,11 @@ def test_the_interval_is_that_of_students_t_for_the_logarithm_of_the_ratio_of_er
         for told in ratios
     )  # fmt: skip
     found = forward.headline("net", (1,), model, {"ridge": ridge}, None)
-    errors = ratios * still
-    without = np.array([np.log(np.delete(errors, at, 1).sum(axis=1)) @ [1, -1] for at in range(12)])
-    error = math.sqrt(11 / 12 * np.square(without - without.mean()).sum())
-    reach = stats.t.ppf(0.975, still.sum() ** 2 / np.square(still).sum() - 1) * error
-    ratio = errors[0].sum() / errors[1].sum()
+    logs = np.log(ratios[0] / ratios[1])  # however large the recordings are
+    ends = stats.t.interval(0.95, 11, logs.mean(), stats.sem(logs))
     assert found is not None
-    assert (found.low, found.high) == pytest.approx((1 - ratio * math.exp(reach), 1 - ratio * math.exp(-reach)))
-    assert found.gain == pytest.approx(1 - (ratios[0] * still).sum() / (ratios[1] * still).sum())
+    assert (found.low, found.high) == pytest.approx((1 - math.exp(ends[1]), 1 - math.exp(ends[0])))
+    assert found.gain == pytest.approx(1 - math.exp(logs.mean()))
 
 
 def test_a_baseline_counts_on_the_recordings_that_it_shares_with_the_model() -> None:
@@ -118,13 +116,54 @@ def test_folds_that_have_seeds_of_their_own_are_no_repeats() -> None:
 
 def test_a_few_recordings_that_carry_most_of_the_error_give_no_verdict() -> None:
     sizes = dict(zip(RECORDINGS, [40.0, 30.0, 20.0, *[1.0] * 9], strict=True))
-    model, still = ({key: value for name, size in sizes.items()
-                     for key, value in forecasts({name: ratio}, persistence=size).items()} for ratio in (0.5, 1.0))  # fmt: skip
-    found = forward.headline("net", (1,), model, {"persistence": still}, None)
+    errors = [{(0, name): (ratio * size, 1) for name, size in sizes.items()} for ratio in (0.5, 1.0)]
+    found = touch.headline("net", "pdc_th", 100.0, errors[0], {"constant": errors[1]}, True, {})
     assert found is not None and found.low > 0
     assert found.effective == pytest.approx(99**2 / (40**2 + 30**2 + 20**2 + 9))
     assert found.verdict == ""
-    assert "12 recordings count as 3.4 equal ones, too few for a verdict" in headlines.sentence(found)
+    assert "12 grasps count as 3.4 equal ones, too few for a verdict" in headlines.sentence(found)
+    model, still = dict[Any, Any](), dict[Any, Any]()
+    for name, size in sizes.items():
+        model |= forecasts({name: 0.5}, persistence=size)
+        still |= forecasts({name: 1.0}, persistence=size)
+    forecast = forward.headline("net", (1,), model, {"persistence": still}, None)
+    assert forecast is not None and forecast.verdict == "better"  # there each recording counts the same
+
+
+def test_recordings_on_which_persistence_makes_no_error_are_left_out_and_counted() -> None:
+    model, still = (forecasts(dict.fromkeys(RECORDINGS, ratio)) for ratio in (0.5, 1.0))
+    quiet = forecasts({"quiet": 0.5}, persistence=0.0)
+    found = forward.headline("net", (1,), {**model, **quiet}, {"persistence": {**still, **quiet}}, None)
+    assert found is not None
+    assert found.gain == pytest.approx(0.5) and (found.clusters, found.left_out) == (12, 1)
+    assert "Left out: 1 recording without an error of persistence." in headlines.caption([found])
+
+
+def test_the_row_of_persistence_is_shown_where_another_baseline_is_better() -> None:
+    sums = {name: forecasts(dict.fromkeys(RECORDINGS, ratio)) for name, ratio in
+            (("net", 0.5), ("persistence", 1.0), ("ridge", 0.8), ("mean", 3.0))}  # fmt: skip
+    found = forward.headline("net", (1,), sums.pop("net"), sums, None)
+    assert found is not None and [one.name for one in found.shown] == ["ridge", "persistence"]
+    table = headline_table.text([found])
+    assert "vs ridge" in table and "\n  persistence" in table and "mean " not in table.split("n: recordings")[0]
+    known = summary.of([found])
+    assert (known["mae_t_1"], known["persistence_mae_t_1"]) == (0.5, 1.0)
+
+
+def test_one_large_recording_does_not_decide_and_errors_that_all_rise_are_never_called_better() -> None:
+    """The absolute error rises on 22 of 23 recordings, and the squared error falls on the one that carries half of it."""
+    names = [f"r{index:02d}" for index in range(23)]
+    model: dict[Any, Any] = {}
+    still: dict[Any, Any] = {}
+    for place, name in enumerate(names):
+        size, ratio = (60.0, 0.8) if place == 0 else (10.0, 1.15)
+        one = np.array([size])
+        model[0, name] = forward.sums(((ratio * one) ** 2, ratio * one), (one**2, one), 1.0)
+        still[0, name] = forward.sums((one**2, one), (one**2, one), 1.0)
+    found = forward.headline("net", (1,), model, {"persistence": still}, None)
+    assert found is not None
+    assert found.model.values[1] > 0 > found.gain == pytest.approx(found.model.values[2])
+    assert found.verdict == "worse"
 
 
 def test_the_end_that_a_choice_moves_is_that_of_the_largest_of_several_statistics() -> None:
@@ -153,7 +192,7 @@ def test_seeds_are_left_out_as_recordings_are() -> None:
     found = forward.headline("net", (1,), model, {"persistence": forecasts(dict.fromkeys(RECORDINGS, 1.0))}, None)
     assert found is not None
     assert found.seeds == 2
-    assert found.gain == pytest.approx(0.5) and found.low < 0.1 and found.high > 0.9
+    assert found.gain == pytest.approx(1 - math.sqrt(0.1 * 0.9)) and found.low < 0.1 and found.high > 0.9
 
 
 def test_a_model_without_recordings_has_no_headline() -> None:

@@ -117,9 +117,9 @@ def caveats(context: Context) -> list[str]:
     ]
     return [
         f"Settings: {settings}." if settings else "",
-        "Skill over persistence is 1 − squared error / squared error of persistence over all channels. Every representation "
-        "is decoded to the channels' own unit before it is evaluated, so all rows can be compared. Errors without a step "
-        "are means over all steps.",
+        "Skill over persistence is 1 − mean absolute error / mean absolute error of persistence over all channels, the "
+        "geometric mean of the ratios over recordings. Every representation is decoded to the channels' own unit before it "
+        "is evaluated, so all rows can be compared. Errors without a step are means over all steps.",
         f"In the first run, {effective[0]}." if effective else "",
         both if any(len(one) > 1 for one in known.values()) else "",
         "The recorded motion represents the plan: errors of methods that read it hold for an arm that follows it perfectly."
@@ -228,7 +228,7 @@ def _actions(context: Context, steps: Sequence[int], parts: Sequence[bool | None
                 own = skill.sums(method, MODEL, steps, known)
                 row.append(skill.cell(skill.skills(own), -1) if own else NONE)
                 other = skill.sums(planned, MODEL, steps, known) if planned and planned is not method else {}
-                lost = pairing.paired_intervals(other, own, skill.skill_at(len(steps))) if other and own else None
+                lost = pairing.paired_intervals(other, own, skill.at_steps) if other and own else None
                 row += [skill.cell(lost, -1), skill.cell(lost, -2)] if lost else [NONE, NONE]
             rows.append([*row, str(len(method.runs))])
     heads = [""]

@@ -78,7 +78,9 @@ def sums(
     at, width = [errors.steps.index(step) for step in steps], errors.channels[group]
     return {
         name: headline.sums(
-            found[0][place, at], found[1][place, at], still[0][place, at], float(errors.windows[place]) * width
+            (found[0][place, at], found[1][place, at]),
+            (still[0][place, at], still[1][place, at]),
+            float(errors.windows[place]) * width,
         )
         for place, name in enumerate(errors.recordings)
         if errors.windows[place] and (known is None or bool(errors.known[place]) == known)

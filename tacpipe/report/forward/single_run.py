@@ -111,7 +111,7 @@ def _error_tables(metrics: Tree, names: Sequence[str], unit: str) -> list[Table]
                 [f"{objects}, {spelled(one)} ({unit})", *cells(_both(part[one]["mae_counts"]))]
                 for one in _ordered(part)[:2]
             ]
-            rows.append([f"{objects}, skill", *(_stated(part["skill"]["mse_counts"].get(step, {})) for step in shown)])
+            rows.append([f"{objects}, skill", *(_stated(_of_recordings(part).get(step, {})) for step in shown)])
     return (
         [*found, table("Known objects and unseen ones: mean absolute error, and skill", heads, rows)] if rows else found
     )
@@ -135,12 +135,19 @@ def _floor(metrics: Tree, unit: str) -> str:
 
 def _seen(metrics: Tree) -> str:
     """Return the errors on recordings that the model was trained on, which prove nothing."""
-    described = metrics.get("seen", {}).get("skill", {}).get("mse_counts", {}).get("mean", {})
+    described = _of_recordings(metrics.get("seen", {})).get("mean", {})
     if "mean" not in described:
         return ""
     count = counted(metrics["seen"]["counts"]["recordings"], "recordings")
     mean = blocks.signed(described["mean"])
     return f"Left out: {count} that the model was trained or stopped on; its mean skill on these is {mean}."
+
+
+def _of_recordings(part: Tree) -> Tree:
+    """Return the skill that ratios of single recordings give; the pooled one of results of before this was measured."""
+    skills: Tree = part.get("skill", {})
+    found: Tree = skills.get(headline.GEOMETRIC, skills.get("mse_counts", {}))
+    return found
 
 
 def _stated(one: Tree) -> Cell:

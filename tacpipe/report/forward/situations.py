@@ -19,8 +19,8 @@ ABOUT = (
     f"closes by more than {1000 * WIDTH_M:g} mm or contact begins; releasing: it opens by more than that or contact ends; "
     f"slipping: the load falls by more than {100 * LOST:g} % with the gripper still; holding in motion: the hand is faster "
     f"than {PACE_M_S:g} m/s or {TURNING_RAD_S:g} rad/s; holding still. Errors are means over all steps and channels, "
-    "skill is 1 − squared error / squared error of persistence. The interval is over recordings, given for methods of one "
-    "run."
+    "skill is 1 − mean absolute error / that of persistence, the geometric mean over recordings. The interval is over "
+    "recordings, given for methods of one run."
 )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,6 +15,7 @@ from tacpipe.metrics.intervals import Interval
 from tacpipe.report import blocks
 from tacpipe.report.blocks import NONE, Cell
 from tacpipe.report.forward import reading
+from tacpipe.tasks.forward.headline import Parts
 
 if TYPE_CHECKING:
     from tacpipe.metrics.pairing import Sums
@@ -38,35 +39,25 @@ def sums(method: Method, predictor: str, steps: Sequence[int], known: bool | Non
     return pairing.added(every)
 
 
-def skill_at(steps: int) -> Callable[[AnyFloats], AnyFloats]:
-    """Return what gives the skill over persistence at each step and its mean, from sums (draw, part)."""
-
-    def skill(found: AnyFloats) -> AnyFloats:
-        squared, still = found[:, :steps], found[:, steps : 2 * steps]
-        one = np.where(still > 0, 1 - squared / np.where(still > 0, still, 1), np.nan)
-        return np.hstack([one, one.mean(axis=1, keepdims=True)])
-
-    return skill
+def at_steps(found: AnyFloats) -> AnyFloats:
+    """Return the skill over persistence at each step and over all, from sums (draw, part) to (draw, step + 1)."""
+    parts = Parts.of_sums(found)
+    return np.hstack([parts.skill, parts.mean_skill[:, None]])
 
 
 def skills(sums: Sums) -> Interval:
-    """Return the skill over persistence at each step, and its mean, with intervals."""
-    width = len(next(iter(sums.values())))
-    skill = skill_at((width - 1) // 3)
-    logs = pairing.value_intervals(sums, lambda found: np.log(np.maximum(1 - skill(found), intervals.SMALLEST)))
-    return intervals.skill_of_log_ratio(logs)
+    """Return the skill over persistence at each step and over all, with intervals."""
+    return intervals.skill_of_log_ratio(pairing.value_intervals(sums, lambda found: np.log1p(-at_steps(found))))
 
 
-def _total(sums: Sums) -> AnyFloats:
-    found: AnyFloats = np.sum(list(sums.values()), axis=0)
-    return found
+def _total(sums: Sums) -> Parts:
+    return Parts.of_sums(np.sum(list(sums.values()), axis=0))
 
 
 def mae(sums: Sums) -> list[float]:
     """Return the mean absolute error at each step."""
     total = _total(sums)
-    steps = (len(total) - 1) // 3
-    return [float(value) for value in total[2 * steps : 3 * steps] / total[-1]]
+    return [float(value) for value in total.absolute / total.values]
 
 
 def mse(sums: Sums) -> float:
@@ -74,7 +65,7 @@ def mse(sums: Sums) -> float:
     if not sums:
         return float("nan")
     total = _total(sums)
-    return float((total[: (len(total) - 1) // 3] / total[-1]).mean())
+    return float((total.squared / total.values).mean())
 
 
 def cell(found: Interval | None, at: int) -> Cell:

@@ -32,7 +32,8 @@ RELIABLE = (
 TABLE = (
     "False unknown: slides of known materials answered unknown. False known: slides of materials that were left out, given "
     "a name. Right: of the names given to slides of known materials. 95 % intervals are Wilson's over slides, each counted "
-    "once, and of false known over materials, where these are six or more; calibration error, log loss and AUROC are means over runs."
+    "once, and of false known over materials, where these are six or more; calibration error, log loss and AUROC are means "
+    "over runs."
 )
 REFUSED = (
     "Each threshold answers some slides of known materials with unknown, and some of materials that were left out of "

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tacpipe.arrays import AnyFloats, Floats
+from tacpipe.arrays import AnyFloats
 from tacpipe.channels import biotac_sp
 from tacpipe.comparison.runs import Method
 from tacpipe.io.parquet import from_parquet

@@ -1,19 +1,22 @@
-"""The headline of forecasts: the error of the shown steps, relative to persistence's."""
+"""The headline of forecasts: the mean absolute error of the shown steps, relative to persistence's."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from tacpipe.arrays import AnyFloats
-from tacpipe.metrics import pairing
+from tacpipe.metrics import intervals, pairing
 from tacpipe.metrics.headline import Headline
 from tacpipe.metrics.pairing import Measure, Sums
 from tacpipe.tasks.forward.units import COUNTS
 
 TASK, MODEL, BASELINE = "forward", "model", "persistence"
 STEPS = (1, 3, 5, 10)  # those shown, as far as a model predicts them
+Errors = tuple[AnyFloats, AnyFloats]  # sums of squared and of absolute errors of a recording, each (step,)
+GEOMETRIC = "mae_counts_geometric"  # the skill of ``metrics.json`` that is not pooled
 RECORDINGS, OBJECTS = "recordings", "objects"  # what chance draws: another recording, or another object
 PARTS = {True: "known objects", False: "unseen objects", None: ""}
 
@@ -36,12 +39,52 @@ def shown(steps: Sequence[int]) -> tuple[int, ...]:
     return tuple(step for step in STEPS if step in steps) or (max(steps),)
 
 
-def sums(squared: AnyFloats, absolute: AnyFloats, persistence: AnyFloats, values: float) -> AnyFloats:
-    """Return what adds up over recordings, from the error sums of a recording at the shown steps, each (step,).
+@dataclass(frozen=True)
+class Parts:
+    """What adds up over recordings, each (..., step), and the number of values."""
+
+    squared: AnyFloats
+    still_squared: AnyFloats  # of persistence
+    absolute: AnyFloats
+    logs: AnyFloats  # of the ratio of the absolute error to persistence's, summed over recordings
+    counted: AnyFloats  # recordings on which persistence errs
+    values: AnyFloats  # (...): windows times channels
+
+    @classmethod
+    def of_sums(cls, found: AnyFloats) -> Parts:
+        """Return the parts of `sums` (..., part)."""
+        steps = (found.shape[-1] - 1) // 5
+        squared, still, absolute, logs, counted = (found[..., at * steps : (at + 1) * steps] for at in range(5))
+        return cls(squared, still, absolute, logs, counted, found[..., -1])
+
+    @property
+    def skill(self) -> AnyFloats:
+        """1 - the geometric mean over recordings of the ratio to persistence's absolute error, (..., step)."""
+        return np.where(self.counted > 0, -np.expm1(self.logs / np.maximum(self.counted, 1)), np.nan)
+
+    @property
+    def mean_skill(self) -> AnyFloats:
+        """`skill` with the geometric mean over steps too, (...)."""
+        counted = self.counted.sum(axis=-1)
+        return np.where(counted > 0, -np.expm1(self.logs.sum(axis=-1) / np.maximum(counted, 1)), np.nan)
+
+    @property
+    def squared_skill(self) -> AnyFloats:
+        """1 - squared error / squared error of persistence, both pooled over recordings, mean over steps, (...)."""
+        ratio = intervals.skill(self.squared, self.still_squared)
+        errs = ~np.isnan(ratio)
+        mean = np.where(errs, ratio, 0).sum(axis=-1) / np.maximum(errs.sum(axis=-1), 1)
+        return np.where(errs.any(axis=-1), mean, np.nan)
+
+
+def sums(errors: Errors, persistence: Errors, values: float) -> AnyFloats:
+    """Return what adds up over recordings (`Parts`), from the errors of a recording at the shown steps.
 
     ``values`` is how many values each was summed over: windows times channels.
     """
-    return np.concatenate([squared, persistence, absolute, [values]])
+    (squared, absolute), (still_squared, still) = errors, persistence
+    logs, counted = intervals.log_ratios(absolute, still)
+    return np.concatenate([squared, still_squared, absolute, logs, counted, [values]])
 
 
 def headline(
@@ -67,34 +110,31 @@ def headline(
 
 def measure(steps: Sequence[int], unit: str = COUNTS, cluster: str = RECORDINGS) -> Measure:
     """Return how `sums` at some steps become errors; ``unit`` is that of the mean absolute ones."""
-    count, ahead = len(steps), [f"t+{step}" for step in steps]
+    ahead = [f"t+{step}" for step in steps]
 
     def error(found: AnyFloats) -> AnyFloats:
-        squared, persistence = found[:, :count], found[:, count : 2 * count]
-        errs = persistence > 0  # where persistence never errs, nothing is relative to it
-        ratio = np.where(errs, squared / np.where(errs, persistence, 1), 0.0)
-        return np.where(errs.any(axis=1), ratio.sum(axis=1) / np.maximum(errs.sum(axis=1), 1), np.nan)
-
-    def gain(one: AnyFloats, other: AnyFloats) -> AnyFloats:
-        return np.where(other > 0, 1 - one / np.where(other > 0, other, 1), np.nan)
+        return 1 - Parts.of_sums(found).mean_skill
 
     def values(found: AnyFloats) -> tuple[float, ...]:
-        mae = found[2 * count : 3 * count] / found[-1] if found[-1] else np.full(count, np.nan)
-        return (*map(float, mae), 1 - float(error(found[None])[0]))
+        parts = Parts.of_sums(found)
+        mae = parts.absolute / parts.values if parts.values else np.full(len(steps), np.nan)
+        return (*map(float, mae), float(parts.squared_skill), float(parts.mean_skill))
 
     # a column of its own for what ranks: errors by step alone do not rank predictors
     over = " and ".join(filter(None, (", ".join(ahead[:-1]), ahead[-1])))
     return Measure(
-        (*(f"MAE {step}" for step in ahead), "vs persistence"),
+        (*(f"MAE {step}" for step in ahead), "squared vs persistence", "vs persistence"),
         unit,
-        f"the squared error as a fraction of persistence's, averaged over {over} (1 less that: vs persistence)",
+        f"the mean absolute error as a fraction of persistence's, the geometric mean over recordings and over {over} "
+        f"(1 less that: vs persistence; squared: 1 less the ratio of squared errors that are pooled over recordings)",
         "skill",
         cluster,
         error,
-        gain,
+        intervals.skill,
         values,
         lambda found: 1 - found,
         "skill over persistence",
         rises=True,
-        weight=lambda found: found[:, count : 2 * count].sum(axis=1),
+        weight=lambda found: Parts.of_sums(found).counted.sum(axis=1),
+        reference=BASELINE,
     )

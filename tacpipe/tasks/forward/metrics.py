@@ -16,6 +16,7 @@ from tacpipe.arrays import AnyArray, AnyFloats, Bools, Int64s
 from tacpipe.io.parquet import to_parquet
 from tacpipe.metrics import forecast, intervals
 from tacpipe.metrics.headline import Headline
+from tacpipe.metrics.intervals import Interval
 from tacpipe.tasks.forward import headline as headlines
 from tacpipe.tasks.forward.headline import BASELINE, MODEL
 from tacpipe.tasks.forward.predictors import Prediction
@@ -135,11 +136,12 @@ def headline(method: str, trials: Sequence[Trial], horizon: int, unit: str = COU
     def sums(predictor: str, chosen: Sequence[Trial]) -> dict[tuple[Any, str], AnyFloats]:
         found: dict[tuple[Any, str], AnyFloats] = {}
         for one in chosen:
-            errors, persistence = one.errors[predictor], one.errors[BASELINE].count_squared
-            squared, absolute, still = (
-                part.sum(axis=1)[at] for part in (errors.count_squared, errors.count_absolute, persistence)
+            errors, persistence = (
+                (sums.count_squared.sum(axis=1)[at], sums.count_absolute.sum(axis=1)[at])
+                for sums in (one.errors[predictor], one.errors[BASELINE])
             )
-            found[0, one.name] = headlines.sums(squared, absolute, still, one.windows * persistence.shape[1])
+            channels = one.errors[predictor].count_squared.shape[1]
+            found[0, one.name] = headlines.sums(errors, persistence, one.windows * channels)
         return found
 
     named = any(one.object is not None for one in fresh)
@@ -211,12 +213,12 @@ def _pooled(errors: Errors, groups: Masks, channel_scale: AnyFloats) -> Iterator
 
 
 def trials_csv(trials: Sequence[Trial]) -> bytes:
-    """Return one line a recording: windows, mean squared error of model and persistence in counts, and skill."""
+    """Return one line a recording: windows, mean absolute error of model and persistence in counts, and skill."""
     rows = []
     for one in trials:
         errors: list[float | str] = ["", "", ""]
         if one.windows:
-            model, baseline = (float(one.errors[name].count_squared.mean()) for name in (MODEL, BASELINE))
+            model, baseline = (float(one.errors[name].count_absolute.mean()) for name in (MODEL, BASELINE))
             gain = float(intervals.skill(np.array([model]), np.array([baseline]))[0])
             values = (model / one.windows, baseline / one.windows, gain)
             errors = [_rounded(value) if math.isfinite(value) else "" for value in values]
@@ -224,7 +226,7 @@ def trials_csv(trials: Sequence[Trial]) -> bytes:
             (one.name, one.object or "", *(str(flag).lower() for flag in (one.known, one.seen)), one.windows, *errors)
         )
     return _csv(
-        ("recording", "object", "known", "seen", "windows", "mse_counts_model", "mse_counts_persistence", "skill"), rows
+        ("recording", "object", "known", "seen", "windows", "mae_counts_model", "mae_counts_persistence", "skill"), rows
     )
 
 
@@ -257,6 +259,8 @@ def _summary(trials: Sequence[Trial], groups: Masks, horizon: int, channel_scale
             name_of: _intervals(_by_step(held, MODEL, kept), _by_step(held, BASELINE, kept), units)
             for name_of, kept in kinds.items()
         }
+        model, still = (_by_step(held, name, "count_absolute") for name in (MODEL, BASELINE))
+        tree["skill"][headlines.GEOMETRIC] = _geometric_skill(model, still, units)
     return tree
 
 
@@ -279,8 +283,18 @@ def _by_step(trials: Sequence[Trial], predictor: str, kept: str) -> AnyFloats:
 def _intervals(model: AnyFloats, baseline: AnyFloats, clusters: AnyArray) -> Tree:
     """Return skill with its interval over clusters by step and over all, from sums (recording, step); undefined left out."""
     wide = [np.hstack([sums, sums.sum(axis=1, keepdims=True)]) for sums in (model, baseline)]  # (recording, step + 1)
-    found = intervals.skill_interval(wide[0], wide[1], clusters)
-    names = [f"t{step}" for step in range(1, model.shape[1] + 1)] + ["mean"]
+    return _named(intervals.skill_interval(wide[0], wide[1], clusters))
+
+
+def _geometric_skill(model: AnyFloats, baseline: AnyFloats, clusters: AnyArray) -> Tree:
+    """Return skill by the geometric mean of ratios of absolute errors (recording, step), as `_named` does."""
+    wide = [np.hstack([sums, sums.sum(axis=1, keepdims=True)]) for sums in (model, baseline)]
+    return _named(intervals.geometric_skill_interval(wide[0], wide[1], clusters))
+
+
+def _named(found: Interval) -> Tree:
+    """Return values with their intervals by step and over all; what is not defined is left out."""
+    names = [f"t{step}" for step in range(1, len(found.mean))] + ["mean"]
     tree: Tree = {}
     for index, name in enumerate(names):
         ends = {part: float(getattr(found, part)[index]) for part in ("mean", "low", "high")}

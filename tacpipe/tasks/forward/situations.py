@@ -90,10 +90,9 @@ class BySituation:
     horizon: int
     channels: int
     windows: dict[str, Int64s] = field(default_factory=dict)  # by recording, (situation,)
-    squared: dict[tuple[str, str], AnyFloats] = field(
+    absolute: dict[tuple[str, str], AnyFloats] = field(
         default_factory=dict
     )  # (situation, step), by recording, predictor
-    absolute: dict[tuple[str, str], AnyFloats] = field(default_factory=dict)
 
     def count(self, recording: str, situations: Int64s) -> None:
         """Count windows of a recording."""
@@ -102,16 +101,16 @@ class BySituation:
 
     def add(self, recording: str, situations: Int64s, name: str, predicted: Prediction, truth: Prediction) -> None:
         """Add the errors of one predictor on these windows."""
-        for sums, of in ((self.squared, forecast.squared_sums), (self.absolute, forecast.absolute_sums)):
-            before = sums.setdefault((recording, name), np.zeros((len(SITUATIONS), self.horizon)))
-            for one in np.unique(situations):
-                chosen = situations == one
-                before[one] += of(predicted.count[chosen], truth.count[chosen]).sum(axis=1)
+        before = self.absolute.setdefault((recording, name), np.zeros((len(SITUATIONS), self.horizon)))
+        for one in np.unique(situations):
+            chosen = situations == one
+            before[one] += forecast.absolute_sums(predicted.count[chosen], truth.count[chosen]).sum(axis=1)
 
     def summary(self) -> Tree:
         """Return by situation the windows, recordings, mean absolute errors by predictor and step, and the model's skill.
 
-        Skill is 1 - squared error / squared error of persistence, by step and over all, with its interval over recordings.
+        Skill is 1 - mean absolute error / that of persistence, the geometric mean of the ratios of recordings, by step and
+        over all, with its interval over recordings.
         """
         return {name: self._of(at) for at, name in enumerate(SITUATIONS) if self._recordings(at)}
 
@@ -125,9 +124,9 @@ class BySituation:
         errors = {name: self._sums(self.absolute, recordings, name, at).sum(axis=0) for name in predictors}
         model, still = (
             np.hstack([sums, sums.sum(axis=1, keepdims=True)])
-            for sums in (self._sums(self.squared, recordings, name, at) for name in (MODEL, BASELINE))
+            for sums in (self._sums(self.absolute, recordings, name, at) for name in (MODEL, BASELINE))
         )
-        found = intervals.skill_interval(model, still)
+        found = intervals.geometric_skill_interval(model, still)
         skill = {
             step: {
                 part: _rounded(value)

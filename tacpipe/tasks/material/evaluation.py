@@ -60,7 +60,9 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
     known = set(classifier.config["trained_on"].values())
     evaluated = {}
     key = classifier.naming.key
-    answers = Answers(classifier, {name: naming.text(one.attributes.get(key, "")) for name, one in recordings.recordings.items()})
+    answers = Answers(
+        classifier, {name: naming.text(one.attributes.get(key, "")) for name, one in recordings.recordings.items()}
+    )
     with progress.bar("evaluate", 2 * len(recordings.recordings)) as advance:  # each slide is read, then named
         for sensor, slides in _read(classifier, recordings, advance).items():
             named = answers.add(slides, np.array([one in known for one in slides.digests], bool))

@@ -81,7 +81,18 @@ class Answers:
         for at, name in enumerate(slides.names):
             answer = UNKNOWN_ANSWER if score[at] < bundle.threshold else str(names[at])
             flags = [str(bool(flag)).lower() for flag in (known[at], not fresh[at])]
-            self.rows.append((name, sensor, *flags, names[at], f"{best[at]:.6g}", f"{score[at]:.6g}", answer, self.labels.get(name, "")))
+            self.rows.append(
+                (
+                    name,
+                    sensor,
+                    *flags,
+                    names[at],
+                    f"{best[at]:.6g}",
+                    f"{score[at]:.6g}",
+                    answer,
+                    self.labels.get(name, ""),
+                )
+            )
 
     def trees(self) -> Tree:
         """Return what ``metrics.json`` holds more: ``calibration`` and ``unknown`` by sensor."""

@@ -78,6 +78,14 @@ def measure(range_counts: float, cluster: str) -> Measure:
     columns = ("RMSE", "RMSE (counts)")
     unit = "shares of the target's range, and counts"
     return Measure(
-        columns, unit, "the RMSE", "skill", cluster, rmse, gain, values, scored="RMSE (fraction of the range)",
+        columns,
+        unit,
+        "the RMSE",
+        "skill",
+        cluster,
+        rmse,
+        gain,
+        values,
+        scored="RMSE (fraction of the range)",
         weight=lambda found: found[:, 0],
     )

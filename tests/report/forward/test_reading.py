@@ -43,15 +43,16 @@ def test_errors_are_means_over_windows_and_channels_of_the_objects_asked_for() -
     best = found["known objects"].best
     assert best is not None
     # (10 · 0.5 + 30 · 0.25) / 40 = 0.3125; the absolute error is twice the step times that
-    assert best.values == pytest.approx((0.625, 1.875, 0.6875))
+    skill = 1 - math.sqrt(0.5 * 0.25)  # of single recordings
+    assert best.values == pytest.approx((0.625, 1.875, 0.6875, skill))
     unseen = found["unseen objects"].best
-    assert unseen is not None and unseen.values == pytest.approx((2.0, 6.0, 0.0))
+    assert unseen is not None and unseen.values == pytest.approx((2.0, 6.0, 0.0, 1 - math.sqrt(1.5 * 0.5)))
 
 
 def test_two_recordings_have_no_interval() -> None:
     best = compared(result(ratio=RATIO))["known objects"].best
     assert best is not None
-    assert best.score.mean == pytest.approx(0.6875) and math.isnan(best.score.low)
+    assert best.score.mean == pytest.approx(1 - math.sqrt(0.5 * 0.25)) and math.isnan(best.score.low)
 
 
 def test_the_gain_over_the_best_baseline_is_that_of_its_errors_whatever_persistence_does() -> None:
@@ -74,7 +75,7 @@ def test_rows_are_all_methods_and_baselines_with_the_best_first() -> None:
         "codec PCA-20": ("oracle", pytest.approx(0.75)),
         "codec raw": ("oracle", pytest.approx(0.75)),
         "recurrent · AE-C1-8": ("model", pytest.approx(0.5)),
-        "recurrent · raw": ("model", pytest.approx(0.34375)),
+        "recurrent · raw": ("model", pytest.approx(1 - math.sqrt(0.5 * 0.25) ** 0.5)),
         "ridge": ("baseline", pytest.approx(0.25)),
         "persistence": ("baseline", pytest.approx(0.0)),
         "recurrent · PCA-20": ("model", pytest.approx(-1.0)),
@@ -83,7 +84,7 @@ def test_rows_are_all_methods_and_baselines_with_the_best_first() -> None:
     scores = [row.score.mean for row in found.rows]
     assert scores == sorted(scores, reverse=True)
     spread = {row.name: row.spread for row in found.rows}
-    assert spread["recurrent · raw"] == pytest.approx(0.6875 / np.sqrt(2))  # of 0.6875 and 0
+    assert spread["recurrent · raw"] == pytest.approx((1 - math.sqrt(0.5 * 0.25)) / np.sqrt(2))  # and 0
 
 
 def test_what_else_was_made_of_a_models_forecast_is_a_variant_and_no_baseline() -> None:

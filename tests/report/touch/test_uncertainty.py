@@ -62,7 +62,9 @@ def test_coverage_is_pooled_over_runs_and_certain_by_grasp_or_by_novel_object() 
         assert one.values == len(own) == 2 * 2 * 10 * 24
         assert one.coverage[0] == own.covered.mean()
         means = own.groupby(cluster).covered.mean().to_numpy()  # clusters are of one size
-        ends = stats.t.interval(0.95, len(means) - 1, means.mean(), stats.sem(means)) if len(means) > 2 else (np.nan,) * 2
+        ends = (
+            stats.t.interval(0.95, len(means) - 1, means.mean(), stats.sem(means)) if len(means) > 2 else (np.nan,) * 2
+        )
         assert one.coverage[1:] == pytest.approx(np.clip(ends, 0, 1), nan_ok=True)
         gains = (0.25, 0.25, 0.25) if len(means) > 2 else (0.25, np.nan, np.nan)
         assert one.gain == pytest.approx(gains, nan_ok=True) and (one.width, one.pinball) == (90, 3)

@@ -86,9 +86,10 @@ def test_errors_and_skill_are_those_of_numpy_over_the_windows_of_a_situation() -
     assert (one["windows"], one["recordings"]) == (len(errors[0]), 3)
     assert one["mae_counts"]["model"]["t2"] == pytest.approx(np.abs(errors[0][:, 1]).mean(), rel=1e-6)
     assert one["mae_counts"]["persistence"]["mean"] == pytest.approx(np.abs(errors[1]).mean(), rel=1e-6)
-    squared = [float((part[:, 2] ** 2).sum()) for part in errors]
-    assert one["skill"]["t3"]["mean"] == pytest.approx(1 - squared[0] / squared[1], rel=1e-6)
-    assert set(one["skill"]["t3"]) == {"mean"}  # two recordings have no interval
+    ratios = [np.divide(*(np.abs(part - truth)[doing == at, 2].sum() for part in (model, still)))
+              for doing, truth, model, still in kept.values()]  # fmt: skip
+    assert one["skill"]["t3"]["mean"] == pytest.approx(1 - np.prod(ratios) ** (1 / 3), rel=1e-6)
+    assert one["skill"]["t3"]["low"] < one["skill"]["t3"]["mean"] < one["skill"]["t3"]["high"]
 
 
 def test_evaluate_states_situations_whose_windows_are_all_windows_of_unseen_recordings(tmp_path: Path) -> None:

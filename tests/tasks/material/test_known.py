@@ -62,7 +62,9 @@ def test_evaluation_reports_calibration_and_unknown_next_to_the_accuracy_on_know
     for sensor in SENSORS:
         found = tree["unknown"][sensor]
         assert (found["false_unknown_n"], found["false_known_n"]) == (20, 4)
-        assert found["false_known_materials"] == 1 and "false_known_low" not in found  # one material says nothing of others
+        assert (
+            found["false_known_materials"] == 1 and "false_known_low" not in found
+        )  # one material says nothing of others
         assert set(found["auroc"]) == {"probability", "distance"} and found["auroc"][found["rule"]] > 0.8
         stated = tree["calibration"][sensor]
         assert stated["n"] == 20

@@ -1,0 +1,65 @@
+"""How often intervals hold the truth in simulations, and the page that states it."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.test_docs import module
+
+PAGE = Path(__file__).parents[1] / "docs" / "explanation" / "intervals.md"
+pytestmark = pytest.mark.long
+
+
+@pytest.fixture(scope="module")
+def rows() -> list[list[str]]:
+    """The cells of the tables that the command prints."""
+    simulation: Any = module("intervals")
+    return [line.strip("| ").split(" | ") for line in simulation.lines() if line and "---" not in line]
+
+
+def stated() -> list[list[str]]:
+    """The cells of the same tables on the page."""
+    text = PAGE.read_text().split("python docs/intervals.py")[1].split("## Known limits")[0]
+    return [line.strip("| ").split(" | ") for line in text.splitlines() if line.startswith("|") and "---" not in line]
+
+
+def number(cell: str) -> float:
+    try:
+        return float(cell.removesuffix(" %"))
+    except ValueError:
+        return math.nan
+
+
+def test_wherever_there_is_a_verdict_intervals_hold_the_truth_in_92_to_97_of_100_cases(rows: list[list[str]]) -> None:
+    coverage = {tuple(row[:3]): number(row[4]) for row in rows if len(row) >= 6 and row[0] != "measure"}
+    assert len(coverage) >= 30
+    chance = 0.007  # standard deviation of a share of 1,000 repetitions
+    stray = {
+        case: share
+        for case, share in coverage.items()
+        if not (math.isnan(share) or abs(share - 0.945) < 0.025 + chance)
+    }
+    assert stray == {}
+
+
+def test_the_best_of_equal_methods_is_called_better_about_as_rarely_as_a_single_one(rows: list[list[str]]) -> None:
+    by_count = {row[0]: (number(row[2]), number(row[3])) for row in rows if len(row) == 4 and row[0].isdigit()}
+    assert by_count["12"][0] > 10 and max(chosen for _, chosen in by_count.values()) <= 4
+
+
+def test_a_rate_over_slides_of_few_materials_holds_less_than_it_states(rows: list[list[str]]) -> None:
+    by_count = {row[0]: (number(row[1]), number(row[2])) for row in rows if len(row) == 3 and row[0].isdigit()}
+    assert by_count["4"][0] < 0.7 and math.isnan(by_count["4"][1])
+    assert by_count["40"][0] < 0.7 and 0.9 <= by_count["40"][1] <= 0.97
+
+
+def test_the_page_holds_the_tables_that_the_command_prints(rows: list[list[str]]) -> None:
+    for printed, shown in zip(rows, stated(), strict=True):
+        for one, other in zip(printed, shown, strict=True):  # another machine rounds otherwise
+            tolerance = 2.0 if one.endswith("%") else 0.02
+            assert number(one) == pytest.approx(number(other), abs=tolerance, nan_ok=True)
+        assert [one for one in printed if math.isnan(number(one))] == [one for one in shown if math.isnan(number(one))]
