@@ -41,9 +41,8 @@ def _arguments(stage: AnyStage) -> list[inspect.Parameter]:
 
 
 def _shared(stage: AnyStage) -> list[inspect.Parameter]:
-    kinds = set(stage.arguments.values())
     found = [_parameter("output", Path | None, typer.Option(None, "-o", "--output", help="Where to write."))]
-    if stage.needs_split or stage.reads_model:
+    if stage.reads_split:
         found += [
             _parameter(
                 "split", Path | None, typer.Option(None, "--split", help="Which recordings train, validate, test.")
@@ -73,7 +72,7 @@ def _shared(stage: AnyStage) -> list[inspect.Parameter]:
     if stage.tracked:
         text = f"Tracker of experiments, NAME or NAME:PLACE: {', '.join(registry.trackers())}."
         found.append(_parameter("track", list[str] | None, typer.Option(None, "--track", help=text)))
-    if "Roles" in kinds:
+    if "extend" in stage.arguments:
         text = "An older split whose roles to keep."
         found.append(_parameter("extend", Path | None, typer.Option(None, "--extend", help=text)))
     return found

@@ -94,10 +94,10 @@ def _refuse_unread(name: str, stage: AnyStage, datasets: Sequence[Given], named:
     kinds = set(stage.arguments.values())
     reads = {
         "model": stage.reads_model,
-        "split": stage.needs_split or stage.reads_model,
+        "split": stage.reads_split,
         "codec": stage.fit is not None,
         "init": "init" in stage.arguments,
-        "extend": "Roles" in kinds,
+        "extend": "extend" in stage.arguments,
     }
     given = {**dict.fromkeys(named, True), "fold": how.fold != 0, "role": how.role is not None}
     given |= {"track": bool(how.track), "device": how.device != AUTO}

@@ -13,7 +13,7 @@ from types import MappingProxyType
 from typing import Any
 
 from tacpipe.datasets import adoption, roles
-from tacpipe.datasets.dataset import Dataset, Recording
+from tacpipe.datasets.dataset import Dataset, Reader, Recording
 from tacpipe.datasets.manifest import ACQUIRE, Manifest
 from tacpipe.datasets.paths import shard_path
 from tacpipe.engine import provenance
@@ -242,13 +242,23 @@ def _arguments(stage: AnyStage, task: Task, store: Store) -> Iterator[dict[str, 
         elif kind == "Shared":
             found[name] = SharedFiles(store) if store.run else None
         elif kind == "Roles":
-            found[name] = roles.read(read(inputs[name], roles.FILE)) if inputs[name] else {}
+            found[name] = _roles(inputs[name], read)
         else:
             found[name] = _begun_workspace(store, digest(task.identity))
     yield found
     for file, path in (task.files or {}).items():
         if remembered_file_digest(path) != inputs[stage.argument("Files")][file]:
             raise StorageError(f"{path} changed while it was read. Run the same command again.")
+
+
+def _roles(identity: str | Mapping[str, Any] | None, read: Reader) -> dict[tuple[str, int], str]:
+    """Return (recording, fold) to role: of a split by its digest, or of one of its folds."""
+    if identity is None:
+        return {}
+    if isinstance(identity, str):
+        return roles.read(read(identity, roles.FILE))
+    folds = roles.read(read(identity["roles"], roles.FILE))
+    return {(recording, fold): role for (recording, fold), role in folds.items() if fold == identity["fold"]}
 
 
 def workspace(store: Store, key: str) -> Path:

@@ -308,8 +308,7 @@ class _Run:
         if kind == "Datasets":
             return [keys.of_dataset(found.manifest, reads, found.manifest.included) for found in inputs.datasets]
         if kind == "Roles":
-            old = inputs.named.get("extend")
-            return roles.digest(old.manifest, str(old.directory)) if old else None
+            return self._roles(name)
         if kind == "Parts":
             return keys.of_dataset(self._parts, None, self._parts.recordings)
         if self.stage.part is not None:
@@ -328,6 +327,21 @@ class _Run:
         if self.request.role is not None:
             raise UsageError(f"--role {self.request.role} has no effect without --split.")
         return keys.of_dataset(given, reads, given.included)
+
+    def _roles(self, name: str) -> Any:
+        """Return what identifies the roles of the argument ``name``, None where its option was not given."""
+        found = self.inputs.named.get(name)
+        fold = self.request.fold
+        if found is None:
+            if name == "split" and fold:
+                raise UsageError(f"--fold {fold} has no effect without --split.")
+            return None
+        table = roles.digest(found.manifest, str(found.directory))
+        if name != "split":
+            return table
+        if not self.inputs.roles.keys() & self.inputs.merged.included.keys():
+            raise UsageError(f"No recording of the dataset has a role in {found.directory}. Split this dataset.")
+        return {"roles": table, "fold": fold}
 
     def _whole(self, name: str, identity: Mapping[str, Any], *, counted: bool = True) -> Mapping[str, Any]:
         """Return the result of a key over whole datasets, from the store or by running the stage."""

@@ -27,6 +27,10 @@ class Array:
     values: AnyArray
     columns: Sequence[str]
     units: Sequence[str]
+    actions: bool = False
+    observed: bool = (
+        False  # measured by a sensor or a robot, or computed of such; no clock, mask, label or ground truth
+    )
 
 
 def from_table(table: pa.Table, actions: str = "") -> list[Array]:
@@ -43,11 +47,12 @@ def from_table(table: pa.Table, actions: str = "") -> list[Array]:
     for name, members in groups.items():
         values = frames.matrix(table, members)
         flat = values[:, 0] if values.shape[1] == 1 else values
-        arrays.append(Array(name, flat, [channel.name for channel in members], [channel.unit for channel in members]))
+        names, units = [channel.name for channel in members], [channel.unit for channel in members]
+        arrays.append(Array(name, flat, names, units, observed=any(channel.observed for channel in members)))
     if actions:
         members, values = frames.action_of(table, channels, actions)
         names, units = [channel.name for channel in members], [channel.unit for channel in members]
-        arrays.append(Array(ACTIONS, values, names, units))
+        arrays.append(Array(ACTIONS, values, names, units, actions=True))
     return arrays
 
 

@@ -28,7 +28,7 @@ SYNCHRONIZE = "synchronize"
 ROBOT = ("joint_position", "position", "orientation")  # a stream with one of these is a robot's
 TARGETS = "target_"  # begins the quantities of what a robot was asked to do
 CLOCKS = ("time", "sequence", "mask", "label", "status", "text")  # quantities that are no signals
-TACTILE = "tactile"
+TACTILE, LATENT = "tactile", "latent"
 _NO_FRAMES = "it has no value in each frame, as images, text and single rows have none"
 
 
@@ -46,6 +46,11 @@ class Channel:
     def short(self) -> str:
         """Its name as it was recorded, without the stream before it."""
         return self.name.removeprefix(f"{self.stream}_") if self.stream and not self.truth else self.name
+
+    @property
+    def observed(self) -> bool:
+        """True for a signal and for what a codec computed of signals: inputs of a policy."""
+        return self.signal or self.quantity == LATENT
 
     @property
     def number(self) -> bool:

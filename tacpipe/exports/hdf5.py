@@ -1,8 +1,9 @@
-"""Write recordings as HDF5 files: a group a stream at its own rate, or one file of demonstrations as robomimic reads them.
+"""Write recordings as HDF5 files: one group per stream at its own rate, or one file of demonstrations for robomimic.
 
-By default one file a recording: a group a stream, a dataset a column in its own type, unit and quantity as attributes,
-labels as attributes of the file. ``--structure robomimic`` writes one file ``demos.hdf5`` from synchronized recordings, or
-any with ``--rate-hz``: ``data/demo_0/obs/STREAM_QUANTITY`` and, with ``--actions``, ``actions``.
+By default one file per recording: one group per stream, one dataset per column in its own type, unit and quantity as
+attributes, labels as attributes of the file. ``--structure robomimic`` writes one file ``demos.hdf5`` from synchronized
+recordings, or any with ``--rate-hz``: ``data/demo_0/obs/STREAM_QUANTITY``, with ``--actions`` ``actions``, and with
+``--split`` the lists ``mask/train`` and ``mask/valid``.
 
 Example: tacpipe export hdf5 data/recordings -o exports/hdf5
 """
@@ -12,7 +13,7 @@ from __future__ import annotations
 import json
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import IO, TYPE_CHECKING, Any, Literal
 
 from tacpipe.errors import UsageError
@@ -21,6 +22,7 @@ from tacpipe.exports.contents import TIME, Loss, Name, shown
 from tacpipe.exports.files import Files, copied
 from tacpipe.plugins.constraints import Rate
 from tacpipe.plugins.stage import ALL, Attribute, RecordingName, RecordingOutput, Result, stage
+from tacpipe.printable import listed
 
 if TYPE_CHECKING:
     import h5py
@@ -28,10 +30,14 @@ if TYPE_CHECKING:
 
     from tacpipe.arrays import AnyArray
     from tacpipe.datasets.dataset import Dataset, Recording
+    from tacpipe.exports.arrays import Array
+    from tacpipe.plugins.stage import Roles
 
     Parts = Dataset
 
 DEMOS = "demos.hdf5"
+MASKS = {"train": "train", "val": "valid", "test": "test"}  # role: name that robomimic has for it
+EXTRA = "tacpipe"  # group of a demonstration with what no policy may read
 VERSION = ("v110", "v110")  # of HDF5, from 2016: many small columns take half of what they take in older ones
 CHUNK_ROWS = 1 << 16
 LEVEL = 4  # of gzip; higher ones take twice the time for 1 %
@@ -50,8 +56,10 @@ tacpipe reads them back with `tacpipe ingest hdf5`.
 """
 _DEMOS = f"""
 One file of demonstrations, `{DEMOS}`, as robomimic reads them: `data/demo_0/obs/STREAM_QUANTITY` has the shape
-(frame, channel); the attribute `columns` names its channels, `units` their units. `data/demo_0` has the recording's name and
-labels as attributes.
+(frame, channel); the attribute `columns` names its channels, `units` their units. `data/demo_0/tacpipe` has clocks, masks of
+gaps and of repeated samples, labels and ground truth, which no policy may read. `data/demo_0` has the recording's name and
+labels as attributes. `mask/train`, `mask/valid` and `mask/test` list the demonstrations of each role of the split, where one
+was given: robomimic reads them with `hdf5_filter_key`.
 """
 
 
@@ -95,24 +103,38 @@ def part(params: Params, recording: Recording, name: RecordingName) -> Result:
 
 
 @stage(version=2, part=part, first=first)
-def hdf5(params: Params, recordings: Dataset, parts: Parts, originals: Dataset) -> Result:
+def hdf5(params: Params, recordings: Dataset, parts: Parts, originals: Dataset, split: Roles | None = None) -> Result:
     """Write recordings as HDF5 files.
 
-    One file a recording with a group a stream at its own rate; or ``--structure robomimic``, one file of demonstrations.
+    One file per recording, with one group per stream at its own rate; or ``--structure robomimic``, one file of
+    demonstrations, with the roles of ``--split`` as masks.
 
     Example: tacpipe export hdf5 data/recordings -o exports/hdf5
     """
-    found = contents.of_parts(parts)
+    described = contents.of_parts(parts)
     written: dict[str, Callable[[Any], object]] = {}
-    opening = _STREAMS
+    opening, notes = _STREAMS, []
     if params.structure == "robomimic":
         from tacpipe.exports import frames
 
-        columns, found = frames.columns(found, common=params.common)
-        found = frames.without_frames(found, recordings, originals)
-        opening, written[DEMOS] = _DEMOS, copied(_demos(params, recordings, columns))
-    text = readme.text("Tactile recordings as HDF5", opening, recordings, found)
-    return Result(files=Files({readme.NAME: text}), notes=readme.notes(recordings, found), written=written)
+        roles = {recording: role for (recording, _), role in (split or {}).items()}
+        columns, described = frames.columns(described, common=params.common)
+        described = frames.without_frames(described, recordings, originals)
+        losses: list[tuple[str, Loss]] = []
+        content = _demos(params, recordings, columns, roles, losses)
+        described = replace(described, losses={**described.losses, **contents.sentences(losses)})
+        opening, written[DEMOS] = _DEMOS, copied(content)
+        missing = [recording.name for recording in recordings if roles and recording.name not in roles]
+        notes += (
+            [f"{len(missing)} recordings have no role in the split and are in no mask: {listed(missing)}"]
+            if missing
+            else []
+        )
+    elif split:
+        raise UsageError("split belongs to --structure robomimic; files of single recordings have no masks.")
+    text = readme.text("Tactile recordings as HDF5", opening, recordings, described)
+    notes += readme.notes(recordings, described)
+    return Result(files=Files({readme.NAME: text}), notes=notes, written=written)
 
 
 def _recording(recording: Recording, losses: list[Loss], columns: list[Name]) -> IO[bytes]:
@@ -179,30 +201,45 @@ def _storage(values: AnyArray) -> dict[str, Any]:
     return {"chunks": chunks, "compression": "gzip", "compression_opts": LEVEL, "shuffle": True}
 
 
-def _demos(params: Params, recordings: Dataset, columns: Sequence[str]) -> IO[bytes]:
+def _demos(
+    params: Params,
+    recordings: Dataset,
+    columns: Sequence[str],
+    roles: Mapping[str, str],
+    losses: list[tuple[str, Loss]],
+) -> IO[bytes]:
+    """Return a temporary file with all demonstrations; what it does not carry of a recording is added to ``losses``."""
     import h5py
 
     from tacpipe.exports import arrays, frames
 
-    every = list(recordings)
-    rate_hz = frames.rate_hz(every)
+    rate_hz = frames.rate_hz(list(recordings))
+    masks: dict[str, list[bytes]] = {}
     sink = tempfile.TemporaryFile()  # noqa: SIM115  (closed by whoever copies it)
     with h5py.File(sink, "w", track_order=True, libver=VERSION) as file:
         data = file.create_group("data", track_order=True)
         total = 0
-        for number, one in enumerate(every):
+        for number, recording in enumerate(recordings):
             demo = data.create_group(f"demo_{number}", track_order=True)
-            table = frames.table(one).select(columns)
+            table = frames.table(recording).select(columns)
             for array in arrays.from_table(table, params.actions):
-                # robomimic reads actions next to obs
-                name = array.name if array.name in ("actions", TIME) else f"obs/{array.name}"
-                made = demo.create_dataset(name, data=array.values, **_storage(array.values))
-                made.attrs["columns"], made.attrs["units"] = list(array.columns), list(array.units)
+                dataset = demo.create_dataset(_demo_path(array), data=array.values, **_storage(array.values))
+                dataset.attrs["columns"], dataset.attrs["units"] = list(array.columns), list(array.units)
+            losses += [(recording.name, loss) for loss in _attributes(demo, recording.attributes)]
             demo.attrs["num_samples"] = table.num_rows
-            demo.attrs["recording"] = one.name
-            for _ in _attributes(demo, one.attributes):
-                pass  # stated for the part
+            demo.attrs["recording"] = recording.name
             total += table.num_rows
+            if mask := MASKS.get(roles.get(recording.name, "")):
+                masks.setdefault(mask, []).append(f"demo_{number}".encode())
         data.attrs["total"] = total
         data.attrs["env_args"] = json.dumps({"env_name": "tacpipe", "type": 1, "env_kwargs": {"control_freq": rate_hz}})
+        for name, demos in sorted(masks.items()):
+            file[f"mask/{name}"] = demos
     return sink
+
+
+def _demo_path(array: Array) -> str:
+    """Return the path of an array below its demonstration: robomimic reads actions next to obs, policies what is in it."""
+    if array.actions or array.name == TIME:
+        return array.name
+    return f"obs/{array.name}" if array.observed else f"{EXTRA}/{array.name}"

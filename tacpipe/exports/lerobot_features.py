@@ -74,7 +74,7 @@ def features(params: Params, table: pa.Table) -> list[Feature]:
         remaining = [channel for channel in signals if channel.stream == stream and channel not in taxels]
         vectors += [vector(f"observation.tactile.{stream}", touch)] if touch else []
         vectors += [vector(f"observation.{stream}", remaining)] if remaining else []
-    latents = [channel for channel in channels if channel.quantity == "latent"]
+    latents = [channel for channel in channels if channel.quantity == frames.LATENT]
     vectors += [vector("observation.latents", latents)] if latents else []
     truth = [channel for channel in channels if channel.truth and channel.type in ("float", "double")]
     vectors += [vector(f"{ORIGINALS}.truth", truth)] if truth else []

@@ -17,7 +17,8 @@ states by its annotation what the stage reads:
 ``Values``         what ``discover`` gave for one recording beside its files, as labels; part of its key
 ``Shared``         files that the recordings of a run share, each made once; ``Shared | None``, since there may be no run
 ``Trial``          the number of one recording to simulate, from 0 to ``params.trials``
-``Roles``          the roles of an older split, (recording, fold) to role; empty unless ``--extend`` names one
+``Roles``          roles of recordings, (recording, fold) to role, empty without the option: an argument ``extend`` holds
+                   those of the older split that ``--extend`` names, ``split`` those of one fold of ``--split``
 ``Workspace``      a folder that survives an interruption, for checkpoints
 =================  ==================================================================================================
 
@@ -199,6 +200,11 @@ class Stage(Generic[P, R]):
     def needs_split(self) -> bool:
         """Whether the stage distinguishes training recordings from others."""
         return self.fit is not None or any(name in ROLES for name in self.arguments)
+
+    @property
+    def reads_split(self) -> bool:
+        """Whether ``--split`` and ``--fold`` may be given."""
+        return self.needs_split or self.reads_model or "split" in self.arguments
 
     @property
     def tracked(self) -> bool:

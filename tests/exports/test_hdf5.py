@@ -6,6 +6,9 @@ import json
 
 import h5py
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
 
 import tacpipe
 from tests.conftest import Lab
@@ -44,6 +47,40 @@ def test_robomimic_finds_demonstrations_with_observations_and_actions(rig: Lab) 
         assert list(touch.attrs["columns"])[3] == "skin_taxel02_x"
         position = table["arm_position_x_m"].to_numpy().astype(np.float32)
         np.testing.assert_array_equal(demo["actions"][:-1, 0], position[1:])
+
+
+def test_observations_hold_neither_clocks_nor_masks_nor_ground_truth(lab: Lab) -> None:
+    truth = pa.table({"t_ns": recordings.skin(1)["t_ns"], "gt_slip": np.arange(40.0)})
+    recordings.write(lab.folder / "rec", {"a": ({"skin": recordings.skin(1), "truth": truth}, {})})
+    lab.run("export hdf5 rec -o demos --structure robomimic --rate-hz 100")
+    with h5py.File("demos/demos.hdf5") as file:
+        demo = file["data/demo_0"]
+        assert set(demo["obs"]) == {"skin_tactile"}
+        assert {"truth", "skin_seq", "skin_gap"} <= set(demo["tacpipe"])
+        assert list(demo["tacpipe/truth"].attrs["columns"]) == ["gt_slip"]
+
+
+def test_masks_list_the_demonstrations_of_each_role_of_the_split(lab: Lab) -> None:
+    recordings.write(lab.folder / "rec", recordings.trials(6))
+    lab.run("split rec -o split --test 0.34 --val 0.25 --repeats 2")
+    roles = {
+        row["recording"]: row["role"] for row in pq.read_table("split/split.parquet").to_pylist() if row["fold"] == 1
+    }
+    lab.run("export hdf5 rec -o demos --structure robomimic --rate-hz 100 --split split --fold 1")
+    with h5py.File("demos/demos.hdf5") as file:
+        masks = {name: [demo.decode() for demo in file["mask"][name]] for name in file["mask"]}
+        listed = {name: {file["data"][demo].attrs["recording"] for demo in demos} for name, demos in masks.items()}
+    assert set(listed) == {"train", "valid", "test"}
+    for mask, role in (("train", "train"), ("valid", "val"), ("test", "test")):
+        assert listed[mask] == {name for name in roles if roles[name] == role}
+    assert masks["train"][0].startswith("demo_")
+
+
+@pytest.mark.parametrize("options", ["--split split", "--structure robomimic --rate-hz 100 --fold 1"])
+def test_a_split_that_no_mask_follows_from_is_refused(rig: Lab, options: str) -> None:
+    rig.run("split rec -o split --test 0.5 --val 0")
+    assert rig.call(f"export hdf5 rec -o out {options}").code == 2
+    assert not (rig.folder / "out").exists()
 
 
 def test_options_of_robomimic_are_refused_for_streams(rig: Lab) -> None:
