@@ -11,7 +11,6 @@ Example: tacpipe export hdf5 data/recordings -o exports/hdf5
 from __future__ import annotations
 
 import json
-import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import IO, TYPE_CHECKING, Any, Literal
@@ -19,7 +18,7 @@ from typing import IO, TYPE_CHECKING, Any, Literal
 from tacpipe.errors import UsageError
 from tacpipe.exports import contents, readme
 from tacpipe.exports.contents import TIME, Loss, Name, shown
-from tacpipe.exports.files import Files, copied
+from tacpipe.exports.files import Files, Scratch, copied
 from tacpipe.plugins.constraints import Rate
 from tacpipe.plugins.stage import ALL, Attribute, RecordingName, RecordingOutput, Result, stage
 from tacpipe.printable import listed
@@ -144,7 +143,7 @@ def _recording(recording: Recording, losses: list[Loss], columns: list[Name]) ->
     """
     import h5py
 
-    sink = tempfile.TemporaryFile()  # noqa: SIM115  (closed by whoever copies it)
+    sink = Scratch()
     with h5py.File(sink, "w", track_order=True, libver=VERSION) as file:
         losses += _attributes(file, recording.attributes)
         for stream in recording.streams:
@@ -153,7 +152,8 @@ def _recording(recording: Recording, losses: list[Loss], columns: list[Name]) ->
             for field in table.schema:
                 losses += _column(group, field, table.column(field.name), stream)
             columns += [(stream, name) for name in group]
-    return sink
+            sink.check()
+    return sink.check()
 
 
 def _attributes(group: h5py.Group, values: Mapping[str, Attribute]) -> Iterator[Loss]:
@@ -215,7 +215,7 @@ def _demos(
 
     rate_hz = frames.rate_hz(list(recordings))
     masks: dict[str, list[bytes]] = {}
-    sink = tempfile.TemporaryFile()  # noqa: SIM115  (closed by whoever copies it)
+    sink = Scratch()
     with h5py.File(sink, "w", track_order=True, libver=VERSION) as file:
         data = file.create_group("data", track_order=True)
         total = 0
@@ -228,6 +228,7 @@ def _demos(
             losses += [(recording.name, loss) for loss in _attributes(demo, recording.attributes)]
             demo.attrs["num_samples"] = table.num_rows
             demo.attrs["recording"] = recording.name
+            sink.check()
             total += table.num_rows
             if mask := MASKS.get(roles.get(recording.name, "")):
                 masks.setdefault(mask, []).append(f"demo_{number}".encode())
@@ -235,7 +236,7 @@ def _demos(
         data.attrs["env_args"] = json.dumps({"env_name": "tacpipe", "type": 1, "env_kwargs": {"control_freq": rate_hz}})
         for name, demos in sorted(masks.items()):
             file[f"mask/{name}"] = demos
-    return sink
+    return sink.check()
 
 
 def _demo_path(array: Array) -> str:

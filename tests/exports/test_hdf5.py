@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 
 import h5py
 import numpy as np
@@ -81,6 +83,22 @@ def test_a_split_that_no_mask_follows_from_is_refused(rig: Lab, options: str) ->
     rig.run("split rec -o split --test 0.5 --val 0")
     assert rig.call(f"export hdf5 rec -o out {options}").code == 2
     assert not (rig.folder / "out").exists()
+
+
+@pytest.mark.parametrize("options", ["", " --structure robomimic --rate-hz 100"])
+def test_a_full_disk_for_temporary_files_is_one_sentence_and_no_crash(rig: Lab, options: str) -> None:
+    code = (
+        "import sys, tempfile; from tacpipe.cli import main;"
+        "tempfile.TemporaryFile = lambda *_, **__: open('/dev/full', 'r+b', buffering=0);"
+        f"sys.exit(main.answer('export hdf5 rec -o out --jobs 1{options}'.split()))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=rig.folder, capture_output=True, text=True)
+    assert done.returncode == 1, done
+    assert "temporary files" in done.stderr
+    assert "TMPDIR" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not (rig.folder / "out").exists()
+    rig.run(f"export hdf5 rec -o out{options}")
 
 
 def test_options_of_robomimic_are_refused_for_streams(rig: Lab) -> None:
