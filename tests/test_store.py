@@ -15,7 +15,7 @@ from tacpipe.io.drafts import Draft
 from tacpipe.io.hashing import bytes_digest, digest
 from tacpipe.store.location import locate, project
 from tacpipe.store.store import MissingError, Store
-from tests.conftest import Ran
+from tests.conftest import Lab, Ran
 
 IDENTITY = {"stage": "scale", "version": 1, "params": {}, "inputs": {}}
 EMPTY: dict[str, dict[str, object]] = {"recordings": {}, "files": {}}
@@ -328,3 +328,26 @@ def test_settling_syncs_each_folder_above_the_names_once_and_those_within_first(
     folders = [str(tmp_path / "store" / name) for name in ("objects/ab", "objects", "records/cd", "records", "")]
     assert sorted(synced) == sorted(folders)
     assert synced.index(folders[0]) < synced.index(folders[1]) < synced.index(folders[4])
+
+
+@pytest.mark.parametrize("harmed", [("data/r",), ("data/s",), ("data/r", "data/s")], ids="+".join)
+@pytest.mark.parametrize("gone", [("data/r",), ("data/s",), ("data/r", "data/s")], ids="+".join)
+def test_all_damaged_objects_are_recomputed_in_one_run(
+    lab: Lab, harmed: tuple[str, ...], gone: tuple[str, ...]
+) -> None:
+    commands = {"data/r": "simulate toy -o data/r --trials 3 --rows 5", "data/s": "scale data/r -o data/s --factor 3"}
+    for command in commands.values():
+        lab.run(command)
+    before = {path: path.read_bytes() for path in Path("data").rglob("*.parquet")}
+    objects = [lab.store.object_path(bytes_digest(before[path])) for path in before if str(path).startswith(harmed)]
+    for name in set(objects):
+        content = bytearray(Path(name).read_bytes())
+        content[len(content) // 2] ^= 1
+        Path(name).unlink()  # the outputs are links to it
+        Path(name).write_bytes(content)
+    for path in before:
+        if str(path).startswith(gone):
+            path.unlink()
+    for directory in gone:
+        lab.run(commands[directory])
+    assert {path: path.read_bytes() for path in Path("data").rglob("*.parquet")} == before

@@ -96,10 +96,22 @@ def settle(store: Store, request: Request, plan: replacing.Plan, work: Work) -> 
         return made
     with store.at_work([*work.reads, *place.named]):
         previous = None if request.rerun else place.previous()
+        result: Manifest | None = None
         try:
-            return place.published(work, work.result(rerun=request.rerun, previous=previous), previous)
-        except MissingError:  # damaged in the store, which shows when it is linked: then it is recomputed
+            result = work.result(rerun=request.rerun, previous=previous)
+            return place.published(work, result, previous)
+        except MissingError:  # An object is damaged, which shows when it is linked: all that are damaged are recomputed
+            if result is not None:
+                _quarantine_damaged(store, result)
             return place.published(work, work.result(rerun=False))
+
+
+def _quarantine_damaged(store: Store, made: Manifest) -> None:
+    """Read all objects of a dataset, so that every damaged one is in quarantine and counts as missing."""
+    for name, size in dict(made.sizes()).items():
+        with suppress(MissingError):
+            for _ in store.blocks(name, size):
+                pass
 
 
 def shown(store: Store, request: Request, work: Work) -> Manifest | Unread | None:
