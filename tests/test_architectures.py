@@ -22,6 +22,7 @@ from tests.conftest import Ran, forget
 
 MODULE = '''
 from dataclasses import dataclass
+from subprocess import run  # which no file of a model may name through this module
 from typing import Any, Literal
 
 from tacpipe.plugins.constraints import PositiveInt
@@ -318,19 +319,14 @@ def test_a_changed_file_of_an_estimator_is_refused_or_read_and_names_of_other_pa
             assert "model.skops" in str(error)
     with zipfile.ZipFile(io.BytesIO(content)) as file:
         members = {name: file.read(name) for name in file.namelist()}
-    call = {
-        "__class__": "system",
-        "__module__": "os",
-        "__loader__": "FunctionNode",
-        "__id__": 1,
-        "content": "os.system",
-    }
-    written, described = io.BytesIO(), json.loads(members["schema.json"])
-    with zipfile.ZipFile(written, "w") as file:
-        for name, own in {**members, "schema.json": json.dumps({**described, **call}).encode()}.items():
-            file.writestr(name, own)
-    with pytest.raises(TacpipeError, match="system"):
-        estimators.unpacked(written.getvalue(), "model.skops", params)
+    for module, name in (("os", "system"), (type(params).__module__, "run")):
+        call = {"__class__": name, "__module__": module, "__loader__": "FunctionNode", "__id__": 1, "content": name}
+        written, described = io.BytesIO(), json.loads(members["schema.json"])
+        with zipfile.ZipFile(written, "w") as file:
+            for member, data in {**members, "schema.json": json.dumps({**described, **call}).encode()}.items():
+                file.writestr(member, data)
+        with pytest.raises(TacpipeError, match=rf"holds {module}\.{name}"):
+            estimators.unpacked(written.getvalue(), "model.skops", params)
 
 
 def test_types_that_are_not_validated_are_refused_unless_the_architecture_trusts_them(package: Path) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import io
 import json
+import pkgutil
 import zipfile
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -130,8 +131,22 @@ def unpacked(content: bytes, name: str, params: Estimator) -> dict[str, Fitted]:
 def _refused(types: Iterable[str], params: Estimator) -> str:
     """Return those of the types that neither the architecture's package has nor the architecture trusts, as text."""
     package = type(params).__module__.partition(".")[0]
-    others = [one for one in types if one.partition(".")[0] != package and one not in params.TRUSTED]
-    return listed([plain(one, 100) for one in others]) if others else ""
+    others = [name for name in types if name not in params.TRUSTED and not _is_defined_in(package, name)]
+    return listed([plain(name, 100) for name in others]) if others else ""
+
+
+def _is_defined_in(package: str, name: str) -> bool:
+    """Return whether a type or function is a package's own, and not one that its modules import from elsewhere.
+
+    A file may name anything that a module of the package holds, as ``package.module.run`` of ``from subprocess import run``.
+    """
+    if name.partition(".")[0] != package:
+        return False
+    try:
+        module = getattr(pkgutil.resolve_name(name), "__module__", None)
+    except (ImportError, AttributeError, ValueError):
+        return False
+    return isinstance(module, str) and module.partition(".")[0] == package
 
 
 def _canonical(content: bytes) -> bytes:
