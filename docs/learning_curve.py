@@ -7,7 +7,7 @@ the best epoch on the validation recordings counts. Results lie in ``.cache/lear
 again. The table is ``docs/tasks/forward-learning.csv``.
 
 ``DATA`` is a dataset of segments (`tacpipe segment contacts`). Options are ``--sizes 8,16,33,0``, 0 being all, ``--draws
-10``, and those of `tacpipe train forward` behind ``--``, as ``-- --architecture mixed``.
+10``, and those of `tacpipe train forward` behind ``--``, as ``-- --members 2``.
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from tacpipe.plugins.stage import Result, Workspace
 
 
-@stage(version=3, requirements=FORWARD_NEEDS)
+@stage(version=4, requirements=FORWARD_NEEDS)
 def forward(
     params: ForwardParams, train: Dataset, val: Dataset, workspace: Workspace, init: Model | None = None
 ) -> Result:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -30,16 +30,6 @@ class Windows(NamedTuple):
     def horizon(self) -> int:
         """How many rows the plan has."""
         return len(self.arm) - len(self.touch)
-
-    def latest(self, context: int) -> Windows:
-        """Return the windows without the rows of the past that are older than the last ``context``."""
-        older = max(self.context - context, 0)
-        return Windows(self.touch[older:], self.arm[older:], self.finger[older:])
-
-    def parts(self, count: int) -> Iterator[Windows]:
-        """Yield the windows, at most ``count`` at a time."""
-        for first in range(0, self.touch.shape[1], count):
-            yield Windows(*(one[:, first : first + count] for one in self))
 
 
 @dataclass(frozen=True)

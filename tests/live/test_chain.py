@@ -34,12 +34,12 @@ KINDS: dict[str, dict[str, Any]] = {
     "increments": {"actions": "none", "codec": "pca", "representation": "increments"},
     "logged": {"actions": "none", "grid": "logged"},
     "fresh": {"actions": "none", "grid": "fresh"},
-    "mixed": {"architecture": "mixed", "actions": "none", "networks": 1, "trees": 6, "history": 30, "frames": 4},
+    "ensemble": {"actions": "none", "members": 2},
 }
 KINDS |= {
     "planned with quantiles": {"calibrated": True},
     "latents with quantiles": {**KINDS["latents"], "calibrated": True},
-    "mixed with quantiles": {**KINDS["mixed"], "calibrated": True},
+    "ensemble with quantiles": {**KINDS["ensemble"], "calibrated": True},
 }
 QUANTILES = {kind: (10, 95) for kind, values in KINDS.items() if "calibrated" in values}
 GAPS = ("t_ns", "xela1_gap", "xela2_gap", "robot_gap")
@@ -99,7 +99,7 @@ def offline(kind: str, forecaster: Forecaster) -> Any:
     return type(shard)(shard.name, table, shard.attributes)
 
 
-@pytest.mark.parametrize("kind", ["raw", "latents", "increments", "logged", "fresh", "mixed"])
+@pytest.mark.parametrize("kind", ["raw", "latents", "increments", "logged", "fresh", "ensemble"])
 def test_forecasts_are_those_of_the_stages_of_the_whole_recording(kind: str, models: dict[str, Made]) -> None:
     made = models[kind]
     forecaster = Forecaster.load(made[0])
@@ -127,7 +127,7 @@ def test_forecasts_are_those_of_the_stages_of_the_whole_recording(kind: str, mod
     assert all((one.count is None) == bool(one.cause & BLOCKING) for one in by_time.values())
 
 
-@pytest.mark.parametrize("kind", ["latents with quantiles", "mixed with quantiles"])
+@pytest.mark.parametrize("kind", ["latents with quantiles", "ensemble with quantiles"])
 def test_quantiles_are_those_of_the_stages_of_the_whole_recording(kind: str, models: dict[str, Made]) -> None:
     forecaster = Forecaster.load(models[kind][0])
     recordings = dataset(offline(kind, forecaster), files=forecaster.codec_files)

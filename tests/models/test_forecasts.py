@@ -11,7 +11,6 @@ from torch import Tensor, nn
 from tacpipe.errors import TacpipeError
 from tacpipe.models.change import ChangeForecast
 from tacpipe.models.forecasts import RecurrentForecast, build
-from tacpipe.models.mixed import MixedForecast, Size
 from tacpipe.models.taxelwise import grid
 from tacpipe.models.windows import ARM, POSE, Windows
 from tacpipe.plugins import registry
@@ -29,9 +28,6 @@ def built(architecture: str, *, changes: bool = False, **changed: Any) -> Any:
     sizes = {**SIZES, **changed}
     if architecture == "recurrent":
         return RecurrentForecast(len(LAYOUT), sizes["hidden"])
-    if architecture == "mixed":
-        shared = {name: sizes[name] for name in ("hidden", "dropout", "context", "horizon")}
-        return MixedForecast(LAYOUT, Size(networks=2, frames=3, trees=4, history=sizes["context"], **shared))
     return build(architecture, len(LAYOUT), LAYOUT, changes=changes, **sizes)
 
 
@@ -62,7 +58,7 @@ def test_an_untrained_model_is_persistence(architecture: str) -> None:
     assert torch.equal(found, given.touch[-1].expand(HORIZON, -1, -1))
 
 
-@pytest.mark.parametrize("architecture", [name for name in CHANGE if name not in ("taxelwise", "mixed")])
+@pytest.mark.parametrize("architecture", [name for name in CHANGE if name != "taxelwise"])
 def test_an_untrained_model_of_increments_tells_none(architecture: str) -> None:
     with torch.no_grad():
         assert not model(architecture, changes=True)(windows()).any()

@@ -98,10 +98,10 @@ class Rolling:
         Where it ``continues`` a session, the first rows depend on rows that it does not know, by velocities and
         latents, and are not read.
         """
-        codec, reads = forecaster.codec, forecaster.reads
+        codec, context = forecaster.codec, forecaster.context
         self._forecaster = forecaster
-        self._latent = np.zeros((reads, len(codec.latents)), np.float32)
-        self._arm, self._finger = np.zeros((reads, ARM), np.float32), np.zeros(reads, np.float32)
+        self._latent = np.zeros((context, len(codec.latents)), np.float32)
+        self._arm, self._finger = np.zeros((context, ARM), np.float32), np.zeros(context, np.float32)
         # rows that the newest row's latents depend on
         frames = int(getattr(codec, "frames", 1)) + (codec.representation == INCREMENTS)
         self._levels = np.zeros((frames, len(codec.channels)))
@@ -169,8 +169,5 @@ class Rolling:
 
     def _windows(self, plan: AnyFloats) -> Windows:
         """Return the rows that are read, and the arm's planned ones, as one window."""
-        reads = self._forecaster.reads
-        past = np.maximum(np.arange(reads), reads - self._run)  # before the first usable row that one is repeated
-        arm = np.concatenate([self._arm[past], plan.astype(np.float32)])
-        read = (self._latent[past], arm, self._finger[past])
-        return Windows(*(torch.from_numpy(np.ascontiguousarray(one[:, None])) for one in read))
+        parts = (self._latent, np.concatenate([self._arm, plan.astype(np.float32)]), self._finger)
+        return Windows(*(torch.from_numpy(part[:, None].copy()) for part in parts))

@@ -19,6 +19,7 @@ from tacpipe.codecs import stored
 from tacpipe.codecs.frame_stacking import INCREMENTS
 from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError
+from tacpipe.models.ensemble import Shrunk
 from tacpipe.models.linear import Baselines
 from tacpipe.models.windows import ARM, POSE, Windows, motion
 from tacpipe.plugins import params as params_of
@@ -51,6 +52,7 @@ NEEDED: dict[str, model_files.Kind] = {
     "largest_level": (float, model_files.NONE),  # which older models lack
 }
 CONFIG, WEIGHTS, BASELINES = "config.json", "model.safetensors", "baselines.safetensors"
+SHRINKAGE = "shrinkage"  # tensor of the weights file, (horizon,): see `Shrunk`; models of levels and older ones lack it
 
 
 class WindowArrays(NamedTuple):
@@ -78,11 +80,6 @@ class Forecaster:
     def context(self) -> int:
         """How many rows of the past the model reads."""
         return self.params.context
-
-    @property
-    def reads(self) -> int:
-        """How many rows of the past it is given where there are as many; the first one is repeated where not."""
-        return self.params.reads
 
     @property
     def horizon(self) -> int:
@@ -182,8 +179,11 @@ class Forecaster:
         inputs = config["inputs"]
         raw = codecs.Raw(tuple(inputs["tactile"]), tuple(inputs["layout"]))
         codec: codecs.Codec = raw if config["codec"]["kind"] == "raw" else stored.load(files)
-        model = model_files.filled(lambda: networks.build(params, codec), model_files.tensors(files[WEIGHTS], WEIGHTS))
+        tensors = model_files.tensors(files[WEIGHTS], WEIGHTS)
+        shrinkage = tensors.pop(SHRINKAGE, None)
+        model = model_files.filled(lambda: networks.build(params, codec), tensors)
         with model_files.validated("the model"):
+            model = model if shrinkage is None else Shrunk(model, shrinkage)
             found = model_files.arrays(files[BASELINES], BASELINES) if BASELINES in files else None
             codec_files = (
                 {} if codec.kind == "raw" else {name: files[name] for name in (codecs.DESCRIPTION, codecs.TENSORS)}
@@ -306,18 +306,14 @@ class Forecaster:
     def _parts(self, window: AnyFloats, plan: AnyFloats) -> tuple[AnyFloats, AnyFloats, AnyFloats]:
         """Return touch (window, context, channel), arm (window, row, 13) and finger (window, context), as float32."""
         channels, posed, derived = len(self.codec.channels), len(self.pose.columns), len(self.derived_columns)
-        past = f"{self.context} to {self.reads}" if self.reads > self.context else f"{self.context}"
-        for name, given, rows, said, before, widths in (
-            (
-                *("window", window, range(self.context, self.reads + 1), past, channels),
-                (channels + posed + derived + 1, channels + posed),
-            ),
-            ("plan", plan, (self.horizon,), f"{self.horizon}", 0, (posed + derived, posed)),
+        for name, given, rows, before, widths in (
+            ("window", window, self.context, channels, (channels + posed + derived + 1, channels + posed)),
+            ("plan", plan, self.horizon, 0, (posed + derived, posed)),
         ):
-            if given.ndim != 3 or given.shape[1] not in rows or given.shape[2] not in widths:
+            if given.ndim != 3 or given.shape[1] != rows or given.shape[2] not in widths:
                 raise TacpipeError(
-                    f"The {name} has the shape {given.shape}; this model reads {said} rows of {widths[0]} columns, or "
-                    f"of {widths[1]} without velocities: (windows, {said}, columns), or one window without its axis."
+                    f"The {name} has the shape {given.shape}; this model reads {rows} rows of {widths[0]} columns, or "
+                    f"of {widths[1]} without velocities: (windows, {rows}, columns), or one window without its axis."
                 )
             if not np.isfinite(given).all():
                 at = np.argwhere(~np.isfinite(given))[0]
@@ -338,8 +334,6 @@ class Forecaster:
         arm = np.concatenate([window[..., channels : channels + plan.shape[2]], plan], axis=1)
         arm = np.stack([self._arm(_posed(one, posed), whole and derived > 0) for one in arm])
         touch = np.ascontiguousarray(window[..., :channels], dtype=np.float32)
-        missing = self.reads - window.shape[1]
-        touch, arm, finger = (_repeated(one, missing) for one in (touch, arm, finger))
         return touch, arm.astype(np.float32), finger.astype(np.float32)
 
     def _arm(self, rows: AnyFloats, whole: bool) -> AnyFloats:
@@ -349,11 +343,6 @@ class Forecaster:
             t_ns = np.rint(np.arange(len(rows)) * 1e9 / self.config["rate_hz"]).astype(np.int64)
             rows = np.hstack([rows, kinematics.differences(t_ns, rows[:, :3], rows[:, 3:])])
         return tracks.aligned(rows, self.orientation)
-
-
-def _repeated(rows: AnyFloats, times: int) -> AnyFloats:
-    """Return the ``rows`` (window, row, …) with the first of each window so many ``times`` more before it."""
-    return np.concatenate([np.repeat(rows[:, :1], times, axis=1), rows], axis=1) if times else rows
 
 
 def _posed(rows: AnyFloats, columns: int) -> AnyFloats:

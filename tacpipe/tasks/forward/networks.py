@@ -10,6 +10,7 @@ from tacpipe.codecs.frame_stacking import INCREMENTS
 from tacpipe.errors import TacpipeError
 from tacpipe.models import forecasts
 from tacpipe.models.change import PlainForecast
+from tacpipe.models.ensemble import Ensemble
 from tacpipe.models.windows import Shape, Windows
 from tacpipe.tasks.forward.params import Forward
 
@@ -21,14 +22,20 @@ def shape(params: Forward, codec: codecs.Codec) -> Shape:
     """Return what a network for the codec's features reads and predicts."""
     where = codec.layout if codec.kind == "raw" else ()
     changes = codec.representation == INCREMENTS
-    return Shape(len(codec.latents), params.reads, params.horizon, tuple(where), changes)
+    return Shape(len(codec.latents), params.context, params.horizon, tuple(where), changes)
 
 
 def build(params: Forward, codec: codecs.Codec) -> nn.Module:
-    """Return the network that ``params`` build, of random weights, for the codec's features; a plain one between scales.
+    """Return the network that ``params`` build, of random weights, for the codec's features; several as an `Ensemble`.
 
     Raises `TacpipeError` where they build something else.
     """
+    members = [_member(params, codec) for _ in range(params.members)]
+    return members[0] if len(members) == 1 else Ensemble(members)
+
+
+def _member(params: Forward, codec: codecs.Codec) -> nn.Module:
+    """Return one network that scales itself; a plain one is put between scales."""
     given = shape(params, codec)
     made = params.build(given)
     if not isinstance(made, nn.Module):

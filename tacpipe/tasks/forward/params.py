@@ -50,23 +50,17 @@ class Forward(ABC):
     baselines: bool = True  # fit the linear baselines too, for evaluate to compare with
     # of products in training; bfloat16 takes half the memory and rounds to 3 digits, weights stay in float32
     precision: Precision = added("float32")
+    # networks of random weights of their own that are trained, and whose forecasts are averaged
+    members: PositiveInt = added(1)
     arm: str = added("")  # stream whose position and orientation are the motion; empty: the only one with a position
     PANELS: ClassVar[Panels] = {
-        "Model": (
-            *("architecture", "actions", "hidden", "dropout", "context", "horizon"),
-            *("networks", "frames", "history", "trees"),
-        ),
+        "Model": ("architecture", "members", "actions", "hidden", "dropout", "context", "horizon"),
         "Training": (
             *("loss", "epochs", "batch", "learning_rate", "cycle", "patience", "gradient_clip"),
-            *("precision", "seed", "baselines", "boosted"),
+            *("precision", "seed", "baselines"),
         ),
         "Data": ("windows", "stride", "arm"),
     }
-
-    @property
-    def reads(self) -> int:
-        """How many rows of the past a network is given: those that a window needs, and older ones where there are any."""
-        return self.context
 
     @abstractmethod
     def build(self, shape: Shape) -> nn.Module:
@@ -149,47 +143,6 @@ class Recurrent(Forward):
         from tacpipe.models.forecasts import RecurrentForecast
 
         return RecurrentForecast(shape.features, self.hidden)
-
-
-@dataclass(frozen=True)
-class Mixed(Forward):
-    """Networks that read the newest frames, a taxelwise one and gradient boosting, blended with persistence.
-
-    Weights of the blend are fitted for each step on the validation recordings.
-    """
-
-    # model: mixed blends networks of new frames, a taxelwise one, boosted trees and persistence
-    architecture: Literal["mixed"] = "mixed"
-    epochs: PositiveInt = 8  # maximum number of passes over the training windows
-    dropout: Dropout = 0.2  # fraction of units left out of each training step
-    networks: Annotated[int, Range(0)] = 3  # networks that read new frames, next to one taxelwise
-    # newest frames that they and the trees read; rows that repeat the one before do not count
-    frames: Annotated[int, Range(2)] = 8
-    history: PositiveInt = 50  # past rows that are read where there are as many; the first is repeated where not
-    trees: Annotated[int, Range(0)] = 0  # of a gradient boosting next to the networks; 0: none
-    boosted: PositiveInt = 4000  # training windows that trees are fitted on at most
-    PRESETS: ClassVar[Presets] = {"quick": {"hidden": 32, "epochs": 3, "networks": 1}}
-
-    @property
-    def reads(self) -> int:
-        """How many rows of the past the networks are given."""
-        return max(self.history, self.context)
-
-    def build(self, shape: Shape) -> nn.Module:
-        """Return networks of random weights, and trees that predict no change; `MixedForecast.complete` fits these."""
-        from tacpipe.models.mixed import MixedForecast, Size
-
-        size = Size(
-            networks=self.networks,
-            frames=self.frames,
-            trees=self.trees,
-            hidden=self.hidden,
-            context=self.context,
-            history=self.reads,
-            horizon=self.horizon,
-            dropout=self.dropout,
-        )
-        return MixedForecast(shape.layout, size)
 
 
 Params = Forward  # of any architecture

@@ -91,8 +91,8 @@ def inputs(forecaster: Forecaster, recordings: Dataset) -> WindowArrays:
     track = tracks.track(shard, forecaster.codec, forecaster.pose)
     check_rate(track, forecaster)
     starts = track.starts(forecaster.context, forecaster.horizon)
-    past = track.past(starts, forecaster.context, forecaster.reads)
-    ahead = starts[:, None] + np.arange(forecaster.context, forecaster.context + forecaster.horizon)
+    window_rows = starts[:, None] + np.arange(forecaster.context + forecaster.horizon)
+    past, ahead = np.split(window_rows, [forecaster.context], axis=1)
     read = [*range(len(forecaster.pose.columns)), *(range(POSE, ARM) if forecaster.derived_columns else ())]
     arm = track.arm[:, read].astype(np.float64)
     window = np.concatenate([track.tactile[past], arm[past], track.finger[past][..., None]], axis=-1)

@@ -67,12 +67,11 @@ def forecasts(forecaster: Forecaster, track: Track, starts: Int64s) -> Iterator[
 
 def _forecast(forecaster: Forecaster, track: Track, some: Int64s) -> Forecast:
     """Return the model's predictions for some windows, those that begin at ``some``, in order."""
-    context, horizon, reads = forecaster.context, forecaster.horizon, forecaster.reads
+    context, horizon = forecaster.context, forecaster.horizon
     past, future = (some[:, None] + np.arange(*ends) for ends in ((0, context), (context, context + horizon)))
-    begins = max(int(some[0]) + context - reads, 0)
-    block = track.between(begins, int(some[-1]) + context + horizon)
-    found = rows([block], [some - begins], context, horizon, reads=reads)
-    windows = found.pick(found.starts)[0]
+    block = track.between(int(some[0]), int(some[-1]) + context + horizon)
+    block_rows = rows([block], [some - some[0]], context, horizon)
+    windows = block_rows.pick(block_rows.starts)[0]
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)  # a control is evaluated with the same shuffled plans each time
         features = forecaster.features(windows)
@@ -118,7 +117,7 @@ class _Predictions(Mapping[str, Prediction]):
         past = track.tactile[some.past]
         yield "context_mean", Prediction(None, _held(past.mean(axis=1), forecaster.horizon))
         if forecaster.baselines is not None:
-            moved = motion(some.windows.latest(forecaster.context))[0].transpose(0, 1).numpy()
+            moved = motion(some.windows)[0].transpose(0, 1).numpy()
             past = past.astype(np.float32)
             for name, counts in forecaster.baselines.each(past, moved):
                 yield name, Prediction(None, counts)

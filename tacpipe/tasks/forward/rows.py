@@ -32,8 +32,6 @@ class Rows:
     context: int
     horizon: int
     actions: str = "planned"
-    reads: int = 0  # rows of the past that windows have, at least `context`
-    begins: Tensor | None = None  # (time,), the first row that may be read with each; None where `reads` is `context`
     aside: MappedArrays | None = None  # what the rows lie in
 
     @property
@@ -44,21 +42,24 @@ class Rows:
     def pick(self, starts: Tensor) -> tuple[Windows, Tensor]:
         """Return the windows that begin at ``starts`` (window,) and their future tactile signals (horizon, window,
         feature)."""
-        reads = max(self.reads, self.context)
-        steps = torch.arange(self.context - reads, self.context + self.horizon, device=starts.device)
+        steps = torch.arange(self.context + self.horizon, device=starts.device)
         rows = steps[:, None] + starts  # (row, window)
-        if self.begins is not None:
-            rows = torch.maximum(rows, self.begins[starts + self.context - 1])
         touch, arm = (one.index_select(0, rows.flatten()).view(*rows.shape, -1) for one in (self.touch, self.arm))
         if self.aside is not None:
             self.aside.read(touch.nbytes + arm.nbytes)
-        return Windows(touch[:reads], arm, self.finger[rows[:reads]]), touch[reads:]
+        return Windows(touch[: self.context], arm, self.finger[rows[: self.context]]), touch[self.context :]
 
     def loss(self, model: nn.Module, indices: Tensor) -> Tensor:
         """Return the mean loss of the windows with these indices."""
         picked, ahead = self.pick(self.starts[indices.to(self.starts.device)])
         lost: Tensor = model.loss(acted(picked, self.actions), ahead)  # type: ignore[operator]
         return lost
+
+    @property
+    def recordings(self) -> int:
+        """How many recordings have a window."""
+        ends = np.cumsum([len(track.t_ns) for track in self.tracks])
+        return len(np.unique(np.searchsorted(ends, self.starts.cpu().numpy(), side="right")))
 
     def tactile(self, rows: Int64s) -> AnyFloats:
         """Return the counts above rest (window, row, channel) of windows of ``rows`` (window, row), each of one track."""
@@ -85,13 +86,11 @@ def rows(
     *,
     actions: str = "planned",
     device: str = "cpu",
-    reads: int = 0,
     aside: MappedArrays | None = None,
 ) -> Rows:
     """Return the rows of all tracks and the windows that begin at ``starts``, counted within each track.
 
-    A window has ``reads`` rows of the past, or ``context`` if that is more; see `Track.past`. The rows lie in ``aside``
-    where it is given. Raises `StorageError` where its disk is full.
+    The rows lie in ``aside`` where it is given. Raises `StorageError` where its disk is full.
     """
     if actions not in ACTIONS:
         raise TacpipeError(f"There are no actions {actions!r}; there are {', '.join(ACTIONS)}.")
@@ -115,11 +114,7 @@ def rows(
         for values in (stacked("latent", features), stacked("arm", (windows_of.ARM,)), stacked("finger", ()))
     )
     first = torch.from_numpy(np.concatenate([np.zeros(0, np.int64), *begins])).to(device)
-    if reads <= context:
-        return Rows(touch, arm, finger, tracks, first, context, horizon, actions, aside=aside)
-    own = [one.begins() + offset for one, offset in zip(tracks, offsets, strict=False)]
-    earliest = torch.from_numpy(np.concatenate([np.zeros(0, np.int64), *own])).to(device)
-    return Rows(touch, arm, finger, tracks, first, context, horizon, actions, reads, earliest, aside)
+    return Rows(touch, arm, finger, tracks, first, context, horizon, actions, aside)
 
 
 def acted(windows: Windows, actions: str) -> Windows:

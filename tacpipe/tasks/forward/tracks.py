@@ -64,20 +64,6 @@ class Track:
         """Return the first rows of all windows of ``context + horizon`` rows (window,)."""
         return window_starts(self.groups, self.usable, context, horizon, stride)
 
-    def past(self, starts: Int64s, context: int, reads: int) -> Int64s:
-        """Return the rows before those to come (window, reads) of windows of ``context`` rows that begin at ``starts``.
-
-        Where fewer than ``reads`` rows follow one another without a gap, the first of them is repeated.
-        """
-        now = starts[:, None] + context - 1
-        past: Int64s = np.maximum(now - np.arange(reads)[::-1], self.begins()[now])
-        return past
-
-    def begins(self) -> Int64s:
-        """Return the first of the usable rows that follow one another up to each row (time,)."""
-        apart = np.r_[True, (np.diff(self.groups) != 0) | ~self.usable[:-1]][: len(self.groups)]
-        return np.maximum.accumulate(np.where(apart, np.arange(len(apart)), 0))
-
     def between(self, first: int, last: int) -> Track:
         """Return the rows from ``first`` to before ``last``."""
 

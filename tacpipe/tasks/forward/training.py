@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
+import torch
 from safetensors.numpy import save as save_arrays
 from safetensors.torch import save as save_tensors
-from torch import nn
+from torch import Tensor, nn
 
 from tacpipe.arrays import AnyFloats, Int64s
 from tacpipe.channels import masks
@@ -22,14 +23,16 @@ from tacpipe.codecs.frame_stacking import INCREMENTS
 from tacpipe.errors import TacpipeError
 from tacpipe.io.mapped import MappedArrays
 from tacpipe.models import forecasts
+from tacpipe.models.ensemble import Shrunk, persistence_weights
 from tacpipe.models.linear import Baselines
-from tacpipe.models.windows import motion
+from tacpipe.models.windows import Windows, motion
 from tacpipe.plugins import params as params_of
-from tacpipe.tasks.forward import completion, networks, tracks, units
+from tacpipe.tasks.forward import networks, tracks, units
 from tacpipe.tasks.forward.alarms import Loads
 from tacpipe.tasks.forward.forecaster import (
     BASELINES,
     CONFIG,
+    SHRINKAGE,
     TASK,
     WEIGHTS,
     Config,
@@ -39,7 +42,7 @@ from tacpipe.tasks.forward.forecaster import (
 )
 from tacpipe.tasks.forward.params import Change, Params
 from tacpipe.tasks.forward.predictors import predicted
-from tacpipe.tasks.forward.rows import Rows, rows
+from tacpipe.tasks.forward.rows import Rows, acted, rows
 from tacpipe.tasks.forward.tracks import Track
 from tacpipe.tasks.seen import seen
 from tacpipe.training import devices, loop, scaling
@@ -53,6 +56,7 @@ CALIBRATED = 16_384  # windows that scales are fitted on, evenly spread: they ov
 BLOCK_ROWS = 1 << 14  # that are looked at at once
 IN_MEMORY = 1 << 27  # bytes of rows of recordings, before they lie on disk
 LINEAR = 20_000  # windows that the linear baselines are fitted on
+SHRINKING = 3000  # validation windows that the weights of the forecast are fitted on at most, evenly spread
 
 
 def train(
@@ -99,7 +103,7 @@ def train(
     build = partial(_built, params, codec, known, start, device)
     schedule = loop.Schedule.of(params, params.seed, params.gradient_clip)
     trained = loop.train(build, loop.Windows(known.part, watched.part, params.batch), schedule, workspace)
-    weights = completion.completed(trained.weights, params, codec, known, watched)
+    weights = trained.weights | _shrinkage(trained.weights, params, codec, watched)
     best = min(trained.history, key=lambda line: line["val_loss"])
     config: Config = {
         **_description(params, codec, pose, unit, reference),
@@ -138,6 +142,21 @@ def _built(params: Params, codec: codecs.Codec, known: Rows, start: Forecaster |
     if start:
         _take_over(model, start)
     return model
+
+
+@torch.no_grad()
+def _shrinkage(weights: dict[str, Tensor], params: Params, codec: codecs.Codec, watched: Rows) -> dict[str, Tensor]:
+    """Return the weight of the forecast at each step, fitted on validation windows; nothing for a forecast of levels."""
+    model = networks.build(params, codec).eval()
+    if not model.change_only:
+        return {}
+    model.load_state_dict(weights)
+    windows, ahead = watched.pick(watched.some(SHRINKING))
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(params.seed)  # of shuffled plans
+        windows = Windows(*(part.cpu() for part in acted(windows, watched.actions)))
+    ahead, now = ahead.cpu(), windows.touch[-1]
+    return {SHRINKAGE: persistence_weights(model(windows) - now, ahead - now, watched.recordings)}
 
 
 def _description(params: Params, codec: codecs.Codec, pose: Pose, unit: str, reference: AnyFloats) -> Config:
@@ -204,7 +223,7 @@ def _windows(part: Sequence[Track], params: Params, stride: int, device: str, as
     """Return the rows of a part and its windows, all or those in contact."""
     context, horizon = params.context, params.horizon
     starts = [(one.starts if params.windows == "all" else one.contact_starts)(context, horizon, stride) for one in part]
-    return rows(part, starts, context, horizon, actions=params.actions, device=device, reads=params.reads, aside=aside)
+    return rows(part, starts, context, horizon, actions=params.actions, device=device, aside=aside)
 
 
 def _linear(part: Rows) -> tuple[AnyFloats, AnyFloats, AnyFloats]:
@@ -212,7 +231,7 @@ def _linear(part: Rows) -> tuple[AnyFloats, AnyFloats, AnyFloats]:
     starts = part.some(LINEAR)
     at = starts.cpu().numpy()[:, None]
     past, ahead = at + np.arange(part.context), at + np.arange(part.context, part.context + part.horizon)
-    moved = motion(part.pick(starts)[0].latest(part.context))[0].transpose(0, 1).cpu().numpy()
+    moved = motion(part.pick(starts)[0])[0].transpose(0, 1).cpu().numpy()
     return part.tactile(past), moved, part.tactile(ahead)
 
 
@@ -306,7 +325,7 @@ def _check_start(
     recordings: Mapping[str, bytes],
 ) -> None:
     """Raise `TacpipeError` where the model to begin with does not fit what is to be trained."""
-    for name in ("architecture", "hidden", "context", "horizon"):
+    for name in ("architecture", "members", "hidden", "context", "horizon"):
         found, wanted = getattr(start.params, name), getattr(params, name)
         if found != wanted:
             raise TacpipeError(
@@ -325,14 +344,17 @@ def _check_start(
 
 def _take_over(model: nn.Module, start: Forecaster) -> None:
     """Give a network the weights of the model to begin with. Raises `TacpipeError` where they are of other shapes."""
-    own, known = ({name: tuple(one.shape) for name, one in of.state_dict().items()} for of in (model, start.model))
-    for name in sorted({*own, *known}):
-        if own.get(name) != known.get(name):
+    network = start.model.network if isinstance(start.model, Shrunk) else start.model
+    shapes, expected = (
+        {name: tuple(weight.shape) for name, weight in each.state_dict().items()} for each in (network, model)
+    )
+    for name in sorted({*shapes, *expected}):
+        if shapes.get(name) != expected.get(name):
             raise TacpipeError(
-                f"The weights {name} of the model of --init are {known.get(name, 'not there')} and should be "
-                f"{own.get(name, 'not there')}. Train with the params that it was trained with, or begin without --init."
+                f"The weights {name} of the model of --init are {shapes.get(name, 'missing')} and should be "
+                f"{expected.get(name, 'missing')}. Train with the params that it was trained with, or begin without --init."
             )
-    model.load_state_dict(start.model.state_dict())
+    model.load_state_dict(network.state_dict())
 
 
 def notes(params: Params, files: Mapping[str, bytes]) -> list[str]:

@@ -112,9 +112,8 @@ def window_signs(
 ) -> Float32s:
     """Return `signs.signs` of windows as a forecaster reads them, their levels (window, context, channel) and forecast.
 
-    Rows older than those of ``past`` are not looked at, nor the plan for a model that reads none or a wrong one.
+    The plan is not looked at for a model that reads none or a wrong one.
     """
-    windows = windows.latest(past.shape[1])
     windows = windows if actions == "planned" else without_plan(windows)
     arm, finger = windows.arm.transpose(0, 1).numpy(), windows.finger.T.numpy()
     return signs(past, ahead, arm, finger, scale)

@@ -17,7 +17,7 @@ from tacpipe.tasks.forward import prediction
 from tacpipe.tasks.forward import task as forward
 from tests.fake_recordings import dataset
 from tests.stages.learning_fakes import CHANNELS, motion
-from tests.tasks.forward.trials import HORIZON, MIXED, asked, compressed, evaluated, predicted_windows, trained
+from tests.tasks.forward.trials import ENSEMBLE, HORIZON, asked, compressed, evaluated, predicted_windows, trained
 
 TEST = motion(20)
 PERCENTS = (10, 50, 90)
@@ -66,7 +66,7 @@ def test_the_table_and_arrays_have_the_same_quantiles(model: dict[str, bytes]) -
     assert np.allclose(one[..., 0], arrays[0, ..., 2], rtol=1e-4, atol=0.05)
 
 
-@pytest.mark.parametrize("changed", [MIXED, {"actions": "none"}])
+@pytest.mark.parametrize("changed", [ENSEMBLE, {"actions": "none"}])
 def test_table_and_arrays_have_the_same_quantiles_where_older_rows_or_no_plan_are_read(
     changed: dict[str, Any], tmp_path: Path
 ) -> None:

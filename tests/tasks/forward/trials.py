@@ -28,7 +28,7 @@ from tests.stages.learning_fakes import CHANNELS, REST, motion, table
 CONTEXT, HORIZON = 5, 4
 LENGTH = CONTEXT + HORIZON
 SMALL = {"architecture": "gru", "hidden": 16, "epochs": 2, "batch": 64, "context": CONTEXT, "horizon": HORIZON}
-MIXED = {"architecture": "mixed", "networks": 1, "trees": 6, "history": 8, "frames": 4}  # next to those
+ENSEMBLE = {"members": 2}
 
 
 def params(**changed: Any) -> Any:

@@ -1,0 +1,89 @@
+"""The mean of several networks, and the weights that shrink it towards persistence."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given as each
+from hypothesis import strategies as st
+from torch import Tensor, nn
+
+from tacpipe.models.ensemble import Ensemble, Shrunk, persistence_weights
+from tacpipe.models.forecasts import build
+from tacpipe.models.windows import Windows
+from tests.models.window_fakes import CONTEXT, HORIZON, LAYOUT, ahead, windows
+
+
+def network(seed: int) -> nn.Module:
+    """A network that no longer begins at persistence."""
+    torch.manual_seed(seed)
+    sizes = {"hidden": 8, "dropout": 0.0, "loss": "absolute", "context": CONTEXT, "horizon": HORIZON}
+    member = build("gru", len(LAYOUT), LAYOUT, changes=False, **sizes)  # type: ignore[arg-type]
+    for weight in member.parameters():
+        nn.init.normal_(weight, std=0.3)
+    return member.eval()
+
+
+def calibrated(count: int) -> tuple[list[nn.Module], Ensemble, Windows]:
+    members, inputs = [network(seed) for seed in range(count)], windows(40)
+    ensemble = Ensemble(members)
+    ensemble.calibrate(inputs, ahead(inputs))
+    return members, ensemble.eval(), inputs
+
+
+@torch.no_grad()
+def test_the_forecast_of_an_ensemble_is_the_mean_of_its_members() -> None:
+    members, ensemble, inputs = calibrated(3)
+    expected = np.mean([member(inputs).numpy() for member in members], axis=0)
+    np.testing.assert_allclose(ensemble(inputs).numpy(), expected, rtol=1e-5, atol=1e-4)
+
+
+def test_each_member_gets_the_gradient_that_it_would_get_alone() -> None:
+    members, ensemble, inputs = calibrated(2)
+    ensemble.loss(inputs, ahead(inputs)).backward()  # type: ignore[no-untyped-call]
+    together = [weight.grad for weight in members[1].parameters()]
+    members[1].zero_grad()
+    members[1].loss(inputs, ahead(inputs)).backward()  # type: ignore[operator]
+    for weight, half in zip(members[1].parameters(), together, strict=True):
+        if weight.grad is not None:
+            assert half is not None
+            torch.testing.assert_close(weight.grad / 2, half)
+
+
+@torch.no_grad()
+def test_a_shrunk_forecast_is_no_worse_than_persistence_at_any_step_of_the_windows_it_was_shrunk_on() -> None:
+    _, ensemble, inputs = calibrated(2)
+    truth = ahead(inputs)
+    errors = (ensemble(inputs) - truth).abs().mean((1, 2))
+    persistence = (inputs.touch[-1] - truth).abs().mean((1, 2))
+    assert (errors > persistence).any()  # these networks were not trained
+    now = inputs.touch[-1]
+    shrunk = Shrunk(ensemble, persistence_weights(ensemble(inputs) - now, truth - now, recordings=3))
+    assert ((shrunk(inputs) - truth).abs().mean((1, 2)) <= persistence * (1 + 1e-6)).all()
+
+
+@each(
+    st.integers(0, 1000),
+    st.integers(1, 30),
+    st.floats(-3, 3, allow_nan=False),
+)
+def test_weights_lie_between_persistence_and_the_forecast_and_never_raise_the_error(
+    seed: int, recordings: int, gain: float
+) -> None:
+    generator = np.random.default_rng(seed)
+    measured = torch.from_numpy(generator.normal(size=(3, 5, 4)))
+    changes = gain * measured + torch.from_numpy(generator.normal(size=(3, 5, 4)))
+    weights = persistence_weights(changes, measured, recordings)
+    assert ((weights >= 0) & (weights <= recordings / (recordings + 1))).all()
+
+    def error(weight: Tensor) -> Tensor:
+        return (measured - weight[:, None, None] * changes).abs().mean((1, 2))
+
+    assert (error(weights.double()) <= error(torch.zeros(3, dtype=torch.float64)) + 1e-9).all()
+
+
+@pytest.mark.parametrize(("recordings", "expected"), [(1, 0.5), (4, 0.8), (99, 0.99)])
+def test_a_perfect_forecast_is_shrunk_more_the_fewer_recordings_show_it(recordings: int, expected: float) -> None:
+    measured = torch.randn(2, 6, 3, generator=torch.Generator().manual_seed(0))
+    assert persistence_weights(measured, measured, recordings).tolist() == pytest.approx([expected] * 2)
