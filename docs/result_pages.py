@@ -75,7 +75,6 @@ def published(params: dict[str, Any], data: Path) -> dict[str, Any]:
     folder = {name: data / name for names in SETS.values() for name in names}
     forward, material, touch = (dict(params[task]) for task in SETS)
     forward["recordings"] = f"ingest xela-flat {folder['xela_flat_pick_move']} --replace"
-    forward["synchronize"] = {**forward["synchronize"], "grid": "logged"}
     material = _by_authors(material)
     material["sources"] = {
         "biotac": f"ingest biotac-slide {folder['biotac_slide_20_50']} --replace",

@@ -32,6 +32,8 @@ class Params:
     steps: Annotated[str, STEPS] = "1,3,5,10"  # steps ahead
     # read no sample that had not arrived yet, as a live session; give recordings as they were recorded
     causal: bool = added(False)
+    # of --causal: also for a model that was trained on rows that look ahead
+    allow_look_ahead: bool = added(False)
     # levels in percent of quantiles to add, of a model that `tacpipe calibrate` made, as 10,50,90; empty: none
     quantiles: Annotated[str, CommaList(PositiveInt)] = added("")
     # of material: add calibrated probabilities and the answer, a name or unknown, of a model that `tacpipe calibrate` made
@@ -50,7 +52,7 @@ def predict(params: Params, model: Model, recordings: Dataset) -> Result:
     steps = sorted(set(STEPS.items(params.steps)))
     quantiles = sorted(set(CommaList(PositiveInt).items(params.quantiles)))
     if params.causal:
-        return _causal(model, recordings, steps, quantiles)
+        return _causal(params, model, recordings, steps, quantiles)
     task = model_files.task(model.files)
     with model_files.validated("the model"):
         result: Result = task.predict(model.files, recordings, steps, **_asked(task, params, quantiles))
@@ -70,7 +72,7 @@ def _asked(task: Any, params: Params, quantiles: list[int]) -> dict[str, Any]:
     return given
 
 
-def _causal(model: Model, recordings: Dataset, steps: list[int], quantiles: list[int]) -> Result:
+def _causal(params: Params, model: Model, recordings: Dataset, steps: list[int], quantiles: list[int]) -> Result:
     from tacpipe.datasets import model_files
     from tacpipe.errors import UsageError
     from tacpipe.live import material_replay, replay
@@ -84,4 +86,4 @@ def _causal(model: Model, recordings: Dataset, steps: list[int], quantiles: list
     with model_files.validated("the model"):
         if name == "material":
             return material_replay.predict(model, recordings)
-        return replay.predict(model, recordings, steps, quantiles)
+        return replay.predict(model, recordings, steps, quantiles, allow_look_ahead=params.allow_look_ahead)

@@ -14,7 +14,7 @@ DIGITS = {"double": 6, "float": 4}  # of a column's largest value: another machi
 RAW = "simulate touch --raw --trials 2 --seed 7 -o raw"  # what `segment grasps` reads; its values are in those below
 COMMANDS = {
     "simulate.forward": "simulate forward --trials 3 --duration-s 4 --seed 7 -o {0}",
-    "synchronize": "synchronize simulate.forward -o {0}",
+    "synchronize": "synchronize simulate.forward --rate-hz 50 --values interpolate -o {0}",
     "segment.contacts": "segment contacts synchronize -o {0}",
     "segment.slips": "segment slips segment.contacts -o {0}",
     "simulate.material": "simulate material --trials 12 --materials 3 --seed 7 -o {0}",

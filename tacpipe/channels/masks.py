@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 GRID = "grid"  # attribute of a synchronized recording: uniform, logged or fresh
 GAP = "_gap"  # how the masks of gaps end
 GAP_MS = "_gap_ms"  # how the attributes of a synchronized recording end that hold the longest time without a gap
+LOOK_AHEAD_MEAN, LOOK_AHEAD_MAX = "look_ahead_mean_ms", "look_ahead_max_ms"  # attributes of a synchronized recording
 MANY = 0.05  # fraction of rows in gaps of a stream, above which a user is warned
 _APART = {"logged": 3.0, "fresh": 3.0}  # times the median step, by grid: further apart, rows are missing between
 _UNIFORM = 1.5

@@ -128,6 +128,10 @@ def add(program: typer.Typer, summary: str) -> None:
                 "--realtime/--no-realtime", help="Real-time scheduling of the session, where the system allows it."
             ),
         ] = None,
+        allow_look_ahead: Annotated[
+            bool | None,
+            typer.Option("--allow-look-ahead", help="Accept a model that was trained on rows that look ahead."),
+        ] = None,
         quiet: Annotated[bool, typer.Option("--quiet", help="Print only errors on stderr.")] = False,
         as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
     ) -> None:
@@ -155,6 +159,7 @@ def add(program: typer.Typer, summary: str) -> None:
             "rank": rank,
             "settle_ms": settle_ms,
             "realtime": realtime,
+            "allow_look_ahead": allow_look_ahead,
         }
         asked = Settings.of(read.live, str(rig), given)
         prepared = preparation.prepared(read, asked)

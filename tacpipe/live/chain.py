@@ -18,7 +18,7 @@ import numpy as np
 from tacpipe.arrays import AnyFloats, Float32s, Floats, Times
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.live.sources import Layout, plan_table
-from tacpipe.live.stages import causal_stages
+from tacpipe.live.stages import causal_stages, refuse_look_ahead
 from tacpipe.live.targets import Targets, facing
 from tacpipe.models.threads import one_thread
 from tacpipe.models.windows import ARM
@@ -129,7 +129,7 @@ class Chain:
         sync = stages.synchronize
         gap_ns = {stream: round(_gap_ms(sync, forecaster, stream) * 1e6) for stream in layout.readings}
         origin_ns = None if beginning is None else beginning.origin_ns
-        self._grid = Grid(layout.readings, layout.master, sync.grid, sync.rate_hz, gap_ns, origin_ns)
+        self._grid = Grid(layout.readings, layout.master, sync.timeline, sync.rate_hz, gap_ns, origin_ns)
         if beginning is not None:
             for stream, levels in layout.levels(beginning.rest).items():
                 self._grid.continue_from(stream, levels)
@@ -156,6 +156,8 @@ class Chain:
         beginning: Beginning | None = None,
         plan_from: str = "",
         quantiles: Sequence[int] = (),
+        *,
+        allow_look_ahead: bool = False,
     ) -> Chain:
         """Return the chain of a model: its files, the stages it was trained behind, and the schema of each recorded stream.
 
@@ -174,6 +176,8 @@ class Chain:
         place of the stream ``plan``. Raises `UsageError` where it has none.
 
         ``quantiles`` (percent) are added to each forecast. Raises `TacpipeError` where the model has none, or not these.
+
+        Raises `TacpipeError` for a model that was trained on rows that look ahead, unless ``allow_look_ahead``.
         """
         forecaster = model if isinstance(model, Forecaster) else Forecaster.load(model)
         if forecaster.actions == "shuffled":
@@ -182,6 +186,8 @@ class Chain:
                 "--actions planned or none."
             )
         stages = causal_stages(steps)
+        if not allow_look_ahead:
+            refuse_look_ahead(forecaster.config, steps)
         if plan_from and plan_from not in layouts:
             raise UsageError(f"There is no stream {plan_from} that plans could come from; there are {listed(layouts)}.")
         targets = Targets(plan_from, layouts[plan_from]) if plan_from else None
@@ -209,8 +215,8 @@ class Chain:
     @property
     def rate_hz(self) -> float:
         """Grid points a second; of a grid ``logged`` or ``fresh``, the median of training."""
-        sync = self._stages.synchronize
-        return float(sync.rate_hz if sync.grid == "uniform" else self._forecaster.config["rate_hz"])
+        rate_hz = self._stages.synchronize.rate_hz
+        return float(self._forecaster.config["rate_hz"] if rate_hz is None else rate_hz)
 
     @property
     def horizon(self) -> int:

@@ -81,7 +81,7 @@ def _simulate(output: Path, name: str, trials: int, seed: int) -> None:
     recordings, synced = str(output / f"{name}-recordings"), str(output / f"{name}-synced")
     asked = ("--trials", str(trials), "--seed", str(seed), "--effort", str(EFFORT))
     _tacpipe("simulate", "forward", *asked, "-o", recordings, "--quiet")
-    _tacpipe("synchronize", recordings, "-o", synced, "--causal", "--quiet")  # as the session makes its rows
+    _tacpipe("synchronize", recordings, "-o", synced, "--rate-hz", "50", "--quiet")
     _tacpipe("segment", "contacts", synced, "-o", str(output / name), "--quiet")
 
 

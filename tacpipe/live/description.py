@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 
 from tacpipe.errors import UsageError
 from tacpipe.live.alarms import NAMES
+from tacpipe.live.stages import refuse_look_ahead
 from tacpipe.live.touch_messages import COLUMNS
 from tacpipe.printable import plain
 
@@ -62,8 +63,12 @@ class Grasped:
         return {"touch": {"output": "touch", "channels": list(self.columns)}, "latency": {"output": "latency"}}
 
 
-def described(model: Path) -> tuple[Described | Surfaces | Grasped, str]:
-    """Return what a model predicts, and the digest of its dataset. Raises `UsageError` where it does not run live."""
+def described(model: Path, *, allow_look_ahead: bool = False) -> tuple[Described | Surfaces | Grasped, str]:
+    """Return what a model predicts, and the digest of its dataset.
+
+    Raises `UsageError` where it does not run live, `TacpipeError` where it was trained on rows that look ahead, unless
+    ``allow_look_ahead``.
+    """
     import tacpipe
     from tacpipe.datasets import model_files
 
@@ -82,6 +87,8 @@ def described(model: Path) -> tuple[Described | Surfaces | Grasped, str]:
             f"{model} was trained for {plain(config['task'])}; models of forward, material and touch run live."
         )
     config = model_files.tree(found.files, CONFIG, {"horizon": int, "inputs.tactile": list})
+    if not allow_look_ahead:
+        refuse_look_ahead(config, found.source.chain)
     inputs = config["inputs"]
     percents = tuple(int(one) for one in config.get("quantiles", {}).get("levels", []))
     about = Described(tuple(inputs["tactile"]), config["horizon"], str(inputs.get("unit", "count")), percents)

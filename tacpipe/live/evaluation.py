@@ -110,7 +110,7 @@ def _session(
     tables = replay.recorded(recording)
     known = () if forecaster.uncertainty is None else forecaster.uncertainty.percents
     session = Published.of(tables["forecast"], forecaster.codec.channels, known)
-    chain = replay.chain_of(forecaster, model.source.chain, recording, tables, session.levels)
+    chain = replay.chain_of(forecaster, model.source.chain, recording, tables, session.levels, allow_look_ahead=True)
     every = list(replay.replayed(chain, tables))
     made = [one for one in every if one.count is not None]
     made_ns = np.array([one.t_ns for one in made], np.int64)

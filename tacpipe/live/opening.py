@@ -60,7 +60,13 @@ def forecasts(options: Options, model: Dataset, rig: Rig, sensors: Mapping[str, 
     """Return the engine of a session with a model of future signals. Raises as `engine`."""
     forecaster = Forecaster.load(model.files)
     opened = functools.partial(
-        chain, forecaster, model.source.chain, rig.master, options.plan_stream, quantiles=options.quantiles
+        chain,
+        forecaster,
+        model.source.chain,
+        rig.master,
+        options.plan_stream,
+        quantiles=options.quantiles,
+        allow_look_ahead=options.allow_look_ahead,
     )
     first: list[Alarms] = []
 
@@ -86,9 +92,12 @@ def chain(
     beginning: Beginning | None = None,
     *,
     quantiles: Sequence[int] = (),
+    allow_look_ahead: bool = False,
 ) -> Chain:
     """Return the chain of a model for streams of these layouts, which continues another's session; raises as `Chain.of`."""
-    return Chain.of(forecaster, steps, layouts, master, beginning, plan_from, quantiles)
+    return Chain.of(
+        forecaster, steps, layouts, master, beginning, plan_from, quantiles, allow_look_ahead=allow_look_ahead
+    )
 
 
 def _alarms(options: Options, model: Dataset, made: Chainlike) -> Alarms:

@@ -36,7 +36,7 @@ def prepared(rig: Rig, asked: Settings) -> Prepared:
         for address in asked.publish:
             publishing.check(address)
     with asked.naming("model"):
-        about, digest = description.described(Path(asked.model))
+        about, digest = description.described(Path(asked.model), allow_look_ahead=asked.allow_look_ahead)
     about, steps = _forecast(about, asked) if isinstance(about, Described) else (_other(about, asked), ())
     with asked.naming("plan"):
         planned = plans.with_plan(rig, asked.plan, asked.plan_from)
@@ -60,6 +60,7 @@ def prepared(rig: Rig, asked: Settings) -> Prepared:
         pause_s=asked.pause_s,
         rank=asked.rank,
         realtime=asked.realtime,
+        allow_look_ahead=asked.allow_look_ahead,
     )
     return Prepared(found, options, digest)
 

@@ -24,7 +24,14 @@ if TYPE_CHECKING:
 PIECE_NS = 1_000_000_000  # of a recording that is given at once
 
 
-def predict(model: Model, recordings: Dataset, steps: Sequence[int], quantiles: Sequence[int] = ()) -> Result:
+def predict(
+    model: Model,
+    recordings: Dataset,
+    steps: Sequence[int],
+    quantiles: Sequence[int] = (),
+    *,
+    allow_look_ahead: bool = False,
+) -> Result:
     """Return a table a recording, as `tasks.forward.prediction.predict` does, of forecasts that look at no later sample.
 
     Attributes count the grid points without a forecast, by cause. Raises `TacpipeError` for a step that the model does not
@@ -38,7 +45,9 @@ def predict(model: Model, recordings: Dataset, steps: Sequence[int], quantiles: 
     with progress.bar("predict", len(recordings.recordings)) as advance:
         for name, recording in sorted(recordings.recordings.items()):
             try:
-                found[name], causes = _predicted(forecaster, model, recording, steps, quantiles)
+                found[name], causes = _predicted(
+                    forecaster, model, recording, steps, quantiles, allow_look_ahead=allow_look_ahead
+                )
             except TacpipeError as error:
                 raise type(error)(f"{name}: {error}") from error
             if not found[name].streams[""].num_rows:
@@ -55,11 +64,17 @@ def predict(model: Model, recordings: Dataset, steps: Sequence[int], quantiles: 
 
 
 def _predicted(
-    forecaster: Forecaster, model: Model, recording: Recording, steps: Sequence[int], quantiles: Sequence[int]
+    forecaster: Forecaster,
+    model: Model,
+    recording: Recording,
+    steps: Sequence[int],
+    quantiles: Sequence[int],
+    *,
+    allow_look_ahead: bool,
 ) -> tuple[RecordingOutput, Counter[Cause]]:
     """Return the predictions of a recording, and how many grid points each cause had."""
     tables = recorded(recording)
-    chain = chain_of(forecaster, model.source.chain, recording, tables, quantiles)
+    chain = chain_of(forecaster, model.source.chain, recording, tables, quantiles, allow_look_ahead=allow_look_ahead)
     check_steps(steps, chain.horizon)
     t_ns, counts, bands, causes = [], [], [], Counter[Cause]()
     wanted = [step - 1 for step in steps]
@@ -92,6 +107,8 @@ def chain_of(
     recording: Recording,
     tables: Mapping[str, pa.Table],
     quantiles: Sequence[int] = (),
+    *,
+    allow_look_ahead: bool = False,
 ) -> Chain:
     """Return the chain of a model for the streams ``tables`` of a recording, with the master and source of plans that it
     names; all else is as in `Chain.of`."""
@@ -99,7 +116,9 @@ def chain_of(
     plan = str(recording.attributes.get("live_plan", ""))
     source = plan.removeprefix("rig:") if plan.startswith("rig:") else ""
     master, source = str(recording.attributes.get("master", "")), source if source in schemas else ""
-    return Chain.of(forecaster, steps, schemas, master, plan_from=source, quantiles=quantiles)
+    return Chain.of(
+        forecaster, steps, schemas, master, plan_from=source, quantiles=quantiles, allow_look_ahead=allow_look_ahead
+    )
 
 
 def recorded(recording: Recording) -> dict[str, pa.Table]:

@@ -13,6 +13,7 @@ SYNCHRONIZE, CONTACTS, COMPRESS = "synchronize", "segment.contacts", "compress."
 
 
 SLIDES = "segment.slides"
+EARLIER = {SYNCHRONIZE: (2,)}  # versions of before whose params today's stage reads, and gives the same rows for
 
 
 def slide_params(steps: Sequence[Mapping[str, Any]]) -> Any:
@@ -40,7 +41,7 @@ def _params(step: Mapping[str, Any]) -> Any:
     """Return the params of a stage of a chain. Raises `UsageError` where it has another version now."""
     name = step["stage"]
     stage = registry.load(name)
-    if stage.version != step["version"]:
+    if step["version"] not in (stage.version, *EARLIER.get(name, ())):
         raise UsageError(
             f"The model was trained behind version {step['version']} of {name}; this tacpipe has version "
             f"{stage.version}. Train it again."
@@ -57,7 +58,7 @@ class CausalStages(NamedTuple):
     @property
     def apart(self) -> float:
         """How many periods two rows may be apart with none missing between."""
-        return apart({GRID: self.synchronize.grid})
+        return apart({GRID: self.synchronize.timeline})
 
 
 def causal_stages(steps: Sequence[Mapping[str, Any]]) -> CausalStages:
@@ -86,3 +87,23 @@ def causal_stages(steps: Sequence[Mapping[str, Any]]) -> CausalStages:
             f"the whole recording; samples as they arrive have the rest at their start. Train it with --rest start."
         )
     return CausalStages(found[SYNCHRONIZE], found[CONTACTS])
+
+
+def refuse_look_ahead(config: Mapping[str, Any], steps: Sequence[Mapping[str, Any]]) -> None:
+    """Raise `TacpipeError` for a model that was trained on rows that look ahead.
+
+    ``config`` is the model's configuration, ``steps`` are the stages that it was trained behind.
+    """
+    stated: Mapping[str, float] | None = config.get("look_ahead")
+    if stated is None:  # a model of an older version, or of rows that state nothing
+        interpolated = [
+            step for step in steps if step["stage"] == SYNCHRONIZE and _params(step).values == "interpolate"
+        ]
+        text = "their values are interpolated" if interpolated else ""
+    else:
+        text = f"{stated['mean_ms']:g} ms on average, at most {stated['max_ms']:g} ms" if stated["max_ms"] else ""
+    if text:
+        raise TacpipeError(
+            f"The model was trained on rows that look ahead ({text}), and a live session has no later samples. Train it on "
+            f"rows of `tacpipe synchronize` without --values interpolate, or give --allow-look-ahead."
+        )

@@ -4,7 +4,8 @@ A stage has one dataclass of params, or several: a tagged union, ``Params = Smal
 same first field, say ``architecture``, with choices (``Literal``) of their own. That field chooses the class, the first
 one by default; a field that the chosen class does not have is refused, and is not part of a key. The classes of a
 task's architectures are found like plug-ins (`tacpipe.plugins.architectures`). A method ``check`` may
-refuse values that do not go together; stored params are read back without it. ``PRESETS`` holds named sets of values,
+refuse values that do not go together; stored params are read back without it. A static method ``upgrade`` returns params
+that any earlier version stored by the names and values of today. ``PRESETS`` holds named sets of values,
 ``PANELS`` the names of the fields that each panel of the help shows.
 """
 
@@ -237,6 +238,8 @@ def _current(several: Sequence[Kind], values: Mapping[str, Any]) -> tuple[Kind |
     """
     name = _tag_name(several) if len(several) > 1 else None
     chosen = next((one for one in several if name is None or _tagged(one, name, values)), None)
+    upgrade = getattr(chosen, "upgrade", None)
+    values = values if upgrade is None else upgrade(values)
     today = _today(tuple(one for one in (chosen, *several) if one is not None))
     found = {}
     for stored, value in values.items():

@@ -1,4 +1,4 @@
-"""Streams on a grid while their samples arrive: the rows that `synchronize --causal` makes of the whole of them.
+"""Streams on a grid while their samples arrive: the rows that `synchronize` makes of the whole of them.
 
 A row has the newest sample of each stream that is not after its grid point. Rows are made up to a time that the caller
 states: all samples up to it were pushed. So neither the pieces in which samples come nor the order of streams between
@@ -42,14 +42,14 @@ class Rows(NamedTuple):
 
 
 class Grid:
-    """Rows of several streams on the grid of one of them, as `synchronize --causal` defines them."""
+    """Rows of several streams on the grid of one of them, as `synchronize` holds values."""
 
     def __init__(
         self,
         streams: Mapping[str, Reading],
         master: str,
         kind: str,
-        rate_hz: float,
+        rate_hz: float | None,
         gap_ns: Mapping[str, int],
         origin_ns: int | None = None,
     ) -> None:
@@ -124,7 +124,7 @@ class Grid:
         master = self._sources[self._master]
         if master.first_ns is None:
             return np.zeros(0, np.int64)
-        if self._kind == "uniform":
+        if self._rate_hz is not None:
             origin_ns = master.first_ns if self._origin_ns is None else self._origin_ns
             if not self._points:  # those before the first sample are the grid's that is continued
                 self._points = max(0, int((master.first_ns - origin_ns) * self._rate_hz / 1e9) - 1)

@@ -46,7 +46,7 @@ def channels(stream: Stream, grid_ns: Times, exact: Int64s | None) -> list[tuple
     return [found[name] for name in stream.channels]
 
 
-def causal_channels(stream: Stream, grid_ns: Times) -> list[tuple[pa.Field, Any]]:
+def held_channels(stream: Stream, grid_ns: Times) -> list[tuple[pa.Field, Any]]:
     """Return field and values of each channel on the grid, from samples that had come by each point alone.
 
     A channel keeps its newest sample, and its type; a proximity sensor has the median of the last `PAST_NS`. Each point
@@ -116,7 +116,19 @@ def masks(stream: Stream, grid_ns: Times, exact: Int64s | None, gap_ns: int) -> 
     return _masks(stream.name, stream.held[rows], gap, np.abs(stream.t_ns[rows] - grid_ns))
 
 
-def causal_masks(stream: Stream, grid_ns: Times, gap_ns: int) -> list[tuple[pa.Field, Any]]:
+def look_ahead_ns(stream: Stream, grid_ns: Times, exact: Int64s | None) -> Times:
+    """Return how long after each point the last sample arrived that `channels` reads there, shape (grid,), 0 or more."""
+    import numpy as np
+
+    rows = np.searchsorted(stream.t_ns, grid_ns).astype(np.int64) if exact is None else exact
+    if exact is None and any(methods.method(stream.columns.schema, name) == "median" for name in stream.channels):
+        rows = np.maximum(rows, np.searchsorted(stream.t_ns, grid_ns + MEDIAN_NS, side="right") - 1)
+    arrived_ns = stream.arrival_ns[np.minimum(rows, len(stream.t_ns) - 1)]
+    ahead_ns: Times = np.maximum(arrived_ns - grid_ns, 0)
+    return ahead_ns
+
+
+def held_masks(stream: Stream, grid_ns: Times, gap_ns: int) -> list[tuple[pa.Field, Any]]:
     """Return where the newest sample was held, where it is older than ``gap_ns``, and how old it is."""
     from tacpipe.signals.resampling import is_overdue, newest_rows
 

@@ -36,12 +36,12 @@ def master(recording: str, wanted: str, schemas: Mapping[str, pa.Schema]) -> str
 
 
 def grid(
-    recording: str, kind: str, rate_hz: float, streams: Mapping[str, Stream], master: Stream, *, causal: bool = False
+    recording: str, kind: str, rate_hz: float | None, streams: Mapping[str, Stream], master: Stream, *, held: bool
 ) -> tuple[Int64s, Int64s]:
     """Return the grid points that lie within every stream, and the row of each: of the master, or of the grid itself.
 
-    A uniform grid is on the phase of the master's first sample. A ``causal`` grid ends where the last stream does, because
-    while it is made nobody knows which sample of a stream was its last, and has one point where stamps are equal.
+    A uniform grid is on the phase of the master's first sample. With ``held`` values it ends where the last stream does,
+    because nobody knows yet which sample of a stream is its last, and it has one point where stamps are equal.
     Raises `TacpipeError` where no point is left.
     """
     import numpy as np
@@ -49,12 +49,12 @@ def grid(
     from tacpipe.signals.resampling import uniform_grid
 
     first = max(int(stream.t_ns[0]) for stream in streams.values())
-    last = (max if causal else min)(int(stream.t_ns[-1]) for stream in streams.values())
-    grid_ns = uniform_grid(int(master.t_ns[0]), last, rate_hz) if kind == "uniform" else master.t_ns
+    last = (max if held else min)(int(stream.t_ns[-1]) for stream in streams.values())
+    grid_ns = uniform_grid(int(master.t_ns[0]), last, rate_hz) if rate_hz is not None else master.t_ns
     within = (grid_ns >= first) & (grid_ns <= last)
     if kind == "fresh":
         within &= ~master.held
-    if causal and kind != "uniform":
+    if held and rate_hz is None:
         within &= np.append(np.diff(grid_ns) > 0, True)
     rows = np.flatnonzero(within)
     if not len(rows):

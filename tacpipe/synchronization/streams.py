@@ -29,6 +29,7 @@ class Stream:
     columns: Columns
     t_ns: Times  # (time,)
     held: Bools  # (time,)
+    arrival_ns: Times  # (time,), when the samples arrived, whatever the clock of `t_ns`
     attributes: dict[str, Attribute] = field(default_factory=dict)  # what the fit of its clock gave
     unwrapped: Mapping[str, Int32s] = field(default_factory=dict)  # channels whose counts had wrapped around
 
@@ -85,7 +86,8 @@ def on_host_clock(recording: str, name: str, columns: Columns, clock: str) -> St
 
     Raises `TacpipeError` for stamps that are absent, run backwards or give no clock.
     """
-    stream = Stream(name, columns, _stamps(recording, name, columns), _held(columns))
+    arrival_ns = _stamps(recording, name, columns)
+    stream = Stream(name, columns, arrival_ns, _held(columns), arrival_ns)
     if clock == "arrival" or stream.truth:
         return stream
     if DEVICE not in columns.column_names:

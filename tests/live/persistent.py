@@ -132,7 +132,7 @@ def main() -> None:
     patch = pytest.MonkeyPatch()
     patch.setattr(supervisor, "MODULE", "tests.live.persistent")
     about = Described(CHANNELS, HORIZON, "count", (10, 50, 90))
-    patch.setattr("tacpipe.live.description.described", lambda model: (about, "0" * 64))
+    patch.setattr("tacpipe.live.description.described", lambda model, **_: (about, "0" * 64))
     from tacpipe.cli import main as cli
     from tests.recording import patient
 

@@ -76,7 +76,7 @@ def model(
     folder: Path, codec: str = "raw", representation: str = "levels", *, calibrated: bool = False, **values: Any
 ) -> Made:
     """The files of a small model, and the chain that it was trained behind; ``values`` are params of both."""
-    names = {"grid", "rate_hz", "gap_ms", "unwrap", "causal", "master"}
+    names = {"grid", "rate_hz", "gap_ms", "unwrap", "values", "master"}
     sync = {name: value for name, value in values.items() if name in names}
     shards = [segmented(recording(seed), **sync) for seed in range(3)]
     steps = [step("synchronize", **sync), step("segment.contacts")]

@@ -32,7 +32,7 @@ KINDS: dict[str, dict[str, Any]] = {
     "planned": {},
     "latents": {"actions": "none", "codec": "pca"},
     "increments": {"actions": "none", "codec": "pca", "representation": "increments"},
-    "logged": {"actions": "none", "grid": "logged"},
+    "logged": {"actions": "none"},
     "fresh": {"actions": "none", "grid": "fresh"},
     "ensemble": {"actions": "none", "members": 2},
 }
@@ -42,13 +42,18 @@ KINDS |= {
     "ensemble with quantiles": {**KINDS["ensemble"], "calibrated": True},
 }
 QUANTILES = {kind: (10, 95) for kind, values in KINDS.items() if "calibrated" in values}
+UNIFORM: dict[str, Any] = {"rate_hz": 50.0}
+ROWS: dict[str, dict[str, Any]] = {"logged": {}, "fresh": {}}  # at the stamps of the master
 GAPS = ("t_ns", "xela1_gap", "xela2_gap", "robot_gap")
 GIVEN = rigs.recording(20, gap_ms=200.0)
 
 
 @pytest.fixture(scope="module")
 def models(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Made]:
-    return {name: rigs.model(tmp_path_factory.mktemp(name), causal=True, **values) for name, values in KINDS.items()}
+    return {
+        name: rigs.model(tmp_path_factory.mktemp(name), **ROWS.get(name, UNIFORM), **values)
+        for name, values in KINDS.items()
+    }
 
 
 def same(found: Sequence[Forecast], wanted: Sequence[Forecast]) -> bool:
@@ -87,7 +92,7 @@ def test_any_cut_of_a_recording_gives_the_same_forecasts_to_the_last_bit(
 
 def offline(kind: str, forecaster: Forecaster) -> Any:
     """The recording after the stages that a model was trained behind, run on the whole of it."""
-    values = {"causal": True, **{name: KINDS[kind][name] for name in ("grid",) if name in KINDS[kind]}}
+    values = ROWS.get(kind, UNIFORM) | ({"grid": "fresh"} if kind == "fresh" else {})
     shard = rigs.segmented(GIVEN, **values)
     table = shard.content
     if "codec" in KINDS[kind]:
@@ -263,6 +268,25 @@ def test_a_model_behind_stages_that_look_ahead_is_refused_by_their_name(
         Chain.of(models["raw"][0], steps, {name: table.schema for name, table in GIVEN.tables.items()})
 
 
+def test_a_model_of_rows_that_look_ahead_is_refused_unless_that_is_allowed(tmp_path: Path) -> None:
+    interpolated = rigs.model(tmp_path, **UNIFORM, values="interpolate")
+    schemas = {name: table.schema for name, table in GIVEN.tables.items()}
+    stated = json.loads(interpolated[0]["config.json"])["look_ahead"]
+    assert 0 < stated["mean_ms"] < stated["max_ms"]
+    with pytest.raises(TacpipeError, match=f"at most {stated['max_ms']:g} ms.*--allow-look-ahead"):
+        Chain.of(*interpolated, schemas)
+    assert Chain.of(*interpolated, schemas, allow_look_ahead=True).rate_hz == 50.0
+    older = json.loads(interpolated[0]["config.json"])
+    del older["look_ahead"]
+    step = {"stage": "synchronize", "version": 2, "params": {"grid": "logged", "rate_hz": 50.0}, "fitted": None}
+    files = {**interpolated[0], "config.json": json.dumps(older).encode()}
+    contacts = rigs.step("segment.contacts")
+    with pytest.raises(TacpipeError, match="interpolated"):
+        Chain.of(files, [step, contacts], schemas)
+    held = {**step, "params": {"grid": "logged", "rate_hz": 50.0, "causal": True}}
+    assert Chain.of(files, [held, contacts], schemas).streams
+
+
 @pytest.mark.parametrize("kind", ["raw", "latents", "logged"])
 def test_a_chain_that_continues_a_session_predicts_the_same_once_it_has_its_context(
     kind: str, models: dict[str, Made]
@@ -309,8 +333,8 @@ def test_a_chain_takes_from_the_model_how_long_slow_streams_may_pause(tmp_path: 
     """The rows of sensors at 9 Hz follow one another by the gap of the training recordings, not by that of the session."""
     slow = {name: table.take(np.arange(0, table.num_rows, 5)) for name, table in rigs.recording(4, 20.0).tables.items()}
     given = FakeRecording(slow, "slow")
-    shards = [rigs.segmented(given, causal=True) for _ in range(2)]
-    stages = [rigs.step("synchronize", causal=True), rigs.step("segment.contacts")]
+    shards = [rigs.segmented(given) for _ in range(2)]
+    stages = [rigs.step("synchronize"), rigs.step("segment.contacts")]
     files = forward.train(fitting("train.forward", rigs.SMALL), dataset(shards[0]), dataset(shards[1]), tmp_path)
     gap_ms = json.loads(files["config.json"])["gap_ms"]
     steps = np.diff(slow["xela1"]["t_ns"].to_numpy()) / MS

@@ -25,7 +25,7 @@ CALIBRATED, PLAIN = Described(("skin_taxel01_x",), 3, "count", (10, 50, 90)), De
 def test_quantiles_that_a_model_does_not_have_are_refused_before_the_session_begins(
     about: Described | Surfaces, asked: str, named: str, lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("tacpipe.live.description.described", lambda model: (about, "0" * 64))
+    monkeypatch.setattr("tacpipe.live.description.described", lambda model, **_: (about, "0" * 64))
     Path("rig.toml").write_text(RIG.read_text())
     ran = lab.call(f"live rig.toml --model models/f --quantiles {asked}")
     assert ran.code == 2 and named in ran.err.replace("\n", " ")

@@ -26,7 +26,8 @@ def recorded(trial: int, **rig: Any) -> RecordingOutput:
 
 
 def synced(recording: RecordingOutput, **params: Any) -> RecordingOutput:
-    found: RecordingOutput = synchronize(synchronize.params(**params), FakeRecording(recording.streams))
+    rows = {"values": "interpolate", **({} if "grid" in params else {"rate_hz": 50.0}), **params}
+    found: RecordingOutput = synchronize(synchronize.params(**rows), FakeRecording(recording.streams))
     return found
 
 

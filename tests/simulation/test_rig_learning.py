@@ -54,7 +54,10 @@ simulate, synchronize, contacts = load("simulate.forward"), load("synchronize"),
 def recorded(index: int, grid: str = "uniform", **rig: Any) -> FakeShard:
     """A segmented trial of the rig."""
     recording = simulate(simulate.params(**rig), index)
-    synced = synchronize(synchronize.params(grid=grid), FakeRecording(recording.streams))
+    synced = synchronize(
+        synchronize.params(values="interpolate", **({"rate_hz": 50.0} if grid == "uniform" else {"grid": grid})),
+        FakeRecording(recording.streams),
+    )
     table = contacts(contacts.params(), FakeRecording({"": synced.streams[""]})).streams[""]
     return FakeShard(f"trial-{index}", table, dict(recording.attributes) | {"grid": grid})
 

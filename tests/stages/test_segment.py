@@ -123,7 +123,7 @@ def test_contacts_of_simulated_trials_in_any_unit_are_those_in_counts_and_of_the
     simulate = load("simulate.forward")
     for trial in range(4):
         recording = simulate(simulate.params(duration_s=6.0), trial)
-        synced = synchronize(synchronize.params(), shard(recording.streams)).streams[""]
+        synced = synchronize(synchronize.params(rate_hz=50.0), shard(recording.streams)).streams[""]
         params = segment.params(pad_s=0.0)
         counted, other = (contacts(params, shard({"": one})) for one in (synced, in_unit(synced, unit, factor)))
         assert other.column("contact").unique().to_pylist() == counted.column("contact").unique().to_pylist()
@@ -139,7 +139,9 @@ def test_contacts_of_published_trials_in_newtons_are_those_in_counts(shard: Reco
     assert ingest.discover is not None
     found = ingest.discover(ingest.params(), SAMPLE / "xela_flat_pick_move")
     for files in list(found.values())[::4]:
-        synced = synchronize(synchronize.params(), shard(ingest(ingest.params(), files).streams)).streams[""]
+        synced = synchronize(synchronize.params(rate_hz=50.0), shard(ingest(ingest.params(), files).streams)).streams[
+            ""
+        ]
         one, other = (contacts(segment.params(), shard({"": each})) for each in (synced, in_unit(synced, "N", 0.004)))
         overlaps.append(overlap(one, other))
     assert len(overlaps) == 13 and min(overlaps) > 0.9 and np.median(overlaps) > 0.99
@@ -208,7 +210,7 @@ def test_the_contact_of_a_simulated_trial_is_that_of_its_ground_truth(shard: Rec
     simulate = load("simulate.forward")
     for trial in range(4):
         recording = simulate(simulate.params(duration_s=6.0, friction_scale=4.0), trial)
-        synced = synchronize(synchronize.params(), shard(recording.streams)).streams[""]
+        synced = synchronize(synchronize.params(rate_hz=50.0), shard(recording.streams)).streams[""]
         found = contacts(segment.params(pad_s=0.0), shard({"": synced}))
         pressed = synced.column("gt_finger1_normal_n").to_numpy() > 0
         first = synced.column("t_ns").to_numpy()[pressed.argmax()]
@@ -318,7 +320,7 @@ def test_each_published_trial_has_one_contact_that_begins_before_the_lift(shard:
     assert ingest.discover is not None
     for files in ingest.discover(ingest.params(), SAMPLE / "xela_flat_pick_move").values():
         recording = ingest(ingest.params(), files)
-        synced = synchronize(synchronize.params(), shard(recording.streams)).streams[""]
+        synced = synchronize(synchronize.params(rate_hz=50.0), shard(recording.streams)).streams[""]
         found = contacts(segment.params(), shard({"": synced}))
         height = synced.column("robot_position_z_m").to_numpy()
         lifted = synced.column("t_ns").to_numpy()[(height > height[0] + 0.02).argmax()]

@@ -116,11 +116,13 @@ def test_an_arm_without_a_wrench_has_no_force(shard: Recording) -> None:
     assert np.isnan(found.streams["profile"].column("force_n").to_numpy()).all()
 
 
-@pytest.mark.parametrize("grid", [{"grid": "logged", "master": "biotac"}, {"rate_hz": 100.0}])
+@pytest.mark.parametrize("grid", [{"master": "biotac"}, {"rate_hz": 100.0}])
 def test_a_synchronized_recording_gives_the_same_slide(shard: Recording, grid: dict[str, Any]) -> None:
     streams = {"biotac": finger(pressed(800, 30)), **drawn(800, slice(60, 740))}
     truth = pa.table({"t_ns": streams["biotac"].column("t_ns"), "gt_force_n": pa.array(np.ones(800))})
-    synced = synchronize(synchronize.params(**grid), shard({**streams, "truth": truth})).streams[""]
+    synced = synchronize(synchronize.params(values="interpolate", **grid), shard({**streams, "truth": truth})).streams[
+        ""
+    ]
     raw, found = cut(shard({**streams, "truth": truth})), cut(shard({"": synced}))
     assert found.streams["slide"].column_names == raw.streams["slide"].column_names
     assert rows_of(found) == rows_of(raw)

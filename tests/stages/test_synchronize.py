@@ -10,22 +10,36 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
 from tacpipe.channels import schema
 from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.plugins.params import from_json, to_json
 from tacpipe.plugins.registry import load
 from tacpipe.plugins.stage import RecordingOutput
+from tests.fake_recordings import FakeRecording
 
 SAMPLE = Path(os.environ.get("TACPIPE_SAMPLE_DATA", Path(__file__).parents[3] / "shared" / "data"))
 T0 = 1_637_771_974_778_354_001
 MS = 1_000_000
-synchronize = load("synchronize")
+synchronize, contacts = load("synchronize"), load("segment.contacts")
 Recording = Callable[..., Any]
+ROWS: dict[str, dict[str, Any]] = {
+    "uniform": {"rate_hz": 50.0},
+    "logged": {"grid": "logged"},
+    "fresh": {"grid": "fresh"},
+}
 
 
 def params(**values: Any) -> Any:
     return synchronize.params(**values)
+
+
+def interpolated(**values: Any) -> Any:
+    """Return params of interpolated rows, at 50 Hz where no rows at the stamps of the master are asked for."""
+    return params(**{"values": "interpolate", **({} if "grid" in values else {"rate_hz": 50.0}), **values})
 
 
 def uskin(t_ms: np.ndarray, values: np.ndarray | None = None) -> pa.Table:
@@ -41,7 +55,7 @@ def robot(t_ms: np.ndarray) -> pa.Table:
 
 
 def run(shard: Any, **values: Any) -> tuple[pa.Table, Any]:
-    recording = synchronize(params(**values), shard)
+    recording = synchronize(interpolated(**values), shard)
     assert isinstance(recording, RecordingOutput)
     return recording.streams[""], recording.attributes
 
@@ -323,19 +337,19 @@ def test_images_text_and_single_rows_neither_bound_the_grid_nor_stand_on_it(shar
     assert attributes["not_synchronized"] == "camera, note, still"
 
 
-def test_causal_rows_hold_the_newest_sample_that_had_come_and_its_age(shard: Recording) -> None:
+def test_held_rows_hold_the_newest_sample_that_had_come_and_its_age(shard: Recording) -> None:
     t_ms = np.cumsum(np.random.default_rng(3).integers(5, 40, 40))
     tactile, arm = uskin(t_ms), robot(np.arange(3, 700, 7))
-    table, attributes = run(shard({"xela1": tactile, "robot": arm}), causal=True)
+    table, attributes = run(shard({"xela1": tactile, "robot": arm}), values="hold", rate_hz=50.0)
     grid_ms = (table.column("t_ns").to_numpy() - T0) / MS
     assert grid_ms[-1] > min(t_ms[-1], 696) - 20 and attributes["grid"] == "uniform"
-    for stream, given, name in (("xela1", tactile, "taxel05_y"), ("robot", arm, "orientation_z")):
-        stamps = (given.column("t_ns").to_numpy() - T0) / MS
+    for stream, recorded, name in (("xela1", tactile, "taxel05_y"), ("robot", arm, "orientation_z")):
+        stamps = (recorded.column("t_ns").to_numpy() - T0) / MS
         rows = [int(np.flatnonzero(stamps <= point)[-1]) for point in grid_ms]
         column = table.column(f"{stream}_{name}")
-        assert column.to_numpy().tolist() == given.column(name).to_numpy()[rows].tolist()
+        assert column.to_numpy().tolist() == recorded.column(name).to_numpy()[rows].tolist()
         assert (column.type, table.schema.field(f"{stream}_{name}").metadata[b"interpolation"]) == (
-            given.schema.field(name).type,
+            recorded.schema.field(name).type,
             b"hold",
         )
         age_ms = grid_ms - stamps[rows]
@@ -343,30 +357,67 @@ def test_causal_rows_hold_the_newest_sample_that_had_come_and_its_age(shard: Rec
         assert table.column(f"{stream}_gap").to_pylist() == (age_ms > 50).tolist()
 
 
-@pytest.mark.parametrize("grid", ["uniform", "logged", "fresh"])
-def test_causal_rows_do_not_depend_on_what_comes_later(shard: Recording, grid: str) -> None:
-    rng = np.random.default_rng(4)
+@pytest.mark.parametrize("kind", ROWS)
+@settings(deadline=None, max_examples=25)
+@given(seed=st.integers(0, 999), until_ms=st.integers(150, 1400))
+def test_rows_of_held_values_do_not_depend_on_what_comes_later(kind: str, seed: int, until_ms: int) -> None:
+    """Recordings that are cut off have the rows before the cut of the whole ones, also with their contacts marked."""
+    rng = np.random.default_rng(seed)
     t_ms = np.cumsum(rng.integers(5, 40, 60))
     near = schema.stream(
         T0 + np.arange(0, 1500, 2) * MS, [rng.normal(size=750)], [schema.float_field("near_m", "m", "proximity")]
     )
-    streams = {
-        "xela1": uskin(t_ms, rng.integers(0, 65_536, (60, 48))),
-        "robot": robot(np.arange(3, 1500, 7)),
-        "n": near,
+    arm = with_device(robot(np.arange(3, 1500, 7)), T0 + np.cumsum(rng.integers(5, 9, 214)) * MS)
+    streams = {"xela1": uskin(t_ms, rng.integers(0, 65_536, (60, 48))), "robot": arm, "n": near}
+    cut = {
+        name: stream.filter(pa.array(stream["t_ns"].to_numpy() <= T0 + until_ms * MS))
+        for name, stream in streams.items()
     }
-    whole, _ = run(shard(streams), causal=True, grid=grid)
-    until_ns = T0 + 700 * MS
-    cut = {name: one.filter(pa.array(one.column("t_ns").to_numpy() <= until_ns)) for name, one in streams.items()}
-    part, _ = run(shard(cut), causal=True, grid=grid)
-    assert part.num_rows > 10
-    for name in part.column_names:
-        assert part.column(name).to_pylist() == whole.column(name).to_pylist()[: part.num_rows], name
+    if not cut["xela1"].num_rows:
+        return
+    held = params(gap_ms=50.0, **ROWS[kind])  # without --gap-ms the gap depends on the rate of the whole recording
+    whole, part = (synchronize(held, FakeRecording(tables)) for tables in (streams, cut))
+    rows = part.streams[""].num_rows
+    assert rows and part.streams[""].to_pydict() == whole.streams[""].slice(0, rows).to_pydict()
+    last_ns = max(stream["t_ns"].to_numpy()[-1] for stream in cut.values())
+    assert whole.streams[""]["t_ns"].to_numpy()[rows:].min(initial=2 * T0) > last_ns
+    assert whole.attributes["look_ahead_max_ms"] == 0.0
+    levels = []
+    for output in (part, whole):
+        segmented = contacts(contacts.params(rest_s=0.0), FakeRecording({"": output.streams[""]})).streams[""]
+        levels.append([(segmented.schema.field(name).metadata or {}).get(b"rest") for name in segmented.column_names])
+    assert levels[0] == levels[1]
 
 
-def test_causal_rows_have_the_clock_of_arrival_and_refuse_that_of_the_device() -> None:
+def test_the_look_ahead_of_interpolated_rows_is_the_time_to_the_next_sample_or_its_arrival(shard: Recording) -> None:
+    tactile, arm = uskin(np.arange(0, 2000, 20)), robot(np.arange(-4, 1990, 26))
+    table, attributes = run(shard({"xela1": tactile, "robot": arm}), grid="logged")
+    arm_ms = (arm["t_ns"].to_numpy() - T0) / MS
+    ahead_ms = [min(arm_ms[arm_ms >= at]) - at for at in (table["t_ns"].to_numpy() - T0) / MS]
+    assert attributes["look_ahead_mean_ms"] == pytest.approx(np.mean(ahead_ms), abs=1e-3)
+    assert attributes["look_ahead_max_ms"] == max(ahead_ms) and attributes["step_ms"] == 20.0
+    held = synchronize(params(), FakeRecording({"xela1": tactile, "robot": arm}))
+    assert held.attributes["look_ahead_max_ms"] == 0.0 and held.attributes["grid"] == "logged"
+    assert held.streams[""]["robot_position_x_m"].type == pa.float64()
+
+
+@pytest.mark.parametrize(
+    ("stored", "values"),
+    [
+        ({"grid": "uniform", "rate_hz": 25.0}, {"rate_hz": 25.0, "values": "interpolate"}),
+        ({"grid": "logged", "rate_hz": 50.0}, {"values": "interpolate"}),
+        ({"grid": "fresh", "rate_hz": 50.0, "causal": True}, {"grid": "fresh"}),
+        ({"grid": "uniform", "rate_hz": 50.0, "causal": True}, {"rate_hz": 50.0}),
+    ],
+)
+def test_params_of_before_held_values_are_read_as_what_they_did(stored: dict[str, Any], values: dict[str, Any]) -> None:
+    assert from_json(synchronize, {**stored, "master": "", "gap_ms": 50.0}) == params(**values, gap_ms=50.0)
+    assert to_json(params())["values"] == "hold"
+
+
+def test_held_rows_have_the_clock_of_arrival_and_refuse_that_of_the_device() -> None:
     with pytest.raises(UsageError, match="arrival"):
-        params(causal=True, clock="device").check()
+        params(clock="device").check()
 
 
 def test_what_a_live_session_records_of_itself_is_no_signal(shard: Recording) -> None:
@@ -399,8 +450,8 @@ def test_without_a_gap_a_slow_stream_may_pause_for_two_and_a_half_periods(
 def test_a_stream_with_many_rows_in_gaps_is_named_and_others_are_not(shard: Recording) -> None:
     slow, fast = uskin(np.arange(0, 4000, 73)), robot(np.arange(0, 4000, 10))
     given = shard({"xela1": slow, "robot": fast})
-    assert not synchronize(params(), given).notes
-    (note,) = synchronize(params(gap_ms=50.0), given).notes
+    assert not synchronize(interpolated(), given).notes
+    (note,) = synchronize(interpolated(gap_ms=50.0), given).notes
     assert "stream xela1" in note and "--gap-ms" in note
 
 

@@ -1,6 +1,8 @@
-"""Rows made while samples arrive are those that `synchronize --causal` makes of the whole recording."""
+"""Rows made while samples arrive are those that `synchronize` makes of the whole recording."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -17,6 +19,7 @@ T0 = 1_637_771_974_778_354_001
 MS = 1_000_000
 GAPS = {"a": 50_000_000, "b": 50_000_000}  # ns, by stream
 synchronize = load("synchronize")
+ROWS: dict[str, dict[str, Any]] = {"uniform": {"rate_hz": 50.0}, "logged": {}, "fresh": {"grid": "fresh"}}
 
 
 def streams() -> dict[str, pa.Table]:
@@ -37,9 +40,9 @@ READINGS = {"xela1": Reading(3, wraps=(0, 1, 2), compared=(0, 1, 2)), "near": Re
 @settings(deadline=None, max_examples=25)
 @given(cuts=st.lists(st.integers(0, 900), max_size=20), turned=st.booleans())
 def test_rows_are_those_of_the_stage_to_the_last_bit(kind: str, cuts: list[int], turned: bool) -> None:
-    result = synchronize(synchronize.params(causal=True, grid=kind, gap_ms=20.0), FakeRecording(STREAMS))
+    result = synchronize(synchronize.params(**ROWS[kind], gap_ms=20.0), FakeRecording(STREAMS))
     wanted = result.streams[""]
-    grid = Grid(READINGS, "xela1", kind, 50.0, dict.fromkeys(READINGS, 20 * MS))
+    grid = Grid(READINGS, "xela1", kind, ROWS[kind].get("rate_hz"), dict.fromkeys(READINGS, 20 * MS))
     last = max(int(table["t_ns"][-1].as_py()) for table in STREAMS.values())
     parts, before = [], T0 - 1
     for until_ns in [*sorted(T0 + cut * MS for cut in cuts if T0 + cut * MS < last), last]:

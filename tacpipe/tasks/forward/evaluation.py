@@ -25,7 +25,7 @@ from tacpipe.tasks.forward.predictors import predicted
 from tacpipe.tasks.forward.situations import BySituation
 from tacpipe.tasks.forward.slip_alarms import SlipAlarms
 from tacpipe.tasks.forward.tracks import Track
-from tacpipe.tasks.forward.training import HISTORY, check_codec
+from tacpipe.tasks.forward.training import HISTORY, check_codec, look_ahead_notes
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
@@ -87,7 +87,7 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
         **bands.files(trials),
         **{name: model[name] for name in (CONFIG, HISTORY, codecs.DESCRIPTION) if name in model},
     }
-    return Result(kept, files)
+    return Result(kept, files, look_ahead_notes(forecaster.config))
 
 
 def _predictions(

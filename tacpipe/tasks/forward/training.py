@@ -109,6 +109,7 @@ def train(
         **_description(params, codec, pose, unit, reference),
         "rate_hz": rate_hz,
         "gap_ms": _gap_ms(training),
+        **_look_ahead(training),
         "timeline": parts[0][0].timeline,
         "scaling": _scaling(parts[0], aside),
         "largest_level": max(largest_level(one.tactile[some]) for one, some in _usable(parts[0], aside)),
@@ -176,6 +177,19 @@ def _description(params: Params, codec: codecs.Codec, pose: Pose, unit: str, ref
             **({} if pose == NAMED else {"pose": {"position": pose.position, "orientation": pose.orientation}}),
         },
     }
+
+
+def _look_ahead(training: Dataset) -> dict[str, Any]:
+    """Return how far the rows of the training recordings look ahead, ms; nothing where no recording states it."""
+    stated = [
+        (float(one.attributes[masks.LOOK_AHEAD_MEAN] or 0), float(one.attributes[masks.LOOK_AHEAD_MAX] or 0))
+        for one in training.recordings.values()
+        if masks.LOOK_AHEAD_MAX in one.attributes
+    ]
+    if not stated:
+        return {}
+    mean, largest = (np.array(column) for column in zip(*stated, strict=True))
+    return {"look_ahead": {"mean_ms": round(float(mean.mean()), 3), "max_ms": float(largest.max())}}
 
 
 def _gap_ms(training: Dataset) -> dict[str, float]:
@@ -360,6 +374,8 @@ def _take_over(model: nn.Module, start: Forecaster) -> None:
 def notes(params: Params, files: Mapping[str, bytes]) -> list[str]:
     """Return what a user should know of a trained model, its ``files`` given: an architecture that is not the best known."""
     config = json.loads(files[CONFIG])
+    rows = [f"A step is {1e3 / config['rate_hz']:.4g} ms."] if config["rate_hz"] else []
+    rows += look_ahead_notes(config)
     raw, channels = config["codec"]["kind"] == "raw", config["inputs"]["layout"]
     if params.architecture == forecasts.AUTO and raw and config["architecture"] != forecasts.TAXELWISE:
         named = sum("taxel" in one for one in channels)
@@ -369,10 +385,23 @@ def notes(params: Params, files: Mapping[str, bytes]) -> list[str]:
             else "sensors differ in size"
         )
         return [
+            *rows,
             f"{why}, so the architecture is {config['architecture']} and not {forecasts.TAXELWISE}. Write {{taxel}} in "
-            f"match of [streams.…] columns of the layout file where channels are taxels."
+            f"match of [streams.…] columns of the layout file where channels are taxels.",
         ]
-    return []
+    return rows
+
+
+def look_ahead_notes(config: Config) -> list[str]:
+    """Return how far the rows that a model was trained on look ahead; nothing where they do not."""
+    ahead = config.get("look_ahead") or {"max_ms": 0.0}
+    if not ahead["max_ms"]:
+        return []
+    return [
+        f"The rows of the training recordings look ahead by {ahead['mean_ms']:g} ms on average and at most "
+        f"{ahead['max_ms']:g} ms, so errors are smaller than a live session's. Synchronize without --values interpolate for "
+        f"models to act on."
+    ]
 
 
 def _check_pose(start: Forecaster, pose: Pose) -> None:

@@ -232,7 +232,7 @@ def published(files: Mapping[str, Path]) -> FakeShard:
         load_stage(name) for name in ("ingest.xela-flat", "synchronize", "segment.contacts")
     )
     recording = ingest(ingest.params(), files)
-    synced = synchronize(synchronize.params(grid="logged"), FakeRecording(recording.streams))
+    synced = synchronize(synchronize.params(), FakeRecording(recording.streams))
     made = contacts(contacts.params(), FakeRecording(synced.streams))
     return FakeShard("-".join(sorted(map(str, files.values())))[-60:], made.streams[""], dict(synced.attributes))
 

@@ -19,7 +19,7 @@ from tests.live import rigs
 
 @pytest.fixture(scope="module")
 def forecaster(tmp_path_factory: pytest.TempPathFactory) -> Forecaster:
-    made = rigs.model(tmp_path_factory.mktemp("model"), causal=True)
+    made = rigs.model(tmp_path_factory.mktemp("model"))
     return Forecaster.load(made[0])
 
 
