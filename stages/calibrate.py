@@ -35,7 +35,7 @@ class Params:
     seed: Seed = 0  # random seed of what is fitted
 
 
-@stage(version=2)
+@stage(version=3)
 def calibrate(params: Params, model: Model, train: Dataset, val: Dataset) -> Result:
     """Return the model's files and what states its uncertainty."""
     from tacpipe.datasets import model_files

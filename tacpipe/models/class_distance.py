@@ -1,11 +1,12 @@
 """How far a slide is from every class that was learned, in a space that does not depend on the classifier.
 
-Slides are described by statistics of each channel (`tacpipe.models.statistics_classifier`), standardised and reduced to
-their principal components. There each class is a mean, all with one covariance, shrunk as by Ledoit and Wolf (2004). The
-score is minus half the squared Mahalanobis distance to the nearest mean (Lee, Lee, Lee and Shin, A simple unified framework
-for detecting out-of-distribution samples, NeurIPS 2018), less the same to the mean of all slides, with the covariance of
-all: the relative Mahalanobis distance (Ren et al., A simple fix to Mahalanobis distance for improving near-OOD detection,
-2021). What is unusual for every class alike then does not count.
+Slides are described by statistics of each channel (`tacpipe.models.statistics_classifier`) and by how often patterns occur
+in them (`tacpipe.models.minirocket`), standardised and reduced to their principal components. Models that were calibrated
+before hold no patterns, and there only statistics count. In that space each class is a mean, all with one covariance,
+shrunk as by Ledoit and Wolf (2004). The score is minus half the squared Mahalanobis distance to the nearest mean (Lee, Lee,
+Lee and Shin, A simple unified framework for detecting out-of-distribution samples, NeurIPS 2018), less the same to the mean
+of all slides, with the covariance of all: the relative Mahalanobis distance (Ren et al., A simple fix to Mahalanobis
+distance for improving near-OOD detection, 2021). What is unusual for every class alike then does not count.
 """
 
 from __future__ import annotations
@@ -17,9 +18,13 @@ from typing import Self
 import numpy as np
 
 from tacpipe.arrays import AnyArray, AnyFloats, Float32s, Floats, Int32s, Ints
+from tacpipe.models.minirocket import Rocket
+from tacpipe.models.minirocket_classifier import with_profile
 from tacpipe.models.statistics_classifier import statistics
+from tacpipe.models.tensors import under
 
-COMPONENTS = 40  # at most, and no more than a third of the slides
+COMPONENTS = 150  # at most, and no more than a third of the slides
+PATTERNS = "patterns."  # begins the names of the tensors of patterns
 NAMES = ("classes", "centre", "projection", "means", "middle", "overall")
 STEADY = 1e-6  # standard deviation below which a feature is constant
 
@@ -34,16 +39,18 @@ class ClassDistance:
     means: AnyFloats  # (class, component)
     middle: AnyFloats  # (component,), the mean of all slides
     overall: AnyFloats  # (component, component), into a space in which the covariance of all slides is the identity
+    patterns: Rocket | None = None  # None: only statistics are features
 
     @classmethod
     def fit(cls, frames: Float32s, labels: Ints) -> Self:
         """Return the distance to classes of slides (slide, time, channel) and their ``labels`` (slide,).
 
-        Raises `TacpipeError` for what `statistics` refuses.
+        Raises `TacpipeError` for what `Rocket.fit` refuses.
         """
         from sklearn.covariance import ledoit_wolf
 
-        read = statistics(frames).astype(np.float64)
+        patterns = Rocket.fit(with_profile(frames))
+        read = _features(frames, patterns)
         centre, spread = read.mean(axis=0), read.std(axis=0)
         gain = np.where(spread > STEADY, 1 / np.maximum(spread, STEADY), 0)
         scaled = (read - centre) * gain
@@ -59,26 +66,37 @@ class ClassDistance:
         spread, axes = np.linalg.eigh(np.atleast_2d(np.cov(within, rowvar=False)))
         overall = axes / np.sqrt(np.maximum(spread, 0) + STEADY)
         projection = gain[:, None] * (basis @ whiten)
-        return cls(classes.astype(np.int32), centre, projection, means @ whiten, within.mean(axis=0), overall)
+        return cls(classes.astype(np.int32), centre, projection, means @ whiten, within.mean(axis=0), overall, patterns)
 
     def scores(self, frames: Float32s) -> Floats:
         """Return minus half the squared relative distance of slides (slide, time, channel) to each class (slide, class)."""
-        placed = (statistics(frames).astype(np.float64) - self.centre) @ self.projection
+        placed = (_features(frames, self.patterns) - self.centre) @ self.projection
         away = np.square((placed - self.middle) @ self.overall).sum(axis=1)  # (slide,), from all slides
         found: Floats = (away[:, None] - np.square(placed[:, None] - self.means[None]).sum(axis=2)) / 2
         return found
 
     def to_tensors(self) -> dict[str, AnyArray]:
         """Return all that `from_tensors` needs."""
-        return {name: getattr(self, name) for name in NAMES}
+        patterns = {} if self.patterns is None else self.patterns.to_tensors()
+        return {**{name: getattr(self, name) for name in NAMES}, **{f"{PATTERNS}{k}": v for k, v in patterns.items()}}
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, AnyArray]) -> Self:
         """Return what `to_tensors` described. Raises `ValueError` where shapes do not fit one another."""
-        made = cls(*(tensors[name] for name in NAMES))
+        patterns = under(PATTERNS, tensors)
+        rocket = Rocket.from_tensors(patterns) if patterns else None
+        made = cls(**{name: tensors[name] for name in NAMES}, patterns=rocket)
         sizes = (len(made.centre), made.means.shape[1])
         if made.projection.shape != sizes or len(made.means) != len(made.classes):
             raise ValueError(f"the projection of slides is {made.projection.shape}, not {sizes}")
         if made.overall.shape != (sizes[1], sizes[1]) or made.middle.shape != (sizes[1],):
             raise ValueError(f"the space of all slides is {made.overall.shape}, not of {sizes[1]} components")
         return made
+
+
+def _features(frames: Float32s, patterns: Rocket | None) -> Floats:
+    """Return the features of slides (slide, time, channel), (slide, feature)."""
+    features = [statistics(frames)]
+    if patterns is not None:
+        features.append(patterns.transform(with_profile(frames)))
+    return np.concatenate(features, axis=1, dtype=np.float64)

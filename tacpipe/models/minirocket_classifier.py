@@ -38,13 +38,13 @@ class MinirocketClassifier:
         ``features`` is the number of patterns; ``seed`` that of the draws among them. Raises `TacpipeError` for slides
         that no pattern fits into, values not finite, or fewer than two classes.
         """
-        wide = _wide(x)
+        wide = with_profile(x)
         patterns = Rocket.fit(wide, features=features, seed=seed)
         return cls(patterns, *_read(patterns.transform(wide), _strength(wide), labels))
 
     def relabelled(self, x: AnyFloats, labels: Ints) -> MinirocketClassifier:
         """Return a classifier with the same patterns, its readout fitted to slides ``x`` and other ``labels``."""
-        wide = _wide(x)
+        wide = with_profile(x)
         return MinirocketClassifier(self.patterns, *_read(self.patterns.transform(wide), _strength(wide), labels))
 
     @property
@@ -57,7 +57,7 @@ class MinirocketClassifier:
 
         Raises `TacpipeError` where slides are not like those that were fitted, or values are not finite.
         """
-        wide = _wide(x)
+        wide = with_profile(x)
         return self.readout.scores(np.concatenate([self.patterns.transform(wide), _strength(wide)], axis=1))
 
     def predict(self, x: AnyFloats) -> Int32s:
@@ -92,7 +92,7 @@ def _read(patterns: AnyFloats, strength: AnyFloats, labels: Ints) -> tuple[Reado
     return Readout.nearest_mean(found, labels, shares(best)), best
 
 
-def _wide(x: AnyFloats) -> AnyFloats:
+def with_profile(x: AnyFloats) -> AnyFloats:
     """Return slides with the mean, spread and quantiles of their channels as six more channels, float32."""
     across = [x.mean(axis=2), x.std(axis=2), *np.quantile(x, QUANTILES, axis=2)]
     return np.concatenate([x, np.stack(across, axis=2)], axis=2, dtype=np.float32)
