@@ -18,6 +18,7 @@ WIDTH = 18  # features of a header: what the convolution gives, and as many of t
 KERNEL = (3, 5)
 MAPS = 3
 POOL = 2
+OTHER = "other"  # in a choice of headers: all sensors without such a grid
 
 
 class Plain(nn.Module):
@@ -121,15 +122,19 @@ def build(kind: str, channels: int, unpool: str = "nearest") -> Plain | Perceptr
 def chosen(given: str, sensors: Mapping[str, int]) -> dict[str, str]:
     """Return the header of each sensor; ``given`` is text like ``biotac=none,roboskin=cnn`` and may leave some out.
 
-    ``sensors`` has the number of channels. A grid of triangles gets a convolution by default, others none.
+    ``sensors`` has the number of channels. A grid of triangles gets a convolution by default, others what ``other``
+    states, or none.
 
     >>> chosen("biotac=mlp", {"biotac": 19, "roboskin": 60})
     {'biotac': 'mlp', 'roboskin': 'cnn'}
+    >>> chosen("other=mlp", {"biotac": 19, "roboskin": 60})
+    {'biotac': 'mlp', 'roboskin': 'cnn'}
     """
     stated = dict(part.strip().partition("=")[::2] for part in given.split(",") if part.strip())
+    other = stated.pop(OTHER, "none")
     unknown = sorted(set(stated) - set(sensors))
     if unknown:
         raise TacpipeError(f"headers names the sensor {unknown[0]}; the recordings have {', '.join(sensors)}.")
     return {
-        name: stated.get(name, "cnn" if channels == GRID[0] * GRID[1] else "none") for name, channels in sensors.items()
+        name: stated.get(name, "cnn" if channels == GRID[0] * GRID[1] else other) for name, channels in sensors.items()
     }

@@ -34,7 +34,9 @@ class Shape:
     hidden: int = HIDDEN
     latents: int = LATENTS
     unpool: str = "nearest"  # of the cnn: nearest, or last as in the published code
-    dropout: float = 0.0  # fraction of the latents left out before the classifier in each training step
+    dropout: float = (
+        0.0  # fraction of the latents, or last states, left out before the classifier in each training step
+    )
 
 
 class NetworkOutput(NamedTuple):
@@ -104,7 +106,7 @@ class RecurrentClassifier(nn.Module):
 
     def classify(self, latents: Tensor) -> Tensor:
         """Return the scores (slide, class) of last states (slide, hidden)."""
-        scores: Tensor = self.classifier(latents)
+        scores: Tensor = self.classifier(nn.functional.dropout(latents, self.shape.dropout, self.training))
         return scores
 
 

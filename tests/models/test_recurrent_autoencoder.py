@@ -110,8 +110,9 @@ def test_the_classifier_alone_has_its_last_state_for_latents_and_makes_no_frames
     assert parameters(network) == 39_960 + 90 * 20 + 20
 
 
-def test_dropout_leaves_out_latents_in_training_only() -> None:
-    network = RecurrentAutoencoder(Shape(19, 20, dropout=0.5))
+@pytest.mark.parametrize("kind", [RecurrentAutoencoder, RecurrentClassifier])
+def test_dropout_leaves_out_latents_in_training_only(kind: type[RecurrentAutoencoder | RecurrentClassifier]) -> None:
+    network = kind(Shape(19, 20, dropout=0.5))
     frames = torch.rand(4, 64, 19)
     network.eval()
     assert torch.equal(network(frames).scores, network(frames).scores)

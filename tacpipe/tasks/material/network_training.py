@@ -32,8 +32,8 @@ from tacpipe.tasks.material.classifier import (
 from tacpipe.tasks.material.losses import JointWork, ScaledSlides, Weights
 from tacpipe.tasks.material.naming import Naming
 from tacpipe.tasks.material.pairs import NONE, Pairs, permuted_classes
+from tacpipe.tasks.material.params import XLSTM, Params, Raec
 from tacpipe.tasks.material.params import Network as NetworkParams
-from tacpipe.tasks.material.params import Params, Raec
 from tacpipe.tasks.material.slides import BySensor, Slides
 from tacpipe.tasks.seen import seen
 from tacpipe.training import devices, loop
@@ -164,6 +164,8 @@ def _pairs(params: NetworkParams, slides: Mapping[str, ScaledSlides], partners: 
 
 def _shape(params: NetworkParams, some: Slides, header: str, classes: int) -> Shape:
     shape = Shape(channels=len(some.layout.channels), classes=classes, header=header, hidden=params.hidden)
+    if isinstance(params, XLSTM):
+        return dataclasses.replace(shape, dropout=params.dropout)
     if not isinstance(params, Raec):
         return shape
     return dataclasses.replace(

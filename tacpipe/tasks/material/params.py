@@ -36,6 +36,8 @@ KEY = "material"  # the label that names classes, unless params name another
 Presets = Mapping[str, Mapping[str, object]]
 Panels = Mapping[str, Sequence[str]]
 Dropout = Annotated[float, Range(0, below=1)]
+# the paper's text; its code has no header for BioTac, and a dropout that PyTorch ignores in an LSTM of one layer
+_PAPER_TEXT: Mapping[str, object] = {"epochs": 2000, "dropout": 0.2, "headers": "other=mlp"}
 HeldOut = Annotated[str, Assignments(Annotated[str, CommaList(least=1)], between=";")]
 
 
@@ -144,7 +146,8 @@ class Network(Material, ABC):
     subsample_sensor: Annotated[str, StoredAs("reduce")] = ""
     # percentage of the batches that it learns from
     subsample_percent: Annotated[Literal[100, 90, 50, 25, 17, 11], StoredAs("ratio")] = 100
-    # network in front of a sensor's, as biotac=mlp; by default cnn for a 6 x 10 grid, else none
+    # network in front of a sensor's, as biotac=mlp, or other=mlp for all sensors without a 6 x 10 grid; by default cnn
+    # for such a grid, else none
     headers: Annotated[str, Assignments(Literal["none", "mlp", "cnn"])] = ""
     hidden: PositiveInt = 90  # units of each LSTM
     # of the input: none; standard: mean 0 and deviation 1 of each channel; spread: one deviation for all channels,
@@ -214,9 +217,10 @@ class Raec(Network):
     classification_weight: NonNegativeFloat = 1.0  # of the negative log-likelihood of classes
     alignment_weight: NonNegativeFloat = 1.0  # of the alignment loss between sensors
     align_from: NonNegativeInt = 20  # first epoch, from 0, in which latents are aligned
-    dropout: Dropout = 0.0  # fraction of latents left out of each training step; 0 as in the published code
+    # fraction of latents left out of each training step; 0 as in the published code, 0.2 in the paper's text
+    dropout: Dropout = 0.0
     PRESETS: ClassVar[Presets] = {
-        "paper": {"epochs": 2000},
+        "paper": _PAPER_TEXT,
         "authors": {  # the published code with its quirks; to be given slides of the layout authors
             "epochs": 2000,
             "pairing": "fixed",
@@ -255,7 +259,8 @@ class XLSTM(Network):
 
     # x-lstm: the paper's classifier without decoder
     architecture: Literal["x-lstm"] = "x-lstm"
-    PRESETS: ClassVar[Presets] = {"paper": {"epochs": 2000}, "quick": {"epochs": 30}}
+    dropout: Dropout = added(0.0)  # fraction of the last state left out of each training step; 0.2 in the paper's text
+    PRESETS: ClassVar[Presets] = {"paper": _PAPER_TEXT, "quick": {"epochs": 30}}
 
     def build(self, shape: Shape) -> nn.Module:
         """Return the paper's recurrent classifier."""
