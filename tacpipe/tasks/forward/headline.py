@@ -60,13 +60,13 @@ class Parts:
     @property
     def skill(self) -> AnyFloats:
         """1 - the geometric mean over recordings of the ratio to persistence's absolute error, (..., step)."""
-        return np.where(self.counted > 0, -np.expm1(self.logs / np.maximum(self.counted, 1)), np.nan)
+        return np.where(self.counted > 0, -np.expm1(self.logs / np.maximum(self.counted, 1)) + 0.0, np.nan)
 
     @property
     def mean_skill(self) -> AnyFloats:
         """`skill` with the geometric mean over steps too, (...)."""
         counted = self.counted.sum(axis=-1)
-        return np.where(counted > 0, -np.expm1(self.logs.sum(axis=-1) / np.maximum(counted, 1)), np.nan)
+        return np.where(counted > 0, -np.expm1(self.logs.sum(axis=-1) / np.maximum(counted, 1)) + 0.0, np.nan)
 
     @property
     def squared_skill(self) -> AnyFloats:
