@@ -31,7 +31,7 @@ def opened(path: Path) -> ArrayContainer:
 
 
 @stage(
-    version=1, discover=COMMAND.discover, preview=COMMAND.preview, guess=COMMAND.guess, why_unread=COMMAND.why_unread
+    version=2, discover=COMMAND.discover, preview=COMMAND.preview, guess=COMMAND.guess, why_unread=COMMAND.why_unread
 )
 def hdf5(params: Params, files: Files, values: Values) -> RecordingOutput:
     """Read HDF5 files of robomimic, ALOHA or a lab's own.

@@ -43,7 +43,7 @@ def preview(params: Params, source: Path) -> str:
         return COMMAND.preview(params, source)
 
 
-@stage(version=1, discover=COMMAND.discover, preview=preview, guess=COMMAND.guess, why_unread=COMMAND.why_unread)
+@stage(version=2, discover=COMMAND.discover, preview=preview, guess=COMMAND.guess, why_unread=COMMAND.why_unread)
 def zarr(params: Params, files: Files, values: Values) -> RecordingOutput:
     """Read Zarr stores, as replay buffers of UMI.
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from tacpipe.arrays import AnyArray
 from tacpipe.errors import TacpipeError
-from tacpipe.formats.arrays.tree import Array
+from tacpipe.formats.arrays.tree import Array, with_time_first
 from tacpipe.io import memory, regular
 from tacpipe.printable import excerpt, plain
 
@@ -72,8 +72,8 @@ class Hdf5Tree:
                     arrays.append(one)
                 elif one and not again:
                     below.append(one)
-        self._members[group] = arrays, below
-        return arrays, below
+        self._members[group] = with_time_first(arrays), below
+        return self._members[group]
 
     def is_group(self, path: str) -> bool:
         """Return whether there is a group of this path."""
@@ -96,8 +96,9 @@ class Hdf5Tree:
             if self._left is not None:
                 _expect_there(found, self._left)
             text = h5py.check_string_dtype(found.dtype) is not None
-            given = (found.asstr(errors="replace") if text else found)[() if not array.shape else slice(start, stop)]
-            return np.asarray(given)
+            rows = (*(slice(None),) * array.time_axis, slice(start, stop)) if array.shape else ()
+            given = (found.asstr(errors="replace") if text else found)[rows]
+            return np.moveaxis(np.asarray(given), array.time_axis, 0) if array.shape else np.asarray(given)
 
     def files(self, array: Array, start: int, stop: int) -> None:
         """Return None: all arrays lie in one file."""

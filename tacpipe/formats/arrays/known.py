@@ -73,10 +73,16 @@ def meanings(name: str, width: int, whole: bool = False) -> list[Meaning]:
     (Meaning(quantity='position', unit='m', component='x'), 'rad')
     >>> meanings("tactile_left", 48, whole=True)[0]
     Meaning(quantity='tactile', unit='count', component='')
+    >>> meanings("tactile_slips_label", 1)[0].quantity, meanings("tactile_timestamps", 1)[0].quantity
+    ('label', '')
     >>> meanings("object", 14)[0], meanings("robot0_joint_pos_cos", 7)[0]
     (Meaning(quantity='', unit='', component=''), Meaning(quantity='', unit='', component=''))
     """
     text = name.strip().lower()
+    if guess.is_clock(text):
+        return [NOTHING] * width
+    if guess.is_label(text):
+        return [Meaning("label", "1")] * width
     for pattern, wanted, found in _VECTORS:
         if wanted == width and re.fullmatch(pattern, text):
             return list(found)

@@ -14,6 +14,7 @@ TIME = re.compile(
     r"(t|time|times|timestamps?|time_?stamps?|stamps?|clock|unix_?time|epoch)(_?(s|sec|seconds|ms|us|ns))?",
     re.IGNORECASE,
 )
+SENSOR_TIME = re.compile(r"\w+_(time_?stamps?|stamps?|time)(_?(s|sec|seconds|ms|us|ns))?", re.IGNORECASE)
 LENGTHS = "compress_len"  # of ALOHA's frames before they were padded
 NEXT = "next_obs"  # of robomimic: obs, one step later
 ROOT = "/"  # the source of arrays that lie in the recording's own group
@@ -115,11 +116,16 @@ def _split(arrays: Sequence[Array], group: str, episode: Episode, above: Sequenc
 
 def _stamps(same: Sequence[Array], above: Sequence[Array]) -> Array | None:
     """Return the array that holds the stamps of arrays of one length: among them, else in a group above."""
-    own = next(filter(_is_time, same), None)
+    clocks = [array for array in same if _is_time(array)]
+    own = next((array for array in clocks if TIME.fullmatch(array.name)), next(iter(clocks), None))
     length = same[0].shape[0] if same else None
     return own or next((one for one in reversed(above) if length is None or one.shape[0] == length), None)
 
 
 def _is_time(array: Array) -> bool:
     narrow = len(array.shape) == 1 or array.shape[1:] == (1,)
-    return narrow and array.dtype.kind in "iuf" and TIME.fullmatch(array.name) is not None
+    return (
+        narrow
+        and array.dtype.kind in "iuf"
+        and (TIME.fullmatch(array.name) is not None or SENSOR_TIME.fullmatch(array.name) is not None)
+    )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -30,6 +30,7 @@ class Array:
     attributes: Mapping[str, Any] = field(default_factory=dict)
     chunk_rows: int = 0  # rows of a chunk, 0 where the file has none
     problem: str = ""  # why it cannot be read, as in "is …"; empty: it can
+    time_axis: int = 0  # the dimension of the file's array that is the first of ``shape``
 
     @property
     def name(self) -> str:
@@ -75,6 +76,39 @@ class Tree(Protocol):
 
     def stated(self, array: Array) -> Any:
         """How the rows of an array are encoded, as JSON, without how many there are."""
+
+
+def with_time_first(arrays: Sequence[Array]) -> list[Array]:
+    """Return the arrays of a group with the dimension of time first: the one that is as long as the group's 1-D arrays.
+
+    Where no dimension is, time is the first unless it is a small part of the longest.
+
+    >>> arrays = [Array("tactile", (18, 3, 400), np.dtype("f4")), Array("t", (400,), np.dtype("f8"))]
+    >>> [array.shape for array in with_time_first(arrays)]
+    [(400, 18, 3), (400,)]
+    """
+    lengths = {array.shape[0] for array in arrays if len(array.shape) == 1 and array.shape[0] > 1}
+    firsts = [array.shape[0] for array in arrays if array.shape]
+    turned = []
+    for array in arrays:
+        axis = 0
+        if (
+            len(array.shape) > 1
+            and array.dtype.kind in "biuf"
+            and not is_image(array)
+            and array.shape[0] not in lengths
+        ):
+            matching = [axis for axis, length in enumerate(array.shape) if length in lengths]
+            longest = array.shape.index(max(array.shape))
+            small = (
+                firsts.count(array.shape[0]) == 1
+                and array.shape[0] < 100
+                and array.shape[longest] >= 4 * array.shape[0]
+            )
+            axis = matching[0] if matching else longest if small else 0
+        shape = (array.shape[axis], *array.shape[:axis], *array.shape[axis + 1 :]) if array.shape else ()
+        turned.append(replace(array, shape=shape, time_axis=axis, chunk_rows=0 if axis else array.chunk_rows))
+    return turned
 
 
 def walk(tree: Tree, group: str = "") -> Iterator[tuple[str, list[Array]]]:

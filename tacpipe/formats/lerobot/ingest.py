@@ -12,7 +12,7 @@ COMMAND = Command("lerobot")
 
 
 @stage(
-    version=1, discover=COMMAND.discover, preview=COMMAND.preview, guess=COMMAND.guess, why_unread=COMMAND.why_unread
+    version=2, discover=COMMAND.discover, preview=COMMAND.preview, guess=COMMAND.guess, why_unread=COMMAND.why_unread
 )
 def lerobot(params: Params, files: Files, values: Values) -> RecordingOutput:
     """Read LeRobot datasets, version 2.0, 2.1 and 3.0.

@@ -512,14 +512,16 @@ def _text_time(texts: Sequence[str], where: str) -> str:
 def _rules(found: Looked, names: Sequence[str]) -> list[str]:
     """Return an entry for each set of columns whose names differ in numbers alone and whose values are alike."""
     by_rule: dict[tuple[str, ...], list[str]] = {}
+    matches = {_match(_base(name)) for name in names}
     for name in names:
         values = [value for value in found.values[name] if value is not None]
         kind = _kind(values)
         quantity, unit = meaning(_base(name), kind)
         unit = _stated_unit(found, name) or unit
-        by_rule.setdefault((_match(_base(name)), name.strip()[len(_base(name)) :], quantity, unit, kind), []).append(
-            name
-        )
+        match, bracket = _match(_base(name)), name.strip()[len(_base(name)) :]
+        if quantity == "tactile" and {f"{match[:-1]}{axis}" for axis in "xyz"} <= matches:
+            match = f"{match[:-1]}{{axis}}"
+        by_rule.setdefault((match, bracket, quantity, unit, kind), []).append(name)
     rules = []
     whole = {part for name in names for part in [_part(_base(name))] if part}
     for (match, bracket, quantity, unit, kind), members in by_rule.items():
@@ -529,7 +531,7 @@ def _rules(found: Looked, names: Sequence[str]) -> list[str]:
             and kind.startswith("float")
             and {_place(_base(name)) for name in members} <= {"x", "y", "z"}
         ):
-            quantity = "position" if whole >= set("xyzw") else quantity
+            quantity = "position" if whole >= set("xyzw") or unit in ("m", "cm", "mm") else quantity
         if kind == "text":
             rules.append(f"{{ match = {_quoted(base + bracket)}, skip = true }},")
             continue
@@ -573,7 +575,9 @@ def _of_taxels(match: str, quantity: str, kind: str) -> str:
     ('pad{taxel}', 'q{number}')
     """
     taxels = quantity == "tactile" or (quantity == UNKNOWN and "int" in kind)
-    return re.sub(r"\{\w+\}", "{taxel}", match) if taxels and match.count("{") == 1 else match
+    if not taxels or match.replace("{axis}", "").count("{") != 1:
+        return match
+    return re.sub(r"\{(?!axis\})\w+\}", "{taxel}", match)
 
 
 def _match(name: str) -> str:
@@ -608,6 +612,10 @@ def meaning(name: str, kind: str) -> tuple[str, str]:
     (('force', 'N'), ('force', '?'), ('tactile', 'count'))
     """
     text = _identifier(name.strip())
+    if is_label(text):
+        return "label", "1"
+    if is_clock(text):
+        return "time", UNKNOWN
     for wanted, quantity in _MEANINGS:
         if re.search(rf"(?:^|_)(?:{wanted})$", text, re.IGNORECASE):
             if quantity == "tactile" and "int" in kind:
@@ -615,6 +623,29 @@ def meaning(name: str, kind: str) -> tuple[str, str]:
             said = (unit for end, unit, of in _SUFFIXES if quantity in of and re.search(f"{end}$", text, re.IGNORECASE))
             return quantity, _UNITS.get(quantity) or next(said, UNKNOWN)
     return UNKNOWN, UNKNOWN
+
+
+def is_label(name: str) -> bool:
+    """Return whether a name is that of labels, which are no readings, even where the name begins with a sensor.
+
+    >>> is_label("tactile_slips_label"), is_label("skin_mask"), is_label("label_free_force")
+    (True, True, False)
+    """
+    return bool(
+        re.search(
+            r"(?:^|[_./ ])(?:labels?|mask|class(?:es)?|annotations?|ground_?truth|target_?class)$", name, re.IGNORECASE
+        )
+    )
+
+
+def is_clock(name: str) -> bool:
+    """Return whether a name is that of stamps, whatever sensor it names too.
+
+    >>> is_clock("tactile_timestamps"), is_clock("obs/time_ns"), is_clock("contact_time_constant")
+    (True, True, False)
+    """
+    last = re.split(r"[/.]", name)[-1]
+    return bool(_TIME.fullmatch(last) or (_ENDS_IN_TIME.fullmatch(last) and not re.search(r"_t$", last)))
 
 
 def _kind(values: Sequence[float | str]) -> str:

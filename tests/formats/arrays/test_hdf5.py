@@ -320,3 +320,32 @@ def test_a_stream_of_many_blocks_is_the_one_that_was_written(
     assert made["skin"].column("label").to_pylist()[99] == "row 99"
     assert made["frames"].column("data").to_pylist() == pictures
     assert about(made["frames"], "data") == {"quantity": "image", "encoding": "jpeg"}
+
+
+def test_labels_and_clocks_of_a_sensor_are_no_channels_and_time_is_the_longest_dimension(tmp_path: Path) -> None:
+    values = np.random.default_rng(3).normal(size=(18, 3, 400)).astype(np.float32)
+    slips, seconds = np.arange(400) % 2, 1_700_000_000 + np.arange(400) / 64
+    for clock in (True, False):
+        with h5py.File(tmp_path / "a.h5", "w") as file:
+            file["tactile_data"] = values
+            if clock:
+                file["tactile_slips_label"], file["tactile_timestamps"] = slips, seconds
+            else:
+                file.attrs["rate_hz"] = 64
+        (output,) = read(tmp_path).values()
+        (table,) = output.streams.values()
+        tactile = [name for name in table.column_names if about(table, name).get("quantity") == "tactile"]
+        assert len(tactile) == 54 and table.num_rows == 400
+        for taxel in range(18):
+            for place, axis in enumerate("xyz"):
+                name = next(
+                    name
+                    for name in tactile
+                    if (about(table, name)["taxel"], about(table, name)["axis"]) == (str(taxel + 1), axis)
+                )
+                assert table.column(name).to_pylist() == values[taxel, place].tolist()
+        if clock:
+            assert about(table, "tactile_slips_label")["quantity"] == "label"
+            assert table.column("t_ns").to_pylist() == [1_700_000_000 * 10**9 + row * 15_625_000 for row in range(400)]
+            rules = [line for line in hdf5.COMMAND.guess(tmp_path).splitlines() if 'quantity = "tactile"' in line]
+            assert rules and not any("label" in line or "timestamps" in line for line in rules)

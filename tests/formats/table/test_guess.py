@@ -119,6 +119,15 @@ def test_numbered_columns_that_are_or_may_be_taxels_state_which(tmp_path: Path) 
     assert 'quantity = "joint_position"' in found["q{number}"]
 
 
+def test_axes_of_taxels_are_one_rule_and_lengths_called_x_y_z_are_a_position(tmp_path: Path) -> None:
+    cells = {f"taxel {n} {axis} [counts]": [1, 2] for n in (1, 2) for axis in "xyz"}
+    place = {f"{axis} [mm]": [0.5, 0.25] for axis in "xyz"}
+    found = columns_of(tmp_path, pd.DataFrame({"time": [1.7e9, 1.7e9 + 1], **cells, **place}))
+    assert set(found) == {"taxel {taxel} {axis} [counts]", "x [mm]", "y [mm]", "z [mm]"}
+    assert 'name = "taxel_{taxel}_{axis}", quantity = "tactile"' in found["taxel {taxel} {axis} [counts]"]
+    assert all('quantity = "position", unit = "mm"' in found[f"{axis} [mm]"] for axis in "xyz")
+
+
 def test_a_place_beside_a_quaternion_is_a_position_and_one_alone_is_asked_for(tmp_path: Path) -> None:
     place, turned = (dict.fromkeys(names, (0.5, 0.25)) for names in ("xyz", ("qx", "qy", "qz", "qw")))
     time = {"time": [1.7e9, 1.7e9 + 1]}
