@@ -145,7 +145,7 @@ def test_the_row_of_persistence_is_shown_where_another_baseline_is_better() -> N
     found = forward.headline("net", (1,), sums.pop("net"), sums, None)
     assert found is not None and [one.name for one in found.shown] == ["ridge", "persistence"]
     table = headline_table.text([found])
-    (row,) = [line.split() for line in table.splitlines() if line.strip().startswith("persistence")]
+    row = next(line.split() for line in table.splitlines() if line.startswith("  persistence"))
     assert row[-2:] == ["0", "0"]
     assert "vs ridge" in table and "\n  persistence" in table and "mean " not in table.split("n: recordings")[0]
     known = summary.of([found])
