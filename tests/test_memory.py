@@ -118,3 +118,30 @@ def test_a_sound_recording_that_is_larger_than_what_is_left_is_not_called_damage
     monkeypatch.setattr(memory, "available", lambda: 1 << 27)
     with pytest.raises(ShortageError, match=r"declares 0\.2 GB of data, and 0\.1 GB of memory are left"):
         from_parquet(content)
+
+
+@pytest.mark.parametrize(
+    ("line", "place", "files"),
+    [
+        ("0::/lab/job", "lab", {"memory.max": "5000", "memory.current": "3000", "memory.stat": "inactive_file 500"}),
+        (
+            "4:cpu,memory:/lab/job",
+            "memory/lab",
+            {
+                "memory.limit_in_bytes": "5000",
+                "memory.usage_in_bytes": "3000",
+                "memory.stat": "total_inactive_file 500",
+            },
+        ),
+    ],
+)
+def test_the_limit_of_a_control_group_above_counts_in_both_versions(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, line: str, place: str, files: dict[str, str]
+) -> None:
+    (tmp_path / place).mkdir(parents=True)
+    for name, text in files.items():
+        (tmp_path / place / name).write_text(text)
+    (tmp_path / "own").write_text(line + "\n")
+    monkeypatch.setattr(memory, "GROUPS", tmp_path)
+    monkeypatch.setattr(memory, "OWN_GROUPS", tmp_path / "own")
+    assert memory.available() == 5000 - 3000 + 500

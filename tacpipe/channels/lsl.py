@@ -105,7 +105,7 @@ def parse(text: str | bytes) -> Description:
     )
     if form not in FORMATS:
         raise TacpipeError(f"its channel_format is {excerpt(form)}, not one of {', '.join(FORMATS)}")
-    if not count.isdecimal() or not 1 <= int(count) <= MOST_CHANNELS:
+    if not count.isdecimal() or len(count) > 9 or not 1 <= int(count) <= MOST_CHANNELS:
         raise TacpipeError(f"its channel_count is {excerpt(count)}, not between 1 and {MOST_CHANNELS:,}")
     try:
         rate_hz = float(rate or 0)

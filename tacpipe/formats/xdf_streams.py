@@ -28,7 +28,7 @@ from tacpipe.formats.containers import kinds
 from tacpipe.formats.containers.container import Batched, Contents, SourceStream, Time
 from tacpipe.formats.xdf_chunks import Chunk, Damage
 from tacpipe.io import regular
-from tacpipe.io.spill import Piece, Spill
+from tacpipe.io.spill import Piece, Spill, unpack
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import excerpt, plain
 from tacpipe.signals import clock_offsets, clocks
@@ -208,23 +208,25 @@ def _content(path: Path) -> xdf_chunks.Content:
         head = file.read(2)
         if head == b"\x1f\x8b":
             file.seek(0)
-            _decompress(file, unpacked)
+            unpack(_unpacked(file), unpacked, path)
+            unpacked.flush()
             head = b"" if not unpacked.tell() else head
         if not head:
             return b""
         return mmap.mmap((unpacked if head == b"\x1f\x8b" else file).fileno(), 0, access=mmap.ACCESS_READ)
 
 
-def _decompress(file: BinaryIO, unpacked: BinaryIO) -> None:
-    stream = zlib.decompressobj(wbits=31)  # of gzip, of which several may follow one another
+def _unpacked(file: BinaryIO) -> Iterator[bytes]:
+    """Yield what a file of gzip holds, of which several may follow one another, up to where it was cut off."""
+    stream = zlib.decompressobj(wbits=31)
     while data := file.read(COMPRESSED_BYTES):
         while data:
             if stream.eof:
                 stream = zlib.decompressobj(wbits=31)
-            unpacked.write(stream.decompress(data))
-            data = stream.unused_data
-    unpacked.write(stream.flush())
-    unpacked.flush()
+            yield stream.decompress(data, COMPRESSED_BYTES)
+            data = stream.unused_data if stream.eof else stream.unconsumed_tail
+    while not stream.eof and (block := stream.decompress(stream.unconsumed_tail, COMPRESSED_BYTES)):
+        yield block
 
 
 def _take(read: _Read, chunk: Chunk | Damage, path: Path) -> None:

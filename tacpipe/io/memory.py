@@ -16,7 +16,12 @@ from tacpipe.errors import ShortageError, TacpipeError
 
 MEMINFO = Path("/proc/meminfo")
 STATM = Path("/proc/self/statm")
-GROUP = Path("/sys/fs/cgroup")  # of a container: its limit, and what is used of it
+GROUPS = Path("/sys/fs/cgroup")  # of containers: their limits, and what is used of them
+OWN_GROUPS = Path("/proc/self/cgroup")  # which of them this process is in
+_VERSIONS = {  # of control groups: files with the limit and the use, and of reclaimable bytes the name in memory.stat
+    "": ("memory.max", "memory.current", "inactive_file"),
+    "memory": ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
+}
 AT_HAND = 1 << 26  # bytes that are not worth asking the system about
 MOST_BLOCK = 1 << 28  # bytes that a chunk, a page or a record of a file may unpack to
 KEPT = 0.9  # fraction of what is left that one file may declare
@@ -39,13 +44,36 @@ def available() -> int:
     with contextlib.suppress(OSError, ValueError, IndexError):
         fields = dict(line.split(":", 1) for line in MEMINFO.read_text().splitlines())
         left.append(int(fields["MemAvailable"].split()[0]) << 10)
-    with contextlib.suppress(OSError, ValueError):  # "max" where there is no limit
-        left.append(int((GROUP / "memory.max").read_text()) - int((GROUP / "memory.current").read_text()))
+    left += _left_in_groups()
     limit, _ = resource.getrlimit(resource.RLIMIT_AS)
     if limit != resource.RLIM_INFINITY:
         with contextlib.suppress(OSError, ValueError, IndexError):
             left.append(limit - int(STATM.read_text().split()[0]) * resource.getpagesize())
     return max(0, min(left))
+
+
+def _left_in_groups() -> Iterator[int]:
+    """Yield how many bytes each control group of this process, of version 1 or 2, and those above it have left."""
+    lines = ["0::/", "0:memory:/"]  # as a container sees its own
+    with contextlib.suppress(OSError):
+        lines += OWN_GROUPS.read_text().splitlines()
+    places: dict[Path, str] = {}
+    for line in lines:
+        _, controllers, path = line.split(":", 2)
+        version = "memory" if "memory" in controllers.split(",") else controllers
+        if version in _VERSIONS:
+            place = GROUPS / version / path.strip("/")
+            places |= dict.fromkeys(
+                [place, *place.parents[: len(place.parts) - len((GROUPS / version).parts)]], version
+            )
+    for place, version in places.items():
+        most, used, reclaimable = _VERSIONS[version]
+        with contextlib.suppress(OSError, ValueError):  # "max" where there is no limit
+            left = int((place / most).read_text()) - int((place / used).read_text())
+            with contextlib.suppress(OSError, ValueError):
+                counts = dict(line.split(maxsplit=1) for line in (place / "memory.stat").read_text().splitlines())
+                left += int(counts.get(reclaimable, 0))
+            yield left
 
 
 def limited() -> bool:
@@ -145,6 +173,43 @@ def require(needed: int, what: str, *, error: type[TacpipeError] = TacpipeError)
             "is what you expect, read it on a computer with more memory or in parts; if its source is untrusted, do "
             "not use it."
         )
+
+
+def require_block(size: int, what: str) -> None:
+    """Raise `TacpipeError` where a chunk, a page or a record of a file declares more than `MOST_BLOCK` bytes."""
+    if size > MOST_BLOCK:
+        raise TacpipeError(
+            f"{what} declares {readable_size(size)} in one piece, and at most {readable_size(MOST_BLOCK)} are read at once. "
+            "Write it in smaller chunks; if its source is untrusted, do not use it."
+        )
+
+
+@contextlib.contextmanager
+def bounded(most: int, what: str) -> Iterator[None]:
+    """Raise `TacpipeError` where the block takes more than ``most`` bytes more than are taken, on Linux.
+
+    It is for libraries that unpack what a file holds without a look at how much that is.
+    """
+    soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
+    try:
+        limit = int(STATM.read_text().split()[5]) * resource.getpagesize() + most
+    except (OSError, ValueError, IndexError):
+        yield
+        return
+    limit = min(one for one in (limit, soft, hard) if one != resource.RLIM_INFINITY)
+    resource.setrlimit(resource.RLIMIT_DATA, (limit, hard))
+    try:
+        yield
+    except Exception as error:
+        resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
+        if isinstance(error, MemoryError) or "alloc" in str(error).lower():
+            raise TacpipeError(
+                f"{what} unpacks to more than {readable_size(most)}, which is more than it declares or than is read at "
+                "once. If its source is untrusted, do not use it."
+            ) from error
+        raise
+    finally:
+        resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
 
 
 def readable_size(count: int) -> str:

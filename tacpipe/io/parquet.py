@@ -5,8 +5,10 @@ from __future__ import annotations
 import io
 import itertools
 import json
+import mmap
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,7 +17,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from tacpipe.errors import DamagedError, ShortageError, TacpipeError
-from tacpipe.io import memory, row_groups
+from tacpipe.io import memory, regular, row_groups
 from tacpipe.io.parquet_claims import claimed, counted
 from tacpipe.printable import plain
 
@@ -107,6 +109,60 @@ def from_parquet(content: bytes, columns: Sequence[str] | None = None) -> pa.Tab
     `ShortageError` where it is more than the memory that is left, which a sound file may hold too.
     """
     return ParquetTable(content).read(columns)
+
+
+def require_claims(
+    path: Path, columns: Collection[str] | None, *, share: float = 1.0, most: int | None = None, rows: int | None = None
+) -> None:
+    """Raise `TacpipeError` where columns of an untrusted file declare more than may be read at once, or than is there.
+
+    That is ``most`` bytes, by default what memory is left, for the fraction ``share`` that is read at once, or
+    `memory.MOST_BLOCK` of ``rows`` rows where so many are. Texts that share an entry of a dictionary count each.
+    """
+    with regular.failing(path), regular.opened(path) as file:
+        try:
+            schema = pq.ParquetFile(file).schema
+            with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as mapped, memoryview(mapped) as content:
+                least, largest, _ = counted(schema, content, columns, shared=True)
+                total, _, _ = counted(schema, content, columns)
+        except BROKEN as error:
+            raise TacpipeError(
+                f"{path} is not a whole Parquet file: {plain(' '.join(str(error).split()), 200)}. Copy it again."
+            ) from error
+        memory.require_block(largest, f"A page of {path}")
+        limit = memory.MOST_BLOCK if rows is not None else most
+        if rows is None:
+            _require_size(path, int(least * share), limit)
+        if total * share > min(limit or total, memory.MOST_BLOCK):
+            texts = _text_bytes(file, schema, columns, rows or BATCH_ROWS)
+            _require_size(path, max(texts, default=0) if rows is not None else int((least + sum(texts)) * share), limit)
+
+
+def _require_size(path: Path, size: int, most: int | None) -> None:
+    if most is None:
+        memory.require(size, str(path))
+    elif size > most:
+        raise TacpipeError(
+            f"{path} declares {memory.readable_size(size)} that would be read at once, and {memory.readable_size(most)} are "
+            f"allowed. Write it with shorter texts; if its source is untrusted, do not use it."
+        )
+
+
+def _text_bytes(file: Any, schema: Any, columns: Collection[str] | None, rows: int) -> Iterator[int]:
+    """Yield how many bytes the texts of so many rows are: their entries in dictionaries are read once each."""
+    leaves = [schema.column(place) for place in range(len(schema))]
+    for path in (leaf.path for leaf in leaves if leaf.physical_type == "BYTE_ARRAY"):
+        if columns is None or path in columns or path.partition(".")[0] in columns:
+            file.seek(0)
+            for batch in pq.ParquetFile(file, read_dictionary=[path]).iter_batches(rows, columns=[path]):
+                values = batch.column(0)
+                while pa.types.is_nested(values.type):
+                    values = values.field(0) if pa.types.is_struct(values.type) else values.flatten()
+                if pa.types.is_dictionary(values.type):
+                    lengths = pc.binary_length(values.dictionary).take(values.indices)
+                else:
+                    lengths = pc.binary_length(values)
+                yield pc.sum(lengths).as_py() or 0
 
 
 class ParquetTable:

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 DATA, DICTIONARY = 0, 2  # kinds of pages
 PLAIN, DELTA_LENGTH = 0, 6  # encodings of texts that are as long as what represents them
+INDEXES = (2, 8)  # encodings of texts that stand in a dictionary
+INDEX = 4  # bytes of a place in a dictionary, in memory
 WIDTHS = {"BOOLEAN": 1, "INT32": 4, "INT64": 8, "INT96": 12, "FLOAT": 4, "DOUBLE": 8}  # bytes of a value in memory
 OFFSET = 8  # bytes that a text takes beside its own
 _VARINT = rb"([\x80-\xff]*[\x00-\x7f])"
@@ -47,9 +49,11 @@ def claimed(schema: ParquetSchema, content: bytes | memoryview, columns: Collect
 
 
 def counted(
-    schema: ParquetSchema, content: bytes | memoryview, columns: Collection[str] | None = None
+    schema: ParquetSchema, content: bytes | memoryview, columns: Collection[str] | None = None, *, shared: bool = False
 ) -> tuple[int, int, int]:
     """Return how many bytes all values of ``columns`` are, how many the largest page is, and how many columns there are.
+
+    Where ``shared``, texts in a dictionary are as they are in the file: each is there once.
 
     The footer is read here, because pyarrow's own look at it ends the process where its parts contradict one another.
     Raises `ValueError` where a column states another number of values than its pages, or of pages that are not there.
@@ -69,7 +73,7 @@ def counted(
             values = sum(page.values for page in pages if page.kind != DICTIONARY)
             if values != chunk.get(5):
                 raise ValueError(f"column {name!r:.60} declares {chunk.get(5)} values and holds {values}")
-            total += values * width if width else _texts(pages)
+            total += values * width if width else _texts(pages, shared=shared)
             largest = max(largest, *(page.unpacked for page in pages), 0)
     if told.get(3) != rows:
         raise ValueError(f"it declares {told.get(3)} rows, and its groups of {rows}")
@@ -96,12 +100,14 @@ def _span(chunk: Mapping[int, Any], end: int, name: str) -> tuple[int, int]:
     return start, stop
 
 
-def _texts(pages: Collection[Page]) -> int:
+def _texts(pages: Collection[Page], *, shared: bool) -> int:
     """Return how many bytes texts can be: those that share beginnings, or stand in a dictionary, as long as it each."""
     words = max((page.unpacked for page in pages if page.kind == DICTIONARY), default=0)
-    total = 0
+    total = words if shared else 0
     for page in pages:
-        if page.kind != DICTIONARY:
+        if page.kind != DICTIONARY and shared and page.encoding in INDEXES:
+            total += page.values * INDEX
+        elif page.kind != DICTIONARY:
             longest = 0 if page.encoding in (PLAIN, DELTA_LENGTH) else max(words, page.unpacked)
             total += page.unpacked + page.values * (OFFSET + longest)
     return total

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import shutil
 import tempfile
 import threading
 import weakref
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO
 
 import numpy as np
 import pyarrow as pa
 
+from tacpipe.errors import StorageError
 from tacpipe.io.files import sentence
 from tacpipe.io.parquet import owned
 
@@ -26,6 +30,9 @@ class Piece:
     size: int
     rows: int
     least: Mapping[str, float] = field(default_factory=dict)
+
+
+KEPT = 0.9  # fraction of the free disk that one file may unpack to
 
 
 class Spill:
@@ -75,6 +82,26 @@ class Spill:
             self._file.seek(piece.start)
             content = self._file.read(piece.size)
         return pa.ipc.open_stream(owned(content)).read_all()
+
+
+def unpack(blocks: Iterable[bytes], target: IO[bytes], path: Path) -> None:
+    """Write what the file at ``path`` unpacks to into a temporary file.
+
+    Raises `StorageError` where that is more than nine tenths of the free disk, before that is full.
+    """
+    folder = tempfile.gettempdir()
+    left = room = int(shutil.disk_usage(folder).free * KEPT)
+    for block in blocks:
+        left -= len(block)
+        if left < 0:
+            raise StorageError(
+                f"{path} unpacks to more than the {room / 1e9:.3g} GB that {folder} has left. Set TMPDIR to a folder with "
+                f"more room; if its source is untrusted, do not use it."
+            )
+        try:
+            target.write(block)
+        except OSError as error:
+            raise sentence(folder, error) from error
 
 
 class Gathered:

@@ -6,13 +6,19 @@ A reader answers with all recordings, with a note that names the loss, or with a
 from __future__ import annotations
 
 import json
+import os
 import pickle
 import re
+import shlex
 import sqlite3
 import struct
-from collections.abc import Callable
+import subprocess
+import sys
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +27,12 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+import zstandard
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 
 from tacpipe.plugins import registry
-from tests.conftest import Lab
+from tests.conftest import Lab, Ran
 from tests.formats import grasp_files, slide_files, xdf_writer, xela_files
 from tests.formats.arrays import files as array_files
 from tests.formats.bags import writers
@@ -633,11 +640,219 @@ def test_no_codec_of_a_file_runs_code(lab: Lab, reader: str, case: Case) -> None
     assert not (lab.folder / "ran").exists()
 
 
+# ---- A size that a file only declares
+
+
+def _wide_template(folder: Path) -> None:
+    lerobot_files.write_v2(folder / "set")
+    path = folder / "set" / "meta" / "info.json"
+    about = json.loads(path.read_text()) | {"data_path": "data/{episode_index:02000000000d}.parquet"}
+    path.write_text(json.dumps(about))
+
+
+def _long_texts(path: Path, columns: dict[str, Any], rows: int) -> None:
+    """Write a table whose texts are one of a megabyte, which its dictionary has once."""
+    text = pa.DictionaryArray.from_arrays(pa.array(np.zeros(rows, np.int32)), pa.array(["x" * 1_000_000]))
+    schema = pa.schema([("text", pa.dictionary(pa.int32(), pa.string())), *((name, pa.float64()) for name in columns)])
+    pq.write_table(pa.table({"text": text, **columns}, schema), path)
+
+
+def _long_texts_of_episodes(folder: Path) -> None:
+    lerobot_files.write_v3(folder / "set")
+    _long_texts(next((folder / "set" / "meta" / "episodes").rglob("*.parquet")), {}, 4000)
+
+
+def _many_chunks(folder: Path) -> None:
+    array_files.store(folder / "a.zarr").create_group("data")
+    (folder / "a.zarr" / "data" / "a").mkdir()
+    about = {**V2, "shape": [4_000_000_000], "chunks": [1], "dtype": "<f8", "filters": None}
+    (folder / "a.zarr" / "data" / "a" / ".zarray").write_text(json.dumps(about))
+
+
+def _large_chunk(folder: Path) -> None:
+    about = {**V2, "shape": [500_000_000], "chunks": [500_000_000], "dtype": "<f8", "filters": None}
+    _zarr_array(about, b"")(folder)
+
+
+def _bomb_chunk(codec: str) -> Callable[[Path], None]:
+    """Return a function that writes a chunk of 80 values which unpacks to 1 GB."""
+
+    def write(folder: Path) -> None:
+        about = {**V2, "dtype": "<f8", "filters": None, "compressor": {"id": codec, "level": 1}}
+        block = bytes(1 << 24)
+        if codec == "zstd":
+            packed = zstandard.ZstdCompressor().compressobj()
+            chunk = b"".join([packed.compress(block) for _ in range(64)]) + packed.flush()
+        else:
+            zipped = zlib.compressobj(wbits=31)
+            chunk = b"".join([zipped.compress(block) for _ in range(64)]) + zipped.flush()
+        _zarr_array(about, chunk)(folder)
+
+    return write
+
+
+def _repeated_text(attribute: bool) -> Callable[[Path], None]:
+    """Return a function that writes 3,000 references to one text of a megabyte: 3 GB."""
+
+    def write(folder: Path) -> None:
+        mark = "a mark of the text"
+        rows = 3000
+        with h5py.File(folder / "a.hdf5", "w") as file:
+            group = file.create_group("demo_0")
+            group["t_s"] = np.arange(float(rows))
+            texts = np.array([mark + "x" * 1_000_000] + ["y"] * (rows - 1), dtype=object)
+            if attribute:
+                group["a"] = np.arange(float(rows))
+                group.attrs.create("note", texts, dtype=h5py.string_dtype())
+            else:
+                group.create_dataset("a", data=texts, dtype=h5py.string_dtype())
+        content = (folder / "a.hdf5").read_bytes()
+        length = struct.pack("<I", len(mark) + 1_000_000)
+        at = next(
+            place for place in _places(content, length) if content[place + 16 : place + 20] == struct.pack("<I", 1)
+        )
+        changed = bytearray(content)
+        changed[at : at + 16 * rows] = content[at : at + 16] * rows
+        (folder / "a.hdf5").write_bytes(changed)
+
+    return write
+
+
+def _places(content: bytes, part: bytes) -> Iterator[int]:
+    at = content.find(part)
+    while at >= 0:
+        yield at
+        at = content.find(part, at + 1)
+
+
+def _doubled_links(folder: Path) -> None:
+    with h5py.File(folder / "a.hdf5", "w") as file:
+        group = file.create_group("demo_0")
+        group["t_s"] = group["a"] = np.arange(5.0)
+        for _ in range(29):
+            inner = group.create_group("left")
+            group["right"] = inner
+            group = inner
+
+
+def _sparse(folder: Path) -> None:
+    with h5py.File(folder / "a.hdf5", "w") as file:
+        file.create_dataset("demo_0/a", shape=(10**12,), chunks=(1000,), dtype="f8")
+        file["demo_0"].attrs["rate_hz"] = 100.0
+
+
+def _wide_array(folder: Path) -> None:
+    with zipfile.ZipFile(folder / "a.npz", "w") as archive:
+        for name, shape in (("t", (0,)), ("a", (0, 3_000_000_000))):
+            with archive.open(f"{name}.npy", "w") as file:
+                np.lib.format.write_array_header_1_0(file, {"descr": "<f8", "fortran_order": False, "shape": shape})
+
+
+def _long_name(folder: Path) -> None:
+    (folder / "x.csv").write_text(f"t,{'a_' * 30_000}!\n0,1\n")
+
+
+def _query(folder: Path) -> None:
+    _database_damaged(folder)
+    path = folder / "a" / "a.db3"
+    path.unlink()
+    with closing(sqlite3.connect(path)) as connection, connection:
+        connection.execute("CREATE TABLE topics (id INTEGER, name TEXT, type TEXT, serialization_format TEXT)")
+        connection.execute("INSERT INTO topics VALUES (1, '/a', 'std_msgs/msg/Float64', 'cdr')")
+        connection.execute(
+            "CREATE VIEW messages AS WITH RECURSIVE n(id) AS (SELECT 1 UNION ALL SELECT id + 1 FROM n) "
+            "SELECT id, 1 AS topic_id, id AS timestamp, zeroblob(1000000) AS data FROM n"
+        )
+
+
+def _zipped_mcap(folder: Path) -> None:
+    """Write an MCAP file with a record of 3 GB of zeros, in 100 kB."""
+    content = b"\x89MCAP0\r\n" + struct.pack("<BQ", 5, 3 << 30)
+    packed = zstandard.ZstdCompressor().compressobj()
+    block = bytes(1 << 24)
+    parts = [packed.compress(content), *(packed.compress(block) for _ in range(192)), packed.flush()]
+    (folder / "a.mcap.zstd").write_bytes(b"".join(parts))
+
+
+def _large_chunk_of_mcap(folder: Path) -> None:
+    _chunk_damaged(
+        CompressionType.ZSTD, lambda content, at, _: content.__setitem__(slice(at + 20, at + 24), b"\1\0\0\0")
+    )(folder)
+
+
+def _zipped_session(folder: Path) -> None:
+    session = xdf_writer.Writer()
+    session.stream(1, "force", "int16", 2_000_000_000)
+    zipped = zlib.compressobj(wbits=31)
+    (folder / "a.xdfz").write_bytes(zipped.compress(session.bytes) + zipped.flush())
+
+
+AT_ONCE = "declares .* GB that would be read at once"
+DECLARED: dict[str, list[Case] | str] = {
+    "lerobot": [Case(_wide_template, "data_path|not there"), Case(_long_texts_of_episodes, AT_ONCE)],
+    "mcap": [Case(_large_chunk_of_mcap, r"declares [\d,]+ bytes, more than the 268,435,456 that are unpacked")],
+    "rosbag": [
+        Case(_query, "has no table messages"),
+        Case(_zipped_mcap, "declares 3,221,225,472 bytes, more than the 268,435,456 that are read"),
+    ],
+    "xdf": [Case(_zipped_session, "channel_count is '2000000000'")],
+    "hdf5": [
+        Case(_repeated_text(attribute=False), "unpacks to more than"),
+        Case(_repeated_text(attribute=True), "unpacks to more than"),
+        Case(_doubled_links, "is the group demo_0/left, which is read there"),
+        Case(_sparse, "declares 8,000.0 GB of values and holds 0"),
+    ],
+    "zarr": [
+        Case(_many_chunks, r"declares [\d,]+ chunks", RATE),
+        Case(_large_chunk, "has chunks of 4.0 GB, which is not read", RATE),
+        Case(_bomb_chunk("zstd"), "unpacks to more than", RATE),
+        Case(_bomb_chunk("gzip"), "unpacks to more than", RATE),
+    ],
+    "table": [
+        Case(_wide_array, "has 3,000,000,000 values a row", LAYOUT % "npz"),
+        Case(_long_name, "in too many ways", (LAYOUT % "csv").replace('"a*"', '"{a}_{b}_{c}_{d}"')),
+        Case(
+            lambda folder: _long_texts(folder / "x.parquet", {"t": np.arange(4000.0), "a": np.ones(4000)}, 4000),
+            AT_ONCE,
+            (LAYOUT % "parquet").replace("[{", '[{ match = "text", type = "text" }, {'),
+        ),
+    ],
+    "biotac-slide": "numbers in text declare no size",
+    "roboskin": [
+        Case(
+            lambda place: slide_files.write_roboskin(place, slide_files.touched(1, 20)).write_bytes(
+                b"\x93NUMPY\x01\x00v\x00"
+                + b"{'descr': '<f4', 'fortran_order': False, 'shape': (200, 6, 10, 750000000), }".ljust(117)
+                + b"\n"
+            ),
+            "icub_fold_0.npy",
+        )
+    ],
+    "vision2tactile": "its clouds are asked in test_hostile_files.py",
+    "xela-flat": "numbers in text declare no size",
+    "xela-psc": "numbers in text declare no size",
+}
+
+
+@pytest.mark.parametrize(("reader", "case"), every_case(DECLARED))
+def test_a_declared_size_takes_no_memory(lab: Lab, reader: str, case: Case) -> None:
+    def call(command: str) -> Ran:
+        with Path("out.txt").open("w") as out, Path("err.txt").open("w") as err:
+            process = subprocess.Popen([sys.executable, "-m", "tacpipe", *shlex.split(command)], stdout=out, stderr=err)
+            _, status, used = os.wait4(process.pid, 0)
+            process.returncode = os.waitstatus_to_exitcode(status)
+        assert used.ru_maxrss < 500_000, "kB"
+        return Ran(process.returncode, Path("out.txt").read_text(), Path("err.txt").read_text())
+
+    ask(replace(lab, call=call), reader, case, "a declared size")
+
+
 QUESTIONS = {
     "two parts with one name": NAMED_TWICE,
     "a damaged block": DAMAGED,
     "a path that leads out": LEADS_OUT,
     "a codec that runs code": RUNS_CODE,
+    "a declared size": DECLARED,
 }
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from tacpipe.arrays import AnyArray
 from tacpipe.errors import TacpipeError
 from tacpipe.formats.arrays.tree import Array, Tree
+from tacpipe.io import memory
 from tacpipe.printable import plain
 
 NUMBERED = re.compile(
@@ -116,6 +117,7 @@ def _checked(tree: Tree, array: Array) -> AnyArray:
         raise TacpipeError(
             f"{tree.path}: {array.path} must be whole numbers, one a recording; it has the shape {array.shape}."
         )
+    memory.require_block(array.row_bytes * array.shape[0], f"{tree.path}: {array.path}")
     ends = np.asarray(tree.read(array, 0, array.shape[0]))
     steps = np.diff(ends.astype(np.int64), prepend=0)
     if (steps < 1).any():

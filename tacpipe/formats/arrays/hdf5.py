@@ -29,6 +29,8 @@ BROKEN = (
     ValueError,
     TypeError,
 )  # what h5py raises for bytes that are not as they should
+ATTRIBUTE_BYTES = 1 << 27  # that reading one may take
+MOST_RATIO = 10_000  # bytes of values that a byte of the file may hold
 FILTERS = {  # that are read, by HDF5's numbers; others could be libraries that a file's author had installed
     *(1, 2, 3, 4, 5, 6),  # of HDF5 itself: deflate, shuffle, fletcher32, szip, nbit, scale-offset
     *(307, 32000, 32001, 32004, 32008, 32013, 32015, 32026),  # bzip2, lzf, blosc, lz4, bitshuffle, zfp, zstd, blosc2
@@ -52,25 +54,23 @@ class Hdf5Tree:
         return [f"{self.path} is cut short after {self._left:,} bytes, and what lies behind is missing. Copy it again."]
 
     def members(self, group: str) -> tuple[list[Array], list[str]]:
-        """Return the arrays in a group and the paths of the groups in it; a group within itself is left out."""
+        """Return the arrays in a group and the paths of the groups in it."""
         if group in self._members:
             return self._members[group]
         arrays, below = [], []
         with self._reading(group or "its root"):
             found = self._file[group or "/"]
-            above = self._addresses(group)
             for name in self._names(found):
                 path = f"{group}/{name}" if group else name
                 try:
-                    one = _member(found, name, path)
-                    again = not isinstance(one, Array) and one and _address(found[name]) in above
+                    one = _member(found, name, path, self.path)
                 except BROKEN:
                     if self._left is None:
                         raise
-                    one, again = path, False  # behind the cut: listed, and refused when it is opened
+                    one = path  # behind the cut: listed, and refused when it is opened
                 if isinstance(one, Array):
                     arrays.append(one)
-                elif one and not again:
+                elif one:
                     below.append(one)
         self._members[group] = with_time_first(arrays), below
         return self._members[group]
@@ -85,13 +85,18 @@ class Hdf5Tree:
         """Return the attributes of a group, but those that cannot be read."""
         with self._reading(group or "its root"):
             if group not in self._stated:
-                self._stated[group] = _attributes(self._file[group or "/"])
+                self._stated[group] = _attributes(self._file[group or "/"], self.path)
             return self._stated[group]
 
     def read(self, array: Array, start: int, stop: int) -> AnyArray:
         """Return the rows of an array; text as ``str`` objects. Raises `TacpipeError` where they are damaged."""
         memory.require(array.row_bytes * max(stop - start, 0), f"{self.path}, {plain(array.path, 200)},")
-        with self._reading(array.path):
+        most = memory.MOST_BLOCK + array.row_bytes * max(stop - start, 1) * 4
+        where = f"{self.path}, {plain(array.path, 200)},"
+        with (
+            memory.bounded(most, where) if array.dtype.hasobject else contextlib.nullcontext(),
+            self._reading(array.path),
+        ):
             found = self._file[array.path]
             if self._left is not None:
                 _expect_there(found, self._left)
@@ -133,10 +138,13 @@ class Hdf5Tree:
             place.links.iterate(found.append)  # a callback that returns nothing continues
         return [name.decode(errors="surrogateescape") for name in found]
 
-    def _addresses(self, group: str) -> set[Any]:
-        """Return where a group and those above it lie in the file."""
-        parts = group.split("/") if group else []
-        return {_address(self._file["/".join(parts[:count]) or "/"]) for count in range(len(parts) + 1)}
+    def identity(self, group: str) -> Any:
+        """Return what the paths of one group share: where it lies in the file."""
+        try:
+            about = h5py.h5o.get_info(self._file[group or "/"].id)
+        except BROKEN:
+            return group  # behind the end of a file that is cut short
+        return about.fileno, about.addr
 
 
 @contextlib.contextmanager
@@ -222,7 +230,7 @@ def _expect_there(found: h5py.Dataset, left: int) -> None:
         raise OSError("its values lie behind the end")
 
 
-def _member(group: h5py.Group, name: str, path: str) -> Array | str:
+def _member(group: h5py.Group, name: str, path: str, file: Path) -> Array | str:
     """Return an array, the path of a group, or an empty text for what is neither."""
     link = group.get(name, getlink=True)
     if isinstance(link, h5py.ExternalLink):
@@ -243,8 +251,13 @@ def _member(group: h5py.Group, name: str, path: str) -> Array | str:
         problem = "holds nothing"
     elif unknown := [number for number in _filters(found) if number not in FILTERS]:
         problem = f"is stored with the filter {unknown[0]}, which is not read"
+    elif found.chunks and (chunk_bytes := int(np.prod(found.chunks)) * found.dtype.itemsize) > memory.MOST_BLOCK:
+        problem = f"has chunks of {memory.readable_size(chunk_bytes)}, which are not read"
+    elif found.nbytes > max(memory.MOST_BLOCK, MOST_RATIO * found.id.get_storage_size()):
+        held = memory.readable_size(found.id.get_storage_size())
+        problem = f"declares {memory.readable_size(found.nbytes)} of values and holds {held}"
     chunk_rows = found.chunks[0] if found.chunks else 0
-    return Array(path, found.shape or (), found.dtype, _attributes(found), chunk_rows, problem)
+    return Array(path, found.shape or (), found.dtype, _attributes(found, file), chunk_rows, problem)
 
 
 def _filters(found: h5py.Dataset) -> Iterator[int]:
@@ -254,14 +267,10 @@ def _filters(found: h5py.Dataset) -> Iterator[int]:
         yield about.get_filter(place)[0]
 
 
-def _address(group: h5py.Group) -> Any:
-    about = h5py.h5o.get_info(group.id)
-    return about.fileno, about.addr
-
-
-def _attributes(found: Any) -> dict[str, Any]:
+def _attributes(found: Any, file: Path) -> dict[str, Any]:
     made = {}
     for name in found.attrs:
-        with contextlib.suppress(*BROKEN):  # of types that numpy has not
+        where = f"{file}, the attribute {plain(name)},"
+        with contextlib.suppress(*BROKEN), memory.bounded(ATTRIBUTE_BYTES, where):  # of types that numpy has not
             made[str(name)] = found.attrs[name]
     return made

@@ -65,6 +65,9 @@ class Tree(Protocol):
     def is_group(self, path: str) -> bool:
         """Whether there is a group of this path."""
 
+    def identity(self, group: str) -> Any:
+        """What the paths of one group share, where links give it several."""
+
     def attributes(self, group: str) -> Mapping[str, Any]:
         """The attributes of a group."""
 
@@ -112,11 +115,19 @@ def with_time_first(arrays: Sequence[Array]) -> list[Array]:
 
 
 def walk(tree: Tree, group: str = "") -> Iterator[tuple[str, list[Array]]]:
-    """Yield each group below a group, itself first, with the arrays in it."""
-    arrays, below = tree.members(group)
-    yield group, arrays
-    for one in below:
-        yield from walk(tree, one)
+    """Yield each group below a group, itself first, with the arrays in it; one of several paths has a problem instead."""
+    seen: dict[Any, str] = {}
+    pending = [group]
+    while pending:
+        path = pending.pop()
+        first = seen.setdefault(tree.identity(path), path)
+        if first != path:
+            problem = f"is the group {plain(first) or '/'}, which is read there"
+            yield path.rpartition("/")[0], [Array(path, (), np.dtype("V"), problem=problem)]
+            continue
+        arrays, below = tree.members(path)
+        yield path, arrays
+        pending += reversed(below)
 
 
 def is_frames(array: Array) -> bool:

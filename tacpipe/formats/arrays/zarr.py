@@ -33,6 +33,8 @@ from tacpipe.io import memory, regular
 from tacpipe.printable import excerpt, listed, plain
 
 MARKS = (".zgroup", ".zarray", "zarr.json")  # what makes a folder a group or an array
+MOST_CHUNKS = 1 << 20  # of an array
+UNPACKED_BYTES = 1 << 27  # that reading chunks may take beside their values
 MOST_BYTES = 1 << 26  # of a file of metadata
 BROKEN_ZIP = (zipfile.BadZipFile, zlib.error, EOFError, KeyError, ValueError, RuntimeError, NotImplementedError)
 BROKEN = (  # what zarr and its codecs raise for bytes that are not as they should be
@@ -74,6 +76,10 @@ class ZarrTree:
         found = self._node(path)
         return found is not None and "shape" not in found[0]
 
+    def identity(self, group: str) -> str:
+        """Return the path of a group: it has no other."""
+        return group
+
     def attributes(self, group: str) -> Mapping[str, Any]:
         """Return the attributes of a group."""
         found = self._node(group)
@@ -98,8 +104,11 @@ class ZarrTree:
                 f"does, give --fill-missing-chunks."
             )
         try:
-            with self._store() as store:
+            with contextlib.ExitStack() as stack, self._store() as store:
                 found = zarr.open_array(store, path=array.path, mode="r")
+                chunk_bytes = math.prod(found.chunks) * max(array.dtype.itemsize, 1)
+                most = UNPACKED_BYTES + array.row_bytes * max(stop - start, 1) + 4 * chunk_bytes
+                stack.enter_context(memory.bounded(most, f"{self.path}, {plain(array.path, 200)},"))
                 return np.asarray(found[() if not array.shape else slice(start, stop)])
         except BROKEN as error:
             if isinstance(error, OSError) and error.errno is not None:
@@ -120,6 +129,11 @@ class ZarrTree:
         spans = [range(math.ceil(size / step)) for size, step in zip(array.shape, shape, strict=True)]
         if spans:
             spans[0] = range(start // shape[0], math.ceil(stop / shape[0]))
+        if (count := math.prod(map(len, spans))) > MOST_CHUNKS:
+            raise TacpipeError(
+                f"{self.path}: {plain(array.path, 200)} declares {count:,} chunks, and {MOST_CHUNKS:,} are read at most. "
+                f"Write larger chunks; if its source is untrusted, do not use it."
+            )
         return [f"{array.path}/{key(at)}" for at in itertools.product(*spans)]
 
     def files(self, array: Array, start: int, stop: int) -> Mapping[str, Path] | None:
@@ -285,10 +299,12 @@ def _array(path: str, about: Mapping[str, Any], attributes: Mapping[str, Any]) -
     if len(steps) != len(shape) or not all(isinstance(step, int) and step > 0 for step in steps):
         problem, steps = "has chunks of no known shape", []
     try:
-        unknown = sorted({str(codec) for codec in _codecs(about)} - CODECS)
+        codecs = {str(codec) for codec in _codecs(about)}
     except (TypeError, AttributeError):
-        unknown = ["unnamed"]
-    if unknown:
+        codecs = {"unnamed"}
+    if math.prod(steps) * kind.itemsize > memory.MOST_BLOCK and "sharding_indexed" not in codecs:
+        problem = f"has chunks of {memory.readable_size(math.prod(steps) * kind.itemsize)}"
+    if unknown := sorted(codecs - CODECS):
         problem = f"is stored with the codec {excerpt(unknown[0])}"
     elif kind.hasobject and kind.metadata is None:
         problem = "holds Python objects"

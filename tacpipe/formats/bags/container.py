@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import shutil
 import tempfile
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
@@ -21,7 +20,7 @@ from tacpipe.formats.containers import kinds
 from tacpipe.formats.containers.container import Contents, SourceStream
 from tacpipe.io import files as file_system
 from tacpipe.io import regular, yaml_text
-from tacpipe.io.spill import Spill
+from tacpipe.io.spill import Spill, unpack
 from tacpipe.plugins import extras
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import excerpt, listed, plain
@@ -29,6 +28,7 @@ from tacpipe.printable import excerpt, listed, plain
 LOOK_MESSAGES = 20_000  # after which a look at a file ends
 MOST_BYTES = 1 << 22  # of a metadata.yaml
 READERS = {".mcap": mcap_file.records, ".db3": sqlite_file.records, ".bag": bag_file.records}
+UNPACKED_BYTES = 1 << 20  # of a compressed file, at once
 ZSTD = ".zstd"  # the ending of a file that was compressed as a whole
 ACTIVE = ".active"  # of a ROS 1 bag that is being written, or whose recorder was killed
 OF = ":"  # between a topic and what names one of its streams, as "/tf:gripper"
@@ -97,7 +97,22 @@ def _files(path: Path, stack: contextlib.ExitStack) -> tuple[list[Path], bool, l
 def _records(path: Path) -> Iterator[Record]:
     if _ending(path) not in READERS:
         raise TacpipeError(f"{path} is not a bag by its name; {', '.join(READERS)} are read.")
-    return READERS[_ending(path)](path)
+    return _streamed(path) if path.suffix.lower() == ZSTD else READERS[_ending(path)](path)
+
+
+def _streamed(path: Path) -> Iterator[Record]:
+    """Yield the records of an MCAP file that is compressed as a whole."""
+    import zstandard
+
+    with (
+        regular.failing(path),
+        regular.opened(path) as file,
+        zstandard.ZstdDecompressor().stream_reader(file) as content,
+    ):
+        try:
+            yield from mcap_file.stream_records(path, content)
+        except zstandard.ZstdError as error:
+            yield Damage(f"{path} cannot be unpacked ({plain(str(error), 80)}): what came after is missing.")
 
 
 def _ending(path: Path) -> str:
@@ -117,8 +132,8 @@ def _described(path: Path) -> dict[str, Any]:
 
 
 def _unpacked(path: Path, stack: contextlib.ExitStack) -> Path:
-    """Return a file, unpacked into a temporary folder where it is compressed as a whole."""
-    if path.suffix.lower() != ZSTD:
+    """Return a file, a database unpacked into a temporary folder where it is compressed as a whole."""
+    if path.suffix.lower() != ZSTD or _ending(path) == ".mcap":
         return path
     import zstandard
 
@@ -127,7 +142,7 @@ def _unpacked(path: Path, stack: contextlib.ExitStack) -> Path:
     with regular.failing(path), regular.opened(path) as file, made.open("wb") as out:
         try:
             with zstandard.ZstdDecompressor().stream_reader(file) as content:
-                shutil.copyfileobj(content, out)
+                unpack(iter(lambda: content.read(UNPACKED_BYTES), b""), out, path)
         except zstandard.ZstdError as error:
             raise TacpipeError(f"{path} cannot be unpacked: {plain(str(error), 80)}.") from error
     return made

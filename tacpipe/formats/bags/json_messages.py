@@ -34,7 +34,10 @@ class Json:
                 raise TopicError("a message is not JSON") from error
             if not isinstance(value, dict):
                 raise TopicError("a message is not a JSON object")
-            row = flat(value)
+            try:
+                row = flat(value)
+            except RecursionError as error:
+                raise TopicError("a message has too many objects within one another") from error
             row |= {name: _decoded(row[name]) for name in encoded if name in row}
             rows.append(row)
         yield paths.block(rows, dict.fromkeys(encoded, pa.binary()))

@@ -28,6 +28,7 @@ def records(path: Path) -> Iterator[Record]:
         raise TacpipeError(f"{path} is not a SQLite file: it {'does not begin as one' if magic else 'is empty'}.")
     with _connected(path) as connection:
         try:
+            _expect_tables(path, connection)
             yield from _channels(connection)
         except _ERRORS as error:
             raise TacpipeError(f"{path} is not a bag of ROS 2: {plain(str(error), 120)}.") from error
@@ -60,6 +61,16 @@ def _connected(path: Path) -> Iterator[sqlite3.Connection]:
             yield connection
         finally:
             connection.close()
+
+
+def _expect_tables(path: Path, connection: sqlite3.Connection) -> None:
+    """Raise `TacpipeError` where what holds topics or messages is no table: a view or a module runs queries of the file."""
+    stated = dict(connection.execute("SELECT name, sql FROM sqlite_master WHERE type = 'table'"))
+    for name in ("topics", "messages"):
+        if not str(stated.get(name, "")).upper().startswith("CREATE TABLE"):
+            raise TacpipeError(
+                f"{path} has no table {name}, which a bag of ROS 2 has; a view of this name is not read."
+            )
 
 
 def _channels(connection: sqlite3.Connection) -> Iterator[Record]:

@@ -27,7 +27,7 @@ from tacpipe.formats.containers.container import Batched, Contents, Share, Sourc
 from tacpipe.formats.lerobot import description
 from tacpipe.formats.lerobot.description import Description, Episode, Feature
 from tacpipe.io import files as file_system
-from tacpipe.io import memory, regular
+from tacpipe.io import parquet, regular
 from tacpipe.io.parquet import SOME_ROWS, ParquetTable
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import plain
@@ -172,7 +172,8 @@ class LeRobotContainer:
             if missing:
                 raise TacpipeError(f"{path} has no column {plain(missing[0])}, which {description.INFO} names.")
             groups = _groups(file, episode.index)
-            memory.require(sum(file.metadata.row_group(one).total_byte_size for one in groups), str(path))
+            share = sum(file.metadata.row_group(group).num_rows for group in groups) / max(file.metadata.num_rows, 1)
+            parquet.require_claims(path, [INDEX, FRAME, STAMP, *keys], share=share)
             columns = [INDEX, FRAME, STAMP, *keys]
             found = file.read_row_groups([], columns=columns, use_threads=False)
             for group in groups:  # others' rows of one go before the next is read

@@ -15,7 +15,7 @@ from tacpipe.errors import TacpipeError
 from tacpipe.formats import unique_names
 from tacpipe.formats.arrays.tree import plain_attributes
 from tacpipe.io import files as file_system
-from tacpipe.io import regular
+from tacpipe.io import memory, parquet, regular
 from tacpipe.io.parquet import BROKEN
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import excerpt, plain
@@ -36,7 +36,7 @@ OWN = (
 )  # how columns of meta/episodes begin that state where things are
 NAME, ATTRIBUTES = "tacpipe/recording", "tacpipe/attributes"  # columns with what an episode was before its export
 ABOUT = "meta/tacpipe.json"  # the name, unit and quantity of each value of a feature, of exported datasets
-_PLACE = re.compile(r"\{(\w+)(?::(\d+)d)?\}")
+_PLACE = re.compile(r"\{(\w+)(?::0?(\d{1,2})d)?\}")  # other braces stay as they are, and name no file
 
 
 @dataclass(frozen=True)
@@ -94,11 +94,16 @@ class Description:
 
     def _of_lines(self) -> Iterator[Episode]:
         path = self.root / "meta/episodes.jsonl"
+        size = self.info.get("chunks_size") or 1000
+        if not isinstance(size, int) or size < 1:
+            raise TacpipeError(
+                f"{self.root / INFO}: chunks_size is {excerpt(size)}; it must be a whole number above 0."
+            )
         for one in _lines(regular.inside(self.root, "meta/episodes.jsonl")):
             index, length = one.get("episode_index"), one.get("length")
             if not isinstance(index, int) or not isinstance(length, int):
                 raise TacpipeError(f"{path}: {excerpt(one)} has no whole numbers episode_index and length.")
-            values = {"episode_chunk": index // int(self.info.get("chunks_size") or 1000), "episode_index": index}
+            values = {"episode_chunk": index // size, "episode_index": index}
             others = {key: value for key, value in one.items() if key not in ("episode_index", "length", "tasks")}
             yield Episode(
                 _name(index, others),
@@ -222,11 +227,15 @@ def _leaves(names: Any) -> list[str]:
     >>> _leaves({"motors": ["a", "b"]}), _leaves([["x"], ["y"]]), _leaves(None)
     (['a', 'b'], ['x', 'y'], [])
     """
-    if isinstance(names, dict):
-        return [leaf for one in names.values() for leaf in _leaves(one)]
-    if isinstance(names, list):
-        return [leaf for one in names for leaf in _leaves(one)]
-    return [str(names)] if names is not None else []
+    leaves: list[str] = []
+    pending = [names]
+    while pending:  # however deep they are nested
+        value = pending.pop()
+        if isinstance(value, dict | list):
+            pending += reversed(list(value.values()) if isinstance(value, dict) else value)
+        elif value is not None:
+            leaves.append(str(value))
+    return leaves
 
 
 def _name(index: int, others: Mapping[str, Any]) -> str:
@@ -290,5 +299,6 @@ def _schema(path: Path) -> Sequence[str]:
 
 
 def _table(path: Path, names: Sequence[str] | None = None) -> Any:
+    parquet.require_claims(path, names, most=memory.MOST_BLOCK)
     with parquet_errors(path), regular.opened(path) as file:
         return pq.ParquetFile(file).read(columns=list(names) if names is not None else None)

@@ -26,12 +26,13 @@ from tacpipe.formats import unique_names
 from tacpipe.formats.table import compressed
 from tacpipe.formats.table.layout import GZIP
 from tacpipe.io import memory, regular
-from tacpipe.io.parquet import BROKEN, owned
+from tacpipe.io.parquet import BROKEN, owned, require_claims
 from tacpipe.printable import plain
 
 BATCH_ROWS = 1 << 18  # of Parquet, at most
 BLOCK_BYTES = 1 << 24  # of JSON lines, or of a block of arrays
 READ_BYTES = 1 << 20  # of a column of Parquet at once, however large its groups of rows are
+MOST_COLUMNS = 1 << 20  # of an array
 LONGEST_LINE = 1 << 26  # bytes of one JSON object
 _BEGUN = re.compile(rb"\S")
 _ZIP_ERRORS = (ValueError, OSError, EOFError, zipfile.BadZipFile, zlib.error, KeyError, RuntimeError)
@@ -54,6 +55,7 @@ class ParquetFile:
     def batches(self, types: Mapping[str, pa.DataType]) -> Iterator[pa.Table]:
         """Yield the columns that ``types`` names, some rows at a time, with the types that the file has."""
         try:
+            require_claims(self.path, list(types), rows=min(BATCH_ROWS, BLOCK_BYTES // max(1, len(types))))
             with regular.opened(self.path) as file:
                 opened = pq.ParquetFile(file, buffer_size=READ_BYTES, pre_buffer=False, page_checksum_verification=True)
                 rows = min(BATCH_ROWS, BLOCK_BYTES // max(1, len(types)))
@@ -195,6 +197,9 @@ class ArrayMember:
             raise ValueError(f"{member.filename} declares more values than it has bytes for")
         if shape and time_axis >= len(shape):
             raise ValueError(f"{member.filename} has the shape {shape}, without a dimension {time_axis} (time_axis)")
+        width = math.prod(size for axis, size in enumerate(shape) if axis != time_axis)
+        if width > MOST_COLUMNS:
+            raise ValueError(f"{member.filename} has {width:,} values a row, {MOST_COLUMNS:,} are allowed")
         name = member.filename.removesuffix(".npy")
         return cls(name, member.filename, shape, columnwise and len(shape) > 1, dtype, time_axis)
 

@@ -26,6 +26,7 @@ _COUNTED = (  # words before numbers that count recordings rather than parts of 
 )
 _COUNTER = re.compile(rf"(?:^|[^a-z])({_COUNTED})[-_ #.]*$", re.IGNORECASE)
 _Token = tuple[str, str]  # its kind (a letter of a name is of its own kind), and its text
+MOST_STEPS = 10_000_000  # of matching one text
 _PART = re.compile(r"\{(\w+)\}|(\*\*/?)|(\*)|([^{}*]+)|(.)", re.DOTALL)
 
 
@@ -59,8 +60,22 @@ def match(pattern: str, text: str) -> dict[str, str] | None:
     >>> match("**/{trial}.csv", "a/b/t1.csv"), match("*.csv", "a/t1.csv"), match("{a}-{a}", "x-y")
     ({'trial': 't1'}, None, None)
     """
+    if _most_steps(pattern, text) > MOST_STEPS:
+        raise UsageError(
+            f"{plain(text)} of {len(text):,} characters can match the pattern {plain(pattern)} in too many ways. Rename it, "
+            f"or use fewer placeholders."
+        )
     found = compiled(pattern).fullmatch(text)
     return None if found is None else found.groupdict()
+
+
+def _most_steps(pattern: str, text: str) -> int:
+    """Return how many ways there are, at most, to divide a text among the placeholders of a pattern."""
+    parts = _PART.findall(pattern)
+    wild = sum(not literal for *_, literal, _ in parts)
+    between = [literal for *_, literal, _ in parts[1:-1] if literal]
+    cuts: int = max(map(text.count, between), default=1) if len(between) >= wild - 1 else len(text)
+    return len(text) * int(cuts ** max(wild - 1, 0))
 
 
 def placeholders(pattern: str) -> tuple[str, ...]:

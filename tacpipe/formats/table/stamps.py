@@ -21,6 +21,9 @@ DIGITS = {"s": 9, "ms": 6, "us": 3, "ns": 0}  # decimals of a unit that are nano
 DECIMAL = pa.decimal128(38, 18)  # as which text is read
 _UNIT = 10**9  # a nanosecond, in the last digit of seconds as `DECIMAL` has them
 _USUAL = 450_000_000  # of the high word of seconds: before the year 2233, and no product below is beyond 64 bits
+_BEYOND = (
+    10**37 >> 64
+)  # of the high word: later than 2262 in every unit; Arrow reads 1e25 as such a number, not as itself
 _ZONED = re.compile(r".*(Z|[+-]\d\d:?\d\d)\s*", re.IGNORECASE)
 _LOGGED = r"(\d{2}:\d{2}:\d{2}),(\d+)"  # as Python's logging writes seconds
 
@@ -98,9 +101,11 @@ def _zoned(t_ns: Int64s, zone: str) -> Int64s:
 
 
 def _of_decimals(column: pa.Array, digits: int) -> Int64s:
-    if column.type == DECIMAL and digits == DIGITS["s"]:
+    if column.type == DECIMAL:
         high, low = _words(column)
-        if (np.abs(high) < _USUAL).all():
+        _refuse(pa.array(np.abs(high) > _BEYOND), column, IN_RANGE)
+        in_seconds = digits == DIGITS["s"] and bool((np.abs(high) < _USUAL).all())
+        if in_seconds:
             return _of_seconds(high, low)
     t_ns, fits = last_digits(
         pc.round(column, ndigits=digits, round_mode="half_to_even").cast(pa.decimal128(38, digits))

@@ -201,6 +201,8 @@ def _shorten(path: Path) -> None:
     [
         ({"codebase_version": "v1.6"}, ("codebase_version", "v1.6", "v2.1")),
         ({"fps": 0}, ("fps", "0")),
+        ({"chunks_size": 0.5}, ("chunks_size", "0.5")),
+        ({"chunks_size": "abc"}, ("chunks_size", "abc")),
         ({"features": {"action": [7]}}, ("action", "shape")),
         ({"data_path": "data/{episode}"}, ("data_path", "episode_index")),
     ],
@@ -249,3 +251,13 @@ def test_a_damaged_episode_is_left_out_with_skip_bad(lab: Lab) -> None:
     refused = lab.call("ingest lerobot sets -o data/rec")
     assert refused.code == 1 and EPISODE.format(1) in refused.err
     assert counts(lab, "--skip-bad") == (0, 2)
+
+
+def test_names_that_are_nested_deep_are_names(tmp_path: Path) -> None:
+    files.write_v2(tmp_path / "pick", episodes=1)
+    path = tmp_path / "pick" / "meta" / "info.json"
+    info = json.loads(path.read_text())
+    info["features"]["action"]["names"] = json.loads("[" * 800 + json.dumps([f"a{n}" for n in range(7)]) + "]" * 800)
+    path.write_text(json.dumps(info))
+    (source,) = COMMAND.discover(NONE, tmp_path).values()
+    assert "a6" in lerobot(NONE, source.files, source.values).streams["action"].schema.names

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import datetime
 from decimal import ROUND_HALF_EVEN, Decimal
+from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
@@ -9,8 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tacpipe.errors import TacpipeError
 from tacpipe.formats.containers.container import Time, TimeUnit
-from tacpipe.formats.table import stamps
+from tacpipe.formats.table import reading, stamps
+from tacpipe.formats.table.layout import Column, Stream
 
 YEAR_2262_NS = 2**63 - 1
 
@@ -85,3 +88,13 @@ def test_a_stamp_that_is_none_is_named_by_its_row(column: pa.Array, unit: TimeUn
     with pytest.raises(stamps.StampError) as found:
         stamps.nanoseconds(column, Time(unit=unit))
     assert found.value.row == row
+
+
+@pytest.mark.parametrize("unit", ["s", "ms", "us", "ns"])
+@pytest.mark.parametrize("text", ["1e25", "-1e25"])
+def test_a_stamp_beyond_every_range_is_refused_and_names_its_row(tmp_path: Path, text: str, unit: TimeUnit) -> None:
+    path = tmp_path / "skin.csv"
+    path.write_text(f"time,a\n0,1\n{text},2\n")
+    stream = Stream("skin", time=Time(column="time", unit=unit), columns=(Column(match="a"),))
+    with pytest.raises(TacpipeError, match=r"line 3, column time holds .*2262"):
+        reading.table(path, stream)
