@@ -19,9 +19,10 @@ if TYPE_CHECKING:
     from tacpipe.tasks.touch.limits import Limits
 
 ABOUT = (
-    "\n\nRepeatability: how alike the readings of pairs of grasps of one object are, by the distance of the grasps, and "
-    "which skill that allows. Learning curve: skill on known objects by the number of training grasps of each. Other "
-    "finger: skill if the reading of the other finger were given. Skill is 1 - RMSE / RMSE of the constant. Takes minutes."
+    "\n\nPairs of grasps: how alike the readings of two grasps of one object are, by the distance of the grasps, and the "
+    "skill of a predictor that errs by as much. Near pairs differ in pose too, so at least that skill can be reached. "
+    "Learning curve: skill on known objects by the number of training grasps of each. Other finger: skill if the reading "
+    "of the other finger were given. Skill is 1 - RMSE / RMSE of the constant. Takes minutes."
 )
 EXAMPLE = "\n\nExample: tacpipe limits data/grasps -o results/limits.json"
 HEADER = '{"schema_version": 1, "limits"'  # how the file begins
@@ -67,13 +68,21 @@ def limits(
 def text(found: Limits) -> str:
     """Return what was found as three tables of text."""
     grasps = sum(found.counts.values())
-    lines = [f"{grasps} grasps of {len(found.counts)} objects", "", "repeatability: skill that pairs of grasps imply"]
+    lines = [
+        f"{grasps} grasps of {len(found.counts)} objects",
+        "",
+        "pairs of grasps: skill of a predictor that errs as pairs differ",
+    ]
     rows = [
-        [_bounds(low, high), str(max(one.pairs for one in by.values())), *(_cell(by[name].ceiling) for name in TARGETS)]
+        [
+            _bounds(low, high),
+            str(max(one.pairs for one in by.values())),
+            *(_cell(by[name].pair_skill) for name in TARGETS),
+        ]
         for low, high, by in found.near
     ]
     lines += _table(["distance (mm)", "pairs", *TARGETS], rows)
-    lines += ["", "repeatability: likeness of readings within an object"]
+    lines += ["", "pairs of grasps: likeness of readings within an object"]
     rows = [
         [
             _bounds(low, high),
@@ -91,6 +100,7 @@ def text(found: Limits) -> str:
     lines += _table(["grasps an object", "trained on", *TARGETS], rows)
     lines += [
         "",
+        "Pairs differ in pose too: the skill of near pairs is a lower bound on what can be reached, not an upper bound.",
         "Skill: 1 - RMSE / RMSE of the constant. Likeness: 1 where readings are equal and 0 where they differ as any two",
         f"of the object. In brackets: 95 % interval over resampled grasps. {found.draws} draws of 5 folds.",
     ]

@@ -27,6 +27,7 @@ class Form:
     setting: str
     names: Mapping[object, str]  # what a row is called, by the setting's value
     printed: Mapping[object, tuple[float, float]] = field(default_factory=dict)  # mean and sd of the RMSE
+    printed_s: Mapping[object, int] = field(default_factory=dict)  # seconds per epoch
     drawn: bool = False  # whether the paper has a figure and no table
     also: tuple[str, ...] = ()  # settings that only some of the values have
 
@@ -52,6 +53,7 @@ FORMS = (
         "points",
         {count: f"{count} points" for count in printed.POINTS},
         printed.POINTS,
+        printed.EPOCH_S,
     ),
     Form(
         "Figure 9",
@@ -138,10 +140,12 @@ def _table(form: Form, methods: Sequence[Method]) -> list[Block]:
     ]
     kinds = {number: "best" for number, name in enumerate(shown.values()) if name == least}
     baselines = tables.baseline_rows(list(found.values()), TARGET, True)
-    blank = [NONE] * bool(form.printed and published)
+    heads_printed = ["paper: RMSE"] * bool(form.printed) + ["paper: s per epoch"] * bool(form.printed_s)
+    heads_printed = heads_printed if published else []
+    blank = [NONE] * len(heads_printed)
     kinds |= dict.fromkeys(range(len(rows), len(rows) + len(baselines)), "quiet")
     rows += [[name, *tables.cells(one), *blank] for name, one in baselines]
-    heads = ["", *tables.ROWS, *(["paper: RMSE"] if form.printed and published else [])]
+    heads = ["", *tables.ROWS, *heads_printed]
     simulated = any(one.simulated for one in found.values())
     title = f"{blocks.form(form.number, form.title, published)}{' (simulated)' if simulated else ''}"
     notes = [
@@ -156,7 +160,8 @@ def _table(form: Form, methods: Sequence[Method]) -> list[Block]:
 
 
 def _printed(form: Form, value: object) -> list[str | Cell]:
-    return [blocks.with_sd(*form.printed[value], digits=5)] if form.printed else []
+    cells: list[str | Cell] = [blocks.with_sd(*form.printed[value], digits=5)] if form.printed else []
+    return [*cells, *([str(form.printed_s[value])] if form.printed_s else [])]
 
 
 def _chart(form: Form, described: Mapping[object, Score | None], baselines: Mapping[str, Score | None]) -> Chart:

@@ -18,6 +18,7 @@ POINTS: Mapping[object, tuple[float, float]] = {  # Table II
     500: (0.02790, 0.00115),
     750: (0.02717, 0.00134),
 }
+EPOCH_S: Mapping[object, int] = {250: 8, 500: 14, 750: 21}  # Table II: seconds per epoch
 NORMALISATIONS: Mapping[object, tuple[float, float]] = {  # Table III
     "none": (0.01859, 0.00065),
     "sphere": (0.01183, 0.00073),

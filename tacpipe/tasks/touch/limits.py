@@ -68,7 +68,7 @@ class Limits:
                     "high_mm": None if math.isinf(high) else high,
                     "pairs": max((one.pairs for one in by.values()), default=0),
                     "likeness": {name: _numbers(one.likeness) for name, one in by.items()},
-                    "ceiling": {name: _numbers(one.ceiling) for name, one in by.items()},
+                    "pair_skill": {name: _numbers(one.pair_skill) for name, one in by.items()},
                 }
                 for low, high, by in self.near
             ],

@@ -1,8 +1,9 @@
-"""How alike the readings of grasps are that are alike themselves: a ceiling for whatever predicts a reading from a grasp.
+"""Compare the readings of pairs of grasps of one object by the distance of the grasps.
 
 Two grasps of one object at the same place differ in their readings by what no camera and no planner states: how hard the
-hand closed, how the skin lay, noise. Half of their mean squared difference is the variance that nothing read of the grasp
-can explain. Pairs at larger distances show how fast likeness is lost, and so how densely an object must be sampled.
+hand closed, how the skin lay, noise. Half of the mean squared difference of near pairs is at least the variance that
+nothing read of the grasp can explain, because such pairs differ in pose too. So the skill that it leaves is a lower bound on
+what can be reached, not an upper bound. Pairs at larger distances show how fast likeness is lost.
 
 Objects differ in how much their readings vary, and not all of them have near pairs. So differences are compared with
 the variance of the pair's own object, and the ratio is what is carried over to all objects.
@@ -52,7 +53,7 @@ class Repeatability:
     likeness: (
         Estimate  # 1 - half the mean squared difference / variance within objects: 1 equal, 0 as unlike as any pair
     )
-    ceiling: Estimate  # skill over the constant of a predictor that errs by no more than such pairs differ
+    pair_skill: Estimate  # skill over the constant of a predictor that errs by no more than such pairs differ
 
 
 def repeatability(
@@ -81,7 +82,7 @@ def repeatability(
 
     rng, count = np.random.default_rng(seed), len(values)
     drawn = [np.bincount(rng.integers(0, count, count), minlength=count).astype(np.float64) for _ in range(RESAMPLES)]
-    resampled = np.array([found(weight) for weight in drawn])  # (resample, likeness or ceiling)
+    resampled = np.array([found(weight) for weight in drawn])  # (resample, likeness or pair skill)
     resampled = resampled[np.isfinite(resampled).all(axis=1)]
     means = found(np.ones(count))
     if not len(resampled):

@@ -54,19 +54,19 @@ def test_equal_grasps_imply_the_skill_of_who_knows_all_but_the_noise() -> None:
     found = repeatability(values, objects, pairs, 0, 1e-6)
     assert found.pairs == 200
     assert found.likeness.low < 9 / (9 + 4) < found.likeness.high
-    assert found.ceiling.mean == pytest.approx(1 - 2 / np.sqrt(25 + 9 + 4), abs=0.04)
-    assert found.ceiling.low < found.ceiling.mean < found.ceiling.high
+    assert found.pair_skill.mean == pytest.approx(1 - 2 / np.sqrt(25 + 9 + 4), abs=0.04)
+    assert found.pair_skill.low < found.pair_skill.mean < found.pair_skill.high
 
 
 def test_pairs_at_any_distance_are_as_unlike_as_the_object_varies() -> None:
     values, objects, pairs = noisy(2.0)
     assert repeatability(values, objects, pairs, *ALL_MM).likeness.mean == pytest.approx(0, abs=0.02)
-    assert repeatability(np.tile(values, 2), objects, pairs, *ALL_MM).ceiling.mean == pytest.approx(
-        repeatability(values, objects, pairs, *ALL_MM).ceiling.mean
+    assert repeatability(np.tile(values, 2), objects, pairs, *ALL_MM).pair_skill.mean == pytest.approx(
+        repeatability(values, objects, pairs, *ALL_MM).pair_skill.mean
     )
 
 
-def test_near_pairs_of_a_steady_object_do_not_raise_the_ceiling_of_others() -> None:
+def test_near_pairs_of_a_steady_object_do_not_raise_the_skill_of_others() -> None:
     rng = np.random.default_rng(2)
     objects = ["steady"] * 40 + ["restless"] * 40
     values = rng.normal(size=(80, 1)) * np.repeat([1.0, 20.0], 40)[:, None]
@@ -74,14 +74,14 @@ def test_near_pairs_of_a_steady_object_do_not_raise_the_ceiling_of_others() -> N
     contacts_m[40:, :, 0] = np.arange(40)[:, None]  # only grasps of the steady one are near each other
     found = repeatability(values, objects, Pairs.of(contacts_m, objects), 0, 6)
     assert found.pairs == 40 * 39 // 2
-    assert found.ceiling.high < 0.1
+    assert found.pair_skill.high < 0.1
 
 
 def test_no_pair_implies_nothing() -> None:
     values, objects, pairs = noisy(1.0, 8)
     found = repeatability(values, objects, pairs, 1e9, math.inf)
     assert found.pairs == 0
-    assert math.isnan(found.ceiling.mean)
+    assert math.isnan(found.pair_skill.mean)
 
 
 def test_folds_spread_each_object_and_a_size_is_of_each_object() -> None:
