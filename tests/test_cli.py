@@ -25,6 +25,12 @@ def test_help_lists_every_command(lab: Lab) -> None:
         assert f"  {name} " in printed
 
 
+@pytest.mark.parametrize(("alias", "command"), [("eval", "evaluate"), ("sync", "synchronize")])
+def test_what_people_type_is_understood_and_not_listed(lab: Lab, alias: str, command: str) -> None:
+    assert lab.run(f"{alias} --help").out == lab.run(f"{command} --help").out
+    assert f"  {alias} " not in lab.run("--help").out
+
+
 @pytest.mark.parametrize(
     ("command", "code", "sentence"),
     [

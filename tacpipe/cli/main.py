@@ -28,6 +28,9 @@ Exit codes: 0 done, 1 failed, 2 usage, 3 would change (--check), 4 damaged data,
 """
 
 
+ALIASES = {"eval": "evaluate", "sync": "synchronize"}  # what people type; help and completion do not list them
+
+
 def app(arguments: Sequence[str]) -> typer.Typer:
     """Return the program that can answer ``arguments``: with the one command they name, or all of them for help."""
     import typer
@@ -140,12 +143,13 @@ def _call(arguments: Sequence[str]) -> tuple[int, str]:
 
     from tacpipe.cli import help as plain_help
 
+    arguments = [ALIASES.get(word, word) for word in arguments[:1]] + list(arguments[1:])
     program = app(arguments if (asked := completion.words()) is None else asked)
     addresses.refuse(program)
     plain_help.apply(program)
     try:
         with extras.named("This command"):
-            code = typer.main.get_command(program).main(list(arguments), prog_name="tacpipe", standalone_mode=False)
+            code = typer.main.get_command(program).main(arguments, prog_name="tacpipe", standalone_mode=False)
     except typer.Abort:
         return FAILED, ""
     except _misuse() as error:
