@@ -53,8 +53,9 @@ def test_a_hit_imports_nothing_heavy(lab: Path, words: str) -> None:
     assert imported(lab, words) & HEAVY == set()
 
 
-def test_explaining_and_looking_after_the_store_import_nothing_heavy(lab: Path) -> None:
-    for words in ("explain report.html", "store status", "store verify", "store gc --dry-run"):
+def test_showing_explaining_and_looking_after_the_store_import_nothing_heavy(lab: Path) -> None:
+    shown = ("show models/forward --json", "show results/forward --json")
+    for words in (*shown, "explain report.html", "store status", "store verify", "store gc --dry-run"):
         assert imported(lab, words) & HEAVY == set()
 
 

@@ -15,7 +15,6 @@ from tacpipe.io import tables
 from tacpipe.metrics import headline
 from tests import chain
 from tests.conftest import tacpipe
-from tests.test_imports import HEAVY, imported
 
 EVALUATE = next(one for one in chain.CHAIN if one.startswith("evaluate"))
 
@@ -111,11 +110,6 @@ def test_the_truth_of_a_simulator_takes_one_line(lab: Path) -> None:
     full = tacpipe(lab, "show data/recordings --full").stdout
     assert sum(line.startswith("gt_") for line in full.splitlines()) == 13
     assert "gt_mass_kg" in next(iter(value["attributes"].values()))  # programs get it whole
-
-
-@pytest.mark.parametrize("what", ["models/forward", "results/forward"])
-def test_showing_a_model_or_a_result_imports_nothing_heavy(lab: Path, what: str) -> None:
-    assert imported(lab, f"show {what} --json") & HEAVY == set()
 
 
 def test_evaluate_prints_its_headline_on_a_hit_too_and_stdout_is_the_output_alone(lab: Path) -> None:

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from tacpipe.errors import TacpipeError
 
 if TYPE_CHECKING:
@@ -26,6 +24,8 @@ _UNIFORM = 1.5
 
 def gaps(table: pa.Table) -> Bools:
     """Return for each row whether any stream had a gap there, shape (time,): a column that ends in ``_gap`` marks it."""
+    import numpy as np
+
     gap = np.zeros(table.num_rows, dtype=bool)
     for name in table.column_names:
         if name.endswith(GAP):
@@ -35,8 +35,8 @@ def gaps(table: pa.Table) -> Bools:
 
 def gap_shares(table: pa.Table | Columns) -> dict[str, float]:
     """Return the fraction of rows that lie in a gap of each stream, by the name of the stream."""
-    found = [name for name in table.column_names if name.endswith(GAP)]
-    return {name.removesuffix(GAP): float(np.mean(table.column(name).to_numpy())) for name in found if table.num_rows}
+    masks = [name for name in table.column_names if name.endswith(GAP)]
+    return {name.removesuffix(GAP): float(table.column(name).to_numpy().mean()) for name in masks if table.num_rows}
 
 
 def describe_gaps(*tables: pa.Table | Columns) -> list[str]:
@@ -60,6 +60,8 @@ def apart(attributes: Mapping[str, Any]) -> float:
 
 def times(table: pa.Table) -> Int64s:
     """Return the rows' times in ns, shape (time,). Raises `TacpipeError` where there are none."""
+    import numpy as np
+
     if "t_ns" not in table.column_names:
         raise TacpipeError("There is no column t_ns, so the order of the rows in time is unknown.")
     return np.asarray(table.column("t_ns").to_numpy(), dtype=np.int64)
