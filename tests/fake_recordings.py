@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pytest
 
 from tacpipe.io.columns import Columns
 from tacpipe.io.hashing import digest
-from tacpipe.io.parquet import to_parquet
+from tacpipe.io.parquet import ParquetTable, to_parquet
 
 
 class _Fake:
@@ -75,3 +76,9 @@ def column(table: pa.Table, name: str) -> np.ndarray[Any, Any]:
     """Return a column (row,) as an array."""
     values: np.ndarray[Any, Any] = table.column(name).to_numpy()
     return values
+
+
+def decode_few_rows_at_a_time(monkeypatch: pytest.MonkeyPatch, rows: int) -> None:
+    """Make every stored table yield batches of ``rows`` rows, whichever number its reader asks for."""
+    batches = ParquetTable.batches
+    monkeypatch.setattr(ParquetTable, "batches", lambda table, columns=None, _=0: batches(table, columns, rows))

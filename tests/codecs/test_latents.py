@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import functools
-
 import numpy as np
 import pyarrow as pa
 import pytest
@@ -11,9 +9,8 @@ import pytest
 from tacpipe.codecs import latents, pca, stored, tactile
 from tacpipe.codecs.moments import Moments
 from tacpipe.errors import TacpipeError
-from tacpipe.io.parquet import ParquetTable
 from tests.any_table import bits
-from tests.fake_recordings import FakeShard
+from tests.fake_recordings import FakeShard, decode_few_rows_at_a_time
 from tests.stages.learning_fakes import CHANNELS, table
 
 ROWS = 1000
@@ -49,7 +46,7 @@ def test_a_long_recording_gets_the_latents_of_the_whole(
     assert isinstance(whole, pa.Table) and np.isnan(whole.column("z00").to_numpy()[300])
 
     monkeypatch.setattr(latents, "SOME_ROWS", 100)
-    monkeypatch.setattr(ParquetTable, "batches", functools.partialmethod(ParquetTable.batches, rows=rows))
+    decode_few_rows_at_a_time(monkeypatch, rows)
     pieces = latents.added(shard, files)  # type: ignore[arg-type]
     assert isinstance(pieces, pa.RecordBatchReader)
     found = pieces.read_all()

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import functools
 import logging
 
 import numpy as np
@@ -8,8 +7,7 @@ import pytest
 
 from tacpipe.codecs import training_rows
 from tacpipe.codecs.training_rows import TrainingRows
-from tacpipe.io.parquet import ParquetTable
-from tests.fake_recordings import FakeShard
+from tests.fake_recordings import FakeShard, decode_few_rows_at_a_time
 from tests.stages.learning_fakes import CHANNELS, motion, table
 
 
@@ -97,7 +95,7 @@ def test_rows_that_are_read_in_pieces_are_those_of_the_whole_recording(
     contact[:4], gap[12] = -1, True
     shard = FakeShard("a", table(values, contact=contact, gap=gap))
     whole = read(shard, representation=representation, frames=2).inputs["a"]
-    monkeypatch.setattr(ParquetTable, "batches", functools.partialmethod(ParquetTable.batches, rows=rows))
+    decode_few_rows_at_a_time(monkeypatch, rows)
     found = training_rows.stored({"a": shard}, representation, 2)  # type: ignore[dict-item]
     pieces = list(found.each(["a"]))
     assert len(pieces) == -(-20 // rows)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import functools
-
 import pyarrow as pa
 import pytest
 
@@ -11,9 +9,9 @@ import tacpipe
 from tacpipe.channels import schema
 from tacpipe.formats.lerobot import container
 from tacpipe.io import row_groups
-from tacpipe.io.parquet import ParquetTable
 from tests.conftest import Lab
 from tests.exports import recordings
+from tests.fake_recordings import decode_few_rows_at_a_time
 
 FORMATS = pytest.mark.parametrize(
     ("export", "ingest"),
@@ -36,7 +34,7 @@ def test_the_shards_are_the_same(rig: Lab, export: str, ingest: str) -> None:
 def test_the_shards_are_the_same_when_few_rows_are_read_at_a_time(
     rig: Lab, monkeypatch: pytest.MonkeyPatch, export: str, ingest: str
 ) -> None:
-    monkeypatch.setattr(ParquetTable, "batches", functools.partialmethod(ParquetTable.batches, rows=7))
+    decode_few_rows_at_a_time(monkeypatch, 7)
     monkeypatch.setattr(container, "SOME_ROWS", 7)
     monkeypatch.setattr(row_groups, "IN_MEMORY", 0)
     assert_same(rig, export, ingest)
