@@ -280,7 +280,7 @@ def test_a_number_whose_name_ends_in_a_unit_shows_that_unit() -> None:
 def test_each_param_of_a_model_is_in_one_panel_of_the_help() -> None:
     for name in STAGES:
         kinds, panels = params_of.kinds(registry.load(name)), params_of.panels(registry.load(name))
-        if not panels:
+        if not set(panels) - {"streams", "without"}:  # which many stages share
             assert not name.startswith(("train.", "compress."))
             continue
         assert set(panels) == set(params_of.fields(registry.load(name))), name
@@ -390,7 +390,7 @@ def test_the_command_line_names_no_stage() -> None:
         ),
         ("report nowhere --preset paper", "There is no preset paper for report; it has none."),
         ("report nowhere --traces -1", "--traces is -1; it must be a whole number of 0 or more."),
-        ("synchronize nowhere --grid bogus --skip-bad", "--grid is 'bogus'; it must be one of uniform, logged, fresh."),
+        ("synchronize nowhere --grid bogus --skip-bad", "--grid is 'bogus'; it must be one of logged, fresh."),
         (
             "synchronize nowhere --rate-hz -5",
             "--rate-hz is -5; it must be a number above 0 and at most 1000000000 (Hz).",

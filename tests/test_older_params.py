@@ -39,7 +39,7 @@ DEFAULTS = {  # digests of the defaults' JSON, which is what keys hold
     "simulate.material": "166b49172d5bf574",
     "simulate.touch": "edc15a5626cb9e7a",
     "split": "b74d573d7062b354",
-    "synchronize": "0e50647ea7230139",
+    "synchronize": "2e08de830bfa8fbe",
     "train.forward": "d31d1b2ee2cee6b5",
     "train.material": "9b431ab5d857947b",
     "train.touch": "b780f0f9e97ab269",

@@ -15,7 +15,6 @@ from tests.conftest import Ran
 
 HITS = {  # commands whose results are in the store, under the keys that they had then
     "data/recordings": "simulate forward --trials 3 --duration-s 4 --tactile-rate-hz 25 --robot-rate-hz 50",
-    "data/synced": "synchronize data/recordings --rate-hz 25",
     "data/segments": "segment contacts data/synced",
     "data/split": "split data/segments --scheme random --val 0.34 --test 0.34",
     "data/predicted": "predict models/forward data/latents --steps 1",
@@ -44,6 +43,16 @@ def test_a_command_finds_its_older_result_under_the_same_key(
     assert done.code == 0, done.err
     assert json.loads(done.out)["ran"] == 0
     assert (older / output / "manifest.json").read_bytes() == before
+
+
+def test_rows_are_computed_again_since_they_no_longer_look_ahead_and_older_ones_stay_readable(
+    older: Path, call: Callable[[str], Ran]
+) -> None:
+    rows = tacpipe.open("data/synced").table().num_rows
+    done = call("synchronize data/recordings --rate-hz 25 -o data/held --json")
+    assert done.code == 0, done.err
+    assert json.loads(done.out)["ran"] == 3
+    assert tacpipe.open("data/synced").table().num_rows == rows
 
 
 def test_components_are_fitted_anew_since_their_stage_has_another_version_and_are_those_of_before(

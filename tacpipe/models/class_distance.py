@@ -95,8 +95,13 @@ class ClassDistance:
 
 
 def _features(frames: Float32s, patterns: Rocket | None) -> Floats:
-    """Return the features of slides (slide, time, channel), (slide, feature)."""
+    """Return the features of slides (slide, time, channel), (slide, feature).
+
+    Patterns need slides of the learned length: a shorter one, as during a live session, is continued with its last row.
+    """
     features = [statistics(frames)]
     if patterns is not None:
-        features.append(patterns.transform(with_profile(frames)))
+        missing = max(patterns.frames - frames.shape[1], 0)
+        continued = np.pad(frames, [(0, 0), (0, missing), (0, 0)], mode="edge")[:, : patterns.frames]
+        features.append(patterns.transform(with_profile(continued)))
     return np.concatenate(features, axis=1, dtype=np.float64)

@@ -118,7 +118,7 @@ def test_a_dataset_is_asked_for_one_recording(lab: Lab, bottle: Cloud, monkeypat
     for words, sentence in (
         ("", "has 2 recordings; pick one with --recording: bleach-1, bleach-2"),
         ("--recording wood-1", "no recording wood-1"),
-        ("--recording bleach-2", "has no cloud, only 'grasp'"),
+        ("--recording bleach-2", "has no cloud; it has the streams grasp"),
     ):
         refused = lab.call(f"candidates data/grasps {words}")
         assert refused.code == 2 and sentence in refused.err, refused.err

@@ -60,6 +60,7 @@ EXTRAS: dict[str, tuple[str, ...]] = {  # to commands that work with it and not 
     "tensorboard": (),
     "track": (),
     "wandb": (),
+    "xlsx": (),
     "zarr": ZARR,
     "all": (*LEARN, *CLOUDS, *DEVICES, *HDF5, *ROS, *ZARR),
 }

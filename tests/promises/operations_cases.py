@@ -120,6 +120,7 @@ TOYS = (
     Case("store status", "store status", TOY[:2]),
     Case("store verify", "store verify", TOY[:2]),
     Case("store repair", "store repair", TOY[:2], spoil=_damage, sound=False),
+    Case("store init", "store init"),
     Case("store list", "store list --json", TOY[:2]),
     Case(
         "store checkout",

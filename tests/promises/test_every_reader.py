@@ -6,7 +6,6 @@ A reader answers with all recordings, with a note that names the loss, or with a
 from __future__ import annotations
 
 import json
-import os
 import pickle
 import re
 import shlex
@@ -32,6 +31,7 @@ from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 
 from tacpipe.plugins import registry
+from tests import peaks
 from tests.conftest import Lab, Ran
 from tests.formats import grasp_files, slide_files, xdf_writer, xela_files
 from tests.formats.arrays import files as array_files
@@ -837,12 +837,11 @@ DECLARED: dict[str, list[Case] | str] = {
 @pytest.mark.parametrize(("reader", "case"), every_case(DECLARED))
 def test_a_declared_size_takes_no_memory(lab: Lab, reader: str, case: Case) -> None:
     def call(command: str) -> Ran:
-        with Path("out.txt").open("w") as out, Path("err.txt").open("w") as err:
-            process = subprocess.Popen([sys.executable, "-m", "tacpipe", *shlex.split(command)], stdout=out, stderr=err)
-            _, status, used = os.wait4(process.pid, 0)
-            process.returncode = os.waitstatus_to_exitcode(status)
-        assert used.ru_maxrss < 500_000, "kB"
-        return Ran(process.returncode, Path("out.txt").read_text(), Path("err.txt").read_text())
+        words = [sys.executable, "-c", peaks.PROGRAM, "{}", *shlex.split(command)]
+        done = subprocess.run(words, capture_output=True, text=True)
+        out, _, peak_kb = done.stdout.rpartition("peak ")
+        assert int(peak_kb) < 500_000
+        return Ran(done.returncode, out, done.stderr)
 
     ask(replace(lab, call=call), reader, case, "a declared size")
 

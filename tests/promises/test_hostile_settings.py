@@ -210,7 +210,7 @@ def test_params_that_no_person_wrote_are_refused_with_a_sentence(
 def test_a_value_of_set_is_read_as_carefully(tmp_path: Path, case: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     stage = registry.load("synchronize")
-    value = YAMLS[case].partition("synchronize: ")[2]
+    value = YAMLS[case].partition("synchronize:")[2]
     with bounded(SMALL), pytest.raises(UsageError) as error:
         given_params.build("synchronize", stage, sets=[f"rate_hz={value}"])
     assert not (tmp_path / "opened").exists()

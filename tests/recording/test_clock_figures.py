@@ -108,7 +108,7 @@ def test_synchronize_tells_the_clock_masks_what_was_lost_and_keeps_the_stamps(xe
             return Columns(to_parquet(xela.table))
 
     stage = registry.load("synchronize")
-    made: Any = stage(stage.params(), Recording())
+    made: Any = stage(stage.params(rate_hz=50.0, values="interpolate"), Recording())
 
     assert abs(float(made.attributes["device_clock_drift_ppm"]) + SKEW_PPM) < 2
     assert float(made.attributes["device_clock_residual_ms"]) < 2

@@ -175,8 +175,9 @@ def test_a_program_begins_and_ends_trials_and_a_start_meanwhile_begins_no_other(
 
 
 def test_lines_about_a_recording_come_every_five_seconds(lab: Lab, script: Script) -> None:
-    err = lab.run("acquire rig.toml -o rec --duration 12 --name one").err.splitlines()
+    created, *err = lab.run("acquire rig.toml -o rec --duration 12 --name one").err.splitlines()
 
+    assert "created the store" in created
     assert [line.split(":")[0] for line in err] == ["recording one, 5 s", "recording one, 10 s", "one"]
     assert "force 333.0 Hz, jitter 0.0 ms" in err[0]
 

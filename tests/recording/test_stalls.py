@@ -196,7 +196,7 @@ def test_a_clock_is_fitted_to_what_arrived_in_time(tmp_path: Path, monkeypatch: 
             return Columns(to_parquet(table))
 
     stage = registry.load("synchronize")
-    made_of: Any = stage(stage.params(), Recording())
+    made_of: Any = stage(stage.params(values="interpolate"), Recording())
 
     assert float(made_of.attributes["pad_clock_residual_ms"]) < 0.1
     assert abs(float(made_of.attributes["pad_clock_drift_ppm"])) < 1

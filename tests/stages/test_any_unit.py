@@ -152,4 +152,6 @@ def test_a_quaternion_without_components_names_the_line_of_the_layout_file(shard
     columns = {f"q{n}": np.ones(ROWS) / 2 for n in range(4)}
     odd = stream(columns, {key: {"quantity": "orientation", "unit": "1"} for key in columns})
     with pytest.raises(TacpipeError, match=r"component.*\[streams\.arm\] columns"):
-        synchronize(synchronize.params(rate_hz=37.0), shard({"skin": skin(1.0, "count"), "arm": odd}))
+        synchronize(
+            synchronize.params(rate_hz=37.0, values="interpolate"), shard({"skin": skin(1.0, "count"), "arm": odd})
+        )
