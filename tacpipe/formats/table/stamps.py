@@ -21,9 +21,8 @@ DIGITS = {"s": 9, "ms": 6, "us": 3, "ns": 0}  # decimals of a unit that are nano
 DECIMAL = pa.decimal128(38, 18)  # as which text is read
 _UNIT = 10**9  # a nanosecond, in the last digit of seconds as `DECIMAL` has them
 _USUAL = 450_000_000  # of the high word of seconds: before the year 2233, and no product below is beyond 64 bits
-_BEYOND = (
-    10**37 >> 64
-)  # of the high word: later than 2262 in every unit; Arrow reads 1e25 as such a number, not as itself
+_BEYOND = 10**37 >> 64  # of the high word: later than 2262 in every unit
+_LARGEST = 1e19  # later than 2262 in every unit, and below the least number that Arrow reads as another decimal
 _ZONED = re.compile(r".*(Z|[+-]\d\d:?\d\d)\s*", re.IGNORECASE)
 _LOGGED = r"(\d{2}:\d{2}:\d{2}),(\d+)"  # as Python's logging writes seconds
 
@@ -123,6 +122,18 @@ def last_digits(column: pa.Array) -> tuple[Int64s, Bools]:
     high, low = _words(column)
     found: Int64s = low.astype(np.int64)
     return found, high == found >> 63
+
+
+def overflows(rounded: pa.ChunkedArray) -> Bools:
+    """Return which stamps Arrow may have read as another number, shape (row,), from the same column read as float64.
+
+    Arrow multiplies the digits of a cell by a power of ten within 128 bits and does not notice an overflow, by which 1e34
+    may become any number.
+
+    >>> overflows(pa.chunked_array([[1744849152.5, None, -1e34]]))
+    array([False, False,  True])
+    """
+    return np.asarray(np.abs(rounded.fill_null(0).to_numpy()) >= _LARGEST)
 
 
 def _words(column: pa.Array) -> tuple[Int64s, np.ndarray[Any, np.dtype[np.uint64]]]:

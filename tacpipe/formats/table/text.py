@@ -20,7 +20,7 @@ import pyarrow as pa
 import pyarrow.csv as pc
 
 from tacpipe.errors import TacpipeError
-from tacpipe.formats.table import compressed
+from tacpipe.formats.table import compressed, stamps
 from tacpipe.formats.table.layout import Stream
 from tacpipe.io.parquet import owned
 from tacpipe.printable import excerpt, listed, plain
@@ -67,21 +67,31 @@ class TextTable:
     def batches(self, types: Mapping[str, pa.DataType]) -> Iterator[pa.Table]:
         """Yield the columns that ``types`` names, block by block. Raises `TacpipeError`, with the line, for a wrong row."""
         names = self.names()
-        options = pc.ConvertOptions(
+        parse = pc.ParseOptions(delimiter=self.stream.separator_of(self.path))
+        read = pc.ReadOptions(column_names=names, use_threads=True)
+        rounded_types = {name: pa.float64() for name, kind in types.items() if pa.types.is_decimal(kind)}
+        for block in self._blocks():
+            content = owned(*block)
+            try:
+                table = pc.read_csv(pa.BufferReader(content), read, parse, self._conversion(types))
+                if rounded_types:
+                    rounded = pc.read_csv(pa.BufferReader(content), read, parse, self._conversion(rounded_types))
+                    if any(stamps.overflows(column).any() for column in rounded.columns):
+                        raise pa.ArrowInvalid("A number is too large")
+            except (pa.ArrowInvalid, UnicodeDecodeError) as error:
+                fault = self._fault(names, types)
+                raise TacpipeError(fault or f"{self.path} cannot be read: {plain(str(error), 200)}.") from error
+            yield table
+
+    def _conversion(self, types: Mapping[str, pa.DataType]) -> pc.ConvertOptions:
+        """Return how Arrow reads the columns that ``types`` names."""
+        return pc.ConvertOptions(
             column_types=dict(types),
             include_columns=list(types),
             null_values=list(self.stream.missing),
             strings_can_be_null=True,
             decimal_point=self.stream.decimal,
         )
-        parse = pc.ParseOptions(delimiter=self.stream.separator_of(self.path))
-        read = pc.ReadOptions(column_names=names, use_threads=True)
-        for block in self._blocks():
-            try:
-                yield pc.read_csv(pa.BufferReader(owned(*block)), read, parse, options)
-            except (pa.ArrowInvalid, UnicodeDecodeError) as error:
-                fault = self._fault(names, types)
-                raise TacpipeError(fault or f"{self.path} cannot be read: {plain(str(error), 200)}.") from error
 
     def _expect_width(self, line: int, cells: Sequence[str]) -> None:
         """Raise `TacpipeError` where a row has another number of cells than the layout names columns."""
@@ -182,13 +192,18 @@ class TextTable:
     def _allowed(self, cell: str, kind: pa.DataType) -> bool:
         if cell in self.stream.missing:
             return True
-        text = pa.BufferReader(owned(f'"{cell}"\n'.encode()))
-        options = pc.ConvertOptions(column_types={"x": kind}, null_values=[], decimal_point=self.stream.decimal)
+
+        def parse(kind: pa.DataType) -> pa.ChunkedArray:
+            text = pa.BufferReader(owned(f'"{cell}"\n'.encode()))
+            read = pc.ReadOptions(column_names=["x"], use_threads=False)
+            options = pc.ConvertOptions(column_types={"x": kind}, null_values=[], decimal_point=self.stream.decimal)
+            return pc.read_csv(text, read, convert_options=options)["x"]
+
         try:
-            pc.read_csv(text, pc.ReadOptions(column_names=["x"], use_threads=False), convert_options=options)
+            parse(kind)
+            return not (pa.types.is_decimal(kind) and stamps.overflows(parse(pa.float64())).any())
         except (pa.ArrowInvalid, UnicodeDecodeError):
             return False
-        return True
 
 
 def described(kind: pa.DataType) -> str:
@@ -203,4 +218,6 @@ def described(kind: pa.DataType) -> str:
         return f"a whole number from {least} to {most}"
     if pa.types.is_boolean(kind):
         return "true or false"
+    if pa.types.is_decimal(kind):
+        return f"a number that is {stamps.IN_RANGE}"
     return "text in UTF-8" if pa.types.is_string(kind) else "a number"

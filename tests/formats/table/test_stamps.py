@@ -2,12 +2,13 @@ from __future__ import annotations
 
 import datetime
 from decimal import ROUND_HALF_EVEN, Decimal
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 import pytest
-from hypothesis import given
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from tacpipe.errors import TacpipeError
@@ -96,5 +97,39 @@ def test_a_stamp_beyond_every_range_is_refused_and_names_its_row(tmp_path: Path,
     path = tmp_path / "skin.csv"
     path.write_text(f"time,a\n0,1\n{text},2\n")
     stream = Stream("skin", time=Time(column="time", unit=unit), columns=(Column(match="a"),))
+    with pytest.raises(TacpipeError, match=r"line 3, column time holds .*2262"):
+        reading.table(path, stream)
+
+
+@given(
+    digits=st.from_regex(r"[-+]?[1-9]\d{0,29}(\.\d{1,9})?", fullmatch=True),
+    exponent=st.integers(-60, 400),
+    unit=st.sampled_from(["s", "ms", "us", "ns"]),
+)
+@example(digits="10000000000000000000000", exponent=0, unit="ns")  # 22 zeros wrap without an exponent
+@example(digits="15", exponent=24, unit="s")
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_a_number_with_any_exponent_is_its_exact_time_or_refused(
+    tmp_path: Path, digits: str, exponent: int, unit: TimeUnit
+) -> None:
+    text = f"{digits}e{exponent}" if exponent else digits
+    path = tmp_path / "skin.csv"
+    path.write_text(f"time,a\n{text},2\n")
+    stream = Stream("skin", time=Time(column="time", unit=unit), columns=(Column(match="a"),))
+    exact = Fraction(text) * 10 ** stamps.DIGITS[unit]
+    try:
+        t_ns = reading.table(path, stream)["t_ns"].to_pylist()
+    except TacpipeError as error:
+        assert "line 2, column time" in str(error)
+        return
+    assert t_ns == [round(exact)]
+
+
+@pytest.mark.parametrize("cell", ["90363683947689815409865596", "995747533096360050131451e3"])
+def test_a_number_that_128_bits_hold_as_a_stamp_of_today_is_refused(tmp_path: Path, cell: str) -> None:
+    assert int(Decimal(cell)) * 10**18 % 2**128 // 10**18 == 1_744_849_152
+    path = tmp_path / "skin.csv"
+    path.write_text(f"time,a\n0,1\n{cell},2\n")
+    stream = Stream("skin", time=Time(column="time"), columns=(Column(match="a"),))
     with pytest.raises(TacpipeError, match=r"line 3, column time holds .*2262"):
         reading.table(path, stream)
