@@ -31,7 +31,7 @@ class Params:
     traces: NonNegativeInt = 2  # recordings of each forecast shown in full whose predictions are drawn
 
 
-@stage(version=10)
+@stage(version=11)
 def report(params: Params, results: Datasets) -> Result:
     """Return one page: the answer, charts, tables, and where every number comes from."""
     from tacpipe.plugins.stage import Result

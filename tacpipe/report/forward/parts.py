@@ -117,6 +117,7 @@ def caveats(context: Context) -> list[str]:
     ]
     return [
         f"Settings: {settings}." if settings else "",
+        *_look_ahead(context),
         "Skill over persistence is 1 − mean absolute error / mean absolute error of persistence over all channels, the "
         "geometric mean of the ratios over recordings. Every representation is decoded to the channels' own unit before it "
         "is evaluated, so all rows can be compared. Errors without a step are means over all steps.",
@@ -127,6 +128,16 @@ def caveats(context: Context) -> list[str]:
         else "",
         "; ".join(f"{single_run.spelled(name)}: {single_run.EXPLAINED[name]}" for name in _predictors(context)) + ".",
     ]  # fmt: skip
+
+
+def _look_ahead(context: Context) -> list[str]:
+    """Return how far the rows that models were trained on look ahead, with their methods where others do not."""
+    methods: dict[str, set[str]] = {}
+    for run in context.runs:
+        for note in headline.look_ahead_notes(run.details.config):
+            methods.setdefault(note, set()).add(run.method)
+    every = {run.method for run in context.runs}
+    return [note if names == every else f"{blocks.listed(sorted(names))}: {note}" for note, names in methods.items()]
 
 
 def about_run(run: Run) -> dict[str, Cell | str]:

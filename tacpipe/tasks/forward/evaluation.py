@@ -20,12 +20,13 @@ from tacpipe.tasks.forward import metrics, situations, tracks, units
 from tacpipe.tasks.forward.alarms import Loads
 from tacpipe.tasks.forward.bands import Bands
 from tacpipe.tasks.forward.forecaster import CONFIG, Forecaster
+from tacpipe.tasks.forward.headline import look_ahead_notes
 from tacpipe.tasks.forward.metrics import Trial
 from tacpipe.tasks.forward.predictors import predicted
 from tacpipe.tasks.forward.situations import BySituation
 from tacpipe.tasks.forward.slip_alarms import SlipAlarms
 from tacpipe.tasks.forward.tracks import Track
-from tacpipe.tasks.forward.training import HISTORY, check_codec, look_ahead_notes
+from tacpipe.tasks.forward.training import HISTORY, check_codec
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -37,6 +38,18 @@ def shown(steps: Sequence[int]) -> tuple[int, ...]:
     ((1, 3, 5, 10), (1, 3), (4,))
     """
     return tuple(step for step in STEPS if step in steps) or (max(steps),)
+
+
+def look_ahead_notes(config: Mapping[str, Any]) -> list[str]:
+    """Return how far the rows that a model was trained on look ahead; nothing where they do not."""
+    ahead = config.get("look_ahead") or {"max_ms": 0.0}
+    if not ahead["max_ms"]:
+        return []
+    return [
+        f"The rows of the training recordings look ahead by {ahead['mean_ms']:g} ms on average and at most "
+        f"{ahead['max_ms']:g} ms, so errors are smaller than a live session's. Synchronize without --values interpolate for "
+        f"models to act on."
+    ]
 
 
 @dataclass(frozen=True)

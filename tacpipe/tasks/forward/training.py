@@ -40,6 +40,7 @@ from tacpipe.tasks.forward.forecaster import (
     largest_level,
     layout,
 )
+from tacpipe.tasks.forward.headline import look_ahead_notes
 from tacpipe.tasks.forward.params import Change, Params
 from tacpipe.tasks.forward.predictors import predicted
 from tacpipe.tasks.forward.rows import Rows, acted, rows
@@ -390,18 +391,6 @@ def notes(params: Params, files: Mapping[str, bytes]) -> list[str]:
             f"match of [streams.…] columns of the layout file where channels are taxels.",
         ]
     return rows
-
-
-def look_ahead_notes(config: Config) -> list[str]:
-    """Return how far the rows that a model was trained on look ahead; nothing where they do not."""
-    ahead = config.get("look_ahead") or {"max_ms": 0.0}
-    if not ahead["max_ms"]:
-        return []
-    return [
-        f"The rows of the training recordings look ahead by {ahead['mean_ms']:g} ms on average and at most "
-        f"{ahead['max_ms']:g} ms, so errors are smaller than a live session's. Synchronize without --values interpolate for "
-        f"models to act on."
-    ]
 
 
 def _check_pose(start: Forecaster, pose: Pose) -> None:

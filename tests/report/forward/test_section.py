@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from tacpipe.comparison.runs import grouped
-from tacpipe.report.blocks import Section
+from tacpipe.report.blocks import Note, Section
 from tacpipe.report.forward import anticipation, reading, representations
 from tests.fake_recordings import FakeDataset
 from tests.report import parts
@@ -237,3 +237,24 @@ def test_recordings_are_listed_worst_first_with_the_command_to_see_each() -> Non
     first = unseen.rows[0].cells[0]
     assert not isinstance(first, str) and first.copy.split()[:2] == ["tacpipe", "view"] and "r3" in first.copy
     assert parts.cell(unseen, "r3", "skill") == "−1.000"  # 1.5 next to 0.75
+
+
+def test_a_page_states_how_far_training_rows_look_ahead_and_of_which_methods() -> None:
+    ahead, none = ({"mean_ms": mean, "max_ms": largest} for mean, largest in ((9.5, 26.25), (0.0, 0.0)))
+    pages = {
+        "one": forward(result("raw", look_ahead=ahead)),
+        "both": forward(result("raw", look_ahead=ahead), result("PCA-20", look_ahead=none)),
+        "none": forward(result("raw", look_ahead=none), result("PCA-20")),
+    }
+    texts = {
+        name: [
+            note.text
+            for note in parts.folds(page)["What these numbers rest on"].blocks
+            if isinstance(note, Note) and "look ahead" in note.text
+        ]
+        for name, page in pages.items()
+    }
+    assert texts["none"] == []
+    for name, begins in (("one", "The rows"), ("both", "recurrent · raw: The rows")):
+        (sentence,) = texts[name]
+        assert sentence.startswith(begins) and "by 9.5 ms on average and at most 26.25 ms" in sentence
