@@ -112,6 +112,13 @@ def test_the_truth_of_a_simulator_takes_one_line(lab: Path) -> None:
     assert "gt_mass_kg" in next(iter(value["attributes"].values()))  # programs get it whole
 
 
+def test_a_picture_hatches_the_padding_of_contacts(lab: Path, tmp_path: Path) -> None:
+    for dataset in ("synced", "segments"):
+        tacpipe(lab, f"show data/{dataset} trial-000 --plot {tmp_path}/{dataset}.svg")
+    assert "<pattern" in (tmp_path / "segments.svg").read_text()
+    assert "<pattern" not in (tmp_path / "synced.svg").read_text()
+
+
 def test_evaluate_prints_its_headline_on_a_hit_too_and_stdout_is_the_output_alone(lab: Path) -> None:
     found = headline.read((lab / "results/forward/headline.json").read_bytes())
     told = headline_table.text(found, tables.width_of(sys.stderr))

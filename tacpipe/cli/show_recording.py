@@ -114,7 +114,7 @@ def draw(dataset: Path, recording: str | None, picture: Path) -> Path:
             f"{dataset} has {len(opened)} recordings, and --plot draws one; name it: {listed(opened.recordings, _NAMED)}."
         )
     name = next(iter(opened.recordings)) if recording is None else recording
-    figure.draw(contents.for_picture(opened[name]), picture)
+    figure.draw(contents.for_picture(opened[name], chain=opened.source.chain), picture)
     return picture
 
 

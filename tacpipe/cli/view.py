@@ -137,7 +137,7 @@ def _drawn(recordings: Sequence[Recording], predictions: Dataset | None) -> Iter
             table, row = predicted(predictions, one.name)
             if table is None and row is None:
                 terminal.note(f"There are no predictions of {one.name} in {predictions.path}.")
-        found = contents.of(one, table, row)
+        found = contents.of(one, table, row, chain=one.alone.source.chain)
         if found.empty:
             raise UsageError(
                 f"Recording {one.name} has no stream with times and no cloud, so there is nothing to draw; "

@@ -139,6 +139,16 @@ def noise_thresholds(
     return Thresholds(on, ENDS * on)
 
 
+def touching(load: Floats, on: float | Floats, off: float | Floats) -> Bools:
+    """Return the rows of touch (time,), as `contact_intervals` detects it before it merges, drops and pads contacts."""
+    loads, ons, offs = np.atleast_2d(load), np.reshape(on, (-1, 1)), np.reshape(off, (-1, 1))  # (sensor, time or 1)
+    if not ((offs >= 0) & (offs <= ons)).all():
+        raise TacpipeError(f"Contact that starts at {on} and ends below {off} flickers; off must lie between 0 and on.")
+    starting: Bools = np.any(loads >= ons, axis=0) & ~np.isnan(loads).any(axis=0)  # (time,)
+    ending: Bools = np.all(loads < offs, axis=0)  # (time,)
+    return latched(starting, ending)
+
+
 def contact_intervals(
     load: Floats,
     t_ns: Times,
@@ -156,12 +166,7 @@ def contact_intervals(
     those shorter than ``min_s`` go; the rest grow by ``pad_s`` on both sides, and where they would meet, the rows
     between them are shared out at the middle. Raises `TacpipeError` unless 0 <= off <= on.
     """
-    loads, ons, offs = np.atleast_2d(load), np.reshape(on, (-1, 1)), np.reshape(off, (-1, 1))  # (sensor, time or 1)
-    if not ((offs >= 0) & (offs <= ons)).all():
-        raise TacpipeError(f"Contact that starts at {on} and ends below {off} flickers; off must lie between 0 and on.")
-    starting: Bools = np.any(loads >= ons, axis=0) & ~np.isnan(loads).any(axis=0)  # (time,)
-    ending: Bools = np.all(loads < offs, axis=0)  # (time,)
-    starts, stops = runs(latched(starting, ending))
+    starts, stops = runs(touching(load, on, off))
     if not len(starts):
         return np.zeros((0, 2), dtype=np.int64)
     apart = t_ns[starts[1:]] - t_ns[stops[:-1] - 1] > round(merge_s * 1e9)  # (contact - 1,)

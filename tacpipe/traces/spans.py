@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from tacpipe.arrays import AnyArray, Times
+from tacpipe.arrays import AnyArray, Bools, Times
 from tacpipe.channels.masks import GAP
 from tacpipe.channels.streams import gaps_before
 from tacpipe.traces.curves import TIME, described
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 _NAMED = {"phase": {-1: "", 0: "slide", 1: ""}}  # values of label columns that have names of their own
 _NOTHING = ("", "0", "-1", "False", "None", "nan")  # values of a label of rows that nothing is drawn for
+CONTACT, PADDING = "contact", "padding"  # lane of the contacts, and the text of a span that is padding
 _SWITCHES = ({"0", "1"}, {"1"}, {"0"}, {"False", "True"}, {"True"}, {"False"})
 
 
@@ -54,6 +55,25 @@ def of_labels(table: pa.Table) -> list[Span]:
         if described(field).get("quantity") == "label" and field.name != TIME:
             found += _of_column(str(field.name), table.column(field.name), t_ns)
     return found
+
+
+def split_padding(labels: Sequence[Span], t_ns: Times, touching: Bools) -> list[Span]:
+    """Return the spans with each contact split into padding, touch and padding; a contact without touch stays whole.
+
+    ``touching`` (time,) has the rows of touch at the stamps ``t_ns`` (time,).
+    """
+    parts: list[Span] = []
+    for span in labels:
+        first, stop = np.searchsorted(t_ns, (span.start_ns, span.stop_ns))
+        rows = first + np.flatnonzero(touching[first:stop])
+        if span.lane != CONTACT or not len(rows):
+            parts.append(span)
+            continue
+        touch = span._replace(start_ns=int(t_ns[rows[0]]), stop_ns=stop_ns(t_ns, int(rows[-1]) + 1))
+        before = span._replace(text=PADDING, stop_ns=touch.start_ns)
+        after = span._replace(text=PADDING, start_ns=touch.stop_ns)
+        parts += [part for part in (before, touch, after) if part.start_ns < part.stop_ns]
+    return parts
 
 
 def _of_column(name: str, column: pa.ChunkedArray, t_ns: Times) -> list[Span]:

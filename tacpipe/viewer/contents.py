@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tacpipe.arrays import Bytes, Float32s, Times
-from tacpipe.channels.streams import EVENTS, TRUTH, rate_hz, read_clocks
+from tacpipe.arrays import Bytes, Float32s, Floats, Times
+from tacpipe.channels.streams import COUNT, EVENTS, TRUTH, rate_hz, read_clocks
 from tacpipe.clouds.cloud import COLOUR, POSITION
 from tacpipe.datasets.streams import split_tables
 from tacpipe.formats.arrays.frames import encoding
+from tacpipe.signals import contact
 from tacpipe.traces import curves, forecasts, named, paths, spans, taxels
 from tacpipe.traces.curves import TIME, Curves, described
 from tacpipe.traces.forecasts import Forecast
@@ -29,6 +31,7 @@ if TYPE_CHECKING:
     from tacpipe.io.columns import Columns
     from tacpipe.plugins.stage import Attribute
 
+StageChain = Sequence[Mapping[str, Any]]  # the chain of a manifest: stages with their params
 # quantities, in the order in which they are looked for
 FIRST = ("force", "static_pressure", "joint_position", "finger_width", "position", "speed", "velocity")
 MOST_VALUES = 1 << 24  # values of a stream, beyond which a picture shows some of its rows
@@ -112,16 +115,20 @@ class Contents:
         return (stop_ns - start_ns) / 1e9
 
 
-def of(recording: Recording, predictions: pa.Table | None = None, row: pa.Table | None = None) -> Contents:
+def of(
+    recording: Recording, predictions: pa.Table | None = None, row: pa.Table | None = None, *, chain: StageChain = ()
+) -> Contents:
     """Return what is drawn of a recording.
 
     ``predictions`` is its table in a dataset of predictions or results, ``row`` its row where that has one each.
+    Where the ``chain`` of its dataset marked contacts, their padding is a span of its own.
     """
     tables = {stream: recording.table(stream) for stream in recording.streams}
-    return _of_tables(recording.name, recording.attributes, tables, predictions, row)
+    contents = _of_tables(recording.name, recording.attributes, tables, predictions, row)
+    return _split_contacts(contents, chain)
 
 
-def for_picture(recording: Recording) -> Contents:
+def for_picture(recording: Recording, *, chain: StageChain = ()) -> Contents:
     """Return what a picture shows of a recording; of a long stream, some rows of each of `STRETCHES` stretches.
 
     These are the rows with the least and the largest touch, those with the least and the largest value of any other channel,
@@ -130,11 +137,12 @@ def for_picture(recording: Recording) -> Contents:
     columns = {stream: recording.columns(stream) for stream in recording.streams}
     long = {stream for stream, stored in columns.items() if stored.num_rows * len(stored.column_names) > MOST_VALUES}
     if not long:
-        return of(recording)
+        return of(recording, chain=chain)
     tables = {
         stream: _thinned(stored) if stream in long else recording.table(stream) for stream, stored in columns.items()
     }
     contents = _of_tables(recording.name, recording.attributes, tables)
+    contents = _split_contacts(contents, chain)
     if set(tables) == {""}:  # a mask marks its gaps
         return contents
     gaps = [gap for gap in contents.gaps if gap.lane not in long]
@@ -144,6 +152,26 @@ def for_picture(recording: Recording) -> Contents:
             stamps = zip(clocks.gap_starts_ns.tolist(), clocks.gap_stops_ns.tolist(), strict=True)
             gaps += [Span(stream, "gap", start_ns, stop_ns) for start_ns, stop_ns in stamps]
     return replace(contents, gaps=gaps)
+
+
+def _split_contacts(contents: Contents, chain: StageChain) -> Contents:
+    """Return the contents with contacts split into touch and padding, by the load and thresholds of `segment contacts`."""
+    params = [step["params"] for step in chain if step["stage"] == "segment.contacts"]
+    if not params or params[-1]["begins"] == "grasped" or not contents.taxels:
+        return contents
+    loads: list[Floats] = []
+    limits: list[tuple[float, float]] = []
+    for stream, members in groupby(contents.taxels, lambda taxel_set: taxel_set.stream):
+        fingers = list(members)
+        loads.append(np.average([finger.load for finger in fingers], 0, [len(finger.names) for finger in fingers]))
+        name = f"{stream}_contact" if stream else "contact"
+        on, off = contents.attributes.get(f"{name}_on"), contents.attributes.get(f"{name}_off")
+        if on is None or off is None:  # in counts, or without a threshold since it never leaves its level at rest
+            counts = fingers[0].unit == COUNT
+            on, off = (params[-1]["on_count"], params[-1]["off_count"]) if counts else (np.inf, np.inf)
+        limits.append((float(on), float(off)))
+    touching = contact.touching(np.array(loads), *np.array(limits).T)
+    return replace(contents, spans=spans.split_padding(contents.spans, contents.taxels[0].t_ns, touching))
 
 
 def _thinned(stored: Columns) -> pa.Table:

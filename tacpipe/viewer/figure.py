@@ -16,7 +16,7 @@ from tacpipe.plugins import extras
 from tacpipe.printable import plain
 from tacpipe.signals.envelope import envelope
 from tacpipe.traces import carpet, palette, taxels
-from tacpipe.traces.spans import Span, merged
+from tacpipe.traces.spans import CONTACT, PADDING, Span, merged
 from tacpipe.traces.taxels import Taxels
 from tacpipe.viewer.contents import Contents
 
@@ -91,10 +91,9 @@ def _over_time(contents: Contents, lines: Sequence[Panel]) -> Any:
     main = axes.pop(0)
     _plot(main, first, start_ns)
     for span in contents.spans:
-        if span.lane == "contact":
-            main.axvspan(
-                _s(span.start_ns, start_ns), _s(span.stop_ns, start_ns), color=palette.DISTINCT[0], alpha=0.12, lw=0
-            )
+        if span.lane == CONTACT:
+            look = _look(span, palette.DISTINCT[0])
+            main.axvspan(_s(span.start_ns, start_ns), _s(span.stop_ns, start_ns), alpha=0.12, lw=0, **look)
     if lanes:
         _diagram(axes.pop(0), lanes, start_ns)
     for one in touched:
@@ -151,17 +150,27 @@ def _diagram(axes: Any, lanes: dict[str, list[Span]], start_ns: int) -> None:
     width_s = max(_s(span.stop_ns, start_ns) for spans in lanes.values() for span in spans)
     for place, (lane, spans) in enumerate(lanes.items()):
         colour = palette.FAULT if lane == "gaps" else palette.numbered(place)
-        bars = [(_s(one.start_ns, start_ns), _s(one.stop_ns, start_ns) - _s(one.start_ns, start_ns)) for one in spans]
-        axes.broken_barh(bars, (place - 0.35, 0.7), facecolors=colour, edgecolors="white", linewidth=0.5)
-        for (left, width), one in zip(bars, spans, strict=True):
-            if width > 0.012 * width_s * len(one.text):
-                axes.text(left + width / 2, place, one.text, ha="center", va="center", fontsize=7)
+        for span in spans:
+            left, width = _s(span.start_ns, start_ns), (span.stop_ns - span.start_ns) / 1e9
+            look = {"edgecolor": "white", **_look(span, colour)}
+            axes.broken_barh([(left, width)], (place - 0.35, 0.7), linewidth=0.5, **look)
+            if width > 0.012 * width_s * len(span.text):
+                axes.text(left + width / 2, place, span.text, ha="center", va="center", fontsize=7)
     axes.set_yticks(range(len(lanes)), [plain(lane) for lane in lanes])
     axes.invert_yaxis()
-    axes.set_title("contacts, labels, gaps", loc="left")
+    padded = any(span.text == PADDING for spans in lanes.values() for span in spans)
+    hatched = " (hatched: padding before and after the touch)" if padded else ""
+    axes.set_title(f"contacts{hatched}, labels, gaps", loc="left")
     axes.tick_params(axis="y", length=0)
     for side in ("top", "right", "left"):
         axes.spines[side].set_visible(False)
+
+
+def _look(span: Span, colour: str) -> dict[str, str]:
+    """Return how a span is filled: padding is hatched, everything else has a plain colour."""
+    if span.text == PADDING:
+        return {"facecolor": "white", "edgecolor": colour, "hatch": "/////"}
+    return {"facecolor": colour}
 
 
 def _image(axes: Any, one: Taxels, start_ns: int, stop_ns: int) -> None:

@@ -17,7 +17,7 @@ from tacpipe.traces.curves import Curves
 from tacpipe.traces.forecasts import Forecast
 from tacpipe.traces.named import Named
 from tacpipe.traces.paths import Path
-from tacpipe.traces.spans import Span, merged
+from tacpipe.traces.spans import PADDING, Span, merged
 from tacpipe.traces.taxels import Taxels
 from tacpipe.viewer import about
 from tacpipe.viewer.contents import Contents, Frames, Points
@@ -237,8 +237,10 @@ class Stream:
     def _lane(self, lane: str, spans: Sequence[Span], colour: str) -> None:
         rr = _rerun()
         t_ns, states = changes(spans)
-        values = list(dict.fromkeys(state for state in states if state))
-        colours = [palette.rgb(colour)] * len(values) if len(values) < 2 else _shades(colour, len(values))
+        named = list(dict.fromkeys(state for state in states if state not in ("", PADDING)))
+        colours = [palette.rgb(colour)] * len(named) if len(named) < 2 else _shades(colour, len(named))
+        values = [*named, PADDING] if PADDING in states else named
+        colours += [palette.rgb(palette.MEASURED)] * (len(values) - len(named))
         self._static((SPANS, lane), rr.StateConfiguration(values=values, labels=values, colors=colours))
         self._columns((SPANS, lane), t_ns, rr.StateChange.columns(state=states))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +12,10 @@ import pytest
 import tacpipe
 from tacpipe.cli import view
 from tacpipe.errors import UsageError
+from tacpipe.plugins.registry import load
 from tacpipe.viewer import contents, figure
 from tests.conftest import Lab
+from tests.fake_recordings import FakeShard
 from tests.viewer import hand
 
 
@@ -63,6 +66,32 @@ def test_a_picture_of_a_long_recording_keeps_peaks_spans_and_gaps(monkeypatch: p
         assert len(thin.t_ns) < len(full.t_ns) / 2
         assert thin.load.max() == full.load.max() and thin.rest.tolist() == full.rest.tolist()
     assert np.ptp(brief.curves[0].values) == np.ptp(every_row.curves[0].values)
+
+
+@pytest.mark.parametrize(("unit", "pressure"), [("count", 500.0), ("N", 2.5)])
+def test_padding_is_apart_from_the_touch_also_where_neighbours_and_ends_cut_it(unit: str, pressure: float) -> None:
+    touches = [(6, 60), (95, 160), (260, 300), (378, 400)]  # rows at 50 Hz; the pad is 25 rows
+    touched = np.zeros(400, dtype=bool)
+    for start, stop in touches:
+        touched[start:stop] = True
+    about = {"quantity": "tactile", "unit": unit, "stream": "skin"}
+    fields = [pa.field("t_ns", pa.int64()), *(pa.field(f"t{n}", pa.float64(), metadata=about) for n in range(4))]
+    noise = np.random.default_rng(0).normal(0, pressure / 1000, (4, 400))
+    rows = [np.arange(400) * 20_000_000, *(touched * pressure + noise)]
+    segment = load("segment.contacts")
+    params = segment.params(rest_s=0.1)
+    segmented = segment(params, FakeShard("a", pa.table(rows, pa.schema(fields))))
+    chain = [{"stage": "segment.contacts", "params": dataclasses.asdict(params)}]
+    shard = FakeShard("a", segmented.streams[""], segmented.attributes)
+
+    drawn = contents.of(shard, chain=chain).spans  # type: ignore[arg-type]
+
+    by_text = {text: np.zeros(400, dtype=bool) for text in ("contact", "padding")}
+    for span in drawn:
+        by_text[span.text.split()[0]][span.start_ns // 20_000_000 : span.stop_ns // 20_000_000] = True
+    assert by_text["contact"].tolist() == touched.tolist()
+    padding = [(0, 6), (60, 95), (160, 185), (235, 260), (300, 325), (353, 378)]
+    assert np.flatnonzero(by_text["padding"]).tolist() == [row for ends in padding for row in range(*ends)]
 
 
 def test_the_first_plot_is_the_touch_of_all_fingers_in_their_unit() -> None:
