@@ -132,12 +132,16 @@ def caveats(context: Context) -> list[str]:
 
 def _look_ahead(context: Context) -> list[str]:
     """Return how far the rows that models were trained on look ahead, with their methods where others do not."""
-    methods: dict[str, set[str]] = {}
-    for run in context.runs:
-        for note in headline.look_ahead_notes(run.details.config):
-            methods.setdefault(note, set()).add(run.method)
-    every = {run.method for run in context.runs}
-    return [note if names == every else f"{blocks.listed(sorted(names))}: {note}" for note, names in methods.items()]
+    methods: dict[str, list[str]] = {}
+    for method in context.methods:
+        for note in dict.fromkeys(
+            note for run in method.runs for note in headline.look_ahead_notes(run.details.config)
+        ):
+            methods.setdefault(note, []).append(method.name)
+    return [
+        note if len(names) == len(context.methods) else f"{blocks.listed(names)}: {note}"
+        for note, names in methods.items()
+    ]
 
 
 def about_run(run: Run) -> dict[str, Cell | str]:

@@ -244,6 +244,7 @@ def test_a_page_states_how_far_training_rows_look_ahead_and_of_which_methods() -
     pages = {
         "one": forward(result("raw", look_ahead=ahead)),
         "both": forward(result("raw", look_ahead=ahead), result("PCA-20", look_ahead=none)),
+        "hidden": forward(result("raw", look_ahead=ahead), result("raw", look_ahead=none, params={"hidden": 8})),
         "none": forward(result("raw", look_ahead=none), result("PCA-20")),
     }
     texts = {
@@ -255,6 +256,11 @@ def test_a_page_states_how_far_training_rows_look_ahead_and_of_which_methods() -
         for name, page in pages.items()
     }
     assert texts["none"] == []
-    for name, begins in (("one", "The rows"), ("both", "recurrent · raw: The rows")):
+    begins = {
+        "one": "The rows",
+        "both": "recurrent · raw: The rows",
+        "hidden": "recurrent · raw · hidden 200: The rows",
+    }
+    for name in begins:
         (sentence,) = texts[name]
-        assert sentence.startswith(begins) and "by 9.5 ms on average and at most 26.25 ms" in sentence
+        assert sentence.startswith(begins[name]) and "by 9.5 ms on average and at most 26.25 ms" in sentence
