@@ -168,6 +168,7 @@ def test_an_older_split_of_other_folds_is_refused() -> None:
         (Scheme("kfold", folds=1), "1 folds cannot be made"),
         (Scheme("leave-one-out", by="colour"), "has no attribute colour; it has object"),
         (Scheme(stratify="colour"), "has no attribute colour"),
+        (Scheme(stratify="objcet"), "Did you mean object\\?"),
         (Scheme("kfold", folds=4, apart="object"), "3 values of object cannot be kept apart in 4 folds"),
         (Scheme("kfold", folds=2, apart="colour"), "has no attribute colour"),
         (Scheme("random", apart="object"), "apart object goes with the scheme kfold alone"),

@@ -157,7 +157,7 @@ def for_picture(recording: Recording, *, chain: StageChain = ()) -> Contents:
 def _split_contacts(contents: Contents, chain: StageChain) -> Contents:
     """Return the contents with contacts split into touch and padding, by the load and thresholds of `segment contacts`."""
     params = [step["params"] for step in chain if step["stage"] == "segment.contacts"]
-    if not params or params[-1]["begins"] == "grasped" or not contents.taxels:
+    if not params or params[-1].get("begins") == "grasped" or not contents.taxels:
         return contents
     loads: list[Floats] = []
     limits: list[tuple[float, float]] = []
@@ -166,9 +166,9 @@ def _split_contacts(contents: Contents, chain: StageChain) -> Contents:
         loads.append(np.average([finger.load for finger in fingers], 0, [len(finger.names) for finger in fingers]))
         name = f"{stream}_contact" if stream else "contact"
         on, off = contents.attributes.get(f"{name}_on"), contents.attributes.get(f"{name}_off")
-        if on is None or off is None:  # in counts, or without a threshold since it never leaves its level at rest
-            counts = fingers[0].unit == COUNT
-            on, off = (params[-1]["on_count"], params[-1]["off_count"]) if counts else (np.inf, np.inf)
+        if on is None or off is None:  # the stream has fixed thresholds in counts, or never leaves its level at rest
+            fixed = params[-1] if fingers[0].unit == COUNT else {}
+            on, off = fixed.get("on_count", np.inf), fixed.get("off_count", np.inf)
         limits.append((float(on), float(off)))
     touching = contact.touching(np.array(loads), *np.array(limits).T)
     return replace(contents, spans=spans.split_padding(contents.spans, contents.taxels[0].t_ns, touching))

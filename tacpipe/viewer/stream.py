@@ -237,10 +237,10 @@ class Stream:
     def _lane(self, lane: str, spans: Sequence[Span], colour: str) -> None:
         rr = _rerun()
         t_ns, states = changes(spans)
-        named = list(dict.fromkeys(state for state in states if state not in ("", PADDING)))
-        colours = [palette.rgb(colour)] * len(named) if len(named) < 2 else _shades(colour, len(named))
-        values = [*named, PADDING] if PADDING in states else named
-        colours += [palette.rgb(palette.MEASURED)] * (len(values) - len(named))
+        labels = list(dict.fromkeys(state for state in states if state not in ("", PADDING)))
+        colours = [palette.rgb(colour)] * len(labels) if len(labels) < 2 else _shades(colour, len(labels))
+        values = [*labels, PADDING] if PADDING in states else labels
+        colours += [palette.rgb(palette.MEASURED)] * (len(values) - len(labels))
         self._static((SPANS, lane), rr.StateConfiguration(values=values, labels=values, colors=colours))
         self._columns((SPANS, lane), t_ns, rr.StateChange.columns(state=states))
 
