@@ -132,7 +132,7 @@ def verify(remote: AtRemote = None, as_json: AsJson = False) -> None:
         found = cache.verify(cache.distant(store))
     else:
         found = upkeep.verify(store) if isinstance(store, Store) else remote_upkeep.verify(store)
-    _print(asdict(found), as_json=as_json, text=found.to_text())
+    _print(asdict(found), as_json=as_json, text=found.to_text(changed=isinstance(store, Store)))
     if found.damaged or found.missing or found.lost:
         raise typer.Exit(DAMAGED)
     _end_unread(found)

@@ -50,15 +50,15 @@ class Soundness:
         """Whether all was read, nothing was damaged and nothing is missing."""
         return not (self.damaged or self.missing or self.lost or self.unread)
 
-    def to_text(self) -> str:
-        """Return the findings in words."""
+    def to_text(self, *, changed: bool = True) -> str:
+        """Return the findings in words; ``changed`` is whether damaged files were moved to quarantine."""
         if not self.there:
             return "there is no store yet, so there is nothing to read"
         lines = [f"{self.objects} objects and {self.records} records read"]
         lines += [f"not part of a store, left as it is: {plain(path, 200)}" for path in self.foreign[:_SHOWN]]
         if len(self.foreign) > _SHOWN:
             lines.append(f"not part of a store, left as they are: {len(self.foreign) - _SHOWN} more")
-        lines += [f"damaged, now in quarantine: {name}" for name in self.damaged]
+        lines += [f"damaged{', now in quarantine' if changed else ''}: {name}" for name in self.damaged]
         lines += [f"missing: {name}" for name in self.missing]
         lines += [f"recomputed: {name}" for name in self.repaired]
         lines += [f"cannot be recomputed: {name}: {why}" for name, why in self.lost.items()]
@@ -68,7 +68,8 @@ class Soundness:
         if self.clean:
             lines.append("all sound")
         elif (self.damaged or self.missing) and not self.repaired and not self.lost:
-            lines.append("`tacpipe store repair` recomputes what it can")
+            push = "`tacpipe store push --verify`, from where they are sound, replaces them"
+            lines.append("`tacpipe store repair` recomputes what it can" if changed else push)
         return "\n".join(lines)
 
 

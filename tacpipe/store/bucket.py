@@ -73,20 +73,36 @@ class Bucket:
         return True
 
     def _create(self, name: str, content: bytes) -> bool:
+        """Create a name with one request. Raises `StorageError` where the server refuses that, and nothing has the name."""
         import obstore
 
         tries = 0
 
-        def put() -> bool:
+        def put() -> bool | None:
             nonlocal tries
             tries += 1
             try:
                 obstore.put(self._client, name, content, mode="create")
-            except obstore.exceptions.AlreadyExistsError:
+            except obstore.exceptions.AlreadyExistsError:  # S3 answers so too where requests collide, and keeps nothing
+                if self.stat(name) is None:
+                    return None
                 return tries > 1 and self.read(name) == content  # an answer that was lost had kept it
             return True
 
-        return self._tried(put)
+        try:
+            for _ in range(TRIES):
+                created = self._tried(put)
+                if created is not None:
+                    return created
+                time.sleep(PAUSE_S)
+        except FileNotFoundError:
+            raise StorageError(
+                f"{self.place} answers 404 Not Found to an upload. Check the address and AWS_ENDPOINT_URL."
+            ) from None
+        raise StorageError(
+            f"{self.place} refuses to create {name} as if it existed, and does not have it. Run the same command again: "
+            f"what went over stays there."
+        )
 
     def read(self, name: str, most: int | None = None) -> bytes:
         """Do as `Backend.read`."""
@@ -143,7 +159,7 @@ class Bucket:
         import obstore
 
         pages: Iterator[Sequence[Any]] | None = None
-        given: set[str] = set()
+        listed: set[str] = set()
 
         def next_page() -> list[Entry]:
             nonlocal pages
@@ -154,11 +170,11 @@ class Bucket:
             except BaseException:
                 pages = None
                 raise
-            return [Entry(one["path"], one["size"], one["last_modified"].timestamp()) for one in page]
+            return [Entry(item["path"], item["size"], item["last_modified"].timestamp()) for item in page]
 
         while page := self._tried(next_page):  # one request each, so whoever looks at some asks for no more
-            new = [entry for entry in page if entry.name not in given]
-            given.update(entry.name for entry in new)
+            new = [entry for entry in page if entry.name not in listed]
+            listed.update(entry.name for entry in new)
             yield from new
 
     def move(self, name: str, to: str) -> bool:
@@ -230,8 +246,9 @@ class Bucket:
             )
         if status is None:
             return StorageError(
-                f"{self.place} cannot be reached, or the connection is lost again and again. Check the network and "
-                f"AWS_ENDPOINT_URL, then run the same command again: what went over stays there."
+                f"{self.place} cannot be reached, the connection is lost again and again, or another program answers, such "
+                f"as a login page. Check the network and AWS_ENDPOINT_URL, then run the same command again: what went over "
+                f"stays there."
             )
         return StorageError(f"{self.place} fails.{answer} Run the same command again: what went over stays there.")
 

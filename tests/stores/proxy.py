@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import http.client
+import re
 import socket
 import struct
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from urllib.parse import urlsplit
 
@@ -24,6 +25,7 @@ class Proxy:
     """What a proxy did; ``fault`` gives what happens to the request of a number, None for nothing."""
 
     fault: Callable[[int], str | None] = lambda number: None
+    change: Change | None = None  # from requests to wrong answers
     endpoint: str = ""
     requests: int = 0
     texts: list[str] = field(default_factory=list)  # the first line of each request
@@ -62,19 +64,24 @@ class _Handler(BaseHTTPRequestHandler):
             self.hang_up()
         else:
             time.sleep(WAIT_S if fault == "slow" else 0.0)
-            found = self.asked(body)
+            request, change = Request(self.command, self.path), self.proxy.change
+
+            def forward(request: Request) -> Answer:
+                return Answer(*self.asked(request.path, body))
+
+            answer = change(request, forward) if change else forward(request)
             if fault == "lost answer":
                 self.hang_up()
             else:
-                self.answer(*found, cut=fault == "cut answer")
+                self.answer(answer.status, answer.headers, answer.content, cut=fault == "cut answer")
 
     do_PUT = do_POST = do_DELETE = do_HEAD = do_GET  # noqa: N815
 
-    def asked(self, body: bytes) -> tuple[int, list[tuple[str, str]], bytes]:
+    def asked(self, path: str, body: bytes) -> tuple[int, list[tuple[str, str]], bytes]:
         """Return what the server answers: status, headers, content."""
         connection = http.client.HTTPConnection(*self.upstream, timeout=60)
         with contextlib.closing(connection):
-            connection.putrequest(self.command, self.path, skip_host=True, skip_accept_encoding=True)
+            connection.putrequest(self.command, path, skip_host=True, skip_accept_encoding=True)
             for name, value in self.headers.items():
                 if name.lower() != "connection":
                     connection.putheader(name, value)
@@ -122,3 +129,127 @@ def between(upstream: str) -> Iterator[Proxy]:
 
     with places.serving(_Server(("127.0.0.1", 0), Handler)) as found.endpoint:
         yield found
+
+
+@dataclass(frozen=True)
+class Request:
+    """What a client asks: the method, and the path with its query."""
+
+    method: str
+    path: str
+
+    @property
+    def is_list(self) -> bool:
+        """Whether it lists names."""
+        return self.method == "GET" and "list-type=" in self.path
+
+    @property
+    def is_object(self) -> bool:
+        """Whether it reads the content of an object."""
+        return self.method == "GET" and not self.is_list
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a server answers."""
+
+    status: int
+    headers: list[tuple[str, str]]
+    content: bytes
+
+
+Forward = Callable[[Request], Answer]
+Change = Callable[[Request, Forward], Answer]  # from a request to a wrong answer; it may ask the server or not
+
+
+def refuse(status: int, code: str, methods: str = "GET PUT POST DELETE HEAD") -> Change:
+    """Return a change that answers some methods with an error, and has the server do nothing."""
+    content = f'<?xml version="1.0"?><Error><Code>{code}</Code><Message>no</Message></Error>'.encode()
+
+    def change(request: Request, forward: Forward) -> Answer:
+        if request.method not in methods.split():
+            return forward(request)
+        return Answer(status, [("Content-Type", "application/xml")], content)
+
+    return change
+
+
+def change_objects(edit: Callable[[bytes], bytes]) -> Change:
+    """Return a change of the content of objects."""
+
+    def change(request: Request, forward: Forward) -> Answer:
+        answer = forward(request)
+        changes = request.is_object and answer.status in (200, 206)
+        return replace(answer, content=edit(answer.content)) if changes else answer
+
+    return change
+
+
+def change_lists(pattern: bytes, replacement: bytes) -> Change:
+    """Return a change of lists of names by a regular expression."""
+
+    def change(request: Request, forward: Forward) -> Answer:
+        answer = forward(request)
+        return replace(answer, content=re.sub(pattern, replacement, answer.content)) if request.is_list else answer
+
+    return change
+
+
+def change_header(name: str, value: str, methods: str = "GET HEAD") -> Change:
+    """Return a change of a header of answers to some methods."""
+
+    def change(request: Request, forward: Forward) -> Answer:
+        answer = forward(request)
+        if request.method not in methods.split() or answer.status >= 300:
+            return answer
+        return replace(answer, headers=[item for item in answer.headers if item[0].lower() != name] + [(name, value)])
+
+    return change
+
+
+def change_clock(header: str, iso: str) -> Change:
+    """Return a change of all times that a server states."""
+    in_lists = change_lists(rb"<LastModified>[^<]*", b"<LastModified>" + iso.encode())
+    in_headers = change_header("last-modified", header)
+    return lambda request, forward: in_headers(request, lambda again: in_lists(again, forward))
+
+
+def lose_uploads(request: Request, forward: Forward) -> Answer:
+    """Acknowledge the upload of an object, and keep nothing."""
+    lost = request.method == "PUT" and "/objects/" in request.path
+    return Answer(200, [("ETag", '"0"')], b"") if lost else forward(request)
+
+
+def answer_login(request: Request, forward: Forward) -> Answer:
+    """Answer as the login page of a network does."""
+    return Answer(200, [("Content-Type", "text/html")], b"<html><form action=login>Password</form></html>")
+
+
+WRONG_ANSWERS: dict[str, Change] = {
+    "other content": change_objects(lambda content: bytes(byte ^ 1 for byte in content)),
+    "shorter content": change_objects(lambda content: content[: len(content) // 2]),
+    "longer content": change_objects(lambda content: content + b"more"),
+    "no content": change_objects(lambda content: b""),
+    "sizes of zero in lists": change_lists(rb"<Size>\d+", b"<Size>0"),
+    "huge sizes in lists": change_lists(rb"<Size>\d+", b"<Size>9000000000000000000"),
+    "negative sizes in lists": change_lists(rb"<Size>\d+", b"<Size>-5"),
+    "a size of zero": change_header("content-length", "0", "HEAD"),
+    "a huge size": change_header("content-length", "9000000000000000000", "HEAD"),
+    "an empty list": change_lists(rb"(?s)<Contents>.*</Contents>", b""),
+    "a cut list": change_lists(rb"(?s)</Name>.*", b""),
+    "names that lead out": change_lists(rb"<Key>[^<]*/", b"<Key>../../"),
+    "a login page": answer_login,
+    "a redirect": lambda request, forward: Answer(307, [("Location", "http://127.0.0.1:9/login")], b""),
+    "a redirect to itself": lambda request, forward: Answer(307, [("Location", request.path)], b""),
+    "403": refuse(403, "AccessDenied"),
+    "404": refuse(404, "NoSuchKey"),
+    "409": refuse(409, "OperationAborted"),
+    "412": refuse(412, "PreconditionFailed"),
+    "uploads end with 404": refuse(404, "NoSuchKey", "PUT"),
+    "uploads end with 409": refuse(409, "ConditionalRequestConflict", "PUT"),
+    "uploads end with 412": refuse(412, "PreconditionFailed", "PUT"),
+    "uploads are lost": lose_uploads,
+    "a clock in 1970": change_clock("Thu, 01 Jan 1970 00:00:00 GMT", "1970-01-01T00:00:00.000Z"),
+    "a clock in 2099": change_clock("Thu, 31 Dec 2099 23:59:59 GMT", "2099-12-31T23:59:59.000Z"),
+    "no clock": change_clock("yesterday", "yesterday"),
+}

@@ -1,6 +1,8 @@
 """Networks and servers that fail at each request of a push and of a pull: for a moment, or from then on."""
 
 import shutil
+import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -13,7 +15,7 @@ from tests.conftest import Lab, Ran
 from tests.promises.counts import count
 from tests.stores import places, proxy
 from tests.stores.places import SECRET, Place
-from tests.stores.proxy import FAULTS, Proxy
+from tests.stores.proxy import FAULTS, WRONG_ANSWERS, Proxy
 
 EVERY = pytest.mark.parametrize(
     "every", [pytest.param(1, marks=pytest.mark.faults), pytest.param(13, marks=pytest.mark.long)]
@@ -177,3 +179,58 @@ def test_an_object_of_several_parts_goes_over_although_the_connection_is_lost_in
             faulty.begin(at(step, fault))
             assert b"".join(place.files.blocks(name, 13 << 20)) == b"".join(blocks), (fault, step)
             count("requests to a store failed", 2)
+
+
+LONGEST_S, MOST_REQUESTS = 30.0, 600
+SUCCEEDS_UNNOTICED = {"uploads are lost"}  # the server acknowledges what it does not keep: a verification names it
+
+
+@pytest.mark.parametrize("kind", WRONG_ANSWERS)
+def test_wrong_answers_end_in_a_sentence_and_harm_nothing(
+    remotes: Remotes, kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lab, faulty = remotes.lab, remotes.faulty
+    full, pushed = remotes.next(), remotes.next()
+    lab.run(f"store push {full.address} data/s")
+    expected = full.whole()
+    manifest = (lab.folder / "data/s/manifest.json").read_bytes()
+
+    def call(command: str) -> Ran:
+        begun_s = time.monotonic()
+        faulty.begin(lambda number: None)
+        faulty.change = WRONG_ANSWERS[kind]
+        watch = threading.Timer(LONGEST_S, setattr, (faulty, "change", WRONG_ANSWERS["403"]))
+        watch.start()
+        try:
+            ran = lab.call(command)
+        finally:
+            watch.cancel()
+            faulty.change = None
+        assert time.monotonic() - begun_s < LONGEST_S and faulty.requests < MOST_REQUESTS, (command, faulty.requests)
+        assert ran.code in (0, 1, 2, 4) and "Traceback" not in ran.err and SECRET not in ran.err + ran.out
+        if ran.code in (1, 2) or (ran.code == 4 and ran.err):
+            assert ran.err.startswith("tacpipe: ") and ran.err.count("\n") == 1, (command, ran)
+            assert "A file cannot be used" not in ran.err
+        count("requests to a store failed", faulty.requests)
+        return ran
+
+    ran = call(f"store push {pushed.address} data/s")
+    assert ran.code or kind in SUCCEEDS_UNNOTICED or pushed.whole() == expected
+    if ran.code == 0 and kind in SUCCEEDS_UNNOTICED:
+        assert lab.call(f"store verify --remote {pushed.address}").code == 4
+    lab.run(f"store push {pushed.address} data/s")
+    assert pushed.whole() == expected
+    for command in ("store list --store", "store verify --remote"):
+        ran = call(f"{command} {full.address}")
+        assert "now in quarantine" not in ran.out
+        assert lab.run(f"{command} {full.address}").code == 0
+    assert full.whole() == expected
+
+    folder = lab.folder.with_name(f"{lab.folder.name}-clone")
+    (folder / ".tacpipe").mkdir(parents=True)
+    monkeypatch.chdir(folder)
+    ran = call(f"store pull {full.address} data/s")
+    assert ran.code or (folder / "data/s/manifest.json").read_bytes() == manifest
+    assert repair.verify(Store(folder / ".tacpipe")).clean
+    lab.run(f"store pull {full.address} data/s")
+    assert (folder / "data/s/manifest.json").read_bytes() == manifest
