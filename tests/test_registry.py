@@ -94,9 +94,16 @@ def test_no_module_outside_of_a_task_s_own_packages_names_a_task() -> None:
 def test_no_module_outside_of_tasks_reports_formats_and_simulation_names_a_stage() -> None:
     data = {"split", "train", "report", "export"}  # words of data too: a role, kinds of dataset, a message of HID
     known = {*registry.stages(), *registry.commands()} - data
-    # the command line has aliases, an export of frames runs synchronize before it, and a live session does what these
-    # stages do, sample by sample
-    needed = {"cli/main.py", "exports/frames.py", "live/stages.py", "live/replay.py", "live/demo.py"}
+    # the command line has aliases, an export of frames runs synchronize before it, the viewer reads the thresholds of
+    # contacts, and a live session does what these stages do, sample by sample
+    needed = {
+        "cli/main.py",
+        "exports/frames.py",
+        "live/stages.py",
+        "live/replay.py",
+        "live/demo.py",
+        "viewer/contents.py",
+    }
 
     assert _modules_with(re.compile("|".join(map(re.escape, known)))) == needed
 
