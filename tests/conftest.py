@@ -169,6 +169,11 @@ def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) ->
     return run
 
 
+def without_created_store(err: str) -> str:
+    """Return what a command printed, without the line on the store that it created."""
+    return "".join(line for line in err.splitlines(keepends=True) if not line.startswith("tacpipe: created the store "))
+
+
 @pytest.fixture
 def lab(tmp_path: Path, plugin: Path, monkeypatch: pytest.MonkeyPatch, call: Callable[[str], Ran]) -> Iterator[Lab]:
     """An empty project, its commands run in this process."""

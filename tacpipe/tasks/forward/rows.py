@@ -55,11 +55,10 @@ class Rows:
         lost: Tensor = model.loss(acted(picked, self.actions), ahead)  # type: ignore[operator]
         return lost
 
-    @property
-    def recordings(self) -> int:
-        """How many recordings have a window."""
-        ends = np.cumsum([len(track.t_ns) for track in self.tracks])
-        return len(np.unique(np.searchsorted(ends, self.starts.cpu().numpy(), side="right")))
+    def recording_of(self, starts: Tensor) -> Tensor:
+        """Return the number of the recording (window,) of the windows that begin at ``starts`` (window,)."""
+        ends = torch.from_numpy(np.cumsum([len(track.t_ns) for track in self.tracks]))
+        return torch.searchsorted(ends, starts.cpu(), right=True)
 
     def tactile(self, rows: Int64s) -> AnyFloats:
         """Return the counts above rest (window, row, channel) of windows of ``rows`` (window, row), each of one track."""

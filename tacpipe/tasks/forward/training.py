@@ -153,12 +153,13 @@ def _shrinkage(weights: dict[str, Tensor], params: Params, codec: codecs.Codec, 
     if not model.change_only:
         return {}
     model.load_state_dict(weights)
-    windows, ahead = watched.pick(watched.some(SHRINKING))
+    starts = watched.some(SHRINKING)
+    windows, ahead = watched.pick(starts)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(params.seed)  # of shuffled plans
         windows = Windows(*(part.cpu() for part in acted(windows, watched.actions)))
     ahead, now = ahead.cpu(), windows.touch[-1]
-    return {SHRINKAGE: persistence_weights(model(windows) - now, ahead - now, watched.recordings)}
+    return {SHRINKAGE: persistence_weights(model(windows) - now, ahead - now, watched.recording_of(starts))}
 
 
 def _description(params: Params, codec: codecs.Codec, pose: Pose, unit: str, reference: AnyFloats) -> Config:

@@ -118,9 +118,10 @@ def test_errors_are_given_in_the_unit_of_the_channels(tmp_path: Path) -> None:
 @pytest.mark.long
 def test_channels_that_state_no_taxel_give_another_network_and_a_note(tmp_path: Path) -> None:
     model = trained(tmp_path, declared=False)
-    (note,) = forward.notes(params(architecture="auto"), model)
-    assert json.loads(model["config.json"])["architecture"] == "gru" and "{taxel}" in note
-    assert forward.notes(params(architecture="gru"), model) == []
+    notes = forward.notes(params(architecture="auto"), model)
+    assert json.loads(model["config.json"])["architecture"] == "gru"
+    assert any("{taxel}" in note for note in notes)
+    assert not any("{taxel}" in note for note in forward.notes(params(architecture="gru"), model))
     with pytest.raises(TacpipeError, match=r"\{taxel\}"):
         trained(tmp_path / "other", "taxelwise", declared=False)
 
