@@ -10,7 +10,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from tacpipe.formats.table import guess
+from tacpipe.formats.table import column_names
 from tacpipe.formats.table.layout import UNKNOWN
 
 XYZ, QUATERNION = ("x", "y", "z"), ("x", "y", "z", "w")
@@ -79,9 +79,9 @@ def meanings(name: str, width: int, whole: bool = False) -> list[Meaning]:
     (Meaning(quantity='', unit='', component=''), Meaning(quantity='', unit='', component=''))
     """
     text = name.strip().lower()
-    if guess.is_clock(text):
+    if column_names.is_clock(text):
         return [NOTHING] * width
-    if guess.is_label(text):
+    if column_names.is_label(text):
         return [Meaning("label", "1")] * width
     for pattern, wanted, found in _VECTORS:
         if wanted == width and re.fullmatch(pattern, text):
@@ -101,7 +101,7 @@ def of_name(name: str, kind: str) -> Meaning:
     >>> of_name("joint1_rad", "float32"), of_name("fx", "float64")
     (Meaning(quantity='joint_position', unit='rad', component=''), Meaning(quantity='', unit='', component=''))
     """
-    quantity, unit = guess.meaning(name, kind)
+    quantity, unit = column_names.meaning(name, kind)
     return NOTHING if UNKNOWN in (quantity, unit) else Meaning(quantity, unit)
 
 

@@ -7,6 +7,7 @@ is opened.
 from __future__ import annotations
 
 import codecs
+import json
 import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -52,16 +53,16 @@ EXTENSIONS: Mapping[str, Format] = {
     ".jsonl": "jsonl",
     ".ndjson": "jsonl",
 }
-TREES = (".json", ".yaml", ".yml")  # of files that hold labels by name
+TREES = (".json", ".yaml", ".yml")  # files that hold labels by name
 TABLES = ("recordings", "streams", "labels", "attributes", "vocabulary")
-STAMPS = ".stamps"  # behind a stream's name: the file of its stamps among the files of a recording
+STAMPS = ".stamps"  # suffix of a stream's name that marks the file of its stamps
 GZIP = ".gz"
 FILE = "file"  # the placeholder of a container's name, where containers are found by their format
 UNKNOWN = "?"  # what a guessed layout could not know
 OPEN = 4  # of such entries that are named at once
 
 
-DECLARED = Time()  # neither a column nor a rate: as a container declares it
+DECLARED = Time()  # neither a column nor a rate: the container declares it
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,7 @@ class Column:
     type: Kind | None = None  # None: as a container declares it, else float64
     scale: float = 1.0  # a value is what the file holds times this
     component: str = ""
-    shape: tuple[PositiveInt, ...] = ()  # of the array that the columns are the cells of, as (taxel, axis)
+    shape: tuple[PositiveInt, ...] = ()  # shape of the array whose cells are the columns, as (taxel, axis)
     axes: tuple[str, ...] = ()  # names along the last dimension of the shape, or else the first
     about: tuple[tuple[str, str], ...] = ()  # more metadata of the column; a table in the file
     skip: bool = False
@@ -102,11 +103,11 @@ class Stream:
     separator: str = ""  # empty: a comma, or a tab in a .tsv
     decimal: Literal[".", ","] = "."
     comment: str = ""  # what lines begin with that hold no row
-    header: bool = True  # without one, columns are named by ``names``, or column1, column2, …
-    names: tuple[str, ...] = ()  # of the columns, where the layout's ``header`` is a list
-    encoding: str = "utf-8"  # of a text file
-    sheet: str = ""  # of a workbook; empty: the first
-    time_axis: NonNegativeInt = 0  # of arrays: the dimension along which rows follow one another
+    header: bool = True  # False: columns are named by ``names``, or column1, column2, …
+    names: tuple[str, ...] = ()  # column names, where the layout's ``header`` is a list
+    encoding: str = "utf-8"  # text files only
+    sheet: str = ""  # workbooks only; empty: the first sheet
+    time_axis: NonNegativeInt = 0  # arrays only: the dimension of the rows
     skip_lines: NonNegativeInt = 0  # before the header
     missing: tuple[str, ...] = ()  # cells that hold no value: NaN
     recording: str = ""  # the column that names the recording, where a file holds many
@@ -257,18 +258,22 @@ def of(tables: Mapping[str, Any], where: str = "The layout", container: Format |
     return made
 
 
-def _expect_known_words(layout: Layout, vocabulary_table: Mapping[str, Any], where: str) -> None:
+def _expect_known_words(layout: Layout, vocabulary_table: Mapping[str, Any], place: str) -> None:
     """Raise `UsageError` for a quantity or unit that is neither in the vocabulary nor declared in the layout."""
-    own: Vocabulary = fields.filled(Vocabulary, vocabulary_table, f"{where}, [vocabulary]", "entry")
+    local: Vocabulary = fields.filled(Vocabulary, vocabulary_table, f"{place}, [vocabulary]", "entry")
     for stream in layout.streams:
         for number, column in enumerate(stream.columns, 1):
             for kind, fault, word in (
-                ("quantities", vocabulary.describe_unknown_quantity(column.quantity, own.quantities), column.quantity),
-                ("units", vocabulary.describe_unknown_unit(column.unit, own.units), column.unit),
+                (
+                    "quantities",
+                    vocabulary.describe_unknown_quantity(column.quantity, local.quantities),
+                    column.quantity,
+                ),
+                ("units", vocabulary.describe_unknown_unit(column.unit, local.units), column.unit),
             ):
                 if fault:
                     raise UsageError(
-                        f"{where}, [streams.{stream.name}], columns {number}: {fault} To use a word of your own, add "
+                        f"{place}, [streams.{stream.name}], columns {number}: {fault} To use a word of your own, add "
                         f"[vocabulary] with {kind} = [{excerpt(word)}]."
                     )
 
@@ -324,13 +329,13 @@ def _stream(name: str, value: Any, where: str, container: Format | None) -> Stre
     return made
 
 
-def _expect_encoding(stream: Stream, where: str) -> None:
+def _expect_encoding(stream: Stream, place: str) -> None:
     """Raise `UsageError` for an encoding that Python does not have."""
     try:
         codecs.lookup(stream.encoding)
     except LookupError:
         raise UsageError(
-            f"{where}: encoding is {excerpt(stream.encoding)}; it must be one of Python's, as utf-8, utf-16 or cp1252."
+            f"{place}: encoding is {excerpt(stream.encoding)}; it must be one of Python's, as utf-8, utf-16 or cp1252."
         ) from None
 
 
@@ -393,7 +398,7 @@ def _labels(value: Any, where: str) -> Labels:
     if isinstance(values.get("columns"), list):
         values["columns"] = tuple(values["columns"])
     made: Labels = fields.filled(Labels, values, where, "entry")
-    is_tree = made.file.lower().endswith(TREES)  # whose names are those of recordings
+    is_tree = made.file.lower().endswith(TREES)  # the names in a tree are those of recordings
     if not pattern.placeholders(made.file) and not made.key and not is_tree:
         raise UsageError(
             f"{where}: {plain(made.file)} is one file for all recordings. Set key to the column that names them."
@@ -414,3 +419,8 @@ def _table(value: Any, where: str, key: str) -> Mapping[str, Any]:
     if not isinstance(value, dict):
         raise UsageError(f"{where}: {key or 'this'} is {excerpt(value)}; it must be a table.")
     return value
+
+
+def quoted(text: str) -> str:
+    """Return a text as a layout file writes it; control characters are escaped."""
+    return json.dumps(plain(text, 500) if not text.isprintable() and text != "\t" else text, ensure_ascii=False)
