@@ -67,3 +67,8 @@ class DeviceError(TacpipeError):
 
 class ResultWarning(UserWarning):
     """A result is valid but probably not what was wanted, or lacks recordings that could not be read."""
+
+
+def is_input_error(error: TacpipeError) -> bool:
+    """Return whether the input is at fault, rather than the command, the disk, the computer or the installation."""
+    return error.exit_code == FAILED and not isinstance(error, StorageError | MissingModuleError)

@@ -18,7 +18,7 @@ from tacpipe.datasets.manifest import VALUES, Manifest
 from tacpipe.engine import execution, provenance
 from tacpipe.engine.execution import Scratch
 from tacpipe.engine.task import Done, Task
-from tacpipe.errors import FAILED, MissingModuleError, StorageError, TacpipeError
+from tacpipe.errors import TacpipeError, is_input_error
 from tacpipe.io.hashing import digest
 from tacpipe.plugins import registry
 from tacpipe.plugins.stage import AnyStage
@@ -117,8 +117,7 @@ def _begun(task: Task, store: Store) -> Callable[[], Done]:
 
 def _failed(task: Task, store: Store, error: TacpipeError) -> Done:
     execution.remove_empty_workspace(store, digest(task.identity))
-    at_fault = error.exit_code == FAILED and not isinstance(error, (StorageError, MissingModuleError))
-    return Done(task.recording, None, str(error), error.exit_code, at_fault=at_fault)
+    return Done(task.recording, None, str(error), error.exit_code, at_fault=is_input_error(error))
 
 
 @dataclass(frozen=True)

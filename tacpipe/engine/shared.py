@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tacpipe.errors import FAILED, MissingModuleError, StorageError, TacpipeError
+from tacpipe.errors import TacpipeError, is_input_error
 from tacpipe.io import drafts, regular
 from tacpipe.io.drafts import Draft
 from tacpipe.io.files import move, present
@@ -39,7 +39,7 @@ class SharedFiles:
                     try:
                         make(draft)
                     except TacpipeError as error:
-                        if error.exit_code == FAILED and not isinstance(error, StorageError | MissingModuleError):
+                        if is_input_error(error):
                             self.store.write_file(failed, str(error).encode())
                         raise
                     move(name, path)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from tacpipe.errors import FAILED, MissingModuleError, StorageError, TacpipeError
+from tacpipe.errors import TacpipeError, is_input_error
 from tacpipe.formats.table import layout as layouts
 from tacpipe.formats.table import pattern
 from tacpipe.plugins.constraints import TomlFile
@@ -26,7 +26,7 @@ STATED = "stated"  # what else a container states of the recording, where not al
 
 @dataclass(frozen=True)
 class Params(StreamSelection):
-    """What the files do not state of themselves."""
+    """Settings that the files do not state."""
 
     layout: Annotated[str, TomlFile()] = ""  # layout file, for what the files do not state; --guess prints one
 
@@ -145,21 +145,24 @@ class _Shares:
         try:
             return container.share(wanted, episode) if isinstance(container, Sharing) else None
         except TacpipeError as error:
-            if error.exit_code != FAILED or isinstance(error, StorageError | MissingModuleError):
+            if not is_input_error(error):
                 raise
             return None  # reading it shows what is wrong, of this recording alone
 
 
 def preview_text(
-    layout: layouts.Layout, source: Path, found: Sequence[recordings.Source], kind: layouts.Format | None = None
+    layout: layouts.Layout,
+    source: Path,
+    listed_sources: Sequence[recordings.Source],
+    kind: layouts.Format | None = None,
 ) -> str:
     """Return what would be read of a source, and what would not, in words."""
     from tacpipe.formats import unread
     from tacpipe.formats.table import preview
 
-    paths = [path for recording in found for path in recording.files.values()]
+    paths = [path for recording in listed_sources for path in recording.files.values()]
     left_out = unread.describe(source, paths, why_unread(layout, source, kind))
-    return "\n".join([preview.text(layout, source, found, kind), *left_out])
+    return "\n".join([preview.text(layout, source, listed_sources, kind), *left_out])
 
 
 def why_unread(layout: layouts.Layout, source: Path, kind: layouts.Format | None = None) -> Callable[[str], str]:

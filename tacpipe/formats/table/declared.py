@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pyarrow as pa
 
-from tacpipe.errors import FAILED, MissingModuleError, StorageError, TacpipeError
+from tacpipe.errors import TacpipeError, is_input_error
 from tacpipe.formats import unread
 from tacpipe.formats.containers import kinds
 from tacpipe.formats.containers.container import Contents, SourceStream, Time
@@ -36,14 +36,16 @@ def layout(kind: str, source: Path) -> str:
             file = kinds.opened(kind, path)
             contents = file.look(next(iter(file.episodes()), None))
         except TacpipeError as error:
-            if error.exit_code != FAILED or isinstance(error, StorageError | MissingModuleError):
+            if not is_input_error(error):
                 raise
             passed_over.append(plain(str(error), 400))
             continue
         if contents.streams:
-            others = unread.describe(source, paths, lambda within: _why_unread(kind, source / within, paths))
-            return _text(contents, f"tacpipe ingest {kind}", path, [*passed_over, *others])
-        reasons = [f"{plain(name)}: {why}" for name, why in contents.skipped.items()]
+            unread_files = unread.describe(
+                source, paths, lambda path_within: _why_unread(kind, source / path_within, paths)
+            )
+            return _text(contents, f"tacpipe ingest {kind}", path, [*passed_over, *unread_files])
+        reasons = [f"{plain(name)}: {problem}" for name, problem in contents.skipped.items()]
         passed_over.append(f"{path} holds no stream that can be read. {'; '.join(reasons)}".rstrip())
     raise TacpipeError(" ".join([f"No recording of ingest {kind} at {source} holds a stream.", *passed_over[:3]]))
 
@@ -64,7 +66,7 @@ def _text(contents: Contents, command: str, path: Path, remarks: Sequence[str] =
         f"#   {command} FOLDER --layout THIS --dry-run"
     ]
     parts += [f"# {plain(source)} is left out: {why}" for source, why in contents.skipped.items()]
-    parts += [f"# {plain(one, 400)}" for one in [*contents.notes, *remarks]]
+    parts += [f"# {plain(remark, 400)}" for remark in [*contents.notes, *remarks]]
     parts += [_stream(one) for one in contents.streams]
     return "\n\n".join(parts) + "\n"
 

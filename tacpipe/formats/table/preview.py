@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from tacpipe.errors import FAILED, MissingModuleError, StorageError, TacpipeError
+from tacpipe.errors import TacpipeError, is_input_error
 from tacpipe.formats.table import labels, recorded
 from tacpipe.formats.table.columns import TIME, TYPES
 from tacpipe.formats.table.layout import Layout
@@ -100,7 +100,7 @@ def text(layout: Layout, folder: Path, sources: Sequence[Source], kind: str | No
         try:
             return "\n".join([*lines, *_first(layout, source, kind)])
         except TacpipeError as error:
-            if error.exit_code != FAILED or isinstance(error, StorageError | MissingModuleError):
+            if not is_input_error(error):
                 raise
             lines.append(f"\n{source.name} cannot be read: {error}")
     raise TacpipeError("\n".join([*lines, "\nNo recording can be read."]))
@@ -110,16 +110,16 @@ def _first(layout: Layout, source: Source, kind: str | None) -> list[str]:
     """Return the streams, attributes and notes of a recording as lines."""
     lines = [f"\n{source.name}, the first:"]
     if layout.streams:
-        found = recorded.of(layout.streams, source.files, source.within)
+        recording = recorded.of(layout.streams, source.files, source.within)
     else:
-        found = recorded.all_of(str(kind), source.files[CONTAINER], source.within)
-    for name in [one.name for one in layout.streams] or found.streams:
-        if name not in found.streams:
+        recording = recorded.all_of(str(kind), source.files[CONTAINER], source.within)
+    for name in [one.name for one in layout.streams] or recording.streams:
+        if name not in recording.streams:
             lines.append(f"  {name}: not there")
             continue
-        lines += _stream(name, found.streams[name], source.files[name if layout.streams else CONTAINER])
-    lines += [f"  attribute {name}: {value}" for name, value in found.attributes.items()]
-    return [*lines, *(f"  {note}" for note in found.notes)]
+        lines += _stream(name, recording.streams[name], source.files[name if layout.streams else CONTAINER])
+    lines += [f"  attribute {name}: {value}" for name, value in recording.attributes.items()]
+    return [*lines, *(f"  {note}" for note in recording.notes)]
 
 
 def _labels(labelled: Mapping[str, Mapping[str, Attribute]]) -> list[str]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tacpipe.datasets import recording_names
-from tacpipe.errors import FAILED, MissingModuleError, StorageError, TacpipeError, UsageError
+from tacpipe.errors import TacpipeError, UsageError, is_input_error
 from tacpipe.formats.containers import kinds
 from tacpipe.formats.containers.container import Naming
 from tacpipe.formats.table import pattern, rows
@@ -44,7 +44,7 @@ def found(layout: Layout, folder: Path) -> list[Source]:
     _refuse_idle(layout, matched, every, folder)
     shared = layout.placeholders
     groups: dict[tuple[str, ...], dict[str, list[Path]]] = {}
-    stamps: dict[Path, Path] = {}  # by the file whose rows they are of
+    stamps: dict[Path, Path] = {}  # the file of the rows to the file of their stamps
     for stream in layout.streams:
         for path, values in matched[stream.name]:
             if not set(shared) <= set(values):
@@ -70,7 +70,11 @@ def found(layout: Layout, folder: Path) -> list[Source]:
                 f"it, or set optional = true in [streams.{lacking[0]}]."
             )
         files = {name: folder / paths[0] for name, paths in by_stream.items()}
-        files |= {f"{name}{STAMPS}": folder / stamps[one] for name, (one,) in by_stream.items() if one in stamps}
+        files |= {
+            f"{name}{STAMPS}": folder / stamps[rows_path]
+            for name, (rows_path,) in by_stream.items()
+            if rows_path in stamps
+        }
         sources += _named(layout, files, dict(zip(shared, key, strict=True)))
     recording_names.refuse_shared((one.name, next(iter(one.files.values()))) for one in sources)
     return sorted(sources, key=lambda one: one.name)
@@ -110,7 +114,7 @@ def _episodes(kind: str, path: Path) -> tuple[Sequence[str | None], bool]:
         container = kinds.opened(kind, path)
         return container.episodes() or [None], isinstance(container, Naming) and container.names_itself
     except TacpipeError as error:
-        if error.exit_code != FAILED or isinstance(error, StorageError | MissingModuleError):
+        if not is_input_error(error):
             raise
         return [None], False
 
