@@ -44,7 +44,7 @@ def trials(source: Path, names: Sequence[str]) -> dict[str, dict[str, Path]]:
         if there or os.path.basename(place).startswith(PREFIX):  # noqa: PTH119  (once a folder, on every hit)
             holds[Path(place)] = there
     parents = {folder.parent for folder in holds}
-    folders = sorted(folder for folder, there in holds.items() if there or folder not in parents)
+    folders = sorted(folder for folder, present in holds.items() if present or folder not in parents)
     if not folders:
         raise TacpipeError(
             f"{source} holds no trial: no folder in it has {', '.join(names[:3])} or the like. "

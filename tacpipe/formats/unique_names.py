@@ -19,15 +19,15 @@ def by_name(parts: Iterable[tuple[str, Part]], path: Path, kind: str) -> dict[st
     >>> by_name([("a", 1), ("b", 2)], Path("x.npz"), "column")
     {'a': 1, 'b': 2}
     """
-    named: dict[str, Part] = {}
+    parts_by_name: dict[str, Part] = {}
     for name, part in parts:
-        if name in named:
+        if name in parts_by_name:
             raise UsageError(
                 f"{path} has more than one {kind} {plain(name)}. Only one of them could be kept: rename the others, or take "
                 f"them away."
             )
-        named[name] = part
-    return named
+        parts_by_name[name] = part
+    return parts_by_name
 
 
 def json_value(text: str | bytes, path: Path) -> Any:

@@ -9,8 +9,8 @@ from pathlib import Path
 from tacpipe.io import files as file_system
 from tacpipe.printable import listed
 
-EXAMPLES = 3  # paths that are named of each group
-Reason = Callable[[str], str]  # of a path within the source: why it is not read, "" for a file that is
+EXAMPLES = 3  # paths named per group
+Reason = Callable[[str], str]  # maps a path within the source to the reason why it is not read, "" if it is
 
 
 def describe(source: Path, read: Collection[Path], reason: Reason, output: Path | None = None) -> list[str]:
@@ -23,25 +23,25 @@ def describe(source: Path, read: Collection[Path], reason: Reason, output: Path 
     for path in _visible(source, output):
         if path in read_paths:
             continue
-        within = os.path.relpath(path, source)
-        why = reason(within)
-        if why:
-            extension = os.path.splitext(within)[1].lower()  # noqa: PTH122  (once per file, on every hit)
-            groups.setdefault((extension, why), []).append(within)
+        path_within = os.path.relpath(path, source)
+        problem = reason(path_within)
+        if problem:
+            extension = os.path.splitext(path_within)[1].lower()  # noqa: PTH122  (once per file, on every hit)
+            groups.setdefault((extension, problem), []).append(path_within)
     return [
         f"{len(paths)} {extension or 'extensionless'} file{'s' * (len(paths) != 1)} below {source} "
-        f"{'are' if len(paths) > 1 else 'is'} not read ({listed(paths, EXAMPLES)}): {why}."
-        for (extension, why), paths in sorted(groups.items())
+        f"{'are' if len(paths) > 1 else 'is'} not read ({listed(paths, EXAMPLES)}): {problem}."
+        for (extension, problem), paths in sorted(groups.items())
     ]
 
 
 def _visible(source: Path, output: Path | None) -> Iterator[str]:
     """Yield the path of each file below a folder."""
-    written = os.path.realpath(output) if output is not None else None
+    output_path = os.path.realpath(output) if output is not None else None
     for place, folders, names in file_system.walk(source) if source.is_dir() else ():
         folders[:] = [
             name
             for name in folders
-            if not name.startswith(".") and (written is None or os.path.realpath(f"{place}/{name}") != written)
+            if not name.startswith(".") and (output_path is None or os.path.realpath(f"{place}/{name}") != output_path)
         ]
         yield from (os.fspath(Path(place, name)) for name in names if not name.startswith("."))

@@ -40,7 +40,7 @@ POINTS, WITH_WRIST = 6, 15  # numbers of a grasp: two points, and with them the 
 
 @dataclass(frozen=True)
 class Params(StreamSelection):
-    """What counts as a grasp of the cloud."""
+    """Criteria for a grasp of the cloud."""
 
     # largest distance of a grasp point from the nearest point of the cloud
     beside_mm: Annotated[NonNegativeFloat, Unit("mm")] = 20.0

@@ -110,7 +110,7 @@ class _Read:
 
     aside: Spill = field(default_factory=Spill)
     streams: dict[int, _Stream] = field(default_factory=dict)
-    headers: dict[int, bytes] = field(default_factory=dict)  # what describes each stream
+    headers: dict[int, bytes] = field(default_factory=dict)  # XML descriptions of the streams
     unknown: dict[int, str] = field(default_factory=dict)  # streams whose description cannot be read, with the reason
     header: bytes = b""
     damage: list[Damage] = field(default_factory=list)

@@ -29,10 +29,10 @@ BROKEN = (
     ValueError,
     TypeError,
 )  # what h5py raises for bytes that are not as they should
-ATTRIBUTE_BYTES = 1 << 27  # that reading one may take
+ATTRIBUTE_BYTES = 1 << 27  # memory limit for reading an attribute
 MOST_RATIO = 10_000  # bytes of values that a byte of the file may hold
-FILTERS = {  # that are read, by HDF5's numbers; others could be libraries that a file's author had installed
-    *(1, 2, 3, 4, 5, 6),  # of HDF5 itself: deflate, shuffle, fletcher32, szip, nbit, scale-offset
+FILTERS = {  # HDF5 numbers of the accepted filters; others may need libraries of the file's author
+    *(1, 2, 3, 4, 5, 6),  # built into HDF5: deflate, shuffle, fletcher32, szip, nbit, scale-offset
     *(307, 32000, 32001, 32004, 32008, 32013, 32015, 32026),  # bzip2, lzf, blosc, lz4, bitshuffle, zfp, zstd, blosc2
 }
 _TRUNCATED = re.compile(r"truncated file: eof = (\d+),.*stored_eof = (\d+)")
@@ -51,7 +51,7 @@ class Hdf5Tree:
         """Return a sentence about what is missing."""
         if self._left is None:
             return []
-        return [f"{self.path} is cut short after {self._left:,} bytes, and what lies behind is missing. Copy it again."]
+        return [f"{self.path} is cut short after {self._left:,} bytes, and the rest is missing. Copy it again."]
 
     def members(self, group: str) -> tuple[list[Array], list[str]]:
         """Return the arrays in a group and the paths of the groups in it."""
@@ -59,19 +59,19 @@ class Hdf5Tree:
             return self._members[group]
         arrays, below = [], []
         with self._reading(group or "its root"):
-            found = self._file[group or "/"]
-            for name in self._names(found):
+            parent = self._file[group or "/"]
+            for name in self._names(parent):
                 path = f"{group}/{name}" if group else name
                 try:
-                    one = _member(found, name, path, self.path)
+                    member = _member(parent, name, path, self.path)
                 except BROKEN:
                     if self._left is None:
                         raise
-                    one = path  # behind the cut: listed, and refused when it is opened
-                if isinstance(one, Array):
-                    arrays.append(one)
-                elif one:
-                    below.append(one)
+                    member = path  # a path beyond the cut is listed and refused when it is opened
+                if isinstance(member, Array):
+                    arrays.append(member)
+                elif member:
+                    below.append(member)
         self._members[group] = with_time_first(arrays), below
         return self._members[group]
 
@@ -91,19 +91,19 @@ class Hdf5Tree:
     def read(self, array: Array, start: int, stop: int) -> AnyArray:
         """Return the rows of an array; text as ``str`` objects. Raises `TacpipeError` where they are damaged."""
         memory.require(array.row_bytes * max(stop - start, 0), f"{self.path}, {plain(array.path, 200)},")
-        most = memory.MOST_BLOCK + array.row_bytes * max(stop - start, 1) * 4
-        where = f"{self.path}, {plain(array.path, 200)},"
+        limit_bytes = memory.MOST_BLOCK + array.row_bytes * max(stop - start, 1) * 4
+        place = f"{self.path}, {plain(array.path, 200)},"
         with (
-            memory.bounded(most, where) if array.dtype.hasobject else contextlib.nullcontext(),
+            memory.bounded(limit_bytes, place) if array.dtype.hasobject else contextlib.nullcontext(),
             self._reading(array.path),
         ):
-            found = self._file[array.path]
+            dataset = self._file[array.path]
             if self._left is not None:
-                _expect_there(found, self._left)
-            text = h5py.check_string_dtype(found.dtype) is not None
+                _expect_there(dataset, self._left)
+            text = h5py.check_string_dtype(dataset.dtype) is not None
             rows = (*(slice(None),) * array.time_axis, slice(start, stop)) if array.shape else ()
-            given = (found.asstr(errors="replace") if text else found)[rows]
-            return np.moveaxis(np.asarray(given), array.time_axis, 0) if array.shape else np.asarray(given)
+            values = (dataset.asstr(errors="replace") if text else dataset)[rows]
+            return np.moveaxis(np.asarray(values), array.time_axis, 0) if array.shape else np.asarray(values)
 
     def files(self, array: Array, start: int, stop: int) -> None:
         """Return None: all arrays lie in one file."""
@@ -143,7 +143,7 @@ class Hdf5Tree:
         try:
             about = h5py.h5o.get_info(self._file[group or "/"].id)
         except BROKEN:
-            return group  # behind the end of a file that is cut short
+            return group  # the group lies beyond the end of a truncated file
         return about.fileno, about.addr
 
 
@@ -254,23 +254,23 @@ def _member(group: h5py.Group, name: str, path: str, file: Path) -> Array | str:
     elif found.chunks and (chunk_bytes := int(np.prod(found.chunks)) * found.dtype.itemsize) > memory.MOST_BLOCK:
         problem = f"has chunks of {memory.readable_size(chunk_bytes)}, which are not read"
     elif found.nbytes > max(memory.MOST_BLOCK, MOST_RATIO * found.id.get_storage_size()):
-        held = memory.readable_size(found.id.get_storage_size())
-        problem = f"declares {memory.readable_size(found.nbytes)} of values and holds {held}"
+        stored = memory.readable_size(found.id.get_storage_size())
+        problem = f"declares {memory.readable_size(found.nbytes)} of values and holds {stored}"
     chunk_rows = found.chunks[0] if found.chunks else 0
     return Array(path, found.shape or (), found.dtype, _attributes(found, file), chunk_rows, problem)
 
 
-def _filters(found: h5py.Dataset) -> Iterator[int]:
+def _filters(dataset: h5py.Dataset) -> Iterator[int]:
     """Yield the numbers of the filters that the chunks of an array passed through."""
-    about = found.id.get_create_plist()
+    about = dataset.id.get_create_plist()
     for place in range(about.get_nfilters()):
         yield about.get_filter(place)[0]
 
 
-def _attributes(found: Any, file: Path) -> dict[str, Any]:
-    made = {}
-    for name in found.attrs:
-        where = f"{file}, the attribute {plain(name)},"
-        with contextlib.suppress(*BROKEN), memory.bounded(ATTRIBUTE_BYTES, where):  # of types that numpy has not
-            made[str(name)] = found.attrs[name]
-    return made
+def _attributes(owner: Any, file: Path) -> dict[str, Any]:
+    attributes = {}
+    for name in owner.attrs:
+        place = f"{file}, the attribute {plain(name)},"
+        with contextlib.suppress(*BROKEN), memory.bounded(ATTRIBUTE_BYTES, place):  # numpy lacks some types
+            attributes[str(name)] = owner.attrs[name]
+    return attributes

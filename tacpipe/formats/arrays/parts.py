@@ -117,9 +117,9 @@ def _split(arrays: Sequence[Array], group: str, episode: Episode, above: Sequenc
 def _stamps(same: Sequence[Array], above: Sequence[Array]) -> Array | None:
     """Return the array that holds the stamps of arrays of one length: among them, else in a group above."""
     clocks = [array for array in same if _is_time(array)]
-    own = next((array for array in clocks if TIME.fullmatch(array.name)), next(iter(clocks), None))
+    clock = next((array for array in clocks if TIME.fullmatch(array.name)), next(iter(clocks), None))
     length = same[0].shape[0] if same else None
-    return own or next((one for one in reversed(above) if length is None or one.shape[0] == length), None)
+    return clock or next((one for one in reversed(above) if length is None or one.shape[0] == length), None)
 
 
 def _is_time(array: Array) -> bool:

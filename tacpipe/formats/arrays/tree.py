@@ -66,7 +66,7 @@ class Tree(Protocol):
         """Whether there is a group of this path."""
 
     def identity(self, group: str) -> Any:
-        """What the paths of one group share, where links give it several."""
+        """Return a value that is equal for all paths of one group; links can give a group several paths."""
 
     def attributes(self, group: str) -> Mapping[str, Any]:
         """The attributes of a group."""
@@ -116,11 +116,11 @@ def with_time_first(arrays: Sequence[Array]) -> list[Array]:
 
 def walk(tree: Tree, group: str = "") -> Iterator[tuple[str, list[Array]]]:
     """Yield each group below a group, itself first, with the arrays in it; one of several paths has a problem instead."""
-    seen: dict[Any, str] = {}
+    first_paths: dict[Any, str] = {}
     pending = [group]
     while pending:
         path = pending.pop()
-        first = seen.setdefault(tree.identity(path), path)
+        first = first_paths.setdefault(tree.identity(path), path)
         if first != path:
             problem = f"is the group {plain(first) or '/'}, which is read there"
             yield path.rpartition("/")[0], [Array(path, (), np.dtype("V"), problem=problem)]

@@ -33,15 +33,15 @@ from tacpipe.io import memory, regular
 from tacpipe.printable import excerpt, listed, plain
 
 MARKS = (".zgroup", ".zarray", "zarr.json")  # what makes a folder a group or an array
-MOST_CHUNKS = 1 << 20  # of an array
-UNPACKED_BYTES = 1 << 27  # that reading chunks may take beside their values
-MOST_BYTES = 1 << 26  # of a file of metadata
+MOST_CHUNKS = 1 << 20  # chunks per array
+UNPACKED_BYTES = 1 << 27  # memory limit for reading chunks, in addition to their values
+MOST_BYTES = 1 << 26  # size of a metadata file
 BROKEN_ZIP = (zipfile.BadZipFile, zlib.error, EOFError, KeyError, ValueError, RuntimeError, NotImplementedError)
 BROKEN = (  # what zarr and its codecs raise for bytes that are not as they should be
     *(*BROKEN_ZIP, OSError, LookupError, TypeError, AttributeError, ArithmeticError, AssertionError, ImportError),
-    SystemError,  # of blosc
+    SystemError,  # raised by blosc
 )
-CODECS = {  # of numcodecs and of zarr: none runs code that is stored with the values, as pickle does
+CODECS = {  # accepted codecs of numcodecs and zarr: none runs stored code, as pickle does
     *("adler32", "astype", "bitround", "blosc", "bytes", "bz2", "crc32", "crc32c", "delta", "fixedscaleoffset"),
     *("fletcher32", "gzip", "jenkins_lookup3", "lz4", "lzma", "packbits", "quantize", "sharding_indexed", "shuffle"),
     *("transpose", "vlen-utf8", "zlib", "zstd"),
@@ -107,8 +107,8 @@ class ZarrTree:
             with contextlib.ExitStack() as stack, self._store() as store:
                 found = zarr.open_array(store, path=array.path, mode="r")
                 chunk_bytes = math.prod(found.chunks) * max(array.dtype.itemsize, 1)
-                most = UNPACKED_BYTES + array.row_bytes * max(stop - start, 1) + 4 * chunk_bytes
-                stack.enter_context(memory.bounded(most, f"{self.path}, {plain(array.path, 200)},"))
+                limit_bytes = UNPACKED_BYTES + array.row_bytes * max(stop - start, 1) + 4 * chunk_bytes
+                stack.enter_context(memory.bounded(limit_bytes, f"{self.path}, {plain(array.path, 200)},"))
                 return np.asarray(found[() if not array.shape else slice(start, stop)])
         except BROKEN as error:
             if isinstance(error, OSError) and error.errno is not None:

@@ -62,10 +62,10 @@ def _records(path: Path, file: BinaryIO, size: int, *, within_chunk: bool = Fals
         if kind == CHUNK and within_chunk:
             raise _BrokenError("a chunk lies within a chunk")
         if kind == CHUNK:
-            content, whole = _content(file, size)
+            content, complete = _content(file, size)
             inside, problem = _decompressed(header.get("compression", b"none"), content, _word(header, "size"))
             records = _records(path, io.BytesIO(inside), len(inside), within_chunk=True)
-            if not whole:
+            if not complete:
                 yield from records
                 raise _BrokenError(CUT_OFF)
             try:

@@ -28,7 +28,7 @@ from tacpipe.printable import excerpt, listed, plain
 LOOK_MESSAGES = 20_000  # after which a look at a file ends
 MOST_BYTES = 1 << 22  # of a metadata.yaml
 READERS = {".mcap": mcap_file.records, ".db3": sqlite_file.records, ".bag": bag_file.records}
-UNPACKED_BYTES = 1 << 20  # of a compressed file, at once
+UNPACKED_BYTES = 1 << 20  # bytes decompressed at once
 ZSTD = ".zstd"  # the ending of a file that was compressed as a whole
 ACTIVE = ".active"  # of a ROS 1 bag that is being written, or whose recorder was killed
 OF = ":"  # between a topic and what names one of its streams, as "/tf:gripper"
@@ -79,19 +79,19 @@ def _files(path: Path, stack: contextlib.ExitStack) -> tuple[list[Path], bool, l
     unique_names.by_name(((name, name) for name in names), path / "metadata.yaml", "file")
     missing = [name for name in names if not (path / name).is_file()]
     notes = [f"{path} lacks {listed(missing, 3)}, which its metadata.yaml names."] if missing else []
-    every = sorted(file for file in file_system.listed(path) if _ending(file) in READERS)
-    there = [regular.inside(path, name) for name in names if name not in missing] or every  # renamed since
-    if unlisted := [file.name for file in every if file not in there]:
+    bag_files = sorted(file for file in file_system.listed(path) if _ending(file) in READERS)
+    present_files = [regular.inside(path, name) for name in names if name not in missing] or bag_files  # renamed since
+    if unlisted := [file.name for file in bag_files if file not in present_files]:
         notes.append(
             f"{path} holds {listed(unlisted, 3)}, which its metadata.yaml does not name and which are not read."
         )
-    if not there:
+    if not present_files:
         raise TacpipeError(f"{path} holds no file of a bag; its metadata.yaml names {listed(names, 3) or 'none'}.")
-    if unknown := [one.name for one in there if _ending(one) not in READERS]:
+    if unknown := [one.name for one in present_files if _ending(one) not in READERS]:
         storage = excerpt(about.get("storage_identifier"))
         raise TacpipeError(f"{path}: {plain(unknown[0])} is of the storage {storage}; mcap and sqlite3 are read.")
     compressed = str(about.get("compression_mode") or "").lower() == "message"
-    return [_unpacked(one, stack) for one in there], compressed, notes
+    return [_unpacked(one, stack) for one in present_files], compressed, notes
 
 
 def _records(path: Path) -> Iterator[Record]:
@@ -164,7 +164,7 @@ class _Reading:
     notes: list[str] = field(default_factory=list)
     aside: Spill = field(default_factory=Spill)  # decoded messages
     undescribed: int = 0  # messages of channels that no record describes
-    _described: dict[tuple[int, int], Channel] = field(default_factory=dict)  # by file and number
+    _described: dict[tuple[int, int], Channel] = field(default_factory=dict)  # file and number to channel
     _channels: dict[tuple[int, int], str] = field(default_factory=dict)  # file and number to topic
 
     def take(self, records: Iterator[Record], file: int, most: int | None) -> None:

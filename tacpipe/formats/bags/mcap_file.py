@@ -18,7 +18,7 @@ from tacpipe.printable import plain
 MAGIC = b"\x89MCAP0\r\n"
 FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, ATTACHMENT = 0x02, 0x03, 0x04, 0x05, 0x06, 0x07, 0x09
 STATISTICS, METADATA, DATA_END = 0x0B, 0x0C, 0x0F
-PIECE_BYTES = 1 << 20  # that are read at once
+PIECE_BYTES = 1 << 20  # bytes read at once
 INDEX_ENTRY = 16  # bytes of a message in the index of a chunk
 _RECORD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
@@ -47,10 +47,10 @@ def stream_records(path: Path, file: BinaryIO) -> Iterator[Record]:
         until = f"; {reader.count:,} messages up to {moment(reader.last_ns)} were read" if reader.count else ""
         yield Damage(f"{path}: {error}{until}.")
         return
-    stated = _stated_messages(file)
-    lost = 0 if stated is None else stated - reader.count
+    declared_count = _stated_messages(file)
+    lost = 0 if declared_count is None else declared_count - reader.count
     if lost > 0:
-        yield Damage(f"{path} states that it has {stated:,} messages, and {lost:,} of them are missing.")
+        yield Damage(f"{path} states that it has {declared_count:,} messages, and {lost:,} of them are missing.")
 
 
 def _data(file: BinaryIO, reader: _Reader) -> Iterator[Record]:
@@ -73,7 +73,7 @@ def _data(file: BinaryIO, reader: _Reader) -> Iterator[Record]:
             if kind == MESSAGE_INDEX and lost is not None:
                 lost.count += max(len(content) - 6, 0) // INDEX_ENTRY
             elif kind == CHUNK:
-                lost = yield from reader.chunk(content, whole=len(content) == length)
+                lost = yield from reader.chunk(content, complete=len(content) == length)
             elif len(content) == length:
                 yield from reader.record(kind, memoryview(content))
             if len(content) < length:
@@ -159,24 +159,24 @@ class _Reader:
         except (EndOfFile, struct.error, UnicodeDecodeError) as error:
             raise _BrokenError(f"a record of kind {kind} is damaged") from error
 
-    def chunk(self, content: bytes, whole: bool) -> Generator[Record, None, LostChunk | None]:
-        """Yield the records of a chunk, of one that was cut off as many as are there.
+    def chunk(self, content: bytes, complete: bool) -> Generator[Record, None, LostChunk | None]:
+        """Yield the records of a chunk; a truncated chunk yields the records that are left.
 
-        Return why a whole one is left out, if it is: nothing of it can be trusted then.
+        Return a lost chunk where a complete chunk is damaged: none of its records can be trusted.
         """
         if len(content) < _CHUNK.size + 4:
-            return LostChunk("has no whole header") if whole else None
+            return LostChunk("has no whole header") if complete else None
         first_ns, last_ns, size, check = _CHUNK.unpack_from(content)
         (length,) = struct.unpack_from("<I", content, _CHUNK.size)
         begin = _CHUNK.size + 4 + length
         compression = bytes(content[_CHUNK.size + 4 : begin]).decode(errors="replace")
         if size > memory.MOST_BLOCK:
-            why = f"declares {size:,} bytes, more than the {memory.MOST_BLOCK:,} that are unpacked"
-            return LostChunk(why, first_ns, last_ns)
+            problem = f"declares {size:,} bytes, more than the {memory.MOST_BLOCK:,} that are unpacked"
+            return LostChunk(problem, first_ns, last_ns)
         inside = _decompressed(compression, content[begin + 8 :], size)
         view = memoryview(inside)
         spans, end = _spans(view)
-        if whole and (len(inside) != size or end != size or (check and zlib.crc32(inside) != check)):
+        if complete and (len(inside) != size or end != size or (check and zlib.crc32(inside) != check)):
             return LostChunk(f"of {size:,} bytes is damaged", first_ns, last_ns)
         for kind, at, length in spans:
             if kind == MESSAGE:

@@ -65,9 +65,9 @@ def _connected(path: Path) -> Iterator[sqlite3.Connection]:
 
 def _expect_tables(path: Path, connection: sqlite3.Connection) -> None:
     """Raise `TacpipeError` where what holds topics or messages is no table: a view or a module runs queries of the file."""
-    stated = dict(connection.execute("SELECT name, sql FROM sqlite_master WHERE type = 'table'"))
+    definitions = dict(connection.execute("SELECT name, sql FROM sqlite_master WHERE type = 'table'"))
     for name in ("topics", "messages"):
-        if not str(stated.get(name, "")).upper().startswith("CREATE TABLE"):
+        if not str(definitions.get(name, "")).upper().startswith("CREATE TABLE"):
             raise TacpipeError(
                 f"{path} has no table {name}, which a bag of ROS 2 has; a view of this name is not read."
             )

@@ -55,7 +55,7 @@ class Damage:
 class LostChunk:
     """A chunk whose messages are left out, and what its header and the index behind it state of them."""
 
-    why: str  # as in "a chunk …"
+    problem: str  # completes the sentence "a chunk …"
     first_ns: int = 0  # log times
     last_ns: int = 0
     count: int = 0  # 0: the file does not state it
@@ -64,7 +64,7 @@ class LostChunk:
         """Return the note about it."""
         interval = f" from {moment(self.first_ns)} to {moment(self.last_ns)}" if self.last_ns else ""
         count = f"its {self.count:,} messages" if self.count else "its messages, an unknown number,"
-        return Damage(f"{path}: a chunk {self.why}; {count}{interval} are left out.")
+        return Damage(f"{path}: a chunk {self.problem}; {count}{interval} are left out.")
 
 
 def moment(time_ns: int) -> str:

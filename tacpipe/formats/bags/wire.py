@@ -193,7 +193,7 @@ class _Walk:
     content: bytes
     types: Types
     shape: Shape
-    messages: int = 0  # that were walked, with those that have no fields
+    messages: int = 0  # messages walked, including those without fields
 
     def message(self, name: str, path: Path, within: tuple[tuple[int, str], ...], at: int) -> int:
         """Walk the fields of a message that begins at ``at``; return where it ends."""

@@ -24,14 +24,14 @@ class Time:
     unit: TimeUnit = "s"
     rate_hz: Rate | None = None
     origin: Literal["unix", "start"] = "unix"  # what a number counts from: 1970, or the start of the recording
-    zone: str = "UTC"  # of ISO 8601 stamps that name none, as Europe/Berlin
+    zone: str = "UTC"  # time zone of ISO 8601 stamps that name none, as Europe/Berlin
     start: str = ""  # UTC, ISO 8601: the first stamp of recordings that count from their start, the day of times of day
     file: str = ""  # pattern of a file that holds the stamps of all rows, one after another
-    format: str = ""  # of stamps that are text, as strptime has it: %d.%m.%Y %H:%M:%S.%f; without %Y the time of day
+    format: str = ""  # strptime format of text stamps, as %d.%m.%Y %H:%M:%S.%f; without %Y the time of day
 
     @property
     def is_text(self) -> bool:
-        """Whether stamps are text."""
+        """Return whether stamps are text."""
         return bool(self.format) or self.unit == "iso8601"
 
     @property

@@ -69,9 +69,9 @@ class LeRobotContainer:
         """Return what an episode is read from: its file, its native streams, and what meta states of it alone."""
         one = self._named(episode)
         about = self._about
-        found = [regular.inside(self.path, one.file), *self._native(one).values()]
+        paths = [regular.inside(self.path, one.file), *self._native(one).values()]
         with regular.failing(self.path):
-            files = {path.relative_to(self.path).as_posix(): path for path in found if file_system.present(path)}
+            files = {path.relative_to(self.path).as_posix(): path for path in paths if file_system.present(path)}
         stated = {"fps": about.fps, "robot": about.robot, "features": about.info["features"], "index": one.index}
         stated |= {"tasks": list(one.tasks), "videos": dict(one.videos), "attributes": dict(one.attributes)}
         stated |= {"length": one.length}
@@ -89,11 +89,13 @@ class LeRobotContainer:
 
     def _notes(self, episode: Episode) -> list[str]:
         """Return, with the first episode, whether there are as many as the dataset states."""
-        stated = self._about.info.get("total_episodes")
+        declared_count = self._about.info.get("total_episodes")
         first = next(iter(self._episodes.values()))
-        if not isinstance(stated, int) or stated == len(self._episodes) or episode is not first:
+        if not isinstance(declared_count, int) or declared_count == len(self._episodes) or episode is not first:
             return []
-        return [f"{self.path} describes {len(self._episodes)} episodes, and {description.INFO} states {stated}."]
+        return [
+            f"{self.path} describes {len(self._episodes)} episodes, and {description.INFO} states {declared_count}."
+        ]
 
     def _named(self, name: str | None) -> Episode:
         if name not in self._episodes:

@@ -99,18 +99,18 @@ class Description:
             raise TacpipeError(
                 f"{self.root / INFO}: chunks_size is {excerpt(size)}; it must be a whole number above 0."
             )
-        for one in _lines(regular.inside(self.root, "meta/episodes.jsonl")):
-            index, length = one.get("episode_index"), one.get("length")
+        for entry in _lines(regular.inside(self.root, "meta/episodes.jsonl")):
+            index, length = entry.get("episode_index"), entry.get("length")
             if not isinstance(index, int) or not isinstance(length, int):
-                raise TacpipeError(f"{path}: {excerpt(one)} has no whole numbers episode_index and length.")
+                raise TacpipeError(f"{path}: {excerpt(entry)} has no whole numbers episode_index and length.")
             values = {"episode_chunk": index // size, "episode_index": index}
-            others = {key: value for key, value in one.items() if key not in ("episode_index", "length", "tasks")}
+            others = {key: value for key, value in entry.items() if key not in ("episode_index", "length", "tasks")}
             yield Episode(
                 _name(index, others),
                 index,
                 self._place("data_path", DATA_PATHS["v2"], values),
                 length,
-                tuple(map(str, one.get("tasks") or ())),
+                tuple(map(str, entry.get("tasks") or ())),
                 {key: self._place("video_path", "", {**values, "video_key": key}) for key in self._videos},
                 _plain(others),
             )
@@ -251,10 +251,10 @@ def _original(path: Path, text: Any) -> dict[str, Attribute] | None:
     if not isinstance(text, str):
         return None
     try:
-        found = unique_names.json_value(text, path)
+        attributes = unique_names.json_value(text, path)
     except (ValueError, RecursionError) as error:
         raise TacpipeError(f"{path}: {ATTRIBUTES} holds {excerpt(text)}, which is not JSON.") from error
-    values = found.items() if isinstance(found, dict) else ()
+    values = attributes.items() if isinstance(attributes, dict) else ()
     return {str(key): value for key, value in values if value is None or isinstance(value, str | int | float | bool)}
 
 
@@ -267,12 +267,12 @@ def _json(root: Path, name: str) -> dict[str, Any]:
     with regular.failing(path):
         content = regular.content(path, MOST_BYTES)
     try:
-        found = unique_names.json_value(content, path)
+        content_json = unique_names.json_value(content, path)
     except (ValueError, RecursionError) as error:
         raise TacpipeError(f"{path} is not JSON: {plain(str(error), 200)}. Copy it again.") from error
-    if not isinstance(found, dict):
-        raise TacpipeError(f"{path} holds {excerpt(found)}; it must be a JSON object.")
-    return found
+    if not isinstance(content_json, dict):
+        raise TacpipeError(f"{path} holds {excerpt(content_json)}; it must be a JSON object.")
+    return content_json
 
 
 def _lines(path: Path) -> Iterator[dict[str, Any]]:
@@ -283,14 +283,14 @@ def _lines(path: Path) -> Iterator[dict[str, Any]]:
         if not line.strip():
             continue
         try:
-            found = unique_names.json_value(line, path)
+            entry = unique_names.json_value(line, path)
         except (ValueError, RecursionError) as error:
             raise TacpipeError(
                 f"{path}, line {number} is not JSON: {plain(str(error), 200)}. Copy the file again."
             ) from error
-        if not isinstance(found, dict):
-            raise TacpipeError(f"{path}, line {number} holds {excerpt(found)}; it must be a JSON object.")
-        yield found
+        if not isinstance(entry, dict):
+            raise TacpipeError(f"{path}, line {number} holds {excerpt(entry)}; it must be a JSON object.")
+        yield entry
 
 
 def _schema(path: Path) -> Sequence[str]:

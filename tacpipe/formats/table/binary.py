@@ -31,8 +31,8 @@ from tacpipe.printable import plain
 
 BATCH_ROWS = 1 << 18  # of Parquet, at most
 BLOCK_BYTES = 1 << 24  # of JSON lines, or of a block of arrays
-READ_BYTES = 1 << 20  # of a column of Parquet at once, however large its groups of rows are
-MOST_COLUMNS = 1 << 20  # of an array
+READ_BYTES = 1 << 20  # bytes read at once per Parquet column, whatever its row groups' size
+MOST_COLUMNS = 1 << 20  # columns per array
 LONGEST_LINE = 1 << 26  # bytes of one JSON object
 _BEGUN = re.compile(rb"\S")
 _ZIP_ERRORS = (ValueError, OSError, EOFError, zipfile.BadZipFile, zlib.error, KeyError, RuntimeError)
@@ -117,11 +117,11 @@ class NumpyArchive:
     def _arrays(self) -> dict[str, ArrayMember]:
         with self._reading(), self._archive() as archive:
             members = [
-                ArrayMember.of(archive, one, self.time_axis)
-                for one in archive.infolist()
-                if one.filename.endswith(".npy")
+                ArrayMember.from_archive(archive, info, self.time_axis)
+                for info in archive.infolist()
+                if info.filename.endswith(".npy")
             ]
-        return unique_names.by_name(((one.name, one) for one in members if one.shape), self.path, "array")
+        return unique_names.by_name(((array.name, array) for array in members if array.shape), self.path, "array")
 
     def _archive(self) -> contextlib.AbstractContextManager[Archive]:
         return _zip_archive(self.path)
@@ -187,7 +187,7 @@ class ArrayMember:
     time_axis: int = 0
 
     @classmethod
-    def of(cls, archive: Archive, member: zipfile.ZipInfo, time_axis: int = 0) -> ArrayMember:
+    def from_archive(cls, archive: Archive, member: zipfile.ZipInfo, time_axis: int = 0) -> ArrayMember:
         """Return what the header declares. Raises `ValueError` for what is not an array, or holds Python objects."""
         with archive.open(member.filename) as file:
             shape, columnwise, dtype = _header(file)

@@ -61,7 +61,7 @@ def chosen(stream: Stream, names: Sequence[str], path: Path, declared: Declared 
     only what it states. Raises `TacpipeError` for a column that neither describes, a rule that matches none, and
     two columns of one name.
     """
-    found: list[Chosen] = []
+    chosen_columns: list[Chosen] = []
     used = set()
     for name in names:
         matches = ((rule, pattern.match(rule.match, name)) for rule in stream.columns)
@@ -75,23 +75,23 @@ def chosen(stream: Stream, names: Sequence[str], path: Path, declared: Declared 
             rule, values = Column(match=name), {}
         used.add(rule)
         if not rule.skip:
-            found.append(Chosen(name, _field(rule, name, values, declared.get(name)), rule))
-    found = _places(found, path, stream)
+            chosen_columns.append(Chosen(name, _field(rule, name, values, declared.get(name)), rule))
+    chosen_columns = _places(chosen_columns, path, stream)
     idle = [rule.match for rule in stream.columns if rule not in used]
     if idle:
         raise TacpipeError(
             f"{path} has no column that matches {listed(idle, 3)} of [streams.{stream.name}]; it has {listed(names, 6)}."
         )
-    out = [one.field.name for one in found]
+    out = [one.field.name for one in chosen_columns]
     doubled = sorted({name for name in out if out.count(name) > 1})
     if doubled or TIME in out:
         raise TacpipeError(
             f"{path}: [streams.{stream.name}] gives more than one column the name {listed(doubled or [TIME], 3)}; "
             f"each name may be there once, and {TIME} is the time."
         )
-    if not found:
+    if not chosen_columns:
         raise TacpipeError(f"{path}: [streams.{stream.name}] skips all columns. Name one that is to be read.")
-    return found
+    return chosen_columns
 
 
 def _places(columns_read: Sequence[Chosen], path: Path, stream: Stream) -> list[Chosen]:
@@ -140,20 +140,20 @@ def _placed(column: Chosen, cell: int) -> pa.Field:
     stem = "taxel" if tactile else column.name.rstrip("0123456789").rstrip("_")
     plain_name = f"{stem}{padded if tactile or count > 1 else ''}{f'_{axis}' if axis else ''}"
     name = pattern.filled(rule.name, {**values, "taxel": padded, "axis": axis}) if rule.name else plain_name
-    stated = {key.decode(): value.decode() for key, value in (column.field.metadata or {}).items()}
-    kept = {key: value for key, value in stated.items() if key not in values}
-    return pa.field(name, column.field.type, metadata={**kept, **about, **dict(rule.about)})
+    declared_metadata = {key.decode(): value.decode() for key, value in (column.field.metadata or {}).items()}
+    retained = {key: value for key, value in declared_metadata.items() if key not in values}
+    return pa.field(name, column.field.type, metadata={**retained, **about, **dict(rule.about)})
 
 
 def _field(rule: Column, name: str, values: dict[str, str], declared: pa.Field | None) -> pa.Field:
-    made = pattern.filled(rule.name, values) if rule.name and not rule.shape else name.strip()
+    column_name = pattern.filled(rule.name, values) if rule.name and not rule.shape else name.strip()
     about = {"unit": rule.unit, "quantity": rule.quantity, "component": rule.component, **values, **dict(rule.about)}
     about = {key: value for key, value in about.items() if value}
     if declared is None:
-        return pa.field(made, TYPES[rule.type or "float64"], metadata=about)
+        return pa.field(column_name, TYPES[rule.type or "float64"], metadata=about)
     kind = TYPES[rule.type] if rule.type else (declared.type if rule.scale == 1.0 else pa.float64())
     own = {key.decode(): value.decode() for key, value in (declared.metadata or {}).items()}
-    return pa.field(made, kind, metadata={**own, **about})
+    return pa.field(column_name, kind, metadata={**own, **about})
 
 
 def converted(

@@ -15,7 +15,7 @@ from tacpipe.formats.table.layout import GZIP
 from tacpipe.io import regular
 from tacpipe.printable import plain
 
-BLOCK_BYTES = 1 << 20  # of a file that are decoded at once
+BLOCK_BYTES = 1 << 20  # bytes decoded at once
 
 
 @contextlib.contextmanager

@@ -13,8 +13,8 @@ from typing import Literal
 
 from tacpipe.formats.table import compressed
 
-LINES = 200  # of a file that are looked at
-HEAD_BYTES = 1 << 20  # of a file that are looked at, at most
+LINES = 200  # lines sampled per file
+HEAD_BYTES = 1 << 20  # bytes sampled per file, at most
 SEPARATORS = (",", ";", "\t", "|", " ")
 COMMENTS = ("#", "%", "//")
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
@@ -35,7 +35,7 @@ class Dialect:
     names: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...] = field(repr=False)  # below the header
     missing: tuple[str, ...] = ()  # cells of MISSING that are there
-    units: tuple[str, ...] = ()  # of the columns, where the row below the header holds them
+    units: tuple[str, ...] = ()  # units of the columns, if the row below the header holds them
 
     def number(self, cell: str) -> float | None:
         """Return the number that a cell holds, an int where it is written as one, None where it holds none.

@@ -141,7 +141,7 @@ def _with_stamps(groups: Sequence[_Group]) -> tuple[list[_Group], list[_Group]]:
 
 
 def _is_clock(group: _Group) -> bool:
-    """Return whether a file of one column holds stamps: its name says so, and its values rise or are text."""
+    """Return whether a file of one column has a name of stamps, and values that rise or are text."""
     stem = group.paths[0].name.partition(".")[0]
     match = column_names.TIME_NAME.fullmatch(stem) or column_names.TIME_ENDING.fullmatch(stem)
     (values,) = group.first.values.values()

@@ -155,14 +155,14 @@ def _tree(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield the entries of a mapping of names to labels, or of a list of labels."""
     text = label_texts.read_text(path)
     try:
-        found = unique_names.json_value(text, path) if path.suffix.lower() == ".json" else yaml_text.load(text)
+        tree = unique_names.json_value(text, path) if path.suffix.lower() == ".json" else yaml_text.load(text)
     except (ValueError, RecursionError) as error:
         raise TacpipeError(f"{path} cannot be read: {plain(str(error), 200)}. Correct it.") from error
     entries = (
-        [(plain(str(name)), {NAME: str(name), **one} if isinstance(one, dict) else one) for name, one in found.items()]
-        if isinstance(found, dict)
-        else [(f"entry {number}", one) for number, one in enumerate(found)]
-        if isinstance(found, list)
+        [(plain(str(name)), {NAME: str(name), **one} if isinstance(one, dict) else one) for name, one in tree.items()]
+        if isinstance(tree, dict)
+        else [(f"entry {number}", one) for number, one in enumerate(tree)]
+        if isinstance(tree, list)
         else []
     )
     for place, one in entries:
@@ -170,4 +170,4 @@ def _tree(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
             raise TacpipeError(f"{path}, {place} is {excerpt(one)}; write NAME: VALUE for each label of a recording.")
         yield place, {str(name): value for name, value in one.items()}
     if not entries:
-        raise TacpipeError(f"{path} holds {excerpt(found)}; write labels by the name of their recording.")
+        raise TacpipeError(f"{path} holds {excerpt(tree)}; write labels by the name of their recording.")

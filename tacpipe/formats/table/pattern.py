@@ -26,7 +26,7 @@ _COUNTED = (  # words before numbers that count recordings rather than parts of 
 )
 _COUNTER = re.compile(rf"(?:^|[^a-z])({_COUNTED})[-_ #.]*$", re.IGNORECASE)
 _Token = tuple[str, str]  # its kind (a letter of a name is of its own kind), and its text
-MOST_STEPS = 10_000_000  # of matching one text
+MOST_STEPS = 10_000_000  # limit of steps for matching a text
 _PART = re.compile(r"\{(\w+)\}|(\*\*/?)|(\*)|([^{}*]+)|(.)", re.DOTALL)
 
 
@@ -115,13 +115,13 @@ def generalize(paths: Sequence[PurePath]) -> str:
     """
     levels = list(zip(*(path.parts for path in paths), strict=True))
     differing = [level for level, names in enumerate(levels) if len(set(names)) > 1]
-    last = differing[-1] if differing else len(levels) - 2  # of a single file the folder is the recording
+    last = differing[-1] if differing else len(levels) - 2  # the folder of a single file is the recording
     names_in_use: dict[str, tuple[str, ...]] = {}
-    made = []
+    level_patterns = []
     for level, names in enumerate(levels):
         text = _level([_tokens(name) for name in names], level, names_in_use, is_last=level == last)
-        made.append(f"{{{TRIAL}}}" if level == last and "{" not in text else text)
-    return "/".join(made)
+        level_patterns.append(f"{{{TRIAL}}}" if level == last and "{" not in text else text)
+    return "/".join(level_patterns)
 
 
 def _tokens(name: str) -> list[_Token]:
@@ -157,9 +157,13 @@ def _level(names: Sequence[list[_Token]], level: int, in_use: dict[str, tuple[st
             name = TRIAL
         else:
             name = word[1].lower() if kind == "number" and word else f"folder{level + 1}"
-        same = [other for other, found in in_use.items() if found == texts and (other == name or len(set(texts)) > 1)]
+        same = [
+            placeholder
+            for placeholder, texts_in_use in in_use.items()
+            if texts_in_use == texts and (placeholder == name or len(set(texts)) > 1)
+        ]
         unique = (f"{name}{number}" if number > 1 else name for number in itertools.count(1))
-        name = same[0] if same else next(one for one in unique if one not in in_use)
+        name = same[0] if same else next(candidate for candidate in unique if candidate not in in_use)
         in_use[name] = texts
         pattern += f"{{{name}}}"
     return pattern
@@ -170,10 +174,10 @@ def _parts(names: Sequence[list[_Token]]) -> list[tuple[str, tuple[str, ...]]]:
     kinds = [[kind for kind, _ in tokens] for tokens in names]
     before = _common(kinds)
     after = 0
-    if any(one != kinds[0] for one in kinds):
+    if any(tokens != kinds[0] for tokens in kinds):
         before = _without_slots(kinds[0], before)
-        after = _without_slots(kinds[0][::-1], _common([one[before:][::-1] for one in kinds]))
-        while any(len(one) == before + after for one in kinds):  # a placeholder is at least one character
+        after = _without_slots(kinds[0][::-1], _common([tokens[before:][::-1] for tokens in kinds]))
+        while any(len(tokens) == before + after for tokens in kinds):  # a placeholder is at least one character
             if before:
                 before = _without_slots(kinds[0], before - 1)
             else:

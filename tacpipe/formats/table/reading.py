@@ -86,10 +86,10 @@ def _batches(
 ) -> pa.RecordBatchReader:
     path, names = file.path, file.names()
     clock = "" if stream.time.file else stream.time.column
-    apart = [name for name in (clock, stream.recording) if name]
+    reserved = [name for name in (clock, stream.recording) if name]
     if stream.long is not None:
-        apart += [stream.long.channel, stream.long.value]
-    missing = [name for name in apart if name not in names]
+        reserved += [stream.long.channel, stream.long.value]
+    missing = [name for name in reserved if name not in names]
     if missing:
         raise TacpipeError(
             f"{path} has no column {listed(missing, 3)}, which [streams.{stream.name}] names; it has {listed(names, 6)}."
@@ -102,7 +102,7 @@ def _batches(
         wanted = columns.chosen(stream, long.channels, path) if long.channels else []
         blocks = long.blocks(wanted)
     else:
-        wanted = columns.chosen(stream, [name for name in names if name not in apart], path, declared)
+        wanted = columns.chosen(stream, [name for name in names if name not in reserved], path, declared)
         types = {**rows.types(file, stream), **{one.name: one.read_as for one in wanted}}
         as_is = bool(declared)  # a container's own NaN and infinity are values
         blocks = (
@@ -169,15 +169,15 @@ def _past_midnight(t_ns: Times, last_ns: int | None) -> Times:
 
 def _stamped_apart(blocks: Iterable[Block], stamps_ns: Times, file: Rows, stream: Stream) -> Iterator[Block]:
     """Yield blocks with the stamps of a file of their own. Raises `TacpipeError` where there are more or fewer than rows."""
-    done = 0
+    row_count = 0
     for _, arrays in blocks:
         count = len(arrays[0])
-        if done + count > len(stamps_ns):
+        if row_count + count > len(stamps_ns):
             raise TacpipeError(_unequal(file, stream, "more rows", stamps_ns))
-        yield stamps_ns[done : done + count], arrays
-        done += count
-    if done < len(stamps_ns):
-        raise TacpipeError(_unequal(file, stream, f"{done} rows", stamps_ns))
+        yield stamps_ns[row_count : row_count + count], arrays
+        row_count += count
+    if row_count < len(stamps_ns):
+        raise TacpipeError(_unequal(file, stream, f"{row_count} rows", stamps_ns))
 
 
 def _unequal(file: Rows, stream: Stream, rows_there: str, stamps_ns: Times) -> str:

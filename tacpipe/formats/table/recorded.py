@@ -21,7 +21,7 @@ from tacpipe.plugins.stage import Attribute, Shared
 from tacpipe.printable import listed, plain
 
 LOWEST_HZ, HIGHEST_HZ = 0.2, 20_000.0  # rates beyond these are probably stamps in another unit
-FEWEST_ROWS = 10  # that show a rate
+FEWEST_ROWS = 10  # rows needed to estimate a rate
 SKIPPED = "skipped"  # the attribute of a recording that names what could not be read
 
 
@@ -30,8 +30,8 @@ class Recorded:
     """What was read of one recording."""
 
     streams: Mapping[str, pa.Table | pa.RecordBatchReader]
-    attributes: Mapping[str, Attribute] = field(default_factory=dict)  # that containers state
-    notes: Sequence[str] = ()  # what was left out or is missing; those on rates are added as streams are read
+    attributes: Mapping[str, Attribute] = field(default_factory=dict)  # attributes that containers state
+    notes: Sequence[str] = ()  # omissions and missing parts; notes on rates are added as streams are read
 
 
 def of(
@@ -57,17 +57,23 @@ def of(
             )
     for (kind, path), several in together.items():
         contents = kinds.opened(kind, path).read([one.source for one in several], within)
-        there = unique_names.by_name(((stream.source, stream) for stream in contents.streams), path, "stream")
+        stream_by_source = unique_names.by_name(
+            ((stream.source, stream) for stream in contents.streams), path, "stream"
+        )
         for stream in several:
-            if stream.source in there:
-                tables[stream.name] = contained(path, there[stream.source], stream)
+            if stream.source in stream_by_source:
+                tables[stream.name] = contained(path, stream_by_source[stream.source], stream)
             elif not stream.optional:
                 raise _lacking(path, stream, contents, kinds.opened(kind, path).look(within))
         attributes |= contents.attributes
-        asked = tuple(f"{stream.source}/" for stream in several)
-        inner = {source: why for source, why in contents.skipped.items() if source.startswith(asked)}
+        prefixes = tuple(f"{stream.source}/" for stream in several)
+        inner = {source: problem for source, problem in contents.skipped.items() if source.startswith(prefixes)}
         notes += [*contents.notes, *_left_out(path, inner)]
-    tables = {one.name: _with_rate_noted(tables[one.name], one.name, notes) for one in streams if one.name in tables}
+    tables = {
+        stream.name: _with_rate_noted(tables[stream.name], stream.name, notes)
+        for stream in streams
+        if stream.name in tables
+    }
     return Recorded(tables, attributes, notes)
 
 
@@ -106,10 +112,10 @@ def all_of(kind: str, path: Path, within: str | None) -> Recorded:
     """
     contents = kinds.opened(kind, path).read(None, within)
     notes = [*contents.notes, *_left_out(path, contents.skipped)]
-    named = unique_names.by_name(((stream.name, stream) for stream in contents.streams), path, "stream")
+    stream_by_name = unique_names.by_name(((stream.name, stream) for stream in contents.streams), path, "stream")
     tables = {
         name: _with_rate_noted(contained(path, stream, Stream(name, source=stream.source)), name, notes)
-        for name, stream in named.items()
+        for name, stream in stream_by_name.items()
         if stream.rows is None or stream.rows
     }
     if not tables:
@@ -119,7 +125,7 @@ def all_of(kind: str, path: Path, within: str | None) -> Recorded:
 
 
 def _left_out(path: Path, skipped: Mapping[str, str]) -> list[str]:
-    return [f"{path}: {plain(source)} is left out: {why}." for source, why in skipped.items()]
+    return [f"{path}: {plain(source)} is left out: {problem}." for source, problem in skipped.items()]
 
 
 def _lacking(path: Path, stream: Stream, contents: Contents, look: Contents) -> TacpipeError:

@@ -90,14 +90,14 @@ def stamps_of_file(path: Path, stream: Stream) -> Times:
     clock = Stream(stream.name, format=kind, time=replace(stream.time, file=""), encoding=stream.encoding)
     if kind == "csv":
         lines = dialect.first_lines(path, stream.encoding)
-        written = dialect.of(lines)
+        clock_dialect = dialect.of(lines)
         clock = replace(
             clock,
-            separator=written.separator,
-            decimal=written.decimal,
-            comment=written.comment,
-            header=written.header,
-            skip_lines=written.skip_lines,
+            separator=clock_dialect.separator,
+            decimal=clock_dialect.decimal,
+            comment=clock_dialect.comment,
+            header=clock_dialect.header,
+            skip_lines=clock_dialect.skip_lines,
         )
     file = opened(path, clock)
     names = file.names()
@@ -108,11 +108,11 @@ def stamps_of_file(path: Path, stream: Stream) -> Times:
             f"in its time."
         )
     clock = replace(clock, time=replace(clock.time, column=column))
-    found = [
+    stamps_ns = [
         stamped(block.column(column), clock, place)
         for block, _, place in blocks(file, clock, types(file, clock), None, None)
     ]
-    return np.concatenate(found) if found else np.zeros(0, np.int64)
+    return np.concatenate(stamps_ns) if stamps_ns else np.zeros(0, np.int64)
 
 
 def types(file: Rows, stream: Stream) -> dict[str, pa.DataType]:

@@ -27,13 +27,13 @@ _MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct",
 DAY_NS = 86_400 * 10**9
 
 
-def check(text: str, where: str) -> None:
+def check(text: str, place: str) -> None:
     """Raise `UsageError` for a format with a directive that is not read, or without an hour."""
     letters = re.findall(r"%(.)", text.replace("%%", ""), re.DOTALL)
     unread = sorted({f"%{letter}" for letter in letters} - {f"%{letter}" for letter in _DIRECTIVES})
     if unread or not {"H", "I"} & set(letters):
         raise UsageError(
-            f"{where}: format is {excerpt(text)}; it must name an hour (%H), and is made of "
+            f"{place}: format is {excerpt(text)}; it must name an hour (%H), and is made of "
             f"{', '.join(f'%{letter}' for letter in _DIRECTIVES)}."
         )
 
@@ -52,20 +52,20 @@ def expression(text: str) -> str:
 
     A fraction of a second may be left out, as Python does where it is zero.
     """
-    made = ""
+    regex = ""
     for match in _PART.finditer(text):
         if match["fraction"]:
-            made += rf"(?P<S>\d{{1,2}})(?:{re.escape(match['fraction'][2])}(?P<f>\d{{1,9}}))?"
+            regex += rf"(?P<S>\d{{1,2}})(?:{re.escape(match['fraction'][2])}(?P<f>\d{{1,9}}))?"
         elif match["letter"] == "%":
-            made += "%"
+            regex += "%"
         elif match["letter"]:
-            made += f"(?P<{match['letter']}>{_DIRECTIVES[match['letter']]})"
+            regex += f"(?P<{match['letter']}>{_DIRECTIVES[match['letter']]})"
         else:
-            made += "".join(
+            regex += "".join(
                 letter if letter.isalnum() or letter == " " else f"[{letter}]" if letter != "^" else r"\^"
                 for letter in match["text"]
             )
-    return f"^{made}$"
+    return f"^{regex}$"
 
 
 def nanoseconds(column: pa.Array, text: str) -> tuple[Int64s, Bools]:
@@ -80,9 +80,9 @@ def nanoseconds(column: pa.Array, text: str) -> tuple[Int64s, Bools]:
     import numpy as np
     import pyarrow.compute as pc
 
-    found = pc.extract_regex(pc.utf8_trim_whitespace(column), expression(text))
-    valid = found.is_valid().to_numpy(zero_copy_only=False)
-    parts = {field.name: pc.struct_field(found, field.name).fill_null("") for field in found.type}
+    groups = pc.extract_regex(pc.utf8_trim_whitespace(column), expression(text))
+    valid = groups.is_valid().to_numpy(zero_copy_only=False)
+    parts = {field.name: pc.struct_field(groups, field.name).fill_null("") for field in groups.type}
 
     def number(letter: str, default: int = 0) -> Int64s:
         values = parts.get(letter)

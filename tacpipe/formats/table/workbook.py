@@ -93,13 +93,13 @@ class Workbook:
         try:
             with regular.failing(self.path), regular.opened(self.path) as file:
                 book = openpyxl.load_workbook(file, read_only=True, data_only=True)
-                wanted = self.stream.sheet or book.sheetnames[0]
-                if wanted not in book.sheetnames:
+                sheet = self.stream.sheet or book.sheetnames[0]
+                if sheet not in book.sheetnames:
                     raise TacpipeError(
-                        f"{self.path} has no sheet {plain(wanted)}; it has {listed(book.sheetnames, 6)}. Correct sheet in "
+                        f"{self.path} has no sheet {plain(sheet)}; it has {listed(book.sheetnames, 6)}. Correct sheet in "
                         f"[streams.{self.stream.name}]."
                     )
-                rows = enumerate(book[wanted].iter_rows(values_only=True), 1)
+                rows = enumerate(book[sheet].iter_rows(values_only=True), 1)
                 yield (
                     (number, cells)
                     for number, cells in rows
