@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Params(StreamSelection):
-    """What counts as contact, and as the level without load.
+    """Criteria for contact and for the level without load.
 
     Thresholds in counts are for streams in counts, and stem from 52 published pick-and-move trials of a XELA uSkin: at
     rest the load stays below 6 counts, in the grasp above 240 and mostly above 1000, and after a drop up to 65 counts

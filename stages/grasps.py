@@ -20,7 +20,7 @@ FINISHED = ("cloud", "grasp")
 
 @dataclass(frozen=True)
 class Params(StreamSelection):
-    """What counts as the grasped object in a camera's view, and as contact in the readings of two BioTac SP.
+    """Criteria for the grasped object in a camera's view and for contact in the readings of two BioTac SP.
 
     Lengths suit a depth camera a metre or so above a table, whose noise is 2 mm there.
     """

@@ -32,7 +32,7 @@ class Params:
     steps: Annotated[str, STEPS] = "1,3,5,10"  # steps ahead
     # read no sample that had not arrived yet, as a live session; give recordings as they were recorded
     causal: bool = added(False)
-    # of --causal: also for a model that was trained on rows that look ahead
+    # with --causal: accept a model that was trained on rows that look ahead
     allow_look_ahead: bool = added(False)
     # levels in percent of quantiles to add, of a model that `tacpipe calibrate` made, as 10,50,90; empty: none
     quantiles: Annotated[str, CommaList(PositiveInt)] = added("")

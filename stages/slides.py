@@ -35,7 +35,7 @@ _KEPT_WHOLE = (
 
 @dataclass(frozen=True)
 class Params(StreamSelection):
-    """Where a slide begins and ends, which of its frames are kept, and what the protocol of the recordings was.
+    """Limits of a slide, the choice of its frames, and the protocol of the recordings.
 
     The defaults are those of the published BioTac slides: 25 mm/s over 0.2 m (one material 0.15 m), begun when the
     finger's pressure reached 40 counts. Half the speed lies in the middle between rest and slide, whose ramp takes 0.1

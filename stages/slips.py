@@ -26,7 +26,7 @@ EVEN = 0.01  # of a step between rows, by which it may differ from the others fo
 
 @dataclass(frozen=True)
 class Params(StreamSelection):
-    """What counts as slip and as drop, in the readings of a proximity sensor that looks at the held object.
+    """Criteria for slip and drop in the readings of a proximity sensor that looks at the held object.
 
     Thresholds are in multiples of the noise of the readings' rate after the grasp. Readings in a unit of length are
     taken as so many counts as ``count_per_mm`` makes of them, and never saturate. One millimetre is 8 counts on the

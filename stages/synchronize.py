@@ -99,15 +99,15 @@ def synchronize(params: Params, recording: Recording) -> RecordingOutput:
 
     every = {name: recording.columns(name) for name in sorted(recording.streams) if name != EVENTS}
     found = {name: columns for name, columns in every.items() if streams.is_signal(columns)} or every
-    held = params.values == "hold"
+    hold_values = params.values == "hold"
     placed: dict[str, Stream] = {}
     for name, stored in found.items():
-        placed[name] = streams.on_host_clock(recording.name, name, stored, "arrival" if held else params.clock)
+        placed[name] = streams.on_host_clock(recording.name, name, stored, "arrival" if hold_values else params.clock)
         stored.forget()
     wanted = params.master or str(recording.attributes.get("master", ""))
     schemas = {name: columns.schema for name, columns in found.items()}
     master = placed[grids.master(recording.name, wanted, schemas)]
-    grid_ns, rows = grids.grid(recording.name, params.timeline, params.rate_hz, placed, master, held=held)
+    grid_ns, rows = grids.grid(recording.name, params.timeline, params.rate_hz, placed, master, held=hold_values)
     columns: list[tuple[pa.Field, Any]] = [(master.columns.schema.field("t_ns"), grid_ns)]
     attributes: dict[str, Attribute] = {masks.GRID: params.timeline, "grid_master": master.name}
     if left := [name for name in every if name not in found]:
@@ -117,14 +117,14 @@ def synchronize(params: Params, recording: Recording) -> RecordingOutput:
         attributes["step_ms"] = round(float(np.median(np.diff(grid_ns))) / 1e6, 3)
     ahead_ns = np.zeros(len(grid_ns), np.int64)  # (grid,)
     for name, stream in placed.items():
-        exact = None if held else grids.rows_at(stream.t_ns, grid_ns, rows)
+        exact = None if hold_values else grids.rows_at(stream.t_ns, grid_ns, rows)
         if params.unwrap:
             stream, wrapped = streams.without_wraps(stream)
             attributes |= {f"{name}_wrapped_channels": wrapped} if wrapped else {}
         gap_ns = default_gap_ns(stream.t_ns) if params.gap_ms is None else round(params.gap_ms * 1e6)
         columns += _on_grid(params, stream, grid_ns, exact, gap_ns)
         if not stream.truth:
-            if not held:
+            if not hold_values:
                 ahead_ns = np.maximum(ahead_ns, look_ahead_ns(stream, grid_ns, exact))
             attributes[f"{name}{masks.GAP_MS}"] = gap_ns / 1e6
             attributes[f"{name}_rate_hz"] = round(mean_rate_hz(stream.t_ns), 3)

@@ -61,7 +61,7 @@ def suggestion(name: str, names: Iterable[str]) -> str:
     return f" Did you mean {plain(similar[0])}?" if similar else ""
 
 
-def grouped_failures(failures: Mapping[str, str], most: int = 5) -> list[str]:
+def grouped_failures(failures: Mapping[str, str], limit: int = 5) -> list[str]:
     """Return one line per reason with the names that failed for it; reasons that differ only in these names are equal.
 
     >>> grouped_failures({"a": "a.csv is empty", "b": "b.csv is empty", "c": "no clock"})
@@ -72,7 +72,7 @@ def grouped_failures(failures: Mapping[str, str], most: int = 5) -> list[str]:
         without_name = re.sub(rf"(?<!\w){re.escape(name)}(?!\w)", "NAME", reason)
         names_by_reason.setdefault(without_name, []).append(name)
     return [
-        f"{listed(names, most)}: {reason if len(names) > 1 else failures[names[0]]}"
+        f"{listed(names, limit)}: {reason if len(names) > 1 else failures[names[0]]}"
         for reason, names in names_by_reason.items()
     ]
 

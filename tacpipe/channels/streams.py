@@ -25,7 +25,7 @@ class Clocks:
 
     start_ns: int
     stop_ns: int
-    rate_hz: float | None  # that of `rate_hz`
+    rate_hz: float | None  # computed by the function `rate_hz`
     gap_starts_ns: Times  # (gap,)
     gap_stops_ns: Times  # (gap,)
 

@@ -59,7 +59,7 @@ _ALIASES = {
     "m/s^2": "meters/second^2 m/s2 m/s²",
     "N m": "nm n·m n*m n.m newtonmeter newtonmeters",
 }
-ALIASES = {word: unit for unit, words in _ALIASES.items() for word in words.split()}  # in lower case
+ALIASES = {word: unit for unit, words in _ALIASES.items() for word in words.split()}  # lower case
 
 
 def is_unit(text: str) -> bool:
@@ -100,7 +100,7 @@ def describe_unknown_unit(word: str, declared: Collection[str] = ()) -> str:
     """
     if not word or is_unit(word) or word in declared:
         return ""
-    meant = ALIASES.get(word.lower())
+    unit = ALIASES.get(word.lower())
     return f"There is no unit {plain(word)}." + (
-        f" Did you mean {meant}?" if meant else suggestion(word, sorted(declared))
+        f" Did you mean {unit}?" if unit else suggestion(word, sorted(declared))
     )

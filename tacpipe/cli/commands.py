@@ -109,8 +109,8 @@ def _show(program: typer.Typer) -> None:
             terminal.result(show_recording.draw(dataset, recording, plot))
             return
         if recording is not None:
-            found = show_recording.overview(dataset, recording)
-            _print(found.to_json() if as_json else found, show_recording.to_text, as_json=as_json, full=full)
+            opened = show_recording.overview(dataset, recording)
+            _print(opened.to_json() if as_json else opened, show_recording.to_text, as_json=as_json, full=full)
             return
         most = None if full or as_json else overview.SHOWN
         _print(overview.of(dataset, most=most), overview.to_text, as_json=as_json, full=full)

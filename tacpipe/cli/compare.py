@@ -151,8 +151,10 @@ class Compared:
                 empty = [""] * (len(heads) - 1 - len(differing) - len(measure.columns))
                 cells = [f"vs {best.name}", *[""] * len(differing), *map(headline.number, best.values), *empty]
                 lines.append(Row(cells, "dim"))
-                for other in (row for row in one.of("baseline") if row.name == measure.reference and row is not best):
-                    cells = [other.name, *[""] * len(differing), *map(headline.number, other.values), *empty]
+                for reference in (
+                    row for row in one.of("baseline") if row.name == measure.reference and row is not best
+                ):
+                    cells = [reference.name, *[""] * len(differing), *map(headline.number, reference.values), *empty]
                     lines.append(Row(cells, "dim"))
             groups.append(Group(one.question.where if len(several) > 1 or one.question.where else "", lines))
         first = 1 + len(differing)
@@ -168,7 +170,7 @@ class Compared:
         points = f"Points are percentage points of {measure.ranked_by} above the best baseline."
         least = min(row.n for one in several for row in one.rows)
         few = f" With n below {headline.FEWEST} no interval proves a difference." if least < headline.FEWEST else ""
-        chosen = max(len(one.models) for one in several)
+        chosen = max(len(comparison.models) for comparison in several)
         chosen_from = f" Intervals account for the choice among {chosen} methods." if chosen > 1 else ""
         pooled = "Runs that differ in seed or fold alone are pooled (--each lists them). " if self.pooled else ""
         return (
@@ -187,16 +189,16 @@ def run(paths: Sequence[Path], *, pool: bool) -> Compared:
     for path, one in results.items():
         if METRICS not in one.files:
             raise UsageError(f"{path} was made by {one.source.stage}; give results of `tacpipe evaluate`.")
-    found = Compared(results, engine.compare(list(results.values()), pool=pool), pool, _places(paths))
-    if not found.comparisons:
+    compared = Compared(results, engine.compare(list(results.values()), pool=pool), pool, _places(paths))
+    if not compared.comparisons:
         raise UsageError(
             "None of these results holds the errors of single recordings. Run `tacpipe evaluate` again, or give "
             "results of recordings that the model has not seen."
         )
     reason = "no errors of single recordings that the model has not seen are stored"
-    for line in printable.grouped_failures(dict.fromkeys(found.unused(), reason)):
+    for line in printable.grouped_failures(dict.fromkeys(compared.unused(), reason)):
         terminal.note(f"tacpipe: left out {line}.")
-    return found
+    return compared
 
 
 def _competes(row: engine.Row) -> bool:

@@ -46,8 +46,8 @@ def table(headlines: Sequence[Headline]) -> Table:
         if one.best:
             values = map(headline.number, one.best.values)
             rows.append(Row([f"vs {one.best.name.replace('_', ' ')}", *values, "", _VERDICTS[one.verdict], ""], "dim"))
-            others = [row for row in one.shown if row is not one.best]
-            rows += [Row([row.name, *map(headline.number, row.values), "", "", ""], "dim") for row in others]
+            baselines = [row for row in one.table_baselines if row is not one.best]
+            rows += [Row([row.name, *map(headline.number, row.values), "", "", ""], "dim") for row in baselines]
         groups.append(Group(one.where, rows))
     errors = list(range(1, len(first.columns)))  # the last one ranks
     return Table(heads, groups, caption(headlines), spare=[*errors[1:-1], *errors[-1:], *errors[:1]][: len(errors)])

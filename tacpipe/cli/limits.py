@@ -76,7 +76,7 @@ def text(found: Limits) -> str:
     rows = [
         [
             _bounds(low, high),
-            str(max(one.pairs for one in by.values())),
+            str(max(estimates.pairs for estimates in by.values())),
             *(_cell(by[name].pair_skill) for name in TARGETS),
         ]
         for low, high, by in found.near
@@ -128,11 +128,11 @@ def _bounds(low: float, high: float) -> str:
     return f"{low:g} or more" if math.isinf(high) else f"{low:g} to {high:g}"
 
 
-def _cell(one: Estimate) -> str:
-    if math.isnan(one.mean):
+def _cell(estimate: Estimate) -> str:
+    if math.isnan(estimate.mean):
         return "-"
-    bounds = "" if math.isnan(one.low) else f" ({_fixed(one.low)} to {_fixed(one.high)})"
-    return _fixed(one.mean) + bounds
+    bounds = "" if math.isnan(estimate.low) else f" ({_fixed(estimate.low)} to {_fixed(estimate.high)})"
+    return _fixed(estimate.mean) + bounds
 
 
 def _fixed(value: float) -> str:

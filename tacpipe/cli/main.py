@@ -28,7 +28,7 @@ Exit codes: 0 done, 1 failed, 2 usage, 3 would change (--check), 4 damaged data,
 """
 
 
-ALIASES = {"eval": "evaluate", "sync": "synchronize"}  # what people type; help and completion do not list them
+ALIASES = {"eval": "evaluate", "sync": "synchronize"}  # abbreviations that help and completion do not list
 
 
 def app(arguments: Sequence[str]) -> typer.Typer:

@@ -140,11 +140,11 @@ def _recordings_text(value: dict[str, Any], full: bool) -> list[str]:
     for name in shown:
         cell = printable.padded(printable.shown(name), 24)
         for stream, figures in value["recordings"][name].items():
-            held = f"{figures['held_share']:.0%}" if "held_share" in figures else ""
+            repeated = f"{figures['held_share']:.0%}" if "held_share" in figures else ""
             lines.append(
                 f"{cell} {stream or '-':<10} {figures['rows']:>7} {figures.get('columns', ''):>7} "
                 f"{figures.get('duration_s', ''):>8} {figures.get('rate_hz', '') or '':>8} {gaps_text(figures):>5} "
-                f"{held:>5} {figures.get('saturated', ''):>9}"
+                f"{repeated:>5} {figures.get('saturated', ''):>9}"
             )
     if count > len(shown):
         lines.append(f"… and {count - len(shown)} more (--full)")

@@ -146,7 +146,7 @@ def overview(dataset: Path, name: str) -> RecordingOverview:
                 _select(stored, [name for name in quantities if quantities[name] == "label"])
             )
     events = spans.events(recording.table(streams.EVENTS)) if streams.EVENTS in recording.streams else []
-    start_ns = min((each.start_ns for each in clocks), default=None)
+    start_ns = min((stream_clocks.start_ns for stream_clocks in clocks), default=None)
     origin_ns = start_ns or 0
     return RecordingOverview(
         name,
@@ -154,7 +154,7 @@ def overview(dataset: Path, name: str) -> RecordingOverview:
         recording.digest,
         sum(recording.sizes.values()),
         start_ns,
-        (max(each.stop_ns for each in clocks) - origin_ns) / 1e9 if clocks else None,
+        (max(stream_clocks.stop_ns for stream_clocks in clocks) - origin_ns) / 1e9 if clocks else None,
         figures,
         columns,
         _intervals(gaps, origin_ns),
@@ -194,10 +194,10 @@ def _select(stored: Columns, names: Sequence[str]) -> pa.Table:
     return pa.table([stored.column(name) for name in names], pa.schema([stored.schema.field(name) for name in names]))
 
 
-def _intervals(found: Sequence[Span], origin_ns: int) -> list[Interval]:
+def _intervals(marked: Sequence[Span], origin_ns: int) -> list[Interval]:
     return [
         Interval(span.lane, span.text, (span.start_ns - origin_ns) / 1e9, (span.stop_ns - origin_ns) / 1e9)
-        for span in found
+        for span in marked
     ]
 
 
@@ -277,10 +277,12 @@ def _streams_text(recording: RecordingOverview) -> str:
     heads = ("stream", "rows", "columns", "s", "Hz", "mean Hz", "gaps", "held", "saturated")
     rows = []
     for stream, figures in recording.streams.items():
-        held = f"{figures['held_share']:.0%}" if "held_share" in figures else ""
+        repeated = f"{figures['held_share']:.0%}" if "held_share" in figures else ""
         values = [figures.get(key) for key in ("rows", "columns", "duration_s", "rate_hz", "mean_hz")]
         cells = ["" if value is None else f"{value:,}" for value in values]
-        rows.append(Row((shown(stream) or "-", *cells, gaps_text(figures), held, str(figures.get("saturated", "")))))
+        rows.append(
+            Row((shown(stream) or "-", *cells, gaps_text(figures), repeated, str(figures.get("saturated", ""))))
+        )
     notes = [RATES, _MEAN_RATES] if recording.start_ns is not None else []
     if any(figures["rows"] > SAMPLED_ROWS and "saturated" in figures for figures in recording.streams.values()):
         notes.append(f"held and saturated are of the first {SAMPLED_ROWS:,} rows.")
@@ -332,8 +334,8 @@ def _intervals_text(label_spans: Sequence[Interval], full: bool) -> str:
 def _events_text(events: Sequence[Event], full: bool) -> str:
     lines = [f"  {event.time_s:.3f} s  {shown(f'{event.stream}: {event.text}')}" for event in events]
     retained = lines if full else lines[:_LISTED]
-    more = [f"  … and {len(lines) - len(retained)} more (--full)"] if len(lines) > len(retained) else []
-    return "\n".join(["events", *retained, *more]) if lines else ""
+    ending = [f"  … and {len(lines) - len(retained)} more (--full)"] if len(lines) > len(retained) else []
+    return "\n".join(["events", *retained, *ending]) if lines else ""
 
 
 def _first(places: Sequence[str], full: bool) -> str:
@@ -348,5 +350,5 @@ def _attributes_text(attributes: Mapping[str, Any], full: bool) -> str:
     names = sorted(attributes)
     listed_names = names if full else [name for name in names if not name.startswith(streams.TRUTH)][:_LABELS]
     lines = [f"  {shown(name)}: {shown(str(attributes[name]))}" for name in listed_names]
-    more = [f"  … and {len(names) - len(lines)} more (--full)"] if len(names) > len(lines) else []
-    return "\n".join(["labels", *lines, *more]) if names else ""
+    ending = [f"  … and {len(names) - len(lines)} more (--full)"] if len(names) > len(lines) else []
+    return "\n".join(["labels", *lines, *ending]) if names else ""

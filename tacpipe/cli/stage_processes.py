@@ -98,8 +98,8 @@ class StageProcesses:
         self._slots[name] = min(set(range(self.jobs)) - set(self._slots.values()))
         gpu = devices.gpu_for(self._slots[name])
         variables = processor.each_of(self.jobs) | processor.jobs_of(together) | gpu
-        given = words, str(Path.cwd()), variables, *map(str, self._printed(self._slots[name]))
-        process = self._context.Process(target=_run, args=given)
+        arguments = words, str(Path.cwd()), variables, *map(str, self._printed(self._slots[name]))
+        process = self._context.Process(target=_run, args=arguments)
         with termination.deferred(), forking.without_main():
             process.start()
         self._running[name] = process

@@ -206,8 +206,10 @@ def headline(row: Row, comparison: Comparison) -> Headline | None:
     question, method = comparison.question, row.method
     source = next((one.method for one in comparison.rows if one.kind == "baseline"), method)
     task = Task(comparison.task)
-    others = [one for one in comparison.models if one is not row] if row.kind == "model" else []
-    ranked = [_ranked(task, one.method, source, question, one.predictor) for one in others]
+    rivals = (
+        [row_of_model for row_of_model in comparison.models if row_of_model is not row] if row.kind == "model" else []
+    )
+    ranked = [_ranked(task, rival.method, source, question, rival.predictor) for rival in rivals]
     return pairing.headline(
         comparison.task,
         row.name,
@@ -263,7 +265,7 @@ def _row(
         spread(each).sd,
         next(iter(pairs), ""),
         gain,
-        next((one.p(measure) for one in pairs.values()), math.nan),
+        next((compared.p(measure) for compared in pairs.values()), math.nan),
         gain.clusters or len({clusters[name] if clusters else name for _, name in sums}),
         len({recording for _, recording in sums}),
         len(runs),

@@ -147,19 +147,19 @@ def edited_files(store: Store, manifest: Manifest, directory: Path) -> list[str]
     """Return the files in ``directory`` that were edited, and that making it show the export ``manifest`` would replace."""
     directory = directory.absolute()
     stale = dict(_stale(store, manifest, directory))
-    _, gone = _compared(_shown(directory), manifest, directory, whole=False)
-    return _edited(store, manifest, directory, {*stale, *gone})
+    _, removed = _compared(_shown(directory), manifest, directory, whole=False)
+    return _edited(store, manifest, directory, {*stale, *removed})
 
 
 def _edited(store: Store, manifest: Manifest, directory: Path, paths: Iterable[str]) -> list[str]:
     """Return the files of an export that hold neither what was written there last nor an object of the store."""
-    shown = _shown(directory)
-    if not (shown or manifest).exported:  # shards are links: what differs is damage
+    current = _shown(directory)
+    if not (current or manifest).exported:  # shards are links: what differs is damage
         return []
-    written = {} if shown is None else {path: file["digest"] for path, file in shown.files.items()}
+    digests_written = {} if current is None else {path: file["digest"] for path, file in current.files.items()}
     present = [path for path in sorted(paths) if (directory / path).is_file()]
     digests = {path: file_digest(directory / path) for path in present}
-    return [path for path, name in digests.items() if name != written.get(path) and not store.has(name)]
+    return [path for path, name in digests.items() if name != digests_written.get(path) and not store.has(name)]
 
 
 def _keep_edited(store: Store, manifest: Manifest, directory: Path, paths: Iterable[str]) -> None:

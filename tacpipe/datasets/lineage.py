@@ -246,7 +246,7 @@ def _lines(node: dict[str, Any], depth: int, described: set[str], argument: str 
     if node["manifest"] in described:
         return [f"{place}  as above"]
     described.add(node["manifest"])
-    what = (
+    content = (
         f"{counted(node['recordings'], 'recordings')}, {counted(node['rows'], 'rows')}"
         if node["recordings"]
         else _files(node)
@@ -254,7 +254,7 @@ def _lines(node: dict[str, Any], depth: int, described: set[str], argument: str 
     nested = {name: tree for name, value in node["params"].items() if (tree := _nested(value)) is not None}
     params = ", ".join(f"{name}={value}" for name, value in node["params"].items() if name not in nested)
     lines = [
-        f"{place}  {what}",
+        f"{place}  {content}",
         f"{pad}  {node['stage']} version {node['version']}" + (f" ({params})" if params else ""),
         *(f"{pad}    {line}" for name, tree in nested.items() for line in _nested_lines(name, tree)),
     ]

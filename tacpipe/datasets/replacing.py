@@ -230,10 +230,10 @@ def refuse_losses(before: Manifest | None, output: Path, after: Manifest) -> Non
 
 def edited(output: Path, paths: Sequence[str]) -> UsageError:
     """Return the error for files of an export that somebody edited."""
-    several = len(paths) > 1
+    plural = len(paths) > 1
     return UsageError(
-        f"{output} holds {'files' if several else 'a file'} that {'were' if several else 'was'} edited after the export "
-        f"({listed(paths, _SHOWN)}). Move {'them' if several else 'it'} elsewhere, or give -o another directory, or "
+        f"{output} holds {'files' if plural else 'a file'} that {'were' if plural else 'was'} edited after the export "
+        f"({listed(paths, _SHOWN)}). Move {'them' if plural else 'it'} elsewhere, or give -o another directory, or "
         f"--replace. {_BACK}"
     )
 

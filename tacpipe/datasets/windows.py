@@ -220,17 +220,17 @@ class Windows(torch.utils.data.Dataset[Window]):
         std = np.sqrt(squares / count)
         return Scaling(mean, np.where(std > 0, std, 1.0))
 
-    def _from_other(self, other: Windows) -> Scaling:
+    def _from_other(self, source: Windows) -> Scaling:
         """Return the scaling of other windows for the channels of these."""
-        scaling = other.scaling
+        scaling = source.scaling
         if scaling is None:
             raise UsageError("scale is windows that are not scaled themselves; make them with scale=True.")
-        missing = [name for name in self.columns if name not in other.columns]
+        missing = [name for name in self.columns if name not in source.columns]
         if missing:
             raise UsageError(
                 f"The windows to scale by have no channel {plain(missing[0])}; give both the same channels."
             )
-        at = other._positions(self.columns)
+        at = source._positions(self.columns)
         return Scaling(scaling.mean[at], scaling.std[at])
 
     def _names_of_channels(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -245,7 +245,7 @@ class Windows(torch.utils.data.Dataset[Window]):
 
     def _rows(self, name: str) -> _Rows:
         rows = self._cache.pop(name, None) or self._decoded(self.dataset[name])
-        self._cache[name] = rows  # as the one used last
+        self._cache[name] = rows  # moves it to the end, as the last one used
         while len(self._cache) > 1 and sum(_bytes(cached) for cached in self._cache.values()) > KEPT_BYTES:
             self._cache.popitem(last=False)
         return rows

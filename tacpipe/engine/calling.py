@@ -99,12 +99,12 @@ def _refuse_unread(name: str, stage: AnyStage, datasets: Sequence[Given], named:
         "init": "init" in stage.arguments,
         "extend": "extend" in stage.arguments,
     }
-    given = {**dict.fromkeys(named, True), "fold": how.fold != 0, "role": how.role is not None}
-    given |= {"track": bool(how.track), "device": how.device != AUTO}
+    is_set = {**dict.fromkeys(named, True), "fold": how.fold != 0, "role": how.role is not None}
+    is_set |= {"track": bool(how.track), "device": how.device != AUTO}
     reads |= {"fold": reads["split"], "role": stage.reads_model and not stage.needs_split, "track": stage.tracked}
     reads |= {"device": stage.trains}
-    for key in given:
-        if given[key] and not reads[key]:
+    for key in is_set:
+        if is_set[key] and not reads[key]:
             raise UsageError(f"The stage {name} does not read {key}; leave it out.")
     if stage.source and len(datasets) != 1:
         raise UsageError(f"The stage {name} reads one folder of recordings, not {len(datasets)}.")

@@ -106,12 +106,12 @@ def _begun(task: Task, store: Store) -> Callable[[], Done]:
     try:
         with ExitStack() as leases:
             with devices.chosen(task.device):
-                found = _computed(task, store, key, leases)
-            if isinstance(found, _Made):
-                return _Sending(task, store, found, leases.pop_all())
+                outcome = _computed(task, store, key, leases)
+            if isinstance(outcome, _Made):
+                return _Sending(task, store, outcome, leases.pop_all())
     except TacpipeError as error:
-        found = _failed(task, store, error)
-    done: Done = found
+        outcome = _failed(task, store, error)
+    done: Done = outcome
     return lambda: done
 
 
@@ -166,11 +166,11 @@ def _computed(task: Task, store: Store, key: str, leases: ExitStack) -> Done | _
         stage = execution.stage_of(task.name)
         code = provenance.code(stage)  # The file may be edited while the stage runs
         result, notes = execution.execute(task, store, store)
-    made = {**provenance.of(round(time.perf_counter() - started, 4)), "irreplaceable": stage.source}
-    made |= {"code": code, "packages": provenance.code_of_packages(task.identity, packages), "notes": notes}
+    origin = {**provenance.of(round(time.perf_counter() - started, 4)), "irreplaceable": stage.source}
+    origin |= {"code": code, "packages": provenance.code_of_packages(task.identity, packages), "notes": notes}
     if stage.source:  # the record alone would mark this as a recording, until a dataset's manifest does
         store.put(_manifest_of(task, stage, result).content, durable=True)
-    return _Made(result, made, replace, stage.source)
+    return _Made(result, origin, replace, stage.source)
 
 
 def _manifest_of(task: Task, stage: AnyStage, result: Mapping[str, Any]) -> Manifest:

@@ -106,11 +106,11 @@ def _add_counts(total: dict[str, dict[str, int]], counts: Mapping[str, Mapping[s
 def _other_package(package: str, counts: Mapping[str, int]) -> str:
     """Return the warning for a plug-in package as `_other_code` does for a stage."""
     now = registry.package_code(package)  # None: it is gone, and its results stay valid
-    others = sum(number for code, number in counts.items() if code != now)
-    if now is None or not others:
+    outdated = sum(number for code, number in counts.items() if code != now)
+    if now is None or not outdated:
         return ""
     return (
-        f"{others} of these results were computed by other code of the package {package} than is installed now. Raise the "
+        f"{outdated} of these results were computed by other code of the package {package} than is installed now. Raise the "
         f"version of the package or of the stage if they differ, or compute them again with --rerun."
     )
 

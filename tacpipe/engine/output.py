@@ -106,9 +106,9 @@ def settle(store: Store, request: Request, plan: replacing.Plan, work: Work) -> 
             return place.published(work, work.result(rerun=False))
 
 
-def _quarantine_damaged(store: Store, made: Manifest) -> None:
+def _quarantine_damaged(store: Store, manifest: Manifest) -> None:
     """Read all objects of a dataset, so that every damaged one is in quarantine and counts as missing."""
-    for name, size in dict(made.sizes()).items():
+    for name, size in dict(manifest.sizes()).items():
         with suppress(MissingError):
             for _ in store.blocks(name, size):
                 pass
@@ -313,8 +313,8 @@ class _Directory(_Place):
         def decided() -> directory.Change:  # somebody may have labelled what is there
             wanted = self.settled(made)
             self._refuse_losses(wanted)
-            whole = previous is not None and previous.stands()
-            return directory.Change(wanted, whole=whole, replace=self.request.replace)
+            complete = previous is not None and previous.stands()
+            return directory.Change(wanted, whole=complete, replace=self.request.replace)
 
         return directory.change(self.store, self.request.output, decided)
 

@@ -330,17 +330,17 @@ class _Run:
 
     def _roles(self, name: str) -> Any:
         """Return what identifies the roles of the argument ``name``, None where its option was not given."""
-        found = self.inputs.named.get(name)
+        dataset = self.inputs.named.get(name)
         fold = self.request.fold
-        if found is None:
+        if dataset is None:
             if name == "split" and fold:
                 raise UsageError(f"--fold {fold} has no effect without --split.")
             return None
-        table = roles.digest(found.manifest, str(found.directory))
+        table = roles.digest(dataset.manifest, str(dataset.directory))
         if name != "split":
             return table
         if not self.inputs.roles.keys() & self.inputs.merged.included.keys():
-            raise UsageError(f"No recording of the dataset has a role in {found.directory}. Split this dataset.")
+            raise UsageError(f"No recording of the dataset has a role in {dataset.directory}. Split this dataset.")
         return {"roles": table, "fold": fold}
 
     def _whole(self, name: str, identity: Mapping[str, Any], *, counted: bool = True) -> Mapping[str, Any]:

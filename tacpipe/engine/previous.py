@@ -116,7 +116,7 @@ class Previous:
         codes: Mapping[str, int] = (provenance.get("code") or {}).get(stage) or {}
         packages: Mapping[str, Mapping[str, int]] = provenance.get("packages") or {}
         for counts in filter(None, (codes, *packages.values())):
-            if [*counts.values()] != [len(self.made.recordings)]:  # which were computed by other code is not known
+            if [*counts.values()] != [len(self.made.recordings)]:  # it is unknown which results other code computed
                 return None
         left = {*others, ""}  # the last: of a stage over a whole dataset, which is asked again
         given: Mapping[str, Sequence[str]] = provenance.get("notes") or {}

@@ -107,8 +107,10 @@ def code_of_packages(identity: Mapping[str, Any], used: Iterable[str] = ()) -> d
     """
     lineages = (value.get("lineage") or {} for value in identity["inputs"].values() if isinstance(value, Mapping))
     params = [identity["params"], *(lineage.get("params") or {} for lineage in lineages)]
-    named = {str(values[architectures.PLUGIN]).partition(" ")[0] for values in params if architectures.PLUGIN in values}
-    codes = {package: registry.package_code(package) for package in sorted({*used, *named})}
+    packages = {
+        str(values[architectures.PLUGIN]).partition(" ")[0] for values in params if architectures.PLUGIN in values
+    }
+    codes = {package: registry.package_code(package) for package in sorted({*used, *packages})}
     return {package: code for package, code in codes.items() if code is not None}
 
 

@@ -55,7 +55,7 @@ class Request:
     init: Path | None = None
     jobs: int = 0
     executor: str = ""  # NAME or NAME://ADDRESS; empty: that of the environment, or this computer
-    device: Device = AUTO  # what networks are trained on
+    device: Device = AUTO  # the device that networks are trained on
     skip_bad: bool = False
     check: bool = False
     compare: bool = False
@@ -75,7 +75,7 @@ class Request:
 
     @property
     def locations(self) -> list[Path]:
-        """Where the store is looked for: the output, then the datasets that are read; a published source has none."""
+        """Return the places to look for the store: the output, then the datasets that are read."""
         return [self.output, *self.datasets, *(path for name, path in self.named.items() if name in DATASETS)]
 
     @property
@@ -116,12 +116,12 @@ class Inputs:
         """Return sentences about the files below the source that no recording is read from."""
         if self.request.source is None or not self.sources:
             return []
-        read = {path for one in self.sources.values() for path in one.files.values()}
+        read = {path for source in self.sources.values() for path in source.files.values()}
         if self.stage.why_unread is not None:
             reason = self.stage.why_unread(self.request.params, self.request.source)
         else:
             command = self.request.name.replace(".", " ")
-            reason = f"`tacpipe {command}` reads no recording from it".format  # of any path
+            reason = f"`tacpipe {command}` reads no recording from it".format  # the reason is the same for any path
         return unread.describe(self.request.source, read, reason, self.request.output)
 
     def plan(self) -> Plan:

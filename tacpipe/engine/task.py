@@ -22,7 +22,7 @@ class Task:
     replace: bool = False  # the old record names objects that are gone
     dry: bool = False  # compute and compare, store nothing
     rerun: bool = False  # compute although a result is stored
-    device: Device = AUTO  # what networks are trained on
+    device: Device = AUTO  # the device that networks are trained on
     run: str = ""  # the lease of the run that it is part of
 
 

@@ -98,8 +98,8 @@ def _losses(stream: str, schema: pa.Schema) -> Iterator[Loss]:
     """Yield what of a stream the card does not hold."""
     for field in schema:
         if not croissant.type_of(str(field.type)):
-            what = f"{croissant.NAME} has no type for {field.type}; the Parquet files have the column"
-            yield Loss(what, stream, field.name)
+            reason = f"{croissant.NAME} has no type for {field.type}; the Parquet files have the column"
+            yield Loss(reason, stream, field.name)
     if RECORDING in schema.names:
         yield Loss("the recording's name, as the stream has a column of this name", stream, RECORDING)
 

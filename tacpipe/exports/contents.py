@@ -143,10 +143,10 @@ def unwritten(
 
     A stream of which only the time is carried becomes one loss.
     """
-    named = {(loss.stream, loss.column) for loss in losses}
+    named_losses = {(loss.stream, loss.column) for loss in losses}
     carried_streams = {stream for stream, column in carried if column != TIME}
-    missing = [name for name in names if name not in carried and not {name, (name[0], "")} & named]
-    empty = {stream for stream, _ in names} - carried_streams - {stream for stream, _ in named}
+    missing = [name for name in names if name not in carried and not {name, (name[0], "")} & named_losses]
+    empty = {stream for stream, _ in names} - carried_streams - {stream for stream, _ in named_losses}
     empty &= {stream for stream, _ in missing}
     return list(dict.fromkeys(Loss(reason, stream, "" if stream in empty else column) for stream, column in missing))
 

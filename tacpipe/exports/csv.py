@@ -50,12 +50,12 @@ class Params:
 @stage(version=2)
 def part(params: Params, recording: Recording, name: RecordingName) -> Result:
     """Return one file per stream."""
-    written: dict[str, Callable[[Any], object]] = {}
+    writers: dict[str, Callable[[Any], object]] = {}
     losses: list[Loss] = []
     for stream in recording.streams:
         losses += list(_losses(stream, recording.columns(stream)))
-        written[f"{name}/{shown(stream)}.csv"] = functools.partial(_write, recording, stream)
-    return Result({"": RecordingOutput(contents.part(recording, losses))}, written=written)
+        writers[f"{name}/{shown(stream)}.csv"] = functools.partial(_write, recording, stream)
+    return Result({"": RecordingOutput(contents.part(recording, losses))}, written=writers)
 
 
 @stage(version=2, part=part)

@@ -113,9 +113,9 @@ def usual_topics(stream: str, table: pa.Table, images: Sequence[str] = ()) -> li
     t_ns = table.column(TIME).to_numpy()
 
     def add(name: str, kind: str, stamps_ns: Int64s, parts: Sequence[Part]) -> None:
-        every = [*cdr.header(stamps_ns, shown(stream)), *parts]
+        values = [*cdr.header(stamps_ns, shown(stream)), *parts]
         metadata = {"derived_from": top}
-        topics.append(Topic(f"{top}/{name}", _full(kind), _definition(kind, _DEFINITIONS), stamps_ns, every, metadata))
+        topics.append(Topic(f"{top}/{name}", _full(kind), _definition(kind, _DEFINITIONS), stamps_ns, values, metadata))
 
     for column in images:
         values = [value or b"" for value in table.column(column).to_pylist()]

@@ -94,7 +94,11 @@ def zarr(params: Params, recordings: Dataset, parts: Parts, originals: Dataset) 
     names = [recording.name for recording in every]
     files |= {".zgroup": _GROUP, "data/.zgroup": _GROUP, "meta/.zgroup": _GROUP}
     files["meta/.zattrs"] = _json(
-        {"rate_hz": rate_hz, "recordings": names, "labels": {each.name: dict(each.attributes) for each in every}}
+        {
+            "rate_hz": rate_hz,
+            "recordings": names,
+            "labels": {recording.name: dict(recording.attributes) for recording in every},
+        }
     )
     files = {f"{STORE}/{name}": content for name, content in files.items()}
     files[readme.NAME] = readme.text("Tactile recordings as a Zarr replay buffer", _OPENING, recordings, described)

@@ -16,9 +16,9 @@ from tacpipe.errors import ShortageError, TacpipeError
 
 MEMINFO = Path("/proc/meminfo")
 STATM = Path("/proc/self/statm")
-GROUPS = Path("/sys/fs/cgroup")  # of containers: their limits, and what is used of them
-OWN_GROUPS = Path("/proc/self/cgroup")  # which of them this process is in
-_VERSIONS = {  # of control groups: files with the limit and the use, and of reclaimable bytes the name in memory.stat
+GROUPS = Path("/sys/fs/cgroup")  # memory limits and use of containers
+OWN_GROUPS = Path("/proc/self/cgroup")  # the control groups of this process
+_VERSIONS = {  # version to the files of limit and use, and the entry of reclaimable bytes in memory.stat
     "": ("memory.max", "memory.current", "inactive_file"),
     "memory": ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
 }
@@ -40,21 +40,21 @@ _NO_THREAD = ("can't start new thread", "Resource temporarily unavailable")
 
 def available() -> int:
     """Return how many bytes this process can still take: by the computer, its container and its own limit."""
-    left = [1 << 62]
+    free_bytes = [1 << 62]
     with contextlib.suppress(OSError, ValueError, IndexError):
         fields = dict(line.split(":", 1) for line in MEMINFO.read_text().splitlines())
-        left.append(int(fields["MemAvailable"].split()[0]) << 10)
-    left += _left_in_groups()
+        free_bytes.append(int(fields["MemAvailable"].split()[0]) << 10)
+    free_bytes += _left_in_groups()
     limit, _ = resource.getrlimit(resource.RLIMIT_AS)
     if limit != resource.RLIM_INFINITY:
         with contextlib.suppress(OSError, ValueError, IndexError):
-            left.append(limit - int(STATM.read_text().split()[0]) * resource.getpagesize())
-    return max(0, min(left))
+            free_bytes.append(limit - int(STATM.read_text().split()[0]) * resource.getpagesize())
+    return max(0, min(free_bytes))
 
 
 def _left_in_groups() -> Iterator[int]:
     """Yield how many bytes each control group of this process, of version 1 or 2, and those above it have left."""
-    lines = ["0::/", "0:memory:/"]  # as a container sees its own
+    lines = ["0::/", "0:memory:/"]  # the paths that a container sees
     with contextlib.suppress(OSError):
         lines += OWN_GROUPS.read_text().splitlines()
     places: dict[Path, str] = {}
@@ -67,13 +67,13 @@ def _left_in_groups() -> Iterator[int]:
                 [place, *place.parents[: len(place.parts) - len((GROUPS / version).parts)]], version
             )
     for place, version in places.items():
-        most, used, reclaimable = _VERSIONS[version]
+        limit_file, used, reclaimable = _VERSIONS[version]
         with contextlib.suppress(OSError, ValueError):  # "max" where there is no limit
-            left = int((place / most).read_text()) - int((place / used).read_text())
+            group_bytes = int((place / limit_file).read_text()) - int((place / used).read_text())
             with contextlib.suppress(OSError, ValueError):
                 counts = dict(line.split(maxsplit=1) for line in (place / "memory.stat").read_text().splitlines())
-                left += int(counts.get(reclaimable, 0))
-            yield left
+                group_bytes += int(counts.get(reclaimable, 0))
+            yield group_bytes
 
 
 def limited() -> bool:
@@ -175,28 +175,28 @@ def require(needed: int, what: str, *, error: type[TacpipeError] = TacpipeError)
         )
 
 
-def require_block(size: int, what: str) -> None:
+def require_block(size: int, source: str) -> None:
     """Raise `TacpipeError` where a chunk, a page or a record of a file declares more than `MOST_BLOCK` bytes."""
     if size > MOST_BLOCK:
         raise TacpipeError(
-            f"{what} declares {readable_size(size)} in one piece, and at most {readable_size(MOST_BLOCK)} are read at once. "
-            "Write it in smaller chunks; if its source is untrusted, do not use it."
+            f"{source} declares {readable_size(size)} in one piece, and at most {readable_size(MOST_BLOCK)} are read at "
+            "once. Write it in smaller chunks; if its source is untrusted, do not use it."
         )
 
 
 @contextlib.contextmanager
-def bounded(most: int, what: str) -> Iterator[None]:
-    """Raise `TacpipeError` where the block takes more than ``most`` bytes more than are taken, on Linux.
+def bounded(max_bytes: int, source: str) -> Iterator[None]:
+    """Raise `TacpipeError` where the block takes more than ``max_bytes`` of further memory, on Linux.
 
     It is for libraries that unpack what a file holds without a look at how much that is.
     """
     soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
     try:
-        limit = int(STATM.read_text().split()[5]) * resource.getpagesize() + most
+        limit = int(STATM.read_text().split()[5]) * resource.getpagesize() + max_bytes
     except (OSError, ValueError, IndexError):
         yield
         return
-    limit = min(one for one in (limit, soft, hard) if one != resource.RLIM_INFINITY)
+    limit = min(bound for bound in (limit, soft, hard) if bound != resource.RLIM_INFINITY)
     resource.setrlimit(resource.RLIMIT_DATA, (limit, hard))
     try:
         yield
@@ -204,8 +204,8 @@ def bounded(most: int, what: str) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
         if isinstance(error, MemoryError) or "alloc" in str(error).lower():
             raise TacpipeError(
-                f"{what} unpacks to more than {readable_size(most)}, which is more than it declares or than is read at "
-                "once. If its source is untrusted, do not use it."
+                f"{source} unpacks to more than {readable_size(max_bytes)}, which is more than it declares or than is "
+                "read at once. If its source is untrusted, do not use it."
             ) from error
         raise
     finally:

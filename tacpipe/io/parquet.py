@@ -112,39 +112,47 @@ def from_parquet(content: bytes, columns: Sequence[str] | None = None) -> pa.Tab
 
 
 def require_claims(
-    path: Path, columns: Collection[str] | None, *, share: float = 1.0, most: int | None = None, rows: int | None = None
+    path: Path,
+    columns: Collection[str] | None,
+    *,
+    share: float = 1.0,
+    max_bytes: int | None = None,
+    rows: int | None = None,
 ) -> None:
     """Raise `TacpipeError` where columns of an untrusted file declare more than may be read at once, or than is there.
 
-    That is ``most`` bytes, by default what memory is left, for the fraction ``share`` that is read at once, or
+    That is ``max_bytes`` bytes, by default what memory is left, for the fraction ``share`` that is read at once, or
     `memory.MOST_BLOCK` of ``rows`` rows where so many are. Texts that share an entry of a dictionary count each.
     """
     with regular.failing(path), regular.opened(path) as file:
         try:
             schema = pq.ParquetFile(file).schema
             with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as mapped, memoryview(mapped) as content:
-                least, largest, _ = counted(schema, content, columns, shared=True)
+                encoded, largest, _ = counted(schema, content, columns, shared=True)
                 total, _, _ = counted(schema, content, columns)
         except BROKEN as error:
             raise TacpipeError(
                 f"{path} is not a whole Parquet file: {plain(' '.join(str(error).split()), 200)}. Copy it again."
             ) from error
         memory.require_block(largest, f"A page of {path}")
-        limit = memory.MOST_BLOCK if rows is not None else most
+        limit = memory.MOST_BLOCK if rows is not None else max_bytes
         if rows is None:
-            _require_size(path, int(least * share), limit)
+            _require_size(path, int(encoded * share), limit)
         if total * share > min(limit or total, memory.MOST_BLOCK):
             texts = _text_bytes(file, schema, columns, rows or BATCH_ROWS)
-            _require_size(path, max(texts, default=0) if rows is not None else int((least + sum(texts)) * share), limit)
+            _require_size(
+                path, max(texts, default=0) if rows is not None else int((encoded + sum(texts)) * share), limit
+            )
 
 
-def _require_size(path: Path, size: int, most: int | None) -> None:
-    if most is None:
+def _require_size(path: Path, size: int, max_bytes: int | None) -> None:
+    if max_bytes is None:
         memory.require(size, str(path))
-    elif size > most:
+    elif size > max_bytes:
         raise TacpipeError(
-            f"{path} declares {memory.readable_size(size)} that would be read at once, and {memory.readable_size(most)} are "
-            f"allowed. Write it with shorter texts; if its source is untrusted, do not use it."
+            f"{path} declares {memory.readable_size(size)} that would be read at once, and "
+            f"{memory.readable_size(max_bytes)} are allowed. Write it with shorter texts; if its source is untrusted, do "
+            f"not use it."
         )
 
 

@@ -125,7 +125,7 @@ def expect_inside(folder: Path, paths: Iterable[Path]) -> None:
     if os.environ.get(FOLLOW_LINKS):
         return
     top = os.path.realpath(folder)
-    parents: dict[Path, str] = {}  # where each folder lies
+    parents: dict[Path, str] = {}  # folder to its real path
     for path in paths:
         if path.parent not in parents:
             parents[path.parent] = os.path.realpath(path.parent)

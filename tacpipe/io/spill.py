@@ -90,10 +90,10 @@ def unpack(blocks: Iterable[bytes], target: IO[bytes], path: Path) -> None:
     Raises `StorageError` where that is more than nine tenths of the free disk, before that is full.
     """
     folder = tempfile.gettempdir()
-    left = room = int(shutil.disk_usage(folder).free * KEPT)
+    free_bytes = room = int(shutil.disk_usage(folder).free * KEPT)
     for block in blocks:
-        left -= len(block)
-        if left < 0:
+        free_bytes -= len(block)
+        if free_bytes < 0:
             raise StorageError(
                 f"{path} unpacks to more than the {room / 1e9:.3g} GB that {folder} has left. Set TMPDIR to a folder with "
                 f"more room; if its source is untrusted, do not use it."

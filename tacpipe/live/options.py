@@ -33,7 +33,7 @@ class Options:
     )
     rank: str = "contact"  # of a model of touch: what candidates are ranked by
     nice: int = 1  # by how much the model's process stands back behind the recording
-    allow_look_ahead: bool = False  # whether the model may have been trained on rows that look ahead
+    allow_look_ahead: bool = False  # accept a model that was trained on rows that look ahead
     realtime: bool = False  # whether both run before all ordinary programs
 
     def to_json(self) -> str:

@@ -38,7 +38,7 @@ class Settings:
     split: str = ""  # whose validation recordings are meant
     settle_ms: Annotated[float, Range(0, 1000)] = 2.0
     realtime: bool = False
-    allow_look_ahead: bool = False  # whether the model may have been trained on rows that look ahead
+    allow_look_ahead: bool = False  # accept a model that was trained on rows that look ahead
     sensor: str = ""  # of a model of materials
     every_ms: Annotated[float, Range(10, 10_000)] = 100.0
     least: Annotated[float, Range(above=0, most=1)] = 0.25

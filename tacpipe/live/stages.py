@@ -94,14 +94,18 @@ def refuse_look_ahead(config: Mapping[str, Any], steps: Sequence[Mapping[str, An
 
     ``config`` is the model's configuration, ``steps`` are the stages that it was trained behind.
     """
-    stated: Mapping[str, float] | None = config.get("look_ahead")
-    if stated is None:  # a model of an older version, or of rows that state nothing
+    look_ahead: Mapping[str, float] | None = config.get("look_ahead")
+    if look_ahead is None:  # a model of an older version, or of rows that state nothing
         interpolated = [
             step for step in steps if step["stage"] == SYNCHRONIZE and _params(step).values == "interpolate"
         ]
         text = "their values are interpolated" if interpolated else ""
     else:
-        text = f"{stated['mean_ms']:g} ms on average, at most {stated['max_ms']:g} ms" if stated["max_ms"] else ""
+        text = (
+            f"{look_ahead['mean_ms']:g} ms on average, at most {look_ahead['max_ms']:g} ms"
+            if look_ahead["max_ms"]
+            else ""
+        )
     if text:
         raise TacpipeError(
             f"The model was trained on rows that look ahead ({text}), and a live session has no later samples. Train it on "

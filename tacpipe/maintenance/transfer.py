@@ -118,18 +118,18 @@ def pull(remote: Path | str, paths: Sequence[Path], *, ancestors: bool = False, 
     there, done = remote_store(remote), Transferred()
     for path in paths:
         found, name = _wanted(path, there)
-        here = locate(found.directory)
+        local_store = locate(found.directory)
         manifest = found.manifest  # one edited by hand is refused before anything moves
-        directory_of.check_output(here, found.directory)
-        occupant = replacing.occupant(here, found.directory)
+        directory_of.check_output(local_store, found.directory)
+        occupant = replacing.occupant(local_store, found.directory)
         if occupant is not None and occupant.content != manifest.content and not replace:
             raise UsageError(
                 f"{found.directory} holds another dataset than {name}. --replace writes {name} there, and what is there now "
                 f"stays in the store; `tacpipe store checkout {name} --store {remote} -o DIRECTORY` writes it elsewhere."
             )
-        with here.at_work([found.digest]):
-            bring(there, here, found, done, ancestors=ancestors)
-            directory_of.publish(here, manifest, found.directory, replace=replace)
+        with local_store.at_work([found.digest]):
+            bring(there, local_store, found, done, ancestors=ancestors)
+            directory_of.publish(local_store, manifest, found.directory, replace=replace)
         done.datasets.append(name)
     return done
 
@@ -233,8 +233,8 @@ def _wanted(path: Path, there: AnyStore) -> tuple[manifest_of.Found, str]:
     if (directory / manifest_of.NAME).exists():
         return manifest_of.find(directory), str(directory)
     folder, name = projects.place(directory)
-    here = locate(directory)
-    root = pushed.find(there, str(path), name, projects.known(here, folder))
+    local_store = locate(directory)
+    root = pushed.find(there, str(path), name, projects.known(local_store, folder))
     if root["path"] != name:  # PROJECT:PATH
         if not paths.safe_path(root["path"]):
             raise UsageError(

@@ -58,9 +58,9 @@ class Headline:
         return self.baselines[0] if self.baselines else None
 
     @property
-    def shown(self) -> tuple[Row, ...]:
-        """The baselines that tables show: the best one, and the reference."""
-        return tuple(one for one in self.baselines if one is self.best or one.name == self.reference)
+    def table_baselines(self) -> tuple[Row, ...]:
+        """Return the baselines that tables show: the best one and the reference."""
+        return tuple(row for row in self.baselines if row is self.best or row.name == self.reference)
 
     @property
     def verdict(self) -> str:
@@ -218,7 +218,9 @@ def table(headlines: Sequence[Headline]) -> tuple[list[str], list[list[str]]]:
             told = {BETTER: "model is better", WORSE: "baseline is better", UNCLEAR: "no clear difference"}
             said = told.get(one.verdict, "too few for a verdict")
             rows.append(["", f"best baseline: {best.name}", *map(number, best.values), "", said, ""])
-            rows += [["", row.name, *map(number, row.values), "", "", ""] for row in one.shown if row is not best]
+            rows += [
+                ["", row.name, *map(number, row.values), "", "", ""] for row in one.table_baselines if row is not best
+            ]
     return heads, rows
 
 
@@ -227,7 +229,7 @@ def caption(headlines: Sequence[Headline]) -> str:
     first = headlines[0]
     skill = f" Skill is 1 − error / error of the best baseline; the error is {first.ranked_by}."
     points = f" Points are percentage points of {first.ranked_by} above the best baseline."
-    over = {f"{one.cluster}{' and seeds' if one.seeds > 1 else ''}" for one in headlines}
+    over = {f"{headline.cluster}{' and seeds' if headline.seeds > 1 else ''}" for headline in headlines}
     return (
         f"Units: {first.unit}.{points if first.measure == 'points' else skill} Intervals: jackknife over "
         f"{' or '.join(sorted(over))}, model and baseline on the same ones.{_left_out(headlines)}"
@@ -235,7 +237,7 @@ def caption(headlines: Sequence[Headline]) -> str:
 
 
 def _left_out(headlines: Sequence[Headline]) -> str:
-    count = sum(one.left_out for one in headlines)
+    count = sum(headline.left_out for headline in headlines)
     return f" Left out: {counted(count, 'recordings')} without an error of {headlines[0].reference}." if count else ""
 
 

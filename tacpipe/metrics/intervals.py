@@ -25,7 +25,7 @@ from tacpipe.arrays import AnyArray, AnyFloats
 COVERAGE = 0.95
 LEAST = 3  # clusters of an interval; two show nothing of how much they vary
 DRAWS = 20_000  # simulated values of the largest of several statistics
-NODES, BISECTIONS = 64, 50  # of the integral of Student's density, and of its inversion
+NODES, BISECTIONS = 64, 50  # nodes to integrate Student's density, and steps to invert it
 SMALLEST = 1e-12  # ratio of errors whose logarithm is taken
 Statistic = Callable[[AnyFloats], AnyFloats]  # sums (draw, part) to values (draw, value)
 
@@ -123,26 +123,26 @@ def jackknife(sums: AnyFloats, statistic: Statistic, weights: AnyFloats | None =
         of_seeds = _variance(_influence(statistic, total, sums.sum(axis=1)))
         of_seeds = 2 * of_seeds if seeds == 2 else of_seeds  # a single difference: else intervals hold less than 92 %
         of_seeds = np.maximum(of_seeds - _variance_of_cells(statistic, total, sums), 0)  # both variances hold it
-        both = variance + of_seeds
+        total_variance = variance + of_seeds
         shares = np.square(variance) / freedom + np.square(of_seeds) / (seeds - 1)
-        freedom = np.where(shares > 0, np.square(both) / np.where(shares > 0, shares, 1), freedom)
-        variance = both
+        freedom = np.where(shares > 0, np.square(total_variance) / np.where(shares > 0, shares, 1), freedom)
+        variance = total_variance
     return Jackknife(mean, np.sqrt(variance), freedom, influence)
 
 
-def largest_quantile(several: Sequence[AnyFloats], freedom: float) -> float:
+def largest_quantile(influences: Sequence[AnyFloats], freedom: float) -> float:
     """Return the value that the largest of several t statistics exceeds in 2.5 % of cases where all true values are 0.
 
-    ``several`` are the influences of the same clusters (cluster,) on each value: their correlations are those of the
+    ``influences`` are the influences of the same clusters (cluster,) on each value: their correlations are those of the
     statistics (Hothorn, Bretz and Westfall, Simultaneous inference in general parametric models, 2008).
 
     >>> round(largest_quantile([np.array([1.0, -1.0, 0.5])], 1e6), 2)
     1.96
     """
     level = (1 + COVERAGE) / 2
-    if len(several) < 2:
+    if len(influences) < 2:
         return student_quantile(freedom, level)
-    centred = np.stack([one - one.mean() for one in several])
+    centred = np.stack([values - values.mean() for values in influences])
     lengths = np.sqrt(np.square(centred).sum(axis=1))
     units = centred[lengths > 0] / lengths[lengths > 0, None]  # (statistic, cluster)
     if not len(units):
@@ -190,16 +190,16 @@ def geometric_skill_interval(model: AnyFloats, baseline: AnyFloats, clusters: An
     values = logs.shape[1]
     sums = _by_cluster(np.hstack([logs, counted]), clusters)
 
-    def statistic(found: AnyFloats) -> AnyFloats:
-        count = found[:, values:]
-        return np.where(count > 0, found[:, :values] / np.maximum(count, 1), np.nan)
+    def statistic(draws: AnyFloats) -> AnyFloats:
+        count = draws[:, values:]
+        return np.where(count > 0, draws[:, :values] / np.maximum(count, 1), np.nan)
 
     return skill_of_log_ratio(jackknife(sums[None], statistic, sums[:, values:]).interval())
 
 
-def skill_of_log_ratio(found: Interval) -> Interval:
+def skill_of_log_ratio(log_interval: Interval) -> Interval:
     """Return skill with its interval from those of `log_ratio`."""
-    return Interval(*(-np.expm1(ends) for ends in (found.mean, found.high, found.low)))
+    return Interval(*(-np.expm1(ends) for ends in (log_interval.mean, log_interval.high, log_interval.low)))
 
 
 def skill_interval(
@@ -213,22 +213,22 @@ def skill_interval(
     values = model.shape[1]
     sums = _by_cluster(np.hstack([model, baseline]), clusters)
 
-    def statistic(found: AnyFloats) -> AnyFloats:
-        return power * log_ratio(found[:, :values], found[:, values:])
+    def statistic(draws: AnyFloats) -> AnyFloats:
+        return power * log_ratio(draws[:, :values], draws[:, values:])
 
     return skill_of_log_ratio(jackknife(sums[None], statistic, sums[:, values:]).interval())
 
 
-def share_interval(part: AnyFloats, whole: AnyFloats, clusters: AnyArray | None = None) -> Interval:
-    """Return the share that sums of ``part`` are of ``whole``, both (item, value), with its interval, each (value,).
+def share_interval(part: AnyFloats, total: AnyFloats, clusters: AnyArray | None = None) -> Interval:
+    """Return the share that sums of ``part`` are of ``total``, both (item, value), with its interval, each (value,).
 
     ``clusters`` (item,) name what chance draws, by default each item. Ends are at most 1 and at least 0.
     """
     values = part.shape[1]
-    sums = _by_cluster(np.hstack([part, whole]), clusters)
-    shares = jackknife(sums[None], lambda found: 1 - skill(found[:, :values], found[:, values:]), sums[:, values:])
-    found = shares.interval()
-    return Interval(found.mean, np.maximum(found.low, 0), np.minimum(found.high, 1))
+    sums = _by_cluster(np.hstack([part, total]), clusters)
+    shares = jackknife(sums[None], lambda draws: 1 - skill(draws[:, :values], draws[:, values:]), sums[:, values:])
+    interval = shares.interval()
+    return Interval(interval.mean, np.maximum(interval.low, 0), np.minimum(interval.high, 1))
 
 
 def _by_cluster(rows: AnyFloats, clusters: AnyArray | None) -> AnyFloats:
@@ -252,8 +252,8 @@ def _variance_of_cells(statistic: Statistic, total: AnyFloats, sums: AnyFloats) 
     """Return the variance that neither seeds nor clusters alone explain, of sums (seed, cluster, part), (value,)."""
     seeds, clusters, _ = sums.shape
     cells = _influence(statistic, total, sums.reshape(seeds * clusters, -1)).reshape(seeds, clusters, -1)
-    rest = cells - cells.mean(axis=0) - cells.mean(axis=1, keepdims=True)
-    variance: AnyFloats = np.square(rest).sum(axis=(0, 1)) * seeds * clusters / ((seeds - 1) * (clusters - 1))
+    residuals = cells - cells.mean(axis=0) - cells.mean(axis=1, keepdims=True)
+    variance: AnyFloats = np.square(residuals).sum(axis=(0, 1)) * seeds * clusters / ((seeds - 1) * (clusters - 1))
     return variance
 
 

@@ -56,7 +56,7 @@ class Measure:
 
 @dataclass(frozen=True)
 class Gain:
-    """What a predictor gains over another with its 95 % interval, and what that rests on; NaN where it is not defined."""
+    """The gain of a predictor over another, its 95 % interval and the number of clusters; NaN where undefined."""
 
     mean: float
     low: float
@@ -66,7 +66,7 @@ class Gain:
 
     @property
     def verdict(self) -> str:
-        """Whether the predictor is better or worse, as `tacpipe.metrics.headline.verdict_of` states it."""
+        """Return whether the predictor is better or worse, as `tacpipe.metrics.headline.verdict_of` states it."""
         return verdict_of(self.low, self.high, self.clusters, self.effective)
 
 
@@ -106,8 +106,8 @@ def pair(measure: Measure, model: Sums, baseline: Sums, clusters: Mapping[str, s
         return None
     width = sums.shape[2] // 2
 
-    def statistic(found: AnyFloats) -> AnyFloats:
-        gain = measure.gain(*map(measure.error, (found[:, :width], found[:, width:])))
+    def statistic(draws: AnyFloats) -> AnyFloats:
+        gain = measure.gain(*map(measure.error, (draws[:, :width], draws[:, width:])))
         return (-np.log(np.maximum(1 - gain, intervals.SMALLEST)) if measure.name == "skill" else gain)[:, None]
 
     weights = measure.weight(sums.sum(axis=0)[:, width:])[:, None]
@@ -125,8 +125,8 @@ def gain(measure: Measure, pairs: Sequence[Pair], rivals: Sequence[Pair] = ()) -
     if not pairs:
         return NO_GAIN
     first = pairs[0]
-    found = first.jackknife
-    mean, error, freedom = (float(value[0]) for value in (found.mean, found.error, found.freedom))
+    estimate = first.jackknife
+    mean, error, freedom = (float(value[0]) for value in (estimate.mean, estimate.error, estimate.freedom))
     low = mean - _reach([first, *rivals], freedom) * error
     high = mean + _reach(pairs, freedom) * error
     if measure.name == "skill":
@@ -138,12 +138,12 @@ def _reach(pairs: Sequence[Pair], freedom: float) -> float:
     """Return how many standard errors an end lies off where the largest of several gains was picked."""
     if np.isnan(freedom):
         return float("nan")
-    several = {id(one): one for one in pairs if not np.isnan(one.jackknife.influence).any()}.values()
-    common = set.intersection(*(set(one.names) for one in pairs))
+    distinct = {id(pair): pair for pair in pairs if not np.isnan(pair.jackknife.influence).any()}.values()
+    common = set.intersection(*(set(pair.names) for pair in pairs))
     if len(common) < 2:  # The correlation is not defined, so Bonferroni applies.
         return intervals.student_quantile(freedom, 1 - (1 - intervals.COVERAGE) / 2 / len(pairs))
-    chosen = ([at for at, name in enumerate(one.names) if name in common] for one in several)
-    influences = [one.jackknife.influence[at, 0] for one, at in zip(several, chosen, strict=True)]
+    chosen = ([at for at, name in enumerate(pair.names) if name in common] for pair in distinct)
+    influences = [pair.jackknife.influence[at, 0] for pair, at in zip(distinct, chosen, strict=True)]
     return intervals.largest_quantile(influences, freedom)
 
 
@@ -164,8 +164,8 @@ def headline(
 
     Baselines are compared as `pair` does, ``rivals`` count as in `gain`.
     """
-    alone = pair(measure, model, model, clusters)
-    if alone is None:
+    own_pair = pair(measure, model, model, clusters)
+    if own_pair is None:
         return None
     ranked = rank(measure, model, baselines, clusters)
     over = gain(measure, list(ranked.values()), rivals)
@@ -177,20 +177,20 @@ def headline(
         measure.columns,
         measure.unit,
         measure.ranked_by,
-        Row(method, measure.values(alone.totals[0])),
-        tuple(Row(name, measure.values(one.totals[1])) for name, one in ranked.items()),
+        Row(method, measure.values(own_pair.totals[0])),
+        tuple(Row(name, measure.values(pair.totals[1])) for name, pair in ranked.items()),
         measure.name,
         over.mean,
         over.low,
         over.high,
-        next(iter(ranked.values()), alone).counted,
+        next(iter(ranked.values()), own_pair).counted,
         measure.cluster,
         runs,
-        len(alone.sums),
-        effective=next(iter(ranked.values()), alone).effective,
+        len(own_pair.sums),
+        effective=next(iter(ranked.values()), own_pair).effective,
         methods=1 + len(rivals),
         reference=measure.reference,
-        left_out=len({name for (_, name), one in model.items() if not measure.weight(one[None])[0]}),
+        left_out=len({name for (_, name), sums in model.items() if not measure.weight(sums[None])[0]}),
     )
 
 
@@ -198,8 +198,8 @@ def rank(
     measure: Measure, model: Sums, baselines: Mapping[str, Sums], clusters: Mapping[str, str] | None = None
 ) -> dict[str, Pair]:
     """Return a model next to each baseline that shares recordings with it, by name, that of least error on them first."""
-    pairs = {name: one for name, sums in baselines.items() if (one := pair(measure, model, sums, clusters))}
-    errors = {name: float(measure.error(one.totals[1][None])[0]) for name, one in pairs.items()}
+    pairs = {name: compared for name, sums in baselines.items() if (compared := pair(measure, model, sums, clusters))}
+    errors = {name: float(measure.error(compared.totals[1][None])[0]) for name, compared in pairs.items()}
     return {name: pairs[name] for name in sorted(pairs, key=lambda name: (np.isnan(errors[name]), errors[name]))}
 
 
@@ -211,20 +211,20 @@ def score(measure: Measure, sums: Sums, clusters: Mapping[str, str] | None = Non
     rows = rows[:, :, : rows.shape[2] // 2]
     relative = measure.name == "skill"  # errors of which ratios count
 
-    def statistic(found: AnyFloats) -> AnyFloats:
-        error = measure.error(found)
+    def statistic(draws: AnyFloats) -> AnyFloats:
+        error = measure.error(draws)
         return (np.log(np.maximum(error, intervals.SMALLEST)) if relative else error)[:, None]
 
-    found = intervals.jackknife(rows, statistic, measure.weight(rows.sum(axis=0))[:, None]).interval()
-    ends = np.concatenate([found.low, found.high])
+    interval = intervals.jackknife(rows, statistic, measure.weight(rows.sum(axis=0))[:, None]).interval()
+    ends = np.concatenate([interval.low, interval.high])
     low, high = sorted(map(float, measure.score(np.exp(ends) if relative else ends)))
     return Estimate(measure.score_of(rows.sum(axis=0)), low, high)
 
 
 def difference(measure: Measure, first: Sums, second: Sums, clusters: Mapping[str, str] | None = None) -> Gain:
     """Return what the first predictor gains over the second on the recordings of both; NaN where they share none."""
-    one = pair(measure, first, second, clusters)
-    return gain(measure, [one] if one else [])
+    compared = pair(measure, first, second, clusters)
+    return gain(measure, [compared] if compared else [])
 
 
 def swap_test(measure: Measure, first: AnyFloats, second: AnyFloats) -> float:
@@ -260,30 +260,30 @@ def _swaps(clusters: int) -> AnyArray:
     return np.random.default_rng(0).integers(0, 2, (SWAPS, clusters), dtype=np.int8)
 
 
-def _side_by_side(model: Sums, other: Sums, clusters: Mapping[str, str] | None) -> tuple[AnyFloats, list[str]]:
+def _side_by_side(model: Sums, reference: Sums, clusters: Mapping[str, str] | None) -> tuple[AnyFloats, list[str]]:
     """Return sums of the model, then of another predictor, (seed, cluster, part), and the clusters' names."""
     elsewhere: dict[str, list[AnyFloats]] = {}
-    for (_, recording), one in other.items():
-        elsewhere.setdefault(recording, []).append(one)
+    for (_, recording), errors in reference.items():
+        elsewhere.setdefault(recording, []).append(errors)
     rows = [
         (
             seed,
             recording,
-            one,
-            other[seed, recording] if (seed, recording) in other else np.mean(elsewhere[recording], axis=0),
+            errors,
+            reference[seed, recording] if (seed, recording) in reference else np.mean(elsewhere[recording], axis=0),
         )
-        for (seed, recording), one in model.items()
+        for (seed, recording), errors in model.items()
         if recording in elsewhere
     ]
     if not rows:
         return np.zeros((0, 0, 0)), []
     repeats = _repeats([(seed, recording) for seed, recording, *_ in rows])
-    held = [clusters[recording] if clusters else recording for _, recording, *_ in rows]
-    places = {name: at for at, name in enumerate(sorted(set(held)))}
-    found = np.zeros((max(repeats.values()) + 1, len(places), 2 * len(rows[0][2])))
-    spot = np.array([repeats[seed] for seed, *_ in rows]), np.array([places[name] for name in held])
-    np.add.at(found, spot, np.array([np.concatenate([one, two]) for _, _, one, two in rows]))
-    return found, list(places)
+    units = [clusters[recording] if clusters else recording for _, recording, *_ in rows]
+    places = {name: at for at, name in enumerate(sorted(set(units)))}
+    sums = np.zeros((max(repeats.values()) + 1, len(places), 2 * len(rows[0][2])))
+    spot = np.array([repeats[seed] for seed, *_ in rows]), np.array([places[name] for name in units])
+    np.add.at(sums, spot, np.array([np.concatenate([first, second]) for _, _, first, second in rows]))
+    return sums, list(places)
 
 
 def _repeats(keys: Iterable[tuple[Hashable, str]]) -> dict[Hashable, int]:
@@ -333,5 +333,5 @@ def paired_intervals(first: Sums, second: Sums, statistic: Callable[[AnyFloats],
     if not names:
         return None
     return intervals.jackknife(
-        pairs, lambda found: statistic(found[:, :width]) - statistic(found[:, width:])
+        pairs, lambda draws: statistic(draws[:, :width]) - statistic(draws[:, width:])
     ).interval()

@@ -103,8 +103,8 @@ def _interval(recordings: list[Sums]) -> tuple[dict[str, float], dict[str, float
         np.stack([np.append(getattr(one, name), getattr(one, name).sum()) for one in recordings])
         for name in ("covered", "values")
     )
-    found = intervals.share_interval(covered, values)
-    return _named(found.low), _named(found.high)
+    shares = intervals.share_interval(covered, values)
+    return _named(shares.low), _named(shares.high)
 
 
 def _named(values: AnyFloats) -> dict[str, float]:

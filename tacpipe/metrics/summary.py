@@ -28,13 +28,13 @@ def of(headlines: Sequence[Headline], names: Names = MappingProxyType({})) -> di
     least = min(headlines, key=lambda one: math.inf if math.isnan(one.gain) else one.gain)
     found: dict[str, float | int] = {"gain": least.gain, "low": least.low, "high": least.high, "n": least.clusters}
     targets = len({one.target for one in headlines}) > 1  # their errors are of one measure, which no name repeats
-    for one, place in zip(headlines, _places(headlines, names), strict=True):
-        found["_".join(place if targets else [*place, _short(one.columns[-1])])] = one.model.values[-1]
-    for one, place in zip(headlines, _places(headlines, names), strict=True):
-        reference = next((row for row in one.baselines if row.name == one.reference), None)
-        for at, column in enumerate(one.columns if reference else ()):
+    for headline, place in zip(headlines, _places(headlines, names), strict=True):
+        found["_".join(place if targets else [*place, _short(headline.columns[-1])])] = headline.model.values[-1]
+    for headline, place in zip(headlines, _places(headlines, names), strict=True):
+        reference = next((row for row in headline.baselines if row.name == headline.reference), None)
+        for at, column in enumerate(headline.columns if reference else ()):
             if reference and column.startswith("MAE"):
-                found["_".join([*place, _short(column)])] = one.model.values[at]
+                found["_".join([*place, _short(column)])] = headline.model.values[at]
                 found["_".join([*place, reference.name, _short(column)])] = reference.values[at]
     known = {name: value for name, value in found.items() if math.isfinite(value)}
     return {name: _rounded(value) for name, value in list(known.items())[: MOST - 1]}

@@ -23,7 +23,7 @@ from tacpipe.models.minirocket_classifier import with_profile
 from tacpipe.models.statistics_classifier import statistics
 from tacpipe.models.tensors import under
 
-COMPONENTS = 150  # at most, and no more than a third of the slides
+COMPONENTS = 150  # upper limit; also at most a third of the slides
 PATTERNS = "patterns."  # begins the names of the tensors of patterns
 NAMES = ("classes", "centre", "projection", "means", "middle", "overall")
 STEADY = 1e-6  # standard deviation below which a feature is constant
@@ -85,13 +85,13 @@ class ClassDistance:
         """Return what `to_tensors` described. Raises `ValueError` where shapes do not fit one another."""
         patterns = under(PATTERNS, tensors)
         rocket = Rocket.from_tensors(patterns) if patterns else None
-        made = cls(**{name: tensors[name] for name in NAMES}, patterns=rocket)
-        sizes = (len(made.centre), made.means.shape[1])
-        if made.projection.shape != sizes or len(made.means) != len(made.classes):
-            raise ValueError(f"the projection of slides is {made.projection.shape}, not {sizes}")
-        if made.overall.shape != (sizes[1], sizes[1]) or made.middle.shape != (sizes[1],):
-            raise ValueError(f"the space of all slides is {made.overall.shape}, not of {sizes[1]} components")
-        return made
+        classifier = cls(**{name: tensors[name] for name in NAMES}, patterns=rocket)
+        sizes = (len(classifier.centre), classifier.means.shape[1])
+        if classifier.projection.shape != sizes or len(classifier.means) != len(classifier.classes):
+            raise ValueError(f"the projection of slides is {classifier.projection.shape}, not {sizes}")
+        if classifier.overall.shape != (sizes[1], sizes[1]) or classifier.middle.shape != (sizes[1],):
+            raise ValueError(f"the space of all slides is {classifier.overall.shape}, not of {sizes[1]} components")
+        return classifier
 
 
 def _features(frames: Float32s, patterns: Rocket | None) -> Floats:

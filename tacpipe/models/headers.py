@@ -18,7 +18,7 @@ WIDTH = 18  # features of a header: what the convolution gives, and as many of t
 KERNEL = (3, 5)
 MAPS = 3
 POOL = 2
-OTHER = "other"  # in a choice of headers: all sensors without such a grid
+OTHER = "other"  # stands for all sensors without such a grid in a choice of headers
 
 
 class Plain(nn.Module):
@@ -131,10 +131,11 @@ def chosen(given: str, sensors: Mapping[str, int]) -> dict[str, str]:
     {'biotac': 'mlp', 'roboskin': 'cnn'}
     """
     stated = dict(part.strip().partition("=")[::2] for part in given.split(",") if part.strip())
-    other = stated.pop(OTHER, "none")
+    default = stated.pop(OTHER, "none")
     unknown = sorted(set(stated) - set(sensors))
     if unknown:
         raise TacpipeError(f"headers names the sensor {unknown[0]}; the recordings have {', '.join(sensors)}.")
     return {
-        name: stated.get(name, "cnn" if channels == GRID[0] * GRID[1] else other) for name, channels in sensors.items()
+        name: stated.get(name, "cnn" if channels == GRID[0] * GRID[1] else default)
+        for name, channels in sensors.items()
     }

@@ -48,7 +48,7 @@ class TaxelwiseForecast(ChangeForecast):
         self.whole = nn.Sequential(
             nn.Linear(inputs, hidden), nn.GELU(), self.drop, nn.Linear(hidden, hidden), nn.GELU()
         )
-        # on the CPU also where weights are loaded: on the meta device torch.randn imports sympy, which takes 0.3 s
+        # Drawn on the CPU even if weights are loaded: torch.randn on the meta device imports sympy, which takes 0.3 s
         self.traits = nn.Parameter(0.3 * torch.randn(self.sensors * self.taxels, TRAITS, device="cpu"))
         self.own, self.from_whole = nn.Linear(own, hidden), nn.Linear(hidden, hidden)
         self.from_traits = nn.Linear(TRAITS, hidden)

@@ -100,8 +100,8 @@ class Source:
 
 
 Discover = Callable[[Any, Path], Mapping[str, Mapping[str, Path] | Source]]
-# Of params and a source: a function from the path of a file within it to the reason why no recording is read from the
-# file, "" for a file that is read in another way, as labels are.
+# Maps params and a source to a function. That function maps the path of a file in the source to the reason why no
+# recording is read from it, "" for a file that is read in another way, as labels are.
 WhyUnread = Callable[[Any, Path], Callable[[str], str]]
 First = Callable[[Any], Mapping[str, Mapping[str, Any]]]  # of params: stages by name, each with params of its own
 
@@ -203,7 +203,7 @@ class Stage(Generic[P, R]):
 
     @property
     def reads_split(self) -> bool:
-        """Whether ``--split`` and ``--fold`` may be given."""
+        """Return whether ``--split`` and ``--fold`` may be given."""
         return self.needs_split or self.reads_model or "split" in self.arguments
 
     @property

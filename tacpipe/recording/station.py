@@ -281,21 +281,21 @@ class Station:
         self._notes.append(Note(time.monotonic_ns(), self.stream.name, OVERRUN, str(overruns - self._overruns)))
         self._overruns = overruns
 
-    def _keep(self, came: list[tuple[int, bytes]]) -> None:
+    def _keep(self, packets: list[tuple[int, bytes]]) -> None:
         """Keep what came and is recorded, and hand it on."""
-        accepted = [packet for packet in came if self.stream.sensor.accepts(packet[1])]
+        accepted = [packet for packet in packets if self.stream.sensor.accepts(packet[1])]
         with self._keeping:
-            self._refused += len(came) - len(accepted)
-            came = accepted
-            if not came:
+            self._refused += len(packets) - len(accepted)
+            packets = accepted
+            if not packets:
                 return
-            self._came.extend(came)
+            self._came.extend(packets)
             if self._tally is not None:
-                self._chunks += len(came)
-                self._bytes += sum(len(data) for _, data in came)
-                self._tally(self._chunks, self._bytes, came[-1][0])
+                self._chunks += len(packets)
+                self._bytes += sum(len(data) for _, data in packets)
+                self._tally(self._chunks, self._bytes, packets[-1][0])
             if self.listener is not None:
-                self._inform(Chunks.of(came))
+                self._inform(Chunks.of(packets))
 
     def _inform(self, block: Chunks | Note) -> None:
         if self.listener is not None:

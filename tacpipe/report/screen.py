@@ -90,8 +90,8 @@ def first_table(context: Context) -> Table | None:
         return _by_target(context, parts, targets)
     firsts = [compared[0] for compared in parts.values()]
     names = list(dict.fromkeys(row.name for one in firsts for row in _leaders(one)))[: MOST - 2]
-    baselines = [row.name for one in firsts for row in [one.best_baseline] if row]
-    baselines += [row.name for one in firsts for row in one.of("baseline") if row.name == one.measure.reference]
+    baselines = [row.name for first in firsts for row in [first.best_baseline] if row]
+    baselines += [row.name for first in firsts for row in first.of("baseline") if row.name == first.measure.reference]
     baselines = list(dict.fromkeys(baselines))
     baselines = baselines[: MOST - len(names)]
     single = len(firsts) == 1
@@ -209,11 +209,11 @@ def _verb(one: Comparison, row: Row) -> str:
     size = counted(row.n, one.measure.cluster)
     if not row.baseline:
         return f"was evaluated without a baseline, on {size}"
-    said = row.gain.verdict
-    if said == headline.NO_VERDICT:
-        few = headline.too_few(row.n, one.measure.cluster, row.gain.effective)
-        return f"has {_gained(one, row)} over the best baseline, {row.baseline}; {few}"
-    return f"is {CLAUSES[said]} the best baseline, {row.baseline}: {_amount(one, row, '95 % interval ')}"
+    verdict = row.gain.verdict
+    if verdict == headline.NO_VERDICT:
+        warning = headline.too_few(row.n, one.measure.cluster, row.gain.effective)
+        return f"has {_gained(one, row)} over the best baseline, {row.baseline}; {warning}"
+    return f"is {CLAUSES[verdict]} the best baseline, {row.baseline}: {_amount(one, row, '95 % interval ')}"
 
 
 def _amount(one: Comparison, row: Row, called: str = "") -> str:

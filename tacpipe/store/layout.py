@@ -19,7 +19,7 @@ from tacpipe.io.hashing import DIGEST
 from tacpipe.printable import listed, plain
 
 FORMAT = "1"
-BESIDE_NAME = ".tacpipe"  # of a store that lies in its project's folder
+BESIDE_NAME = ".tacpipe"  # name of a store in its project's folder
 MARK = "format"  # the file that makes a folder a store
 PROJECT = "project"  # the file that makes the folder of a store that of a project, written by `tacpipe store init`
 FOLDERS = ("objects", "records", "roots", "leases", "checkpoints", "quarantine", "tmp")
@@ -112,8 +112,8 @@ def entries(root: Path, name: str) -> Iterator[Path]:
 def foreign(root: Path) -> list[str]:
     """Return the paths within the store of all that is not of its form, sorted; symbolic links are among it."""
     found = [path for name in _FORMS for path, ours in _found(root, name) if not ours]
-    known = {MARK, PROJECT, *_FORMS, *_BESIDE}
-    found += [Path(entry.path) for entry in _scan(root, root) if entry.name not in known]
+    expected = {MARK, PROJECT, *_FORMS, *_BESIDE}
+    found += [Path(entry.path) for entry in _scan(root, root) if entry.name not in expected]
     return sorted(str(path.relative_to(root)) for path in found)
 
 

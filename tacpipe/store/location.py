@@ -81,8 +81,8 @@ def project_folder(path: Path) -> Path | None:
     for folder in (path, *path.parents):
         if any(_marks(folder / mark) for mark in MARKS):
             return folder
-    here = Path.cwd()
-    return here if here in path.parents else None
+    working_directory = Path.cwd()
+    return working_directory if working_directory in path.parents else None
 
 
 def _holder(folders: Iterable[Path], datasets: Sequence[Path]) -> Path | None:

@@ -55,11 +55,11 @@ def gpu_for(worker: int) -> dict[str, str]:
 
     Workers take the visible GPUs in turn, so trainings that run at the same time do not share one while another is idle.
     """
-    stated = os.environ.get(VISIBLE_GPUS)
-    if stated is None:
+    visible = os.environ.get(VISIBLE_GPUS)
+    if visible is None:
         names = [str(number) for number in range(len(list(_GPUS.iterdir())))] if _GPUS.is_dir() else []
     else:
-        names = [name.strip() for name in stated.split(",") if name.strip()]
+        names = [name.strip() for name in visible.split(",") if name.strip()]
     return {VISIBLE_GPUS: names[worker % len(names)]} if len(names) > 1 else {}
 
 

@@ -180,7 +180,7 @@ def _thinned(stored: Columns) -> pa.Table:
 
     names = [channel.name for channel in stored.schema if not str(channel.type).endswith("binary")]
     chosen: list[pa.Table] = []
-    rest: dict[str, float] = {}
+    resting: dict[str, float] = {}
     for stretch in stored.batches(names, -(-stored.num_rows // STRETCHES)):
         rows = {0, stretch.num_rows - 1}
         touch = np.zeros(stretch.num_rows)
@@ -194,7 +194,7 @@ def _thinned(stored: Columns) -> pa.Table:
             elif pa.types.is_integer(channel.type) or pa.types.is_floating(channel.type):
                 values = np.nan_to_num(column.to_numpy().astype(np.float64))
                 if quantity == "tactile":
-                    touch += np.abs(values - rest.setdefault(channel.name, float(values[0])))
+                    touch += np.abs(values - resting.setdefault(channel.name, float(values[0])))
                 elif quantity not in ("time", "sequence"):
                     rows.update((int(values.argmin()), int(values.argmax())))
         rows.update((int(touch.argmin()), int(touch.argmax())))
@@ -213,20 +213,20 @@ def _of_tables(
     row: pa.Table | None = None,
 ) -> Contents:
     predicted = {} if row is None else _values(row)
-    whole = tables[""] if set(tables) == {""} else None
-    if whole is not None and TIME not in whole.column_names:  # of a split, or one row a recording
-        return Contents(name, attributes, {"": (whole.num_rows, None)})
+    only_table = tables[""] if set(tables) == {""} else None
+    if only_table is not None and TIME not in only_table.column_names:  # of a split, or one row a recording
+        return Contents(name, attributes, {"": (only_table.num_rows, None)})
     streams = split_tables(tables)
     truth = _truth(tables)
     touched = taxels.of_streams(streams)
     marks = [span for table in streams.values() for span in spans.of_labels(table)]
     marks += [span for table in truth.values() for span in spans.of_labels(table)]
-    if whole is None:
+    if only_table is None:
         missing = [
             span for stream, table in streams.items() if not _is_cloud(table) for span in spans.gaps(stream, table)
         ]
     else:
-        missing = spans.masked_gaps(whole)
+        missing = spans.masked_gaps(only_table)
     happened = spans.events(tables[EVENTS]) if EVENTS in tables else []
     clouds = {stream: table for stream, table in streams.items() if _is_cloud(table)}
     plotted = {stream: table for stream, table in streams.items() if stream not in clouds}

@@ -143,7 +143,7 @@ def test_the_row_of_persistence_is_shown_where_another_baseline_is_better() -> N
     sums = {name: forecasts(dict.fromkeys(RECORDINGS, ratio)) for name, ratio in
             (("net", 0.5), ("persistence", 1.0), ("ridge", 0.8), ("mean", 3.0))}  # fmt: skip
     found = forward.headline("net", (1,), sums.pop("net"), sums, None)
-    assert found is not None and [one.name for one in found.shown] == ["ridge", "persistence"]
+    assert found is not None and [one.name for one in found.table_baselines] == ["ridge", "persistence"]
     table = headline_table.text([found])
     row = next(line.split() for line in table.splitlines() if line.startswith("  persistence"))
     assert row[-2:] == ["0", "0"]

@@ -85,8 +85,8 @@ def load(file: Path, wanted: Sequence[str] = ()) -> Chain:
     for stage in _stages(file):
         if by_name.setdefault(stage.name, stage) != stage:
             raise UsageError(f"{file} has two stages {plain(stage.name)}; give one of them another name.")
-    found = list(by_name.values())
-    after = _dependencies(found, file)
+    stages = list(by_name.values())
+    after = _dependencies(stages, file)
     try:
         ordered = list(TopologicalSorter(after).static_order())
     except CycleError as error:
@@ -102,30 +102,30 @@ def _stages(file: Path) -> Iterator[ChainStage]:
     if not content.get("stages"):
         raise UsageError(f"{file} has no stages; it must hold them as a dvc.yaml does: `dvc stage add` writes one.")
     for name, definition in content["stages"].items():
-        where = f"{file}, stage {plain(name)}"
+        place = f"{file}, stage {plain(name)}"
         if not name or "@" in name:
-            raise UsageError(f"{where}: give it a name without @, which stands in names of foreach and matrix.")
-        several = "foreach" in definition or "do" in definition
-        _check(definition, _FOREACH if several else _MATRIX, where)
-        if several:
+            raise UsageError(f"{place}: give it a name without @, which stands in names of foreach and matrix.")
+        is_group = "foreach" in definition or "do" in definition
+        _check(definition, _FOREACH if is_group else _MATRIX, place)
+        if is_group:
             for key in _FOREACH:
                 if key not in definition:
-                    raise UsageError(f"{where}: foreach and do belong together, and it has no {key}.")
-            _check(definition["do"], _STAGE, f"{where}, do")
-        for key, given, known in template.several(definition, values, where):
-            yield _stage(f"{name}@{key}" if key else name, given, known, file, where)
+                    raise UsageError(f"{place}: foreach and do belong together, and it has no {key}.")
+            _check(definition["do"], _STAGE, f"{place}, do")
+        for key, given, known in template.several(definition, values, place):
+            yield _stage(f"{name}@{key}" if key else name, given, known, file, place)
 
 
-def _check(content: Mapping[str, Any], schema: Mapping[str, Any], where: str) -> None:
+def _check(content: Mapping[str, Any], schema: Mapping[str, Any], place: str) -> None:
     """Raise `UsageError` for a key that a part of the file does not have, and for a value of the wrong form."""
     for key, value in content.items():
         if key not in schema:
-            raise UsageError(f"{where}: there is no key {excerpt(key)}; there are {listed(schema, len(schema))}.")
+            raise UsageError(f"{place}: there is no key {excerpt(key)}; there are {listed(schema, len(schema))}.")
         if not _fits(value, schema[key]) and not (
             key == "do" and isinstance(value, Mapping)
         ):  # its keys are checked next
             expected = _EXPECTED.get(key, "a text")
-            raise UsageError(f"{where}: its {key} is {excerpt(value)}; it must be {expected}.")
+            raise UsageError(f"{place}: its {key} is {excerpt(value)}; it must be {expected}.")
 
 
 def _fits(value: Any, schema: Any) -> bool:
@@ -156,7 +156,9 @@ def _stage(name: str, given: Mapping[str, Any], values: template.Values, file: P
             f"relative to {file.name}, or run it with `dvc repro`."
         )
     folder = file.parent.absolute().as_posix()
-    files = [entry for entry in made.get("params", []) if isinstance(entry, Mapping)]  # of params, but for params.yaml
+    files = [
+        entry for entry in made.get("params", []) if isinstance(entry, Mapping)
+    ]  # params files other than params.yaml
     reads = _paths([*made.get("deps", []), *files], folder, where)
     writes = [path for kind in _OUTPUTS for path in dict.fromkeys(_paths(made.get(kind, []), folder, where))]
     for path in writes:
@@ -169,13 +171,13 @@ def _stage(name: str, given: Mapping[str, Any], values: template.Values, file: P
     return ChainStage(name, [command.strip() for command in commands], reads, writes, given.get("frozen", False))
 
 
-def _paths(entries: Sequence[Any], folder: str, where: str) -> list[str]:
+def _paths(entries: Sequence[Any], folder: str, place: str) -> list[str]:
     """Return the paths of entries, which are paths or mappings from paths to options: from ``folder`` what lies in it."""
     paths = []
     for entry in entries:
         for path in entry if isinstance(entry, Mapping) else [entry]:
             if not isinstance(path, str) or not path:
-                raise UsageError(f"{where}: {excerpt(path)} is not a path.")
+                raise UsageError(f"{place}: {excerpt(path)} is not a path.")
             full = posixpath.normpath(posixpath.join(folder, path))
             paths.append(posixpath.relpath(full, folder) if _is_within(full, folder) else full)
     return paths
@@ -185,14 +187,14 @@ def _is_within(path: str, folder: str) -> bool:
     return posixpath.isabs(folder) and posixpath.commonpath([path, folder]) == folder
 
 
-def _values(file: Path, given: Sequence[Any], before: template.Values, where: str) -> template.Values:
+def _values(file: Path, entries: Sequence[Any], before: template.Values, place: str) -> template.Values:
     """Return the values that texts may use: those of ``before``, and over them those of ``vars``."""
     values = dict(before)
-    for one in given:
+    for one in entries:
         if isinstance(one, str) and one.endswith((".yaml", ".yml")):
             one = _mapping(file.with_name(one))
         if not isinstance(one, Mapping):
-            raise UsageError(f"{where}: vars has {excerpt(one)}; `tacpipe run` reads mappings and YAML files there.")
+            raise UsageError(f"{place}: vars has {excerpt(one)}; `tacpipe run` reads mappings and YAML files there.")
         values = _merged(values, one)
     return values
 

@@ -299,6 +299,6 @@ def _schema(path: Path) -> Sequence[str]:
 
 
 def _table(path: Path, names: Sequence[str] | None = None) -> Any:
-    parquet.require_claims(path, names, most=memory.MOST_BLOCK)
+    parquet.require_claims(path, names, max_bytes=memory.MOST_BLOCK)
     with parquet_errors(path), regular.opened(path) as file:
         return pq.ParquetFile(file).read(columns=list(names) if names is not None else None)

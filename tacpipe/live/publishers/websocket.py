@@ -130,10 +130,10 @@ class WebsocketPublisher:
 
     def _send(self, text: str) -> None:
         """Send a message to the subscribers for which few others wait. Runs in the server's thread."""
-        most = min(QUEUED * len(text), QUEUED_BYTES)
+        backlog_bytes = min(QUEUED * len(text), QUEUED_BYTES)
         ready = []
         for connection, missed in self._subscribers.items():
-            late = connection.transport.get_write_buffer_size() > most
+            late = connection.transport.get_write_buffer_size() > backlog_bytes
             self._subscribers[connection] = missed + 1 if late else 0
             self.dropped += late
             if missed + late == BEHIND:

@@ -35,7 +35,7 @@ def ranking(dots: Sequence[Dot], x: str, *, level: Mapping[str, float] | None = 
     """
     low, high = _ends(dots)
     panels = list(dict.fromkeys(one.panel for one in dots))
-    lines_by_name = {one.name: textwrap.wrap(one.name, LABEL_CHARACTERS) or [""] for one in dots}
+    lines_by_name = {dot.name: textwrap.wrap(dot.name, LABEL_CHARACTERS) or [""] for dot in dots}
     row = max(row, LINE_HEIGHT * max(map(len, lines_by_name.values()), default=1) + 5)
     values = []
     for place, one in enumerate(dots):

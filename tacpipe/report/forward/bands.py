@@ -72,10 +72,10 @@ def _sums(runs: Sequence[Run]) -> dict[str, dict[bool, dict[str, dict[str, AnyFl
     for run in runs:
         read = from_parquet(run.details.dataset.files[COVERAGE]).to_pandas()
         read["unit"] = read["recording"].where(read["known"] | read["object"].isna(), read["object"])
-        for (name, known, recording), one in read[~read.seen].groupby(["predictor", "known", "unit"]):
-            own = one.groupby("step", as_index=False)[["covered", "width", "pinball", "values"]].sum()
-            added = {key: own[key].to_numpy(float) for key in ("covered", "width", "pinball", "values")}
-            there = found.setdefault(str(name), {}).setdefault(bool(known), {})
+        for (name, is_known, recording), group in read[~read.seen].groupby(["predictor", "known", "unit"]):
+            by_step = group.groupby("step", as_index=False)[["covered", "width", "pinball", "values"]].sum()
+            added = {key: by_step[key].to_numpy(float) for key in ("covered", "width", "pinball", "values")}
+            there = found.setdefault(str(name), {}).setdefault(bool(is_known), {})
             before = there.get(str(recording))
             there[str(recording)] = added if before is None else {key: before[key] + added[key] for key in added}
     return found
@@ -90,10 +90,10 @@ def _coverage(title: str, sums: Mapping[str, Mapping[str, Mapping[str, AnyFloats
     """Return coverage by step of each predictor, with its interval over recordings."""
     several = []
     for name in (one for one in NAMES if one in sums):
-        found = intervals.share_interval(_of(sums[name], "covered"), _of(sums[name], "values"))
-        low, high = (np.where(np.isnan(ends), found.mean, ends) for ends in (found.low, found.high))
+        interval = intervals.share_interval(_of(sums[name], "covered"), _of(sums[name], "values"))
+        low, high = (np.where(np.isnan(ends), interval.mean, ends) for ends in (interval.low, interval.high))
         steps = np.arange(1.0, len(low) + 1)
-        several.append(Line(NAMES[name], steps, found.mean, low, high, dashed=name != "model"))
+        several.append(Line(NAMES[name], steps, interval.mean, low, high, dashed=name != "model"))
     spec = charts.lines(several, "rows ahead", "coverage", level=("asked for", level))
     return Chart(f"Coverage: {title}", spec)
 

@@ -44,7 +44,7 @@ class ErrorSums:
     squared: AnyFloats  # (predictor, group, recording, step)
     absolute: AnyFloats  # (predictor, group, recording, step)
     named: bool = True  # whether any recording names its object: else none is known or unseen
-    objects: Mapping[str, str] = field(default_factory=dict)  # by recording, where it names one
+    objects: Mapping[str, str] = field(default_factory=dict)  # recording to its object, if it names one
 
     def of(self, predictor: str, group: str) -> tuple[AnyFloats, AnyFloats] | None:
         """Return squared and absolute sums, both (recording, step); None where there are none."""

@@ -146,8 +146,8 @@ def _seen(metrics: Tree) -> str:
 def _of_recordings(part: Tree) -> Tree:
     """Return the skill that ratios of single recordings give; the pooled one of results of before this was measured."""
     skills: Tree = part.get("skill", {})
-    found: Tree = skills.get(headline.GEOMETRIC, skills.get("mse_counts", {}))
-    return found
+    scores: Tree = skills.get(headline.GEOMETRIC, skills.get("mse_counts", {}))
+    return scores
 
 
 def _stated(one: Tree) -> Cell:

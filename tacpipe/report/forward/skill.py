@@ -31,23 +31,23 @@ def sums(method: Method, predictor: str, steps: Sequence[int], known: bool | Non
 
     Those of unseen objects are by seed and object.
     """
-    every = []
+    parts = []
     for run in method.runs:
         clusters = reading.clusters(run.details, known) or {}
         sums = reading.sums(run.details, predictor, steps, known, group)
-        every += [((run.seed, clusters.get(name, name)), one) for name, one in sums.items()]
-    return pairing.added(every)
+        parts += [((run.seed, clusters.get(name, name)), errors) for name, errors in sums.items()]
+    return pairing.added(parts)
 
 
-def at_steps(found: AnyFloats) -> AnyFloats:
+def at_steps(draws: AnyFloats) -> AnyFloats:
     """Return the skill over persistence at each step and over all, from sums (draw, part) to (draw, step + 1)."""
-    parts = Parts.of_sums(found)
+    parts = Parts.of_sums(draws)
     return np.hstack([parts.skill, parts.mean_skill[:, None]])
 
 
 def skills(sums: Sums) -> Interval:
     """Return the skill over persistence at each step and over all, with intervals."""
-    return intervals.skill_of_log_ratio(pairing.value_intervals(sums, lambda found: np.log1p(-at_steps(found))))
+    return intervals.skill_of_log_ratio(pairing.value_intervals(sums, lambda draws: np.log1p(-at_steps(draws))))
 
 
 def _total(sums: Sums) -> Parts:

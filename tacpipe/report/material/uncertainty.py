@@ -117,8 +117,8 @@ def rate_over_materials(rows: pd.DataFrame, column: str) -> Rate:
     """
     if "label" not in rows or rows.label.nunique() < headline.FEWEST:
         return rate(rows, column)._replace(low=float("nan"), high=float("nan"))
-    found = share_interval(rows[[column]].to_numpy(float), np.ones((len(rows), 1)), rows.label.to_numpy(str)).first
-    return Rate(*found, rows.recording.nunique())
+    interval = share_interval(rows[[column]].to_numpy(float), np.ones((len(rows), 1)), rows.label.to_numpy(str)).first
+    return Rate(*interval, rows.recording.nunique())
 
 
 def curve(known: AnyFloats, unknown: AnyFloats) -> Floats:

@@ -42,7 +42,9 @@ def sentence(context: Context) -> tuple[str, str]:
     """Return the general sentence, and where no method is better than the baselines on novel objects, that this is so."""
     text, verdict = screen.sentence(context)
     novel = [one for one in context.comparisons if one.question.part.startswith("novel")]
-    better = [one for one in novel if any(row.gain.verdict == headline.BETTER for row in one.models)]
+    better = [
+        comparison for comparison in novel if any(row.gain.verdict == headline.BETTER for row in comparison.models)
+    ]
     if novel and not better:
         text = f"{text.removesuffix('.')}: {NO_EVIDENCE}."
     return text, verdict

@@ -76,13 +76,21 @@ class Bands:
         return {**stated, **(self._tree(fresh, uncertainty.percents) if fresh else {}), **trees}
 
     def _tree(self, trials: Sequence[Trial], percents: tuple[int, ...]) -> dict[str, Any]:
-        each: dict[str, dict[str, Sums]] = {}  # by what chance draws: recordings, and objects that are unseen
+        sums_by_unit: dict[
+            str, dict[str, Sums]
+        ] = {}  # unit of the interval (recording, or unseen object) to sums by predictor
         for trial in trials:
             sums, unit = self.sums[trial.name], trial.name if trial.known else str(trial.object)
-            each[unit] = {name: each[unit][name] + one for name, one in sums.items()} if unit in each else sums
-        several = list(each.values())
-        still = [one[BASELINE] for one in several]
-        return {name: quantiles.tree([one[name] for one in several], percents, still) for name in several[0]}
+            sums_by_unit[unit] = (
+                {name: sums_by_unit[unit][name] + unit_sums for name, unit_sums in sums.items()}
+                if unit in sums_by_unit
+                else sums
+            )
+        unit_sums = list(sums_by_unit.values())
+        persistence = [sums[BASELINE] for sums in unit_sums]
+        return {
+            name: quantiles.tree([sums[name] for sums in unit_sums], percents, persistence) for name in unit_sums[0]
+        }
 
     def files(self, trials: Sequence[Trial]) -> dict[str, bytes]:
         """Return ``coverage.parquet``, the sums by recording, predictor and step, and ``bands.json``, forecasts to draw."""

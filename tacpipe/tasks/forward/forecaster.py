@@ -306,22 +306,22 @@ class Forecaster:
     def _parts(self, window: AnyFloats, plan: AnyFloats) -> tuple[AnyFloats, AnyFloats, AnyFloats]:
         """Return touch (window, context, channel), arm (window, row, 13) and finger (window, context), as float32."""
         channels, posed, derived = len(self.codec.channels), len(self.pose.columns), len(self.derived_columns)
-        for name, given, rows, before, widths in (
+        for name, array, rows, before, widths in (
             ("window", window, self.context, channels, (channels + posed + derived + 1, channels + posed)),
             ("plan", plan, self.horizon, 0, (posed + derived, posed)),
         ):
-            if given.ndim != 3 or given.shape[1] != rows or given.shape[2] not in widths:
+            if array.ndim != 3 or array.shape[1] != rows or array.shape[2] not in widths:
                 raise TacpipeError(
-                    f"The {name} has the shape {given.shape}; this model reads {rows} rows of {widths[0]} columns, or "
+                    f"The {name} has the shape {array.shape}; this model reads {rows} rows of {widths[0]} columns, or "
                     f"of {widths[1]} without velocities: (windows, {rows}, columns), or one window without its axis."
                 )
-            if not np.isfinite(given).all():
-                at = np.argwhere(~np.isfinite(given))[0]
+            if not np.isfinite(array).all():
+                at = np.argwhere(~np.isfinite(array))[0]
                 raise TacpipeError(
-                    f"The {name} holds {given[tuple(at)]} in row {at[1]}, column {at[2]} (counted from 0); "
+                    f"The {name} holds {array[tuple(at)]} in row {at[1]}, column {at[2]} (counted from 0); "
                     "all values must be finite. Leave the window out, or repair the recording."
                 )
-            if self.pose.orientation and not given[..., before + 3 : before + POSE].any(axis=-1).all():
+            if self.pose.orientation and not array[..., before + 3 : before + POSE].any(axis=-1).all():
                 raise TacpipeError(f"The {name} holds a quaternion of length 0, which is not an orientation.")
         if len(window) != len(plan):
             raise TacpipeError(

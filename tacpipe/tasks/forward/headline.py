@@ -18,7 +18,7 @@ TASK, MODEL, BASELINE = "forward", "model", "persistence"
 STEPS = (1, 3, 5, 10)  # those shown, as far as a model predicts them
 Errors = tuple[AnyFloats, AnyFloats]  # sums of squared and of absolute errors of a recording, each (step,)
 GEOMETRIC = "mae_counts_geometric"  # the skill of ``metrics.json`` that is not pooled
-RECORDINGS, OBJECTS = "recordings", "objects"  # what chance draws: another recording, or another object
+RECORDINGS, OBJECTS = "recordings", "objects"  # units of the interval
 PARTS = {True: "known objects", False: "unseen objects", None: ""}
 
 
@@ -54,21 +54,21 @@ def look_ahead_notes(config: Mapping[str, Any]) -> list[str]:
 
 @dataclass(frozen=True)
 class Parts:
-    """What adds up over recordings, each (..., step), and the number of values."""
+    """The sums over recordings, each (..., step), and the number of values."""
 
     squared: AnyFloats
-    still_squared: AnyFloats  # of persistence
+    still_squared: AnyFloats  # errors of persistence
     absolute: AnyFloats
-    logs: AnyFloats  # of the ratio of the absolute error to persistence's, summed over recordings
+    logs: AnyFloats  # logarithms of the ratio to persistence's absolute error, summed over recordings
     counted: AnyFloats  # recordings on which persistence errs
     values: AnyFloats  # (...): windows times channels
 
     @classmethod
-    def of_sums(cls, found: AnyFloats) -> Parts:
+    def of_sums(cls, sums: AnyFloats) -> Parts:
         """Return the parts of `sums` (..., part)."""
-        steps = (found.shape[-1] - 1) // 5
-        squared, still, absolute, logs, counted = (found[..., at * steps : (at + 1) * steps] for at in range(5))
-        return cls(squared, still, absolute, logs, counted, found[..., -1])
+        steps = (sums.shape[-1] - 1) // 5
+        squared, persistence, absolute, logs, counted = (sums[..., at * steps : (at + 1) * steps] for at in range(5))
+        return cls(squared, persistence, absolute, logs, counted, sums[..., -1])
 
     @property
     def skill(self) -> AnyFloats:
@@ -95,8 +95,8 @@ def sums(errors: Errors, persistence: Errors, values: float) -> AnyFloats:
 
     ``values`` is how many values each was summed over: windows times channels.
     """
-    (squared, absolute), (still_squared, still) = errors, persistence
-    logs, counted = intervals.log_ratios(absolute, still)
+    (squared, absolute), (still_squared, still_absolute) = errors, persistence
+    logs, counted = intervals.log_ratios(absolute, still_absolute)
     return np.concatenate([squared, still_squared, absolute, logs, counted, [values]])
 
 
@@ -148,6 +148,6 @@ def measure(steps: Sequence[int], unit: str = COUNTS, cluster: str = RECORDINGS)
         lambda found: 1 - found,
         "skill over persistence",
         rises=True,
-        weight=lambda found: Parts.of_sums(found).counted.sum(axis=1),
+        weight=lambda draws: Parts.of_sums(draws).counted.sum(axis=1),
         reference=BASELINE,
     )

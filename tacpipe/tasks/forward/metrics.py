@@ -150,9 +150,9 @@ def headline(method: str, trials: Sequence[Trial], horizon: int, unit: str = COU
         chosen = [one for one in fresh if part is None or one.known == part]
         names = [name for name in (chosen[0].errors if chosen else ()) if name != MODEL]
         others = {name: sums(name, chosen) for name in names}
-        objects = {one.name: str(one.object) for one in chosen} if part is False else None
-        one = headlines.headline(method, steps, sums(MODEL, chosen), others, part, unit=unit, objects=objects)
-        found += [one] if one else []
+        objects = {trial.name: str(trial.object) for trial in chosen} if part is False else None
+        result = headlines.headline(method, steps, sums(MODEL, chosen), others, part, unit=unit, objects=objects)
+        found += [result] if result else []
     return found
 
 
@@ -253,14 +253,14 @@ def _summary(trials: Sequence[Trial], groups: Masks, horizon: int, channel_scale
             if getattr(errors[0], kept) is not None:
                 tree[name][name_of] = _steps(np.stack([getattr(one, kept) for one in errors]), windows)
     if held:
-        units = np.array([one.name if one.known else one.object for one in held])
+        units = np.array([trial.name if trial.known else trial.object for trial in held])
         kinds = {"mse_counts": "count_squared", "mae_counts": "count_absolute", "mse_feature": "feature_squared"}
         tree["skill"] = {
             name_of: _intervals(_by_step(held, MODEL, kept), _by_step(held, BASELINE, kept), units)
             for name_of, kept in kinds.items()
         }
-        model, still = (_by_step(held, name, "count_absolute") for name in (MODEL, BASELINE))
-        tree["skill"][headlines.GEOMETRIC] = _geometric_skill(model, still, units)
+        model, persistence = (_by_step(held, name, "count_absolute") for name in (MODEL, BASELINE))
+        tree["skill"][headlines.GEOMETRIC] = _geometric_skill(model, persistence, units)
     return tree
 
 
@@ -292,12 +292,12 @@ def _geometric_skill(model: AnyFloats, baseline: AnyFloats, clusters: AnyArray) 
     return _named(intervals.geometric_skill_interval(wide[0], wide[1], clusters))
 
 
-def _named(found: Interval) -> Tree:
+def _named(interval: Interval) -> Tree:
     """Return values with their intervals by step and over all; what is not defined is left out."""
-    names = [f"t{step}" for step in range(1, len(found.mean))] + ["mean"]
+    names = [f"t{step}" for step in range(1, len(interval.mean))] + ["mean"]
     tree: Tree = {}
     for index, name in enumerate(names):
-        ends = {part: float(getattr(found, part)[index]) for part in ("mean", "low", "high")}
+        ends = {part: float(getattr(interval, part)[index]) for part in ("mean", "low", "high")}
         tree[name] = {part: _rounded(value) for part, value in ends.items() if math.isfinite(value)}
     return {name: one for name, one in tree.items() if one}
 

@@ -102,9 +102,9 @@ class BySituation:
     def add(self, recording: str, situations: Int64s, name: str, predicted: Prediction, truth: Prediction) -> None:
         """Add the errors of one predictor on these windows."""
         before = self.absolute.setdefault((recording, name), np.zeros((len(SITUATIONS), self.horizon)))
-        for one in np.unique(situations):
-            chosen = situations == one
-            before[one] += forecast.absolute_sums(predicted.count[chosen], truth.count[chosen]).sum(axis=1)
+        for situation in np.unique(situations):
+            chosen = situations == situation
+            before[situation] += forecast.absolute_sums(predicted.count[chosen], truth.count[chosen]).sum(axis=1)
 
     def summary(self) -> Tree:
         """Return by situation the windows, recordings, mean absolute errors by predictor and step, and the model's skill.
@@ -126,12 +126,12 @@ class BySituation:
             np.hstack([sums, sums.sum(axis=1, keepdims=True)])
             for sums in (self._sums(self.absolute, recordings, name, at) for name in (MODEL, BASELINE))
         )
-        found = intervals.geometric_skill_interval(model, still)
+        interval = intervals.geometric_skill_interval(model, still)
         skill = {
             step: {
                 part: _rounded(value)
                 for part in ("mean", "low", "high")
-                if math.isfinite(value := getattr(found, part)[place])
+                if math.isfinite(value := getattr(interval, part)[place])
             }
             for place, step in enumerate([*(f"t{step}" for step in range(1, self.horizon + 1)), "mean"])
         }

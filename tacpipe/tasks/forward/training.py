@@ -156,7 +156,7 @@ def _shrinkage(weights: dict[str, Tensor], params: Params, codec: codecs.Codec, 
     starts = watched.some(SHRINKING)
     windows, ahead = watched.pick(starts)
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(params.seed)  # of shuffled plans
+        torch.manual_seed(params.seed)  # plans may be shuffled
         windows = Windows(*(part.cpu() for part in acted(windows, watched.actions)))
     ahead, now = ahead.cpu(), windows.touch[-1]
     return {SHRINKAGE: persistence_weights(model(windows) - now, ahead - now, watched.recording_of(starts))}
@@ -183,14 +183,17 @@ def _description(params: Params, codec: codecs.Codec, pose: Pose, unit: str, ref
 
 def _look_ahead(training: Dataset) -> dict[str, Any]:
     """Return how far the rows of the training recordings look ahead, ms; nothing where no recording states it."""
-    stated = [
-        (float(one.attributes[masks.LOOK_AHEAD_MEAN] or 0), float(one.attributes[masks.LOOK_AHEAD_MAX] or 0))
-        for one in training.recordings.values()
-        if masks.LOOK_AHEAD_MAX in one.attributes
+    look_ahead = [
+        (
+            float(recording.attributes[masks.LOOK_AHEAD_MEAN] or 0),
+            float(recording.attributes[masks.LOOK_AHEAD_MAX] or 0),
+        )
+        for recording in training.recordings.values()
+        if masks.LOOK_AHEAD_MAX in recording.attributes
     ]
-    if not stated:
+    if not look_ahead:
         return {}
-    mean, largest = (np.array(column) for column in zip(*stated, strict=True))
+    mean, largest = (np.array(column) for column in zip(*look_ahead, strict=True))
     return {"look_ahead": {"mean_ms": round(float(mean.mean()), 3), "max_ms": float(largest.max())}}
 
 
@@ -201,7 +204,7 @@ def _gap_ms(training: Dataset) -> dict[str, float]:
         for name, value in recording.attributes.items():
             if name.endswith(masks.GAP_MS) and value is not None:
                 values.setdefault(name.removesuffix(masks.GAP_MS), []).append(float(value))
-    return {stream: float(np.median(several)) for stream, several in sorted(values.items())}
+    return {stream: float(np.median(gaps_ms)) for stream, gaps_ms in sorted(values.items())}
 
 
 def _alarms(forecaster: Forecaster, part: Sequence[Track]) -> dict[str, Any]:
@@ -362,7 +365,7 @@ def _take_over(model: nn.Module, start: Forecaster) -> None:
     """Give a network the weights of the model to begin with. Raises `TacpipeError` where they are of other shapes."""
     network = start.model.network if isinstance(start.model, Shrunk) else start.model
     shapes, expected = (
-        {name: tuple(weight.shape) for name, weight in each.state_dict().items()} for each in (network, model)
+        {name: tuple(weight.shape) for name, weight in module.state_dict().items()} for module in (network, model)
     )
     for name in sorted({*shapes, *expected}):
         if shapes.get(name) != expected.get(name):

@@ -131,8 +131,8 @@ def unpacked(content: bytes, name: str, params: Estimator) -> dict[str, Fitted]:
 def _refused(types: Iterable[str], params: Estimator) -> str:
     """Return those of the types that neither the architecture's package has nor the architecture trusts, as text."""
     package = type(params).__module__.partition(".")[0]
-    others = [name for name in types if name not in params.TRUSTED and not _is_defined_in(package, name)]
-    return listed([plain(name, 100) for name in others]) if others else ""
+    foreign = [name for name in types if name not in params.TRUSTED and not _is_defined_in(package, name)]
+    return listed([plain(name, 100) for name in foreign]) if foreign else ""
 
 
 def _is_defined_in(package: str, name: str) -> bool:

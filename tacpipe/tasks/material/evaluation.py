@@ -61,7 +61,8 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
     evaluated = {}
     key = classifier.naming.key
     answers = Answers(
-        classifier, {name: naming.text(one.attributes.get(key, "")) for name, one in recordings.recordings.items()}
+        classifier,
+        {name: naming.text(recording.attributes.get(key, "")) for name, recording in recordings.recordings.items()},
     )
     with progress.bar("evaluate", 2 * len(recordings.recordings)) as advance:  # each slide is read, then named
         for sensor, slides in _read(classifier, recordings, advance).items():

@@ -59,5 +59,5 @@ MEASURE = Measure(
     lambda wrong: 100 * (1 - wrong),
     "accuracy (%)",
     rises=True,
-    weight=lambda found: found[:, 1],
+    weight=lambda draws: draws[:, 1],
 )

@@ -102,7 +102,7 @@ def read(
     """
     found: dict[str, list[tuple[Recording, Layout, Float32s]]] = {}
     there: set[str] = set()
-    for shard in recordings.recordings.values() if labelled else ():  # before any frame is read
+    for shard in recordings.recordings.values() if labelled else ():  # labels are checked before any frame is read
         if not only or shard.attributes.get("sensor") in only:
             _require_label(shard, naming.key)
     for name, shard in sorted(recordings.recordings.items()):

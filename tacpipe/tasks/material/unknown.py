@@ -27,7 +27,7 @@ class Answers:
     """What a calibrated classifier answers of slides, by sensor; empty where it is not calibrated."""
 
     classifier: Classifier
-    labels: Mapping[str, str] = field(default_factory=dict)  # by recording, its label as text
+    labels: Mapping[str, str] = field(default_factory=dict)  # recording to its label as text
     calibration: Tree = field(default_factory=dict)
     unknown: Tree = field(default_factory=dict)
     rows: list[tuple[Any, ...]] = field(default_factory=list)
@@ -125,5 +125,5 @@ def _rate(name: str, flags: Bools, materials: AnyArray | None = None) -> Tree:
     tree[f"{name}_materials"] = len(np.unique(materials))
     if tree[f"{name}_materials"] < FEWEST:
         return tree
-    found = share_interval(flags[:, None].astype(np.float64), np.ones((len(flags), 1)), materials).first
-    return {**tree, f"{name}_low": found.low, f"{name}_high": found.high}
+    interval = share_interval(flags[:, None].astype(np.float64), np.ones((len(flags), 1)), materials).first
+    return {**tree, f"{name}_low": interval.low, f"{name}_high": interval.high}

@@ -87,5 +87,5 @@ def measure(range_counts: float, cluster: str) -> Measure:
         gain,
         values,
         scored="RMSE (fraction of the range)",
-        weight=lambda found: found[:, 0],
+        weight=lambda draws: draws[:, 0],
     )

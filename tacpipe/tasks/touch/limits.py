@@ -32,7 +32,7 @@ OTHER = {
     "e_mf": ("pdc_th", "e_th"),
 }
 Tree = dict[str, Any]
-Skills = dict[str, Estimate]  # by target
+Skills = dict[str, Estimate]  # target to skill
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class Limits:
                     "high_mm": None if math.isinf(high) else high,
                     "pairs": max((one.pairs for one in by.values()), default=0),
                     "likeness": {name: _numbers(one.likeness) for name, one in by.items()},
-                    "pair_skill": {name: _numbers(one.pair_skill) for name, one in by.items()},
+                    "pair_skill": {name: _numbers(estimates.pair_skill) for name, estimates in by.items()},
                 }
                 for low, high, by in self.near
             ],
@@ -188,5 +188,5 @@ def _by_target(skills: Skills) -> Tree:
     return {name: _numbers(one) for name, one in skills.items()}
 
 
-def _numbers(one: Estimate) -> Tree:
-    return {name: None if math.isnan(value) else value for name, value in one._asdict().items()}
+def _numbers(estimate: Estimate) -> Tree:
+    return {name: None if math.isnan(value) else value for name, value in estimate._asdict().items()}

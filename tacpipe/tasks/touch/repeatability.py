@@ -88,7 +88,7 @@ def repeatability(
     if not len(resampled):
         return Repeatability(len(first), *(Estimate(mean, math.nan, math.nan) for mean in means))
     low, high = np.quantile(resampled, (0.025, 0.975), axis=0)
-    return Repeatability(len(first), *(Estimate(*map(float, one)) for one in zip(means, low, high, strict=True)))
+    return Repeatability(len(first), *(Estimate(*map(float, ends)) for ends in zip(means, low, high, strict=True)))
 
 
 def variances(values: Floats, kind: Indices, weight: Floats) -> tuple[Floats, float]:
