@@ -18,7 +18,7 @@ WIDTH = 18  # features of a header: what the convolution gives, and as many of t
 KERNEL = (3, 5)
 MAPS = 3
 POOL = 2
-OTHER = "other"  # stands for all sensors without such a grid in a choice of headers
+OTHER = "other"  # key of a choice of headers: all sensors without such a grid
 
 
 class Plain(nn.Module):
