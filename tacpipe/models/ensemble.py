@@ -74,7 +74,7 @@ def persistence_weights(changes: Tensor, measured: Tensor, recording: Tensor) ->
     tensor([0.5000])
     """
     total = DOUBT * TRIED[:, None].double().expand(-1, len(changes)).clone()  # (weight, horizon)
-    for number in recording.unique():
+    for number in torch.unique(recording):
         windows = recording == number
         predicted, truth = changes[:, windows].double(), measured[:, windows].double()
         errors = torch.stack([(truth - weight * predicted).abs().mean((1, 2)) for weight in TRIED])

@@ -79,7 +79,7 @@ def test_weights_never_raise_the_mean_over_recordings_of_the_error_beside_persis
     for step in range(3):
         ratios = [
             errors[step, recording == number].mean() / persistence[step, recording == number].mean()
-            for number in recording.unique()
+            for number in torch.unique(recording)
         ]
         assert np.mean(ratios) <= 1 + 1e-9
 
