@@ -90,7 +90,7 @@ def test_a_small_gain_counts_the_more_the_more_recordings_show_it() -> None:
     measured = 0.05 * changes + torch.randn(1, 400, 30, generator=generator)
     few, many = (persistence_weights(changes, measured, torch.arange(400) % count) for count in (1, 40))
     assert few < many
-    assert persistence_weights(measured, measured, torch.zeros(60)) == 1  # of a perfect forecast one shows enough
+    assert persistence_weights(measured, measured, torch.zeros(400)) == 1  # of a perfect forecast one shows enough
 
 
 def test_recordings_in_which_nothing_changes_decide_nothing() -> None:

@@ -70,14 +70,17 @@ class TextTable:
         parse = pc.ParseOptions(delimiter=self.stream.separator_of(self.path))
         read = pc.ReadOptions(column_names=names, use_threads=True)
         rounded_types = {name: pa.float64() for name, kind in types.items() if pa.types.is_decimal(kind)}
+
+        def parsed(block: Sequence[bytes | memoryview], kinds: Mapping[str, pa.DataType]) -> pa.Table:
+            return pc.read_csv(pa.BufferReader(owned(*block)), read, parse, self._conversion(kinds))
+
         for block in self._blocks():
-            content = owned(*block)
             try:
-                table = pc.read_csv(pa.BufferReader(content), read, parse, self._conversion(types))
-                if rounded_types:
-                    rounded = pc.read_csv(pa.BufferReader(content), read, parse, self._conversion(rounded_types))
-                    if any(stamps.overflows(column).any() for column in rounded.columns):
-                        raise pa.ArrowInvalid("A number is too large")
+                table = parsed(block, types)
+                if rounded_types and any(
+                    stamps.overflows(column).any() for column in parsed(block, rounded_types).columns
+                ):
+                    raise pa.ArrowInvalid("A number is too large")
             except (pa.ArrowInvalid, UnicodeDecodeError) as error:
                 fault = self._fault(names, types)
                 raise TacpipeError(fault or f"{self.path} cannot be read: {plain(str(error), 200)}.") from error
