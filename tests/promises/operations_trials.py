@@ -227,7 +227,9 @@ def _succeed(command: str) -> None:
 
 def _wrong(ran: Ran) -> list[str]:
     """Return what is wrong with how a command ended."""
-    sentences = [line for line in ran.err.splitlines() if line.startswith("tacpipe: ")]
+    sentences = [
+        line for line in ran.err.splitlines() if line.startswith("tacpipe: ") and "created the store" not in line
+    ]
     if ran.code not in CODES or "Traceback" in ran.err:
         return [f"ended with {ran.code}: {ran.err[-900:]}"]
     if ran.code == DAMAGED and ran.out:
