@@ -49,12 +49,12 @@ WORK = (  # a command for each that needs no extra; {o} is a new place
     "ingest lerobot sets -o {o}",
     "export csv data/recordings -o {o}",
     "export card data/recordings -o {o}",
-    "export lerobot data/synced -o {o}",
+    "export lerobot data/recordings --rate-hz 20 -o {o}",
     "ingest xdf sessions -o {o}",
     "version",
     "synchronize data/recordings -o {o} --rate-hz 20",
     "segment contacts data/synced -o {o} --pad-s 0.4",
-    "segment slips data/synced -o {o}",
+    "segment slips data/even -o {o}",
     "segment slides data/touched -o {o}",
     "segment grasps data/pinched -o {o}",
     "split data/segments -o {o} --scheme random",
@@ -102,7 +102,7 @@ LACK = {  # and for each that does need one, with that extra
     "ingest rosbag bags --guess": "ros",
     "export mcap data/recordings -o {o}": "ros",
     "export hdf5 data/recordings -o {o}": "hdf5",
-    "export zarr data/synced -o {o}": "zarr",
+    "export zarr data/recordings --rate-hz 20 -o {o}": "zarr",
     "split data/segments --scheme random --seed 7 -o {o} --executor dask": "dask",
     "store push s3://lab/store data/split": "bucket",
     "store pull gs://lab/store data/split": "bucket",
@@ -182,6 +182,7 @@ def prepare(folder: Path) -> None:
     (folder / "bags" / "a.mcap").write_bytes(b"")
     for name, (sensor, transport) in RIGS.items():
         (folder / f"{name}.toml").write_text(stream("s", sensor, transport))
+    run_all(folder, ["synchronize data/recordings -o data/even --rate-hz 50"])
 
 
 @pytest.fixture(scope="module")
