@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,12 @@ import pytest
 from tests.test_docs import module
 
 PAGE = Path(__file__).parents[1] / "docs" / "explanation" / "intervals.md"
-pytestmark = pytest.mark.long
+pytestmark = [
+    pytest.mark.long,
+    pytest.mark.skipif(
+        "TACPIPE_TEST_COVERAGE" not in os.environ, reason="simulates for 10 minutes where TACPIPE_TEST_COVERAGE is set"
+    ),
+]
 
 
 @pytest.fixture(scope="module")
