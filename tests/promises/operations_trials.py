@@ -227,8 +227,11 @@ def _succeed(command: str) -> None:
 
 def _wrong(ran: Ran) -> list[str]:
     """Return what is wrong with how a command ended."""
+    notes = ("created the store", "; training continues without it.")
     sentences = [
-        line for line in ran.err.splitlines() if line.startswith("tacpipe: ") and "created the store" not in line
+        line
+        for line in ran.err.splitlines()
+        if line.startswith("tacpipe: ") and not any(note in line for note in notes)
     ]
     if ran.code not in CODES or "Traceback" in ran.err:
         return [f"ended with {ran.code}: {ran.err[-900:]}"]
