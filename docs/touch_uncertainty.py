@@ -19,10 +19,10 @@ from typing import TYPE_CHECKING, Any
 import tacpipe
 from tacpipe.io.parquet import from_parquet
 from tacpipe.plugins import given_params, registry
-from tacpipe.report.touch.uncertainty import Measured, measured
 from tacpipe.tasks.calibrated import Asked
 from tacpipe.tasks.touch import headline as headlines
 from tacpipe.tasks.touch import task as touch
+from tacpipe.tasks.touch.report.uncertainty import Measured, measured
 from tacpipe.tasks.touch.result_names import CONSTANT, COVERAGE, MODEL, OBJECT_MEAN
 
 if TYPE_CHECKING:

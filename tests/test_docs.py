@@ -330,7 +330,7 @@ def test_reduced_params_have_one_fold_one_epoch_and_one_method_and_splits_stay()
 
 def test_the_tables_of_results_are_made_from_results() -> None:
     from tacpipe.comparison import engine
-    from tests.report.touch.touch_fakes import result
+    from tests.tasks.touch.report.touch_fakes import result
 
     made = module("result_pages").table(engine.compare([result(), result("trees", off=0.02)]))
     rows = list(csv.DictReader(io.StringIO(made)))

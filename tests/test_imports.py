@@ -63,6 +63,19 @@ def test_ingest_does_not_import_torch(tmp_path: Path, lab: Path) -> None:
     assert "torch" not in imported(lab, "synchronize data/recordings -o data/other --rate-hz 20 --jobs 1")
 
 
+@pytest.mark.parametrize("task", ["forward", "material", "touch"])
+def test_the_report_of_a_task_imports_no_torch(task: str) -> None:
+    lines = (
+        "import importlib, pkgutil, sys",
+        f"import tacpipe.tasks.{task}.report as report",
+        "for module in pkgutil.iter_modules(report.__path__, report.__name__ + '.'):",
+        "    importlib.import_module(module.name)",
+        "print('torch' in sys.modules)",
+    )
+    done = subprocess.run([sys.executable, "-c", "\n".join(lines)], capture_output=True, text=True, check=True)
+    assert done.stdout == "False\n"
+
+
 def test_using_the_default_forecaster_imports_only_what_models_need(lab: Path) -> None:
     commands.run(
         lab, ["train forward data/segments --split data/split --epochs 1 --hidden 8 --stride 4 -o models/default"]

@@ -19,10 +19,10 @@ from tacpipe.report.charts import Line
 from tests.fake_recordings import FakeDataset, FakeRecording, FakeShard
 from tests.promises.counts import count
 from tests.promises.limits import some
-from tests.report.forward import result_fakes
-from tests.report.material import material_fakes
 from tests.report.test_page import check, other
-from tests.report.touch import touch_fakes
+from tests.tasks.forward.report import result_fakes
+from tests.tasks.material.report import material_fakes
+from tests.tasks.touch.report import touch_fakes
 
 HOSTILE = "\"'><script>alert('x')</script><img src=x onerror=alert(1)>&lt;svg onload=alert(2)> $\\frac{$ </style></svg>"
 Words = Mapping[str, str]

@@ -16,10 +16,10 @@ from tacpipe.plugins import registry
 from tacpipe.report import html, page
 from tacpipe.report.blocks import Chart, Fold, Note, Section, table
 from tests.fake_recordings import FakeDataset, FakeShard, dataset
-from tests.report.forward import result_fakes
-from tests.report.material import material_fakes
-from tests.report.touch import touch_fakes
 from tests.stages.learning_fakes import motion
+from tests.tasks.forward.report import result_fakes
+from tests.tasks.material.report import material_fakes
+from tests.tasks.touch.report import touch_fakes
 
 pytestmark = pytest.mark.usefixtures("unbundled")
 VOID = ("meta", "br")

@@ -12,10 +12,10 @@ from tacpipe.report import page
 from tests.fake_recordings import FakeDataset, FakeShard
 from tests.report import browser
 from tests.report.browser import Browser
-from tests.report.forward import result_fakes
-from tests.report.material import material_fakes
 from tests.report.test_page import other
-from tests.report.touch import touch_fakes
+from tests.tasks.forward.report import result_fakes
+from tests.tasks.material.report import material_fakes
+from tests.tasks.touch.report import touch_fakes
 
 INSPECTION = (Path(__file__).parent / "inspection.js").read_text()
 WIDTHS = (1280, 400)

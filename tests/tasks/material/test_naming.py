@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.report.material import confusion, predictions
 from tacpipe.tasks.material import task as material
 from tacpipe.tasks.material.model import MaterialModel
 from tacpipe.tasks.material.naming import UNKNOWN, Naming
+from tacpipe.tasks.material.report import confusion, predictions
 from tests.fake_recordings import FakeDataset, FakeShard
 from tests.report import parts
 from tests.tasks.material.textures import MATERIALS, dataset, evaluated, slide, slides, trained

@@ -1,0 +1,53 @@
+"""The page's part on live sessions: there where a result has them, and nowhere else."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+from tacpipe.tasks.forward.report import live
+
+LIVE = {
+    "mae": {"live": {"t1": 2.5, "t10": 40.0}, "persistence": {"t1": 2.75, "t10": 41.0}},
+    "rows": {"published": 1500, "equal": 1419, "compared": 1489, "differ_after_late_samples": 70, "skipped": 3},
+    "latency": {
+        "count": 1489,
+        "median_ms": 6.25,
+        "p99_ms": 8.5,
+        "largest_ms": 22.0,
+        "above_10_ms": 3,
+        "above_20_ms": 1,
+    },
+    "alarms": {
+        "slip alarm, slips": {
+            "live": {"events": 13, "led": 1, "median_lead_ms": None, "false_alarms_per_hour": 41.5},
+        }
+    },
+}
+
+
+def context(metrics: dict[str, Any]) -> Any:
+    return SimpleNamespace(runs=[SimpleNamespace(details=SimpleNamespace(metrics=metrics))])
+
+
+def test_a_result_of_live_sessions_has_errors_rows_and_alarms() -> None:
+    (found,) = live.folds(context({"live": LIVE}))
+    text = str(found)
+    for shown in ("published live", "t+10", "1,419 of 1,489", "slip alarm, slips", "8.5", "41.5"):
+        assert shown in text
+
+
+def test_steps_stand_in_their_order() -> None:
+    errors = {"live": {"t1": 1.0, "t10": 3.0, "t5": 2.0}}  # as JSON sorts them
+    (found,) = live.folds(context({"live": {**LIVE, "mae": errors}}))
+    text = str(found)
+    assert text.index("t+1'") < text.index("t+5'") < text.index("t+10'")
+
+
+def test_a_session_without_forecasts_or_alarms_has_its_rows() -> None:
+    (found,) = live.folds(context({"live": {**LIVE, "mae": {}, "alarms": {}, "latency": {"count": 0}}}))
+    assert "1,500" in str(found) and "published live" not in str(found)
+
+
+def test_another_result_has_no_such_part() -> None:
+    assert live.folds(context({"counts": {}})) == []

@@ -1,0 +1,266 @@
+"""What the section of forecasts holds beyond the comparison."""
+
+from __future__ import annotations
+
+import json
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tacpipe.comparison.runs import grouped
+from tacpipe.report.blocks import Note, Section
+from tacpipe.tasks.forward.report import anticipation, reading, representations
+from tests.fake_recordings import FakeDataset
+from tests.report import parts
+from tests.tasks.forward.report.result_fakes import codec, errors, result
+from tests.tasks.forward.report.test_reading import RATIO
+
+
+def forward(*results: Any, **how: Any) -> Section:
+    return parts.section("forward", *results, **how)
+
+
+def many(ratio: float | dict[str, float], recordings: int = 8, **how: Any) -> Any:
+    """A result on as many recordings of known objects, on which ridge has 0.75 of persistence's squared error."""
+    one = result("raw", **how)
+    names = {f"r{index}": 20 for index in range(recordings)}
+    by_name = dict.fromkeys(names, ratio) if isinstance(ratio, float) else ratio
+    ratios = {"model": by_name, "ridge": dict.fromkeys(names, 0.75), "last_value_linear": dict.fromkeys(names, 0.9)}
+    held = errors(ratios, names, known=tuple(names))
+    return FakeDataset(one.recordings, {**one.files, "errors.parquet": held}, one.manifest)
+
+
+@pytest.mark.parametrize(
+    ("ratio", "verdict", "gain"),
+    [
+        (0.5, "better", "+0.333"),
+        (0.8, "worse", "−0.067"),
+        ({f"r{index}": (0.5, 1.125)[index % 2] for index in range(8)}, "unclear", "+0.000"),
+    ],
+)
+def test_a_page_is_green_only_where_the_best_baseline_is_beaten_beyond_the_interval(
+    ratio: Any, verdict: str, gain: str
+) -> None:
+    """At 0.8 of persistence's error the model has 20 % less than it, and the intervals of ridge exclude it."""
+    for given in ([many(ratio)], [many(ratio), many(ratio, seed=1)]):
+        found = forward(*given)
+        assert found.verdict == verdict
+        assert gain in found.sentence and "ridge" in found.sentence and "8 recordings" in found.sentence
+
+
+def test_two_recordings_are_too_few_for_a_verdict() -> None:
+    found = forward(result("raw", ratio=RATIO))
+    assert found.verdict == "" and "2 recordings" in found.sentence
+
+
+def test_the_table_of_all_methods_holds_errors_skill_and_what_they_rest_on() -> None:
+    found = forward(result("raw", 0, ratio=RATIO), result("raw", 1, ratio=1.0), result("PCA-20", ratio=2.0))
+    (table,) = [
+        one for one in parts.tables([parts.folds(found)["All methods and baselines"]]) if one.title == "known objects"
+    ]
+
+    def of(name: str, *heads: str) -> list[str]:
+        return [parts.cell(table, name, head).split(" | ")[0] for head in heads]
+
+    # squared skills 0.6875 and 0 pool to 0.34375, ratios of recordings to 0.125 ** 0.25;
+    # MAE is twice the step times 0.65625, MSE the mean step times that
+    heads: tuple[str, ...] = (
+        "MAE t+1",
+        "MAE t+3",
+        "squared vs persistence",
+        "vs persistence",
+        "sd over runs",
+        "MSE (counts²)",
+        "MSE (standardised)",
+    )
+    assert of("recurrent · raw", *heads) == ["1.312", "3.938", "0.3438", "0.4054", "0.457", "1.312", "1.312"]
+    assert of("persistence", *heads)[:4] == ["2", "6", "0", "0"]
+    heads = (
+        "skill over persistence t+1",
+        "skill over persistence, channels standardised",
+        "windows",
+        "recordings",
+        "runs",
+    )
+    assert of("recurrent · raw", *heads) == ["+0.405", "+0.405", "40", "2", "2"]
+    assert [group.title for group in table.groups] == ["", "Baselines", "Oracles, which know what they predict"]
+
+
+def test_methods_of_a_family_fold_behind_the_best_one() -> None:
+    found = forward(*(result("raw", params={"hidden": width}, ratio=width / 100) for width in (25, 50, 75)))
+    table = parts.tables([parts.folds(found)["All methods and baselines"]])[0]
+    first = table.groups[0]
+    assert first.folded and [parts.text(row.cells[0]) for row in first.rows] == [
+        "recurrent · raw · hidden 25", "recurrent · raw · hidden 50", "recurrent · raw · hidden 75"
+    ]  # fmt: skip
+
+
+def test_the_worth_of_the_plan_is_the_difference_to_a_model_without_it() -> None:
+    none = {name: ratio + 0.125 for name, ratio in RATIO.items()}
+    found = forward(result("raw", ratio=RATIO), result("raw", ratio=none, params={"actions": "none"}), result("PCA-20"))
+    (table,) = parts.tables([parts.folds(found)["What the plan and the timeline change"]])
+    shown = [[one.split(" | ")[0] for one in parts.cells(table, name)] for name in ("recurrent · raw", "… none")]
+    assert shown[0] == ["+0.646", "–", "–", "+0.134", "–", "–", "1"]
+    assert shown[1] == ["+0.516", "+0.131", "+0.131", "−0.008", "+0.142", "+0.142", "1"]
+
+
+def test_timelines_are_next_to_each_other_with_how_long_a_step_lasts() -> None:
+    results = [result("raw", seed, ratio=RATIO) for seed in range(2)]
+    found = forward(*results, result("raw", ratio=0.25, timeline="fresh", rate_hz=10.0))
+    (table,) = parts.tables([parts.folds(found)["What the plan and the timeline change"]])
+    assert parts.cells(table, "recurrent · raw · fresh (fresh)")[:2] == ["100", "+0.750"]
+    assert [one.split(" | ")[0] for one in parts.cells(table, "recurrent · raw (uniform)")[:2]] == ["20", "+0.646"]
+
+
+def test_of_a_labs_own_data_nothing_is_stated_that_the_paper_states_of_its_own() -> None:
+    hows: tuple[dict[str, Any], ...] = ({"attributes": {}}, {})
+    own, published = (
+        parts.words(
+            forward(
+                *(result(name, seed, **how) for name in ("PCA-20", "AE-C1-8", "raw") for seed in range(2)),
+                others=[codec(20)],
+            )
+        )
+        for how in hows
+    )
+    assert "paper" not in own.lower()
+    for told in ("Table 1 in the paper", "in the paper 20 hold", "Figure 5 in the paper", "Figure 6 in the paper"):
+        assert told in published, told
+
+
+def test_table_1_holds_the_papers_numbers_next_to_ours_and_those_not_run() -> None:
+    found = forward(result("PCA-20", 0), result("PCA-20", 1), result("PCA-8"))
+    table = parts.tables([parts.folds(found)["Representations"]])[0]
+    ours = ["0.0150 ± 0.0071", "1.0000 ± 0.0000", "1.0000 ± 0.0000", "2.0000 ± 0.0000", "0.5"]
+    assert parts.cells(table, "PCA-20") == [*ours, "0.0298", "0.0363", "2"]
+    assert parts.cells(table, "PCA-8") == ["0.0100", "1.0000", "1.0000", "2.0000", "0.5", "–", "–", "1"]
+    assert parts.cells(table, "AE-C3") == ["–", "–", "–", "–", "–", "0.0405", "0.0510", "0"]
+
+
+def test_a_row_of_table_1_has_mean_and_sd_over_runs_in_the_models_own_space() -> None:
+    (method,) = grouped(reading.read([result(seed=0, ratio=0.5), result(seed=1, ratio=0.75)]))
+    found = representations.represented(method)
+    assert found is not None and found.known is not None
+    assert (found.validation.mean, found.validation.sd) == pytest.approx((0.015, 0.01 / np.sqrt(2)))
+    assert (found.test.mean, found.test.sd) == pytest.approx((1.25, 0.5 / np.sqrt(2)))  # ratio times the mean step, 2
+    assert found.known.mean == pytest.approx(1.25)
+    assert (found.persistence.mean, found.persistence.sd) == pytest.approx((2, 0))
+    (method,) = grouped(reading.read([result(validation={"loss": 0.25, "epoch": 3})]))
+    found = representations.represented(method)
+    assert found is not None and found.validation.mean == 0.25  # the recurrent model's loss is that error
+
+
+def test_anticipation_is_weighted_by_events_and_leaves_out_what_was_never_seen_coming() -> None:
+    names = ("events", "recall", "median_lead_rows", "median_lead_frames", "false_alarms_per_minute")
+    stated = [(4, 0.5, 6.0, None, 1), (12, 1.0, 2.0, 1.0, 3), (0, None, None, None, 9)]
+    given = [result(seed=seed) for seed in range(3)]
+    for one, row in zip(given, stated, strict=True):
+        content = {"anticipation": {"model": dict(zip(names, row, strict=True))}}
+        one.files["metrics.json"] = json.dumps(content).encode()
+    (method,) = grouped(reading.read(given))
+    assert anticipation.of(method, "model") == pytest.approx(dict(zip(names, (16, 0.875, 3.0, 1.0, 2.5), strict=True)))
+    assert anticipation.of(method, "ridge") is None
+
+
+def test_in_full_are_the_median_run_of_the_best_method_and_of_the_papers() -> None:
+    results = [result("raw", seed, ratio=ratio) for seed, ratio in enumerate((0.5, 0.25, 0.375))]
+    found = forward(*results, *(result("PCA-20", seed, ratio=2.0) for seed in range(2)))
+    assert [name for name in parts.folds(found) if name.startswith("In full")] == [
+        "In full: recurrent · raw", "In full: recurrent · PCA-20"
+    ]  # fmt: skip
+    table = next(
+        one for one in parts.tables([parts.folds(found)["In full: recurrent · raw"]]) if "squared" in one.title
+    )
+    assert parts.cells(table, "model") == ["0.375", "1.125", "0.75"]  # of the middle run, times the step
+
+
+def test_known_and_unseen_objects_are_apart_in_a_single_run() -> None:
+    found = forward(result(ratio=RATIO))
+    tables = parts.tables([parts.folds(found)["In full: recurrent · PCA-20"]])
+    row = parts.cells(tables, "known objects (2 recordings), skill")
+    assert row[0] == "+0.625 | +0.525 to +0.725"  # 1 - the mean of 0.5 and 0.25
+
+
+def test_results_of_before_groups_were_renamed_are_still_read() -> None:
+    one = result(ratio=RATIO)
+    old = json.loads(one.files["metrics.json"])
+    for name in ("model", "persistence", "train_mean", "codec"):
+        for measure in ("mse_counts", "mae_counts"):
+            old[name][measure]["all"] = old[name][measure].pop("both")
+    del old["known"], old["unseen"]
+    one.files["metrics.json"] = json.dumps(old).encode()
+    text = parts.words(forward(one))
+    assert "model, sensor1" in text and "model, all" not in text
+
+
+@pytest.mark.parametrize("several", [False, True])
+def test_results_of_a_sensor_in_kilopascal_name_no_count(several: bool) -> None:
+    given = [result("raw", seed, attributes={}, inputs={"unit": "kPa"}) for seed in range(2 if several else 1)]
+    text = parts.words(forward(*given))
+    assert "kPa²" in text and not re.search(r"\bcounts?\b", text.replace("counts, ", ""))
+
+
+def test_the_number_of_traces_is_the_readers_choice_and_they_are_drawn_in_part() -> None:
+    drawn = [parts.charts(forward(result(ratio=RATIO, attributes={}), traces=count)) for count in (0, 1, 2)]
+    named = [[one for one in held if "truth now" in json.dumps(one.spec)] for held in drawn]
+    assert [len(one) for one in named] == [0, 2, 4]  # two latents a recording
+
+
+def test_codecs_next_to_results_are_drawn_by_their_width() -> None:
+    found = forward(result(ratio=RATIO), others=[codec(2, loss=0.75), codec(4, loss=0.5)])
+    (chart,) = [one for one in parts.charts(found) if one.title == "Reconstruction error by number of latents"]
+    assert [(row["x"], row["y"]) for row in parts.values(chart)] == [(2, 0.75), (4, 0.5)]
+    assert parts.cells(parts.tables([parts.folds(found)["Representations"]]), "PCA")[:2] == ["2", "0.7500"]
+
+
+def test_the_paper_figures_are_of_its_latents() -> None:
+    found = forward(result("PCA-20"), result("AE-C1-8"), result("raw"))
+    drawn = [one.title for one in parts.charts(found) if one.title.startswith("Figure")]
+    assert [one.rpartition(" ")[2] for one in drawn] == ["z00", "z01", "z01", "z03"]
+
+
+def test_a_result_without_errors_by_recording_is_still_reported_next_to_others() -> None:
+    plain: Any = FakeDataset(
+        files={"metrics.json": b'{"counts": {"recordings": 0}}', "config.json": b'{"task": "forward"}'},
+        manifest={"stage": "evaluate"},
+    )
+    for given in ([plain], [result(), plain]):
+        assert parts.cells(parts.tables(forward(*given)), "counts, recordings") == ["0"]
+
+
+def test_recordings_are_listed_worst_first_with_the_command_to_see_each() -> None:
+    found = forward(result("raw", ratio={"r1": 0.5, "r2": 0.25, "r3": 1.5, "r4": 0.5}))
+    known, unseen = parts.tables([parts.folds(found)["Recordings"]])
+    assert [parts.text(row.cells[0]) for row in (*known.rows, *unseen.rows)] == ["r1", "r2", "r3", "r4"]
+    first = unseen.rows[0].cells[0]
+    assert not isinstance(first, str) and first.copy.split()[:2] == ["tacpipe", "view"] and "r3" in first.copy
+    assert parts.cell(unseen, "r3", "skill") == "−1.000"  # 1.5 next to 0.75
+
+
+def test_a_page_states_how_far_training_rows_look_ahead_and_of_which_methods() -> None:
+    ahead, none = ({"mean_ms": mean, "max_ms": largest} for mean, largest in ((9.5, 26.25), (0.0, 0.0)))
+    pages = {
+        "one": forward(result("raw", look_ahead=ahead)),
+        "both": forward(result("raw", look_ahead=ahead), result("PCA-20", look_ahead=none)),
+        "hidden": forward(result("raw", look_ahead=ahead), result("raw", look_ahead=none, params={"hidden": 8})),
+        "none": forward(result("raw", look_ahead=none), result("PCA-20")),
+    }
+    texts = {
+        name: [
+            note.text
+            for note in parts.folds(page)["What these numbers rest on"].blocks
+            if isinstance(note, Note) and "look ahead" in note.text
+        ]
+        for name, page in pages.items()
+    }
+    assert texts["none"] == []
+    begins = {
+        "one": "The rows",
+        "both": "recurrent · raw: The rows",
+        "hidden": "recurrent · raw · hidden 200: The rows",
+    }
+    for name in begins:
+        (sentence,) = texts[name]
+        assert sentence.startswith(begins[name]) and "by 9.5 ms on average and at most 26.25 ms" in sentence

@@ -1,0 +1,52 @@
+"""Errors by situation, pooled over the runs of a method."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tacpipe.tasks.forward.report import situations
+
+
+def run(**found: tuple[int, float, float, float]) -> Any:
+    """A run with windows, errors of persistence and of the model, and skill by situation."""
+    tree = {
+        name.replace("_", " "): {
+            "windows": windows,
+            "mae_counts": {"persistence": {"mean": still}, "model": {"mean": model}},
+            "skill": {"mean": {"mean": skill, "low": skill - 0.1, "high": skill + 0.1}},
+        }
+        for name, (windows, still, model, skill) in found.items()
+    }
+    return SimpleNamespace(details=SimpleNamespace(metrics={"situations": tree} if tree else {}))
+
+
+def test_several_runs_are_weighted_by_their_windows_and_one_has_its_interval() -> None:
+    first, second = (
+        run(closing=(100, 40.0, 30.0, 0.2), slipping=(50, 80.0, 60.0, 0.3)),
+        run(closing=(300, 20.0, 20.0, 0.0)),
+    )
+    method: Any = SimpleNamespace(name="mixed", runs=[first, second])
+    found = situations.of_method(method, "closing")
+    assert found is not None
+    assert found["windows"] == 400
+    assert (found["persistence"], found["model"]) == pytest.approx((25.0, 22.5))
+    assert found["skill"] == pytest.approx(0.05)
+    assert found["part"] == pytest.approx((4000 + 6000) / (4000 + 6000 + 4000))
+    assert np.isnan(found["low"])
+    alone = situations.of_method(SimpleNamespace(name="mixed", runs=[first]), "slipping")  # type: ignore[arg-type]
+    assert alone is not None and (alone["low"], alone["high"]) == pytest.approx((0.2, 0.4))
+    assert situations.of_method(method, "releasing") is None
+
+
+def test_results_without_situations_have_no_table() -> None:
+    empty: Any = SimpleNamespace(methods=[SimpleNamespace(name="gru", runs=[run()])])
+    assert situations.folds(empty) == []
+    full: Any = SimpleNamespace(methods=[SimpleNamespace(name="mixed", runs=[run(closing=(100, 40.0, 30.0, 0.2))])])
+    (one,) = situations.folds(full)
+    assert one.title == "By situation"
+    table: Any = one.blocks[0]
+    assert [getattr(cell, "text", cell) for cell in table.rows[0].cells][:4] == ["closing", "mixed", "100", "100.0 %"]

@@ -1,0 +1,148 @@
+"""Which results are runs of one method, and what it is called."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+
+from tacpipe.comparison.runs import Method
+from tacpipe.tasks.material.report import methods
+from tacpipe.tasks.material.report.methods import Result
+from tests.report import parts
+from tests.tasks.material.report.material_fakes import result
+
+BOTH = {"biotac": 1, "roboskin": 2}
+
+
+def grouped(*results: Any) -> dict[str, Method]:
+    return {one.name: one for one in parts.methods("material", *results)}
+
+
+def test_seeds_folds_and_sensors_that_were_trained_alone_make_one_method() -> None:
+    found = grouped(
+        *(
+            result(wrong={sensor: 1}, fold=fold, seed=seed, sensors=sensor)
+            for sensor in BOTH
+            for fold in (0, 1)
+            for seed in (0, 1)
+        )
+    )
+    assert {name: len(one.runs) for name, one in found.items()} == {"RAEC independent": 8}
+    assert methods.sensors_of([found["RAEC independent"]]) == ("biotac", "roboskin")
+    assert len(methods.of(found["RAEC independent"], "biotac")) == 4
+
+
+def test_names_say_what_keeps_a_method_from_being_plain() -> None:
+    found = grouped(
+        result("minirocket", wrong=BOTH),
+        result("x-lstm", wrong=BOTH),
+        result(wrong=BOTH),
+        result(wrong=BOTH, joint=True),
+        result(wrong=BOTH, joint=True, pairing="permuted"),
+        result(wrong=BOTH, labels="permuted"),
+        result(wrong=BOTH, joint=True, reduce="biotac", ratio=11),
+        result(wrong=BOTH, joint=True, hold_out="roboskin=3,4"),
+        result("minirocket", wrong=BOTH, train={"biotac": 64, "roboskin": 64}),
+        result(wrong=BOTH, known="biotac"),
+    )
+    assert {name: methods.plain(one.settings) for name, one in found.items()} == {
+        "MiniRocket": True,
+        "X-LSTM": True,
+        "RAEC independent": True,
+        "RAEC joint": True,
+        "mapping to known space": True,
+        "RAEC joint · permuted pairs": False,
+        "RAEC independent · permuted labels": False,
+        "RAEC joint · BioTac 11 %": False,
+        "RAEC joint · RoboSkin without 3, 4": False,
+        "MiniRocket · 64 slides": False,
+    }
+
+
+def test_settings_are_told_only_where_they_tell_methods_apart() -> None:
+    found = grouped(
+        result(wrong=BOTH, joint=True, decoder="D1", pairing="fixed", epochs_most=5),
+        result(wrong=BOTH, joint=True, decoder="D2", pairing="fixed", epochs_most=5),
+        result(wrong=BOTH, decoder="D1", epochs_most=5),
+    )
+    assert list(found) == ["RAEC independent", "RAEC joint · decoder D1", "RAEC joint · decoder D2"]
+
+
+def test_settings_without_effect_make_no_other_method() -> None:
+    found = grouped(
+        result("minirocket", wrong=BOTH, joint=True, decoder="D1", epochs_most=1, reduce="biotac", ratio=11),
+        result("minirocket", wrong=BOTH, joint=False, decoder="D2", epochs_most=2),
+        result("x-lstm", wrong=BOTH, joint=True, pairing="fixed", decoder="D1"),
+        result("x-lstm", wrong=BOTH, joint=False, pairing="random", decoder="D2"),
+        result(wrong=BOTH, pairing="fixed", alignment_weight=1.0),
+        result(wrong=BOTH, pairing="random", alignment_weight=2.0),
+    )
+    assert {name: len(one.runs) for name, one in found.items()} == {"MiniRocket": 2, "X-LSTM": 2, "RAEC independent": 2}
+
+
+def test_results_of_another_split_stand_apart_from_what_most_have() -> None:
+    def placed(split: str, fold: int) -> Any:
+        made = result("minirocket", wrong=BOTH, fold=fold)
+        made.files["config.json"] = json.dumps({**json.loads(made.files["config.json"]), "split": split}).encode()
+        return made
+
+    found = grouped(placed("", 0), placed("", 1), placed("last to first", 2))
+    assert {name: methods.plain(one.settings) for name, one in found.items()} == {
+        "MiniRocket": True,
+        "MiniRocket · split last to first": False,
+    }
+    assert methods.plain(found["MiniRocket · split last to first"].settings, "elsewhere")
+
+
+def test_folds_of_nearly_one_size_pool_and_fewer_slides_do_not() -> None:
+    sizes = (600, 599, 585, 430, 96, 100, 64)
+    found = grouped(*(result(wrong=BOTH, train=dict.fromkeys(BOTH, size), fold=size) for size in sizes))
+    assert {name: len(one.runs) for name, one in found.items()} == {
+        "RAEC independent": 3,
+        "RAEC independent · 430 slides": 1,
+        "RAEC independent · 96 slides": 2,
+        "RAEC independent · 64 slides": 1,
+    }
+
+
+def test_a_sensor_with_fewer_slides_than_another_has_all_of_its_own() -> None:
+    found = grouped(
+        result(wrong={"biotac": 1}, train={"biotac": 100}), result(wrong={"roboskin": 1}, train={"roboskin": 60})
+    )
+    assert list(found) == ["RAEC independent"]
+
+
+def test_one_sensor_with_fewer_slides_than_the_other_is_a_method_of_its_own() -> None:
+    found = grouped(
+        result(wrong=BOTH, joint=True),
+        result(wrong=BOTH, joint=True, train={"biotac": 576, "roboskin": 64}),
+        result(wrong=BOTH, joint=True, train={"biotac": 64, "roboskin": 64}),
+    )
+    assert list(found) == ["RAEC joint", "RAEC joint · 64 slides", "RAEC joint · RoboSkin 64 slides"]
+    assert methods.line(found["RAEC joint · RoboSkin 64 slides"]) == "RAEC joint · other sensor whole"
+    assert methods.line(found["RAEC joint · 64 slides"]) == "RAEC joint"
+
+
+def test_simulated_slides_and_scrambled_ones_are_kept_apart() -> None:
+    found = grouped(result(wrong=BOTH), result(wrong=BOTH, simulated=True))
+    assert {one.simulated for one in found.values()} == {True, False}
+
+
+def test_a_mapped_method_tells_of_the_sensor_that_was_mapped() -> None:
+    found = grouped(result(wrong=BOTH, known="biotac"), result(wrong=BOTH, known="roboskin"))
+    (method,) = found.values()
+    assert [run.details.sensors for run in methods.of(method, "roboskin")] == [("roboskin",)]
+    assert [run.details.sensors for run in methods.of(method, "biotac")] == [("biotac",)]
+
+
+@pytest.mark.parametrize(("params", "slides"), [({"reduce": "biotac", "ratio": 25, "batch": 32}, 160), ({}, 576)])
+def test_a_reduced_sensor_learns_from_its_share_of_the_batches(params: dict[str, Any], slides: int) -> None:
+    run = Result(result(wrong=BOTH, joint=True, **params))
+    assert run.learned == {"biotac": slides, "roboskin": 576}
+
+
+def test_a_readout_learns_from_validation_slides_too_where_it_says_so() -> None:
+    given = result("minirocket", wrong=BOTH, use_validation=True, validation_slides=200)
+    assert Result(given).learned == {"biotac": 776, "roboskin": 776}

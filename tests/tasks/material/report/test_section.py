@@ -1,0 +1,246 @@
+"""The whole section of materials, and the numbers that go into its charts."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tacpipe.comparison.runs import Method
+from tacpipe.report import provenance
+from tacpipe.report.blocks import Section
+from tacpipe.tasks.material.report import confusion, curves, latents, profiles, wording
+from tacpipe.tasks.material.report.methods import Result
+from tests.fake_recordings import FakeDataset
+from tests.report import parts
+from tests.tasks.material.report import material_fakes
+from tests.tasks.material.report.material_fakes import result
+
+BOTH = {"biotac": 1, "roboskin": 2}
+PARTNERS = {1: 2, 2: 3, 3: 4, 4: 1}
+
+
+def grouped(*results: Any) -> list[Method]:
+    return parts.methods("material", *results)
+
+
+def everything(**kind: Any) -> list[Any]:
+    level = {"mean_level": {"biotac": 4, "roboskin": 8}, "permuted_labels": {"biotac": 15, "roboskin": 20}}
+    joint = {**level, "swapped": BOTH, "last_epoch": BOTH}
+    found = []
+    for fold in (0, 1):
+        how: dict[str, Any] = {"fold": fold, "epochs": 3, **kind}
+        found += [
+            result("minirocket", wrong=BOTH, also=level, fold=fold, **kind),
+            result("minirocket", wrong=BOTH, train=dict.fromkeys(BOTH, 64), fold=fold, **kind),
+            result("x-lstm", wrong=BOTH, **how),
+            result(wrong={"biotac": 2 + fold}, **how),
+            result(wrong={"roboskin": 3}, **how),
+            result(wrong=BOTH, also=joint, joint=True, **how),
+            result(wrong=BOTH, also=joint, joint=True, pairing="permuted", partners=PARTNERS, **how),
+            result(wrong={"roboskin": 3}, known="biotac", **how),
+        ]
+    return [*found, result(wrong=BOTH, joint=True, reduce="biotac", ratio=25, shuffle=False, epochs=3, **kind)]
+
+
+@pytest.fixture(scope="module")
+def whole() -> Section:
+    return parts.section("material", *everything(), others=[material_fakes.recorded()])
+
+
+def test_the_first_screen_is_about_both_sensors(whole: Section) -> None:
+    assert "BioTac" in whole.sentence and "RoboSkin" in whole.sentence and "20 slides" in whole.sentence
+    assert whole.table is not None and len(whole.table.rows) <= 7
+    assert whole.counts == ["8 methods", "17 results", "40 slides"]
+
+
+def test_all_that_there_is_has_its_fold(whole: Section) -> None:
+    assert list(parts.folds(whole)) == [
+        "All methods and baselines", "Joint learning", "Fewer slides of one sensor", "Few slides",
+        "Which materials are confused", "Latents", "Training", "The slides", "Recordings", "Every run",
+        "What these numbers rest on", "Where it comes from",
+    ]  # fmt: skip
+    text = parts.words(whole)
+    for told in (
+        "Table II in",
+        "Table III in",
+        "Figure 5",
+        "Figure 6",
+        "Figure 9",
+        "Figure 10",
+        "label-driven",
+        "cd" * 32,
+    ):
+        assert told in text, told
+    assert "20 slides of biotac after training on 64, 160 and 576" in text
+
+
+@pytest.mark.parametrize("simulated", [False, True])
+def test_a_labs_own_slides_get_nothing_that_the_paper_states_of_its_own(simulated: bool) -> None:
+    level = {"mean_level": {"biotac": 4, "roboskin": 8}, "swapped": BOTH}
+    how: dict[str, Any] = {"published": False, "simulated": simulated, "sessions": 2}
+    given = [
+        result("minirocket", wrong=BOTH, also=level, **how),
+        result(wrong=BOTH, also=level, joint=True, epochs=3, **how),
+        result(wrong=BOTH, also=level, joint=True, reduce="biotac", ratio=25, epochs=3, **how),
+    ]
+    slides = material_fakes.recorded()
+    for shard in slides.recordings.values():
+        del shard.attributes["published"]
+    found = parts.section("material", *given, others=[slides])
+    text = parts.words(found)
+    for told in ("paper", "192 slides", "one session", "mapping to known space", "X-LSTM", "Figure"):
+        assert told not in text, told
+    assert (found.simulated, text.count(provenance.SIMULATED)) == (simulated, int(simulated))
+
+
+@pytest.mark.parametrize(("sessions", "told"), [(1, True), (2, False)])
+def test_that_each_material_has_one_session_is_stated_where_it_is_so(sessions: int, told: bool) -> None:
+    given = result("minirocket", wrong=BOTH, published=False, sessions=sessions)
+    assert (wording.SESSIONS in parts.words(parts.section("material", given))) == told
+
+
+def test_one_result_alone_has_no_comparison_of_methods() -> None:
+    found = parts.section("material", result("minirocket", wrong={"biotac": 1}))
+    assert "Joint learning" not in parts.folds(found) and "MiniRocket" in found.sentence
+
+
+def test_results_that_are_all_variants_have_no_best_method() -> None:
+    given = [result(wrong=BOTH, labels="permuted"), result(wrong=BOTH, joint=True, pairing="permuted")]
+    found = parts.section("material", *given)
+    assert (found.sentence, found.table) == ("", None)
+    assert "RAEC joint · permuted pairs" in parts.words(found)
+
+
+def test_a_result_without_unseen_slides_is_reported_as_its_metrics_name_it() -> None:
+    given = result("minirocket", wrong=BOTH, metrics={"seen": {"n": 7}})
+    bare: Any = FakeDataset({}, given.files, given.manifest)
+    assert parts.cells(parts.tables(parts.section("material", bare)), "seen, n") == ["7"]
+
+
+def test_confusions_are_counted_over_runs_and_stated_in_words() -> None:
+    (method,) = grouped(result(wrong={"biotac": 2}, fold=0), result(wrong={"biotac": 1}, fold=1))
+    counts, materials = confusion.counted(method, "biotac")
+    assert materials == [1, 2, 3, 4]
+    # the fakes take the first slide of material 1 for 2 in both runs, and that of 2 for 3 in one
+    assert counts.tolist() == [[8, 2, 0, 0], [0, 9, 1, 0], [0, 0, 10, 0], [0, 0, 0, 10]]
+    assert confusion.worst(counts, materials) == "Most often it takes 1 for 2 (2 of 10) and 2 for 3 (1 of 10)."
+    assert confusion.worst(np.diag([3, 3]), [1, 2]) == "It takes none for another."
+
+
+def test_confusion_matrices_hold_every_count_of_the_best_method_and_of_the_joint_one() -> None:
+    drawn = parts.charts(
+        confusion.folds(
+            parts.context("material", result("minirocket", wrong={"biotac": 1}), result(wrong=BOTH, joint=True))
+        )
+    )
+    assert [one.title for one in drawn] == ["BioTac: MiniRocket", "BioTac: RAEC joint", "RoboSkin: RAEC joint"]
+    cells = {(row["row"], row["column"]): (row["count"], row["right"]) for row in parts.values(drawn[0])}
+    assert cells == {("1", "1"): (4, True), ("1", "2"): (1, False), **{(n, n): (5, True) for n in "234"}}
+
+
+def test_projections_keep_what_lies_in_a_plane() -> None:
+    rng = np.random.default_rng(0)
+    plane = rng.normal(size=(2, 5))
+    points = [rng.normal(size=(count, 2)) @ plane for count in (4, 7)]
+    flat = latents.projected(points)
+    assert [one.shape for one in flat] == [(4, 2), (7, 2)]
+    together = np.vstack(points), np.vstack(flat)
+    apart = [np.linalg.norm(one[:, None] - one[None], axis=2) for one in together]
+    assert np.allclose(*apart)
+
+
+def test_a_projection_does_not_depend_on_the_sign_that_a_decomposition_takes() -> None:
+    points = np.random.default_rng(1).normal(size=(9, 4)) * [5, 2, 1, 1]
+    first, second = latents.projected([points])[0], latents.projected([points[::-1]])[0][::-1]
+    assert np.allclose(first, second)
+
+
+def test_materials_lie_together_with_those_that_they_were_paired_with() -> None:
+    same, other = (
+        Result(result(wrong=BOTH, joint=True, epochs=2, partners=partners, pairing="permuted")).predictions
+        for partners in (None, PARTNERS)
+    )
+    assert latents.together(same.of("biotac"), same.of("roboskin"), {}) == (4, 4)
+    assert latents.together(other.of("biotac"), other.of("roboskin"), {}) == (0, 4)
+    assert latents.together(other.of("biotac"), other.of("roboskin"), PARTNERS) == (4, 4)
+
+
+def test_latents_of_a_joint_run_are_next_to_the_control_and_two_that_learned_alone() -> None:
+    drawn = parts.charts(
+        latents.folds(
+            grouped(
+                result(wrong=BOTH, joint=True, epochs=2),
+                result(wrong=BOTH, joint=True, epochs=2, partners=PARTNERS, pairing="permuted"),
+                result(wrong={"biotac": 1}, epochs=2),
+                result(wrong={"roboskin": 1}, epochs=2),
+            )
+        )
+    )
+    names = ["RAEC joint", "RAEC joint · permuted pairs", "RAEC independent"]
+    assert [one.title.split(":")[0] for one in drawn] == names
+    assert "4 of 4 materials" in drawn[1].caption and "paired" in drawn[1].caption
+    assert {row["shape"] for row in parts.values(drawn[0])} == {"BioTac", "RoboSkin"}
+    lines = drawn[1].spec["layer"][-1]["data"]["values"]
+    assert [one["text"] for one in lines] == ["1", "2", "3", "4"]
+    assert latents.folds(grouped(result("minirocket", wrong=BOTH))) == []
+
+
+def test_convergence_is_drawn_for_each_sensor_and_the_alignment_with_its_control() -> None:
+    given = grouped(
+        result(wrong=BOTH, joint=True, epochs=4, fold=0),
+        result(wrong=BOTH, joint=True, epochs=5, fold=1),
+        result(wrong=BOTH, joint=True, epochs=4, pairing="permuted"),
+        result(wrong={"roboskin": 1}, epochs=4),
+    )
+    biotac, roboskin = curves.convergence(given)
+    assert "BioTac" in biotac.title and "RoboSkin" in roboskin.title
+    rows = parts.values(biotac)
+    assert {row["name"] for row in rows} == {"RAEC joint"}
+    assert sorted(sum(row["run"] == run for row in rows) for run in {row["run"] for row in rows}) == [
+        4,
+        4,
+        5,
+    ]  # the mean last
+    (pairs,) = curves.alignment(given)
+    assert {row["name"] for row in parts.values(pairs)} == {"RAEC joint", "RAEC joint · permuted pairs"}
+    assert curves.convergence(grouped(result("minirocket", wrong=BOTH))) == []
+    assert curves.alignment(grouped(result(wrong=BOTH, epochs=3))) == []
+
+
+def test_curves_over_slides_are_those_of_methods_with_several_numbers() -> None:
+    drawn = parts.charts(
+        curves.few_slides(
+            grouped(
+                *(result("minirocket", wrong=BOTH, train=dict.fromkeys(BOTH, count)) for count in (64, 576)),
+                *(result(wrong=BOTH, joint=True, reduce="biotac", ratio=ratio, shuffle=False) for ratio in (11, 50)),
+                *(result(wrong=BOTH, joint=True, train={"biotac": 576, "roboskin": count}) for count in (96, 576)),
+                result("x-lstm", wrong=BOTH),
+            )
+        )
+    )
+    joint = "RAEC joint · other sensor whole"
+    names = [{row["name"] for row in parts.values(one)} for one in drawn]
+    assert names == [{"MiniRocket", f"{joint} · fixed batches"}, {"MiniRocket", joint}]
+    assert {row["x"] for row in parts.values(drawn[0]) if row["name"] == "MiniRocket"} == {64, 576}
+    assert curves.few_slides(grouped(result("minirocket", wrong=BOTH))) == []
+
+
+def test_slides_are_counted_and_the_one_of_median_force_is_drawn() -> None:
+    found = profiles.folds([material_fakes.recorded(5, outside=2)])
+    text = parts.words(found)
+    assert "5 slides of BioTac, 2 of them outside the protocol (2 moved at 12 mm/s)." in text
+    assert "1 slide of RoboSkin, 0 of them outside the protocol." in text
+    drawn = parts.charts(found)
+    assert len(drawn) == 2 and "biotac-m01-t003" in drawn[0].caption  # forces of 3, 4 and 5 N kept to the protocol
+    assert {row["name"] for row in parts.values(drawn[1])} == {"as measured", "median of 3"}
+
+
+@pytest.mark.parametrize("lacking", ["force_n", "speed_m_s"])
+def test_what_was_not_measured_is_not_drawn(lacking: str) -> None:
+    given = material_fakes.recorded(1, outside=0)
+    shard = given.recordings["biotac-m01-t000"]
+    short = shard.tables["profile"].drop_columns([lacking] if lacking == "force_n" else [lacking, "speed_raw_m_s"])
+    shard.tables = {**shard.tables, "profile": short}
+    assert len(parts.charts(profiles.folds([given]))) == 1

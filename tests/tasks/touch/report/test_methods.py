@@ -1,0 +1,119 @@
+"""Which results are runs of one method, and what it is called."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from tacpipe.comparison.runs import Method
+from tacpipe.tasks.touch.report.methods import default, groups, main
+from tests.report import parts
+from tests.tasks.touch.report.touch_fakes import result
+
+
+def methods(*results: Any) -> list[Method]:
+    return parts.methods("touch", *results)
+
+
+def test_runs_that_differ_in_seed_words_or_other_networks_targets_are_one_method() -> None:
+    found = methods(
+        result("patches", seed=0),
+        result("patches", seed=1, setting="random"),
+        result("patches", seed=2, baselines={}),
+        result("patches", targets=("pdc_th",)),
+    )
+    assert [(one.name, len(one.runs)) for one in found] == [("patches", 4)]
+
+
+def test_options_that_another_architecture_has_set_no_method_apart() -> None:
+    found = methods(result(trees=300), result(trees=300, points=64, head="fc1"), result(trees=300, wrist="estimated"))
+    assert [(one.name, len(one.runs)) for one in found] == [("tree-ensemble", 3)]
+
+
+def test_one_network_for_other_targets_is_another_method() -> None:
+    found = methods(result(together=True), result(together=True), result(together=True, targets=("pdc_th",)))
+    assert [one.name for one in found] == ["tree-ensemble", "tree-ensemble · targets pdc_th"]
+
+
+def test_a_name_tells_what_sets_a_method_apart_from_most_of_its_architecture() -> None:
+    found = methods(
+        *(result("pointnet", head=head) for head in ("fc3", "fc1")),
+        result("pointnet", points=250),
+        result("pointnet", transform=False),
+        result("trees", head="fc6"),
+    )
+    assert [one.name for one in found] == [
+        "PointNet",
+        "PointNet · head fc1",
+        "PointNet · no transform",
+        "PointNet · points 250",
+        "trees on geometry and colour",
+    ]
+
+
+def test_trees_are_called_by_whether_they_read_colour_and_others_say_where_they_do_not() -> None:
+    kinds = ("strong", "trees", "patches")  # as they are stored
+    found = methods(*(result(kind, inputs=inputs) for kind in kinds for inputs in ("rgbcont", "xyzcont", "xyz")))
+    assert [(one.name, len(one.runs)) for one in found] == [
+        ("patches", 1),
+        ("patches · without colour", 2),  # contacts are read whatever the inputs
+        ("tree-ensemble", 1),
+        ("tree-ensemble · without colour", 2),
+        ("trees on geometry", 2),
+        ("trees on geometry and colour", 1),
+    ]
+    assert [one.name for one in methods(result(inputs="xyz"))] == ["tree-ensemble · without colour"]  # alone, too
+    assert [one.name for one in methods(result("pointnet", inputs="xyz"), result("pointnet"), result("pointnet"))] == [
+        "PointNet",
+        "PointNet · inputs xyz",
+    ]
+
+
+def test_marks_of_other_settings_come_behind_the_colour() -> None:
+    found = methods(result(leaf=0), *(result(inputs="xyz", leaf=leaf) for leaf in (0, 4)))
+    assert [one.name for one in found] == [
+        "tree-ensemble",
+        "tree-ensemble · without colour",
+        "tree-ensemble · without colour · leaf 4",
+    ]
+
+
+def test_the_wrist_makes_a_method_only_where_it_is_read() -> None:
+    pairs = [("rgbcont", "given"), ("rgbcont", "estimated"), ("rgbpose", "given"), ("rgbpose", "estimated")]
+    found = methods(*(result("pointnet", inputs=inputs, wrist=wrist) for inputs, wrist in pairs))
+    assert sorted(len(one.runs) for one in found) == [1, 1, 2]
+
+
+def test_methods_are_compared_on_one_split_alone_recorded_grasps_first() -> None:
+    found = groups(
+        methods(
+            *(result("pointnet", split="folds", seed=seed, targets=("pdc_th",)) for seed in range(5)),
+            result(split="random"),
+            result("trees", split="random"),
+            result(simulated=True),
+        )
+    )
+    assert [(one[0].settings["split"], one[0].settings["simulated"]) for one in found] == [
+        ("random", False),
+        ("folds", False),
+        ("random", True),
+    ]
+    assert [one.name for one in found[0]] == ["tree-ensemble", "trees on geometry and colour"]
+    assert {one.name for group in found for one in group} == {
+        "tree-ensemble",
+        "PointNet",
+        "trees on geometry and colour",
+    }
+
+
+def test_the_default_stands_for_a_group_and_else_the_method_of_most_runs() -> None:
+    (both,) = groups(methods(result(), result("trees", seed=0), result("trees", seed=1)))
+    assert default(both).name == "tree-ensemble"
+    (others,) = groups(methods(result("pointnet"), result("trees", seed=0), result("trees", seed=1)))
+    assert default(others).name == "trees on geometry and colour"
+
+
+def test_one_method_an_architecture_is_told_in_detail() -> None:
+    (group,) = groups(methods(*(result("pointnet", head=head) for head in ("fc1", "fc3", "fc3")), result()))
+    assert [one.name for one in main(group)] == ["PointNet", "tree-ensemble"]
+    (both,) = groups(methods(result("trees", inputs="xyzcont"), result("trees")))
+    assert [one.name for one in main(both)] == ["trees on geometry and colour"]

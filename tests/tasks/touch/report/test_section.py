@@ -1,0 +1,239 @@
+"""The whole section of touch, and the numbers that go into its charts."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pyarrow as pa
+import pytest
+
+from tacpipe.channels import biotac_sp
+from tacpipe.comparison.runs import Method
+from tacpipe.report import provenance
+from tacpipe.report.blocks import Section
+from tacpipe.tasks.touch import headline as headlines
+from tacpipe.tasks.touch.report import clouds, curves, electrodes, pressure
+from tacpipe.tasks.touch.report.methods import Result
+from tacpipe.tasks.touch.report.parts import NO_EVIDENCE
+from tests.fake_recordings import FakeDataset
+from tests.report import parts
+from tests.tasks.touch.report.touch_fakes import NOVEL, recorded, result
+
+BASELINES = {"object_mean": 0.08, "nearest_in_time": 0.09}
+FULL: dict[str, Any] = {"novel": NOVEL, "baselines": BASELINES}
+APART = {"bleach": 0.05, "coffee": 0.05, "spam": 0.05}
+MANY = tuple("abcdef")
+
+
+def methods(*results: Any) -> list[Method]:
+    return parts.methods("touch", *results)
+
+
+def touch(*results: Any, **how: Any) -> Section:
+    return parts.section("touch", *results, **how)
+
+
+@pytest.fixture(scope="module")
+def whole() -> Section:
+    return touch(
+        *(result(seed=seed, **FULL) for seed in (0, 1)),
+        result("trees", off=0.06, **FULL),
+        result("pointnet", off=0.07, epochs=4, **FULL),
+        result("pointnet", head="fc1", targets=("pdc_th",), epochs=4, **FULL),
+        others=[recorded()],
+    )
+
+
+def test_the_first_screen_has_a_row_a_target_on_known_and_on_novel_objects(whole: Section) -> None:
+    assert whole.table is not None
+    assert [parts.text(row.cells[0]) for row in whole.table.rows] == [
+        headlines.TARGETS[one] for one in biotac_sp.TARGETS
+    ]
+    assert len(whole.table.heads) == 7
+    assert whole.counts[:2] == ["4 methods", "5 results"]
+
+
+def test_all_that_there_is_has_its_fold(whole: Section) -> None:
+    assert list(parts.folds(whole)) == [
+        "All methods and baselines", "The pressure, predicted and true", "Electrodes", "Clouds and their grasps",
+        "The paper's tables and figures", "By object", "Training", "Recordings", "Every run",
+        "What these numbers rest on", "Where it comes from",
+    ]  # fmt: skip
+    text = parts.words(whole)
+    for told in ("R² of each electrode, novel objects", "worst decile by error", "Table I in", "Figures 10 and 11 in",
+                 "Figure 8 in", "By object, tree-ensemble", "cd" * 32):  # fmt: skip
+        assert told in text, told
+
+
+def test_the_verdict_is_better_only_where_every_target_is() -> None:
+    known = touch(result(baselines={"object_mean": 0.2}))
+    assert known.verdict == "better" and "24 grasps" in known.sentence
+    assert touch(result(baselines={"object_mean": 0.04})).verdict == "worse"
+    given = result(baselines={"object_mean": 0.04})
+    other = result(targets=("pdc_th",), baselines={"object_mean": 0.04})
+    rows = given.recordings["predictions"].tables
+    rows["object_mean"] = other.recordings["predictions"].tables["object_mean"]  # of one target alone
+    mixed = touch(given)
+    assert mixed.verdict == "unclear"
+    assert mixed.sentence.index("better") < mixed.sentence.index("worse") < mixed.sentence.index("PDC thumb")
+
+
+def test_where_nothing_is_better_than_the_baselines_on_novel_objects_it_is_stated() -> None:
+    worse = {**APART, **dict.fromkeys(MANY, 0.12)}
+    found = touch(result(off=worse, novel=MANY), result("trees", off=0.11, novel=MANY))
+    assert NO_EVIDENCE in found.sentence and found.verdict != "better"
+    evident = touch(result(off=worse, novel=MANY), result("trees", off=0.05, novel=MANY, targets=("pdc_th",)))
+    assert NO_EVIDENCE not in evident.sentence
+    assert NO_EVIDENCE not in touch(result()).sentence
+
+
+@pytest.mark.parametrize("novel", [("drill",), NOVEL, tuple("abcde")])
+def test_a_gain_on_few_novel_objects_is_no_evidence(novel: tuple[str, ...]) -> None:
+    found = touch(result(off=0.01, novel=novel))
+    assert "too few" in found.sentence and NO_EVIDENCE in found.sentence and found.verdict == "unclear"
+
+
+@pytest.mark.parametrize("simulated", [False, True])
+def test_a_labs_own_grasps_get_nothing_that_the_paper_states_of_its_own(simulated: bool) -> None:
+    how: dict[str, Any] = {"published": False, "simulated": simulated}
+    found = touch(
+        result(**how, **FULL),
+        result("pointnet", off=0.07, epochs=4, **how, **FULL),
+        *(result("pointnet", head=head, targets=("pdc_th",), epochs=4, **how, **FULL) for head in ("fc1", "fc2")),
+        *(result("pointnet", inputs=one, targets=("pdc_th",), epochs=4, **how) for one in ("xyz", "rgbpose")),
+    )
+    text = parts.words(found)
+    for told in ("paper", "RGBPose, trained on", "9,000 grasps", "FC6"):
+        assert told not in text, told
+    assert "Number of hidden layers of the head" in text
+    assert (found.simulated, text.count(provenance.SIMULATED) > 0) == (simulated, simulated)
+
+
+def test_that_an_objects_grasps_follow_one_another_is_stated_where_they_do() -> None:
+    told = "of 23 evaluated grasps follow one of the same object in time"
+    assert f"21 {told}" in parts.words(touch(result(published=False)))
+    turns = result(published=False)
+    tables = turns.recordings["predictions"].tables
+    t_ns = pa.array([index % 8 * 3 + index // 8 for index in range(24)] + [99], pa.int64())
+    place = tables["grasps"].column_names.index("t_ns")
+    tables["grasps"] = tables["grasps"].set_column(place, "t_ns", t_ns)
+    assert told not in parts.words(touch(turns))
+
+
+def test_simulated_results_next_to_recorded_ones_are_questions_of_their_own() -> None:
+    found = touch(result(), result(simulated=True))
+    text = parts.words(found)
+    assert "PDC thumb, known objects, random" in text and "PDC thumb, known objects, random, simulated" in text
+    assert "What is marked simulated is not evidence about a real sensor." in text
+    assert "simulated" not in found.sentence
+
+
+def test_one_result_of_one_target_has_nothing_that_it_lacks() -> None:
+    found = touch(result("trees", targets=("pdc_mf",), known=(), novel=("drill",)))
+    assert "trees on geometry and colour" in found.sentence
+    assert not {"Electrodes", "Clouds and their grasps", "The paper's tables and figures"} & set(parts.folds(found))
+    assert "known objects" not in parts.words(found)
+
+
+def test_a_result_without_a_constant_has_no_skill() -> None:
+    given = result()
+    del given.recordings["predictions"].tables["constant"]
+    found = touch(given)
+    table = parts.tables([parts.folds(found)["All methods and baselines"]])[0]
+    assert parts.cell(table, "tree-ensemble", "skill over the constant") == "–"
+    assert found.verdict == ""
+
+
+def test_a_result_without_unseen_grasps_is_reported_as_its_metrics_name_it() -> None:
+    given = result(metrics={"seen": {"n": 7}})
+    bare: Any = FakeDataset({}, given.files, given.manifest)
+    assert parts.cells(parts.tables(touch(bare)), "seen, n") == ["7"]
+
+
+def test_grasps_are_chosen_by_their_error_whatever_the_order_of_rows() -> None:
+    names = [f"object{number:02d}" for number in range(11)]
+    off = {name: 0.01 * (11 - number) for number, name in enumerate(names)}
+    given = result(off=off, known=names, per_object=1)
+    chosen = electrodes.chosen(Result(given).predictions)
+    assert [(one.place, one.recording) for one in chosen] == [
+        ("median", "object05-000"),
+        ("best decile", "object09-000"),
+        ("worst decile", "object01-000"),
+    ]
+    assert [one.error for one in chosen] == pytest.approx([0.06, 0.02, 0.10], abs=1e-5)
+    shard = given.recordings["predictions"]
+    back = list(range(len(names)))[::-1]
+    shard.tables = {name: table.take(back) for name, table in shard.tables.items()}
+    assert [one.recording for one in electrodes.chosen(Result(given).predictions)] == [one.recording for one in chosen]
+
+
+def test_electrodes_are_drawn_where_they_are_with_their_values_and_errors_in_counts() -> None:
+    (method,) = methods(result(off=0.05, novel=NOVEL))
+    drawn = parts.charts(electrodes.folds(method))
+    assert len(drawn) == 5  # R² on known and novel objects, three grasps
+    assert (
+        "RMSE 0.0500 of the range" in drawn[2].caption
+        and "thumb 175 counts, middle finger 165 counts" in drawn[2].caption
+    )
+    at = {row["Electrode"]: (row["x"], row["y"]) for row in parts.values(drawn[0]) if row["panel"] == "thumb"}
+    # 1 and 11 mirror each other, 10 lies nearer the palm than 1, 21 nearer the tip than 24 on the midline
+    assert at[1][0] == pytest.approx(-at[11][0], abs=0.01) and at[1][1] == pytest.approx(at[11][1], abs=0.01)
+    assert at[1][1] > at[10][1] and at[21][1] > at[24][1]
+    panels = {row["panel"] for row in parts.values(drawn[2])}
+    assert panels == {"thumb, true", "thumb, predicted", "middle finger, true", "middle finger, predicted"}
+    assert electrodes.folds(methods(result(targets=("pdc_th",)))[0]) == []
+
+
+def test_pressures_are_drawn_for_the_fingers_that_are_predicted() -> None:
+    (method,) = methods(result(novel=NOVEL, targets=("pdc_mf", "e_mf")))
+    (chart,) = parts.charts(pressure.folds(method))
+    assert chart.title == "PDC middle finger" and "40 unseen grasps" in chart.caption
+    assert len(parts.values(chart)) == 40 and "drill (novel)" in {row["name"] for row in parts.values(chart)}
+
+
+def test_a_cloud_is_drawn_with_its_grasp_and_the_chosen_ones_first() -> None:
+    (chart,) = parts.charts(clouds.folds([recorded()], {"drill-002": "median by error", "elsewhere": "best"}))
+    assert chart.title == "drill-002 (median by error): drill"
+    assert chart.caption == "2,000 points, the fingers 70 mm apart."
+    assert len(parts.values(chart)) == 2 * (clouds.POINTS + 2)  # two views, and both contacts in each
+    assert len(parts.charts(clouds.folds([recorded()], {}))) == 2
+    assert clouds.folds([], {"drill-002": "median"}) == []
+
+
+def test_a_dataset_without_clouds_or_grasps_is_not_read() -> None:
+    given = recorded(["a"])
+    assert clouds.reads(given)
+    shard = given.recordings["a"]
+    shard.tables = {name: table for name, table in shard.tables.items() if name != "grasp"}
+    assert not clouds.reads(given)
+
+
+def test_losses_are_of_one_target_and_the_mean_of_its_networks() -> None:
+    run = Result(result("pointnet", targets=("pdc_th", "e_th"), epochs=4))
+    lines = [
+        {"epoch": epoch, "train_loss": loss, "val_loss": None, "target": "all", "network": network}
+        for network, losses in enumerate(([4.0, 2.0, 1.0], [2.0, 1.0]))
+        for epoch, loss in enumerate(losses, 1)
+    ]
+    several = Result(run.dataset)
+    several.__dict__["history"] = [*run.history, *lines]
+    assert curves.losses(several, "all", "train_loss") == [3.0, 1.5]
+    assert curves.losses(several, "all", "val_loss") == []
+    assert len(curves.losses(several, "e_th", "train_loss")) == 4
+    assert curves.losses(several, "pdc_mf", "train_loss") == []
+
+
+def test_figure_8_is_of_the_papers_network_trained_longest() -> None:
+    heads = (("fc3", 3), ("fc1", 8))
+    given = [result("pointnet", head=head, epochs=epochs, targets=("pdc_th",)) for head, epochs in heads]
+    (chart,) = curves.figure_8(methods(*given, result(epochs=20)))
+    assert "PointNet · head fc1" in chart.title and "paper schedule" in chart.caption
+    assert curves.figure_8(methods(result(epochs=20))) == []
+
+
+def test_losses_without_validation_grasps_are_reported_as_such() -> None:
+    watched, unwatched = result(epochs=3), result(epochs=3)
+    unwatched.files["config.json"] = unwatched.files["config.json"].replace(b'"val": 10', b'"val": 0')
+    drawn = [curves.charts_of(methods(one))[0] for one in (watched, unwatched)]
+    assert [curves.UNWATCHED in one.caption for one in drawn] == [False, True]
+    assert curves.charts_of(methods(result())) == []
