@@ -18,7 +18,6 @@ import numpy as np
 
 from tacpipe.live import messages, opening, own_streams, wire
 from tacpipe.live.description import Described, described
-from tacpipe.live.engine import EARLY_NS, Engine
 from tacpipe.live.options import OWN, Options
 from tacpipe.recording import rig as rigs
 from tacpipe.recording.spool_blocks import Note
@@ -26,6 +25,7 @@ from tacpipe.recording.station import BEGAN
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.live import Live
 from tacpipe.simulation.emulation.emulator import Emulator, pace
+from tacpipe.tasks.forward.live.engine import EARLY_NS, Engine
 
 RIG = Path(__file__).parents[1] / "rigs/first-paper.toml"
 PERIOD_NS, OFFSET_NS, START_NS = 20_000_000, 10**18, 10**12

@@ -13,10 +13,9 @@ from dataclasses import replace
 import numpy as np
 
 import tacpipe
-from tacpipe.live import stages
-from tacpipe.live.material_slide import Held, SlideSoFar
 from tacpipe.plugins import registry
 from tacpipe.tasks.material.classifier import Classifier
+from tacpipe.tasks.material.live.slide import SLIDES, Held, SlideSoFar, slide_params
 
 FRACTIONS = (0.05, 0.1, 0.25, 0.5, 0.75, 1.0)
 EVERY = 2  # of the test recordings every second one
@@ -26,10 +25,10 @@ LEAST = 0.01
 def main(model: str, recordings: str, slides: str, split: str) -> None:
     opened = tacpipe.open(model)
     classifier = Classifier.load(opened.files)
-    params = stages.slide_params(opened.source.chain)
+    params = slide_params(opened.source.chain)
     sensor = next(iter(classifier.layouts))
     slide = SlideSoFar(classifier, params, sensor, LEAST)
-    stage = registry.load(stages.SLIDES)
+    stage = registry.load(SLIDES)
     names = sorted(tacpipe.open(slides).select(split=split, role="test").recordings)[::EVERY]
     whole = tacpipe.open(recordings)
     right: dict[float, list[bool]] = {fraction: [] for fraction in (*FRACTIONS, np.inf)}

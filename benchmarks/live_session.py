@@ -25,13 +25,13 @@ from typing import Any
 import numpy as np
 
 import tacpipe
-from tacpipe.live.demo import EFFORT, SEED, SWITCH_S, send_plans
 from tacpipe.live.own_streams import free_ports
 from tacpipe.recording import rig as rigs
 from tacpipe.recording import rig_text
 from tacpipe.simulation import pick_and_move
 from tacpipe.simulation.emulation.emulator import Emulator
 from tacpipe.simulation.emulation.world import World
+from tacpipe.tasks.forward.live.demo import EFFORT, SEED, SWITCH_S, send_plans
 
 RIG = Path(__file__).parents[1] / "rigs/first-paper.toml"
 LOOK_S = 2.0  # between two looks at memory

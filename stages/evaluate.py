@@ -61,7 +61,7 @@ def evaluate(params: Params, model: Model, recordings: Dataset) -> Result:
 def _live(model: Model, recordings: Dataset) -> Result:
     from tacpipe.datasets import model_files
     from tacpipe.errors import UsageError
-    from tacpipe.live import evaluation
+    from tacpipe.tasks.forward.live import evaluation
 
     name = model_files.tree(model.files, model_files.CONFIG)["task"]
     if name != "forward":

@@ -75,7 +75,8 @@ def _asked(task: Any, params: Params, quantiles: list[int]) -> dict[str, Any]:
 def _causal(params: Params, model: Model, recordings: Dataset, steps: list[int], quantiles: list[int]) -> Result:
     from tacpipe.datasets import model_files
     from tacpipe.errors import UsageError
-    from tacpipe.live import material_replay, replay
+    from tacpipe.tasks.forward.live import replay
+    from tacpipe.tasks.material.live import replay as material_replay
 
     model_files.task(model.files)
     name = model_files.tree(model.files, model_files.CONFIG)["task"]

@@ -88,20 +88,18 @@ def test_no_module_outside_of_a_task_s_own_packages_names_a_task() -> None:
     names = "|".join(registry.tasks())
     # words of data, as the label material, are no names of tasks where they stand alone
     literal = re.compile(rf"forward|(?:.*[./])?(?:tasks|report|train|simulate|models|results)[./](?:{names})(?:\..*)?")
-    assert _modules_with(literal) == {"live/demo.py"}  # which trains a forecaster, and runs it
+    assert _modules_with(literal) == set()
 
 
 def test_no_module_outside_of_tasks_reports_formats_and_simulation_names_a_stage() -> None:
     data = {"split", "train", "report", "export"}  # words of data too: a role, kinds of dataset, a message of HID
     known = {*registry.stages(), *registry.commands()} - data
     # the command line has aliases, an export of frames runs synchronize before it, the viewer reads the thresholds of
-    # contacts, and a live session does what these stages do, sample by sample
+    # contacts, and a live session reads the params of an earlier version of synchronize
     needed = {
         "cli/main.py",
         "exports/frames.py",
         "live/stages.py",
-        "live/replay.py",
-        "live/demo.py",
         "viewer/contents.py",
     }
 

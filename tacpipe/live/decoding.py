@@ -84,7 +84,7 @@ Places = dict[tuple[int, ...], list[Place]]
 
 
 class Columns:
-    """A batch as the recording will hold it, without a copy: what `tacpipe.live.chain.Chain.push` reads of a table.
+    """A batch as the recording will hold it, without a copy. It has what a causal chain reads of a table.
 
     A table of pyarrow costs 10 us a column, and an arm has fifty of which a model reads ten.
     """

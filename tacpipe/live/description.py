@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from tacpipe.errors import UsageError
-from tacpipe.live.alarms import NAMES
-from tacpipe.live.stages import refuse_look_ahead
-from tacpipe.live.touch_messages import COLUMNS
 from tacpipe.printable import plain
+from tacpipe.tasks.forward.live.alarms import NAMES
+from tacpipe.tasks.forward.live.stages import refuse_look_ahead
+from tacpipe.tasks.touch.live.messages import COLUMNS
 
 CONFIG = "config.json"
 READ = ("horizon", "inputs")  # of the description of a model of future signals
@@ -69,10 +69,10 @@ def described(model: Path, *, allow_look_ahead: bool = False) -> tuple[Described
     Raises `UsageError` where it does not run live, `TacpipeError` where it was trained on rows that look ahead, unless
     ``allow_look_ahead``.
     """
-    import tacpipe
     from tacpipe.datasets import model_files
+    from tacpipe.engine.pipeline import open_dataset
 
-    found = tacpipe.open(model)
+    found = open_dataset(model)
     if CONFIG not in found.files:
         raise UsageError(f"{model} is not a model; give one of `tacpipe train`.")
     config = model_files.tree(found.files, CONFIG, {"task": str})

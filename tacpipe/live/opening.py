@@ -7,13 +7,13 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from tacpipe.errors import FAILED, TacpipeError, UsageError
-from tacpipe.live import alarms as alarms_of
-from tacpipe.live.alarms import Alarms
-from tacpipe.live.chain import Beginning, Chain
-from tacpipe.live.engine import Chainlike, Engine
 from tacpipe.live.options import Options
 from tacpipe.recording import rig as rigs
 from tacpipe.tasks.forward.forecaster import Forecaster
+from tacpipe.tasks.forward.live import alarms as alarms_of
+from tacpipe.tasks.forward.live.alarms import Alarms
+from tacpipe.tasks.forward.live.chain import Beginning, Chain
+from tacpipe.tasks.forward.live.engine import Chainlike, Engine
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -26,9 +26,9 @@ if TYPE_CHECKING:
 
 def engine(options: Options) -> Working:
     """Return the engine of a session. Raises `UsageError` where model, rig and recordings do not belong together."""
-    import tacpipe
+    from tacpipe.engine.pipeline import open_dataset
 
-    model = tacpipe.open(options.model)
+    model = open_dataset(options.model)
     rig = rigs.parse(options.rig)
     sensors = {name: rig.streams[name].sensor for name in options.streams}
     made = {"forecast": forecasts, "material": materials, "touch": touches}[options.kind]
@@ -42,15 +42,15 @@ def engine(options: Options) -> Working:
 
 def materials(options: Options, model: Dataset, rig: Rig, sensors: Mapping[str, Sensor]) -> Working:
     """Return the engine of a session with a model of materials. Raises as `engine`."""
-    from tacpipe.live import material_opening
+    from tacpipe.tasks.material.live import opening as material_opening
 
     return material_opening.engine(options, model, sensors)
 
 
 def touches(options: Options, model: Dataset, rig: Rig, sensors: Mapping[str, Sensor]) -> Working:
     """Return the engine of a session with a model of touch. Raises as `engine`."""
-    from tacpipe.live import touch_ranking
-    from tacpipe.live.touch_engine import TouchEngine
+    from tacpipe.tasks.touch.live import ranking as touch_ranking
+    from tacpipe.tasks.touch.live.engine import TouchEngine
     from tacpipe.tasks.touch.predictor import Predictor
 
     return TouchEngine(sensors, Predictor.load(model.files), touch_ranking.criterion(options.rank))
@@ -103,9 +103,9 @@ def chain(
 def _alarms(options: Options, model: Dataset, made: Chainlike) -> Alarms:
     if not options.alarms_per_hour:
         return Alarms.unset(made.layout)
-    import tacpipe
+    from tacpipe.engine.pipeline import open_dataset
 
-    recordings = tacpipe.open(options.alarms_on)
+    recordings = open_dataset(options.alarms_on)
     if options.split:
         recordings = recordings.select(split=options.split, role="val")
     return on_recordings(model, recordings, options.alarms_per_hour)

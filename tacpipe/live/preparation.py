@@ -6,13 +6,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.live import description, own_streams, plans, publishing, scheduling
+from tacpipe.live import description, own_streams, publishing, scheduling
 from tacpipe.live.description import Described, Grasped, Surfaces
 from tacpipe.live.options import Options
 from tacpipe.live.settings import MEASURED, Settings
 from tacpipe.recording import completing
 from tacpipe.recording.rig import Rig
 from tacpipe.tasks import calibrated
+from tacpipe.tasks.forward.live import plans
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,7 @@ class Continued(Protocol):
 
 
 class Engine(Protocol):
-    """What makes messages of blocks: of forecasts, `tacpipe.live.engine.Engine`; those of other tasks are alike."""
+    """An object that turns blocks of bytes into messages; each task has its own."""
 
     skipped: int  # messages so far that were left out under overload
     overflows: int  # times that blocks were thrown away

@@ -1,113 +1,23 @@
-"""The stages that a model was trained behind, as far as they have a rule that does not look ahead."""
+"""Params of the stages that a model was trained behind."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from typing import Any
 
-from tacpipe.channels.masks import GRID, apart
-from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.errors import UsageError
 from tacpipe.plugins import params, registry
 
-SYNCHRONIZE, CONTACTS, COMPRESS = "synchronize", "segment.contacts", "compress."
+EARLIER_VERSIONS = {"synchronize": (2,)}  # whose params today's stage reads, and for which it gives the same rows
 
 
-SLIDES = "segment.slides"
-EARLIER = {SYNCHRONIZE: (2,)}  # versions of before whose params today's stage reads, and gives the same rows for
-
-
-def slide_params(steps: Sequence[Mapping[str, Any]]) -> Any:
-    """Return the params of `segment slides` that a model of materials was trained behind.
-
-    Raises `UsageError` where that stage has another version now, `TacpipeError` where the model was trained behind others.
-    """
-    names = [step["stage"] for step in steps]
-    if names != [SLIDES]:
-        found = ", ".join(f"`tacpipe {name.replace('.', ' ')}`" for name in names) or "no stage"
-        raise TacpipeError(
-            f"The model was trained behind {found}; live, a slide is cut out by `tacpipe segment slides` alone. Train it "
-            f"on recordings that went through that stage."
-        )
-    params_found = _params(steps[0])
-    if params_found.trigger == "load" and params_found.rest != "start":
-        raise TacpipeError(
-            f"The model was trained with `segment slides --rest {params_found.rest}`, which looks for the rest in the whole "
-            f"recording; samples as they arrive have the rest at their start. Train it with --rest start."
-        )
-    return params_found
-
-
-def _params(step: Mapping[str, Any]) -> Any:
+def stage_params(step: Mapping[str, Any]) -> Any:
     """Return the params of a stage of a chain. Raises `UsageError` where it has another version now."""
     name = step["stage"]
     stage = registry.load(name)
-    if step["version"] not in (stage.version, *EARLIER.get(name, ())):
+    if step["version"] not in (stage.version, *EARLIER_VERSIONS.get(name, ())):
         raise UsageError(
             f"The model was trained behind version {step['version']} of {name}; this tacpipe has version "
             f"{stage.version}. Train it again."
         )
     return params.from_json(stage, step["params"])
-
-
-class CausalStages(NamedTuple):
-    """The params of the stages that a model's rows went through; its codec is among its files."""
-
-    synchronize: Any
-    contacts: Any
-
-    @property
-    def apart(self) -> float:
-        """How many periods two rows may be apart with none missing between."""
-        return apart({GRID: self.synchronize.timeline})
-
-
-def causal_stages(steps: Sequence[Mapping[str, Any]]) -> CausalStages:
-    """Return the params of the stages of a chain, as manifests list them.
-
-    Raises `UsageError` where a stage has another version now, `TacpipeError` where one has no causal rule or is absent.
-    """
-    found: dict[str, Any] = {}
-    for step in steps:
-        name = step["stage"]
-        if name not in (SYNCHRONIZE, CONTACTS) and not name.startswith(COMPRESS):
-            raise TacpipeError(
-                f"The model was trained behind `tacpipe {name.replace('.', ' ')}`, which has no rule for samples as they "
-                f"arrive. Train one behind synchronize, segment contacts and, if you like, compress."
-            )
-        found[name] = _params(step)
-    missing = [name for name in (SYNCHRONIZE, CONTACTS) if name not in found]
-    if missing:
-        raise TacpipeError(
-            f"The model was not trained behind `tacpipe {missing[0].replace('.', ' ')}`, so it is unknown how samples "
-            f"become its rows. Train it on recordings that went through that stage."
-        )
-    if found[CONTACTS].rest != "start":
-        raise TacpipeError(
-            f"The model was trained with `segment contacts --rest {found[CONTACTS].rest}`, which looks for the rest in "
-            f"the whole recording; samples as they arrive have the rest at their start. Train it with --rest start."
-        )
-    return CausalStages(found[SYNCHRONIZE], found[CONTACTS])
-
-
-def refuse_look_ahead(config: Mapping[str, Any], steps: Sequence[Mapping[str, Any]]) -> None:
-    """Raise `TacpipeError` for a model that was trained on rows that look ahead.
-
-    ``config`` is the model's configuration, ``steps`` are the stages that it was trained behind.
-    """
-    look_ahead: Mapping[str, float] | None = config.get("look_ahead")
-    if look_ahead is None:  # a model of an older version, or of rows that state nothing
-        interpolated = [
-            step for step in steps if step["stage"] == SYNCHRONIZE and _params(step).values == "interpolate"
-        ]
-        text = "their values are interpolated" if interpolated else ""
-    else:
-        text = (
-            f"{look_ahead['mean_ms']:g} ms on average, at most {look_ahead['max_ms']:g} ms"
-            if look_ahead["max_ms"]
-            else ""
-        )
-    if text:
-        raise TacpipeError(
-            f"The model was trained on rows that look ahead ({text}), and a live session has no later samples. Train it on "
-            f"rows of `tacpipe synchronize` without --values interpolate, or give --allow-look-ahead."
-        )

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from tacpipe.errors import UsageError
 from tacpipe.io.hashing import digest
 from tacpipe.plugins import params, registry
 from tacpipe.plugins.stage import RecordingOutput
@@ -49,6 +50,16 @@ class Recordings:
 
     recordings: Mapping[str, Any]
     files: Mapping[str, bytes] = field(default_factory=dict)
+
+
+def recorded(recording: Recording) -> dict[str, pa.Table]:
+    """Return the streams of a recording. Raises `UsageError` for one that went through `synchronize` already."""
+    if set(recording.streams) == {""}:
+        raise UsageError(
+            "this recording went through a stage already, and what had arrived when cannot be seen from it. Give the "
+            "recordings themselves; the model's own stages are run on them."
+        )
+    return {name: recording.table(name) for name in recording.streams}
 
 
 def continued(recording: Recording, model: Dataset) -> Any:

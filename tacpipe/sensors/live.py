@@ -35,7 +35,7 @@ LATENCY = {  # column to unit
     "latency_ms": "ms",  # from the arrival of the newest sample that was read to when the forecast was published
     "age_ms": "ms",  # from the arrival of the newest sample of the master to the same moment
     "compute_ms": "ms",  # of it, what rows, model and alarms took
-    "cause": "1",  # flags of `tacpipe.live.chain.Cause`
+    "cause": "1",  # flags of `tacpipe.tasks.forward.live.chain.Cause`
     "skipped": "1",  # grid points so far whose forecast was left out under overload
     "late": "1",  # samples so far that came after the row that they belong to
 }

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from tacpipe.live import publishing
-from tacpipe.live.alarms import State
-from tacpipe.live.material_messages import SLIDING, MaterialDescription, MaterialMessage
-from tacpipe.live.messages import Description, Message
+from tacpipe.tasks.forward.live.alarms import State
+from tacpipe.tasks.forward.live.messages import Description, Message
+from tacpipe.tasks.material.live.messages import SLIDING, MaterialDescription, MaterialMessage
 
 SOON_S = 120.0
 COUNT = 5

@@ -19,13 +19,13 @@ import pytest
 
 from tacpipe.errors import UsageError
 from tacpipe.live import process, supervisor
-from tacpipe.live.alarms import Alarms
-from tacpipe.live.chain import Beginning, Cause, Forecast
 from tacpipe.live.description import Described
-from tacpipe.live.engine import Engine
 from tacpipe.live.options import Options
 from tacpipe.recording import rig as rigs
 from tacpipe.signals.loads import axes
+from tacpipe.tasks.forward.live.alarms import Alarms
+from tacpipe.tasks.forward.live.chain import Beginning, Cause, Forecast
+from tacpipe.tasks.forward.live.engine import Engine
 
 HORIZON = 3
 PERIOD_NS = 20_000_000

@@ -11,13 +11,13 @@ import pyarrow as pa
 from safetensors.numpy import load, save
 
 from tacpipe.channels import schema
-from tacpipe.live.chain import Chain, Forecast
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
 from tacpipe.plugins.stage import RecordingOutput
 from tacpipe.tasks.calibrated import Asked
 from tacpipe.tasks.forward import task as forward
 from tacpipe.tasks.forward.forecaster import SHRINKAGE, WEIGHTS
+from tacpipe.tasks.forward.live.chain import Chain, Forecast
 from tests.asked import fitting
 from tests.fake_recordings import FakeRecording, FakeShard, dataset
 

@@ -17,10 +17,10 @@ from hypothesis import strategies as st
 from tacpipe.codecs import tactile
 from tacpipe.codecs.frame_stacking import breaks
 from tacpipe.errors import TacpipeError
-from tacpipe.live.chain import BLOCKING, Beginning, Cause, Chain, Forecast
 from tacpipe.tasks.forward import prediction, tracks
 from tacpipe.tasks.forward import task as forward
 from tacpipe.tasks.forward.forecaster import Forecaster
+from tacpipe.tasks.forward.live.chain import BLOCKING, Beginning, Cause, Chain, Forecast
 from tacpipe.tasks.forward.predictors import forecasts
 from tests.asked import fitting
 from tests.fake_recordings import FakeRecording, dataset

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from tacpipe.live.alarms import State
-from tacpipe.live.messages import Description, Message
 from tacpipe.live.publishers.websocket import WebsocketPublisher
+from tacpipe.tasks.forward.live.alarms import State
+from tacpipe.tasks.forward.live.messages import Description, Message
 from tests.live.test_publishers import free_port
 from tests.recording.live import ROOT, awaited
 

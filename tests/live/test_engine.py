@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 from tacpipe.live import wire
-from tacpipe.live.alarms import Alarms
-from tacpipe.live.chain import Cause
-from tacpipe.live.engine import EARLY_NS, Engine
-from tacpipe.live.messages import Message
 from tacpipe.recording import rig as rigs
 from tacpipe.recording.spool_blocks import Note
 from tacpipe.recording.station import BEGAN, LOST
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Sensor
+from tacpipe.tasks.forward.live.alarms import Alarms
+from tacpipe.tasks.forward.live.chain import Cause
+from tacpipe.tasks.forward.live.engine import EARLY_NS, Engine
+from tacpipe.tasks.forward.live.messages import Message
 from tests.live.persistent import CHANNELS, HORIZON, PERIOD_NS, Persistence
 from tests.sensors import made
 

@@ -12,7 +12,8 @@ import pytest
 
 import tacpipe
 from tacpipe.errors import UsageError
-from tacpipe.live import description, evaluation, worth
+from tacpipe.live import description
+from tacpipe.tasks.forward.live import evaluation, worth
 from tests.conftest import Lab
 from tests.fake_recordings import FakeRecording
 from tests.live.sessions import CALIBRATED, TRAINED

@@ -11,10 +11,7 @@ import pyarrow as pa
 import pytest
 
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.live import material_opening, material_replay, wire
-from tacpipe.live.material_engine import RESTARTED, THROWN, MaterialEngine
-from tacpipe.live.material_messages import FINAL, SLIDING, WAITING, MaterialMessage
-from tacpipe.live.material_slide import UNLIKE
+from tacpipe.live import wire
 from tacpipe.live.messages import packets
 from tacpipe.live.options import Options
 from tacpipe.metrics import calibration
@@ -30,6 +27,11 @@ from tacpipe.tasks.calibrated import Asked
 from tacpipe.tasks.material import known, prediction
 from tacpipe.tasks.material import task as material
 from tacpipe.tasks.material.classifier import Classifier
+from tacpipe.tasks.material.live import opening as material_opening
+from tacpipe.tasks.material.live import replay as material_replay
+from tacpipe.tasks.material.live.engine import RESTARTED, THROWN, MaterialEngine
+from tacpipe.tasks.material.live.messages import FINAL, SLIDING, WAITING, MaterialMessage
+from tacpipe.tasks.material.live.slide import UNLIKE
 from tests.asked import fitting
 from tests.fake_recordings import FakeDataset, FakeRecording
 from tests.live import rigs

@@ -12,11 +12,11 @@ import pytest
 from tacpipe.arrays import Float32s
 from tacpipe.errors import UsageError
 from tacpipe.live import messages
-from tacpipe.live.alarms import State
-from tacpipe.live.messages import Description, Message
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.live import LATENCY, Live
 from tacpipe.sensors.plan import Plan, is_plan, packet
+from tacpipe.tasks.forward.live.alarms import State
+from tacpipe.tasks.forward.live.messages import Description, Message
 
 VALUES = np.random.default_rng(0).normal(0, 1000, (3, 5)).astype(np.float32)
 CHANNELS = tuple(f"c{number}" for number in range(5))

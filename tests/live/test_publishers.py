@@ -15,10 +15,10 @@ import pytest
 
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.live import publishing
-from tacpipe.live.material_messages import SLIDING, MaterialDescription, MaterialMessage
-from tacpipe.live.messages import Description, Message
 from tacpipe.live.publishers.udp import UdpPublisher
 from tacpipe.live.publishers.websocket import BEHIND, CONNECTIONS, QUEUED, TOKEN, WebsocketPublisher
+from tacpipe.tasks.forward.live.messages import Description, Message
+from tacpipe.tasks.material.live.messages import SLIDING, MaterialDescription, MaterialMessage
 from tests.recording.live import awaited
 
 ABOUT = Description(("a", "b"), (1, 2), "count", 50.0, "models/forward")

@@ -9,8 +9,8 @@ import pyarrow as pa
 import pytest
 
 import tacpipe
-from tacpipe.live.chain import Chain
-from tacpipe.live.sources import plan_table
+from tacpipe.tasks.forward.live.chain import Chain
+from tacpipe.tasks.forward.live.inputs import plan_table
 from tests.conftest import Lab
 from tests.live.sessions import CALIBRATED, TRAINED
 

@@ -12,10 +12,10 @@ import pytest
 
 from tacpipe.cli import live as command
 from tacpipe.errors import UsageError
-from tacpipe.live import plans
 from tacpipe.live.settings import Settings
 from tacpipe.recording import rig as rigs
 from tacpipe.recording import rig_text
+from tacpipe.tasks.forward.live import plans
 from tests.conftest import Lab
 from tests.live.sessions import TRAINED
 from tests.test_docs import fenced

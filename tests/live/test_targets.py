@@ -9,14 +9,14 @@ import pytest
 
 from tacpipe.channels import schema
 from tacpipe.errors import UsageError
-from tacpipe.live.chain import Cause, Chain
 from tacpipe.live.decoding import likely_schema
-from tacpipe.live.targets import Targets
 from tacpipe.recording import rig as rigs_of
 from tacpipe.recording.reading import Reading
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Sensor
 from tacpipe.tasks.forward import planned
+from tacpipe.tasks.forward.live.chain import Cause, Chain
+from tacpipe.tasks.forward.live.targets import Targets
 from tests.fake_recordings import FakeRecording
 from tests.live import rigs
 from tests.live.rigs import MS, T0, Made

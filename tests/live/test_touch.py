@@ -15,10 +15,8 @@ from tacpipe.clouds import ply
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.live import touch_ranking, wire
+from tacpipe.live import wire
 from tacpipe.live.messages import packets
-from tacpipe.live.touch_engine import WAITING, TouchEngine
-from tacpipe.live.touch_messages import COLUMNS, TouchMessage
 from tacpipe.recording import rig as rigs_of
 from tacpipe.recording.spool_blocks import Note
 from tacpipe.recording.station import BEGAN
@@ -26,6 +24,9 @@ from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.grasps import is_request
 from tacpipe.sensors.live import Live
 from tacpipe.tasks.touch import task as touch
+from tacpipe.tasks.touch.live import ranking as touch_ranking
+from tacpipe.tasks.touch.live.engine import WAITING, TouchEngine
+from tacpipe.tasks.touch.live.messages import COLUMNS, TouchMessage
 from tacpipe.tasks.touch.predictor import Predictor
 from tests.tasks.touch import handmade
 

@@ -17,7 +17,7 @@ from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
 from tacpipe.live.own_streams import free_ports
 from tacpipe.live.supervisor import DIED, RESTARTED
-from tacpipe.live.touch_messages import COLUMNS
+from tacpipe.tasks.touch.live.messages import COLUMNS
 from tests.conftest import Lab
 from tests.live.sessions import commanded, ended, model_process, subscriber
 from tests.recording import live

@@ -1,7 +1,7 @@
-"""A live session's logic for models of materials: blocks of bytes in, answers out; as `tacpipe.live.engine` for forecasts.
+"""Turn the blocks of a live session into answers of a model of materials.
 
 A recording holds one slide, as `tacpipe segment slides` has it, or with a pause several, one after another
-(`tacpipe.live.material_parts`). Several times a second the slide so far is read, from all samples up to a moment; the last
+(`parts`). Several times a second the slide so far is read, from all samples up to a moment; the last
 answer of a slide, from all that belongs to it, is its final one.
 """
 
@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Any
 
 from tacpipe.live import wire
 from tacpipe.live.decoding import Decoder, likely_schema
-from tacpipe.live.material_messages import ENDED, FINAL, SLIDING, WAITING, MaterialDescription, MaterialMessage
-from tacpipe.live.material_parts import Parting, after, up_to
-from tacpipe.live.material_slide import Answer, SlideSoFar
 from tacpipe.recording.spool_blocks import Note
 from tacpipe.recording.station import BEGAN, OVER
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Sensor
+from tacpipe.tasks.material.live.messages import ENDED, FINAL, SLIDING, WAITING, MaterialDescription, MaterialMessage
+from tacpipe.tasks.material.live.parts import Parting, after, up_to
+from tacpipe.tasks.material.live.slide import Answer, SlideSoFar
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -6,14 +6,13 @@ from collections.abc import Mapping
 
 from tacpipe.datasets.dataset import Dataset
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.live import stages
-from tacpipe.live.material_engine import MaterialEngine, finger_of
-from tacpipe.live.material_messages import MaterialDescription
-from tacpipe.live.material_slide import SlideSoFar
 from tacpipe.live.options import Options
 from tacpipe.printable import listed
 from tacpipe.sensors.sensor import Sensor
 from tacpipe.tasks.material.classifier import Classifier, NetworkReader, SpectraReader
+from tacpipe.tasks.material.live.engine import MaterialEngine, finger_of
+from tacpipe.tasks.material.live.messages import MaterialDescription
+from tacpipe.tasks.material.live.slide import SlideSoFar, slide_params
 
 
 def engine(options: Options, model: Dataset, sensors: Mapping[str, Sensor]) -> MaterialEngine:
@@ -23,7 +22,7 @@ def engine(options: Options, model: Dataset, sensors: Mapping[str, Sensor]) -> M
     what the model reads, or the model was trained behind a stage that has no rule for samples as they arrive.
     """
     classifier = Classifier.load(model.files)
-    params = stages.slide_params(model.source.chain)
+    params = slide_params(model.source.chain)
     known = tuple(classifier.layouts)
     if not options.sensor and len(known) > 1:
         raise UsageError(f"The model knows the sensors {listed(known)}; give --sensor {known[0]}, or what the rig has.")

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from tacpipe.arrays import Float32s
 from tacpipe.channels.finger import finger
 from tacpipe.errors import TacpipeError
-from tacpipe.live.stages import SLIDES
+from tacpipe.live.stages import stage_params
 from tacpipe.plugins import registry
 from tacpipe.tasks.material import slides as slides_of
 from tacpipe.tasks.material.classifier import Classifier
@@ -23,8 +23,30 @@ from tacpipe.tasks.material.slides import STREAM, difference
 if TYPE_CHECKING:
     import pyarrow as pa
 
+SLIDES = "segment.slides"
 ENDED_NS = 200_000_000  # without a row of the slide, after which it counts as over
 UNLIKE = "the slide is like none of the materials that the model knows"
+
+
+def slide_params(steps: Sequence[Mapping[str, Any]]) -> Any:
+    """Return the params of `segment slides` that a model of materials was trained behind.
+
+    Raises `UsageError` where that stage has another version now, `TacpipeError` where the model was trained behind others.
+    """
+    names = [step["stage"] for step in steps]
+    if names != [SLIDES]:
+        found = ", ".join(f"`tacpipe {name.replace('.', ' ')}`" for name in names) or "no stage"
+        raise TacpipeError(
+            f"The model was trained behind {found}; live, a slide is cut out by `tacpipe segment slides` alone. Train it "
+            f"on recordings that went through that stage."
+        )
+    params_found = stage_params(steps[0])
+    if params_found.trigger == "load" and params_found.rest != "start":
+        raise TacpipeError(
+            f"The model was trained with `segment slides --rest {params_found.rest}`, which looks for the rest in the whole "
+            f"recording; samples as they arrive have the rest at their start. Train it with --rest start."
+        )
+    return params_found
 
 
 @dataclass(frozen=True)

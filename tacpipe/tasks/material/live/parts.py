@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tacpipe.live.material_slide import SlideSoFar
+from tacpipe.tasks.material.live.slide import SlideSoFar
 
 if TYPE_CHECKING:
     import pyarrow as pa

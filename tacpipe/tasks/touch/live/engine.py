@@ -11,14 +11,16 @@ import numpy as np
 
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.errors import TacpipeError
-from tacpipe.live import touch_ranking, touch_requests, wire
-from tacpipe.live.touch_messages import TouchDescription, TouchMessage
-from tacpipe.live.touch_ranking import Criterion
+from tacpipe.live import wire
 from tacpipe.recording.spool_blocks import Note
 from tacpipe.recording.station import BEGAN
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.grasps import Grasps, parsed
 from tacpipe.sensors.sensor import Sensor
+from tacpipe.tasks.touch.live import ranking as touch_ranking
+from tacpipe.tasks.touch.live import requests as touch_requests
+from tacpipe.tasks.touch.live.messages import TouchDescription, TouchMessage
+from tacpipe.tasks.touch.live.ranking import Criterion
 from tacpipe.tasks.touch.predictor import Predictor, Touch
 
 WAITING = 16  # requests that wait; of more the oldest are answered no more

@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tacpipe.arrays import Floats
-from tacpipe.live import truth
 from tacpipe.signals import leads
 from tacpipe.signals.leads import Leads
+from tacpipe.tasks.forward.live import truth
 
 LIVE, LIVE_STILL, OFFLINE, STILL = "live", "live_persistence", "offline", "persistence"
 PREDICTORS = (LIVE, LIVE_STILL, OFFLINE, STILL)

@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.errors import TacpipeError
 from tacpipe.io import progress
-from tacpipe.live.chain import BLOCKING, Cause, Chain, Forecast
+from tacpipe.live.unstored import recorded
 from tacpipe.plugins.stage import RecordingOutput, Result
 from tacpipe.sensors.plan import NAME as PLAN
 from tacpipe.tasks.forward.forecaster import Forecaster
+from tacpipe.tasks.forward.live.chain import BLOCKING, Cause, Chain, Forecast
 from tacpipe.tasks.forward.prediction import check_steps, prediction_table
 
 if TYPE_CHECKING:
@@ -119,16 +120,6 @@ def chain_of(
     return Chain.of(
         forecaster, steps, schemas, master, plan_from=source, quantiles=quantiles, allow_look_ahead=allow_look_ahead
     )
-
-
-def recorded(recording: Recording) -> dict[str, pa.Table]:
-    """Return the streams of a recording. Raises `UsageError` for one that went through `synchronize` already."""
-    if set(recording.streams) == {""}:
-        raise UsageError(
-            "this recording went through a stage already, and what had arrived when cannot be seen from it. Give the "
-            "recordings themselves; the model's own stages are run on them."
-        )
-    return {name: recording.table(name) for name in recording.streams}
 
 
 def replayed(chain: Chain, tables: Mapping[str, pa.Table]) -> Iterator[Forecast]:

@@ -18,7 +18,6 @@ import numpy as np
 
 from tacpipe.errors import TacpipeError
 from tacpipe.io import terminal
-from tacpipe.live import demo_picture
 from tacpipe.live.own_streams import free_ports
 from tacpipe.recording import rig as rigs
 from tacpipe.recording import rig_text
@@ -28,6 +27,7 @@ from tacpipe.signals.leads import events as events_of
 from tacpipe.simulation import pick_and_move
 from tacpipe.simulation.emulation.emulator import Emulator
 from tacpipe.simulation.emulation.world import World
+from tacpipe.tasks.forward.live import demo_picture
 
 TRIALS, EPOCHS, STRIDE = 60, 8, 2
 SETTING, SETTING_SEED = 24, 1  # further trials, which the levels of the alarms are set on

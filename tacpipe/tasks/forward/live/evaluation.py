@@ -16,12 +16,7 @@ import numpy as np
 
 from tacpipe.arrays import AnyFloats, Int64s, Times
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.live import replay, truth, worth
-from tacpipe.live.alarms import NAMES, Alarms
-from tacpipe.live.chain import Chain, Forecast
-from tacpipe.live.published import Published, times
-from tacpipe.live.unstored import Recordings, continued
-from tacpipe.live.worth import LIVE, LIVE_STILL, OFFLINE, STILL, Session, Sums, summed
+from tacpipe.live.unstored import Recordings, continued, recorded
 from tacpipe.metrics import headline
 from tacpipe.plugins.stage import Result
 from tacpipe.signals import anticipation
@@ -31,6 +26,11 @@ from tacpipe.tasks.forward import evaluation, tracks, units
 from tacpipe.tasks.forward import headline as headlines
 from tacpipe.tasks.forward.forecaster import Forecaster
 from tacpipe.tasks.forward.levels import Levels
+from tacpipe.tasks.forward.live import replay, truth, worth
+from tacpipe.tasks.forward.live.alarms import NAMES, Alarms
+from tacpipe.tasks.forward.live.chain import Chain, Forecast
+from tacpipe.tasks.forward.live.published import Published, times
+from tacpipe.tasks.forward.live.worth import LIVE, LIVE_STILL, OFFLINE, STILL, Session, Sums, summed
 from tacpipe.tasks.forward.predictors import forecasts
 from tacpipe.tasks.forward.tracks import Track
 
@@ -107,7 +107,7 @@ def check(digest: str, recordings: Dataset) -> None:
 def _session(
     forecaster: Forecaster, model: Model, recording: Recording, offline: Any, steps: tuple[int, ...]
 ) -> Session:
-    tables = replay.recorded(recording)
+    tables = recorded(recording)
     known = () if forecaster.uncertainty is None else forecaster.uncertainty.percents
     session = Published.of(tables["forecast"], forecaster.codec.channels, known)
     chain = replay.chain_of(forecaster, model.source.chain, recording, tables, session.levels, allow_look_ahead=True)

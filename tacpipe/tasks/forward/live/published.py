@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from tacpipe.arrays import Float32s, Times
-from tacpipe.live.chain import Forecast
+from tacpipe.tasks.forward.live.chain import Forecast
 
 
 @dataclass(frozen=True)

@@ -10,14 +10,13 @@ import numpy as np
 from tacpipe.channels.finger import finger
 from tacpipe.channels.streams import EVENTS
 from tacpipe.errors import TacpipeError
-from tacpipe.live import stages
-from tacpipe.live.material_parts import parts
-from tacpipe.live.material_slide import Answer, SlideSoFar
 from tacpipe.live.options import OWN, Options
-from tacpipe.live.replay import recorded
+from tacpipe.live.unstored import recorded
 from tacpipe.plugins.stage import RecordingOutput, Result
 from tacpipe.tasks.material.classifier import Classifier
 from tacpipe.tasks.material.evaluation import PREDICTIONS
+from tacpipe.tasks.material.live.parts import parts
+from tacpipe.tasks.material.live.slide import Answer, SlideSoFar, slide_params
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -37,7 +36,7 @@ def predict(model: Model, recordings: Dataset) -> Result:
     model reads.
     """
     classifier = Classifier.load(model.files)
-    params = stages.slide_params(model.source.chain)
+    params = slide_params(model.source.chain)
     rows: list[Row] = []
     for name, recording in sorted(recordings.recordings.items()):
         try:

@@ -17,9 +17,6 @@ import numpy as np
 
 from tacpipe.arrays import AnyFloats, Float32s, Floats, Times
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.live.sources import Layout, plan_table
-from tacpipe.live.stages import causal_stages, refuse_look_ahead
-from tacpipe.live.targets import Targets, facing
 from tacpipe.models.threads import one_thread
 from tacpipe.models.windows import ARM
 from tacpipe.printable import listed
@@ -30,6 +27,9 @@ from tacpipe.synchronization.causal import Grid, Rows
 from tacpipe.tasks.forward import planned, units
 from tacpipe.tasks.forward.causal import Arm, Rolling
 from tacpipe.tasks.forward.forecaster import Forecaster
+from tacpipe.tasks.forward.live.inputs import Layout, plan_table
+from tacpipe.tasks.forward.live.stages import causal_stages, refuse_look_ahead
+from tacpipe.tasks.forward.live.targets import Targets, facing
 from tacpipe.tasks.forward.planned import Plan
 
 if TYPE_CHECKING:
@@ -172,8 +172,8 @@ class Chain:
         this one predicts the same once it has read a few rows more than the model reads. Counts that had wrapped
         around are taken as near to the level at rest as they can be.
 
-        ``plan_from`` names the stream of an arm whose set-points are the planned motion (`tacpipe.live.targets`), in the
-        place of the stream ``plan``. Raises `UsageError` where it has none.
+        ``plan_from`` names the stream of an arm whose set-points are the planned motion (`targets`), in the place
+        of the stream ``plan``. Raises `UsageError` where it has none.
 
         ``quantiles`` (percent) are added to each forecast. Raises `TacpipeError` where the model has none, or not these.
 
@@ -287,7 +287,7 @@ class Chain:
         ``t_ns`` (point,) are the times, ascending, on the clock of the samples, at which the hand is to be at ``poses``
         (point, 3 or 7): position in m and quaternion x, y, z, w in the frame of the recorded pose. Between points the
         position is interpolated linearly and the orientation along the shorter arc. The same as pushing the rows of
-        `tacpipe.live.sources.plan_table`, which is what a session records. Raises `TacpipeError` for other shapes.
+        `inputs.plan_table`, which is what a session records. Raises `TacpipeError` for other shapes.
         """
         self._push_plans(plan_table(arrived_ns, t_ns, poses))
 

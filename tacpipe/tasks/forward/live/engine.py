@@ -1,6 +1,6 @@
 """A live session's logic: blocks of bytes in, messages out. It reads no clock and does no input or output.
 
-The chain is `tacpipe.live.chain.Chain`, or anything that behaves so. `take` keeps what came, `due_ns` states when the next
+The chain is `chain.Chain`, or any `Chainlike`. `take` keeps what came, `due_ns` states when the next
 grid point can be predicted, and `step` makes what is due. Where several grid points are due, this process fell behind: the
 newest alone is published, the others are counted as skipped.
 """
@@ -16,15 +16,15 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from tacpipe.live import wire
-from tacpipe.live.alarms import NOTHING_KNOWN, Alarms
-from tacpipe.live.chain import Beginning, Cause, Forecast
 from tacpipe.live.decoding import Decoder, batch_schema, likely_schema
-from tacpipe.live.messages import Description, Message
 from tacpipe.recording.spool_blocks import Note
 from tacpipe.recording.station import BEGAN
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.plan import NAME as PLAN
 from tacpipe.sensors.sensor import Sensor
+from tacpipe.tasks.forward.live.alarms import NOTHING_KNOWN, Alarms
+from tacpipe.tasks.forward.live.chain import Beginning, Cause, Forecast
+from tacpipe.tasks.forward.live.messages import Description, Message
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -40,7 +40,7 @@ STARTING_S = 0.005  # between two tries while the grid is not known
 
 
 class Chainlike(Protocol):
-    """What is used of a `tacpipe.live.chain.Chain`."""
+    """What is used of a `tacpipe.tasks.forward.live.chain.Chain`."""
 
     @property
     def streams(self) -> tuple[str, ...]:

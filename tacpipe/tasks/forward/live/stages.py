@@ -1,0 +1,76 @@
+"""The stages that a model was trained behind, as far as they have a rule that does not look ahead."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+from tacpipe.channels.masks import GRID, apart
+from tacpipe.errors import TacpipeError
+from tacpipe.live.stages import stage_params
+
+SYNCHRONIZE, CONTACTS, COMPRESS = "synchronize", "segment.contacts", "compress."
+
+
+class CausalStages(NamedTuple):
+    """The params of the stages that a model's rows went through; its codec is among its files."""
+
+    synchronize: Any
+    contacts: Any
+
+    @property
+    def apart(self) -> float:
+        """How many periods two rows may be apart with none missing between."""
+        return apart({GRID: self.synchronize.timeline})
+
+
+def causal_stages(steps: Sequence[Mapping[str, Any]]) -> CausalStages:
+    """Return the params of the stages of a chain, as manifests list them.
+
+    Raises `UsageError` where a stage has another version now, `TacpipeError` where one has no causal rule or is absent.
+    """
+    found: dict[str, Any] = {}
+    for step in steps:
+        name = step["stage"]
+        if name not in (SYNCHRONIZE, CONTACTS) and not name.startswith(COMPRESS):
+            raise TacpipeError(
+                f"The model was trained behind `tacpipe {name.replace('.', ' ')}`, which has no rule for samples as they "
+                f"arrive. Train one behind synchronize, segment contacts and, if you like, compress."
+            )
+        found[name] = stage_params(step)
+    missing = [name for name in (SYNCHRONIZE, CONTACTS) if name not in found]
+    if missing:
+        raise TacpipeError(
+            f"The model was not trained behind `tacpipe {missing[0].replace('.', ' ')}`, so it is unknown how samples "
+            f"become its rows. Train it on recordings that went through that stage."
+        )
+    if found[CONTACTS].rest != "start":
+        raise TacpipeError(
+            f"The model was trained with `segment contacts --rest {found[CONTACTS].rest}`, which looks for the rest in "
+            f"the whole recording; samples as they arrive have the rest at their start. Train it with --rest start."
+        )
+    return CausalStages(found[SYNCHRONIZE], found[CONTACTS])
+
+
+def refuse_look_ahead(config: Mapping[str, Any], steps: Sequence[Mapping[str, Any]]) -> None:
+    """Raise `TacpipeError` for a model that was trained on rows that look ahead.
+
+    ``config`` is the model's configuration, ``steps`` are the stages that it was trained behind.
+    """
+    look_ahead: Mapping[str, float] | None = config.get("look_ahead")
+    if look_ahead is None:  # a model of an older version, or of rows that state nothing
+        interpolated = [
+            step for step in steps if step["stage"] == SYNCHRONIZE and stage_params(step).values == "interpolate"
+        ]
+        text = "their values are interpolated" if interpolated else ""
+    else:
+        text = (
+            f"{look_ahead['mean_ms']:g} ms on average, at most {look_ahead['max_ms']:g} ms"
+            if look_ahead["max_ms"]
+            else ""
+        )
+    if text:
+        raise TacpipeError(
+            f"The model was trained on rows that look ahead ({text}), and a live session has no later samples. Train it on "
+            f"rows of `tacpipe synchronize` without --values interpolate, or give --allow-look-ahead."
+        )

@@ -1,0 +1,1 @@
+"""Name the material of a slide while it lasts."""

@@ -1,0 +1,1 @@
+"""Rank candidate grasps on request."""
