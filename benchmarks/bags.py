@@ -60,7 +60,7 @@ def write(path: Path, storage: StoragePlugin, seconds: int) -> float:
 
 def streams(path: Path) -> int:
     """Read the bag as tacpipe does; return how many rows there are."""
-    contents = container.opened(path).read(None, None)
+    contents = container.open_bag(path).read(None, None)
     return sum(one.table.num_rows for one in contents.streams)
 
 

@@ -1,23 +1,30 @@
-"""A bag as a container of streams: the storages' records, decoded topic by topic in one pass over its files."""
+"""Read a bag as a container of streams: one pass over the records of its files, decoded topic by topic.
+
+A bag that `tacpipe export mcap` wrote comes back as it was. The metadata of a stream's channel hold the names of the
+stream and its columns (key ``tacpipe``, JSON). Topics that repeat some columns as usual messages name the topic that they
+are derived from. The metadata record ``tacpipe`` holds the attributes.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import json
 import tempfile
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
+
 from tacpipe.errors import TacpipeError
 from tacpipe.formats import unique_names
-from tacpipe.formats.bags import bag_file, json_messages, mcap_file, own, protobuf_messages, ros, sqlite_file
-from tacpipe.formats.bags.own import Own
+from tacpipe.formats.bags import bag_file, mcap_file, object_messages, ros, sqlite_file
 from tacpipe.formats.bags.storages import Channel, Damage, Message, Metadata, Record
-from tacpipe.formats.bags.topics import Decoder, Topic, TopicError
+from tacpipe.formats.bags.topics import HEADER, LOG, MessageDecoder, TopicDecoder, TopicError
 from tacpipe.formats.containers import kinds
-from tacpipe.formats.containers.container import Contents, SourceStream
+from tacpipe.formats.containers.container import Batched, Contents, SourceStream, Time
 from tacpipe.io import files as file_system
 from tacpipe.io import regular, yaml_text
 from tacpipe.io.spill import Spill, unpack
@@ -25,14 +32,83 @@ from tacpipe.plugins import extras
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import excerpt, listed, plain
 
-LOOK_MESSAGES = 20_000  # after which a look at a file ends
-MOST_BYTES = 1 << 22  # of a metadata.yaml
-READERS = {".mcap": mcap_file.records, ".db3": sqlite_file.records, ".bag": bag_file.records}
+EXPORT_KEY = "tacpipe"  # key in a channel's metadata, and name of the metadata record
+
+
+@dataclass(frozen=True)
+class ExportedStream:
+    """A stream as it was before it was exported."""
+
+    stream: str
+    derived: bool  # True where the topic only repeats another one
+    columns: Mapping[str, tuple[str, Mapping[str, str]]]  # column name and metadata by field of the message
+    time: Mapping[str, str]  # metadata of ``t_ns``
+
+
+def exported_stream(metadata: Mapping[str, str]) -> ExportedStream | None:
+    """Return the stream that the metadata of a channel describe, None where tacpipe did not write them."""
+    metadata_json = _json_object(metadata.get(EXPORT_KEY, ""))
+    if "derived_from" in metadata_json:
+        return ExportedStream("", True, {}, {})
+    try:
+        columns = {
+            str(column["field"]): (str(column["name"]), _texts(column["about"])) for column in metadata_json["columns"]
+        }
+        return ExportedStream(str(metadata_json["stream"]), False, columns, _texts(metadata_json.get("time", {})))
+    except (KeyError, TypeError, AttributeError):
+        return None
+
+
+def exported_attributes(values: Mapping[str, str]) -> dict[str, Attribute]:
+    """Return the attributes that the metadata record holds."""
+    metadata_json = _json_object(values.get("attributes", ""))
+    return {
+        str(name): value
+        for name, value in metadata_json.items()
+        if value is None or isinstance(value, str | int | float | bool)
+    }
+
+
+def restore_stream(stream: SourceStream, exported: ExportedStream) -> SourceStream:
+    """Return a stream with the names and the metadata that its columns had."""
+    fields: dict[str, pa.Field] = {}  # restored fields by the name of the column in the bag
+    for column in stream.schema:
+        if column.name in exported.columns:
+            name, metadata = exported.columns[column.name]
+            fields[column.name] = pa.field(name, column.type, metadata=dict(metadata))
+        elif column.name == stream.time.column:
+            fields[column.name] = pa.field(HEADER, column.type, metadata=dict(exported.time))
+        elif column.name != LOG:  # exported log times equal the header stamps
+            fields[column.name] = column
+    schema = pa.schema(list(fields.values()))
+
+    def renamed(table: pa.Table) -> pa.Table:
+        return pa.table([table.column(name) for name in fields], schema)
+
+    content = stream.content.mapped(schema, renamed) if isinstance(stream.content, Batched) else renamed(stream.content)
+    return SourceStream(stream.source, stream.name, Time(HEADER, "ns"), content, stream.rows)
+
+
+def _json_object(text: str) -> dict[str, Any]:
+    try:
+        value = json.loads(text or "{}")
+    except (ValueError, RecursionError):
+        return {}
+    return value if isinstance(value, dict) else {}
+
+
+def _texts(values: Mapping[str, Any]) -> dict[str, str]:
+    return {str(key): str(value) for key, value in values.items()}
+
+
+LOOK_MESSAGES = 20_000  # messages per file that a look reads
+MAX_DESCRIPTION_BYTES = 1 << 22  # size of a metadata.yaml
+READERS = {".mcap": mcap_file.read_records, ".db3": sqlite_file.read_records, ".bag": bag_file.read_records}
 UNPACKED_BYTES = 1 << 20  # bytes decompressed at once
 ZSTD = ".zstd"  # the ending of a file that was compressed as a whole
-ACTIVE = ".active"  # of a ROS 1 bag that is being written, or whose recorder was killed
-OF = ":"  # between a topic and what names one of its streams, as "/tf:gripper"
-OWN = "rosbag2"  # the metadata record that a ROS 2 bag writes about itself
+ACTIVE = ".active"  # ending of a ROS 1 bag that is being written, or whose recorder was killed
+SUFFIX_MARK = ":"  # separates a topic from the suffix of one of its streams, as "/tf:gripper"
+ROS2_METADATA = "rosbag2"  # the metadata record that a ROS 2 bag writes about itself
 
 
 @dataclass(frozen=True)
@@ -53,33 +129,33 @@ class Bag:
         """Return the streams of these topics, or of all."""
         return self._read(sources, None)
 
-    def _read(self, sources: Collection[str] | None, most: int | None) -> Contents:
+    def _read(self, sources: Collection[str] | None, max_messages: int | None) -> Contents:
         with contextlib.ExitStack() as stack:
-            files, messages_compressed, notes = _files(self.path, stack)
-            reading = _Reading(self.path, sources, messages_compressed)
+            files, messages_compressed, notes = _bag_files(self.path, stack)
+            reading = _BagReading(self.path, sources, messages_compressed)
             for number, file in enumerate(files):
-                reading.take(_records(file), number, most)
+                reading.add_records(_read_records(file), number, max_messages)
         contents = reading.contents()
         return Contents(contents.streams, contents.attributes, contents.skipped, [*notes, *contents.notes])
 
 
-def opened(path: Path) -> Bag:
+def open_bag(path: Path) -> Bag:
     """Return the bag at ``path``. Raises `MissingModuleError` where a library is missing."""
     extras.require("Reading bags and MCAP files", "rosbags", "mcap", "lz4", "zstandard", "google.protobuf")
     return Bag(path)
 
 
-def _files(path: Path, stack: contextlib.ExitStack) -> tuple[list[Path], bool, list[str]]:
-    """Return the files of a bag in their order, whether each message is compressed, and what is to be noted."""
+def _bag_files(path: Path, stack: contextlib.ExitStack) -> tuple[list[Path], bool, list[str]]:
+    """Return the files of a bag in their order, whether each message is compressed, and notes about its files."""
     if not path.is_dir():
-        return [_unpacked(path, stack)], False, []
-    about = _described(path / "metadata.yaml")
+        return [_unpack_file(path, stack)], False, []
+    about = _bag_description(path / "metadata.yaml")
     listing = about.get("relative_file_paths")
     names = [Path(str(name)).name for name in listing] if isinstance(listing, list) else []
     unique_names.by_name(((name, name) for name in names), path / "metadata.yaml", "file")
     missing = [name for name in names if not (path / name).is_file()]
     notes = [f"{path} lacks {listed(missing, 3)}, which its metadata.yaml names."] if missing else []
-    bag_files = sorted(file for file in file_system.listed(path) if _ending(file) in READERS)
+    bag_files = sorted(file for file in file_system.listed(path) if _file_ending(file) in READERS)
     present_files = [regular.inside(path, name) for name in names if name not in missing] or bag_files  # renamed since
     if unlisted := [file.name for file in bag_files if file not in present_files]:
         notes.append(
@@ -87,20 +163,20 @@ def _files(path: Path, stack: contextlib.ExitStack) -> tuple[list[Path], bool, l
         )
     if not present_files:
         raise TacpipeError(f"{path} holds no file of a bag; its metadata.yaml names {listed(names, 3) or 'none'}.")
-    if unknown := [one.name for one in present_files if _ending(one) not in READERS]:
+    if unsupported := [file.name for file in present_files if _file_ending(file) not in READERS]:
         storage = excerpt(about.get("storage_identifier"))
-        raise TacpipeError(f"{path}: {plain(unknown[0])} is of the storage {storage}; mcap and sqlite3 are read.")
+        raise TacpipeError(f"{path}: {plain(unsupported[0])} is of the storage {storage}; mcap and sqlite3 are read.")
     compressed = str(about.get("compression_mode") or "").lower() == "message"
-    return [_unpacked(one, stack) for one in present_files], compressed, notes
+    return [_unpack_file(file, stack) for file in present_files], compressed, notes
 
 
-def _records(path: Path) -> Iterator[Record]:
-    if _ending(path) not in READERS:
+def _read_records(path: Path) -> Iterator[Record]:
+    if _file_ending(path) not in READERS:
         raise TacpipeError(f"{path} is not a bag by its name; {', '.join(READERS)} are read.")
-    return _streamed(path) if path.suffix.lower() == ZSTD else READERS[_ending(path)](path)
+    return _read_compressed(path) if path.suffix.lower() == ZSTD else READERS[_file_ending(path)](path)
 
 
-def _streamed(path: Path) -> Iterator[Record]:
+def _read_compressed(path: Path) -> Iterator[Record]:
     """Yield the records of an MCAP file that is compressed as a whole."""
     import zstandard
 
@@ -110,19 +186,19 @@ def _streamed(path: Path) -> Iterator[Record]:
         zstandard.ZstdDecompressor().stream_reader(file) as content,
     ):
         try:
-            yield from mcap_file.stream_records(path, content)
+            yield from mcap_file.read_stream(path, content)
         except zstandard.ZstdError as error:
             yield Damage(f"{path} cannot be unpacked ({plain(str(error), 80)}): what came after is missing.")
 
 
-def _ending(path: Path) -> str:
-    """Return the ending of a file, that below .zstd where it is compressed as a whole, or .active where it was cut off."""
+def _file_ending(path: Path) -> str:
+    """Return the ending of a file in lower case, without .zstd of a compressed file or .active of an unfinished one."""
     return (path.with_suffix("") if path.suffix.lower() in (ZSTD, ACTIVE) else path).suffix.lower()
 
 
-def _described(path: Path) -> dict[str, Any]:
+def _bag_description(path: Path) -> dict[str, Any]:
     try:
-        value = yaml_text.load(regular.content(regular.inside(path.parent, path.name), MOST_BYTES).decode())
+        value = yaml_text.load(regular.content(regular.inside(path.parent, path.name), MAX_DESCRIPTION_BYTES).decode())
         about = value["rosbag2_bagfile_information"]
         return dict(about)
     except (ValueError, KeyError, TypeError, RecursionError) as error:
@@ -131,48 +207,48 @@ def _described(path: Path) -> dict[str, Any]:
         ) from error
 
 
-def _unpacked(path: Path, stack: contextlib.ExitStack) -> Path:
+def _unpack_file(path: Path, stack: contextlib.ExitStack) -> Path:
     """Return a file, a database unpacked into a temporary folder where it is compressed as a whole."""
-    if path.suffix.lower() != ZSTD or _ending(path) == ".mcap":
+    if path.suffix.lower() != ZSTD or _file_ending(path) == ".mcap":
         return path
     import zstandard
 
     folder = stack.enter_context(tempfile.TemporaryDirectory())
-    made = Path(folder, path.stem)
-    with regular.failing(path), regular.opened(path) as file, made.open("wb") as out:
+    unpacked_path = Path(folder, path.stem)
+    with regular.failing(path), regular.opened(path) as file, unpacked_path.open("wb") as out:
         try:
             with zstandard.ZstdDecompressor().stream_reader(file) as content:
                 unpack(iter(lambda: content.read(UNPACKED_BYTES), b""), out, path)
         except zstandard.ZstdError as error:
             raise TacpipeError(f"{path} cannot be unpacked: {plain(str(error), 80)}.") from error
-    return made
+    return unpacked_path
 
 
 @dataclass
-class _Reading:
-    """What is known of a bag while its records pass."""
+class _BagReading:
+    """Collect the topics and attributes of a bag while its records pass."""
 
     path: Path
     sources: Collection[str] | None
     compressed: bool
     ended_early: bool = False
-    topics: dict[str, Topic] = field(default_factory=dict)
-    types: dict[str, str] = field(default_factory=dict)  # of each topic
+    topics: dict[str, TopicDecoder] = field(default_factory=dict)
+    types: dict[str, str] = field(default_factory=dict)  # message type by topic
     skipped: dict[str, str] = field(default_factory=dict)
     attributes: dict[str, Attribute] = field(default_factory=dict)
-    own: dict[str, Own] = field(default_factory=dict)  # topics that tacpipe itself exported
+    exported: dict[str, ExportedStream] = field(default_factory=dict)  # streams that tacpipe exported, by topic
     notes: list[str] = field(default_factory=list)
-    aside: Spill = field(default_factory=Spill)  # decoded messages
+    spill: Spill = field(default_factory=Spill)  # decoded messages
     undescribed: int = 0  # messages of channels that no record describes
     _described: dict[tuple[int, int], Channel] = field(default_factory=dict)  # file and number to channel
     _channels: dict[tuple[int, int], str] = field(default_factory=dict)  # file and number to topic
 
-    def take(self, records: Iterator[Record], file: int, most: int | None) -> None:
-        """Take in the records of one file of the bag, ``most`` messages of it at most."""
+    def add_records(self, records: Iterator[Record], file: int, max_messages: int | None) -> None:
+        """Add the records of one file of the bag, with at most ``max_messages`` messages."""
         for record in records:
             if isinstance(record, Message):
                 self._message(record, file)
-                if most is not None and (most := most - 1) <= 0:
+                if max_messages is not None and (max_messages := max_messages - 1) <= 0:
                     self.ended_early = True
                     return
             elif isinstance(record, Channel):
@@ -192,11 +268,11 @@ class _Reading:
                     f"{plain(topic)}, so its messages cannot be assigned. Record it again, or repair it with `mcap recover`."
                 )
             return
-        if (found := own.described(channel.metadata)) is not None:
-            if found.derived:
+        if (exported := exported_stream(channel.metadata)) is not None:
+            if exported.derived:
                 return
-            self.own[topic] = found
-        if self.sources is not None and all(one.split(OF)[0] != topic for one in self.sources):
+            self.exported[topic] = exported
+        if self.sources is not None and all(source.split(SUFFIX_MARK)[0] != topic for source in self.sources):
             return
         self._channels[file, channel.number] = topic
         if topic in self.skipped:
@@ -206,7 +282,7 @@ class _Reading:
                 self._skip(topic, f"it has messages of two types, {plain(self.types[topic])} and {plain(channel.type)}")
             return
         try:
-            self.topics[topic] = Topic(_decoder(channel), self.aside)
+            self.topics[topic] = TopicDecoder(_decoder_for_channel(channel), self.spill)
             self.types[topic] = channel.type
         except TopicError as error:
             self._skip(topic, str(error))
@@ -217,31 +293,31 @@ class _Reading:
             self.undescribed += (file, message.channel) not in self._described
             return
         try:
-            content = _unzipped(message.content) if self.compressed else message.content
+            content = _decompress_message(message.content) if self.compressed else message.content
             topic.add(content, message.log_ns, message.publish_ns)
         except TopicError as error:
             self._skip(self._channels[file, message.channel], str(error))
 
-    def _metadata(self, found: Metadata) -> None:
-        if found.name == OWN:
-            if found.values.get("ros_distro"):
-                self.attributes["ros_distro"] = found.values["ros_distro"]
+    def _metadata(self, metadata: Metadata) -> None:
+        if metadata.name == ROS2_METADATA:
+            if metadata.values.get("ros_distro"):
+                self.attributes["ros_distro"] = metadata.values["ros_distro"]
             return
-        if found.name == own.KEY:
-            self.attributes |= own.attributes(found.values)
+        if metadata.name == EXPORT_KEY:
+            self.attributes |= exported_attributes(metadata.values)
             return
         from tacpipe.formats.table.label_texts import plain_value
 
-        for name, value in found.values.items():
+        for name, value in metadata.values.items():
             self.attributes.setdefault(plain(name), plain_value(value))
 
-    def _skip(self, topic: str, why: str) -> None:
-        self.skipped[topic] = why
+    def _skip(self, topic: str, reason: str) -> None:
+        self.skipped[topic] = reason
         self.topics.pop(topic, None)
 
     def contents(self) -> Contents:
-        """Return what was read."""
-        found: list[tuple[Own | None, SourceStream]] = []
+        """Return the streams, attributes, skipped topics and notes."""
+        streams_with_origin: list[tuple[ExportedStream | None, SourceStream]] = []
         for topic, reading in list(self.topics.items()):
             if not reading.count:
                 continue
@@ -252,33 +328,39 @@ class _Reading:
                 continue
             if not finished:
                 self.skipped[topic] = f"its messages ({plain(self.types[topic])}) hold no values"
-            for one in finished:
-                source = f"{topic}{OF}{one.suffix}" if one.suffix else topic
+            for topic_stream in finished:
+                source = f"{topic}{SUFFIX_MARK}{topic_stream.suffix}" if topic_stream.suffix else topic
                 if self.sources is not None and source not in self.sources:
                     continue
-                rows = None if self.ended_early else one.content.rows
-                before = self.own.get(topic)
-                name = before.stream if before is not None and before.stream else source
-                found.append((before, SourceStream(source, name, one.time, one.content, rows)))
-                if one.note:
-                    self.notes.append(f"{plain(source)}: {one.note}; its log times are used.")
+                rows = None if self.ended_early else topic_stream.content.rows
+                exported = self.exported.get(topic)
+                name = exported.stream if exported is not None and exported.stream else source
+                streams_with_origin.append(
+                    (exported, SourceStream(source, name, topic_stream.time, topic_stream.content, rows))
+                )
+                if topic_stream.note:
+                    self.notes.append(f"{plain(source)}: {topic_stream.note}; its log times are used.")
         if self.undescribed:
             self.notes.append(f"{self.path} has {self.undescribed:,} messages of channels that it does not describe.")
         if self.ended_early:
             self.notes.append(
                 f"The first {LOOK_MESSAGES} messages of each file were looked at; later ones may have other topics."
             )
-        if not found and not self.skipped:
+        if not streams_with_origin and not self.skipped:
             self.skipped = dict.fromkeys(self.topics, "it has no messages")
-        streams = [stream if before is None else own.restored(stream, before) for before, stream in found]
-        known = Counter(stream.name for stream in streams)
-        streams = [stream if known[stream.name] == 1 else replace(stream, name=stream.source) for stream in streams]
+        streams = [
+            stream if exported is None else restore_stream(stream, exported) for exported, stream in streams_with_origin
+        ]
+        name_counts = Counter(stream.name for stream in streams)
+        streams = [
+            stream if name_counts[stream.name] == 1 else replace(stream, name=stream.source) for stream in streams
+        ]
         names = kinds.identifiers([stream.name for stream in streams])
         streams = [replace(stream, name=names[stream.name]) for stream in streams]
         return Contents(streams, self.attributes, self.skipped, self.notes)
 
 
-def _unzipped(content: bytes) -> bytes:
+def _decompress_message(content: bytes) -> bytes:
     import zstandard
 
     try:
@@ -287,17 +369,17 @@ def _unzipped(content: bytes) -> bytes:
         raise TopicError("a compressed message is damaged") from error
 
 
-def _decoder(channel: Channel) -> Decoder:
-    """Return what decodes the messages of a channel. Raises `TopicError` where none does."""
+def _decoder_for_channel(channel: Channel) -> MessageDecoder:
+    """Return the decoder for the messages of a channel. Raises `TopicError` for an unsupported encoding."""
     text = channel.schema.decode(errors="replace")
     if channel.encoding in ("ros1", "cdr"):
         kind: ros.Definition = "idl" if channel.schema_encoding == "ros2idl" else "msg"
-        name = ros.normal(channel.type)
-        return ros.Ros(name, ros.types(name, kind, text), channel.encoding == "cdr")
+        name = ros.normalize_type_name(channel.type)
+        return ros.RosDecoder(name, ros.parse_definitions(name, kind, text), channel.encoding == "cdr")
     if channel.encoding == "json":
-        return json_messages.Json(text)
+        return object_messages.Json(text)
     if channel.encoding == "protobuf":
-        return protobuf_messages.Protobuf(channel.type, channel.schema)
+        return object_messages.Protobuf(channel.type, channel.schema)
     raise TopicError(
         f"its messages are written as {plain(channel.encoding) or 'nothing known'}, not ros1, cdr, json or protobuf"
     )

@@ -1,4 +1,4 @@
-"""The records of an MCAP file, from the first byte on: indexes are not needed, so a file without them reads as well."""
+"""Read the records of an MCAP file from the first byte on, without its indexes, which a damaged file may lack."""
 
 from __future__ import annotations
 
@@ -11,7 +11,17 @@ from pathlib import Path
 from typing import BinaryIO
 
 from tacpipe.errors import TacpipeError
-from tacpipe.formats.bags.storages import Channel, Damage, LostChunk, Message, Metadata, Record, moment
+from tacpipe.formats.bags.storages import (
+    CUT_OFF,
+    BrokenRecordError,
+    Channel,
+    Damage,
+    LostChunk,
+    Message,
+    Metadata,
+    Record,
+    format_time,
+)
 from tacpipe.io import memory, regular
 from tacpipe.printable import plain
 
@@ -23,53 +33,48 @@ INDEX_ENTRY = 16  # bytes of a message in the index of a chunk
 _RECORD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _CHUNK = struct.Struct("<QQQI")  # first and last time, size and check sum of what is inside
-CUT_OFF = "the file ends within a record: it was cut off, and what came after is missing"
 
 
-class _BrokenError(Exception):
-    """A record that cannot be read: why, as a clause."""
-
-
-def records(path: Path) -> Iterator[Record]:
-    """Yield what an MCAP file holds. Raises `TacpipeError` where it is not one."""
+def read_records(path: Path) -> Iterator[Record]:
+    """Yield the records of an MCAP file. Raises `TacpipeError` where it is not one."""
     with regular.failing(path), regular.opened(path) as file:
-        yield from stream_records(path, file)
+        yield from read_stream(path, file)
 
 
-def stream_records(path: Path, file: BinaryIO) -> Iterator[Record]:
-    """Yield what ``file``, the bytes of an MCAP file from the first on, holds. Raises as `records` does."""
+def read_stream(path: Path, file: BinaryIO) -> Iterator[Record]:
+    """Yield the records of ``file``, the bytes of an MCAP file from the first on. Raises as `read_records` does."""
     if file.read(len(MAGIC)) != MAGIC:
         raise TacpipeError(f"{path} is not an MCAP file: it does not begin as one.")
     reader = _Reader(path)
     try:
-        yield from _data(file, reader)
-    except _BrokenError as error:
-        until = f"; {reader.count:,} messages up to {moment(reader.last_ns)} were read" if reader.count else ""
+        yield from _read_data(file, reader)
+    except BrokenRecordError as error:
+        until = f"; {reader.count:,} messages up to {format_time(reader.last_ns)} were read" if reader.count else ""
         yield Damage(f"{path}: {error}{until}.")
         return
-    declared_count = _stated_messages(file)
+    declared_count = _declared_message_count(file)
     lost = 0 if declared_count is None else declared_count - reader.count
     if lost > 0:
         yield Damage(f"{path} states that it has {declared_count:,} messages, and {lost:,} of them are missing.")
 
 
-def _data(file: BinaryIO, reader: _Reader) -> Iterator[Record]:
-    """Yield what stands before the summary at the end of a file."""
+def _read_data(file: BinaryIO, reader: _Reader) -> Iterator[Record]:
+    """Yield the records before the summary at the end of a file."""
     lost: LostChunk | None = None
     while True:
-        kind, length = _head(file)
+        kind, length = _read_head(file)
         if lost is not None and kind != MESSAGE_INDEX:
             yield lost.damage(reader.path)
             lost = None
         if kind in (FOOTER, DATA_END):
-            _pass(file, length)
+            _skip_bytes(file, length)
             return
         if kind == ATTACHMENT:
-            name = _attached(beginning := file.read(min(length, 4096)))
+            name = _attachment_name(beginning := file.read(min(length, 4096)))
             yield Damage(f"{reader.path}: the attachment {name} is not read.")
-            _pass(file, length - len(beginning))
+            _skip_bytes(file, length - len(beginning))
         elif kind in (SCHEMA, CHANNEL, MESSAGE, CHUNK, METADATA) or (kind == MESSAGE_INDEX and lost is not None):
-            content = _content(file, length)
+            content = _read_content(file, length)
             if kind == MESSAGE_INDEX and lost is not None:
                 lost.count += max(len(content) - 6, 0) // INDEX_ENTRY
             elif kind == CHUNK:
@@ -77,36 +82,38 @@ def _data(file: BinaryIO, reader: _Reader) -> Iterator[Record]:
             elif len(content) == length:
                 yield from reader.record(kind, memoryview(content))
             if len(content) < length:
-                raise _BrokenError(CUT_OFF)
+                raise BrokenRecordError(CUT_OFF)
         else:  # an index, or what is newer
-            _pass(file, length)
+            _skip_bytes(file, length)
 
 
-def _stated_messages(file: BinaryIO) -> int | None:
+def _declared_message_count(file: BinaryIO) -> int | None:
     """Return how many messages the summary states; None where there is none, or where it is damaged."""
     try:
         while True:
-            kind, length = _head(file)
+            kind, length = _read_head(file)
             if kind == STATISTICS:
-                return int.from_bytes(_content(file, length)[:8], "little")
-            _pass(file, length)
-    except _BrokenError:
+                return int.from_bytes(_read_content(file, length)[:8], "little")
+            _skip_bytes(file, length)
+    except BrokenRecordError:
         return None
 
 
-def _head(file: BinaryIO) -> tuple[int, int]:
+def _read_head(file: BinaryIO) -> tuple[int, int]:
     """Return kind and length in bytes of the next record."""
     head = file.read(_RECORD.size)
     if len(head) < _RECORD.size:
-        raise _BrokenError(CUT_OFF)
+        raise BrokenRecordError(CUT_OFF)
     kind, length = _RECORD.unpack(head)
     return kind, length
 
 
-def _content(file: BinaryIO, length: int) -> bytes:
+def _read_content(file: BinaryIO, length: int) -> bytes:
     """Return the next ``length`` bytes, or as many as there are: what is declared takes no memory."""
     if length > memory.MOST_BLOCK:
-        raise _BrokenError(f"a record declares {length:,} bytes, more than the {memory.MOST_BLOCK:,} that are read")
+        raise BrokenRecordError(
+            f"a record declares {length:,} bytes, more than the {memory.MOST_BLOCK:,} that are read"
+        )
     parts: list[bytes] = []
     while length and (part := file.read(min(length, PIECE_BYTES))):
         parts.append(part)
@@ -114,18 +121,18 @@ def _content(file: BinaryIO, length: int) -> bytes:
     return parts[0] if len(parts) == 1 else b"".join(parts)
 
 
-def _pass(file: BinaryIO, length: int) -> None:
+def _skip_bytes(file: BinaryIO, length: int) -> None:
     if not length:
         return
     if length >= 1 << 62:
-        raise _BrokenError(CUT_OFF)
+        raise BrokenRecordError(CUT_OFF)
     file.seek(length - 1, io.SEEK_CUR)
     if not file.read(1):
-        raise _BrokenError(CUT_OFF)
+        raise BrokenRecordError(CUT_OFF)
 
 
 class _Reader:
-    """Records in the words of `storages`; keeps schemas, which channels name by number."""
+    """Convert records to the types of `storages`; keeps schemas, which channels name by number."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -134,7 +141,7 @@ class _Reader:
         self._schemas: dict[int, tuple[str, str, bytes]] = {0: ("", "", b"")}
 
     def record(self, kind: int, content: memoryview) -> Iterator[Record]:
-        """Yield what a record is, if it is one that counts."""
+        """Yield a message, channel or metadata record; keep a schema for the channels that name it."""
         if kind == MESSAGE:
             yield self._message(content, 0, len(content))
             return
@@ -154,10 +161,10 @@ class _Reader:
                     channel.id, channel.topic, name, channel.message_encoding, encoding, data, channel.metadata
                 )
             elif kind == METADATA:
-                found = mcap_records.Metadata.read(stream)
-                yield Metadata(found.name, found.metadata)
+                metadata = mcap_records.Metadata.read(stream)
+                yield Metadata(metadata.name, metadata.metadata)
         except (EndOfFile, struct.error, UnicodeDecodeError) as error:
-            raise _BrokenError(f"a record of kind {kind} is damaged") from error
+            raise BrokenRecordError(f"a record of kind {kind} is damaged") from error
 
     def chunk(self, content: bytes, complete: bool) -> Generator[Record, None, LostChunk | None]:
         """Yield the records of a chunk; a truncated chunk yields the records that are left.
@@ -173,9 +180,9 @@ class _Reader:
         if size > memory.MOST_BLOCK:
             problem = f"declares {size:,} bytes, more than the {memory.MOST_BLOCK:,} that are unpacked"
             return LostChunk(problem, first_ns, last_ns)
-        inside = _decompressed(compression, content[begin + 8 :], size)
+        inside = _decompress(compression, content[begin + 8 :], size)
         view = memoryview(inside)
-        spans, end = _spans(view)
+        spans, end = _record_spans(view)
         if complete and (len(inside) != size or end != size or (check and zlib.crc32(inside) != check)):
             return LostChunk(f"of {size:,} bytes is damaged", first_ns, last_ns)
         for kind, at, length in spans:
@@ -187,15 +194,15 @@ class _Reader:
 
     def _message(self, view: memoryview, at: int, length: int) -> Message:
         if length < _MESSAGE.size:
-            raise _BrokenError("a message record is too short")
+            raise BrokenRecordError("a message record is too short")
         number, _, log_ns, publish_ns = _MESSAGE.unpack_from(view, at)
         self.count += 1
         self.last_ns = log_ns
         return Message(number, log_ns, publish_ns, bytes(view[at + _MESSAGE.size : at + length]))
 
 
-def _spans(view: memoryview) -> tuple[list[tuple[int, int, int]], int]:
-    """Return kind, place and length of the whole records in a chunk, and where the last one ends."""
+def _record_spans(view: memoryview) -> tuple[list[tuple[int, int, int]], int]:
+    """Return kind, place and length of the complete records in a chunk, and the end of the last one."""
     spans: list[tuple[int, int, int]] = []
     end = 0
     while end + _RECORD.size <= len(view):
@@ -208,12 +215,12 @@ def _spans(view: memoryview) -> tuple[list[tuple[int, int, int]], int]:
     return spans, end
 
 
-def _attached(content: bytes) -> str:
-    """Return the name in an attachment: after two times, and its length."""
+def _attachment_name(content: bytes) -> str:
+    """Return the name in an attachment, which follows two times and its own length."""
     return plain(content[20 : 20 + int.from_bytes(content[16:20], "little")].decode(errors="replace"))
 
 
-def _decompressed(compression: str, content: bytes, size: int) -> bytes:
+def _decompress(compression: str, content: bytes, size: int) -> bytes:
     """Return what a chunk of ``size`` bytes holds, as much of it as can be unpacked, and of a longer one a byte more."""
     if compression == "":
         return content
@@ -228,7 +235,7 @@ def _decompressed(compression: str, content: bytes, size: int) -> bytes:
         source = lz4.frame.LZ4FrameFile(io.BytesIO(content))
         damaged = (RuntimeError, EOFError, OSError)
     else:
-        raise _BrokenError(f"its chunks are compressed with {plain(compression)}, not zstd or lz4")
+        raise BrokenRecordError(f"its chunks are compressed with {plain(compression)}, not zstd or lz4")
     parts: list[bytes] = []
     remaining = size + 1
     with contextlib.suppress(*damaged):

@@ -1,7 +1,7 @@
-"""What the values of ROS messages measure: columns, their names, quantities and units, by message type.
+"""Map ROS messages to columns with names, quantities and units, by message type.
 
-Units follow REP 103 (SI). Types are recognised wherever they stand inside a message, so a lab's own message with a
-``geometry_msgs/Wrench`` in it has forces in newtons. What is not known keeps its path as name, without quantity.
+Units follow REP 103 (SI). Types are recognised at any depth of a message, so a lab's own message with a
+``geometry_msgs/Wrench`` in it has forces in newtons. Other values keep their path as name, without quantity.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 
 from tacpipe.formats.bags.wire import TEXT, Leaf, Path, Shape
 
-MOST_COLUMNS = 4096  # of a stream; longer arrays of bytes are one column of bytes
+MAX_COLUMNS = 4096  # longer arrays of bytes are one column of bytes
 _XYZ = ("x", "y", "z")
 _STAMPS = (("header", "stamp"), ("timestamp",), ("stamp",))  # Foxglove's own messages and logs have no header
 _FRAMES = (("header", "frame_id"), ("frame_id",))
@@ -34,7 +34,7 @@ class Column:
 class Part:
     """Columns that were measured at one moment; most messages are one part, those with many sensors one each."""
 
-    suffix: str = ""  # of the stream's name
+    suffix: str = ""  # end of the stream's name
     columns: list[Column] = field(default_factory=list)
     stamp: Leaf | None = None
     frame: Leaf | None = None
@@ -42,19 +42,24 @@ class Part:
 
 @dataclass(frozen=True)
 class Meaning:
-    """How messages of a type become parts, and which of their values name the others."""
+    """The function that divides messages of a type into parts, and the leaves whose values name others."""
 
     parts: Callable[[Shape], list[Part]]
-    keys: Callable[[Leaf], bool] = lambda leaf: False  # messages whose keys differ are not alike
+    is_key: Callable[[Leaf], bool] = lambda leaf: False  # messages with different keys are decoded apart
 
 
-def _geometry() -> dict[tuple[str, Path], tuple[str, str, str, str]]:
+def _geometry_meanings() -> dict[tuple[str, Path], tuple[str, str, str, str]]:
     """Return name, quantity, unit and component of a value, by the message type around it and its path in that."""
-    found: dict[tuple[str, Path], tuple[str, str, str, str]] = {}
+    meanings: dict[tuple[str, Path], tuple[str, str, str, str]] = {}
 
     def vector(kind: str, path: Path, name: str, quantity: str, unit: str, parts: Sequence[str] = _XYZ) -> None:
         for part in parts:
-            found[f"geometry_msgs/msg/{kind}", (*path, part)] = (name.format(part), quantity, unit, part)
+            meanings[f"geometry_msgs/msg/{kind}", (*path, part)] = (
+                name.format(part),
+                quantity,
+                unit,
+                part,
+            )
 
     vector("Wrench", ("force",), "force_{}_n", "force", "N")
     vector("Wrench", ("torque",), "torque_{}_nm", "torque", "N m")
@@ -72,62 +77,83 @@ def _geometry() -> dict[tuple[str, Path], tuple[str, str, str, str]]:
     vector("Accel", ("linear",), "acceleration_{}_m_s2", "acceleration", "m/s^2")
     vector("Accel", ("angular",), "angular_acceleration_{}_rad_s2", "angular_acceleration", "rad/s^2")
     for part in quaternion:
-        found["sensor_msgs/msg/Imu", ("orientation", part)] = (f"orientation_{part}", "orientation", "1", part)
+        meanings["sensor_msgs/msg/Imu", ("orientation", part)] = (
+            f"orientation_{part}",
+            "orientation",
+            "1",
+            part,
+        )
     for part in _XYZ:
         imu, field_of = "sensor_msgs/msg/Imu", "sensor_msgs/msg/MagneticField"
         name = f"angular_velocity_{part}_rad_s"
-        found[imu, ("angular_velocity", part)] = (name, "angular_velocity", "rad/s", part)
-        found[imu, ("linear_acceleration", part)] = (f"acceleration_{part}_m_s2", "acceleration", "m/s^2", part)
-        found[field_of, ("magnetic_field", part)] = (f"magnetic_field_{part}_t", "magnetic_field", "T", part)
-    found["sensor_msgs/msg/Temperature", ("temperature",)] = ("temperature_degc", "temperature", "degC", "")
-    found["sensor_msgs/msg/FluidPressure", ("fluid_pressure",)] = ("pressure_pa", "static_pressure", "Pa", "")
-    found["sensor_msgs/msg/Range", ("range",)] = ("range_m", "proximity", "m", "")
-    return found
+        meanings[imu, ("angular_velocity", part)] = (name, "angular_velocity", "rad/s", part)
+        meanings[imu, ("linear_acceleration", part)] = (
+            f"acceleration_{part}_m_s2",
+            "acceleration",
+            "m/s^2",
+            part,
+        )
+        meanings[field_of, ("magnetic_field", part)] = (
+            f"magnetic_field_{part}_t",
+            "magnetic_field",
+            "T",
+            part,
+        )
+    meanings["sensor_msgs/msg/Temperature", ("temperature",)] = ("temperature_degc", "temperature", "degC", "")
+    meanings["sensor_msgs/msg/FluidPressure", ("fluid_pressure",)] = ("pressure_pa", "static_pressure", "Pa", "")
+    meanings["sensor_msgs/msg/Range", ("range",)] = ("range_m", "proximity", "m", "")
+    return meanings
 
 
-_GEOMETRY = _geometry()
+_GEOMETRY = _geometry_meanings()
 
 
-def known(leaf: Leaf) -> tuple[str, str, str, str, int] | None:
-    """Return name, quantity, unit, component of a value inside a type that is known, and the length of that type's path."""
-    for depth, kind in reversed(leaf.within):
-        found = _GEOMETRY.get((kind, leaf.path[depth:]))
-        if found is not None:
-            return *found, depth
+def enclosing_meaning(leaf: Leaf) -> tuple[str, str, str, str, int] | None:
+    """Return name, quantity, unit and component of a value, and the length of the path of the type that defines them.
+
+    None where no enclosing type defines the value.
+    """
+    for depth, kind in reversed(leaf.enclosing):
+        meaning = _GEOMETRY.get((kind, leaf.path[depth:]))
+        if meaning is not None:
+            return *meaning, depth
     return None
 
 
-def plain_parts(shape: Shape) -> list[Part]:
+def single_part(shape: Shape) -> list[Part]:
     """Return all values of a message as one part, with the meaning that the types inside give them."""
-    return [part(shape.leaves)]
+    return [part_from_leaves(shape.leaves)]
 
 
-def part(leaves: Sequence[Leaf], start: int = 0, suffix: str = "") -> Part:
+def part_from_leaves(leaves: Sequence[Leaf], start: int = 0, suffix: str = "") -> Part:
     """Return these values as a part; the first ``start`` names of their paths are left out of the columns' names."""
-    made = Part(suffix)
+    result = Part(suffix)
     places = {
-        (name, leaf.path[:depth]) for leaf in leaves if (found := known(leaf)) for name, depth in [(found[0], found[4])]
+        (name, leaf.path[:depth])
+        for leaf in leaves
+        if (meaning := enclosing_meaning(leaf))
+        for name, depth in [(meaning[0], meaning[4])]
     }
-    several = {name for name, _ in places if sum(other == name for other, _ in places) > 1}
+    repeated_names = {name for name, _ in places if sum(other_name == name for other_name, _ in places) > 1}
     for leaf in leaves:
         path = leaf.path[start:]
         if leaf.kind == "stamp" and path in _STAMPS:
-            made.stamp = leaf
+            result.stamp = leaf
         elif path in _FRAMES:
-            made.frame = leaf
+            result.frame = leaf
         elif path == ("header", "seq"):
-            made.columns.append(Column("seq", leaf, about=(("unit", "1"), ("quantity", "sequence"))))
-        elif found := known(leaf):
-            name, quantity, unit, component, depth = found
-            before = _joined(leaf.path[start:depth]) + "_" if name in several and depth > start else ""
-            made.columns.append(Column(before + name, leaf, about=_about(quantity, unit, component=component)))
+            result.columns.append(Column("seq", leaf, about=(("unit", "1"), ("quantity", "sequence"))))
+        elif meaning := enclosing_meaning(leaf):
+            name, quantity, unit, component, depth = meaning
+            before = _join_path(leaf.path[start:depth]) + "_" if name in repeated_names and depth > start else ""
+            result.columns.append(Column(before + name, leaf, about=_metadata(quantity, unit, component=component)))
         else:
-            made.columns += columns(leaf, _joined(path) or "data")
-    return made
+            result.columns += columns_from_leaf(leaf, _join_path(path) or "data")
+    return result
 
 
-def columns(leaf: Leaf, name: str, about: tuple[tuple[str, str], ...] = ()) -> list[Column]:
-    """Return the columns of a value: one, or one for each number of an array; long arrays of bytes are one of bytes."""
+def columns_from_leaf(leaf: Leaf, name: str, about: tuple[tuple[str, str], ...] = ()) -> list[Column]:
+    """Return the columns of a value: one per number of an array; long arrays of bytes are one column of bytes."""
     if leaf.kind == "stamp":
         return [Column(f"{name}_ns", leaf, about=about or (("unit", "ns"), ("quantity", "time")))]
     if leaf.count is None or leaf.kind == TEXT or is_bytes(leaf):
@@ -141,23 +167,23 @@ def is_bytes(leaf: Leaf) -> bool:
     """Return whether an array is bytes, as those of an image, rather than channels."""
     if leaf.kind not in ("uint8", "byte", "char", "int8") or leaf.count is None:
         return False
-    if leaf.within[-1][1].startswith("tacpipe_msgs/"):  # what an export writes has no other arrays
+    if leaf.enclosing[-1][1].startswith("tacpipe_msgs/"):  # an export writes no other arrays of these types
         return True
-    arrays = "MultiArray" in leaf.within[-1][1]
-    return leaf.count > MOST_COLUMNS or (not arrays and leaf.path[-1] == "data")
+    arrays = "MultiArray" in leaf.enclosing[-1][1]
+    return leaf.count > MAX_COLUMNS or (not arrays and leaf.path[-1] == "data")
 
 
-def _joined(path: Path) -> str:
+def _join_path(path: Path) -> str:
     """Return a path as a name: positions count from 0, as those of arrays do.
 
-    >>> _joined(("sensors", 0, "taxels", 3, "x"))
+    >>> _join_path(("sensors", 0, "taxels", 3, "x"))
     'sensors_0_taxels_3_x'
     """
     return "_".join(map(str, path))
 
 
-def _about(quantity: str, unit: str, **more: str) -> tuple[tuple[str, str], ...]:
-    return tuple((key, value) for key, value in {"quantity": quantity, "unit": unit, **more}.items() if value)
+def _metadata(quantity: str, unit: str, **metadata: str) -> tuple[tuple[str, str], ...]:
+    return tuple((key, value) for key, value in {"quantity": quantity, "unit": unit, **metadata}.items() if value)
 
 
 _JOINT = {  # name of the column, quantity, unit of a joint that turns
@@ -169,10 +195,10 @@ _SLIDES = re.compile(r"finger|prismatic|slid|linear|rail|lift", re.IGNORECASE)
 
 
 class _Joints:
-    """JointStates of one topic: a column a joint, numbered as the first message has them, with its name in the metadata.
+    """JointStates of one topic: one column per joint in the order of the first message, with its name in the metadata.
 
-    Several drivers may write to the topic, each its own joints: each set of joints is a stream. A driver may write them in
-    another order each time.
+    Several drivers may write to the topic, each its own joints: each set of joints is a stream. The order of the joints may
+    differ between messages.
     """
 
     def __init__(self) -> None:
@@ -182,7 +208,7 @@ class _Joints:
         names = [shape.text(leaf) for leaf in shape.leaves if leaf.path[0] == "name"]
         order = self._orders.setdefault(frozenset(names), names)
         first = order is next(iter(self._orders.values()))
-        made = part(
+        result = part_from_leaves(
             [leaf for leaf in shape.leaves if leaf.path[0] == "header"], 0, "" if first or not names else order[0]
         )
         for leaf in shape.leaves:
@@ -191,60 +217,60 @@ class _Joints:
             by_name = dict(zip(names, range(leaf.count), strict=False))
             for number, joint in enumerate(order if len(by_name) == len(names) == leaf.count else names, 1):
                 if joint in by_name:
-                    made.columns.append(_joint(leaf, by_name[joint], number, joint))
+                    result.columns.append(_joint(leaf, by_name[joint], number, joint))
             for index in range(len(names), leaf.count):
-                made.columns.append(_joint(leaf, index, index + 1, ""))
-        return [made]
+                result.columns.append(_joint(leaf, index, index + 1, ""))
+        return [result]
 
 
 def _joint(leaf: Leaf, index: int, number: int, joint: str) -> Column:
     name, quantity, unit = _JOINT[str(leaf.path[0])]
     if _SLIDES.search(joint):  # its unit would be m; a message does not state which joints slide
         name, unit = f"joint{{}}_{leaf.path[0]}", ""
-    return Column(name.format(number), leaf, index, _about(quantity, unit, joint=joint))
+    return Column(name.format(number), leaf, index, _metadata(quantity, unit, joint=joint))
 
 
-def _multi_array(shape: Shape) -> list[Part]:
-    """Return an array of std_msgs: a column a number, whose metadata are its place where the layout names dimensions."""
+def _multi_array_parts(shape: Shape) -> list[Part]:
+    """Return an array of std_msgs with one column per number, placed in the dimensions that the layout names."""
     layout = {leaf.path[1:]: leaf for leaf in shape.leaves if leaf.path[0] == "layout"}
     dimensions = [
         (shape.text(layout[path]), shape.number(layout[(*path[:2], "size")])) for path in layout if path[-1] == "label"
     ]
     names = [name or f"dimension{number}" for number, (name, _) in enumerate(dimensions, 1)]
     sizes = [size for _, size in dimensions]
-    made = Part()
+    result = Part()
     for leaf in shape.leaves:
         if leaf.path[0] != "layout":
-            made.columns += columns(leaf, "_".join(map(str, leaf.path)))
-    if dimensions and math.prod(sizes) == len(made.columns) and len(set(names)) == len(names):
+            result.columns += columns_from_leaf(leaf, "_".join(map(str, leaf.path)))
+    if dimensions and math.prod(sizes) == len(result.columns) and len(set(names)) == len(names):
         places = itertools.product(*map(range, sizes))
-        made.columns = [
+        result.columns = [
             replace(column, about=tuple(zip(names, map(str, place), strict=True)))
-            for column, place in zip(made.columns, places, strict=True)
+            for column, place in zip(result.columns, places, strict=True)
         ]
-    return [made]
+    return [result]
 
 
-def _transforms(shape: Shape) -> list[Part]:
-    """Return the transforms of a message, a part for each pair of frames."""
+def _transform_parts(shape: Shape) -> list[Part]:
+    """Return the transforms of a message, one part per pair of frames."""
     places = sorted({leaf.path[1] for leaf in shape.leaves}, key=int)
-    made = []
+    parts = []
     for place in places:
         leaves = [leaf for leaf in shape.leaves if leaf.path[1] == place]
         child = next(shape.text(leaf) for leaf in leaves if leaf.path[-1] == "child_frame_id")
-        made.append(part([leaf for leaf in leaves if leaf.path[-1] != "child_frame_id"], 2, child))
-    return made
+        parts.append(part_from_leaves([leaf for leaf in leaves if leaf.path[-1] != "child_frame_id"], 2, child))
+    return parts
 
 
-def _transform(shape: Shape) -> list[Part]:
+def _single_transform(shape: Shape) -> list[Part]:
     child = next(shape.text(leaf) for leaf in shape.leaves if leaf.path == ("child_frame_id",))
-    return [part([leaf for leaf in shape.leaves if leaf.path != ("child_frame_id",)], 0, child)]
+    return [part_from_leaves([leaf for leaf in shape.leaves if leaf.path != ("child_frame_id",)], 0, child)]
 
 
-def _tactile_state(shape: Shape) -> list[Part]:
-    """Return a tactile_msgs/TactileState: a column a taxel of each sensor, whose names the message has."""
+def _tactile_parts(shape: Shape) -> list[Part]:
+    """Return a tactile_msgs/TactileState with one column per taxel of each sensor that the message names."""
     names = {leaf.path[1]: shape.text(leaf) for leaf in shape.leaves if leaf.path[0] == "sensors" and leaf.kind == TEXT}
-    made = part([leaf for leaf in shape.leaves if leaf.path[0] == "header"])
+    result = part_from_leaves([leaf for leaf in shape.leaves if leaf.path[0] == "header"])
     for leaf in shape.leaves:
         if leaf.path[0] != "sensors" or leaf.kind == TEXT:
             continue
@@ -252,50 +278,52 @@ def _tactile_state(shape: Shape) -> list[Part]:
         before = re.sub(r"\W+", "_", sensor).strip("_")
         digits = max(2, len(str(leaf.count)))
         for index in range(leaf.count or 0):
-            about = _about("tactile", "", sensor=sensor, taxel=str(index + 1))
-            made.columns.append(Column(f"{before}_taxel{index + 1:0{digits}d}", leaf, index, about))
-    return [made]
+            about = _metadata("tactile", "", sensor=sensor, taxel=str(index + 1))
+            result.columns.append(Column(f"{before}_taxel{index + 1:0{digits}d}", leaf, index, about))
+    return [result]
 
 
-def _xela(shape: Shape) -> list[Part]:
-    """Return a xela_server_ros2/SensStream: a part a sensor, whose taxels have counts and, if it is calibrated, forces.
+def _xela_parts(shape: Shape) -> list[Part]:
+    """Return a xela_server_ros2/SensStream, one part per sensor; taxels have counts and, if calibrated, forces.
 
     ``time`` is the server's Unix time in seconds; there is no header.
     """
-    made = []
+    parts = []
     for place in sorted({leaf.path[1] for leaf in shape.leaves}, key=int):
         leaves = {leaf.path[2:]: leaf for leaf in shape.leaves if leaf.path[1] == place}
-        one = Part(f"sensor{int(place) + 1}")
+        sensor_part = Part(f"sensor{int(place) + 1}")
         for path, leaf in leaves.items():
             if path[0] in ("taxels", "forces") and leaf.path[-1] in _XYZ:
                 taxel, axis = int(path[1]) + 1, str(path[-1])
                 quantity, unit, end = (
                     ("tactile", "count", axis) if path[0] == "taxels" else ("force", "N", f"force_{axis}_n")
                 )
-                about = _about(quantity, unit, taxel=str(taxel), axis=axis)
-                one.columns.append(Column(f"taxel{taxel:02d}_{end}", leaf, about=about))
+                about = _metadata(quantity, unit, taxel=str(taxel), axis=axis)
+                sensor_part.columns.append(Column(f"taxel{taxel:02d}_{end}", leaf, about=about))
             elif path == ("message",):
-                one.columns.append(Column("seq", leaf, about=_about("sequence", "1")))
+                sensor_part.columns.append(Column("seq", leaf, about=_metadata("sequence", "1")))
             elif path == ("time",):
-                one.columns.append(Column("server_time_s", leaf, about=_about("time", "s")))
+                sensor_part.columns.append(Column("server_time_s", leaf, about=_metadata("time", "s")))
             else:
-                one.columns += columns(leaf, _joined(path))
-        made.append(one)
-    return made
+                sensor_part.columns += columns_from_leaf(leaf, _join_path(path))
+        parts.append(sensor_part)
+    return parts
 
 
 _MEANINGS: Mapping[str, Callable[[], Meaning]] = {
     "sensor_msgs/msg/JointState": lambda: Meaning(_Joints(), lambda leaf: leaf.path[0] == "name"),
-    "tf2_msgs/msg/TFMessage": lambda: Meaning(_transforms, lambda leaf: leaf.kind == TEXT),
-    "tf/msg/tfMessage": lambda: Meaning(_transforms, lambda leaf: leaf.kind == TEXT),
-    "geometry_msgs/msg/TransformStamped": lambda: Meaning(_transform, lambda leaf: leaf.path == ("child_frame_id",)),
-    "tactile_msgs/msg/TactileState": lambda: Meaning(_tactile_state, lambda leaf: leaf.kind == TEXT),
-    "xela_server_ros2/msg/SensStream": lambda: Meaning(_xela),
+    "tf2_msgs/msg/TFMessage": lambda: Meaning(_transform_parts, lambda leaf: leaf.kind == TEXT),
+    "tf/msg/tfMessage": lambda: Meaning(_transform_parts, lambda leaf: leaf.kind == TEXT),
+    "geometry_msgs/msg/TransformStamped": lambda: Meaning(
+        _single_transform, lambda leaf: leaf.path == ("child_frame_id",)
+    ),
+    "tactile_msgs/msg/TactileState": lambda: Meaning(_tactile_parts, lambda leaf: leaf.kind == TEXT),
+    "xela_server_ros2/msg/SensStream": lambda: Meaning(_xela_parts),
 }
 
 
-def of(name: str) -> Meaning:
+def meaning_of_type(name: str) -> Meaning:
     """Return the meaning of the messages of one topic, whose type has this name."""
     if name.startswith("std_msgs/msg/") and name.endswith("MultiArray"):
-        return Meaning(_multi_array, lambda leaf: leaf.path[0] == "layout")
-    return _MEANINGS.get(name, lambda: Meaning(plain_parts))()
+        return Meaning(_multi_array_parts, lambda leaf: leaf.path[0] == "layout")
+    return _MEANINGS.get(name, lambda: Meaning(single_part))()

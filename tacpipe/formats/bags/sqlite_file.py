@@ -1,4 +1,4 @@
-"""The records of a ROS 2 bag's SQLite file (.db3)."""
+"""Read the records of a ROS 2 bag's SQLite file (.db3)."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ _ERRORS = (sqlite3.Error, UnicodeDecodeError)  # the second where a message of S
 MAGIC = b"SQLite format 3\0"
 
 
-def records(path: Path) -> Iterator[Record]:
-    """Yield what a file holds, in the order in which it was written. Raises `TacpipeError` where it is not one."""
+def read_records(path: Path) -> Iterator[Record]:
+    """Yield the records of a file in the order in which they were written. Raises `TacpipeError` where it is no bag."""
     with regular.failing(path), regular.opened(path) as file:
         magic = file.read(len(MAGIC))
     if magic != MAGIC:
         raise TacpipeError(f"{path} is not a SQLite file: it {'does not begin as one' if magic else 'is empty'}.")
-    with _connected(path) as connection:
+    with _connect(path) as connection:
         try:
             _expect_tables(path, connection)
-            yield from _channels(connection)
+            yield from _read_channels(connection)
         except _ERRORS as error:
             raise TacpipeError(f"{path} is not a bag of ROS 2: {plain(str(error), 120)}.") from error
         try:
@@ -45,15 +45,15 @@ def records(path: Path) -> Iterator[Record]:
 
 
 @contextlib.contextmanager
-def _connected(path: Path) -> Iterator[sqlite3.Connection]:
+def _connect(path: Path) -> Iterator[sqlite3.Connection]:
     """Open a file without changing it; what was not yet moved from its log (-wal) is read from a copy."""
     log = regular.inside(path.parent, f"{path.name}-wal")
     with tempfile.TemporaryDirectory() if log.is_file() and log.stat().st_size else contextlib.nullcontext() as copies:
         if copies is None:
             address = f"file:{quote(str(path.absolute()))}?immutable=1"
         else:
-            for one in (path, log):
-                shutil.copy(one, copies)
+            for source in (path, log):
+                shutil.copy(source, copies)
             address = f"file:{quote(str(Path(copies, path.name)))}"
         connection = sqlite3.connect(address, uri=True)
         connection.text_factory = lambda content: content.decode(errors="replace")
@@ -73,7 +73,7 @@ def _expect_tables(path: Path, connection: sqlite3.Connection) -> None:
             )
 
 
-def _channels(connection: sqlite3.Connection) -> Iterator[Record]:
+def _read_channels(connection: sqlite3.Connection) -> Iterator[Record]:
     definitions: dict[str, tuple[str, bytes]] = {}
     tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
     if "message_definitions" in tables:
@@ -81,7 +81,7 @@ def _channels(connection: sqlite3.Connection) -> Iterator[Record]:
         definitions = {str(name): (str(kind), str(text).encode()) for name, kind, text in connection.execute(query)}
     for number, topic, name, encoding in connection.execute("SELECT id, name, type, serialization_format FROM topics"):
         kind, text = definitions.get(str(name), ("ros2msg", b""))
-        yield Channel(number, str(topic), ros.normal(str(name)), str(encoding), kind, text)
+        yield Channel(number, str(topic), ros.normalize_type_name(str(name)), str(encoding), kind, text)
     if "schema" in tables:
         for (distribution,) in connection.execute("SELECT ros_distro FROM schema"):
             yield Metadata("rosbag2", {"ros_distro": str(distribution or "")})

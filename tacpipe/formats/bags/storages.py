@@ -1,7 +1,7 @@
-"""What a bag's file holds, record by record: topics with their definitions, raw messages, metadata.
+"""Records that the files of a bag hold: topics with their definitions, raw messages, metadata.
 
-All three storages (MCAP, ROS 1 bags, ROS 2's SQLite) are read from their first record on and yield the same things, so what
-comes after them knows no difference. What stops a reader early is the last thing that it yields: a `Damage`.
+The readers of all three storages (MCAP, ROS 1 bags, ROS 2's SQLite) start at the first record and yield the same types.
+A reader that stops early yields a `Damage` last.
 """
 
 from __future__ import annotations
@@ -13,16 +13,22 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
+CUT_OFF = "the file ends within a record: it was cut off, and what came after is missing"
+
+
+class BrokenRecordError(Exception):
+    """A record that cannot be read; the message is a clause with the reason."""
+
 
 @dataclass(frozen=True)
 class Channel:
-    """Who wrote messages to a topic, and how: a topic may have several channels."""
+    """A source of messages of one topic with their type and encoding; a topic may have several channels."""
 
-    number: int  # by which messages name it
+    number: int  # identifies the channel in messages
     topic: str
     type: str  # name of the message type, of the schema
-    encoding: str  # of messages: ros1, cdr, json, protobuf, …
-    schema_encoding: str  # of the definition: ros1msg, ros2msg, ros2idl, jsonschema, protobuf, …
+    encoding: str  # encoding of messages: ros1, cdr, json, protobuf, …
+    schema_encoding: str  # encoding of the definition: ros1msg, ros2msg, ros2idl, jsonschema, protobuf, …
     schema: bytes
     metadata: Mapping[str, str] = field(default_factory=dict)
 
@@ -46,14 +52,14 @@ class Metadata:
 
 @dataclass(frozen=True)
 class Damage:
-    """Why reading ended early, or what was passed over, as a sentence about the file."""
+    """A sentence about the file that says why reading ended early, or what was not read."""
 
     text: str
 
 
 @dataclass
 class LostChunk:
-    """A chunk whose messages are left out, and what its header and the index behind it state of them."""
+    """A chunk whose messages are left out, with what its header and its index state about them."""
 
     problem: str  # completes the sentence "a chunk …"
     first_ns: int = 0  # log times
@@ -62,15 +68,15 @@ class LostChunk:
 
     def damage(self, path: Path) -> Damage:
         """Return the note about it."""
-        interval = f" from {moment(self.first_ns)} to {moment(self.last_ns)}" if self.last_ns else ""
+        interval = f" from {format_time(self.first_ns)} to {format_time(self.last_ns)}" if self.last_ns else ""
         count = f"its {self.count:,} messages" if self.count else "its messages, an unknown number,"
         return Damage(f"{path}: a chunk {self.problem}; {count}{interval} are left out.")
 
 
-def moment(time_ns: int) -> str:
+def format_time(time_ns: int) -> str:
     """Return a time since 1970 as a date, UTC.
 
-    >>> moment(1_700_000_000_000_000_000), moment(2**64 - 1)
+    >>> format_time(1_700_000_000_000_000_000), format_time(2**64 - 1)
     ('2023-11-14T22:13:20.000', '18446744073709551615 ns')
     """
     if not 0 <= time_ns < 2**63:

@@ -1,4 +1,4 @@
-"""Messages of one topic on their way to rows: decoded in batches, which are put aside."""
+"""Decode the messages of a topic in batches and collect their rows in a spill file, in the order of one clock."""
 
 from __future__ import annotations
 
@@ -10,12 +10,138 @@ import numpy as np
 import pyarrow as pa
 
 from tacpipe.arrays import Int64s
-from tacpipe.formats.bags.topic_rows import LOG, PUBLISH, Finished, TopicRows
-from tacpipe.io.spill import Spill
+from tacpipe.formats.containers.container import Batched, Time
+from tacpipe.io import spill
+from tacpipe.io.spill import Piece, Spill
+from tacpipe.printable import plain
 
-BATCH_BYTES = 1 << 24  # of undecoded messages of one topic
+LOG, HEADER, PUBLISH, FRAME = "t_log_ns", "t_header_ns", "t_publish_ns", "frame_id"
+MAX_STAMP_OFFSET_NS = 60 * 10**9  # largest distance of a header stamp from its log time, in the same clock
+ABOUT_TIME = {"unit": "ns", "quantity": "time"}
+
+
+@dataclass(frozen=True)
+class TopicStream:
+    """A stream of a topic: its rows in the order of their stamps, and the column of the stamps."""
+
+    suffix: str
+    content: Batched
+    time: Time
+    note: str  # remark about the stamps; empty where there is none
+
+
+class TopicRows:
+    """The rows of one stream of a topic: ``spill`` has the rows, this object what holds for all of them."""
+
+    def __init__(self, spill: Spill) -> None:
+        self._spill = spill
+        self._pieces: list[Piece] = []
+        self._schema: pa.Schema = pa.schema([])
+        self._about: dict[str, Mapping[str, str]] = {}
+        self._absent: set[str] = set()  # columns that not every row has
+        self._headers_set = self._headers_unset = False
+        self._apart_ns = 0  # largest distance of header stamps from log times
+        self._published_apart = False  # True where a publish time differs from its log time
+        self._frames: set[str] = set()  # names of frames, two at most
+
+    def describe(self, about: Mapping[str, Mapping[str, str]]) -> int:
+        """Add field metadata by column, keep earlier metadata, and return the number of described columns."""
+        for name, values in about.items():
+            self._about.setdefault(name, values)
+        return len(self._about)
+
+    def add(self, table: pa.Table) -> None:
+        """Add rows to the spill."""
+        names = set(table.column_names)
+        if self._pieces:
+            self._absent |= names ^ set(self._schema.names)
+            self._schema = pa.unify_schemas([self._schema, table.schema], promote_options="permissive")
+        else:
+            self._schema = table.schema
+        self._absent |= {name for name in names if table.column(name).null_count}
+        log_ns = table.column(LOG).to_numpy()
+        orders = [LOG]
+        if HEADER in names and not table.column(HEADER).null_count:
+            orders.append(HEADER)
+            header_ns = table.column(HEADER).to_numpy()
+            self._headers_set |= bool(header_ns.any())
+            self._headers_unset |= not header_ns.all()
+            self._apart_ns = max(self._apart_ns, int(np.abs(header_ns - log_ns).max(initial=0)))
+        self._published_apart |= not table.column(PUBLISH).equals(table.column(LOG))
+        if len(self._frames) < 2:
+            frames = table.column(FRAME).unique().to_pylist() if FRAME in names else [""]
+            self._frames |= {frame or "" for frame in frames}
+        self._pieces.append(self._spill.add(table, orders))
+
+    def finish(self, suffix: str) -> TopicStream:
+        """Return the rows in the order of their clock, and the name of the clock's column."""
+        clock, note = self._clock()
+        left_out = set() if self._published_apart else {PUBLISH}
+        if clock == LOG and HEADER not in self._absent and not self._headers_set:
+            left_out.add(HEADER)
+        described = {name: dict(values) for name, values in self._about.items()}
+        described |= {name: dict(ABOUT_TIME) for name in (LOG, PUBLISH, HEADER)}
+        described[clock]["clock"] = "header stamp" if clock == HEADER else "log time"
+        if FRAME in self._schema.names and len(self._frames) == 1:
+            (frame,) = self._frames
+            if frame:
+                described[clock]["frame"] = plain(frame)
+            left_out.add(FRAME)
+        kinds = {column.name: _column_type(column.type, column.name in self._absent) for column in self._schema}
+        schema = pa.schema(
+            [pa.field(name, kind, metadata=described.get(name)) for name, kind in kinds.items() if name not in left_out]
+        )
+
+        def read(piece: Piece) -> pa.Table:
+            table = self._spill.read(piece)
+            return pa.table([_without_nulls(table, field) for field in schema], schema)
+
+        count = sum(piece.rows for piece in self._pieces)
+        content = Batched(schema, count, lambda: spill.in_order(self._pieces, read, clock))
+        return TopicStream(suffix, content, Time(clock, "ns"), note)
+
+    def _clock(self) -> tuple[str, str]:
+        """Return the column with the time of the rows, and the reason where it is not the header stamp.
+
+        A header states when a value was measured, the log when it arrived. Headers count where all are set and in the clock
+        of the log: those of a simulation, of a device's own clock or of a clock that was set in between would tear streams
+        apart.
+        """
+        if HEADER not in self._schema.names or HEADER in self._absent:
+            return LOG, ""
+        if self._headers_unset:
+            return LOG, "some header stamps are not set" if self._headers_set else ""
+        if self._apart_ns > MAX_STAMP_OFFSET_NS:
+            return LOG, f"header stamps are up to {self._apart_ns / 1e9:.3g} s from the log times"
+        return HEADER, ""
+
+
+def _column_type(kind: pa.DataType, absent: bool) -> pa.DataType:
+    """Return the stored type of a column; numbers that some rows lack become float64, since NaN marks them."""
+    if not absent or pa.types.is_string(kind) or pa.types.is_binary(kind) or pa.types.is_floating(kind):
+        return kind
+    return pa.float64()
+
+
+def _without_nulls(table: pa.Table, field: pa.Field) -> pa.ChunkedArray:
+    """Return a column cast to the type of ``field``, with NaN or empty text in place of nulls."""
+    if field.name not in table.column_names:
+        column = pa.chunked_array([pa.nulls(table.num_rows, field.type)])
+    else:
+        column = table.column(field.name)
+        if pa.types.is_boolean(column.type) and column.type != field.type:
+            column = column.cast(pa.uint8())
+        column = column.cast(field.type, safe=False)
+    if not column.null_count:
+        return column
+    if pa.types.is_string(field.type):
+        return column.fill_null("")
+    return column.fill_null(b"" if pa.types.is_binary(field.type) else float("nan"))
+
+
+BATCH_BYTES = 1 << 24  # undecoded messages of one topic in memory
 BATCH_MESSAGES = 1 << 16
-MOST_COLUMNS = 1 << 14  # of a stream
+MAX_STREAM_COLUMNS = 1 << 14
 
 
 class TopicError(ValueError):
@@ -26,33 +152,33 @@ class TopicError(ValueError):
 class Block:
     """Messages of one shape, decoded: which they are, and their columns."""
 
-    suffix: str  # of the stream's name; a message may have rows of several streams
+    suffix: str  # end of the stream's name; a message may have rows of several streams
     rows: Int64s  # (row,), positions in the batch
     columns: Mapping[str, pa.Array]
     about: Mapping[str, Mapping[str, str]] = field(default_factory=dict)  # field metadata, by column
 
 
-class Decoder(Protocol):
-    """What turns the messages of a topic into columns."""
+class MessageDecoder(Protocol):
+    """A decoder that turns the messages of a topic into columns."""
 
     def blocks(self, messages: Sequence[bytes]) -> Iterator[Block]:
         """Yield the columns of messages; raises `TopicError` where they cannot be decoded."""
 
 
-class Topic:
-    """The messages of one topic on their way to streams; ``aside`` takes their rows."""
+class TopicDecoder:
+    """Decode the messages of one topic into streams, whose rows go to ``spill``."""
 
-    def __init__(self, decoder: Decoder, aside: Spill) -> None:
-        self._decoder, self._aside = decoder, aside
+    def __init__(self, decoder: MessageDecoder, spill: Spill) -> None:
+        self._decoder, self._spill = decoder, spill
         self._messages: list[bytes] = []
         self._log_ns: list[int] = []
         self._publish_ns: list[int] = []
         self._bytes = 0
-        self._streams: dict[str, TopicRows] = {}  # by suffix
+        self._streams: dict[str, TopicRows] = {}  # rows by suffix of the stream's name
         self.count = 0
 
     def add(self, message: bytes, log_ns: int, publish_ns: int) -> None:
-        """Take a message in. Raises `TopicError` where those so far cannot be decoded."""
+        """Add a message. Raises `TopicError` where a full batch cannot be decoded."""
         self._messages.append(message)
         self._log_ns.append(log_ns)
         self._publish_ns.append(publish_ns)
@@ -61,29 +187,29 @@ class Topic:
         if self._bytes >= BATCH_BYTES or len(self._messages) >= BATCH_MESSAGES:
             self._flush()
 
-    def finish(self) -> list[Finished]:
+    def finish(self) -> list[TopicStream]:
         """Return the streams of the topic. Raises `TopicError` where they cannot be decoded."""
         self._flush()
-        return [rows.finished(suffix) for suffix, rows in self._streams.items()]
+        return [rows.finish(suffix) for suffix, rows in self._streams.items()]
 
     def _flush(self) -> None:
         if not self._messages:
             return
-        log_ns, publish_ns = (_stamps(values) for values in (self._log_ns, self._publish_ns))
+        log_ns, publish_ns = (_stamp_array(values) for values in (self._log_ns, self._publish_ns))
         blocks: dict[str, list[Block]] = {}
         for block in self._decoder.blocks(self._messages):
             blocks.setdefault(block.suffix, []).append(block)
         self._messages, self._log_ns, self._publish_ns, self._bytes = [], [], [], 0
-        for suffix, several in blocks.items():
-            stream = self._streams.setdefault(suffix, TopicRows(self._aside))
+        for suffix, suffix_blocks in blocks.items():
+            stream = self._streams.setdefault(suffix, TopicRows(self._spill))
             tables = []
-            for block in several:
+            for block in suffix_blocks:
                 stamps = {LOG: pa.array(log_ns[block.rows]), PUBLISH: pa.array(publish_ns[block.rows])}
                 tables.append(pa.table({**stamps, **block.columns}))
-                if stream.describe(block.about) > MOST_COLUMNS:
-                    raise TopicError(f"its messages have more than {MOST_COLUMNS} values")
+                if stream.describe(block.about) > MAX_STREAM_COLUMNS:
+                    raise TopicError(f"its messages have more than {MAX_STREAM_COLUMNS} values")
             table = pa.concat_tables(tables, promote_options="permissive")
-            rows = np.concatenate([block.rows for block in several])
+            rows = np.concatenate([block.rows for block in suffix_blocks])
             if (np.diff(rows) < 0).any():
                 table = table.combine_chunks().take(pa.array(np.argsort(rows, kind="stable")))
             try:
@@ -92,7 +218,7 @@ class Topic:
                 raise TopicError("its messages hold values of different types in one place") from error
 
 
-def _stamps(values: Sequence[int]) -> Int64s:
+def _stamp_array(values: Sequence[int]) -> Int64s:
     try:
         return np.array(values, np.int64)
     except OverflowError:

@@ -1,4 +1,4 @@
-"""Where the values of a ROS message lie in its bytes, for many messages of one shape at once.
+"""Locate the values of ROS messages in their bytes, for many messages of one shape at once.
 
 A message has no table of contents: where a value lies depends on the lengths of all strings and sequences before it.
 Messages with the same lengths have the same *shape*, so the first is walked and all are rows of one matrix.
@@ -29,8 +29,9 @@ _CODES = {  # struct's own, whose "l" has four bytes where numpy's has eight
 }
 STAMPS = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 TEXT = "text"
-MOST_LEAVES = 1 << 16  # of a message
-TRIED, MANY = 8, 4  # after so many shapes of fewer messages each, others of this size are taken one by one
+MAX_LEAVES = 1 << 16  # values per message
+# Messages of one size are decoded one by one once 8 shapes have matched fewer than 4 messages each on average.
+TRIED_SHAPES, FEW_MESSAGES = 8, 4
 _BASE, _NAME, _ARRAY = 1, 2, 3  # rosbags.interfaces.Nodetype
 
 
@@ -40,17 +41,17 @@ class WireError(ValueError):
 
 @dataclass(frozen=True)
 class Leaf:
-    """A value, or an array of numbers, and where it lies."""
+    """A value, or an array of numbers, and its place in the message."""
 
     path: Path
     kind: str  # a ROS type of `NUMBERS`, "text" or "stamp"
     offset: int  # bytes from the start
-    count: int | None  # of an array; of a text its bytes; None: a single number
-    within: tuple[tuple[int, str], ...]  # message types around it: length of their path, name
+    count: int | None  # length of an array, bytes of a text, None for a single number
+    enclosing: tuple[tuple[int, str], ...]  # message types around it: length of their path, name
 
     @property
     def size(self) -> int:
-        """How many bytes it takes."""
+        """The size in bytes."""
         if self.kind == "stamp":
             return 8
         width = 1 if self.kind == TEXT else np.dtype(NUMBERS[self.kind]).itemsize
@@ -61,17 +62,17 @@ class Leaf:
 class Encoding:
     """How messages are written: ROS 1, or CDR of one byte order."""
 
-    order: str = "<"  # as numpy has it
-    start: int = 0  # where the message begins, and alignment counts from
+    order: str = "<"  # byte order in numpy's notation
+    start: int = 0  # offset of the message, from which alignment counts
     aligned: bool = False
-    terminated: bool = False  # whether texts end with a zero byte
+    terminated: bool = False  # True where texts end with a zero byte
 
 
 ROS1 = Encoding()
 
 
-def encoding_of(message: bytes) -> Encoding:
-    """Return how a CDR message is written. Raises `WireError` for an encapsulation that ROS 2 does not write."""
+def cdr_encoding(message: bytes) -> Encoding:
+    """Return the encoding of a CDR message. Raises `WireError` for an encapsulation that ROS 2 does not write."""
     kind = bytes(message[:2])
     if kind not in (b"\x00\x00", b"\x00\x01"):
         raise WireError(f"its encapsulation is {kind.hex() or 'missing'}, not CDR's 0000 or 0001")
@@ -80,13 +81,13 @@ def encoding_of(message: bytes) -> Encoding:
 
 @dataclass
 class Shape:
-    """Leaves of messages of one size, and the length words that make it so."""
+    """The leaves of messages of one size whose length words agree."""
 
     encoding: Encoding
     size: int
     leaves: list[Leaf] = field(default_factory=list)
     lengths: list[int] = field(default_factory=list)  # offsets of the 4-byte words that hold a length
-    counts: list[int] = field(default_factory=list)  # of its sequences: messages with the same have the same leaves
+    counts: list[int] = field(default_factory=list)  # lengths of sequences: equal counts mean equal leaves
     first: bytes = b""
 
     def text(self, leaf: Leaf) -> str:
@@ -98,13 +99,13 @@ class Shape:
         if leaf.kind == TEXT:
             return self.text(leaf)
         if leaf.kind == "stamp":
-            seconds, rest = struct.unpack_from(f"{self.encoding.order}iI", self.first, leaf.offset)
-            return seconds * 10**9 + rest
+            seconds, nanoseconds = struct.unpack_from(f"{self.encoding.order}iI", self.first, leaf.offset)
+            return seconds * 10**9 + nanoseconds
         if index is None and leaf.count is not None:
             return self.first[leaf.offset : leaf.offset + leaf.size]
         code, width = _CODES[leaf.kind]
-        (found,) = struct.unpack_from(f"{self.encoding.order}{code}", self.first, leaf.offset + (index or 0) * width)
-        return bool(found) if leaf.kind == "bool" else found
+        (number,) = struct.unpack_from(f"{self.encoding.order}{code}", self.first, leaf.offset + (index or 0) * width)
+        return bool(number) if leaf.kind == "bool" else number
 
     def number(self, leaf: Leaf) -> int:
         """Return a whole number of the first message."""
@@ -115,27 +116,27 @@ class Shape:
         order = self.encoding.order
         if leaf.kind == "stamp":
             # ROS 1 has unsigned seconds, an unset stamp of ROS 2 may be negative: both fit 32 bits until 2038
-            seconds = _view(matrix, leaf.offset, 1, f"{order}i4")[:, 0].astype(np.int64)
-            return seconds * 10**9 + _view(matrix, leaf.offset + 4, 1, f"{order}u4")[:, 0].astype(np.int64)
+            seconds = _numbers_at(matrix, leaf.offset, 1, f"{order}i4")[:, 0].astype(np.int64)
+            return seconds * 10**9 + _numbers_at(matrix, leaf.offset + 4, 1, f"{order}u4")[:, 0].astype(np.int64)
         kind = np.dtype(f"{order}{NUMBERS[leaf.kind]}")
-        values = _view(matrix, leaf.offset, 1 if leaf.count is None else leaf.count, kind)
+        values = _numbers_at(matrix, leaf.offset, 1 if leaf.count is None else leaf.count, kind)
         values = values.astype(kind.newbyteorder("="), copy=False)
         return values[:, 0] if leaf.count is None else values
 
 
-def _view(matrix: Matrix, offset: int, count: int, kind: npt.DTypeLike) -> npt.NDArray[Any]:
+def _numbers_at(matrix: Matrix, offset: int, count: int, kind: npt.DTypeLike) -> npt.NDArray[Any]:
     width = np.dtype(kind).itemsize * count
     if not width:
         return np.empty((len(matrix), 0), kind)
     return np.ascontiguousarray(matrix[:, offset : offset + width]).view(kind)
 
 
-def shapes(
-    messages: Sequence[bytes], types: Types, name: str, encoding: Encoding, known: list[Shape]
+def group_by_shape(
+    messages: Sequence[bytes], types: Types, name: str, encoding: Encoding, earlier_shapes: list[Shape]
 ) -> Iterator[tuple[Shape, npt.NDArray[np.int64], Matrix]]:
     """Yield the messages of each shape: the shape, which messages (message,), and their bytes (message, byte).
 
-    ``known`` are shapes of messages before; new ones are added. Raises `WireError` where a message is not of its type.
+    New shapes are added to ``earlier_shapes``. Raises `WireError` where a message is not of its type.
     """
     sizes = np.fromiter(map(len, messages), np.int64, len(messages))
     different, first = np.unique(sizes, return_index=True)
@@ -143,20 +144,20 @@ def shapes(
         rows = np.flatnonzero(sizes == size)
         content = messages[int(rows[0])] if len(rows) == 1 else b"".join([messages[row] for row in rows.tolist()])
         matrix = np.frombuffer(content, np.uint8).reshape(len(rows), int(size))
-        candidates = [shape for shape in known if shape.size == size]
-        tried = taken = 0
+        candidates = [shape for shape in earlier_shapes if shape.size == size]
+        tried = matched = 0
         while len(rows):
-            if tried >= TRIED and taken < MANY * tried:  # texts of any length: hardly two are alike
+            if tried >= TRIED_SHAPES and matched < FEW_MESSAGES * tried:  # texts of any length: hardly two are alike
                 for row, message in zip(rows.tolist(), matrix, strict=True):
-                    yield walked(message.tobytes(), types, name, encoding), np.array([row]), message[None]
+                    yield walk_message(message.tobytes(), types, name, encoding), np.array([row]), message[None]
                 break
             shape = next(iter(candidates), None)
             if shape is None:
-                shape = walked(matrix[0].tobytes(), types, name, encoding)
-                known.append(shape)
+                shape = walk_message(matrix[0].tobytes(), types, name, encoding)
+                earlier_shapes.append(shape)
             candidates = candidates[1:]
-            same = _alike(shape, matrix)
-            tried, taken = tried + 1, taken + int(same.sum())
+            same = _matching_rows(shape, matrix)
+            tried, matched = tried + 1, matched + int(same.sum())
             if same.all():
                 yield shape, rows, matrix
                 break
@@ -165,7 +166,7 @@ def shapes(
                 rows, matrix = rows[~same], matrix[~same]
 
 
-def _alike(shape: Shape, matrix: Matrix) -> npt.NDArray[np.bool_]:
+def _matching_rows(shape: Shape, matrix: Matrix) -> npt.NDArray[np.bool_]:
     first = np.frombuffer(shape.first, np.uint8)
     same = np.ones(len(matrix), bool)
     for offset in shape.lengths:
@@ -173,16 +174,16 @@ def _alike(shape: Shape, matrix: Matrix) -> npt.NDArray[np.bool_]:
     return same
 
 
-def walked(message: bytes, types: Types, name: str, encoding: Encoding) -> Shape:
+def walk_message(message: bytes, types: Types, name: str, encoding: Encoding) -> Shape:
     """Return the shape of a message. Raises `WireError` where its bytes do not fit its type."""
     shape = Shape(encoding, len(message), first=message)
     try:
         end = _Walk(message, types, shape).message(name, (), (), encoding.start)
     except (struct.error, KeyError, RecursionError) as error:
-        wrong = (
+        problem = (
             f"the type {plain(str(error.args[0]))} is not defined" if isinstance(error, KeyError) else "it ends early"
         )
-        raise WireError(f"a message is not a {plain(name)}: {wrong}") from error
+        raise WireError(f"a message is not a {plain(name)}: {problem}") from error
     if end > len(message) or len(message) - end > 3 + (not encoding.aligned) * -3:
         raise WireError(f"a message is not a {plain(name)}: it has {len(message)} bytes, its values take {end}")
     return shape
@@ -195,21 +196,21 @@ class _Walk:
     shape: Shape
     messages: int = 0  # messages walked, including those without fields
 
-    def message(self, name: str, path: Path, within: tuple[tuple[int, str], ...], at: int) -> int:
-        """Walk the fields of a message that begins at ``at``; return where it ends."""
+    def message(self, name: str, path: Path, enclosing: tuple[tuple[int, str], ...], at: int) -> int:
+        """Walk the fields of a message that begins at ``at`` and return its end."""
         if name in STAMPS:
             at = self._aligned(at, 4)
-            self._add(Leaf(path, "stamp", at, None, within))
+            self._add(Leaf(path, "stamp", at, None, enclosing))
             return at + 8
         self.messages += 1
-        if self.messages > MOST_LEAVES:
-            raise WireError(f"a message has more than {MOST_LEAVES} messages in it")
-        within = (*within, (len(path), name))
+        if self.messages > MAX_LEAVES:
+            raise WireError(f"a message has more than {MAX_LEAVES} messages in it")
+        enclosing = (*enclosing, (len(path), name))
         fields = [field for field in self.types[name] if field[0] != "structure_needs_at_least_one_member"]
         if not fields:
             return self._padding(at)
         for field_name, description in fields:
-            at = self._field(description, (*path, field_name), within, at)
+            at = self._field(description, (*path, field_name), enclosing, at)
         return at
 
     def _padding(self, at: int) -> int:
@@ -219,12 +220,12 @@ class _Walk:
             raise struct.error
         return end
 
-    def _field(self, description: Any, path: Path, within: tuple[tuple[int, str], ...], at: int) -> int:
+    def _field(self, description: Any, path: Path, enclosing: tuple[tuple[int, str], ...], at: int) -> int:
         node, inner = int(description[0]), description[1]
         if node == _NAME:
-            return self.message(inner, path, within, at)
+            return self.message(inner, path, enclosing, at)
         if node == _BASE:
-            return self._single(inner[0], path, within, at)
+            return self._single(inner[0], path, enclosing, at)
         element: Any = inner[0]
         count: int = inner[1]
         if node != _ARRAY:
@@ -236,20 +237,20 @@ class _Walk:
             at = self._aligned(at, width) if count else at
             if at + width * count > len(self.content):
                 raise struct.error
-            self._add(Leaf(path, kind, at, count, within))
+            self._add(Leaf(path, kind, at, count, enclosing))
             return at + width * count
-        if count > max(len(self.content), MOST_LEAVES):  # elements without fields take no bytes in ROS 1
+        if count > max(len(self.content), MAX_LEAVES):  # elements without fields take no bytes in ROS 1
             raise struct.error
         for position in range(count):
-            at = self._field(element, (*path, position), within, at)
+            at = self._field(element, (*path, position), enclosing, at)
         return at
 
-    def _single(self, kind: str, path: Path, within: tuple[tuple[int, str], ...], at: int) -> int:
+    def _single(self, kind: str, path: Path, enclosing: tuple[tuple[int, str], ...], at: int) -> int:
         if kind == "string":
             length, at = self._length(at)
             if at + length > len(self.content):
                 raise struct.error
-            self._add(Leaf(path, TEXT, at, max(length - self.shape.encoding.terminated, 0), within))
+            self._add(Leaf(path, TEXT, at, max(length - self.shape.encoding.terminated, 0), enclosing))
             return at + length
         if kind not in NUMBERS:
             raise WireError(f"its field {'.'.join(map(str, path))} is a {plain(kind)}, which is not read")
@@ -257,7 +258,7 @@ class _Walk:
         at = self._aligned(at, width)
         if at + width > len(self.content):
             raise struct.error
-        self._add(Leaf(path, kind, at, None, within))
+        self._add(Leaf(path, kind, at, None, enclosing))
         return at + width
 
     def _length(self, at: int) -> tuple[int, int]:
@@ -273,6 +274,6 @@ class _Walk:
         return at + gap
 
     def _add(self, leaf: Leaf) -> None:
-        if len(self.shape.leaves) >= MOST_LEAVES:
-            raise WireError(f"a message has more than {MOST_LEAVES} values")
+        if len(self.shape.leaves) >= MAX_LEAVES:
+            raise WireError(f"a message has more than {MAX_LEAVES} values")
         self.shape.leaves.append(leaf)

@@ -25,9 +25,9 @@ class Kind:
 
 
 KINDS: Mapping[str, Kind] = {
-    "mcap": Kind("tacpipe.formats.bags.container:opened", (".mcap",)),
+    "mcap": Kind("tacpipe.formats.bags.container:open_bag", (".mcap",)),
     "rosbag": Kind(
-        "tacpipe.formats.bags.container:opened",
+        "tacpipe.formats.bags.container:open_bag",
         (".bag", ".bag.active", ".db3", ".mcap", ".db3.zstd", ".mcap.zstd"),
         ("metadata.yaml",),
         b"rosbag2_bagfile_information",

@@ -15,7 +15,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode
 
 from tacpipe.errors import TacpipeError
 from tacpipe.formats.bags import topics
-from tacpipe.formats.bags.container import opened
+from tacpipe.formats.bags.container import open_bag
 from tacpipe.formats.containers.container import Contents, SourceStream
 from tests.conftest import Lab, sample_data
 from tests.formats.bags import writers
@@ -26,7 +26,7 @@ TYPES, TYPES1 = writers.store(), writers.store(ros1=True)
 
 
 def read(path: Path) -> Contents:
-    return opened(path).read(None, None)
+    return open_bag(path).read(None, None)
 
 
 def streams(path: Path) -> dict[str, SourceStream]:
@@ -486,13 +486,13 @@ def test_what_a_database_has_not_moved_from_its_log_is_read_too_and_stays_there(
 
 def test_a_look_has_the_columns_of_the_whole(tmp_path: Path) -> None:
     bag = WAYS["ros2-mcap"](tmp_path)
-    looked = {one.name: one.table.schema for one in opened(bag).look(None).streams}
+    looked = {one.name: one.table.schema for one in open_bag(bag).look(None).streams}
     assert looked == {name: one.table.schema for name, one in streams(bag).items()}
 
 
 def test_a_look_that_ended_early_states_no_number_of_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tacpipe.formats.bags.container.LOOK_MESSAGES", 10)
-    contents = opened(WAYS["ros2-mcap"](tmp_path)).look(None)
+    contents = open_bag(WAYS["ros2-mcap"](tmp_path)).look(None)
     assert [(one.table.num_rows, one.rows) for one in contents.streams] == [(5, None), (5, None)]
     assert contents.notes
 
@@ -506,7 +506,7 @@ def test_a_bag_whose_recorder_was_killed_is_found(lab: Lab) -> None:
 
 def test_only_the_topics_that_were_asked_for_are_read(tmp_path: Path) -> None:
     bag = WAYS["ros2-mcap"](tmp_path)
-    contents = opened(bag).read(["/left/skin"], None)
+    contents = open_bag(bag).read(["/left/skin"], None)
     assert [one.source for one in contents.streams] == ["/left/skin"]
 
 

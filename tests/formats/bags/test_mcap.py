@@ -17,7 +17,7 @@ from mcap.writer import Writer as McapWriter
 
 import tacpipe
 from tacpipe.errors import TacpipeError
-from tacpipe.formats.bags.container import opened
+from tacpipe.formats.bags.container import open_bag
 from tests.conftest import Lab
 from tests.formats.bags import writers
 from tests.formats.bags.test_bags import only, read
@@ -286,7 +286,7 @@ def test_what_is_not_an_mcap_file_is_refused_in_one_sentence(tmp_path: Path) -> 
     for content in (b"", b"\x89MCAP", b"PK\x03\x04" * 10):
         path.write_bytes(content)
         with pytest.raises(TacpipeError, match=r"a\.mcap"):
-            opened(path).read(None, None)
+            open_bag(path).read(None, None)
 
 
 def test_a_file_that_tacpipe_exported_comes_back_with_its_names_and_metadata(tmp_path: Path) -> None:

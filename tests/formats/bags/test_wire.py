@@ -81,10 +81,10 @@ def test_every_value_of_a_message_is_where_rosbags_finds_it(name: str, form: str
     else:
         raw = [bytes(types.serialize_cdr(one, name, little_endian=form == "little")) for one in sent]
         back = [types.deserialize_cdr(one, name) for one in raw]
-        encoding = wire.encoding_of(raw[0])
+        encoding = wire.cdr_encoding(raw[0])
         assert encoding == Encoding("<" if form == "little" else ">", 4, True, True)
     seen = []
-    for shape, rows, matrix in wire.shapes(raw, _types(types), name, encoding, []):
+    for shape, rows, matrix in wire.group_by_shape(raw, _types(types), name, encoding, []):
         for at, row in enumerate(rows.tolist()):
             seen.append(row)
             wanted = dict(_leaves(back[row]))
@@ -107,7 +107,7 @@ def test_messages_of_one_shape_are_decoded_together() -> None:
     types = writers.store()
     name = "std_msgs/msg/Float32MultiArray"
     raw = [bytes(types.serialize_cdr(writers.build(types, name, data=[n] * (3 + n % 2)), name)) for n in range(10)]
-    found = list(wire.shapes(raw, _types(types), name, wire.encoding_of(raw[0]), []))
+    found = list(wire.group_by_shape(raw, _types(types), name, wire.cdr_encoding(raw[0]), []))
     assert [len(rows) for _, rows, _ in found] == [5, 5]
 
 
@@ -118,14 +118,14 @@ def test_a_message_that_does_not_fit_its_type_is_an_error(cut: int) -> None:
     message = writers.build(types, name, header=writers.header(types, 5, "base"), name=["a"], position=[1.0])
     raw = bytes(types.serialize_cdr(message, name))
     with pytest.raises(WireError):
-        wire.walked(raw[:cut], _types(types), name, wire.encoding_of(b"\0\1"))
+        wire.walk_message(raw[:cut], _types(types), name, wire.cdr_encoding(b"\0\1"))
     with pytest.raises(WireError, match=r"\d+ bytes"):
-        wire.walked(raw + bytes(8), _types(types), name, wire.encoding_of(raw))
+        wire.walk_message(raw + bytes(8), _types(types), name, wire.cdr_encoding(raw))
 
 
 def test_an_encapsulation_that_ros_does_not_write_is_refused() -> None:
     with pytest.raises(WireError, match="0009"):
-        wire.encoding_of(b"\x00\x09\x00\x00")
+        wire.cdr_encoding(b"\x00\x09\x00\x00")
 
 
 def test_a_message_without_fields_takes_one_byte_in_cdr_and_none_in_ros1() -> None:
@@ -134,9 +134,9 @@ def test_a_message_without_fields_takes_one_byte_in_cdr_and_none_in_ros1() -> No
     text = "Limits[3] limits\nint16 after\n" + "=" * 80 + "\nMSG: lab_msgs/Limits\nbool ON=true\n"
     types = {name: fields for name, (_, fields) in get_types_from_msg(text, "lab_msgs/msg/Arrays").items()}
     cdr = b"\0\1\0\0" + bytes(3) + b"\0" + (-7).to_bytes(2, "little", signed=True)  # three bytes, one to align
-    for message, encoding in ((cdr, wire.encoding_of(cdr)), (cdr[-2:], ROS1)):
-        shape = wire.walked(message, types, "lab_msgs/msg/Arrays", encoding)
+    for message, encoding in ((cdr, wire.cdr_encoding(cdr)), (cdr[-2:], ROS1)):
+        shape = wire.walk_message(message, types, "lab_msgs/msg/Arrays", encoding)
         (leaf,) = shape.leaves
         assert (leaf.path, shape.value(leaf, None)) == (("after",), -7)
     with pytest.raises(WireError, match="ends early"):
-        wire.walked(cdr[:6], types, "lab_msgs/msg/Arrays", wire.encoding_of(cdr))
+        wire.walk_message(cdr[:6], types, "lab_msgs/msg/Arrays", wire.cdr_encoding(cdr))
