@@ -180,7 +180,7 @@ types: $(VENV)/.dev ## check types
 bless: $(VENV)/.dev ## pin the golden digests of stages whose version was raised
 	@$(BIN)/python -m tests.golden_values
 
-bench: $(VENV)/.dev ## measure, beside what a user would do instead; writes benchmarks/results.md
+bench: $(VENV)/.dev ## measure CPU seconds, memory and bytes next to peers; writes benchmarks/results.md
 	@$(BIN)/python benchmarks/run.py
 
 clean: ## remove .venv, demo and caches; .tacpipe stays, because recordings lie there

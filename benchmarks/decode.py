@@ -3,13 +3,11 @@
 Ours is the framer and `decode`; the vendors' are fed through an object in place of the serial port, and called as their
 users call them. In bulk we get all bytes at once, as when a recording is sealed; live, in pieces of a tenth of a second at
 the product's own rate, where most of the time goes into each piece and not into its frames. Both must give the same numbers.
-XELA has no parser beside its server: there it is a loop over `json.loads` and the counts, as one would write it.
 """
 
 from __future__ import annotations
 
 import functools
-import json
 import logging
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -29,21 +27,18 @@ from RSIPI.xml_handler import FastXMLParser
 from tactile_sdk.protocol.modbus_rtu import ModbusRTU
 
 from tacpipe.arrays import AnyArray
-from tacpipe.sensors import anyskin, kuka_rsi, xela
+from tacpipe.sensors import anyskin, kuka_rsi
 from tacpipe.sensors.anyskin import AnySkin
 from tacpipe.sensors.flexitac import FlexiTac
 from tacpipe.sensors.framing import Chunks
-from tacpipe.sensors.generic import Generic
 from tacpipe.sensors.kuka_rsi import KukaRsi
-from tacpipe.sensors.layout import Number, Sequence, Sum
 from tacpipe.sensors.modbus_tactile import ModbusTactile
 from tacpipe.sensors.optoforce import OptoForce
 from tacpipe.sensors.paxini import SLOTS, Paxini
 from tacpipe.sensors.robotiq import Robotiq
 from tacpipe.sensors.sensor import Samples, Sensor
-from tacpipe.sensors.xela import Xela
 
-FRAMES, PIECE_S, BAR = 2000, 0.1, 10.0
+FRAMES, PIECE_S, AIM = 2000, 0.1, 10.0
 
 
 class Port:
@@ -161,14 +156,14 @@ def _measure(contest: Contest, rounds: int) -> Iterator[timing.Line]:
     )
     for name in ("bulk", "live"):
         found = timing.ratio(times, "vendor", name)
-        bar = BAR if name == "bulk" and contest.name not in UNPARSED else None
+        aim = AIM if name == "bulk" else None
         yield timing.Line(
             f"{contest.name}, {'in bulk' if name == 'bulk' else f'{live} frames at a time'}",
             _rate(timing.median(times, name)),
-            f"{'json' if contest.name in UNPARSED else 'vendor'}: {_rate(timing.median(times, 'vendor'))}",
+            f"vendor: {_rate(timing.median(times, 'vendor'))}",
             f"{found:.1f} times as fast",
-            "" if bar is None else f"{bar:g} times as fast",
-            None if bar is None else found >= bar,
+            "" if aim is None else f"{aim:g} times as fast",
+            None if aim is None else found >= aim,
         )
 
 
@@ -176,15 +171,14 @@ def _rate(seconds: float) -> str:
     return f"{FRAMES / seconds:,.0f} frames/s"
 
 
-UNPARSED = ("xela",)  # without a vendor's parser
 HEADLESS = ("anyskin", "anyskin, ASCII")  # the first frame is lost: where it begins is known behind an end alone
 
 
 def contests() -> list[Contest]:
     """Return what is measured, each with frames of random numbers."""
     rng = np.random.default_rng(0)
-    made = [_flexitac(rng), _anyskin(rng, "binary"), _anyskin(rng, "ascii"), _optoforce(rng), _described(rng)]
-    return [*made, _paxini(rng), _robotiq(rng), _modbus(rng), _kuka(rng), _xela(rng)]
+    made = [_flexitac(rng), _anyskin(rng, "binary"), _anyskin(rng, "ascii"), _optoforce(rng)]
+    return [*made, _paxini(rng), _robotiq(rng), _modbus(rng), _kuka(rng)]
 
 
 def _flexitac(rng: np.random.Generator) -> Contest:
@@ -231,26 +225,6 @@ def _daq(rng: np.random.Generator) -> tuple[OptoForce, Samples, Callable[[bytes,
 def _optoforce(rng: np.random.Generator) -> Contest:
     sensor, samples, vendor = _daq(rng)
     return Contest("optoforce", sensor, sensor.encode(samples), vendor, lambda samples: samples.values[1])
-
-
-def _described(rng: np.random.Generator) -> Contest:
-    sensor, samples, vendor = _daq(rng)
-    described = Generic(
-        rate_hz=1000.0,
-        marker="AA 07 08 10",
-        order="big",
-        numbers=(
-            Number("count", "u16"),
-            Number("status", "u16"),
-            Number("axis", "i16", count=6),
-            Number("check", "u16"),
-        ),
-        sequence=Sequence("count"),
-        sum=Sum("sum16", "check"),
-    )
-    return Contest(
-        "optoforce, as generic", described, sensor.encode(samples), vendor, lambda samples: samples.values[1]
-    )
 
 
 def _paxini(rng: np.random.Generator) -> Contest:
@@ -333,17 +307,3 @@ def _kuka(rng: np.random.Generator) -> Contest:
 
     forget = kuka_rsi._table.cache_clear
     return Contest("kuka-rsi", sensor, frames, vendor, lambda samples: samples.values[1], packets=True, forget=forget)
-
-
-def _xela(rng: np.random.Generator) -> Contest:
-    sensor = Xela()
-    counts = rng.integers(0, 1 << 16, (FRAMES, 48)).astype(np.uint16)
-    t_ns = 1_700_000_000_000_000_000 + 10_000_000 * np.arange(FRAMES)
-    frames = sensor.encode(Samples((counts,), seq=np.arange(FRAMES), t_device_ns=t_ns))
-
-    def loop(data: bytes, size: int) -> AnyArray:
-        readings = [json.loads(frame)["1"]["data"] for frame in frames]
-        return np.array([[int(count, 16) for count in reading.split(",")] for reading in readings], dtype=np.uint16)
-
-    forget = xela._parsed.cache_clear
-    return Contest("xela", sensor, frames, loop, lambda samples: samples.values[0], packets=True, forget=forget)

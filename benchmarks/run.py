@@ -1,8 +1,9 @@
 """Run all benchmarks, print a table and write it to ``results.md``.
 
-    python benchmarks/run.py [--rounds 20] [--only startup small ...]
+    python benchmarks/run.py [--rounds 20] [--only commands small ...]
 
-Everything is timed in the same run, round by round beside what it is compared with; ratios are medians over rounds.
+Costs are CPU seconds (user and system, children included) unless a row says otherwise. Each round measures a command and
+its peer one after the other, and ratios are medians over rounds.
 """
 
 from __future__ import annotations
@@ -20,20 +21,15 @@ from pathlib import Path
 import timing
 
 MODULES = (
-    "startup",
+    "commands",
     "small",
-    "executors",
     "verified_reads",
     "synchronization",
     "decode",
-    "encoding",
     "forward_training",
     "material_training",
-    "touch_training",
-    "chain",
+    "ingestion",
     "sizes",
-    "array_files",
-    "tables",
 )
 RESULTS = Path(__file__).with_name("results.md")
 
@@ -57,10 +53,10 @@ def main() -> None:
 
 def table(lines: Sequence[timing.Line]) -> str:
     """Return the lines as a Markdown table."""
-    told = {True: "reached", False: "**missed**", None: ""}
-    rows = ["| what | tacpipe | beside | ratio | bar | |", "| --- | --- | --- | --- | --- | --- |"]
+    marks = {True: "reached", False: "**missed**", None: ""}
+    rows = ["| what | tacpipe | peer | ratio | aim | |", "| --- | --- | --- | --- | --- | --- |"]
     rows += [
-        f"| {line.what} | {line.ours} | {line.beside} | {line.ratio} | {line.bar} | {told[line.reached]} |"
+        f"| {line.what} | {line.ours} | {line.peer} | {line.ratio} | {line.aim} | {marks[line.reached]} |"
         for line in lines
     ]
     return "\n".join(rows)

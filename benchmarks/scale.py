@@ -13,14 +13,11 @@ the steps are those that look at the manifest.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import re
 import shlex
 import shutil
-import subprocess
 import tempfile
-import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -43,13 +40,10 @@ OPEN = "import tacpipe; tacpipe.open('synced')['trial-0000001']"
 
 
 @dataclass(frozen=True)
-class Cost:
-    """What one process took."""
+class Measured:
+    """The cost of one step."""
 
-    seconds: float
-    cpu_s: float  # of the processor, on all cores
-    memory_bytes: int  # peak of resident memory
-    read_bytes: int
+    cost: timing.Cost
     looks: int | None = None  # system calls that look at files, where they were counted
 
 
@@ -152,30 +146,23 @@ STEPS = {  # in this order; those that change the dataset come last
 OF_MANIFEST = ("open, one recording", "show", "explain", "split", "one label")  # look at no shard, or at twenty
 
 
-def measure(lab: Lab) -> dict[str, Cost]:
+def measure(lab: Lab) -> dict[str, Measured]:
     """Return what each step costs."""
-    found = {}
+    results = {}
     for name, command in STEPS.items():
         if name == "one new recording":
             lab.add(1)
-        found[name] = cost(lab, command)
+        results[name] = run_step(lab, command)
     lab.add(1)
     for name in ("one new recording", "first hit", "hit", "show", "explain"):
-        found[name] = replace(found[name], looks=looks(lab, STEPS[name]))
-    return found
+        results[name] = replace(results[name], looks=looks(lab, STEPS[name]))
+    return results
 
 
-def cost(lab: Lab, command: str) -> Cost:
-    """Return what a command of tacpipe costs; its looks are not counted."""
-    begun = time.perf_counter()
-    program = [timing.PYTHON, "-c", command] if command == OPEN else [f"{timing.BIN}/tacpipe", *shlex.split(command)]
-    words = [timing.PYTHON, "-S", "-c", timing.SMALL, *program]
-    done = subprocess.run(words, cwd=lab.folder, env=timing.environment_of(), stdout=subprocess.PIPE, check=False)
-    seconds = time.perf_counter() - begun
-    if done.returncode:
-        raise SystemExit(f"tacpipe {command} ended with {done.returncode}")
-    cpu_s, memory_bytes, read_bytes = json.loads(done.stdout.splitlines()[-1])
-    return Cost(seconds, cpu_s, memory_bytes, read_bytes)
+def run_step(lab: Lab, command: str) -> Measured:
+    """Return the cost of a command of tacpipe, its system calls not counted."""
+    words = [timing.PYTHON, "-c", command] if command == OPEN else ["tacpipe", *shlex.split(command)]
+    return Measured(timing.cost(words, lab.folder))
 
 
 def looks(lab: Lab, command: str) -> int | None:
@@ -188,25 +175,21 @@ def looks(lab: Lab, command: str) -> int | None:
         return sum(int(found[1]) for found in re.finditer(r"^ *(\d+) +(?!total)\w+$", counts.read(), re.MULTILINE))
 
 
-def table(found: dict[int, dict[str, Cost]]) -> str:
-    """Return what was found as a table of Markdown: a row a step, the counts next to each other, and the growth."""
-    counts = sorted(found)
-    heads = [f"{count:,}: s | CPU s | MB | MB read | looks" for count in counts] + ["growth of CPU s"] * (
-        len(counts) > 1
-    )
+def table(results: dict[int, dict[str, Measured]]) -> str:
+    """Return the Markdown table: one row per step, one group of columns per count, and the growth."""
+    counts = sorted(results)
+    heads = [f"{count:,}: s | CPU s | MB | MB read | looks" for count in counts]
+    heads += ["growth of CPU s"] * (len(counts) > 1)
     lines = [f"| step | {' | '.join(heads)} |", "| --- |" + " ---: |" * (5 * len(counts) + (len(counts) > 1))]
-    for name in (name for name in STEPS if name in found[counts[0]]):
+    for name in (name for name in STEPS if name in results[counts[0]]):
         cells = [name]
-        for cost in (found[count][name] for count in counts):
-            megabytes = (f"{size / 1e6:,.0f}" for size in (cost.memory_bytes, cost.read_bytes))
-            cells += [
-                f"{cost.seconds:.2f}",
-                f"{cost.cpu_s:.2f}",
-                *megabytes,
-                "" if cost.looks is None else f"{cost.looks:,}",
-            ]
+        for measured in (results[count][name] for count in counts):
+            cost = measured.cost
+            cells += [f"{cost.seconds:.2f}", f"{cost.cpu_s:.2f}"]
+            cells += [f"{size / 1e6:,.0f}" for size in (cost.memory_bytes, cost.read_bytes)]
+            cells += ["" if measured.looks is None else f"{measured.looks:,}"]
         if len(counts) > 1:
-            cells.append(f"{found[counts[-1]][name].cpu_s / found[counts[0]][name].cpu_s:.1f}")
+            cells.append(f"{results[counts[-1]][name].cost.cpu_s / results[counts[0]][name].cost.cpu_s:.1f}")
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 
@@ -217,17 +200,19 @@ def main() -> None:
     parser.add_argument("--counts", type=int, nargs="+", default=COUNTS)
     parser.add_argument("--folder", type=Path, help="Where to make the stores; they stay there.")
     parser.add_argument("--manifest-alone", action="store_true", help="Measure what looks at manifests alone.")
-    given = parser.parse_args()
+    options = parser.parse_args()
     setattr(os, "fsync", lambda handle: None)  # noqa: B010  (of this process alone, which makes what is measured)
-    found = {}
+    results = {}
     with tempfile.TemporaryDirectory(prefix="tacpipe-scale-") as temporary:
-        for count in given.counts:
-            lab = Lab((given.folder or Path(temporary)) / str(count), count, manifest_alone=given.manifest_alone)
-            steps = {name: cost(lab, STEPS[name]) for name in OF_MANIFEST} if given.manifest_alone else measure(lab)
-            found[count] = steps
+        for count in options.counts:
+            lab = Lab((options.folder or Path(temporary)) / str(count), count, manifest_alone=options.manifest_alone)
+            steps = (
+                {name: run_step(lab, STEPS[name]) for name in OF_MANIFEST} if options.manifest_alone else measure(lab)
+            )
+            results[count] = steps
             print(table({count: steps}), flush=True)
-    if len(found) > 1:
-        print(table(found))
+    if len(results) > 1:
+        print(table(results))
 
 
 if __name__ == "__main__":

@@ -9,10 +9,7 @@ The spool holds packets as the arm sends them, written by the sensor's own encod
 from __future__ import annotations
 
 import argparse
-import json
-import subprocess
 import tempfile
-import time
 from pathlib import Path
 
 import numpy as np
@@ -58,21 +55,17 @@ def main() -> None:
     """Write the spool, seal it and print what that took."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--minutes", type=float, default=10.0)
-    given = parser.parse_args()
+    options = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="tacpipe-seal-") as name:
         folder = Path(name)
-        made = spooled(folder, round(60 * given.minutes))
+        made = spooled(folder, round(60 * options.minutes))
         size = (made / "bytes").stat().st_size
-        begun = time.perf_counter()
-        words = [timing.PYTHON, "-S", "-c", timing.SMALL, f"{timing.BIN}/tacpipe", "acquire", "--recover"]
-        done = subprocess.run(words, cwd=folder, env=timing.environment_of(), stdout=subprocess.PIPE, check=True)
-        seconds = time.perf_counter() - begun
-        cpu_s, memory_bytes, _ = json.loads(done.stdout.splitlines()[-1])
+        cost = timing.cost(["tacpipe", "acquire", "--recover"], folder)
         manifest = find(folder / "rec").manifest
         print(
-            f"{given.minutes:g} min, {size / 1e6:,.0f} MB of spool: {seconds:.1f} s, {cpu_s:.1f} s of processor time, "
+            f"{options.minutes:g} min, {size / 1e6:,.0f} MB of spool: {cost.seconds:.1f} s, "
+            f"{cost.cpu_s:.1f} s of processor time, {cost.memory_bytes / 1e6:,.0f} MB of memory at most"
         )
-        print(f"{memory_bytes / 1e6:,.0f} MB of memory at most")
         for stream, shard in sorted(manifest.recordings["long"]["shards"].items()):
             print(f"{stream}: {shard['rows']:,} rows, {shard['bytes'] / 1e6:,.1f} MB, {shard['digest']}")
 

@@ -13,26 +13,26 @@ import timing
 HERE = Path(__file__).parent
 TRIALS = 1000
 FEW = 20  # as many as `tacpipe show` lists
-ENTRY_POINTS = "[tacpipe.stages]\nsimulate.small = small_stages:make\nadd = small_stages:add\n"
+ENTRY_POINTS = "[tacpipe.stages]\nsimulate.small = bench_stages:make\nadd = bench_stages:add\n"
 PLAIN = """
 import sys
 from pathlib import Path
 from types import SimpleNamespace
 
-import small_stages
+import bench_stages
 from tacpipe.io.parquet import from_parquet, to_parquet
 
 source, target, count = Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3])
 target.mkdir(parents=True)
 for path in sorted(source.glob("*.parquet")):
     shard = SimpleNamespace(table=lambda: from_parquet(path.read_bytes()))
-    (target / path.name).write_bytes(to_parquet(small_stages.add(small_stages.Add(count), shard)))
+    (target / path.name).write_bytes(to_parquet(bench_stages.add(bench_stages.Add(count), shard)))
 """
 
 
 def measure(folder: Path, rounds: int) -> list[timing.Line]:
     """Return what `tacpipe` takes at 1,000 shards that are there, and for each that is not."""
-    plugin = timing.plugin(folder, "small_stages", ENTRY_POINTS)
+    plugin = timing.plugin(folder, "bench_stages", ENTRY_POINTS)
     project = folder / "small"
     (project / ".tacpipe").mkdir(parents=True)
 

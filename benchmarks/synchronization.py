@@ -145,12 +145,12 @@ def _measure(seconds: int, rounds: int) -> list[timing.Line]:
     ]
 
 
-def _faster(what: str, times: timing.Times, ours: str, beside: str, bar: float | None = None) -> timing.Line:
-    """Return the line of what must be at least ``bar`` times as fast as pandas."""
-    line, found = timing.at_most(what, times, ours, beside), timing.ratio(times, beside, ours)
-    told = "" if bar is None else f"{bar:g} times as fast"
-    reached = None if bar is None else found >= bar
-    return timing.Line(what, line.ours, f"pandas: {line.beside}", f"{found:.1f} times as fast", told, reached)
+def _faster(what: str, times: timing.Times, ours: str, peer: str, aim: float | None = None) -> timing.Line:
+    """Return the line of what must be at least ``aim`` times as fast as pandas."""
+    line, found = timing.at_most(what, times, ours, peer), timing.ratio(times, peer, ours)
+    told = "" if aim is None else f"{aim:g} times as fast"
+    reached = None if aim is None else found >= aim
+    return timing.Line(what, line.ours, f"pandas: {line.peer}", f"{found:.1f} times as fast", told, reached)
 
 
 def _table(name: str, stream: Stream) -> pa.Table:

@@ -1,8 +1,10 @@
-"""Timing of things side by side: interleaved, repeated, and compared round by round."""
+"""Measure contestants side by side, in interleaved rounds, and compare them round by round."""
 
 from __future__ import annotations
 
+import json
 import os
+import resource
 import shlex
 import shutil
 import statistics
@@ -15,8 +17,8 @@ from pathlib import Path
 
 PYTHON = sys.executable
 BIN = Path(sys.executable).parent
-Times = dict[str, list[float]]  # what was timed, seconds of each round
-SMALL = """
+Times = dict[str, list[float]]  # seconds of each round, by contestant
+_RUSAGE_OF_CHILD = """
 import json, os, re, sys
 child = os.posix_spawn(sys.argv[1], sys.argv[1:], os.environ)
 os.waitid(os.P_PID, child, os.WEXITED | os.WNOWAIT)
@@ -25,36 +27,54 @@ _, status, used = os.wait4(child, 0)
 print()
 print(json.dumps([used.ru_utime + used.ru_stime, used.ru_maxrss * 1024, int(read[1])]))
 sys.exit(os.waitstatus_to_exitcode(status))
-"""  # a child's peak of memory is at least that of the process that it came from, so that is a small one
+"""  # a small process starts the command: a child's peak of memory is at least that of its parent
 
 
 @dataclass(frozen=True)
 class Line:
-    """One measurement as it stands in the table."""
+    """One row of the table."""
 
     what: str
     ours: str
-    beside: str  # what a user would do instead, and what it took
+    peer: str  # what a user would do without tacpipe, and its cost
     ratio: str
-    bar: str = ""  # what must be reached; empty where nothing must
-    reached: bool | None = None
+    aim: str = ""
+    reached: bool | None = None  # None where there is no aim
 
 
-def interleaved(contestants: Mapping[str, Callable[[], object]], rounds: int) -> Times:
-    """Return the seconds of each contestant in each round, after one round that does not count."""
+@dataclass(frozen=True)
+class Cost:
+    """The cost of one process and its children."""
+
+    seconds: float  # by the clock
+    cpu_s: float  # user and system, on all cores
+    memory_bytes: int  # peak of resident memory
+    read_bytes: int
+
+
+def cpu_seconds() -> float:
+    """Return the user and system time of this process and of the children that ended."""
+    usages = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return sum(usage.ru_utime + usage.ru_stime for usage in usages)
+
+
+def interleaved(
+    contestants: Mapping[str, Callable[[], object]], rounds: int, clock: Callable[[], float] = cpu_seconds
+) -> Times:
+    """Return the seconds of each contestant in each round. The first round is a warm-up and does not count."""
     times: Times = {name: [] for name in contestants}
     for number in range(rounds + 1):
         for name, call in contestants.items():
-            begun = time.perf_counter()
+            start_s = clock()
             call()
             if number:
-                times[name].append(time.perf_counter() - begun)
+                times[name].append(clock() - start_s)
     return times
 
 
-def ratio(times: Times, ours: str, beside: str) -> float:
+def ratio(times: Times, ours: str, peer: str) -> float:
     """Return the median over the rounds of the quotient of two contestants."""
-    return statistics.median(a / b for a, b in zip(times[ours], times[beside], strict=True))
+    return statistics.median(a / b for a, b in zip(times[ours], times[peer], strict=True))
 
 
 def median(times: Times, name: str) -> float:
@@ -62,31 +82,63 @@ def median(times: Times, name: str) -> float:
     return statistics.median(times[name])
 
 
-def at_most(what: str, times: Times, ours: str, beside: str, bar: float | None = None) -> Line:
-    """Return the line of a contestant that must not take more than ``bar`` times another."""
-    found = ratio(times, ours, beside)
+def at_most(what: str, times: Times, ours: str, peer: str, aim: float | None = None) -> Line:
+    """Return the line of a contestant that must not take more than ``aim`` times the CPU seconds of a peer."""
+    quotient = ratio(times, ours, peer)
     return Line(
         what,
-        _time(median(times, ours)),
-        f"{beside}: {_time(median(times, beside))}",
-        f"{found:.2f}",
-        "" if bar is None else f"at most {bar}",
-        None if bar is None else found <= bar,
+        _format_seconds(median(times, ours)),
+        f"{peer}: {_format_seconds(median(times, peer))}",
+        f"{quotient:.2f}",
+        "" if aim is None else f"at most {aim:g}",
+        None if aim is None else quotient <= aim,
     )
+
+
+def faster(what: str, times: Times, ours: str, peer: str, aim: float, rates: tuple[str, str]) -> Line:
+    """Return the line of a contestant that must be ``aim`` times as fast as a peer, with the ``rates`` of both."""
+    quotient = 1 / ratio(times, ours, peer)
+    told = f"{quotient:.2f} times as fast"
+    return Line(what, rates[0], f"{peer}: {rates[1]}", told, f"{aim:g} times as fast", quotient >= aim)
+
+
+def memory_line(what: str, ours: Cost, peer: str, theirs: Cost) -> Line:
+    """Return the line of the peaks of memory of two processes."""
+    ours_mb, theirs_mb = ours.memory_bytes / 1e6, theirs.memory_bytes / 1e6
+    return Line(what, f"{ours_mb:.0f} MB", f"{peer}: {theirs_mb:.0f} MB", f"{ours_mb / theirs_mb:.2f}")
+
+
+def cost(command: Sequence[str], folder: Path) -> Cost:
+    """Run a command that must succeed and return what it cost; ``tacpipe`` is that of this Python."""
+    program = [str(BIN / "tacpipe"), *command[1:]] if command[0] == "tacpipe" else list(command)
+    start_s = time.perf_counter()
+    process = subprocess.run(
+        [PYTHON, "-S", "-c", _RUSAGE_OF_CHILD, *program],
+        cwd=folder,
+        env=environment_of(),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    seconds = time.perf_counter() - start_s
+    if process.returncode:
+        raise SystemExit(f"{shlex.join(command)} ended with {process.returncode}: {process.stderr}")
+    cpu_s, memory_bytes, read_bytes = json.loads(process.stdout.splitlines()[-1])
+    return Cost(seconds, cpu_s, memory_bytes, read_bytes)
 
 
 def run(command: str | Sequence[str], folder: Path | None = None, **environment: str) -> None:
-    """Run a command that must succeed, in silence; ``tacpipe`` and ``dvc`` are those of this Python."""
+    """Run a command that must succeed and print nothing; ``tacpipe`` and ``dvc`` are those of this Python."""
     words = shlex.split(command) if isinstance(command, str) else list(command)
-    done = subprocess.run(
+    process = subprocess.run(
         words, cwd=folder, env=environment_of(**environment), capture_output=True, text=True, check=False
     )
-    if done.returncode:
-        raise SystemExit(f"{shlex.join(words)} ended with {done.returncode}: {done.stderr}")
+    if process.returncode:
+        raise SystemExit(f"{shlex.join(words)} ended with {process.returncode}: {process.stderr}")
 
 
 def plugin(folder: Path, module: str, entry_points: str) -> Path:
-    """Return the folder of an installed plug-in that holds a module which lies beside this one."""
+    """Install a module of this folder as a plug-in and return its folder."""
     place = folder / f"plugin-{module}"
     (place / "bench.egg-info").mkdir(parents=True)
     (place / "bench.egg-info" / "entry_points.txt").write_text(entry_points)
@@ -95,10 +147,10 @@ def plugin(folder: Path, module: str, entry_points: str) -> Path:
 
 
 def environment_of(**more: str) -> dict[str, str]:
-    """Return the environment of this process, without a store of its own, and with this Python's programs first."""
-    kept = {name: value for name, value in os.environ.items() if name != "TACPIPE_STORE"}
-    return {**kept, "PATH": f"{BIN}{os.pathsep}{kept.get('PATH', '')}", **more}
+    """Return the environment of this process without a named store, with this Python's programs first."""
+    inherited = {name: value for name, value in os.environ.items() if name != "TACPIPE_STORE"}
+    return {**inherited, "PATH": f"{BIN}{os.pathsep}{inherited.get('PATH', '')}", **more}
 
 
-def _time(seconds: float) -> str:
+def _format_seconds(seconds: float) -> str:
     return f"{seconds:.2f} s" if seconds >= 1 else f"{seconds * 1000:.1f} ms"

@@ -1,4 +1,4 @@
-"""The table of `benchmarks/trust.py`: the same faults done to tacpipe, DVC and joblib; tacpipe's column must hold."""
+"""The same faults done to tacpipe, DVC and joblib; tacpipe's column must hold."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 
 from tests.test_dvc import NEEDS_DVC
 
-SCRIPT = Path(__file__).parents[2] / "benchmarks" / "trust.py"
+PROJECT = Path(__file__).parents[2]
 
 
 @pytest.mark.faults
@@ -22,7 +22,12 @@ SCRIPT = Path(__file__).parents[2] / "benchmarks" / "trust.py"
 def test_tacpipe_holds_under_each_fault_that_is_done_to_dvc_and_joblib_too() -> None:
     kept = {name: value for name, value in os.environ.items() if not name.startswith(("GIT_", "DVC_", "TACPIPE_"))}
     done = subprocess.run(
-        [sys.executable, str(SCRIPT), "--json"], env=kept, capture_output=True, text=True, check=False
+        [sys.executable, "-m", "tests.promises.trust.table", "--json"],
+        cwd=PROJECT,
+        env=kept,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert done.stdout, done.stderr
     table = json.loads(done.stdout)

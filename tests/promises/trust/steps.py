@@ -1,8 +1,8 @@
 """One small chain for three tools: numbers are read from text, scaled, and summed; each step says what it computed.
 
-    python trust_steps.py dvc load|scale|total [FACTOR]      one step, from folder to folder, as a stage of DVC
-    python trust_steps.py joblib load|scale|total [FACTOR]   the chain up to a step, its values printed
-    python trust_steps.py clean                              a cleaning of joblib's cache
+    python -m tests.promises.trust.steps dvc load|scale|total [FACTOR]      one step between folders, as a stage of DVC
+    python -m tests.promises.trust.steps joblib load|scale|total [FACTOR]   the chain up to a step, its values printed
+    python -m tests.promises.trust.steps clean                              a cleaning of joblib's cache
 
 What a test wants of a step stands in the environment, which is part of no tool's key.
 """
@@ -110,12 +110,13 @@ def total_all(values: dict[str, np.ndarray]) -> dict[str, int]:
 
 
 def _by_joblib(step: str, factor: int) -> object:
-    import trust_steps  # joblib names a function by its module, and this one is __main__
     from joblib import Memory, Parallel, delayed
 
+    from tests.promises.trust import steps  # joblib names a function by its module, and this one is __main__
+
     memory = Memory("cache", verbose=0)
-    loading = memory.cache(trust_steps.load_one, ignore=["recording"])
-    scaling = memory.cache(trust_steps.scale_one, ignore=["recording"])
+    loading = memory.cache(steps.load_one, ignore=["recording"])
+    scaling = memory.cache(steps.scale_one, ignore=["recording"])
     texts = {path.stem: path.read_text() for path in sorted(Path("raw").glob("*.txt"))}
     parallel = Parallel(n_jobs=2)
     values = dict(zip(texts, parallel(delayed(loading)(*item) for item in texts.items()), strict=True))
@@ -123,7 +124,7 @@ def _by_joblib(step: str, factor: int) -> object:
         scaled_values = parallel(delayed(scaling)(*item, factor) for item in values.items())
         values = dict(zip(texts, scaled_values, strict=True))
     if step == "total":
-        return memory.cache(trust_steps.total_all)(values)
+        return memory.cache(steps.total_all)(values)
     return {name: array.tolist() for name, array in values.items()}
 
 

@@ -1,6 +1,6 @@
 """The same faults, done to tacpipe, to `dvc repro` and to `joblib.Memory`; prints a table, ends with 1 if tacpipe fails one.
 
-    python benchmarks/trust.py [--only edited flipped ...] [--tools tacpipe "dvc repro" joblib.Memory] [--json]
+    python -m tests.promises.trust.table [--only edited flipped ...] [--tools tacpipe "dvc repro" joblib.Memory] [--json]
 
 A chain of three steps over eight recordings is the same for all three, and each tool is set up as its manual says. Every
 cell is found by looking at what the tool serves afterwards. Needs Linux; the full disk needs `unshare` (util-linux) besides.
@@ -18,10 +18,10 @@ from concurrent.futures import ThreadPoolExecutor
 from importlib.metadata import version
 from pathlib import Path
 
-import trust_faults
-from trust_faults import FAULTS
-from trust_lab import Cell
-from trust_tools import TOOLS
+from tests.promises.trust import faults as trust_faults
+from tests.promises.trust.faults import FAULTS
+from tests.promises.trust.lab import Cell
+from tests.promises.trust.tools import TOOLS
 
 MOUNTED = ("full",)  # faults that mount something, and so happen in a namespace of their own
 NAMESPACE = ("unshare", "--user", "--map-root-user", "--mount")
@@ -41,7 +41,8 @@ def _cell(fault: str, tool: str, folder: Path) -> Cell:
         return trust_faults.met(fault, tool, folder)
     if shutil.which(NAMESPACE[0]) is None or subprocess.run([*NAMESPACE, "true"], check=False).returncode:
         return Cell("not tried: nothing can be mounted here", None)
-    words = [*NAMESPACE, sys.executable, __file__, "--only", fault, "--tools", tool, "--inside", str(folder)]
+    program = [*NAMESPACE, sys.executable, "-m", "tests.promises.trust.table"]
+    words = [*program, "--only", fault, "--tools", tool, "--inside", str(folder)]
     done = subprocess.run(words, capture_output=True, text=True, check=False)
     if done.returncode:
         raise RuntimeError(f"{fault} with {tool} ended with {done.returncode}: {done.stderr}")

@@ -1,4 +1,4 @@
-"""A folder in which one tool runs the chain of `trust_steps`, and is done harm."""
+"""A folder in which one tool runs the chain of `steps`, and is done harm."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import timing
-import trust_steps
 
-HERE = Path(__file__).parent
+from tests.promises.trust import steps
+
+PROJECT = Path(__file__).parents[3]
 RECORDINGS = tuple(f"rec-{number}" for number in range(8))
 VICTIM = RECORDINGS[3]
 
@@ -53,9 +53,9 @@ class Lab:
     def __init__(self, folder: Path, environment: dict[str, str], rows: int = 300) -> None:
         self.folder = folder
         self.log_path = folder.with_name(f"{folder.name}.log")
-        paths = [str(HERE), environment.get("PYTHONPATH", "")]
+        paths = [str(PROJECT), environment.get("PYTHONPATH", "")]
         plain = {"OMP_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1", "PYTHONPATH": os.pathsep.join(paths)}
-        self.environment = timing.environment_of(**environment | plain | {trust_steps.LOG: str(self.log_path)})
+        self.environment = environment_of(**environment | plain | {steps.LOG: str(self.log_path)})
         (folder / "raw").mkdir(parents=True)
         draw = np.random.default_rng(0)
         self.raw = {name: draw.integers(0, 1 << 40, rows) for name in RECORDINGS}
@@ -113,11 +113,11 @@ class Lab:
 
     def start_gated(self, words: Sequence[str], step: str, when: str = "after") -> subprocess.Popen[str]:
         """Start a command and return once ``step`` waits before, or after, it has read the victim; the rest may go on."""
-        process = self.start(words, **{trust_steps.GATE: f"{step} {when} {VICTIM} {self._gate}"})
-        deadline = time.monotonic() + trust_steps.PATIENCE_S
+        process = self.start(words, **{steps.GATE: f"{step} {when} {VICTIM} {self._gate}"})
+        deadline = time.monotonic() + steps.PATIENCE_S
         while not Path(f"{self._gate}.reached").exists():
             if time.monotonic() > deadline:
-                raise RuntimeError(f"{step} did not begin in {trust_steps.PATIENCE_S:g} s.")
+                raise RuntimeError(f"{step} did not begin in {steps.PATIENCE_S:g} s.")
             time.sleep(0.01)
         return process
 
@@ -131,7 +131,7 @@ class Lab:
 
     def alive(self) -> list[int]:
         """Return the processes that work in this lab."""
-        mark, found = f"{trust_steps.LOG}={self.log_path}".encode(), []
+        mark, found = f"{steps.LOG}={self.log_path}".encode(), []
         for place in Path("/proc").glob("[0-9]*"):
             try:
                 if mark in (place / "environ").read_bytes().split(b"\0"):
@@ -155,17 +155,24 @@ class Lab:
 def finished(process: subprocess.Popen[str]) -> Done:
     """Wait for a command's end, and only for its own: what it left running may hold its pipes."""
     try:
-        out, err = process.communicate(timeout=trust_steps.PATIENCE_S)
+        out, err = process.communicate(timeout=steps.PATIENCE_S)
     except subprocess.TimeoutExpired:
         os.killpg(process.pid, signal.SIGKILL)
         out, err = process.communicate()
-        return Done(-9, out, f"{err}\nkilled after {trust_steps.PATIENCE_S:g} s")
+        return Done(-9, out, f"{err}\nkilled after {steps.PATIENCE_S:g} s")
     return Done(process.returncode, out, err)
 
 
-def python(*words: str) -> list[str]:
-    """Return the words of a script that lies beside this one."""
-    return [sys.executable, str(HERE / words[0]), *words[1:]]
+def environment_of(**more: str) -> dict[str, str]:
+    """Return the environment of this process without a named store, with this Python's programs first."""
+    inherited = {name: value for name, value in os.environ.items() if name != "TACPIPE_STORE"}
+    programs = f"{Path(sys.executable).parent}{os.pathsep}{inherited.get('PATH', '')}"
+    return {**inherited, "PATH": programs, **more}
+
+
+def python(module: str, *words: str) -> list[str]:
+    """Return the command that runs a module of this folder."""
+    return [sys.executable, "-m", f"tests.promises.trust.{module}", *words]
 
 
 def loaded(text: str) -> dict[str, object]:

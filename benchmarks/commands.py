@@ -1,4 +1,4 @@
-"""The forward chain, small: what DVC and tacpipe take to find out that there is nothing to do."""
+"""Measure `tacpipe --help`, a hit of each command, and a chain in which nothing changed, next to typer and DVC."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from typing import Any
 import timing
 import yaml
 
-COMMANDS = (  # of the forward chain, small; what each reads and writes is in its words
+BARE = str(Path(__file__).with_name("bare.py"))
+COMMANDS = (  # a small forward chain; each command names its inputs and its output
     "tacpipe simulate forward --trials 8 --duration-s 4 -o data/recordings",
     "tacpipe synchronize data/recordings -o data/synced",
     "tacpipe segment contacts data/synced -o data/segments",
@@ -44,8 +45,37 @@ def project(folder: Path) -> Path:
 
 
 def measure(folder: Path, rounds: int) -> list[timing.Line]:
-    """Return what both take on a chain in which nothing changed."""
+    """Return the ratios of `tacpipe --help` and of hits to a bare typer program, and of an unchanged chain to DVC."""
+    times = timing.interleaved(
+        {
+            "help": lambda: timing.run("tacpipe --help"),
+            "bare typer program": lambda: timing.run([timing.PYTHON, BARE, "--help", "--plain"]),
+            "the same with rich help": lambda: timing.run([timing.PYTHON, BARE, "--help"]),
+        },
+        rounds,
+    )
+    lines = [
+        timing.at_most("tacpipe --help", times, "help", "bare typer program", 1.4),
+        timing.at_most("tacpipe --help", times, "help", "the same with rich help"),
+    ]
     place = project(folder)
+    for command in COMMANDS:
+        times = timing.interleaved(
+            {
+                "hit": lambda command=command: timing.run(command, place),  # type: ignore[misc]
+                "bare typer program": lambda: timing.run([timing.PYTHON, BARE]),
+            },
+            max(5, rounds // 2),
+        )
+        name = " ".join(word for word in command.split()[:3] if "/" not in word)
+        lines.append(timing.at_most(f"{name}, at a hit", times, "hit", "bare typer program", 2.0))
+    hit, bare = (timing.cost(command, place) for command in (COMMANDS[1].split(), [timing.PYTHON, BARE]))
+    lines.append(timing.memory_line("peak of memory of a hit", hit, "bare typer program", bare))
+    return [*lines, *_unchanged_chain(place, rounds)]
+
+
+def _unchanged_chain(place: Path, rounds: int) -> list[timing.Line]:
+    """Return the seconds of tacpipe and of DVC for a chain in which nothing changed."""
 
     def tacpipe() -> None:
         for command in COMMANDS:

@@ -4,21 +4,23 @@ from __future__ import annotations
 
 import json
 import shutil
+import sys
 from pathlib import Path
 from typing import Protocol
 
 import joblib
-import timing
 import yaml
-from trust_lab import RECORDINGS, VICTIM, Done, Lab, loaded, python
-from trust_steps import STEPS
 
+from tests.promises.trust.lab import RECORDINGS, VICTIM, Done, Lab, loaded, python
+from tests.promises.trust.steps import STEPS
+
+JOBLIB_CACHE = Path("cache/joblib/tests/promises/trust/steps")  # joblib names folders after the module
 ENTRY_POINTS = """
 [tacpipe.stages]
-scale = trust_stages:scale
-total = trust_stages:total
+scale = tests.promises.trust.stages:scale
+total = tests.promises.trust.stages:total
 [tacpipe.formats]
-numbers = trust_stages:load
+numbers = tests.promises.trust.stages:load
 """
 
 
@@ -65,7 +67,9 @@ class Tacpipe:
     name, room = "tacpipe", 0.3
 
     def lab(self, folder: Path, rows: int = 300) -> Lab:
-        plugin = timing.plugin(folder.with_name(f"{folder.name}-plugin"), "trust_stages", ENTRY_POINTS)
+        plugin = folder.with_name(f"{folder.name}-plugin")
+        (plugin / "trust.egg-info").mkdir(parents=True)
+        (plugin / "trust.egg-info" / "entry_points.txt").write_text(ENTRY_POINTS)
         lab = Lab(folder, {"PYTHONPATH": str(plugin)}, rows)
         (folder / ".tacpipe").mkdir()
         return lab
@@ -82,7 +86,7 @@ class Tacpipe:
         if step == "total":
             path = lab.folder / "data" / "total" / "total.json"
             return loaded(path.read_text()) if path.exists() else {}
-        return loaded(lab.run(python("trust_stages.py", f"data/{step}")).out)
+        return loaded(lab.run(python("stages", f"data/{step}")).out)
 
     def stored(self, lab: Lab, step: str) -> Path:
         manifest = json.loads((lab.folder / "data" / step / "manifest.json").read_text())
@@ -122,7 +126,7 @@ class Dvc:
         lab.must(["dvc", "config", "core.check_update", "false"])
         if self.cache_type:
             lab.must(["dvc", "config", "cache.type", self.cache_type])
-        script = " ".join(python("trust_steps.py", "dvc"))
+        script = " ".join(python("steps", "dvc"))
         stages = {
             "load": {"cmd": f"{script} load", "deps": ["raw"], "outs": ["load"]},
             "scale": {"cmd": f"{script} scale ${{factor}}", "deps": ["load"], "params": ["factor"], "outs": ["scale"]},
@@ -144,7 +148,7 @@ class Dvc:
             return loaded(path.read_text()) if path.exists() else {}
         read = "import json, numpy, pathlib, sys; print(json.dumps({path.stem: numpy.load(path).tolist() "
         read += "for path in pathlib.Path(sys.argv[1]).glob('*.npy')}))"
-        return loaded(lab.run([timing.PYTHON, "-c", read, step]).out)
+        return loaded(lab.run([sys.executable, "-c", read, step]).out)
 
     def stored(self, lab: Lab, step: str) -> Path:
         lock = yaml.safe_load((lab.folder / "dvc.lock").read_text())
@@ -184,14 +188,14 @@ class Joblib:
         return Lab(folder, {}, rows)
 
     def words(self, lab: Lab, step: str, factor: int = 2) -> list[str]:
-        return python("trust_steps.py", "joblib", step, str(factor))
+        return python("steps", "joblib", step, str(factor))
 
     def values(self, lab: Lab, step: str, factor: int = 2) -> dict[str, object]:
         return loaded(lab.run(self.words(lab, step, factor)).out)
 
     def stored(self, lab: Lab, step: str) -> Path:
         right = lab.right(step)[VICTIM]
-        for path in (lab.folder / "cache" / "joblib" / "trust_steps" / f"{step}_one").glob("*/output.pkl"):
+        for path in (lab.folder / JOBLIB_CACHE / f"{step}_one").glob("*/output.pkl"):
             if joblib.load(path).tolist() == right:
                 return path
         raise RuntimeError(f"joblib has no output of {step}.")
@@ -203,7 +207,7 @@ class Joblib:
         return lab.run(self.words(lab, step))
 
     def cleaning(self) -> list[str]:
-        return python("trust_steps.py", "clean")
+        return python("steps", "clean")
 
     def comparing(self, lab: Lab, step: str, factor: int = 2) -> tuple[bool, str]:
         return False, "it has no way to compare; a hit is served as it is"

@@ -11,9 +11,9 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from trust_lab import RECORDINGS, VICTIM, Cell, edited, finished, truncated
-from trust_steps import NOISE, PAUSE
-from trust_tools import TOOLS, Dvc, Tool, removed, up_to
+from tests.promises.trust.lab import RECORDINGS, VICTIM, Cell, edited, finished, truncated
+from tests.promises.trust.steps import NOISE, PAUSE
+from tests.promises.trust.tools import TOOLS, Dvc, Tool, removed, up_to
 
 CROWD = 8
 SOON_S = 5.0

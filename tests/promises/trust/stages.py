@@ -1,4 +1,4 @@
-"""The chain of `trust_steps` as stages of tacpipe."""
+"""The chain of `steps` as stages of tacpipe."""
 
 from __future__ import annotations
 
@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import trust_steps
-
 from tacpipe.plugins.stage import Files, Result, stage
+from tests.promises.trust import steps
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -40,8 +39,8 @@ def load(params: Nothing, files: Files) -> pa.Table:
     import pyarrow as pa
 
     (path,) = files.values()
-    trust_steps.begun("load", path.stem)
-    return pa.table({"x": trust_steps.parsed(path.stem, path.read_text())})
+    steps.begun("load", path.stem)
+    return pa.table({"x": steps.parsed(path.stem, path.read_text())})
 
 
 @stage(version=1)
@@ -49,15 +48,15 @@ def scale(params: Factor, recording: Recording) -> pa.Table:
     """Scale a table."""
     import pyarrow as pa
 
-    trust_steps.begun("scale", recording.name)
+    steps.begun("scale", recording.name)
     values = recording.table()["x"].to_numpy()
-    return pa.table({"x": trust_steps.scaled(recording.name, values, params.factor)})
+    return pa.table({"x": steps.scaled(recording.name, values, params.factor)})
 
 
 @stage(version=1)
 def total(params: Nothing, recordings: Dataset) -> Result:
     """Sum tables."""
-    trust_steps.begun("total", "all")
+    steps.begun("total", "all")
     sums = {name: int(shard.table()["x"].to_numpy().sum()) for name, shard in recordings.recordings.items()}
     return Result(files={"total.json": json.dumps(sums).encode()})
 
