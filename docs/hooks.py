@@ -97,7 +97,7 @@ def help_of(words: list[str]) -> str:
     sys.argv, os.environ["COLUMNS"] = ["tacpipe", *arguments], "102"
     try:
         program = main.app(arguments)
-        plain_help.apply(program)
+        plain_help.apply(program, brief=False)
         command: Any = typer.main.get_command(program)
         context = command.make_context("tacpipe", [], resilient_parsing=True)
         for word in words:

@@ -214,7 +214,7 @@ def test_an_architecture_of_another_package_is_a_choice_and_its_params_are_optio
 def test_the_help_shows_it_in_a_panel_and_imports_nothing_heavy(
     package: Path, call: Callable[[str], Ran], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    text = call("train forward --help").out
+    text = call("train forward --architecture plain --help").out
     model = text.split("Model:")[1].split("Training:")[0]
     assert "|plain]" in model and "--width" in model
     probe = (

@@ -213,7 +213,10 @@ def test_a_preset_that_a_stage_does_not_have_is_refused_and_those_it_has_can_be_
 @pytest.mark.parametrize("name", STAGES)
 def test_help_shows_choices_ranges_and_whose_an_option_is(name: str, call: Call) -> None:
     stage = registry.load(name)
-    printed = " ".join(call(f"{name.replace('.', ' ')} --help").out.split())
+    tag = params_of.tag(stage)
+    choices = [f"--{tag} {params_of.choices(kind, tag)[0]} " for kind in params_of.kinds(stage)] if tag else [""]
+    texts = [call(f"{name.replace('.', ' ')} {words}--help").out for words in choices]
+    printed = " ".join(" ".join(texts).split())
     for field, wanted in params_of.fields(stage).items():
         assert f"--{field.replace('_', '-')}" in printed
         if get_origin(fields.bare(wanted)) is Literal:
@@ -498,7 +501,7 @@ def test_a_plug_ins_stage_has_choices_ranges_and_kinds_like_a_built_in_one(bendi
     ):
         ran = bending(f"bend -o out {words}")
         assert (ran.code, ran.err) == (2, f"tacpipe: {sentence}\n")
-    printed = bending("bend --help").out
+    printed = bending("bend --way hard --help").out
     assert "[gentle|hard]" in printed and "only with way hard" in " ".join(printed.split())
     assert json.loads(bending("bend --preset strong --print-params").out) == {
         "way": "hard",

@@ -11,7 +11,7 @@ import pytest
 from tests.conftest import tacpipe
 from tests.test_docs import PYTHON, ROOT, fenced, printed, section
 
-FIRST_COMMANDS = "Sixty seconds on simulated recordings"  # section of the README
+FIRST_COMMANDS = "From data to a report"  # section of the README
 CHECKS = """
 import html
 import pyarrow.compute as pc

@@ -94,9 +94,10 @@ def test_no_module_outside_of_a_task_s_own_packages_names_a_task() -> None:
 def test_no_module_outside_of_tasks_reports_formats_and_simulation_names_a_stage() -> None:
     data = {"split", "train", "report", "export"}  # words of data too: a role, kinds of dataset, a message of HID
     known = {*registry.stages(), *registry.commands()} - data
-    # the command line has aliases, an export of frames runs synchronize before it, the viewer reads the thresholds of
-    # contacts, and a live session reads the params of an earlier version of synchronize
+    # the command line has aliases and groups of commands, an export of frames runs synchronize before it, the viewer
+    # reads the thresholds of contacts, and a live session reads the params of an earlier version of synchronize
     needed = {
+        "cli/help.py",
         "cli/main.py",
         "exports/frames.py",
         "live/stages.py",

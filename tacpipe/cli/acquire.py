@@ -80,13 +80,13 @@ def add(program: typer.Typer, summary: str) -> None:
 
         store = locate(*([] if output is None else [output]))
         if rig is None and not recover:
-            raise UsageError("acquire needs a rig file, as in `tacpipe acquire rig.toml -o data/recordings`.")
+            raise UsageError("Missing argument RIG. Give a rig file: tacpipe acquire rig.toml -o data/recordings.")
         found = rig_of.read(rig) if rig is not None else None
         if found is not None and dry_run:
             terminal.result(_dry_run(found, as_json=as_json))
             return
         if found is not None and output is None and not recover:
-            raise UsageError("acquire needs -o: the dataset of recordings to append to.")
+            raise UsageError("Missing option -o. Give the dataset of recordings to append to, as -o data/recordings.")
         began_s = time.monotonic()
         sealed, left = _recovered(store, output, quiet=quiet)
         if recover and not quiet:

@@ -11,6 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
+from tacpipe.errors import UsageError
 from tacpipe.io import terminal
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
@@ -133,7 +134,7 @@ def _compare(program: typer.Typer) -> None:
         from tacpipe.io import tables
 
         if as_csv and as_json:
-            raise typer.BadParameter("give --csv or --json, not both", param_hint="--csv")
+            raise UsageError("--csv and --json exclude each other. Give one of them.")
         found = comparing.run(results, pool=not each)
         with _ends_with_its_reader():
             if as_json:

@@ -20,14 +20,18 @@ from tacpipe.plugins import extras, failures
 if TYPE_CHECKING:
     import typer
 
-HELP = """From a tactile sensor's recordings to results that trace back to the recorded bytes.
+HELP = """Record touch, train models on it, and trace every result back to the recorded bytes.
 
-Stages read and write datasets: `tacpipe STAGE INPUT... -o OUTPUT`. Stored results are not recomputed.
-Exit codes: 0 done, 1 failed, 2 usage, 3 would change (--check), 4 damaged data, 5 device missing or lost,
-6 lock wait timed out, 130 interrupted.
+Stages read and write datasets: tacpipe STAGE INPUT... -o OUTPUT. Stored results are not recomputed.
+-h shows the common options of a command, --help shows all.
+
+Documentation: `make docs` builds the site from docs/, which starts at docs/index.md.
+
+Exit codes: 0 done, 1 to 6 and 130 as in docs/reference/exit-codes.md.
 """
 
 
+WIDEST = 1_000  # Columns of help: the terminal's, up to this.
 ALIASES = {"eval": "evaluate", "sync": "synchronize"}  # abbreviations that help and completion do not list
 
 
@@ -43,7 +47,7 @@ def app(arguments: Sequence[str]) -> typer.Typer:
         no_args_is_help=True,
         pretty_exceptions_enable=False,
         rich_markup_mode=None,
-        context_settings={"help_option_names": ["-h", "--help"]},
+        context_settings={"help_option_names": ["-h", "--help"], "max_content_width": WIDEST},
     )
 
     @program.callback()
@@ -146,7 +150,7 @@ def _call(arguments: Sequence[str]) -> tuple[int, str]:
     arguments = [ALIASES.get(word, word) for word in arguments[:1]] + list(arguments[1:])
     program = app(arguments if (asked := completion.words()) is None else asked)
     addresses.refuse(program)
-    plain_help.apply(program)
+    plain_help.apply(program, brief="-h" in arguments)
     try:
         with extras.named("This command"):
             code = typer.main.get_command(program).main(arguments, prog_name="tacpipe", standalone_mode=False)

@@ -10,6 +10,7 @@ from typing import Any, Literal, get_args, get_origin
 
 import typer
 
+from tacpipe.cli.help import REQUIRED
 from tacpipe.io import terminal
 from tacpipe.plugins import fields as fields_of
 from tacpipe.plugins import params as params_of
@@ -41,11 +42,19 @@ def _arguments(stage: AnyStage) -> list[inspect.Parameter]:
 
 
 def _shared(stage: AnyStage) -> list[inspect.Parameter]:
-    found = [_parameter("output", Path | None, typer.Option(None, "-o", "--output", help="Where to write."))]
+    output = typer.Option(None, "-o", "--output", help="Directory to write.", rich_help_panel=REQUIRED)
+    found = [_parameter("output", Path | None, output)]
     if stage.reads_split:
         found += [
             _parameter(
-                "split", Path | None, typer.Option(None, "--split", help="Which recordings train, validate, test.")
+                "split",
+                Path | None,
+                typer.Option(
+                    None,
+                    "--split",
+                    help="Split that assigns the roles train, val and test.",
+                    rich_help_panel=REQUIRED if stage.needs_split else None,
+                ),
             ),
             _parameter(
                 "fold",
@@ -81,6 +90,7 @@ def _shared(stage: AnyStage) -> list[inspect.Parameter]:
 def _options(stage: AnyStage, fields: dict[str, Any]) -> list[inspect.Parameter]:
     helps = params_of.comments(stage) if {"--help", "-h"} & set(sys.argv) else {}
     panels = params_of.panels(stage)
+    choice = _shown_choice(stage)
     found = []
     for name, wanted in fields.items():
         kind = fields_of.bare(wanted)
@@ -90,8 +100,15 @@ def _options(stage: AnyStage, fields: dict[str, Any]) -> list[inspect.Parameter]
         annotation = bool | None if kind is bool else list[str] | None if many else str | None  # parsed as --set is
         text = _about(stage, name, helps.get(name, ""))
         metavar = None if kind is bool else _metavar(wanted)
+        owners = params_of.having(stage, name)
         option = typer.Option(
-            None, *flags, help=text, show_default=False, metavar=metavar, rich_help_panel=panels.get(name)
+            None,
+            *flags,
+            help=text,
+            show_default=False,
+            metavar=metavar,
+            rich_help_panel=panels.get(name),
+            hidden=bool(owners) and choice not in owners,
         )
         found.append(_parameter(name, annotation, option))
     more: list[tuple[str, Any, Any]] = [
@@ -103,7 +120,7 @@ def _options(stage: AnyStage, fields: dict[str, Any]) -> list[inspect.Parameter]
         (
             "params_file",
             Path | None,
-            typer.Option(None, "--params", help="File of params [params.yaml if there is one]."),
+            typer.Option(None, "--params", help="File of params. Default: params.yaml if it exists."),
         ),
         ("block", str | None, typer.Option(None, "--block", help="Block of the params file, as forward.synchronize.")),
         ("set_", list[str] | None, typer.Option(None, "--set", help="Set a param: --set name=value.")),
@@ -112,7 +129,7 @@ def _options(stage: AnyStage, fields: dict[str, Any]) -> list[inspect.Parameter]
             bool,
             typer.Option(False, PRINT_PARAMS, help="Print the params that would count, and stop."),
         ),
-        ("jobs", int, typer.Option(0, "--jobs", help="Processes to use; 0: one a core.")),
+        ("jobs", int, typer.Option(0, "--jobs", help="Processes to use; 0: one per core.")),
         (
             "executor",
             str | None,
@@ -121,7 +138,11 @@ def _options(stage: AnyStage, fields: dict[str, Any]) -> list[inspect.Parameter]
             ),
         ),
         ("skip_bad", bool, typer.Option(False, "--skip-bad", help="Skip recordings that cannot be read.")),
-        ("check", bool, typer.Option(False, "--check", help="Do nothing; exit with 3 if something would change.")),
+        (
+            "check",
+            bool,
+            typer.Option(False, "--check", help="Report what would change; exit with 3 if anything would."),
+        ),
         (
             "compare",
             bool,
@@ -166,15 +187,41 @@ def _shows(requirements: Requirements) -> Callable[[bool], None]:
     return show
 
 
+def _shown_choice(stage: AnyStage) -> str | None:
+    """Return the architecture, or what else distinguishes params of several kinds, whose options the help shows."""
+    tag = params_of.tag(stage)
+    if tag is None:
+        return None
+    for word, following in zip(sys.argv, [*sys.argv[1:], ""], strict=True):
+        if word == f"--{tag}":
+            return following
+        if word.startswith(f"--{tag}="):
+            return word.partition("=")[2]
+    return str(params_of.defaults(stage, tag)[0])
+
+
 def _about(stage: AnyStage, name: str, comment: str) -> str:
-    """Return the help of an option: its comment, what it may be, which choices have it, and its default."""
-    wanted = params_of.fields(stage)[name]
+    """Return the help of an option: its comment, its range, which choices have it, and its default."""
+    annotation = params_of.fields(stage)[name]
     parts = [comment] if comment else []
-    if fields_of.constraints(wanted):
-        parts.append(fields_of.describe(wanted))
+    if fields_of.constraints(annotation):
+        parts.append(fields_of.describe(annotation))
+    tag = params_of.tag(stage)
     if owners := params_of.having(stage, name):
-        parts.append(f"only with {params_of.tag(stage)} {', '.join(owners)}")
-    return f"{'; '.join(parts)} [{' or '.join(map(str, params_of.defaults(stage, name)))}]".strip()
+        parts.append(f"only with {tag} {', '.join(owners)}")
+    if name == tag and any(params_of.having(stage, field) for field in params_of.fields(stage)):
+        parts.append(f"--{tag} NAME --help shows the options of NAME")
+    defaults = [_default(name, value) for value in params_of.defaults(stage, name) if value not in (None, "", ())]
+    return "; ".join(parts) + (f" [default: {' or '.join(defaults)}]" if defaults else "")
+
+
+def _default(name: str, value: Any) -> str:
+    """Return a default as an option writes it."""
+    if isinstance(value, bool):
+        return ("" if value else "no-") + name.replace("_", "-")
+    if isinstance(value, dict):
+        return ",".join(f"{key}={each}" for key, each in value.items())
+    return ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
 
 
 def _metavar(wanted: Any) -> str:

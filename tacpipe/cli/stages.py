@@ -17,7 +17,7 @@ from tacpipe.cli import stage_options
 from tacpipe.engine import by_recording, estimate, grid, pipeline
 from tacpipe.engine.outcome import Outcome
 from tacpipe.engine.request import OPTIONS, PATHS, Request
-from tacpipe.errors import FAILED, TacpipeError
+from tacpipe.errors import FAILED, TacpipeError, UsageError
 from tacpipe.io import progress, terminal
 from tacpipe.plugins import fields as fields_of
 from tacpipe.plugins import given_params, registry
@@ -103,7 +103,7 @@ def _call(name: str, stage: AnyStage, given: dict[str, Any], named: Sequence[str
         terminal.result(stage.preview(params, given["source"]))
         return
     if given["output"] is None:
-        raise typer.BadParameter("give the directory to write with -o", param_hint="-o")
+        raise UsageError("Missing option -o. Give the directory to write, as -o data/output.")
     requests = grid.requests(_request(name, stage, params, given), grid.folds(given.get("fold") or "0"))
     shown = stage.headline if not (given["check"] or given["compare"]) else None  # these write nothing
     how = {"as_json": given["json_"], "quiet": given["quiet"]}
