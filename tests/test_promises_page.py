@@ -1,4 +1,4 @@
-"""docs/promises.md names the tests that speak for each promise: files that exist, and every file of tests/promises."""
+"""docs/promises.md names the tests of each guarantee, and the pages on guarantees name every file of tests/promises."""
 
 from __future__ import annotations
 
@@ -9,26 +9,28 @@ from pathlib import Path
 import pytest
 
 TESTS = Path(__file__).parent
-PAGE = TESTS.parent / "docs/promises.md"
-NAMED = re.compile(r"`((?:\w+/)*test_[\w*]+\.py)`")
+DOCS = TESTS.parent / "docs"
+PAGE = DOCS / "promises.md"
+TEXT = "".join((DOCS / name).read_text() for name in ("promises.md", "explanation/limits.md", "benchmarks/faults.md"))
+NAMED = re.compile(r"`(?:tests/)?((?:\w+/)*test_[\w*]+\.py)`")
 
 
 def rows() -> Iterator[list[str]]:
     """Yield the cells of each row of the table of promises."""
-    table = PAGE.read_text().split("## What is promised")[1].split("\n## ")[0]
+    table = PAGE.read_text().split("## Guarantees and evidence")[1].split("\n## ")[0]
     for line in table.splitlines():
         cells = [cell.strip() for cell in line.strip("|").split("|")]
-        if line.startswith("| ") and cells[0] not in ("promise", "---"):
+        if line.startswith("| ") and cells[0] not in ("guarantee", "---"):
             yield cells
 
 
-@pytest.mark.parametrize("name", sorted(set(NAMED.findall(PAGE.read_text()))))
+@pytest.mark.parametrize("name", sorted(set(NAMED.findall(TEXT))))
 def test_a_file_that_the_page_names_exists(name: str) -> None:
-    assert list(TESTS.glob(name)), f"docs/promises.md names {name}, which is not below tests/"
+    assert list(TESTS.glob(name)), f"a page names {name}, which is not below tests/"
 
 
 def test_every_file_of_tests_promises_is_named() -> None:
-    named = {path for name in NAMED.findall(PAGE.read_text()) for path in TESTS.glob(name)}
+    named = {path for name in NAMED.findall(TEXT) for path in TESTS.glob(name)}
     assert sorted(set(TESTS.glob("promises/test_*.py")) - named) == []
 
 
@@ -36,7 +38,7 @@ def test_every_promise_names_a_test() -> None:
     found = list(rows())
     assert len(found) > 20
     without = [cells[0] for cells in found if len(cells) != 3 or not NAMED.search(cells[2])]
-    assert without == ["Bad input is one sentence, with the documented exit code, and leaves everything as it was."]
+    assert without == ["Bad input gives one sentence and the documented exit code, and leaves everything as it was."]
 
 
 def test_every_promise_states_how_it_is_kept() -> None:

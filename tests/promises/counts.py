@@ -1,6 +1,6 @@
 """How much was tried, and what came of it: counted by tests in any process, summed up for a page.
 
-python -m tests.promises.counts COUNTS [--write docs/promises.md]
+python -m tests.promises.counts COUNTS [--write docs/benchmarks/faults.md]
 """
 
 from __future__ import annotations
