@@ -20,8 +20,10 @@ import tacpipe
 from tacpipe.io.parquet import from_parquet
 from tacpipe.plugins import given_params, registry
 from tacpipe.tasks.calibrated import Asked
+from tacpipe.tasks.touch import calibration as touch_calibration
+from tacpipe.tasks.touch import evaluation as touch_evaluation
 from tacpipe.tasks.touch import headline as headlines
-from tacpipe.tasks.touch import task as touch
+from tacpipe.tasks.touch import training as touch_training
 from tacpipe.tasks.touch.report.uncertainty import Measured, measured
 from tacpipe.tasks.touch.result_names import CONSTANT, COVERAGE, MODEL, OBJECT_MEAN
 
@@ -69,9 +71,9 @@ def _evaluated(parts: Mapping[str, Any], seed: int) -> pd.DataFrame:
     options = {**OPTIONS, "seed": seed}
     params = given_params.build("train.touch", registry.load("train.touch"), options=options)
     with tempfile.TemporaryDirectory() as workspace:
-        model = touch.train(params, parts["train"], parts["val"], Path(workspace))
-    model = touch.calibrate(model, ASKED, parts["train"], parts["val"])
-    found: pd.DataFrame = from_parquet(touch.evaluate(model, parts["test"]).files[COVERAGE]).to_pandas()
+        model = touch_training.train(params, parts["train"], parts["val"], Path(workspace))
+    model = touch_calibration.calibrate(model, ASKED, parts["train"], parts["val"])
+    found: pd.DataFrame = from_parquet(touch_evaluation.evaluate(model, parts["test"]).files[COVERAGE]).to_pandas()
     return found
 
 

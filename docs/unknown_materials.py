@@ -24,7 +24,9 @@ import numpy as np
 import tacpipe
 from tacpipe.plugins import given_params, registry
 from tacpipe.tasks.calibrated import Asked
-from tacpipe.tasks.material import task as material
+from tacpipe.tasks.material import calibration as material_calibration
+from tacpipe.tasks.material import evaluation as material_evaluation
+from tacpipe.tasks.material import training as material_training
 
 ARCHITECTURES = ("minirocket", "statistics")
 FOLDS = 5
@@ -95,9 +97,9 @@ def _evaluated(parts: list[Any], about: tuple[int, int, str]) -> list[dict[str, 
     options = {"architecture": architecture, "use_validation": False, "baselines": False}
     params = given_params.build("train.material", registry.load("train.material"), options=options)
     with tempfile.TemporaryDirectory() as workspace:
-        model = material.train(params, parts[0], parts[1], Path(workspace))
-    model = material.calibrate(model, ASKED, parts[0], parts[1])
-    tree = json.loads(material.evaluate(model, parts[2]).files["metrics.json"])
+        model = material_training.train(params, parts[0], parts[1], Path(workspace))
+    model = material_calibration.calibrate(model, ASKED, parts[0], parts[1])
+    tree = json.loads(material_evaluation.evaluate(model, parts[2]).files["metrics.json"])
     known = json.loads(model["config.json"])["known"]
     return [
         {

@@ -44,10 +44,10 @@ def calibrate(params: Params, model: Model, train: Dataset, val: Dataset) -> Res
     from tacpipe.tasks.calibrated import Asked
 
     task = model_files.task(model.files)
-    if not hasattr(task, "calibrate"):
-        name = model_files.tree(model.files, model_files.CONFIG)["task"]
-        raise UsageError(f"The task {name} has no calibration: its module needs a function calibrate.")
+    calibration = task.calibration
+    if calibration is None:
+        raise UsageError(f"Models of the task {task.name} cannot be calibrated. Give a model of another task.")
     asked = Asked(tuple(LEVELS.items(params.quantiles)), params.promise, params.false_unknown, params.seed)
     files = {name: model.files[name] for name in model.files}
     with model_files.validated("the model"):
-        return Result(files=task.calibrate(files, asked, train, val))
+        return Result(files=calibration.calibrate(files, asked, train, val))

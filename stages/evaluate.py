@@ -51,11 +51,11 @@ def evaluate(params: Params, model: Model, recordings: Dataset) -> Result:
         result = _live(model, recordings)
     else:
         with model_files.validated("the model"):
-            result = task.evaluate(model.files, recordings)
+            result = task.evaluate(model, recordings)
     if headline.FILE not in result.files:  # of a task of another package that has none
         return result
-    found = summary.write(headline.read(result.files[headline.FILE]), getattr(task, "SHORT_NAMES", {}))
-    return dataclasses.replace(result, files={**result.files, summary.FILE: found})
+    summarized = summary.write(headline.read(result.files[headline.FILE]), task.short_names)
+    return dataclasses.replace(result, files={**result.files, summary.FILE: summarized})
 
 
 def _live(model: Model, recordings: Dataset) -> Result:

@@ -10,17 +10,18 @@ Example: tacpipe predict models/forward data/segments -o data/predictions
 
 from __future__ import annotations
 
-import inspect
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from tacpipe.plugins.constraints import CommaList, PositiveInt
 from tacpipe.plugins.params import added
 from tacpipe.plugins.stage import stage
+from tacpipe.tasks.task import PredictionRequest
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset, Model
     from tacpipe.plugins.stage import Result
+    from tacpipe.tasks.task import Task
 
 STEPS = CommaList(PositiveInt, least=1)
 
@@ -55,21 +56,19 @@ def predict(params: Params, model: Model, recordings: Dataset) -> Result:
         return _causal(params, model, recordings, steps, quantiles)
     task = model_files.task(model.files)
     with model_files.validated("the model"):
-        result: Result = task.predict(model.files, recordings, steps, **_asked(task, params, quantiles))
-    return result
+        request = PredictionRequest(steps, quantiles, params.probabilities, params.allow_look_ahead)
+        _refuse_unstated(task, request)
+        return task.predict(model, recordings, request)
 
 
-def _asked(task: Any, params: Params, quantiles: list[int]) -> dict[str, Any]:
-    """Return what is asked for beyond the steps, as a task's ``predict`` takes it."""
+def _refuse_unstated(task: Task, request: PredictionRequest) -> None:
+    """Raise `UsageError` for a kind of uncertainty that no model of the task states."""
     from tacpipe.errors import UsageError
 
-    asked = {"quantiles": quantiles, "probabilities": params.probabilities}
-    given = {name: value for name, value in asked.items() if value}
-    known = inspect.signature(task.predict).parameters
-    for name in given:
-        if name not in known:
-            raise UsageError(f"Models of this task have no {name}; leave out --{name}.")
-    return given
+    requested = {"quantiles": bool(request.quantiles), "probabilities": request.probabilities}
+    for name in [name for name, wanted in requested.items() if wanted]:
+        if task.calibration is None or task.calibration.states != name:
+            raise UsageError(f"Models of the task {task.name} have no {name}; leave out --{name}.")
 
 
 def _causal(params: Params, model: Model, recordings: Dataset, steps: list[int], quantiles: list[int]) -> Result:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
@@ -13,11 +13,12 @@ from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io.hashing import digest
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
-from tacpipe.tasks.forward import task as forward
-from tacpipe.tasks.material import task as material
-from tacpipe.tasks.touch import task as touch
+from tacpipe.tasks.forward import prediction as forward_prediction
+from tacpipe.tasks.material import prediction as material_prediction
+from tacpipe.tasks.touch import prediction as touch_prediction
 from tacpipe.tasks.touch.params import Trees
 from tests.asked import asked
+from tests.fake_recordings import FakeDataset
 from tests.stages.learning_fakes import motion
 from tests.tasks.forward import trials
 from tests.tasks.material import textures
@@ -183,8 +184,10 @@ def older(files: Mapping[str, bytes], name: str, **changed: Any) -> dict[str, by
     return {**files, "config.json": json.dumps(config).encode()}
 
 
-def metrics(task: Any, files: Mapping[str, bytes], recordings: Any) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads(task.evaluate(files, recordings).files["metrics.json"])
+def metrics(task: str, files: Mapping[str, bytes], recordings: Any) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(
+        registry.load_task(task).evaluate(cast(Any, FakeDataset({}, files, {})), recordings).files["metrics.json"]
+    )
     return found
 
 
@@ -192,16 +195,16 @@ def metrics(task: Any, files: Mapping[str, bytes], recordings: Any) -> dict[str,
 def test_a_forecaster_of_before_is_evaluated_and_predicts(architecture: str, tmp_path: Path) -> None:
     files, recordings = trials.trained(tmp_path, architecture=architecture), trials.dataset(motion(20))
     before = older(files, "train.forward", **({"loss": "squared"} if architecture == "recurrent" else {}))
-    assert metrics(forward, before, recordings) == metrics(forward, files, recordings)
-    assert set(forward.predict(before, recordings, [1]).recordings) == {motion(20).name}
+    assert metrics("forward", before, recordings) == metrics("forward", files, recordings)
+    assert set(forward_prediction.predict(before, recordings, [1]).recordings) == {motion(20).name}
 
 
 @pytest.mark.parametrize("architecture", ["minirocket", "raec", "x-lstm", "spectra"])
 def test_a_classifier_of_before_is_evaluated_and_predicts(architecture: str, tmp_path: Path) -> None:
     files, recordings = textures.trained(tmp_path, architecture=architecture), textures.slides(8, 2)
     before = older(files, "train.material")
-    assert metrics(material, before, recordings) == metrics(material, files, recordings)
-    assert material.predict(before, recordings, [1]).recordings
+    assert metrics("material", before, recordings) == metrics("material", files, recordings)
+    assert material_prediction.predict(before, recordings, [1]).recordings
 
 
 @pytest.mark.parametrize("architecture", ["tree-ensemble", "patches", "pointnet"])
@@ -209,6 +212,6 @@ def test_a_model_of_touch_of_before_is_evaluated_and_predicts(architecture: str,
     changed = handmade.POINTNET if architecture == "pointnet" else {"architecture": architecture}
     files, recordings = handmade.trained(tmp_path, **changed), handmade.recordings(6, 1)
     before = older(files, "train.touch", **({} if architecture == "pointnet" else {"inputs": "rgbcont"}))
-    assert metrics(touch, before, recordings) == metrics(touch, files, recordings)
-    (predicted,) = touch.predict(before, recordings, [1]).recordings.values()
+    assert metrics("touch", before, recordings) == metrics("touch", files, recordings)
+    (predicted,) = touch_prediction.predict(before, recordings, [1]).recordings.values()
     assert predicted.streams[""].column("recording").to_pylist() == sorted(recordings.recordings)

@@ -60,7 +60,51 @@ def test_an_unknown_stage_is_a_usage_error() -> None:
         registry.load_task("polish")
 
 
-def test_the_report_of_a_task_comes_from_the_plug_in_that_brings_the_task(
+OWN_TASK = """
+from dataclasses import dataclass
+
+from tacpipe import Dataset, Result, stage
+from tacpipe.comparison.specification import TaskReport
+from tacpipe.report.blocks import Fold, Note
+from tacpipe.tasks.task import Task
+
+
+@dataclass(frozen=True)
+class Params:
+    springs: int = 2  # number of springs
+
+
+class WeighingReport(TaskReport):
+    title = "weights of objects"
+
+    def folds(self, context):
+        return [Fold("Scales", [Note(f"{len(context.bare)} scales")])]
+
+
+class Weighing(Task):
+    name = "weighing"
+
+    @staticmethod
+    @stage(version=3)
+    def train(params: Params, train: Dataset) -> Result:
+        \"\"\"Train a scale.\"\"\"
+
+    def evaluate(self, model, recordings):
+        pass
+
+    predict = load = evaluate
+
+    @property
+    def report(self):
+        return WeighingReport(self.name)
+
+
+class Unfinished(Task):
+    name = "unfinished"
+"""
+
+
+def test_the_parts_of_a_task_come_from_the_plug_in_that_brings_the_task(
     lab: Lab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     import json
@@ -69,19 +113,22 @@ def test_the_report_of_a_task_comes_from_the_plug_in_that_brings_the_task(
     from tests.fake_recordings import FakeDataset
 
     (tmp_path / "own" / "own.egg-info").mkdir(parents=True)
-    (tmp_path / "own/own.egg-info/entry_points.txt").write_text("[tacpipe.reports]\nweighing = own_report\n")
-    (tmp_path / "own/own_report.py").write_text(
-        "from tacpipe.report.blocks import Fold, Note\n\nTITLE = 'weights of objects'\n\n\n"
-        "def read(results):\n    return []\n\n\n"
-        "def folds(context):\n    return [Fold('Scales', [Note(f'{len(context.bare)} scales')])]\n"
+    (tmp_path / "own/own.egg-info/entry_points.txt").write_text(
+        "[tacpipe.tasks]\nweighing = own_task:Weighing\nunfinished = own_task:Unfinished\nold = own_task\n"
     )
+    (tmp_path / "own/own_task.py").write_text(OWN_TASK)
     monkeypatch.syspath_prepend(tmp_path / "own")
     forget()
     files = {"metrics.json": b"{}", "config.json": json.dumps({"task": "weighing"}).encode()}
     result: Any = FakeDataset({}, files, {})
     text = page.render([result, result]).decode()
     assert "Weights of objects" in text and "2 scales" in text
-    assert registry.load_report("unheard-of") is None
+    assert registry.load("train.weighing").version == 3
+    assert "Train a scale." in lab.run("train --help").out
+    assert "number of springs" in lab.run("train weighing --help").out
+    for name in ("unfinished", "old"):
+        with pytest.raises(TacpipeError, match=r"not a task .*subclass of tacpipe\.tasks\.task\.Task"):
+            registry.load_task(name)
 
 
 def test_no_module_outside_of_a_task_s_own_packages_names_a_task() -> None:
@@ -108,11 +155,9 @@ def test_no_module_outside_of_tasks_reports_formats_and_simulation_names_a_stage
 
 
 def test_the_demo_runs_the_part_of_every_task_and_one_page_of_their_results(lab: Lab) -> None:
-    from tacpipe.plugins.registry import demos
     from tacpipe.simulation import demo
 
     *commands, last = demo.commands(Path("out"))
-    assert list(demos()) == registry.tasks()
     assert {words[1] for words in commands if words[0] == "train"} == set(registry.tasks())
     evaluated = [words[-1] for words in commands if words[0] == "evaluate"]
     assert last[: len(evaluated) + 1] == ["report", *evaluated]

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -16,7 +16,6 @@ from tacpipe.datasets import replacing
 from tacpipe.datasets.streams import describe_streams
 from tacpipe.errors import UsageError
 from tacpipe.io import terminal
-from tacpipe.printable import plain
 
 if TYPE_CHECKING:
     from tacpipe.clouds.candidates import Candidate
@@ -126,17 +125,15 @@ def _predict_grasp(path: Path) -> Callable[[Cloud, Grasp], Row]:
     from tacpipe.datasets import model_files
     from tacpipe.plugins import registry
 
-    files = tacpipe.open(path).files
-    task = model_files.tree(files, model_files.CONFIG).get("task") if model_files.CONFIG in files else None
-    predict: Any = None if task is None else getattr(registry.load_task(str(task)), "predict_grasp", None)
-    if task is not None and predict is None:
-        able = [name for name in registry.tasks() if hasattr(registry.load_task(name), "predict_grasp")]
+    task = model_files.task(tacpipe.open(path).files, str(path))
+    predict = task.grasp_predictor
+    if predict is None:
+        able = [name for name in registry.tasks() if registry.load_task(name).grasp_predictor is not None]
         raise UsageError(
-            f"{path} is a model of task {plain(str(task))}, which predicts recordings and not single grasps. Give a model "
-            f"of task {' or '.join(able)}: {' or '.join(f'`tacpipe train {name}`' for name in able)} makes one."
+            f"{path} is a model of task {task.name}, which predicts recordings and not single grasps. Give a model of task "
+            f"{' or '.join(able)}: {' or '.join(f'`tacpipe train {name}`' for name in able)} makes one."
         )
-    model = tacpipe.load(path)  # refuses what is not a model
-    return partial(predict, model)
+    return partial(predict, tacpipe.load(path))
 
 
 def _row(rank: int, candidate: Candidate) -> Row:

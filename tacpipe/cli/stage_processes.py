@@ -21,7 +21,6 @@ from typing import TYPE_CHECKING
 from tacpipe.engine import processor
 from tacpipe.engine.executors import forking
 from tacpipe.io import termination
-from tacpipe.plugins import registry
 from tacpipe.training import devices
 
 if TYPE_CHECKING:
@@ -38,6 +37,7 @@ OWN = (
 )
 OTHERS = ("yaml", "pydantic.type_adapter", "pandas")  # by params, by typer, and by pyarrow where it converts a column
 MODULES = OWN + OTHERS
+LEARNING = ("torch", "tacpipe.training.loop")
 _LEARNS = re.compile(r"\btacpipe (train|evaluate|predict|compress autoencoder) ")
 
 
@@ -48,7 +48,7 @@ def modules(commands: Iterable[str]) -> tuple[str, ...]:
     True
     """
     learning = any(_LEARNS.search(command) for command in commands)
-    return (*MODULES, *registry.task_modules()) if learning else MODULES
+    return (*MODULES, *LEARNING) if learning else MODULES
 
 
 class StageProcesses:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from tacpipe.comparison.runs import MODEL, Method, Question, Run, Settings, grouped, separate
-from tacpipe.comparison.specification import Kind, Task, by_task
+from tacpipe.comparison.specification import Kind, TaskReport, by_task, report_on
 from tacpipe.comparison.spread import spread
 from tacpipe.metrics import pairing
 from tacpipe.metrics.headline import Headline
@@ -124,13 +124,13 @@ def compare(results: Sequence[Dataset], *, pool: bool = True) -> list[Comparison
     """
     found = []
     for name, same in by_task(results).items():
-        task = Task(name)
+        task = report_on(name)
         runs = task.read(same)
         found += comparisons(task, grouped(runs, task.usual) if pool else separate(runs))
     return found
 
 
-def comparisons(task: Task, methods: Sequence[Method]) -> list[Comparison]:
+def comparisons(task: TaskReport, methods: Sequence[Method]) -> list[Comparison]:
     """Return one comparison per question and unit of its errors, questions in the order in which runs have them."""
     questions = questions_of([run for method in methods for run in method.runs])
     answers = [
@@ -154,7 +154,7 @@ def questions_of(runs: Sequence[Run]) -> list[Question]:
     return sorted(dict.fromkeys(question for run in most for question in run.questions), key=lambda one: one.place)
 
 
-def compare_on(task: Task, methods: Sequence[Method], question: Question) -> Comparison:
+def compare_on(task: TaskReport, methods: Sequence[Method], question: Question) -> Comparison:
     """Return how methods compare on one question.
 
     Baselines, oracles and controls are those of one method's runs (`reference`), because a split has the same for all; a
@@ -174,10 +174,10 @@ def compare_on(task: Task, methods: Sequence[Method], question: Question) -> Com
             if kind == "model" and one.control:
                 entries.append((one.name, "control", predictor, one))
             elif kind == "model" or kind == "variant":
-                name = one.name if kind == "model" else f"{one.name} · {task.called(predictor)}"
+                name = one.name if kind == "model" else f"{one.name} · {task.predictor_name(predictor)}"
                 entries.append((name, kind, predictor, one))
             elif one is sources[predictor]:
-                entries.append((task.called(predictor), kind, predictor, one))
+                entries.append((task.predictor_name(predictor), kind, predictor, one))
     ranked = [_ranked(task, method, source, question, predictor) for _, _, predictor, method in entries]
     picked = [next(iter(pairs.values())) for (_, kind, *_), pairs in zip(entries, ranked, strict=True)
               if kind == "model" and pairs]  # fmt: skip
@@ -190,7 +190,7 @@ def compare_on(task: Task, methods: Sequence[Method], question: Question) -> Com
     return Comparison(task.name, question, measure, tuple(sorted(rows, key=place)))
 
 
-def reference(task: Task, methods: Sequence[Method], question: Question, measure: Measure) -> Method:
+def reference(task: TaskReport, methods: Sequence[Method], question: Question, measure: Measure) -> Method:
     """Return the method whose runs report on baselines: with most baselines, then most runs, then the least error."""
 
     def place(one: Method) -> tuple[int, int, float]:
@@ -205,7 +205,7 @@ def headline(row: Row, comparison: Comparison) -> Headline | None:
     """Return a row of a method as a headline, with all baselines that it was compared with."""
     question, method = comparison.question, row.method
     source = next((one.method for one in comparison.rows if one.kind == "baseline"), method)
-    task = Task(comparison.task)
+    task = report_on(comparison.task)
     rivals = (
         [row_of_model for row_of_model in comparison.models if row_of_model is not row] if row.kind == "model" else []
     )
@@ -231,7 +231,7 @@ def difference(first: Method, second: Method, question: Question, predictors: tu
     return pairing.difference(measure, one, other, _clusters(first, question))
 
 
-def _ranked(task: Task, method: Method, source: Method, question: Question, predictor: str) -> dict[str, Pair]:
+def _ranked(task: TaskReport, method: Method, source: Method, question: Question, predictor: str) -> dict[str, Pair]:
     """Return a method's own predictor next to each baseline, the best first; nothing for a predictor of another kind."""
     if task.kind(predictor) not in ("model", "variant"):
         return {}
@@ -273,12 +273,12 @@ def _row(
     )
 
 
-def _baselines(task: Task, method: Method, source: Method, question: Question) -> dict[str, Sums]:
+def _baselines(task: TaskReport, method: Method, source: Method, question: Question) -> dict[str, Sums]:
     """Return the baselines of a method's own runs, or else of ``source``, by what tables call them."""
     found = {}
     for name in dict.fromkeys([*method.predictors(question), *source.predictors(question)]):
         if task.kind(name) == "baseline":
-            found[task.called(name)] = method.sums(question, name) or source.sums(question, name)
+            found[task.predictor_name(name)] = method.sums(question, name) or source.sums(question, name)
     return found
 
 

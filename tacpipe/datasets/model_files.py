@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     import torch
 
     from tacpipe.arrays import AnyArray
+    from tacpipe.tasks.task import Task
 
 CONFIG = "config.json"
 MOST = 100_000  # rows, points, units: what no model of touch comes near
@@ -61,8 +62,8 @@ def validated(what: str) -> Iterator[None]:
         ) from error
 
 
-def task(files: Mapping[str, bytes], where: str = "This") -> Any:
-    """Return the module of the task that a model among ``files`` was trained for. Raises `TacpipeError` where none is."""
+def task(files: Mapping[str, bytes], where: str = "This") -> Task:
+    """Return the task that a model among ``files`` was trained for. Raises `TacpipeError` where none is."""
     from tacpipe.plugins import registry
 
     if CONFIG not in files:

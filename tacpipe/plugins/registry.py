@@ -7,13 +7,14 @@ import contextlib
 import functools
 import importlib
 import importlib.util
+import operator
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from configparser import ConfigParser
 from contextvars import ContextVar
 from importlib.machinery import EXTENSION_SUFFIXES, SOURCE_SUFFIXES
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import memory
@@ -23,17 +24,20 @@ from tacpipe.plugins import extras, failures
 from tacpipe.plugins.stage import AnyStage, Stage
 from tacpipe.printable import plain
 
-STAGES, FORMATS, TASKS, SENSORS = "tacpipe.stages", "tacpipe.formats", "tacpipe.tasks", "tacpipe.sensors"
+if TYPE_CHECKING:
+    from tacpipe.tasks.task import Task
+
+STAGES, FORMATS, SENSORS = "tacpipe.stages", "tacpipe.formats", "tacpipe.sensors"
+TASKS = "tacpipe.tasks"  # by name: a subclass of `tacpipe.tasks.task.Task`
 EXPORTS = "tacpipe.exports"
-REPORTS = "tacpipe.reports"  # by the name of a task: the module that reports its results
 EXECUTORS = "tacpipe.executors"
-DEMOS = "tacpipe.demos"  # by the name of a task: what `tacpipe demo` runs of it
 COMMANDS = "tacpipe.commands"  # by the name of a package: the order of its commands, and the lines of its groups
 OWN = "tacpipe"  # the name of its own entry point there
 TRACKERS = "tacpipe.trackers"
 MODELS = "tacpipe.models"  # TASK.NAME: params of an architecture of a task (`tacpipe.plugins.architectures`)
 CODECS = "tacpipe.codecs"  # by the kind of a codec: its class (`tacpipe.codecs.codec.Codec`)
-GROUPS = (STAGES, FORMATS, EXPORTS, TASKS, REPORTS, DEMOS, COMMANDS, SENSORS, EXECUTORS, TRACKERS, MODELS, CODECS)
+GROUPS = (STAGES, FORMATS, EXPORTS, TASKS, COMMANDS, SENSORS, EXECUTORS, TRACKERS, MODELS, CODECS)
+PREFIXES = {FORMATS: "ingest.", EXPORTS: "export.", TASKS: "train."}  # of the stages of other groups
 FIT, PART = ".fit", ".part"  # end the names of what belongs to a stage and has a key of its own
 _used_packages: ContextVar[set[str] | None] = ContextVar("used_packages", default=None)
 
@@ -111,7 +115,7 @@ def plugin_packages() -> dict[str, Path]:
 def package_of_stage(name: str) -> str | None:
     """Return the name of the plug-in package that brings a stage; None for tacpipe's own stages and unknown names."""
     name = whole(name)
-    for group, prefix in ((FORMATS, "ingest."), (EXPORTS, "export."), (STAGES, "")):
+    for group, prefix in (*PREFIXES.items(), (STAGES, "")):
         if name.startswith(prefix) and name.removeprefix(prefix) in entry_points()[group]:
             package = brought_by(group, name.removeprefix(prefix))
             return None if package is None else package.name
@@ -187,11 +191,16 @@ def _entry_point_files(folder: str) -> list[Path]:
 
 @functools.cache
 def stages() -> dict[str, str]:
-    """Return the target of every stage by name; a format ``x`` is the stage ``ingest.x``, an export ``export.x``."""
-    found = entry_points()
-    formats = {f"ingest.{name}": target for name, target in found[FORMATS].items()}
-    exports = {f"export.{name}": target for name, target in found[EXPORTS].items()}
-    return dict(sorted({**found[STAGES], **formats, **exports}.items()))
+    """Return the target of every stage by name.
+
+    A format ``x`` is the stage ``ingest.x``, an export ``export.x``, the member ``train`` of a task ``train.x``.
+    """
+    points = entry_points()
+    targets = dict(points[STAGES])
+    for group, prefix in PREFIXES.items():
+        member = ".train" if group == TASKS else ""
+        targets |= {f"{prefix}{name}": f"{target}{member}" for name, target in points[group].items()}
+    return dict(sorted(targets.items()))
 
 
 def commands() -> dict[str, str]:
@@ -242,31 +251,21 @@ def tasks() -> list[str]:
     return sorted(entry_points()[TASKS])
 
 
-def task_modules() -> list[str]:
-    """Return the names of the modules of all tasks, which import torch."""
-    return sorted(target.partition(":")[0] for target in entry_points()[TASKS].values())
+def load_task(name: str) -> Task:
+    """Return the task of this name.
 
-
-def load_task(name: str) -> Any:
-    """Return the module of the task of this name."""
-    return _named(TASKS, "task", name)
-
-
-def load_report(task: str) -> Any:
-    """Return the module that states how results of a task are compared and reported, None where the task brings none.
-
-    `tacpipe.comparison.specification.Specification` lists what it may hold.
+    Raises `UsageError` if there is none, `TacpipeError` if it cannot be imported or is no subclass of `Task`.
     """
-    target = entry_points()[REPORTS].get(task)
-    return None if target is None else _import(task, target)
-
-
-def demos() -> dict[str, Any]:
-    """Return of each task that brings one the function that describes its part of `tacpipe demo`, by name.
-
-    Called with the folder to write to, it returns a `tacpipe.tasks.demonstration.Demo`.
-    """
-    return {name: _import(name, target) for name, target in sorted(entry_points()[DEMOS].items())}
+    task_class = _named(TASKS, "task", name)
+    try:
+        task: Task = task_class()
+    except TypeError as error:  # a module, an instance, or a class that lacks abstract members
+        target = entry_points()[TASKS][str(name)]
+        raise TacpipeError(
+            f"{target}, registered as task {plain(str(name))}, is not a task ({error}): it must be a subclass of "
+            f"tacpipe.tasks.task.Task."
+        ) from error
+    return task
 
 
 def sensors() -> dict[str, str]:
@@ -358,7 +357,7 @@ def _import(name: str, target: str) -> Any:
     except Exception as error:  # a mistake in a plug-in's module
         raise TacpipeError(f"The module {module} of {name} cannot be loaded. {failures.line(error)}") from error
     try:
-        return getattr(loaded, attribute) if attribute else loaded
+        return operator.attrgetter(attribute)(loaded) if attribute else loaded
     except AttributeError as error:
         raise TacpipeError(f"{module} has no {attribute}, though it is registered as {name}.") from error
 
@@ -384,11 +383,23 @@ def summary(name: str) -> str:
     module, _, attribute = stages()[name].partition(":")
     try:
         tree = ast.parse(source(module).read_text(encoding="utf-8"))
-        functions = {node.name: node for node in tree.body if isinstance(node, ast.FunctionDef)}
-        text = "." in name and attribute in functions and ast.get_docstring(functions[attribute])
+        function = _definition(tree, attribute.split(".")) if "." in name else None
+        text = function and ast.get_docstring(function)
         return (text or ast.get_docstring(tree) or "").split("\n")[0]
     except (OSError, SyntaxError, ValueError, ImportError):
         return "(its module cannot be read)"
+
+
+def _definition(tree: ast.Module, names: Sequence[str]) -> ast.FunctionDef | None:
+    """Return the definition of a function, or of a member of a class, in the code of a module."""
+    body = tree.body
+    for name in names:
+        kinds = ast.FunctionDef if name == names[-1] else ast.ClassDef
+        node = next((node for node in body if isinstance(node, kinds) and node.name == name), None)
+        if isinstance(node, ast.FunctionDef):
+            return node
+        body = [] if node is None else node.body
+    return None
 
 
 def source(module: str) -> Path:

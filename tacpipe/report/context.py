@@ -11,7 +11,7 @@ import numpy as np
 
 from tacpipe.comparison.engine import Comparison, Row
 from tacpipe.comparison.runs import MODEL, Method, Run
-from tacpipe.comparison.specification import Task
+from tacpipe.comparison.specification import TaskReport
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 class Context:
     """The results of one task, compared, and the datasets next to them."""
 
-    task: Task
+    task: TaskReport
     methods: Sequence[Method]
     comparisons: Sequence[Comparison]
     others: Sequence[Dataset] = ()  # that are not results

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from tacpipe.comparison.specification import Task, by_task
+from tacpipe.comparison.specification import TaskReport, by_task, report_on
 from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError
 from tacpipe.report import html
@@ -30,7 +30,7 @@ def render(given: Sequence[Dataset], *, title: str = "", traces: int = 2) -> byt
 def _rendered(given: Sequence[Dataset], title: str, traces: int) -> bytes:
     results = [one for one in given if "metrics.json" in one.files]
     others = [one for one in given if "metrics.json" not in one.files]
-    tasks = {name: Task(name) for name in by_task(results)}
+    tasks = {name: report_on(name) for name in by_task(results)}
     if not results or not all(_users(one, tasks) for one in others):
         raise TacpipeError("There is no metrics.json in this dataset. Give the output of `tacpipe evaluate`.")
     sections = []
@@ -43,6 +43,6 @@ def _rendered(given: Sequence[Dataset], title: str, traces: int) -> bytes:
     )
 
 
-def _users(dataset: Dataset, tasks: Mapping[str, Task]) -> list[str]:
+def _users(dataset: Dataset, tasks: Mapping[str, TaskReport]) -> list[str]:
     """Return the tasks whose section can use a dataset that is not a result."""
-    return [name for name, task in tasks.items() if getattr(task.module, "reads", lambda _: False)(dataset)]
+    return [name for name, task in tasks.items() if task.uses(dataset)]

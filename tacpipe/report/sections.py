@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tacpipe.comparison import engine
 from tacpipe.comparison.engine import Comparison, Row
-from tacpipe.comparison.runs import MODEL, Run, grouped
-from tacpipe.comparison.specification import Task
+from tacpipe.comparison.runs import MODEL, grouped
+from tacpipe.comparison.specification import TaskReport
 from tacpipe.metrics import pairing
 from tacpipe.metrics.pairing import Measure
 from tacpipe.report import blocks, charts, plain, provenance, screen
@@ -36,20 +36,18 @@ PICKED = (
 )
 
 
-def section(task: Task, results: Sequence[Dataset], others: Sequence[Dataset], traces: int) -> Section:
+def section(task: TaskReport, results: Sequence[Dataset], others: Sequence[Dataset], traces: int) -> Section:
     """Return what results of one task state, with datasets that are not results next to them."""
     runs = task.read(results)
     methods = grouped(runs, task.usual)
     compared = {id(one.dataset) for one in runs}
     bare = [one for one in results if id(one) not in compared]
     context = Context(task, methods, engine.comparisons(task, methods), others, bare, traces, runs)
-    own = getattr(task.module, "folds", None)
-    described = getattr(task.module, "sentence", screen.sentence)
-    sentence, verdict = described(context)
+    sentence, verdict = task.sentence(context) or screen.sentence(context)
     unread = [each for number, one in enumerate(bare, 1) for each in plain.folds(one, number, len(bare))]
     folds = [
         *everything(context),
-        *([] if own is None else own(context)),
+        *task.folds(context),
         *recordings(context),
         *every_run(context),
         *unread,
@@ -102,8 +100,7 @@ def headline_caption(measure: Measure) -> str:
 
 
 def _table(context: Context, one: Comparison) -> Table:
-    more = getattr(context.task.module, "columns", None)
-    extra = [] if more is None else more(context, one)  # heads and a function of a row
+    extra = context.task.columns(context, one)
     families: dict[str, list[Row]] = {}
     for row in one.models:
         families.setdefault(row.family, []).append(row)
@@ -202,7 +199,6 @@ def _by_recording(one: Comparison, row: Row) -> list[blocks.Block]:
 
 def every_run(context: Context) -> list[Fold]:
     """Return one row a run."""
-    about: Callable[[Run], Mapping[str, str | Cell]] = getattr(context.task.module, "about_run", lambda _: {})
     rows: list[Sequence[str | Cell]] = []
     for method in context.methods:
         for run in sorted(method.runs, key=lambda run: (str(run.fold), str(run.seed))):
@@ -216,20 +212,19 @@ def every_run(context: Context) -> list[Fold]:
                     number(one.measure.score_of(sums.values())) if sums else NONE,
                     f"{len(sums):,}" if sums else NONE,
                 ]
-            rows.append([*cells, *about(run).values()])
+            rows.append([*cells, *context.task.run_columns(run).values()])
     if not rows:
         return []
     heads: list[str] = ["", "fold", "seed"]
     for one in context.comparisons:
         heads += [f"{one.question.where}: {one.measure.scored}", "recordings"]
-    heads += list(about(context.runs[0]))
+    heads += list(context.task.run_columns(context.runs[0]))
     return fold("Every run", blocks.table("", heads, rows), about=counted(len(rows), "runs"))
 
 
 def basis(context: Context) -> list[Fold]:
     """Return what the numbers rest on and cannot show."""
-    own = getattr(context.task.module, "caveats", None)
-    texts = [] if own is None else list(own(context))
+    texts = list(context.task.caveats(context))
     texts += [PICKED] if len(context.methods) > 1 else []
     texts += [provenance.SIMULATED] if context.simulated else []
     texts += ["No recording above is one that its model was trained on."] if context.runs else []

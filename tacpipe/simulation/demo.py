@@ -12,7 +12,7 @@ EMULATED = "emulated"  # the folder of the emulated rig's own rig file
 
 def commands(output: Path) -> list[list[str]]:
     """Return the commands of each task's demo without the leading ``tacpipe``, and the page of all results."""
-    demos = [describe(output) for describe in registry.demos().values()]
+    demos = [demo for name in registry.tasks() if (demo := registry.load_task(name).demo(output)) is not None]
     given = [*(name for demo in demos for name in demo.results), *(name for demo in demos for name in demo.others)]
     return [*(words for demo in demos for words in demo.commands), ["report", *given, "-o", str(page(output))]]
 

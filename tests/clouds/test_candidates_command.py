@@ -19,7 +19,7 @@ from tacpipe.cli import candidates as candidates_command
 from tacpipe.clouds.candidates import candidates
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
-from tacpipe.tasks.touch.task import predict_grasp
+from tacpipe.tasks.touch.model import grasp_values
 from tests.clouds import shapes
 from tests.conftest import Lab
 
@@ -73,7 +73,7 @@ def test_with_a_model_each_row_has_the_fifty_values_with_their_units(
 
     def load(path: Path) -> Any:
         asked.append(path)
-        return partial(predict_grasp, cast(Any, Model()))
+        return partial(grasp_values, cast(Any, Model()))
 
     monkeypatch.setattr(candidates_command, "_predict_grasp", load)
     value = json.loads(lab.run("candidates bottle.ply --model models/touch --count 3 --json").out)
@@ -89,7 +89,7 @@ def test_with_a_model_each_row_has_the_fifty_values_with_their_units(
 def test_a_terminal_gets_a_table_with_the_mean_of_the_electrodes(
     lab: Lab, bottle: Cloud, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(candidates_command, "_predict_grasp", lambda path: partial(predict_grasp, cast(Any, Model())))
+    monkeypatch.setattr(candidates_command, "_predict_grasp", lambda path: partial(grasp_values, cast(Any, Model())))
     monkeypatch.setattr(candidates_command, "_on_terminal", lambda: True)
     monkeypatch.setenv("COLUMNS", "160")
     printed = lab.run("candidates bottle.ply --model models/touch --count 2").out.splitlines()

@@ -17,7 +17,7 @@ from tacpipe.cli import compare
 from tacpipe.cli.compare import Compared
 from tacpipe.comparison import engine, runs
 from tacpipe.comparison.runs import Question, Run
-from tacpipe.comparison.specification import Task
+from tacpipe.comparison.specification import report_on
 from tacpipe.engine import pipeline
 from tacpipe.metrics import headline
 from tests import older
@@ -37,7 +37,7 @@ def weighed(errors: list[float], path: str, data: str = "d" * 64, **about: Any) 
 
 
 def compared(*given: tuple[str, Run], pool: bool = True) -> Compared:
-    task, every = Task("weighing"), [one for _, one in given]
+    task, every = report_on("weighing"), [one for _, one in given]
     methods = runs.grouped(every) if pool else runs.separate(every)
     return Compared({path: one.dataset for path, one in given}, engine.comparisons(task, methods), pool)
 

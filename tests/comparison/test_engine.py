@@ -10,7 +10,7 @@ from scipy import stats
 
 from tacpipe.comparison import engine
 from tacpipe.comparison.runs import grouped, separate
-from tacpipe.comparison.specification import Task
+from tacpipe.comparison.specification import report_on
 from tacpipe.metrics import pairing, proportions
 from tests.comparison.comparison_fakes import MEAN, QUESTION, run, sums
 
@@ -20,7 +20,7 @@ GOOD = BASE * RNG.uniform(0.5, 0.9, 20)
 
 
 def compared(*runs: object) -> engine.Comparison:
-    return engine.compare_on(Task("weighing"), grouped(runs), QUESTION)  # type: ignore[arg-type]
+    return engine.compare_on(report_on("weighing"), grouped(runs), QUESTION)  # type: ignore[arg-type]
 
 
 def test_the_rows_are_the_methods_and_baselines_with_their_errors_the_best_first() -> None:

@@ -15,7 +15,8 @@ from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
 from tacpipe.plugins.stage import RecordingOutput
 from tacpipe.tasks.calibrated import Asked
-from tacpipe.tasks.forward import task as forward
+from tacpipe.tasks.forward import calibration as forward_calibration
+from tacpipe.tasks.forward import training as forward_training
 from tacpipe.tasks.forward.forecaster import SHRINKAGE, WEIGHTS
 from tacpipe.tasks.forward.live.chain import Chain, Forecast
 from tests.asked import fitting
@@ -93,8 +94,8 @@ def model(
         steps.append(step("compress.pca", components=3, representation=representation))
     trained = {name: value for name, value in values.items() if name not in names}
     params = fitting("train.forward", {**SMALL, **trained})
-    files = half_shrunk(forward.train(params, parts[0], parts[1], folder))
-    return (forward.calibrate(files, ASKED, parts[0], parts[1]) if calibrated else files), steps
+    files = half_shrunk(forward_training.train(params, parts[0], parts[1], folder))
+    return (forward_calibration.calibrate(files, ASKED, parts[0], parts[1]) if calibrated else files), steps
 
 
 def half_shrunk(files: dict[str, bytes]) -> dict[str, bytes]:

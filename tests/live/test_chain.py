@@ -18,7 +18,7 @@ from tacpipe.codecs import tactile
 from tacpipe.codecs.frame_stacking import breaks
 from tacpipe.errors import TacpipeError
 from tacpipe.tasks.forward import prediction, tracks
-from tacpipe.tasks.forward import task as forward
+from tacpipe.tasks.forward import training as forward_training
 from tacpipe.tasks.forward.forecaster import Forecaster
 from tacpipe.tasks.forward.live.chain import BLOCKING, Beginning, Cause, Chain, Forecast
 from tacpipe.tasks.forward.predictors import forecasts
@@ -335,7 +335,9 @@ def test_a_chain_takes_from_the_model_how_long_slow_streams_may_pause(tmp_path: 
     given = FakeRecording(slow, "slow")
     shards = [rigs.segmented(given) for _ in range(2)]
     stages = [rigs.step("synchronize"), rigs.step("segment.contacts")]
-    files = forward.train(fitting("train.forward", rigs.SMALL), dataset(shards[0]), dataset(shards[1]), tmp_path)
+    files = forward_training.train(
+        fitting("train.forward", rigs.SMALL), dataset(shards[0]), dataset(shards[1]), tmp_path
+    )
     gap_ms = json.loads(files["config.json"])["gap_ms"]
     steps = np.diff(slow["xela1"]["t_ns"].to_numpy()) / MS
     assert gap_ms["xela1"] == pytest.approx(2.5 * np.median(steps)) and gap_ms["robot"] == pytest.approx(50.0, abs=90)

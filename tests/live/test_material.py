@@ -24,8 +24,9 @@ from tacpipe.sensors.live import SLIDE, Live
 from tacpipe.sensors.sensor import Samples
 from tacpipe.simulation.slide import Rig, simulate_trial
 from tacpipe.tasks.calibrated import Asked
+from tacpipe.tasks.material import calibration as material_calibration
 from tacpipe.tasks.material import known, prediction
-from tacpipe.tasks.material import task as material
+from tacpipe.tasks.material import training as material_training
 from tacpipe.tasks.material.classifier import Classifier
 from tacpipe.tasks.material.live import opening as material_opening
 from tacpipe.tasks.material.live import replay as material_replay
@@ -66,7 +67,7 @@ def models(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Opened]:
     found = {}
     for kind, params in KINDS.items():
         asked = fitting("train.material", params)
-        found[kind] = Opened(material.train(asked, parts[0], parts[1], tmp_path_factory.mktemp(kind), None))
+        found[kind] = Opened(material_training.train(asked, parts[0], parts[1], tmp_path_factory.mktemp(kind), None))
     return found
 
 
@@ -165,7 +166,9 @@ def test_a_calibrated_model_names_what_predict_answers_or_states_that_the_slide_
     models: dict[str, Opened],
 ) -> None:
     learned, watched = (slides(RIG, indices(RIG, ["biotac"], some), frames=FRAMES) for some in (TRAINED, range(4, 8)))
-    files = material.calibrate(models["statistics"].files, Asked((10, 50, 90), False, 0.1, 0), learned, watched)
+    files = material_calibration.calibrate(
+        models["statistics"].files, Asked((10, 50, 90), False, 0.1, 0), learned, watched
+    )
     fitted = known.unpacked(files[known.FILE], {"biotac": None})
     for moved, cause in ((-1e9, ""), (1e9, UNLIKE)):
         bundles = {name: replace(one, threshold=one.threshold + moved) for name, one in fitted.items()}
@@ -329,7 +332,7 @@ def test_a_model_of_several_sensors_needs_the_name_of_the_rigs(tmp_path: Path) -
     rig = Rig(materials=2, pac=False, arm_every=0)
     parts = [slides(rig, indices(rig, ["biotac", "roboskin"], some), frames=FRAMES) for some in (range(2), [2])]
     model: Any = Opened(
-        material.train(fitting("train.material", KINDS["statistics"]), parts[0], parts[1], tmp_path, None)
+        material_training.train(fitting("train.material", KINDS["statistics"]), parts[0], parts[1], tmp_path, None)
     )
     sensors = {"finger": rigs_of.make("biotac", {}, "finger")}
     with pytest.raises(UsageError, match="--sensor"):

@@ -23,7 +23,7 @@ from tacpipe.recording.station import BEGAN
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.grasps import is_request
 from tacpipe.sensors.live import Live
-from tacpipe.tasks.touch import task as touch
+from tacpipe.tasks.touch import prediction as touch_prediction
 from tacpipe.tasks.touch.live import ranking as touch_ranking
 from tacpipe.tasks.touch.live.engine import WAITING, TouchEngine
 from tacpipe.tasks.touch.live.messages import COLUMNS, TouchMessage
@@ -91,7 +91,7 @@ def predicted(files: Files, cloud: Cloud) -> Any:
         handmade.recording(number, "unseen", felt=False, cloud=cloud, grasp=one)
         for number, one in enumerate(candidates())
     ]
-    table = touch.predict(files, handmade.dataset(*shards)).recordings["predictions"].streams[""]
+    table = touch_prediction.predict(files, handmade.dataset(*shards)).recordings["predictions"].streams[""]
     there = [name for name in COLUMNS if name in table.column_names]
     return there, np.column_stack([table.column(name).to_numpy() for name in there])
 

@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tacpipe.comparison.runs import Errors, Question, Run
+from tacpipe.comparison.specification import TaskReport
 from tacpipe.metrics.pairing import Measure
 
 if TYPE_CHECKING:
     from tacpipe.arrays import AnyFloats
     from tacpipe.datasets.dataset import Dataset
-
-TITLE = "weights of things"
 
 
 def error(sums: AnyFloats) -> AnyFloats:
@@ -37,15 +36,20 @@ WEIGHT = Measure(
 )
 
 
-def read(results: Sequence[Dataset]) -> list[Run]:
-    """Return a run a result: what the model and each baseline err on each thing."""
-    runs = []
-    for result in results:
-        config, errors = (json.loads(result.files[name]) for name in ("config.json", "errors.json"))
-        sums = {
-            predictor: {thing: np.array([grams, 1.0]) for thing, grams in by_thing.items()}
-            for predictor, by_thing in errors.items()
-        }
-        about = {"method": config["architecture"], "settings": config["params"], "seed": config.get("seed")}
-        runs.append(Run(result, "weighing", **about, questions={Question("light things"): Errors(WEIGHT, sums)}))
-    return runs
+class WeighingReport(TaskReport):
+    """The report of the task ``weighing``."""
+
+    title = "weights of things"
+
+    def read(self, results: Sequence[Dataset]) -> list[Run]:
+        """Return a run a result: the errors of the model and of each baseline on each thing."""
+        runs = []
+        for result in results:
+            config, errors = (json.loads(result.files[name]) for name in ("config.json", "errors.json"))
+            sums = {
+                predictor: {thing: np.array([grams, 1.0]) for thing, grams in by_thing.items()}
+                for predictor, by_thing in errors.items()
+            }
+            about = {"method": config["architecture"], "settings": config["params"], "seed": config.get("seed")}
+            runs.append(Run(result, self.name, **about, questions={Question("light things"): Errors(WEIGHT, sums)}))
+        return runs

@@ -21,9 +21,6 @@ import tacpipe
 from tacpipe.errors import TacpipeError
 from tacpipe.models.forest import Forest
 from tacpipe.plugins import registry
-from tacpipe.tasks.forward import task as forward
-from tacpipe.tasks.material import task as material
-from tacpipe.tasks.touch import task as touch
 from tests import chain
 from tests.conftest import tacpipe as ran
 from tests.fake_recordings import FakeDataset
@@ -37,7 +34,6 @@ from tests.tasks.touch import handmade
 Files = dict[str, bytes]
 SMALL = GIB  # memory that refusing a model may take
 ALL = {"targets": "pdc_th,pdc_mf,e_th,e_mf"}
-TASKS: Mapping[str, Any] = {"forward": forward, "material": material, "touch": touch}
 KINDS = (
     *(
         "forward recurrent",
@@ -77,7 +73,7 @@ def made(kind: str) -> Files:
 
 
 def loaded(kind: str, files: Mapping[str, bytes]) -> Any:
-    return TASKS[kind.partition(" ")[0]].load(files)
+    return registry.load_task(kind.partition(" ")[0]).load(files)
 
 
 def evaluated(kind: str, files: Mapping[str, bytes]) -> Any:

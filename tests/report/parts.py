@@ -7,7 +7,7 @@ from typing import Any
 
 from tacpipe.comparison import engine
 from tacpipe.comparison.runs import Method, grouped
-from tacpipe.comparison.specification import Task
+from tacpipe.comparison.specification import report_on
 from tacpipe.report import sections
 from tacpipe.report.blocks import Block, Cell, Chart, Charts, Fold, Note, Section, Table
 from tacpipe.report.context import Context
@@ -15,7 +15,7 @@ from tacpipe.report.context import Context
 
 def section(task: str, *results: Any, others: Sequence[Any] = (), traces: int = 0) -> Section:
     """The section that a page has of results of one task."""
-    return sections.section(Task(task), results, others, traces)
+    return sections.section(report_on(task), results, others, traces)
 
 
 def methods(task: str, *results: Any) -> list[Method]:
@@ -25,7 +25,7 @@ def methods(task: str, *results: Any) -> list[Method]:
 
 def context(task: str, *results: Any) -> Context:
     """The results of one task, compared."""
-    of = Task(task)
+    of = report_on(task)
     runs = of.read(results)
     found = grouped(runs, of.usual)
     return Context(of, found, engine.comparisons(of, found), runs=runs)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -12,9 +13,9 @@ import pytest
 
 from tacpipe.comparison import engine
 from tacpipe.errors import TacpipeError
-from tacpipe.plugins import registry
 from tacpipe.report import html, page
 from tacpipe.report.blocks import Chart, Fold, Note, Section, table
+from tests.conftest import forget
 from tests.fake_recordings import FakeDataset, FakeShard, dataset
 from tests.stages.learning_fakes import motion
 from tests.tasks.forward.report import result_fakes
@@ -24,6 +25,22 @@ from tests.tasks.touch.report import touch_fakes
 pytestmark = pytest.mark.usefixtures("unbundled")
 VOID = ("meta", "br")
 PLUGIN = Path(__file__).parents[1] / "plugin"
+TOY_TASK = """
+from tacpipe.tasks.task import Task
+from toy_report import WeighingReport
+
+class Weighing(Task):
+    name = "weighing"
+
+    def evaluate(self, *_):
+        raise NotImplementedError
+
+    predict = load = evaluate
+
+    @property
+    def report(self):
+        return WeighingReport(self.name)
+"""
 
 
 class Elements(HTMLParser):
@@ -121,10 +138,17 @@ def test_a_task_named_like_a_module_of_the_page_is_one_without_a_specification(t
 
 
 @pytest.fixture
-def weighing(monkeypatch: pytest.MonkeyPatch) -> None:
+def weighing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """The task of the plug-in of a third party, as its entry point gives it."""
-    monkeypatch.syspath_prepend(PLUGIN)
-    monkeypatch.setitem(registry.entry_points()[registry.REPORTS], "weighing", "toy_report")
+    (tmp_path / "toy.egg-info").mkdir()
+    (tmp_path / "toy_task.py").write_text(TOY_TASK)
+    (tmp_path / "toy.egg-info" / "entry_points.txt").write_text("[tacpipe.tasks]\nweighing = toy_task:Weighing\n")
+    with monkeypatch.context() as paths:
+        paths.syspath_prepend(tmp_path)
+        paths.syspath_prepend(PLUGIN)
+        forget()
+        yield
+    forget()
 
 
 def weighed(name: str, off: float, seed: int = 0) -> Any:

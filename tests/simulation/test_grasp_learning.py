@@ -16,7 +16,9 @@ from tacpipe.clouds import geometry
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
 from tacpipe.simulation.grasp_scene import Rig
-from tacpipe.tasks.touch import task as touch
+from tacpipe.tasks.touch import evaluation as touch_evaluation
+from tacpipe.tasks.touch import training as touch_training
+from tacpipe.tasks.touch.model import TouchModel
 from tests.asked import fitting
 from tests.simulation.grasp_datasets import grasps, readings
 
@@ -34,12 +36,12 @@ Metrics = dict[str, Any]
 
 def trained(training: Any, workspace: Path, **changed: Any) -> dict[str, bytes]:
     params = fitting("train.touch", {"trees": 60}, **changed)
-    return touch.train(params, training, None, workspace)
+    return touch_training.train(params, training, None, workspace)
 
 
 def evaluated(training: Any, tested: Any, workspace: Path, **changed: Any) -> Metrics:
     files = trained(training, workspace, **changed)
-    found: Metrics = json.loads(touch.evaluate(files, tested).files["metrics.json"])
+    found: Metrics = json.loads(touch_evaluation.evaluate(files, tested).files["metrics.json"])
     return found
 
 
@@ -47,7 +49,7 @@ def test_a_strong_model_foretells_the_same_wherever_the_object_hand_and_wrist_ar
     tmp_path: Path,
 ) -> None:
     made = grasps(Rig(), range(60))
-    strong = touch.load(trained(made, tmp_path, trees=20, leaf=2))
+    strong = TouchModel.load(trained(made, tmp_path, trees=20, leaf=2))
     rng = np.random.default_rng(0)
     for shard in list(made.recordings.values())[:12]:
         cloud, grasp = Cloud.of(shard.table("cloud")), Grasp.of(shard.table("grasp"))
@@ -155,7 +157,7 @@ def test_more_points_of_a_cloud_make_what_a_network_tells_depend_less_on_which_w
 ) -> None:
     made = grasps(Rig(), range(80))
     files = trained(made, tmp_path, **{**POINTNET, "points": points, "epochs": 5, "draws": 1, "targets": "pdc_th"})
-    network = touch.load(files)
+    network = TouchModel.load(files)
     spread = _spread_over_draws(network, made)
     assert spread > 0
     assert points == 32 or spread < 0.25  # share of what the pressure differs by from grasp to grasp

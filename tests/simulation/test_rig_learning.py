@@ -19,8 +19,8 @@ from tacpipe.arrays import AnyFloats, Bools, Int64s
 from tacpipe.metrics.intervals import skill
 from tacpipe.plugins.registry import load
 from tacpipe.simulation import taxels, trajectory
-from tacpipe.tasks.forward import task as forward
 from tacpipe.tasks.forward import tracks
+from tacpipe.tasks.forward import training as forward_training
 from tacpipe.tasks.forward.forecaster import Forecaster
 from tacpipe.tasks.forward.headline import BASELINE, MODEL
 from tacpipe.tasks.forward.predictors import predicted
@@ -68,7 +68,7 @@ def trials(indices: range, **rig: Any) -> list[FakeShard]:
 
 def trained(folder: Path, training: list[FakeShard], watched: list[FakeShard], **params: Any) -> Forecaster:
     given = fitting("train.forward", SMALL, **params)
-    return Forecaster.load(forward.train(given, dataset(*training), dataset(*watched), folder))
+    return Forecaster.load(forward_training.train(given, dataset(*training), dataset(*watched), folder))
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,8 @@ import pytest
 from tacpipe.arrays import Floats
 from tacpipe.plugins.registry import load
 from tacpipe.simulation.slide import SENSORS, SPECTRA
-from tacpipe.tasks.material import task as material
+from tacpipe.tasks.material import evaluation as material_evaluation
+from tacpipe.tasks.material import training as material_training
 from tests.asked import fitting
 from tests.fake_recordings import FakeRecording
 from tests.tasks.material.textures import Slide, dataset
@@ -54,10 +55,10 @@ def named(spectra: str) -> dict[str, Floats]:
     for seed, held in product(SEEDS, HELD):
         hold_out = "roboskin=" + ",".join(map(str, held))
         params = fitting("train.material", {}, architecture="spectra", hold_out=hold_out, baselines=False)
-        files = material.train(params, dataset(*slides(seed, KNOWN, spectra)), None, Path())
+        files = material_training.train(params, dataset(*slides(seed, KNOWN, spectra)), None, Path())
         for number in held:
             new = [one for one in slides(seed, NEW, spectra) if one.attributes["material"] == number]
-            zero: dict[str, Any] = json.loads(material.evaluate(files, dataset(*new)).files["metrics.json"])[
+            zero: dict[str, Any] = json.loads(material_evaluation.evaluate(files, dataset(*new)).files["metrics.json"])[
                 "zero_shot"
             ]
             assert zero["n"] == {"roboskin": len(NEW)}
@@ -90,7 +91,7 @@ def test_sensors_that_feel_other_materials_name_nothing_for_one_another() -> Non
 @pytest.mark.parametrize("spectra", SPECTRA)
 def test_each_sensor_names_what_it_was_told_whatever_the_other_feels(spectra: str) -> None:
     params = fitting("train.material", {}, architecture="spectra", baselines=False)
-    files = material.train(params, dataset(*slides(0, KNOWN, spectra)), None, Path())
-    metrics = json.loads(material.evaluate(files, dataset(*slides(0, NEW, spectra))).files["metrics.json"])
+    files = material_training.train(params, dataset(*slides(0, KNOWN, spectra)), None, Path())
+    metrics = json.loads(material_evaluation.evaluate(files, dataset(*slides(0, NEW, spectra))).files["metrics.json"])
     assert metrics["model"]["accuracy"]["biotac"] >= 0.95
     assert metrics["model"]["accuracy"]["roboskin"] >= 0.8

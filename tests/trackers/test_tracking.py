@@ -162,7 +162,9 @@ def test_an_unknown_tracker_is_a_usage_error_before_anything_is_trained(lab: Lab
 
 def test_stages_that_train_or_evaluate_can_be_tracked_and_no_others() -> None:
     found = {name for name in registry.stages() if registry.load(name).tracked}
-    built_in = {name for name, target in registry.stages().items() if target.startswith("tacpipe_stages.")}
+    built_in = {
+        name for name, target in registry.stages().items() if target.startswith(("tacpipe.", "tacpipe_stages."))
+    }
     assert found & built_in == {
         *("train.forward", "train.material", "train.touch", "compress.autoencoder", "evaluate"),
     }

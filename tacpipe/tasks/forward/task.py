@@ -1,23 +1,85 @@
-"""The task ``forward`` as a plug-in: train, evaluate, predict and load its models."""
+"""The task ``forward``: which tactile signals follow from the planned motion."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
-from tacpipe.tasks.forward.calibration import calibrate
-from tacpipe.tasks.forward.evaluation import evaluate
-from tacpipe.tasks.forward.forecaster import TASK
-from tacpipe.tasks.forward.model import ForwardModel
-from tacpipe.tasks.forward.prediction import predict
-from tacpipe.tasks.forward.training import notes, train
-from tacpipe.tasks.opened import Chain
+from tacpipe.plugins.stage import stage
+from tacpipe.tasks.forward.params import Params
+from tacpipe.tasks.forward.requirements import REQUIREMENTS
+from tacpipe.tasks.task import Calibration, Demo, Files, PredictionRequest, Task
 
-SHORT_NAMES = {"known objects": "known", "unseen objects": "unseen"}  # of parts, in summary.json
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from tacpipe.comparison.specification import TaskReport
+    from tacpipe.datasets.dataset import Dataset, Model
+    from tacpipe.plugins.stage import Result, Workspace
+    from tacpipe.tasks.forward.model import ForwardModel
+    from tacpipe.tasks.opened import Chain
 
 
-def load(files: Mapping[str, bytes], chain: Chain | None = None) -> ForwardModel:
-    """Return the model among these files, trained behind the stages ``chain``: what `tacpipe.load` returns."""
-    return ForwardModel.load(files, chain)
+class Forward(Task):
+    """Forecasts of tactile signals."""
 
+    name = "forward"
 
-__all__ = ["SHORT_NAMES", "TASK", "ForwardModel", "calibrate", "evaluate", "load", "notes", "predict", "train"]
+    @staticmethod
+    @stage(version=4, requirements=REQUIREMENTS)
+    def train(params: Params, train: Dataset, val: Dataset, workspace: Workspace, init: Model | None = None) -> Result:
+        """Train a model that predicts future tactile signals.
+
+        It reads past tactile signals, past motion and the planned motion. ``init`` is a model to begin with: its weights
+        and scalings are taken over.
+
+        Example: tacpipe train forward data/segments --split data/split -o models/forward
+        """
+        from tacpipe.plugins.stage import Result
+        from tacpipe.tasks.forward import training
+
+        files = training.train(params, train, val, workspace, init.files if init else None)
+        return Result(files=files, notes=training.notes(params, files))
+
+    def evaluate(self, model: Model, recordings: Dataset) -> Result:
+        """Return the errors of forecasts next to those of the baselines; raises as `tacpipe.tasks.forward.evaluation`."""
+        from tacpipe.tasks.forward import evaluation
+
+        return evaluation.evaluate(model.files, recordings)
+
+    def predict(self, model: Model, recordings: Dataset, request: PredictionRequest) -> Result:
+        """Return a table of forecasts for each recording; raises as `tacpipe.tasks.forward.prediction`."""
+        from tacpipe.tasks.forward import prediction
+
+        return prediction.predict(model.files, recordings, request.steps, request.quantiles)
+
+    def load(self, files: Files, chain: Chain | None = None) -> ForwardModel:
+        """Return the model among ``files``, trained behind the stages of ``chain``."""
+        from tacpipe.tasks.forward.model import ForwardModel
+
+        return ForwardModel.load(files, chain)
+
+    @property
+    def short_names(self) -> Mapping[str, str]:
+        """The first words of parts."""
+        return {"known objects": "known", "unseen objects": "unseen"}
+
+    @property
+    def calibration(self) -> Calibration:
+        """Quantiles of each channel at each step ahead."""
+        from tacpipe.tasks.forward.calibration import calibrate
+
+        return Calibration("quantiles", calibrate)
+
+    @property
+    def report(self) -> TaskReport:
+        """Errors by step, recording and situation."""
+        from tacpipe.tasks.forward.report import ForwardReport
+
+        return ForwardReport(self.name)
+
+    def demo(self, output: Path) -> Demo:
+        """Return the chain on simulated recordings, for the default model and that of the paper."""
+        from tacpipe.tasks.forward.demo import demo
+
+        return demo(output)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tacpipe.tasks.demonstration import Demo
+from tacpipe.tasks.task import Demo
 
 MATERIALS, SLIDES = 6, 240  # as many slides of each sensor on each material
 

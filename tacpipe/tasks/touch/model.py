@@ -48,3 +48,13 @@ class TouchModel(Predictor):
                 )
             return self.predict_all(given, [grasp])[0]
         return prediction.predictions(self, opened(given, self.chain), sorted(set(quantiles)))
+
+
+def grasp_values(model: TouchModel, cloud: Cloud, grasp: Grasp) -> dict[str, float]:
+    """Return the 50 predicted values of a grasp on a cloud by column, device counts."""
+    touch = model.predict(cloud, grasp)
+    values: dict[str, float] = {}
+    for finger, pressure, electrodes in (("th", touch.pdc_th, touch.e_th), ("mf", touch.pdc_mf, touch.e_mf)):
+        values[f"pdc_{finger}_counts"] = round(float(pressure), 1)
+        values |= {f"e_{finger}_{n:02d}_counts": round(float(value), 1) for n, value in enumerate(electrodes, 1)}
+    return values

@@ -12,8 +12,10 @@ import pytest
 
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.metrics import headline
+from tacpipe.tasks.forward import evaluation as forward_evaluation
 from tacpipe.tasks.forward import prediction
-from tacpipe.tasks.forward import task as forward
+from tacpipe.tasks.forward import prediction as forward_prediction
+from tacpipe.tasks.forward import training as forward_training
 from tacpipe.tasks.forward.model import ForwardModel
 from tests.fake_recordings import FakeShard, dataset
 from tests.tasks.forward.trials import CONTEXT, HORIZON, params
@@ -55,7 +57,7 @@ def recording(
 def trained(folder: Path, architecture: str = "auto", actions: str = "planned", arm: str = "", **made: Any) -> Any:
     training, validation = (dataset(*(recording(seed, **made) for seed in seeds)) for seeds in (range(3), [10]))
     asked = params(architecture=architecture, actions=actions, arm=arm)
-    return forward.train(asked, training, validation, folder)
+    return forward_training.train(asked, training, validation, folder)
 
 
 @pytest.mark.long
@@ -70,7 +72,7 @@ def test_each_architecture_reads_an_array_of_one_axis_with_and_without_an_arm(
     window, plan, _ = prediction.inputs(loaded, dataset(recording(20, **made)))
     assert plan.shape[1:] == (HORIZON, len(loaded.plan_columns) + len(loaded.derived_columns))
     assert window.shape[1:] == (CONTEXT, len(loaded.window_columns) + len(loaded.derived_columns) + 1)
-    (one,) = forward.predict(model, dataset(recording(20, **made)), [HORIZON]).recordings.values()
+    (one,) = forward_prediction.predict(model, dataset(recording(20, **made)), [HORIZON]).recordings.values()
     levels = loaded.predict(window, plan)
     for channel in range(5):
         stored = one.streams[""].column(f"pad_{channel}_t{HORIZON}").to_numpy()
@@ -108,9 +110,9 @@ def test_an_arm_that_is_not_there_is_a_mistake_of_the_command(tmp_path: Path) ->
 def test_errors_are_given_in_the_unit_of_the_channels(tmp_path: Path) -> None:
     for unit, said in (("kPa", "kPa"), ("count", "counts")):
         model = trained(tmp_path / unit, unit=unit)
-        result = forward.evaluate(model, dataset(recording(20, unit=unit), recording(21, unit=unit)))
+        result = forward_evaluation.evaluate(model, dataset(recording(20, unit=unit), recording(21, unit=unit)))
         assert {one.unit for one in headline.read(result.files[headline.FILE])} == {said}
-        (table, *_) = forward.predict(model, dataset(recording(20, unit=unit)), [1]).recordings.values()
+        (table, *_) = forward_prediction.predict(model, dataset(recording(20, unit=unit)), [1]).recordings.values()
         assert table.streams[""].schema.field("pad_0_t1").metadata[b"unit"] == unit.encode()
         assert ("unit" in json.loads(model["config.json"])["inputs"]) == (unit != "count")
 
@@ -118,10 +120,10 @@ def test_errors_are_given_in_the_unit_of_the_channels(tmp_path: Path) -> None:
 @pytest.mark.long
 def test_channels_that_state_no_taxel_give_another_network_and_a_note(tmp_path: Path) -> None:
     model = trained(tmp_path, declared=False)
-    notes = forward.notes(params(architecture="auto"), model)
+    notes = forward_training.notes(params(architecture="auto"), model)
     assert json.loads(model["config.json"])["architecture"] == "gru"
     assert any("{taxel}" in note for note in notes)
-    assert not any("{taxel}" in note for note in forward.notes(params(architecture="gru"), model))
+    assert not any("{taxel}" in note for note in forward_training.notes(params(architecture="gru"), model))
     with pytest.raises(TacpipeError, match=r"\{taxel\}"):
         trained(tmp_path / "other", "taxelwise", declared=False)
 
@@ -131,4 +133,4 @@ def test_a_model_to_begin_with_must_read_the_same_arm(tmp_path: Path) -> None:
     start = trained(tmp_path / "one", "gru", place="m")
     part = dataset(*(recording(seed, place="m", turned=True) for seed in range(3)))
     with pytest.raises(TacpipeError, match=r"ur_x, ur_y, ur_z and the recordings hold ur_x, ur_y, ur_z, ur_qx"):
-        forward.train(params(architecture="gru"), part, part, tmp_path / "two", start)
+        forward_training.train(params(architecture="gru"), part, part, tmp_path / "two", start)

@@ -17,7 +17,7 @@ from tacpipe.plugins.registry import load as load_stage
 from tacpipe.plugins.stage import Source
 from tacpipe.signals import kinematics
 from tacpipe.tasks.forward import tracks
-from tacpipe.tasks.forward.task import ForwardModel, load
+from tacpipe.tasks.forward.model import ForwardModel
 from tests.conftest import sample_data
 from tests.fake_recordings import FakeRecording, FakeShard, dataset
 from tests.stages.learning_fakes import CHANNELS, REST, motion, table
@@ -58,7 +58,7 @@ def models(latents: Mapping[str, Any], tmp_path_factory: pytest.TempPathFactory)
 
 @pytest.fixture(scope="module")
 def forecaster(models: Mapping[str, Mapping[str, bytes]]) -> ForwardModel:
-    return load(models["gru raw"])
+    return ForwardModel.load(models["gru raw"])
 
 
 def windows(count: int = 3) -> tuple[AnyFloats, AnyFloats]:
@@ -77,7 +77,7 @@ NAMES = ("gru raw", "taxelwise raw", "recurrent raw", "gru levels", "recurrent l
 def test_predict_says_what_is_judged(
     name: str, models: Mapping[str, Mapping[str, bytes]], latents: Mapping[str, Any]
 ) -> None:
-    made = load(models[name])
+    made = ForwardModel.load(models[name])
     shard = TEST if "raw" in name else compressed(TEST, files=latents["levels"].files).recordings[TEST.name]
     found, starts, some = predicted_windows(made, shard)
     predicted = made.predict(*asked(found, starts))
@@ -90,7 +90,7 @@ def test_predict_says_what_is_judged(
 def test_predict_of_increments_says_what_is_judged_but_for_the_first_row_of_a_window(
     models: Mapping[str, Mapping[str, bytes]], latents: Mapping[str, Any]
 ) -> None:
-    made = load(models["gru increments"])
+    made = ForwardModel.load(models["gru increments"])
     shard = compressed(TEST, files=latents["increments"].files, representation="increments").recordings[TEST.name]
     found, starts, some = predicted_windows(made, shard)
     predicted, wanted = made.predict(*asked(found, starts)), some.predictions["model"].count
@@ -127,7 +127,7 @@ def test_the_columns_that_it_names_are_those_that_it_reads(forecaster: ForwardMo
 
 @pytest.mark.parametrize("name", ["gru raw", "taxelwise raw", "recurrent raw"])
 def test_a_quaternion_s_sign_and_length_do_not_matter(name: str, models: Mapping[str, Mapping[str, bytes]]) -> None:
-    made, (window, plan) = load(models[name]), windows()
+    made, (window, plan) = ForwardModel.load(models[name]), windows()
     before = made.predict(window, plan)
     turned = slice(len(CHANNELS) + 3, len(CHANNELS) + 7)
     window[:, 1::2, turned] *= -1
@@ -139,7 +139,7 @@ def test_a_quaternion_s_sign_and_length_do_not_matter(name: str, models: Mapping
 def test_touch_after_now_does_not_change_what_is_predicted_now(
     name: str, models: Mapping[str, Mapping[str, bytes]], latents: Mapping[str, Any]
 ) -> None:
-    made, now = load(models[name]), 40
+    made, now = ForwardModel.load(models[name]), 40
     felt = counts(TEST)
     felt[now + 1 :] += 500
     later = FakeShard(TEST.name, table(felt, poses(TEST)))
@@ -160,7 +160,7 @@ def test_touch_after_now_does_not_change_what_is_predicted_now(
 def test_the_plan_of_a_step_changes_only_it_and_later_ones(
     name: str, models: Mapping[str, Mapping[str, bytes]]
 ) -> None:
-    made, (window, plan) = load(models[name]), windows()
+    made, (window, plan) = ForwardModel.load(models[name]), windows()
     zeros = np.zeros((3, CONTEXT, 7))
     window, plan = np.concatenate([window, zeros], axis=-1), np.concatenate([plan, np.zeros((3, HORIZON, 6))], axis=-1)
     before, changed = made.predict(window, plan), plan.copy()
@@ -201,7 +201,7 @@ def test_what_cannot_be_read_is_one_sentence(
 def test_raw_counts_are_refused_and_counts_above_rest_are_not(
     name: str, models: Mapping[str, Mapping[str, bytes]]
 ) -> None:
-    made, (window, plan) = load(models[name]), windows()
+    made, (window, plan) = ForwardModel.load(models[name]), windows()
     made.predict(window, plan)
     window[1:, :, : len(CHANNELS)] += REST
     with pytest.raises(TacpipeError, match=r"Window 1 holds counts of 1[56]\d\d\d in the median.*level at rest"):
@@ -223,7 +223,7 @@ def test_a_model_that_keeps_no_level_predicts_with_a_warning(models: Mapping[str
     older = ForwardModel.load({**models["gru raw"], "config.json": json.dumps(config).encode()})
     with pytest.warns(UserWarning, match="trained before levels were kept"):
         found = older.predict(*windows())
-    assert np.array_equal(found, load(models["gru raw"]).predict(*windows()))
+    assert np.array_equal(found, ForwardModel.load(models["gru raw"]).predict(*windows()))
 
 
 def published(files: Mapping[str, Path]) -> FakeShard:
@@ -245,7 +245,7 @@ def test_raw_counts_of_published_trials_are_always_refused_and_counts_above_rest
     found = list(ingest.discover(ingest.params(), sample_data() / "xela_flat_pick_move").values())[::4]
     training, watched, *others = (published(dict(files)) for files in found if not isinstance(files, Source))
     asked_for = {"epochs": 1, "stride": 10, "baselines": False}  # trained on one trial, where the limit is least sure
-    made = load(trained(tmp_path, dataset(training), dataset(watched), **asked_for))
+    made = ForwardModel.load(trained(tmp_path, dataset(training), dataset(watched), **asked_for))
     refused = 0
     for shard in [watched, *others]:
         channels = made.codec.channels
@@ -272,7 +272,7 @@ def test_velocities_of_a_panda_s_joints_reach_the_model(tmp_path: Path) -> None:
     pose, joints = panda(80)
     felt = 1000 * (pose[:, :1] - pose[0, :1]) + np.random.default_rng(0).normal(0, 1, (80, len(CHANNELS)))
     shard = FakeShard("panda", table(felt, pose, extra=joints))
-    made = load(trained(tmp_path, dataset(shard), dataset(shard), epochs=1))
+    made = ForwardModel.load(trained(tmp_path, dataset(shard), dataset(shard), epochs=1))
     found, starts, some = predicted_windows(made, shard)
     assert np.allclose(made.predict(*asked(found, starts)), some.predictions["model"].count, atol=0.05)
     assert found.arm[0, 7:].any()

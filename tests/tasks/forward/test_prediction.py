@@ -9,7 +9,8 @@ import pytest
 
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins import registry
-from tacpipe.tasks.forward import task as forward
+from tacpipe.tasks.forward import prediction as forward_prediction
+from tacpipe.tasks.forward.model import ForwardModel
 from tests.fake_recordings import FakeShard, dataset
 from tests.stages.learning_fakes import CHANNELS, motion, table
 from tests.tasks.forward.trials import HORIZON, compressed, predicted_windows, trained
@@ -23,8 +24,8 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
 
 
 def test_each_row_holds_what_the_model_says_of_the_steps_asked_for(model: dict[str, bytes]) -> None:
-    found = forward.predict(model, dataset(TEST), [1, 4]).recordings[TEST.name].streams[""]
-    _, _, some = predicted_windows(forward.load(model), TEST)
+    found = forward_prediction.predict(model, dataset(TEST), [1, 4]).recordings[TEST.name].streams[""]
+    _, _, some = predicted_windows(ForwardModel.load(model), TEST)
     assert found.column_names[:3] == ["t_ns", f"{CHANNELS[0]}_t1", f"{CHANNELS[0]}_t4"]
     assert found.num_columns == 1 + 2 * len(CHANNELS)
     assert found["t_ns"].to_pylist()[:2] == [4 * 20_000_000, 5 * 20_000_000]
@@ -40,22 +41,22 @@ def test_a_model_of_latents_tells_counts(tmp_path: Path) -> None:
     training = compressed(*(motion(seed) for seed in range(3)))
     model = trained(tmp_path, training, compressed(motion(9), files=training.files))
     given = compressed(TEST, files=training.files)
-    found = forward.predict(model, given, [HORIZON]).recordings[TEST.name].streams[""]
+    found = forward_prediction.predict(model, given, [HORIZON]).recordings[TEST.name].streams[""]
     assert found.column_names == ["t_ns", *(f"{name}_t{HORIZON}" for name in CHANNELS)]
     with pytest.raises(TacpipeError, match="another codec"):
-        forward.predict(model, compressed(TEST), [1])
+        forward_prediction.predict(model, compressed(TEST), [1])
 
 
 def test_a_recording_without_a_window_has_a_table_without_rows(model: dict[str, bytes]) -> None:
     short = FakeShard("short", table(np.zeros((3, len(CHANNELS)))))
-    found = forward.predict(model, dataset(short), [1]).recordings["short"].streams[""]
+    found = forward_prediction.predict(model, dataset(short), [1]).recordings["short"].streams[""]
     assert (found.num_rows, found.num_columns) == (0, 1 + len(CHANNELS))
 
 
 @pytest.mark.parametrize("step", [0, HORIZON + 1, -1])
 def test_steps_that_the_model_does_not_reach_are_refused(step: int, model: dict[str, bytes]) -> None:
     with pytest.raises(TacpipeError, match=rf" 1 to {HORIZON} steps ahead, not {step}\."):
-        forward.predict(model, dataset(TEST), [1, step])
+        forward_prediction.predict(model, dataset(TEST), [1, step])
 
 
 def test_the_stage_reads_steps_as_a_list(model: dict[str, bytes]) -> None:

@@ -16,8 +16,8 @@ from tacpipe.errors import TacpipeError
 from tacpipe.io import mapped
 from tacpipe.plugins import registry
 from tacpipe.plugins.params import to_json
-from tacpipe.tasks.forward import task as forward
 from tacpipe.tasks.forward import training
+from tacpipe.tasks.forward import training as forward_training
 from tacpipe.training import checkpoint
 from tests.fake_recordings import FakeShard, dataset
 from tests.stages.learning_fakes import CHANNELS, motion, table
@@ -225,7 +225,7 @@ def test_a_model_begins_with_another_and_remembers_what_that_has_seen(architectu
     asked: dict[str, Any] = {"architecture": architecture, "epochs": 6, "learning_rate": 0.01, "cycle": False}
     first = trained(tmp_path / "first", **asked)
     given = params(**{**asked, "epochs": 1, "learning_rate": 1e-9})
-    tuned = forward.train(given, dataset(motion(5)), dataset(motion(10)), tmp_path / "tuned", first)
+    tuned = forward_training.train(given, dataset(motion(5)), dataset(motion(10)), tmp_path / "tuned", first)
     for name, values in load(first["model.safetensors"]).items():
         assert np.allclose(load(tuned["model.safetensors"])[name], values, atol=1e-6), name
     assert losses(tuned)[0] == pytest.approx(min(losses(first)), rel=1e-4)
@@ -239,7 +239,7 @@ def test_a_model_begins_with_another_and_remembers_what_that_has_seen(architectu
 def test_a_model_that_begins_with_another_is_trained_by_its_own_loss_and_dropout(tmp_path: Path) -> None:
     first = trained(tmp_path / "first")
     found = {
-        name: forward.train(params(**changed), dataset(*TRAIN), dataset(*VAL), tmp_path / name, first)
+        name: forward_training.train(params(**changed), dataset(*TRAIN), dataset(*VAL), tmp_path / name, first)
         for name, changed in (("same", {}), ("loss", {"loss": "squared"}), ("dropout", {"dropout": 0.5}))
     }
     assert losses(found["loss"]) != losses(found["same"])
@@ -256,18 +256,20 @@ def test_a_model_that_begins_with_another_is_trained_by_its_own_loss_and_dropout
 )
 def test_a_model_of_another_shape_is_nothing_to_begin_with(changed: dict[str, Any], said: str, tmp_path: Path) -> None:
     with pytest.raises(TacpipeError, match=said):
-        forward.train(params(**changed), dataset(*TRAIN), dataset(*VAL), tmp_path / "b", trained(tmp_path / "a"))
+        forward_training.train(
+            params(**changed), dataset(*TRAIN), dataset(*VAL), tmp_path / "b", trained(tmp_path / "a")
+        )
 
 
 def test_a_model_of_another_representation_is_nothing_to_begin_with(tmp_path: Path) -> None:
     latents = compressed(*TRAIN)
     first, watched = trained(tmp_path / "a"), compressed(*VAL, files=latents.files)
     with pytest.raises(TacpipeError, match="--init reads raw and the recordings hold PCA-3"):
-        forward.train(params(), latents, watched, tmp_path / "b", first)
+        forward_training.train(params(), latents, watched, tmp_path / "b", first)
     other = compressed(*VAL)
-    model = forward.train(params(), latents, watched, tmp_path / "c")
+    model = forward_training.train(params(), latents, watched, tmp_path / "c")
     with pytest.raises(TacpipeError, match="another codec"):
-        forward.train(params(), other, other, tmp_path / "d", model)
+        forward_training.train(params(), other, other, tmp_path / "d", model)
 
 
 @pytest.mark.parametrize(("of", "name"), [("levels", "PCA-3"), ("increments", "PCA-3 increments")])
@@ -299,14 +301,14 @@ def test_ground_truth_columns_change_nothing(tmp_path: Path) -> None:
 def test_training_without_recordings_windows_or_touch_is_refused(tmp_path: Path) -> None:
     empty, short = dataset(), dataset(motion(1, rows=8))
     with pytest.raises(TacpipeError, match="no training recording"):
-        forward.train(params(), empty, dataset(*VAL), tmp_path)
+        forward_training.train(params(), empty, dataset(*VAL), tmp_path)
     with pytest.raises(TacpipeError, match="validation recordings hold no window"):
-        forward.train(params(), dataset(*TRAIN), empty, tmp_path)
+        forward_training.train(params(), dataset(*TRAIN), empty, tmp_path)
     with pytest.raises(TacpipeError, match="training recordings hold no window"):
-        forward.train(params(), short, dataset(*VAL), tmp_path)
+        forward_training.train(params(), short, dataset(*VAL), tmp_path)
     still = dataset(FakeShard("still", table(np.zeros((40, len(CHANNELS))))))
     with pytest.raises(TacpipeError, match="None of the 12 tactile channels ever moves in 1 training recordings"):
-        forward.train(params(), still, dataset(*VAL), tmp_path)
+        forward_training.train(params(), still, dataset(*VAL), tmp_path)
 
 
 def test_an_error_that_gaps_cause_names_the_stream_and_the_option(tmp_path: Path) -> None:
@@ -315,7 +317,7 @@ def test_an_error_that_gaps_cause_names_the_stream_and_the_option(tmp_path: Path
         for one in TRAIN
     ]
     with pytest.raises(TacpipeError, match=r"training recordings hold no window.*stream sole.*--gap-ms"):
-        forward.train(params(), dataset(*paused), dataset(*VAL), tmp_path)
+        forward_training.train(params(), dataset(*paused), dataset(*VAL), tmp_path)
 
 
 def test_training_on_rows_of_another_rate_or_grid_than_validation_is_refused(tmp_path: Path) -> None:

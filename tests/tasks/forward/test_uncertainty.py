@@ -13,8 +13,11 @@ import pytest
 
 from tacpipe.errors import TacpipeError
 from tacpipe.tasks.calibrated import Asked
+from tacpipe.tasks.forward import calibration as forward_calibration
+from tacpipe.tasks.forward import evaluation as forward_evaluation
 from tacpipe.tasks.forward import prediction
-from tacpipe.tasks.forward import task as forward
+from tacpipe.tasks.forward import prediction as forward_prediction
+from tacpipe.tasks.forward.model import ForwardModel
 from tests.fake_recordings import dataset
 from tests.stages.learning_fakes import CHANNELS, motion
 from tests.tasks.forward.trials import ENSEMBLE, HORIZON, asked, compressed, evaluated, predicted_windows, trained
@@ -31,7 +34,7 @@ def plain(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
 
 def calibrated(files: dict[str, bytes], *, promise: bool = False, count: int = 4) -> dict[str, bytes]:
     how = Asked(PERCENTS, promise, 0.05, 0)
-    return forward.calibrate(files, how, dataset(*TRAINING), dataset(*CALIBRATION[:count]))
+    return forward_calibration.calibrate(files, how, dataset(*TRAINING), dataset(*CALIBRATION[:count]))
 
 
 @pytest.fixture(scope="module")
@@ -42,10 +45,10 @@ def model(plain: dict[str, bytes]) -> dict[str, bytes]:
 def test_a_calibrated_model_predicts_the_same_and_adds_its_quantiles(
     plain: dict[str, bytes], model: dict[str, bytes]
 ) -> None:
-    before = forward.predict(plain, dataset(TEST), [1, 4]).recordings[TEST.name].streams[""]
-    after = forward.predict(model, dataset(TEST), [1, 4]).recordings[TEST.name].streams[""]
+    before = forward_prediction.predict(plain, dataset(TEST), [1, 4]).recordings[TEST.name].streams[""]
+    after = forward_prediction.predict(model, dataset(TEST), [1, 4]).recordings[TEST.name].streams[""]
     assert before.equals(after)
-    found = forward.predict(model, dataset(TEST), [1, 4], [10, 90]).recordings[TEST.name].streams[""]
+    found = forward_prediction.predict(model, dataset(TEST), [1, 4], [10, 90]).recordings[TEST.name].streams[""]
     assert found.select(before.column_names).equals(before)
     assert found.column_names[1:4] == [f"{CHANNELS[0]}_t1", f"{CHANNELS[0]}_t1_q10", f"{CHANNELS[0]}_t1_q90"]
     assert found.schema.field(f"{CHANNELS[0]}_t1_q90").metadata[b"quantile"] == b"0.9"
@@ -54,8 +57,8 @@ def test_a_calibrated_model_predicts_the_same_and_adds_its_quantiles(
 
 
 def test_the_table_and_arrays_have_the_same_quantiles(model: dict[str, bytes]) -> None:
-    table = forward.predict(model, dataset(TEST), [4], PERCENTS).recordings[TEST.name].streams[""]
-    loaded = forward.load(model)
+    table = forward_prediction.predict(model, dataset(TEST), [4], PERCENTS).recordings[TEST.name].streams[""]
+    loaded = ForwardModel.load(model)
     found, starts, _ = predicted_windows(loaded, TEST)
     arrays = loaded.predict(*asked(found, starts), quantiles=PERCENTS)
     assert arrays.shape == (len(starts), HORIZON, len(CHANNELS), 3)
@@ -71,8 +74,8 @@ def test_table_and_arrays_have_the_same_quantiles_where_older_rows_or_no_plan_ar
     changed: dict[str, Any], tmp_path: Path
 ) -> None:
     files = calibrated(trained(tmp_path, **changed))
-    table = forward.predict(files, dataset(TEST), [4], PERCENTS).recordings[TEST.name].streams[""]
-    model = forward.load(files)
+    table = forward_prediction.predict(files, dataset(TEST), [4], PERCENTS).recordings[TEST.name].streams[""]
+    model = ForwardModel.load(files)
     window, plan, _ = prediction.inputs(model, dataset(TEST))
     if "actions" in changed:
         plan = plan[::-1].copy()  # another plan, of which this model reads nothing
@@ -112,8 +115,8 @@ def test_evaluation_reports_quantiles_next_to_those_of_persistence(model: dict[s
 
 def test_pinball_in_metrics_is_that_of_the_predicted_table(model: dict[str, bytes]) -> None:
     tree, _ = evaluated(model, TEST)
-    table = forward.predict(model, dataset(TEST), [2], PERCENTS).recordings[TEST.name].streams[""]
-    _, _, some = predicted_windows(forward.load(model), TEST)
+    table = forward_prediction.predict(model, dataset(TEST), [2], PERCENTS).recordings[TEST.name].streams[""]
+    _, _, some = predicted_windows(ForwardModel.load(model), TEST)
     lost = []
     for channel, name in enumerate(CHANNELS):
         for percent in PERCENTS:
@@ -126,12 +129,12 @@ def test_a_model_without_quantiles_is_evaluated_as_before_and_has_none_to_give(p
     tree, result = evaluated(plain, TEST)
     assert "quantiles" not in tree and "coverage.parquet" not in result.files
     with pytest.raises(TacpipeError, match="tacpipe calibrate"):
-        forward.predict(plain, dataset(TEST), [1], [10])
+        forward_prediction.predict(plain, dataset(TEST), [1], [10])
 
 
 def test_a_level_that_was_not_fitted_is_refused(model: dict[str, bytes]) -> None:
     with pytest.raises(TacpipeError, match="10,50,90, not 25"):
-        forward.predict(model, dataset(TEST), [1], [25])
+        forward_prediction.predict(model, dataset(TEST), [1], [25])
 
 
 def test_four_recordings_can_promise_the_band_and_three_cannot(
@@ -154,7 +157,7 @@ def test_a_model_of_latents_has_quantiles_in_counts(tmp_path: Path) -> None:
     training = compressed(*TRAINING)
     files = trained(tmp_path, training, compressed(motion(10), files=training.files))
     how = Asked(PERCENTS, False, 0.05, 0)
-    made = forward.calibrate(files, how, training, compressed(*CALIBRATION, files=training.files))
+    made = forward_calibration.calibrate(files, how, training, compressed(*CALIBRATION, files=training.files))
     tree, _ = evaluated(made, *compressed(TEST, files=training.files).recordings.values(), files=training.files)
     assert 0.5 < tree["quantiles"]["model"]["coverage"]["mean"] <= 1
 
@@ -162,4 +165,4 @@ def test_a_model_of_latents_has_quantiles_in_counts(tmp_path: Path) -> None:
 def test_quantiles_of_another_model_are_refused(model: dict[str, bytes], tmp_path: Path) -> None:
     other = trained(tmp_path, horizon=2)
     with pytest.raises(TacpipeError, match="other channels or steps"):
-        forward.evaluate({**other, "quantiles.safetensors": model["quantiles.safetensors"]}, dataset(TEST))
+        forward_evaluation.evaluate({**other, "quantiles.safetensors": model["quantiles.safetensors"]}, dataset(TEST))

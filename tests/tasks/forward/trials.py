@@ -17,8 +17,9 @@ from tacpipe.codecs import codec as codecs
 from tacpipe.plugins import registry
 from tacpipe.plugins.stage import Result
 from tacpipe.signals import kinematics
-from tacpipe.tasks.forward import task as forward
+from tacpipe.tasks.forward import evaluation as forward_evaluation
 from tacpipe.tasks.forward import tracks
+from tacpipe.tasks.forward import training as forward_training
 from tacpipe.tasks.forward.forecaster import Forecaster
 from tacpipe.tasks.forward.predictors import Predicted, predicted
 from tests.asked import fitting
@@ -39,7 +40,7 @@ def params(**changed: Any) -> Any:
 def trained(folder: Path, training: Any = None, validation: Any = None, **changed: Any) -> dict[str, bytes]:
     """The files of a small model of swinging arms."""
     training = training or dataset(*(motion(seed) for seed in range(3)))
-    return forward.train(params(**changed), training, validation or dataset(motion(10)), folder)
+    return forward_training.train(params(**changed), training, validation or dataset(motion(10)), folder)
 
 
 def compressed(*shards: FakeShard, files: Mapping[str, bytes] | None = None, representation: str = "levels") -> Any:
@@ -60,7 +61,7 @@ def track(content: pa.Table, name: str = "trial", **attributes: Any) -> tracks.T
 
 def evaluated(model: Mapping[str, bytes], *shards: FakeShard, files: Mapping[str, bytes] | None = None) -> Any:
     """``metrics.json`` and the result of evaluating a model on recordings."""
-    result: Result = forward.evaluate(model, dataset(*shards, files=files))
+    result: Result = forward_evaluation.evaluate(model, dataset(*shards, files=files))
     return json.loads(result.files["metrics.json"]), result
 
 

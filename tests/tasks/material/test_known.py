@@ -11,7 +11,9 @@ import pytest
 
 from tacpipe.errors import TacpipeError
 from tacpipe.tasks.calibrated import Asked
-from tacpipe.tasks.material import task as material
+from tacpipe.tasks.material import calibration as material_calibration
+from tacpipe.tasks.material import prediction as material_prediction
+from tacpipe.tasks.material.model import MaterialModel
 from tests.tasks.material.textures import MATERIALS, dataset, evaluated, slide, slides, trained
 
 FOREIGN = 9  # a material that no model here learns
@@ -35,16 +37,18 @@ def plain(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
 
 @pytest.fixture(scope="module")
 def model(plain: dict[str, bytes]) -> dict[str, bytes]:
-    return material.calibrate(plain, ASKED, slides(0, 8), slides(20, 5))
+    return material_calibration.calibrate(plain, ASKED, slides(0, 8), slides(20, 5))
 
 
 def test_a_calibrated_model_names_the_same_and_adds_probabilities_and_answers(
     plain: dict[str, bytes], model: dict[str, bytes]
 ) -> None:
     asked = slides(40, 2)
-    before, after = (material.predict(one, asked).recordings["predictions"].streams[""] for one in (plain, model))
+    before, after = (
+        material_prediction.predict(one, asked).recordings["predictions"].streams[""] for one in (plain, model)
+    )
     assert before.equals(after)
-    found = material.predict(model, asked, probabilities=True).recordings["predictions"].streams[""]
+    found = material_prediction.predict(model, asked, probabilities=True).recordings["predictions"].streams[""]
     assert found.select(before.column_names).equals(before)
     each = np.column_stack([found[f"probability_{kind:02d}"].to_numpy() for kind in MATERIALS])
     assert each.sum(axis=1) == pytest.approx(1, abs=1e-5)
@@ -76,7 +80,7 @@ def test_evaluation_reports_calibration_and_unknown_next_to_the_accuracy_on_know
 
 
 def test_at_most_the_asked_fraction_of_calibration_slides_is_unknown(model: dict[str, bytes]) -> None:
-    loaded = material.load(model)
+    loaded = MaterialModel.load(model)
     for sensor, some in loaded.read(slides(20, 5)).items():
         assert sum(one == "unknown" for one in loaded.answers(some.frames, sensor)) <= ASKED.false_unknown * len(some)
 
@@ -91,7 +95,7 @@ def test_slides_of_unknown_materials_whose_labels_are_text_are_evaluated_too(tmp
         )
 
     files = trained(tmp_path, named(slides(0, 8)), named(slides(20, 5)), use_validation=False, label="object")
-    made = material.calibrate(files, ASKED, named(slides(0, 8)), named(slides(20, 5)))
+    made = material_calibration.calibrate(files, ASKED, named(slides(0, 8)), named(slides(20, 5)))
     tree, _ = evaluated(made, both(named(slides(40, 2)), named(others())))
     assert tree["unknown"]["biotac"]["false_known_n"] == 4
 
@@ -103,7 +107,7 @@ def test_slides_of_unknown_materials_alone_leave_no_accuracy_to_report(model: di
 
 def test_a_model_that_is_not_calibrated_has_no_answers_and_refuses_other_materials(plain: dict[str, bytes]) -> None:
     with pytest.raises(TacpipeError, match="tacpipe calibrate"):
-        material.predict(plain, slides(40, 1), probabilities=True)
+        material_prediction.predict(plain, slides(40, 1), probabilities=True)
     with pytest.raises(TacpipeError, match="not one of those the model names"):
         evaluated(plain, both(slides(40, 1), others()))
 
@@ -111,24 +115,26 @@ def test_a_model_that_is_not_calibrated_has_no_answers_and_refuses_other_materia
 def test_validation_slides_that_the_model_learned_from_are_refused(tmp_path: Path) -> None:
     files = trained(tmp_path, slides(0, 8), slides(20, 5))
     with pytest.raises(TacpipeError, match="--no-use-validation"):
-        material.calibrate(files, ASKED, slides(0, 8), slides(20, 5))
+        material_calibration.calibrate(files, ASKED, slides(0, 8), slides(20, 5))
 
 
 def test_too_few_slides_for_the_asked_fraction_are_refused(plain: dict[str, bytes]) -> None:
     how = Asked((10, 50, 90), False, 0.01, 0)
     with pytest.raises(TacpipeError, match=r"20 validation slides cannot set a threshold .* takes 99 or more"):
-        material.calibrate(plain, how, slides(0, 8), slides(20, 5))
+        material_calibration.calibrate(plain, how, slides(0, 8), slides(20, 5))
 
 
 def test_a_network_is_calibrated_as_any_architecture(tmp_path: Path) -> None:
     files = trained(tmp_path, slides(0, 8), slides(20, 5), architecture="x-lstm", scaling="standard")
-    tree, _ = evaluated(material.calibrate(files, ASKED, slides(0, 8), slides(20, 5)), both(slides(40, 2), others()))
+    tree, _ = evaluated(
+        material_calibration.calibrate(files, ASKED, slides(0, 8), slides(20, 5)), both(slides(40, 2), others())
+    )
     assert set(tree["calibration"]) == set(SENSORS)
 
 
 def test_probabilities_of_arrays_are_those_of_the_table(model: dict[str, bytes]) -> None:
-    loaded = material.load(model)
-    table = material.predict(model, slides(40, 1), probabilities=True).recordings["predictions"].streams[""]
+    loaded = MaterialModel.load(model)
+    table = material_prediction.predict(model, slides(40, 1), probabilities=True).recordings["predictions"].streams[""]
     ((_, some),) = list(loaded.read(slides(40, 1, ("roboskin",))).items())
     rows = [at for at, name in enumerate(table["sensor"].to_pylist()) if name == "roboskin"]
     wanted = np.column_stack([table[f"probability_{kind:02d}"].to_numpy()[rows] for kind in MATERIALS])

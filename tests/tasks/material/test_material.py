@@ -18,11 +18,13 @@ from tacpipe.metrics import headline
 from tacpipe.metrics.proportions import wilson
 from tacpipe.models.statistics_classifier import StatisticsClassifier, View
 from tacpipe.plugins import given_params, registry
+from tacpipe.tasks.material import evaluation as material_evaluation
 from tacpipe.tasks.material import headline as headlines
 from tacpipe.tasks.material import losses
+from tacpipe.tasks.material import prediction as material_prediction
 from tacpipe.tasks.material import slides as slides_of
-from tacpipe.tasks.material import task as material
 from tacpipe.tasks.material.classifier import BASELINES, CONFIG, LAST, WEIGHTS
+from tacpipe.tasks.material.model import MaterialModel
 from tacpipe.training import loop
 from tests.tasks.material.textures import MATERIALS, dataset, evaluated, slide, slides, trained
 
@@ -118,12 +120,12 @@ def test_scores_and_latents_of_a_network_lie_beside_what_it_names(tmp_path: Path
 def test_a_loaded_model_says_what_evaluate_says(tmp_path: Path) -> None:
     files = trained(tmp_path, **RAEC)
     _, result = evaluated(files, slides(8, 1))
-    rows, found = predictions(result), material.load(files)
+    rows, found = predictions(result), MaterialModel.load(files)
     frames = np.column_stack(
         [slide("biotac", 2, 8).table("slide").column(f"channel{number:02d}").to_numpy() for number in range(1, 6)]
     )
     assert found.predict(frames, "biotac").tolist() == [rows["model"][rows["recording"].index("biotac-m02-t008")]]
-    told = predictions(material.predict(files, slides(8, 1, material=None)))
+    told = predictions(material_prediction.predict(files, slides(8, 1, material=None)))
     assert told["material"] == rows["model"]
 
 
@@ -202,7 +204,7 @@ def test_swapped_names_go_through_the_permutation_that_sensors_were_aligned_by(t
     partners = {int(one): other for one, other in json.loads(files[CONFIG])["partners"].items()}
     assert sorted(partners.values()) == list(MATERIALS)
     _, result = evaluated(files, slides(8, 2))
-    rows, found = predictions(result), material.load(files)
+    rows, found = predictions(result), MaterialModel.load(files)
     latents = np.array([rows[f"z{number:02d}"] for number in range(1, 7)], np.float32).T
     for sensor, partner in (("biotac", "roboskin"), ("roboskin", "biotac")):
         at = [i for i, one in enumerate(rows["sensor"]) if one == sensor]
@@ -299,17 +301,17 @@ def test_networks_need_validation_slides(tmp_path: Path) -> None:
 def test_recordings_of_an_unknown_layout_are_refused_when_judged(tmp_path: Path) -> None:
     files = trained(tmp_path)
     with pytest.raises(TacpipeError, match="does not know the sensor digit; it was trained on biotac, roboskin"):
-        material.evaluate(files, dataset(slide("biotac", 1, 8, sensor="digit")))
+        material_evaluation.evaluate(files, dataset(slide("biotac", 1, 8, sensor="digit")))
     with pytest.raises(TacpipeError, match="has 60 channels, among them channel06"):
-        material.evaluate(files, dataset(slide("roboskin", 1, 8, sensor="biotac")))
+        material_evaluation.evaluate(files, dataset(slide("roboskin", 1, 8, sensor="biotac")))
     with pytest.raises(TacpipeError, match="of material 7, "):
-        material.evaluate(files, dataset(slide("biotac", 7, 8)))
+        material_evaluation.evaluate(files, dataset(slide("biotac", 7, 8)))
     with pytest.raises(TacpipeError, match="of the task forward"):
-        material.load({CONFIG: b'{"task": "forward"}'})
+        MaterialModel.load({CONFIG: b'{"task": "forward"}'})
 
 
 def test_slides_of_another_shape_are_refused_by_a_loaded_model(tmp_path: Path) -> None:
-    found = material.load(trained(tmp_path))
+    found = MaterialModel.load(trained(tmp_path))
     with pytest.raises(TacpipeError, match=r"Slides of biotac are \(slide, 40, 5\), not \(1, 40, 4\)"):
         found.predict(np.zeros((40, 4)), "biotac")
     with pytest.raises(UsageError, match="biotac, roboskin"):

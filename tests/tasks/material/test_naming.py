@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.tasks.material import task as material
+from tacpipe.tasks.material import prediction as material_prediction
 from tacpipe.tasks.material.model import MaterialModel
 from tacpipe.tasks.material.naming import UNKNOWN, Naming
 from tacpipe.tasks.material.report import confusion, predictions
@@ -64,7 +64,7 @@ def test_words_give_the_predictions_of_numbers_in_words(tmp_path: Path, key: str
         assert [WORDS[one] for one in tables[0].column(column).to_pylist()] == tables[1].column(column).to_pylist()
     assert "score_cork" in tables[1].column_names and "score_01" in tables[0].column_names
     assert "cork" in other.files["confusion.csv"].decode()
-    predicted = material.predict(by_word, worded(5, 2, key)).recordings["predictions"].streams[""]
+    predicted = material_prediction.predict(by_word, worded(5, 2, key)).recordings["predictions"].streams[""]
     assert predicted.column("material").to_pylist() == tables[1].column("model").to_pylist()
 
 
@@ -82,7 +82,7 @@ def test_slides_of_an_unknown_word_are_refused_by_evaluation_and_read_by_predict
     strange = dataset(slide("biotac", 2, 9, material="tin"))
     with pytest.raises(TacpipeError, match=r"biotac-m02-t009.*tin.*cork"):
         evaluated(model, strange)
-    assert material.predict(model, strange).recordings["predictions"].streams[""].num_rows == 1
+    assert material_prediction.predict(model, strange).recordings["predictions"].streams[""].num_rows == 1
 
 
 @pytest.mark.long

@@ -11,8 +11,9 @@ import pyarrow as pa
 import pytest
 
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.tasks.material import task as material
+from tacpipe.tasks.material import training as material_training
 from tacpipe.tasks.material.classifier import BASELINES, CONFIG, WEIGHTS
+from tacpipe.tasks.material.model import MaterialModel
 from tests.tasks.material.textures import Slide, dataset, evaluated, params
 
 # Two waves, in periods a metre, by which each of eight materials is known.
@@ -51,7 +52,7 @@ def slides(first: int, count: int, **attributes: Any) -> Any:
 
 def trained(folder: Path, training: Any = None, validation: Any = None, **changed: Any) -> dict[str, bytes]:
     asked = params(**{**SPECTRA, **changed})
-    return material.train(asked, training or slides(0, 5), validation or dataset(), folder)
+    return material_training.train(asked, training or slides(0, 5), validation or dataset(), folder)
 
 
 def predictions(result: Any) -> dict[str, list[Any]]:
@@ -131,7 +132,7 @@ def test_a_loaded_model_says_what_evaluate_says(tmp_path: Path) -> None:
     one = slide("roboskin", 2, 5)
     table = one.table("slide")
     frames = np.column_stack([table.column(name).to_numpy() for name in table.column_names])
-    assert material.load(files).predict(frames, "roboskin").tolist() == [
+    assert MaterialModel.load(files).predict(frames, "roboskin").tolist() == [
         rows["model"][rows["recording"].index(one.name)]
     ]
     assert np.isfinite([rows[f"z{number:02d}"] for number in range(1, 18)]).all()

@@ -12,7 +12,8 @@ import pyarrow as pa
 
 from tacpipe.io.hashing import digest
 from tacpipe.plugins.stage import Result
-from tacpipe.tasks.material import task as material
+from tacpipe.tasks.material import evaluation as material_evaluation
+from tacpipe.tasks.material import training as material_training
 from tests.asked import fitting
 from tests.fake_recordings import FakeDataset, FakeRecording
 
@@ -72,12 +73,12 @@ def trained(
     folder: Path, training: Any = None, validation: Any = None, init: Any = None, **changed: Any
 ) -> dict[str, bytes]:
     """The files of a small model."""
-    return material.train(
+    return material_training.train(
         params(**changed), training or slides(0, 6), slides(6, 2) if validation is None else validation, folder, init
     )
 
 
 def evaluated(model: Mapping[str, bytes], recordings: Any) -> tuple[dict[str, Any], Result]:
     """``metrics.json`` and the result of evaluating a model."""
-    result: Result = material.evaluate(model, recordings)
+    result: Result = material_evaluation.evaluate(model, recordings)
     return json.loads(result.files["metrics.json"]), result

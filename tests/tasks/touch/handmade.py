@@ -16,8 +16,9 @@ from tacpipe.clouds.frame import axes
 from tacpipe.clouds.grasp import Grasp
 from tacpipe.io.hashing import digest
 from tacpipe.plugins.stage import Result
+from tacpipe.tasks.touch import evaluation as touch_evaluation
 from tacpipe.tasks.touch import grasps as grasps_of
-from tacpipe.tasks.touch import task as touch
+from tacpipe.tasks.touch import training as touch_training
 from tacpipe.tasks.touch.grasps import Grasps
 from tests.asked import fitting
 from tests.fake_recordings import FakeDataset, FakeRecording
@@ -100,12 +101,12 @@ def params(**changed: Any) -> Any:
 
 def trained(folder: Path, training: Any = None, validation: Any = None, **changed: Any) -> dict[str, bytes]:
     """The files of a small model; without ``validation`` no recording has the role val."""
-    return touch.train(params(**changed), training or recordings(), validation or dataset(), folder)
+    return touch_training.train(params(**changed), training or recordings(), validation or dataset(), folder)
 
 
 def evaluated(model: Mapping[str, bytes], given: Any) -> tuple[dict[str, Any], Result]:
     """``metrics.json`` and the result of evaluating a model."""
-    result: Result = touch.evaluate(model, given)
+    result: Result = touch_evaluation.evaluate(model, given)
     return json.loads(result.files["metrics.json"]), result
 
 

@@ -19,7 +19,7 @@ from tacpipe.channels import biotac_sp
 from tacpipe.errors import TacpipeError
 from tacpipe.metrics import regression
 from tacpipe.plugins.stage import Result
-from tacpipe.tasks.touch import task as touch
+from tacpipe.tasks.touch import evaluation as touch_evaluation
 from tests.tasks.touch.handmade import dataset, evaluated, recording, recordings, trained
 
 PREDICTORS = ("model", "constant", "object_mean", "nearest_in_time")
@@ -224,9 +224,9 @@ def test_the_model_and_its_history_come_along(tmp_path: Path) -> None:
 
 def test_what_cannot_be_judged_is_refused(model: dict[str, bytes], tmp_path: Path) -> None:
     with pytest.raises(TacpipeError, match="no grasp"):
-        touch.evaluate(model, dataset())
+        touch_evaluation.evaluate(model, dataset())
     with pytest.raises(TacpipeError, match="ball-000 has no tactile reading"):
-        touch.evaluate(model, dataset(recording(0, felt=False)))
+        touch_evaluation.evaluate(model, dataset(recording(0, felt=False)))
     bare = trained(tmp_path, **FAST, baselines=False)
     with pytest.raises(TacpipeError, match="--baselines"):
-        touch.evaluate(bare, recordings(6, 1))
+        touch_evaluation.evaluate(bare, recordings(6, 1))

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from tacpipe.errors import TacpipeError
-from tacpipe.tasks.touch import task as touch
+from tacpipe.tasks.touch import prediction as touch_prediction
 from tests.tasks.touch.handmade import cloud, dataset, evaluated, recording, recordings, trained
 
 FAST = {"architecture": "trees", "targets": "pdc_th,e_mf"}
@@ -15,7 +15,7 @@ FAST = {"architecture": "trees", "targets": "pdc_th,e_mf"}
 
 def test_grasps_without_reading_are_told_what_evaluate_tells(tmp_path: Path) -> None:
     files = trained(tmp_path, **FAST)
-    table = touch.predict(files, recordings(6, 2, felt=False)).recordings["predictions"].streams[""]
+    table = touch_prediction.predict(files, recordings(6, 2, felt=False)).recordings["predictions"].streams[""]
     assert table.column_names == ["recording", "pdc_th", *(f"e_mf_{n:02d}" for n in range(1, 25))]
     assert table.column("recording").to_pylist() == ["ball-006", "ball-007", "melon-006", "melon-007"]
     told = evaluated(files, recordings(6, 2))[1].recordings["predictions"].streams["model"]
@@ -25,6 +25,6 @@ def test_grasps_without_reading_are_told_what_evaluate_tells(tmp_path: Path) -> 
 def test_what_is_not_what_the_model_reads_is_refused(tmp_path: Path) -> None:
     files = trained(tmp_path, **FAST)
     with pytest.raises(TacpipeError, match="no grasp to predict"):
-        touch.predict(files, dataset())
+        touch_prediction.predict(files, dataset())
     with pytest.raises(TacpipeError, match="melon-003 has a cloud without colours"):
-        touch.predict(files, dataset(recording(3, "melon", cloud=cloud(3, 0.05, coloured=False))))
+        touch_prediction.predict(files, dataset(recording(3, "melon", cloud=cloud(3, 0.05, coloured=False))))

@@ -16,8 +16,8 @@ from tacpipe.clouds import geometry
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.errors import TacpipeError
 from tacpipe.tasks.touch import members
-from tacpipe.tasks.touch import task as touch
-from tacpipe.tasks.touch.task import Touch, TouchModel
+from tacpipe.tasks.touch.model import TouchModel
+from tacpipe.tasks.touch.predictor import Touch
 from tests.tasks.touch.handmade import OBJECTS, POINTNET, cloud, grasp, grasps, trained
 
 ALL = {"targets": "pdc_th,pdc_mf,e_th,e_mf"}
@@ -32,7 +32,7 @@ KINDS: dict[str, dict[str, Any]] = {
 
 @pytest.fixture(scope="module")
 def models(tmp_path_factory: pytest.TempPathFactory) -> dict[str, TouchModel]:
-    return {name: touch.load(trained(tmp_path_factory.mktemp(name), **changed)) for name, changed in KINDS.items()}
+    return {name: TouchModel.load(trained(tmp_path_factory.mktemp(name), **changed)) for name, changed in KINDS.items()}
 
 
 def flat(one: Touch) -> np.ndarray:
@@ -105,7 +105,7 @@ def test_in_their_units_every_target_varies_the_same() -> None:
 
 
 def test_what_a_model_does_not_foretell_is_not_a_number(tmp_path: Path) -> None:
-    found = touch.load(trained(tmp_path, **POINTNET)).predict(cloud(0), grasp(0))
+    found = TouchModel.load(trained(tmp_path, **POINTNET)).predict(cloud(0), grasp(0))
     assert np.isfinite(found.pdc_th)
     assert np.isnan(found.pdc_mf)
     assert np.isnan(found.e_th).all() and found.e_mf.shape == (24,)

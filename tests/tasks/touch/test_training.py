@@ -13,8 +13,9 @@ from safetensors.torch import load
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.models.forest import Forest
 from tacpipe.plugins.params import to_json
-from tacpipe.tasks.touch import task as touch
 from tacpipe.tasks.touch import training
+from tacpipe.tasks.touch import training as touch_training
+from tacpipe.tasks.touch.model import TouchModel
 from tacpipe.tasks.touch.predictor import BASELINES, CONFIG, HISTORY, WEIGHTS
 from tacpipe.training import checkpoint
 from tests.tasks.touch.handmade import (
@@ -112,7 +113,7 @@ def test_validation_grasps_are_learned_from_where_nothing_is_chosen_by_them(
     assert told["counts"] == ({"train": 14, "val": 0} if joined else {"train": 12, "val": 2})
     assert ("egg" in told["objects"]) == joined
     assert len(told["trained_on"]) == 14
-    assert len(touch.load(files).baselines.objects) == (14 if joined else 12)  # type: ignore[union-attr]
+    assert len(TouchModel.load(files).baselines.objects) == (14 if joined else 12)  # type: ignore[union-attr]
 
 
 def test_of_grasps_kept_for_validation_the_loss_is_told_and_else_that_of_training(tmp_path: Path) -> None:
@@ -183,7 +184,7 @@ def test_several_networks_have_other_first_weights(tmp_path: Path) -> None:
 def test_some_targets_alone_are_told_where_only_they_are_asked_for(changed: dict[str, Any], tmp_path: Path) -> None:
     files = trained(tmp_path, **{**changed, "targets": "e_th,pdc_mf"})
     assert config(files)["targets"] == ["pdc_mf", "e_th"]
-    told = touch.load(files).predict_grasps(grasps(6, 1))
+    told = TouchModel.load(files).predict_grasps(grasps(6, 1))
     assert {target: values.shape for target, values in told.items()} == {"pdc_mf": (2, 1), "e_th": (2, 24)}
     metrics, result = evaluated(files, recordings(6, 2))
     assert list(metrics["model"]["rmse"]) == ["e_th", "pdc_mf"]
@@ -289,7 +290,7 @@ def test_params_that_cannot_be_are_refused_before_anything_is_read(
     changed: dict[str, Any], sentence: str, tmp_path: Path
 ) -> None:
     with pytest.raises(UsageError, match=sentence):
-        touch.train(params(**changed), dataset(), None, tmp_path)
+        touch_training.train(params(**changed), dataset(), None, tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -320,7 +321,7 @@ def test_colours_that_are_to_be_read_must_be_there(changed: dict[str, Any], tmp_
 
 def test_without_training_grasps_or_with_one_alone_there_is_nothing_to_learn(tmp_path: Path) -> None:
     with pytest.raises(TacpipeError, match="There is no training recording"):
-        touch.train(params(), dataset(), None, tmp_path)
+        touch_training.train(params(), dataset(), None, tmp_path)
     with pytest.raises(TacpipeError, match="There are 1 grasps to learn from; there must be 2 or more"):
         trained(tmp_path, dataset(recording(0)), **PATCHES)
 

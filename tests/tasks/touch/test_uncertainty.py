@@ -12,8 +12,10 @@ import pytest
 
 from tacpipe.errors import TacpipeError
 from tacpipe.tasks.calibrated import Asked
+from tacpipe.tasks.touch import calibration as touch_calibration
 from tacpipe.tasks.touch import grasps as grasps_of
-from tacpipe.tasks.touch import task as touch
+from tacpipe.tasks.touch import prediction as touch_prediction
+from tacpipe.tasks.touch.model import TouchModel
 from tests.tasks.touch.handmade import dataset, evaluated, recording, recordings, trained
 
 PERCENTS = (10, 50, 90)
@@ -33,26 +35,28 @@ def watched() -> Any:
 
 @pytest.fixture(scope="module")
 def model(plain: dict[str, bytes], watched: Any) -> dict[str, bytes]:
-    return touch.calibrate(plain, ASKED, recordings(), watched)
+    return touch_calibration.calibrate(plain, ASKED, recordings(), watched)
 
 
 def test_a_calibrated_model_predicts_the_same_and_adds_its_quantiles(
     plain: dict[str, bytes], model: dict[str, bytes]
 ) -> None:
     asked = recordings(80, 2)
-    before, after = (touch.predict(one, asked).recordings["predictions"].streams[""] for one in (plain, model))
+    before, after = (
+        touch_prediction.predict(one, asked).recordings["predictions"].streams[""] for one in (plain, model)
+    )
     assert before.equals(after)
-    found = touch.predict(model, asked, (), [10, 90]).recordings["predictions"].streams[""]
+    found = touch_prediction.predict(model, asked, (), [10, 90]).recordings["predictions"].streams[""]
     assert found.select(before.column_names).equals(before)
     assert found.column_names[1:4] == ["pdc_th", "pdc_th_q10", "pdc_th_q90"]
     assert (found["e_mf_07_q10"].to_numpy() < found["e_mf_07_q90"].to_numpy()).all()
-    assert touch.load(model).uncertainty.percents == PERCENTS  # type: ignore[union-attr]
+    assert TouchModel.load(model).uncertainty.percents == PERCENTS  # type: ignore[union-attr]
 
 
 def test_as_many_values_of_calibration_grasps_lie_below_a_quantile_as_its_level_states(
     model: dict[str, bytes], watched: Any
 ) -> None:
-    loaded = touch.load(model)
+    loaded = TouchModel.load(model)
     assert loaded.uncertainty is not None
     grasps = grasps_of.read(watched)
     for target, bands in loaded.uncertainty.quantiles(loaded.predict_grasps(grasps)).items():
@@ -88,16 +92,16 @@ def test_a_model_without_quantiles_is_evaluated_as_before_and_has_none_to_give(p
     tree, result = evaluated(plain, recordings(80, 2))
     assert "quantiles" not in tree and "coverage.parquet" not in result.files
     with pytest.raises(TacpipeError, match="tacpipe calibrate"):
-        touch.predict(plain, recordings(80, 1), (), [10])
+        touch_prediction.predict(plain, recordings(80, 1), (), [10])
 
 
 def test_grasps_that_the_model_learned_from_are_refused(tmp_path: Path, watched: Any) -> None:
     files = trained(tmp_path, recordings(), watched, **FAST)
     with pytest.raises(TacpipeError, match="--no-use-validation"):
-        touch.calibrate(files, ASKED, recordings(), watched)
+        touch_calibration.calibrate(files, ASKED, recordings(), watched)
 
 
 def test_too_few_grasps_cannot_promise_the_band(plain: dict[str, bytes]) -> None:
     how = Asked(PERCENTS, True, 0.05, 0)
     with pytest.raises(TacpipeError, match="3 calibration grasps can promise a band that holds 75 %"):
-        touch.calibrate(plain, how, recordings(), dataset(*(recording(n) for n in (60, 61, 62))))
+        touch_calibration.calibrate(plain, how, recordings(), dataset(*(recording(n) for n in (60, 61, 62))))

@@ -1,0 +1,180 @@
+"""The interface between tacpipe and a task: what is predicted, from which recordings, and how that is evaluated.
+
+A package brings a task with an entry point of the group ``tacpipe.tasks`` that names a subclass of `Task`. The commands
+``tacpipe train``, ``evaluate``, ``predict``, ``calibrate``, ``report``, ``live`` and ``demo`` work for every such task.
+
+The module of the subclass is imported to print the help of ``tacpipe train NAME`` and to answer from the cache. It imports
+torch, pandas and pyarrow inside of its methods only.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Protocol
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from tacpipe.clouds.cloud import Cloud
+    from tacpipe.clouds.grasp import Grasp
+    from tacpipe.comparison.specification import TaskReport
+    from tacpipe.datasets.dataset import Dataset, Model
+    from tacpipe.live.options import Options
+    from tacpipe.live.process import Engine
+    from tacpipe.plugins.requirements import Requirements
+    from tacpipe.plugins.stage import AnyStage, Result
+    from tacpipe.recording.rig import Rig
+    from tacpipe.sensors.sensor import Sensor
+    from tacpipe.tasks.calibrated import Asked
+    from tacpipe.tasks.opened import Chain
+
+Files = Mapping[str, bytes]  # the files of a model by name
+GraspPredictor = Callable[[Any, "Cloud", "Grasp"], dict[str, float]]
+
+
+class LoadedModel(Protocol):
+    """A model in memory, as `tacpipe.load` returns it."""
+
+    @property
+    def predict(self) -> Callable[..., Any]:
+        """A function of a dataset or a recording that returns the table of ``tacpipe predict``."""
+        ...
+
+
+@dataclass(frozen=True)
+class PredictionRequest:
+    """The predictions that are requested of a model."""
+
+    steps: Sequence[int]  # steps ahead, ascending, for tasks that predict a future
+    quantiles: Sequence[int] = ()  # percent, ascending
+    probabilities: bool = False  # whether calibrated probabilities are added
+    allow_look_ahead: bool = False  # with causal predictions: accept a model that was trained on rows that look ahead
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A task's way to measure how uncertain its models are."""
+
+    states: Literal["quantiles", "probabilities"]  # what a calibrated model states, by its name in `PredictionRequest`
+    # Returns the files of a model, which are given, with those that state its uncertainty, measured on recordings with the
+    # role train and with the role val.
+    calibrate: Callable[[Files, Asked, Dataset, Dataset], dict[str, bytes]]
+
+
+class Demo(NamedTuple):
+    """The part of `tacpipe demo` that shows a task."""
+
+    commands: list[list[str]]  # in their order, each without the leading ``tacpipe``
+    results: list[str]  # paths of results that the page shows
+    others: Sequence[str] = ()  # paths of datasets that the page uses, which are not results
+
+
+class LiveDescription(Protocol):
+    """What a model publishes in a live session."""
+
+    @property
+    def kind(self) -> str:
+        """The kind of its messages."""
+        ...
+
+    def own(self, steps: Sequence[int]) -> dict[str, Mapping[str, Any]]:
+        """Return the streams that the session adds to the rig, by name with the options of the sensor ``live``."""
+        ...
+
+
+class LiveTask(Protocol):
+    """A task's part of a live session, and what reads the recordings of such sessions."""
+
+    def describe(self, model: Dataset, *, allow_look_ahead: bool) -> LiveDescription:
+        """Return what a model publishes, read from its configuration without torch.
+
+        Raises `TacpipeError` where the model was trained on rows that look ahead, unless ``allow_look_ahead``.
+        """
+        ...
+
+    def engine(self, options: Options, model: Dataset, rig: Rig, sensors: Mapping[str, Sensor]) -> Engine:
+        """Return the engine that turns the samples of ``sensors``, by stream, into messages, in the model's process.
+
+        Raises `UsageError` where model, rig and options do not belong together.
+        """
+        ...
+
+    def predict(self, model: Model, recordings: Dataset, request: PredictionRequest) -> Result:
+        """Return what a live session publishes for recordings as they were recorded (``predict --causal``).
+
+        Raises `UsageError` where the task has no such predictions.
+        """
+        ...
+
+    def evaluate(self, model: Model, recordings: Dataset) -> Result:
+        """Return metrics of what live sessions published in their recordings (``evaluate --live``).
+
+        Raises `UsageError` where the task has no such metrics.
+        """
+        ...
+
+
+class Task(ABC):
+    """A task. The abstract members are required; every property without a body in the subclass is an absent capability."""
+
+    name: ClassVar[str]  # as the entry point states it
+    # A stage whose function is in the module of the subclass: its signature, params, version and requirements are those of
+    # ``tacpipe train NAME``. Its result holds ``config.json`` with ``task``, `name`, and ``trained_on``, the digests of the
+    # recordings that the model has seen by name.
+    train: ClassVar[AnyStage]
+
+    @property
+    def params(self) -> Any:
+        """The dataclass of the options of ``tacpipe train``, or a union with one dataclass per architecture."""
+        return self.train.params
+
+    @property
+    def requirements(self) -> Requirements | None:
+        """The streams, quantities and labels that recordings must have; None where the task does not state them."""
+        return self.train.requirements
+
+    @abstractmethod
+    def evaluate(self, model: Model, recordings: Dataset) -> Result:
+        """Return ``metrics.json``, errors by recording and the headline of a model next to its baselines."""
+
+    @abstractmethod
+    def predict(self, model: Model, recordings: Dataset, request: PredictionRequest) -> Result:
+        """Return a table of predictions for each recording, or one of all."""
+
+    @abstractmethod
+    def load(self, files: Files, chain: Chain | None = None) -> LoadedModel:
+        """Return the model among ``files``, which may be untrusted, trained behind the stages of ``chain``."""
+
+    @property
+    def short_names(self) -> Mapping[str, str]:
+        """Names in ``summary.json`` of the parts and targets of headlines; others are written as they are."""
+        return {}
+
+    @property
+    def calibration(self) -> Calibration | None:
+        """How uncertainty is measured; None where it is not."""
+        return None
+
+    @property
+    def live(self) -> LiveTask | None:
+        """The task's part of a live session; None where its models do not run live."""
+        return None
+
+    @property
+    def report(self) -> TaskReport | None:
+        """How results are compared and drawn; None: by their headlines. Its package does not import torch."""
+        return None
+
+    @property
+    def grasp_predictor(self) -> GraspPredictor | None:
+        """A function of a loaded model, a cloud and a grasp that returns predicted values by column with their unit.
+
+        ``tacpipe candidates`` calls it; None where models predict recordings only.
+        """
+        return None
+
+    def demo(self, output: Path) -> Demo | None:
+        """Return the task's part of ``tacpipe demo``, which writes below ``output``; None where it has no part."""
+        return None
