@@ -52,7 +52,7 @@ class Metadata:
 
 @dataclass(frozen=True)
 class Damage:
-    """A sentence about the file that says why reading ended early, or what was not read."""
+    """A sentence about the file with the reason why reading ended early, or with the part that was not read."""
 
     text: str
 
