@@ -72,8 +72,8 @@ def _read_with_pyarrow(path: Path) -> None:
 
 
 def _read_batches(path: Path) -> None:
-    (stream,) = layout.parse(CSV_LAYOUT).streams
-    for _ in reading.batches(rows.opened(path, stream), stream):
+    (stream,) = layout.parse_layout(CSV_LAYOUT).streams
+    for _ in reading.stream_batches(rows.open_rows(path, stream), stream):
         pass
 
 

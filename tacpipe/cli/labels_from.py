@@ -35,7 +35,7 @@ def run(dataset: Path, path: Path, key: str, *, dry_run: bool, as_json: bool) ->
     table: list[label_table.LabelTable] = []
 
     def wanted(known: labels.ByRecording) -> labels.ByRecording:
-        table.append(label_table.read(path, key, known))
+        table.append(label_table.read_label_table(path, key, known))
         return table[-1].by_recording(known)
 
     now, changes = labels.planned(dataset, wanted)

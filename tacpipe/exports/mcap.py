@@ -136,12 +136,12 @@ def _holds_images(table: Columns, name: str) -> bool:
     """Return whether the first entry of a column of bytes is an encoded image."""
     import pyarrow as pa
 
-    from tacpipe.formats.arrays.frames import encoding
+    from tacpipe.formats.arrays.columns import picture_encoding
 
     if not pa.types.is_binary(table.schema.field(name).type):
         return False
     first = next((value.as_py() for value in table.column(name) if value.is_valid and len(value.as_buffer())), b"")
-    return bool(encoding(first))
+    return bool(picture_encoding(first))
 
 
 def _cloud(stream: str, start_ns: int, table: pa.Table) -> list[Topic]:

@@ -20,7 +20,7 @@ from tacpipe.channels.schema import AXES, COMPONENTS
 from tacpipe.exports import cdr
 from tacpipe.exports.cdr import Constant, Part, Texts, Values
 from tacpipe.exports.contents import TIME, about, shown
-from tacpipe.formats.arrays.frames import encoding
+from tacpipe.formats.arrays.columns import picture_encoding
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -119,7 +119,7 @@ def usual_topics(stream: str, table: pa.Table, images: Sequence[str] = ()) -> li
 
     for column in images:
         values = [value or b"" for value in table.column(column).to_pylist()]
-        encodings = list(map(encoding, values))
+        encodings = list(map(picture_encoding, values))
         rows = [row for row, name in enumerate(encodings) if name]
         image: list[Part] = [Texts([encodings[row] for row in rows]), Texts([values[row] for row in rows])]
         name = "image" if len(images) == 1 else f"image/{topic_part(column)}"

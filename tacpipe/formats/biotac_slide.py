@@ -12,14 +12,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.formats.folders import Params
+from tacpipe.formats.published import Params
 from tacpipe.io.files import walk
 from tacpipe.plugins.stage import Files, RecordingOutput, stage
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-RATE_HZ = 100.0  # of the finger; the mean of each published slide is within 0.03 Hz of it
+RATE_HZ = 100.0  # nominal rate of the finger; the means of published slides are within 0.03 Hz of it
 NAME = re.compile(r"mat(\d+)_(\d+)_(bio|cp|cv|cw|jp|jt|jv)\.csv")
 ARM = {  # end of the file's name: stream, columns
     "cp": ("pose", ("posx", "posy", "posz", "ox", "oy", "oz", "ow")),
@@ -41,14 +41,14 @@ def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
         raise TacpipeError(
             f"{source} is not a folder; give the folder that holds the slides, mat1_1_bio.csv and so on."
         )
-    found: dict[str, dict[str, Path]] = {}
+    files_by_slide: dict[str, dict[str, Path]] = {}
     for place, _, names in walk(source):
         for name in names:
             match = NAME.fullmatch(name)
             if match is None:
                 continue
-            files = found.setdefault(recording_name(int(match[1]), int(match[2])), {})
-            same = next((path for other, path in files.items() if other.endswith(f"_{match[3]}.csv")), None)
+            files = files_by_slide.setdefault(recording_name(int(match[1]), int(match[2])), {})
+            same = next((path for file_name, path in files.items() if file_name.endswith(f"_{match[3]}.csv")), None)
             if same is not None:  # mat3_7_bio.csv in two folders, or next to mat03_7_bio.csv
                 raise UsageError(
                     f"{same} and {Path(place) / name} are the same slide. Give the folder that holds one of them."
@@ -56,7 +56,7 @@ def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
             files[name] = Path(place) / name
     slides = {
         recording: dict(sorted(files.items()))
-        for recording, files in sorted(found.items())
+        for recording, files in sorted(files_by_slide.items())
         if any(name.endswith("_bio.csv") for name in files)
     }
     if not slides:
@@ -95,7 +95,7 @@ def biotac_slide(params: Params, files: Files) -> RecordingOutput:
             stream, columns = ARM[match[3]]
             streams[stream] = _arm(path, stream, columns)
     begin = next(iter(streams.values()))["t_ns"]
-    marked = published.mark("biotac-slide", begin[0].as_py() if len(begin) else 0)
+    marked = published.published_attribute("biotac-slide", begin[0].as_py() if len(begin) else 0)
     # all published slides of a material were recorded in a row; of others nobody states it
     session = {"session": f"biotac-m{material:02d}"} if marked else {}
     return RecordingOutput(

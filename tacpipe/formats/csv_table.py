@@ -150,8 +150,8 @@ def _check_header(path: Path, names: Sequence[str], columns: Sequence[str]) -> N
     doubled = sorted(name for name, count in Counter(names).items() if count > 1)
     if doubled:
         raise TacpipeError(f"{path} has more than one column {listed(doubled, 4)}; each name may stand once.")
-    there = set(names)
-    missing = [name for name in columns if name not in there]
+    header_names = set(names)
+    missing = [name for name in columns if name not in header_names]
     if missing:
         raise TacpipeError(
             f"{path} lacks the column {listed(missing, 4)}; its header begins with {', '.join(map(plain, names[:4]))}. "
@@ -200,15 +200,15 @@ def _nanoseconds(path: Path, name: str, column: pa.ChunkedArray) -> Int64s:
 def _check_values(path: Path, name: str, array: Floats, integers: pa.DataType | None, nan: bool) -> None:
     """Raise for the first value of a column that is not allowed."""
     if nan:
-        bad, wanted = np.isinf(array), "a finite number or NaN"
+        bad, expected = np.isinf(array), "a finite number or NaN"
     else:
-        bad, wanted = ~np.isfinite(array), "a finite number"
+        bad, expected = ~np.isfinite(array), "a finite number"
     if integers is not None and not bad.any():
         limits = np.iinfo(integers.to_pandas_dtype())
         bad = (array != np.rint(array)) | (array < limits.min) | (array > limits.max)
-        wanted = f"a whole number from {limits.min} to {limits.max}"
+        expected = f"a whole number from {limits.min} to {limits.max}"
     if bad.any():
         index = int(bad.argmax())
         raise TacpipeError(
-            f"{path}, row {file_row(path, index)}, column {name} holds {array[index]:.12g}; it must be {wanted}."
+            f"{path}, row {file_row(path, index)}, column {name} holds {array[index]:.12g}; it must be {expected}."
         )

@@ -1,14 +1,96 @@
-"""Which recordings are those of a published set, and not a lab's own in the same layout: known by when they were recorded.
+"""Find and name the trials of published sets, and recognise the recordings of a set. Imports nothing heavy.
 
-What a set's paper printed, and what is known of how it was recorded, holds for its recordings alone.
+A recording is recognised by the month in which it was recorded. The figures of a set's paper, and facts about its
+measurement, hold only for its recordings, not for a lab's own in the same layout.
 """
 
 from __future__ import annotations
 
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
+from pathlib import Path
+from typing import Literal
 
+from tacpipe.datasets import recording_names
 from tacpipe.datasets.origin import PUBLISHED
-from tacpipe.plugins.stage import Attribute
+from tacpipe.errors import TacpipeError
+from tacpipe.io.files import walk
+from tacpipe.plugins.stage import Attribute, Files
+from tacpipe.plugins.stream_selection import StreamSelection
+
+PREFIX = "data_sample_"
+
+
+@dataclass(frozen=True)
+class Params(StreamSelection):
+    """How trials are read."""
+
+    # part of the authors' split that this folder is; empty: none
+    authors_role: Literal["", "train", "val", "test"] = ""
+
+
+def trials(source: Path, names: Sequence[str]) -> dict[str, dict[str, Path]]:
+    """Return the trials below ``source``: recording name to file name to path, with only the files that are there.
+
+    A trial is a folder named ``data_sample_…`` or one that holds a file of ``names``; ``source`` may be one itself. The
+    recording's name is the folder's without the prefix; where two folders would share one, the folders above go before.
+    Raises `TacpipeError` if ``source`` is not a folder or holds no trial, `UsageError` where two trials share a name
+    even so.
+    """
+    if not source.is_dir():
+        raise TacpipeError(
+            f"{source} is not a folder; give the folder that holds the trials, each a folder of CSV files."
+        )
+    expected_names = set(names)
+    holds: dict[Path, set[str]] = {}  # expected files that each trial has
+    for place, _, files in walk(source):
+        present_names = expected_names.intersection(files)
+        if present_names or os.path.basename(place).startswith(PREFIX):  # noqa: PTH119  (once a folder, on every hit)
+            holds[Path(place)] = present_names
+    parents = {folder.parent for folder in holds}
+    folders = sorted(folder for folder, present in holds.items() if present or folder not in parents)
+    if not folders:
+        raise TacpipeError(
+            f"{source} holds no trial: no folder in it has {', '.join(names[:3])} or the like. "
+            f"Give the folder of the unpacked data set."
+        )
+    by_name: dict[str, list[Path]] = {}
+    for folder in folders:
+        by_name.setdefault(recording_names.folded(valid(folder.name)), []).append(folder)
+    named_folders: list[tuple[str, Path]] = []
+    for same in by_name.values():
+        for folder in same:
+            name = valid(folder.name)
+            above = folder.relative_to(source).parts[:-1]
+            named_folders.append((name if len(same) == 1 else valid("-".join([*above, name])), folder))
+    recording_names.refuse_shared(named_folders)
+    return {
+        name: {file: folder / file for file in names if file in holds[folder]} for name, folder in sorted(named_folders)
+    }
+
+
+def require(files: Files, names: Sequence[str]) -> str:
+    """Return the name of the trial's folder, as `text`. Raises `TacpipeError` if it lacks one of the files ``names``."""
+    folder = next((path.parent for path in files.values()), None)
+    missing = [name for name in names if name not in files]
+    if missing:
+        place = str(folder) if folder else "A trial folder"
+        raise TacpipeError(f"{place} lacks {' and '.join(missing)}; copy the trial again or leave it out.")
+    assert folder is not None
+    return text(folder.name)
+
+
+def text(name: str) -> str:
+    """Return a name of the file system as text: bytes in it that are not a UTF-8 become U+FFFD."""
+    return os.fsencode(name).decode(errors="replace")
+
+
+def valid(name: str) -> str:
+    """Return a folder's name as that of a recording (`recording_names.valid`), without the prefix of trials."""
+    return recording_names.valid(name.removeprefix(PREFIX) or name) or "trial"
+
 
 MONTHS = {  # first and last month (UTC) in which a set was recorded, by format; one without stamps is known by its layout
     "biotac-slide": ("2020-02", "2020-02"),
@@ -17,13 +99,15 @@ MONTHS = {  # first and last month (UTC) in which a set was recorded, by format;
 }
 
 
-def mark(name: str, t_ns: int | None = None) -> dict[str, Attribute]:
+def published_attribute(name: str, t_ns: int | None = None) -> dict[str, Attribute]:
     """Return the attribute that names the published set of a recording, given its format and its first time stamp (UTC).
 
     Empty for a recording of another time; one of a format without stamps is of the set.
 
-    >>> mark("vision2tactile", 1561629162 * 10**9), mark("vision2tactile", 1861629162 * 10**9), mark("roboskin")
-    ({'published': 'vision2tactile'}, {}, {'published': 'roboskin'})
+    >>> [published_attribute("vision2tactile", second * 10**9) for second in (1561629162, 1861629162)]
+    [{'published': 'vision2tactile'}, {}]
+    >>> published_attribute("roboskin")
+    {'published': 'roboskin'}
     """
     if t_ns is None:
         return {PUBLISHED: name}

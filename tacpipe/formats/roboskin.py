@@ -38,9 +38,9 @@ UNREADABLE = (
     tokenize.TokenError,
 )
 MADE = "from nominal rate"
-MOST_LABEL = 10_000  # materials
+MAX_LABEL = 10_000  # materials
 LONGEST_HEAD = 10_000  # bytes in front of an array, as numpy allows
-KIND = re.compile(r"[<>|=]?[bfiu](\d)")  # of numbers, with the bytes of each
+KIND = re.compile(r"[<>|=]?[bfiu](\d)")  # numeric dtype with its size in bytes
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
     if not source.is_dir():
         raise TacpipeError(f"{source} is not a folder; give the folder that holds icub_fold_0.npy and so on.")
     blocks: dict[str, Path] = {}
-    for name, path in _found(source):
+    for name, path in _find_blocks(source):
         if name in blocks:
             raise TacpipeError(f"{blocks[name]} and {path} are the same block. Give the folder that holds one of them.")
         blocks[name] = path
@@ -72,14 +72,14 @@ def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
             f"{source} holds no block of slides: no file in it is named as icub_fold_0.npy. Give the folder of the "
             f"unpacked data set."
         )
-    found: dict[str, dict[str, Path]] = {}
+    files_by_slide: dict[str, dict[str, Path]] = {}
     for name, path in sorted(blocks.items()):
         labels = path.with_name(path.name.replace("icub", "labels", 1))
         if not labels.is_file():
             raise TacpipeError(f"{path} has no labels: {labels.name} is not next to it. Copy both files.")
-        for slide in range(_slides(path)):
-            found[f"roboskin-{name}-{slide:03d}"] = {f"{file.name}[{slide}]": file for file in (path, labels)}
-    return found
+        for slide in range(_count_slides(path)):
+            files_by_slide[f"roboskin-{name}-{slide:03d}"] = {f"{file.name}[{slide}]": file for file in (path, labels)}
+    return files_by_slide
 
 
 @stage(version=2, discover=discover)
@@ -95,14 +95,14 @@ def roboskin(params: Params, files: Files) -> RecordingOutput:
     from tacpipe.signals.resampling import uniform_grid
     from tacpipe.signals.scrambling import scramble
 
-    (block, place), (labels, _) = sorted((path, _place(name)) for name, path in files.items())
-    slide = _values(block, place)  # (triangle, taxel, time)
+    (block, place), (labels, _) = sorted((path, _slide_number(name)) for name, path in files.items())
+    slide = _read_slide(block, place)  # (triangle, taxel, time)
     if params.layout == "authors":
         slide = scramble(slide)
     frames = slide.shape[-1]
     t_ns = uniform_grid(0, round((frames - 1) * 1e9 / params.rate_hz), params.rate_hz)
     columns = np.reshape(slide, (-1, frames))
-    material = _label(block, labels, place) + 1
+    material = _read_label(block, labels, place) + 1
     return RecordingOutput(
         {"roboskin": schema.stream(t_ns, columns, schema.roboskin_fields(), MADE)},
         {
@@ -112,25 +112,25 @@ def roboskin(params: Params, files: Files) -> RecordingOutput:
             "session": f"roboskin-m{material:02d}",
             "rate_hz": params.rate_hz,
             "layout": params.layout,
-            **published.mark("roboskin"),
-            **_part(block),
+            **published.published_attribute("roboskin"),
+            **_role_attribute(block),
         },
     )
 
 
-def _found(source: Path) -> list[tuple[str, Path]]:
+def _find_blocks(source: Path) -> list[tuple[str, Path]]:
     """Return the blocks below a folder: name within the recordings' names, path."""
-    found = []
+    blocks = []
     for place, below, names in walk(source):
         for name in sorted(names):
             match = BLOCK.fullmatch(name)
             if match is not None:
-                found.append((match[2] or f"fold{int(match[1])}", Path(place) / name))
+                blocks.append((match[2] or f"fold{int(match[1])}", Path(place) / name))
                 below.clear()  # the published folder holds others with arrays made of these
-    return found
+    return blocks
 
 
-def _slides(path: Path) -> int:
+def _count_slides(path: Path) -> int:
     """Return how many slides a block has, from the head of the file alone: numpy takes longer to load than a hit."""
     try:
         with regular.failing(path), regular.opened(path) as file:
@@ -141,7 +141,7 @@ def _slides(path: Path) -> int:
             if length > LONGEST_HEAD:
                 raise ValueError(f"its head has {length} bytes, {LONGEST_HEAD} are allowed")
             head = ast.literal_eval(file.read(length).decode())
-            held = os.fstat(file.fileno()).st_size - file.tell()
+            available = os.fstat(file.fileno()).st_size - file.tell()
         shape, kind = head["shape"], KIND.fullmatch(head["descr"])
     except UNREADABLE as error:
         raise _unreadable(path, error) from error
@@ -154,28 +154,28 @@ def _slides(path: Path) -> int:
         raise TacpipeError(
             f"{path} cannot be read as an array of numbers: it holds {described}. Copy it again from its source."
         )
-    if math.prod(shape) * int(kind[1]) > held:
+    if math.prod(shape) * int(kind[1]) > available:
         raise TacpipeError(
             f"{path} cannot be read as an array of numbers: it declares {excerpt(shape)} numbers of {kind[1]} bytes, and "
-            f"{held} bytes follow. Copy it again from its source."
+            f"{available} bytes follow. Copy it again from its source."
         )
     return int(shape[0])
 
 
-def _place(name: str) -> int:
+def _slide_number(name: str) -> int:
     match = PLACE.fullmatch(name)
     assert match is not None
     return int(match[2])
 
 
-def _part(block: Path) -> dict[str, Attribute]:
+def _role_attribute(block: Path) -> dict[str, Attribute]:
     """Return the attribute of the authors' part that a block is."""
     match = BLOCK.fullmatch(block.name)
     assert match is not None
     return {"authors_role": "test"} if match[2] else {"authors_fold": int(match[1])}
 
 
-def _values(path: Path, place: int) -> Float32s:
+def _read_slide(path: Path, place: int) -> Float32s:
     """Return a slide as it was measured (triangle, taxel, time), float32; its values are checked.
 
     Where a slide alone does not state which of its axes is time, because next to nothing was touched, its block does.
@@ -187,7 +187,7 @@ def _values(path: Path, place: int) -> Float32s:
     from tacpipe.signals.axes import is_time, lag_one
     from tacpipe.signals.scrambling import unscramble
 
-    block = _array(path)
+    block = _cached_array(path)
     if block.dtype.kind not in "fiu" or block.shape[1:3] != (TRIANGLES, TRIANGLE_TAXELS) or block.shape[3] < 2:
         raise TacpipeError(
             f"{path} is an array of {block.dtype} of the shape {block.shape}; it must hold numbers, and be (slide, "
@@ -214,31 +214,31 @@ def _values(path: Path, place: int) -> Float32s:
     )
 
 
-def _label(block: Path, path: Path, place: int) -> int:
+def _read_label(block: Path, path: Path, place: int) -> int:
     """Return the label of a slide, from 0. Raises `TacpipeError` if the labels are not one whole number a slide."""
     import numpy as np
 
-    labels, slides = np.atleast_1d(_array(path)).ravel(), len(_array(block))
+    labels, slides = np.atleast_1d(_cached_array(path)).ravel(), len(_cached_array(block))
     if len(labels) != slides:
         raise TacpipeError(f"{path} has {len(labels)} labels and {block.name} {slides} slides; copy both files again.")
     label = labels[place]
-    if labels.dtype.kind not in "fiu" or not (0 <= label <= MOST_LABEL and label == np.rint(label)):
+    if labels.dtype.kind not in "fiu" or not (0 <= label <= MAX_LABEL and label == np.rint(label)):
         raise TacpipeError(
-            f"{path}, label {place} is {excerpt(label)}; it must be a whole number from 0 to {MOST_LABEL}. Copy the "
+            f"{path}, label {place} is {excerpt(label)}; it must be a whole number from 0 to {MAX_LABEL}. Copy the "
             f"file again."
         )
     return int(label)
 
 
-def _array(path: Path) -> AnyArray:
+def _cached_array(path: Path) -> AnyArray:
     """Return an array. Raises `TacpipeError` if the file is none; a pickle is never opened."""
     with regular.failing(path):
         stat = path.stat()
-    return _read(path, stat.st_size, stat.st_mtime_ns)
+    return _load_array(path, stat.st_size, stat.st_mtime_ns)
 
 
 @functools.lru_cache(maxsize=2)  # a block and its labels: the slides of a block are read one after another
-def _read(path: Path, size: int, t_ns: int) -> AnyArray:
+def _load_array(path: Path, size: int, t_ns: int) -> AnyArray:
     """Return the array of a file, for as long as the file has this size and time of change.
 
     Not as a map of memory: a disk that fails ends the process there, with SIGBUS.
@@ -251,13 +251,13 @@ def _read(path: Path, size: int, t_ns: int) -> AnyArray:
         wide = np.lib.format.read_magic(file) != (1, 0)
         read_head = np.lib.format.read_array_header_2_0 if wide else np.lib.format.read_array_header_1_0
         shape, _, kind = read_head(file)
-        if math.prod(shape) * kind.itemsize > len(content):  # before memory is taken for it
+        if math.prod(shape) * kind.itemsize > len(content):  # checked first, since np.load allocates the array
             raise ValueError(f"its head declares {math.prod(shape)} numbers, and it has {len(content)} bytes")
-        found: AnyArray = np.load(io.BytesIO(content), allow_pickle=False)
+        array: AnyArray = np.load(io.BytesIO(content), allow_pickle=False)
     except UNREADABLE as error:
         raise _unreadable(path, error) from error
-    found.flags.writeable = False
-    return found
+    array.flags.writeable = False
+    return array
 
 
 def _unreadable(path: Path, error: BaseException) -> TacpipeError:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tacpipe.datasets import recording_names
 from tacpipe.errors import TacpipeError
-from tacpipe.formats.folders import require, text, valid
+from tacpipe.formats.published import require, text, valid
 from tacpipe.io import regular
 from tacpipe.io.files import walk
 from tacpipe.io.hashing import remembered_file_digest
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 CLOUD, GRASP, READING = NAMES = ("cloud-object.pcd", "best-grasp.txt", "tactile.tac")
 TWIN = "duplicate_of="  # begins the name of the file of an earlier grasp with the same reading
 UNIX_TIME = re.compile(r"[1-9]\d{9}")  # seconds since 1970, from 2001 on
-VALUES = 58  # of a reading: 29 of the middle finger, then as many of the thumb
+VALUES = 58  # values of a reading: 29 of the middle finger, then as many of the thumb
 LARGEST = 4095  # counts; the sensor's converter has twelve bits
 POINTS, WITH_WRIST = 6, 15  # numbers of a grasp: two points, and with them the wrist's rotation, row by row
 
@@ -57,25 +57,25 @@ def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
         raise TacpipeError(
             f"{source} is not a folder; give the folder that holds those of the objects, bleach and so on."
         )
-    found: dict[str, dict[str, Path]] = {}
-    named: list[tuple[str, Path]] = []
+    files_by_grasp: dict[str, dict[str, Path]] = {}
+    named_folders: list[tuple[str, Path]] = []
     for place, _, names in walk(source):
-        there = [name for name in NAMES if name in names]
-        if not there:
+        present_names = [name for name in NAMES if name in names]
+        if not present_names:
             continue
         above, time_s = os.path.split(os.path.abspath(place))  # noqa: PTH100  (once a folder, on every hit)
         label, time_s = text(os.path.basename(above)), text(time_s)  # noqa: PTH119
-        files = {f"{label}/{time_s}/{name}": Path(place, name) for name in there}
+        files = {f"{label}/{time_s}/{name}": Path(place, name) for name in present_names}
         name = valid(f"{label}-{time_s}")
-        named.append((name, Path(place)))
-        found[name] = files
-    recording_names.refuse_shared(named)
-    if not found:
+        named_folders.append((name, Path(place)))
+        files_by_grasp[name] = files
+    recording_names.refuse_shared(named_folders)
+    if not files_by_grasp:
         raise TacpipeError(
             f"{source} holds no grasp: no folder in it has {', '.join(NAMES)}. Give the folder of the unpacked data set."
         )
-    _add_twins(found)
-    return dict(sorted(found.items()))
+    _add_twins(files_by_grasp)
+    return dict(sorted(files_by_grasp.items()))
 
 
 @stage(version=2, discover=discover)
@@ -91,19 +91,21 @@ def vision2tactile(params: Params, files: Files) -> RecordingOutput:
     from tacpipe.clouds.files import require_metres
     from tacpipe.formats import published
 
-    own = {Path(name).name: path for name, path in files.items() if not name.startswith(TWIN)}
+    grasp_files = {Path(name).name: path for name, path in files.items() if not name.startswith(TWIN)}
     label, time_s, _ = next(name for name in files if not name.startswith(TWIN)).split("/")
-    require(own, NAMES)
+    require(grasp_files, NAMES)
     if not UNIX_TIME.fullmatch(time_s):
         raise TacpipeError(
-            f"{own[CLOUD].parent} is named {time_s!r}; a grasp's folder must be named after its time, ten digits of unix "
-            f"seconds. Give it the name that it was published under."
+            f"{grasp_files[CLOUD].parent} is named {time_s!r}; a grasp's folder must be named after its time, ten digits of "
+            f"unix seconds. Give it the name that it was published under."
         )
-    cloud, grasp = pcd.read(own[CLOUD]), _grasp(own[GRASP])
-    require_metres(own[CLOUD], cloud)
-    _check_distance(own[GRASP], cloud, grasp, params.beside_mm)
+    cloud, grasp = pcd.read(grasp_files[CLOUD]), _read_grasp(grasp_files[GRASP])
+    require_metres(grasp_files[CLOUD], cloud)
+    _check_distance(grasp_files[GRASP], cloud, grasp, params.beside_mm)
     t_ns = int(time_s) * 10**9
-    reading = schema.stream(np.array([t_ns]), [[value] for value in _reading(own[READING])], biotac_sp.fields())
+    reading = schema.stream(
+        np.array([t_ns]), [[value] for value in _read_counts(grasp_files[READING])], biotac_sp.fields()
+    )
     twins = [name.removeprefix(TWIN) for name in files if name.startswith(TWIN)]
     return RecordingOutput(
         {"cloud": cloud.table(), "grasp": grasp.table(t_ns), "reading": reading},
@@ -111,7 +113,7 @@ def vision2tactile(params: Params, files: Files) -> RecordingOutput:
             "sensor": "biotac-sp",
             "object": label,
             "session": session(label, int(time_s)),
-            **published.mark("vision2tactile", t_ns),
+            **published.published_attribute("vision2tactile", t_ns),
             **({"duplicate_of": twins[0]} if twins else {}),
         },
     )
@@ -129,20 +131,20 @@ def session(label: str, time_s: int) -> str:
     return f"{label}-{datetime.fromtimestamp(time_s, UTC).date()}"
 
 
-def _add_twins(found: dict[str, dict[str, Path]]) -> None:
+def _add_twins(files_by_grasp: dict[str, dict[str, Path]]) -> None:
     """Add to each grasp the file of the earliest one that has the same reading, if that is another one."""
     same: dict[str, list[tuple[str, str, Path]]] = defaultdict(list)  # digest: time, recording, file
-    for recording, files in found.items():
+    for recording, files in files_by_grasp.items():
         for name, path in files.items():
             if name.endswith(READING):
                 same[remembered_file_digest(path)].append((name.split("/")[1], recording, path))
-    for several in same.values():
-        (_, first, path), *later = sorted(several)
+    for twins in same.values():
+        (_, first, path), *later = sorted(twins)
         for _, recording, _ in later:
-            found[recording][f"{TWIN}{first}"] = path
+            files_by_grasp[recording][f"{TWIN}{first}"] = path
 
 
-def _lines(path: Path) -> list[str]:
+def _read_lines(path: Path) -> list[str]:
     """Return the lines of a small file of text. Raises `TacpipeError` if it is empty, or none."""
     try:
         lines = regular.source(path).decode("ascii").splitlines()
@@ -155,13 +157,13 @@ def _lines(path: Path) -> list[str]:
     return lines
 
 
-def _grasp(path: Path) -> Grasp:
+def _read_grasp(path: Path) -> Grasp:
     """Return the grasp of a file: six numbers in one line, metres, or these and nine of the wrist's rotation."""
     import numpy as np
 
     from tacpipe.clouds.grasp import Grasp
 
-    lines = _lines(path)
+    lines = _read_lines(path)
     cells = lines[0].split(",")
     if len(lines) > 1 or len(cells) not in (POINTS, WITH_WRIST):
         raise TacpipeError(
@@ -194,22 +196,22 @@ def _check_distance(path: Path, cloud: Cloud, grasp: Grasp, beside_mm: float) ->
             )
 
 
-def _reading(path: Path) -> list[int]:
+def _read_counts(path: Path) -> list[int]:
     """Return the 58 counts of a reading's one line, which begins with a comma. Raises `TacpipeError` for another line."""
-    lines = _lines(path)
+    lines = _read_lines(path)
     if len(lines) != 1:
         raise TacpipeError(
             f"{path} has {len(lines)} rows; a grasp has one reading, in one row. Keep the one that was taken in the grasp."
         )
     first, *cells = lines[0].split(",")
     if first.strip() or len(cells) != VALUES:
-        more = (
+        readings_text = (
             f", as many as {len(cells) // VALUES} readings" if len(cells) > VALUES and not len(cells) % VALUES else ""
         )
         empty = "an empty first one" if not first.strip() else f"{first[:20]!r} as the first one"
         raise TacpipeError(
-            f"{path}, row 1: there are {len(cells) + 1} fields with {empty}{more}; there must be {VALUES + 1}, the first "
-            f"empty, then {VALUES // 2} counts of the middle finger and {VALUES // 2} of the thumb. Copy it again."
+            f"{path}, row 1: there are {len(cells) + 1} fields with {empty}{readings_text}; there must be {VALUES + 1}, "
+            f"the first empty, then {VALUES // 2} counts of the middle finger and {VALUES // 2} of the thumb. Copy it again."
         )
     values = []
     for place, cell in enumerate(cells, start=2):

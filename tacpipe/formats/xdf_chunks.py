@@ -1,4 +1,4 @@
-"""The chunks of an XDF file (Extensible Data Format, version 1.0), and the samples in them.
+"""Read the chunks of an XDF file (Extensible Data Format, version 1.0) and the samples in them.
 
 Source: https://github.com/sccn/xdf/wiki/Specifications. After ``XDF:`` come chunks: their length, a tag of two bytes, and a
 content. A boundary chunk is written every few seconds, so that a reader finds its way again after bytes that are wrong.
@@ -23,18 +23,18 @@ MAGIC = b"XDF:"
 FILE_HEADER, STREAM_HEADER, SAMPLES, CLOCK_OFFSET, BOUNDARY, STREAM_FOOTER = range(1, 7)
 OF_A_STREAM = (STREAM_HEADER, SAMPLES, CLOCK_OFFSET, STREAM_FOOTER)
 MARK = bytes.fromhex("43 A5 46 DC CB F5 41 0F B3 0E D5 46 73 83 CB E4")  # content of a boundary chunk
-SIZES = {1: "<B", 4: "<I", 8: "<Q"}  # of a length, by the byte before it
+SIZES = {1: "<B", 4: "<I", 8: "<Q"}  # struct formats of a length by the byte before it
 
 
 @dataclass(frozen=True)
 class Chunk:
     """A chunk: ``content`` is what follows the tag, and the number of the stream where it has one."""
 
-    at: int  # where it begins in the file
+    at: int  # offset in the file
     tag: int
     stream: int | None
     content: bytes
-    whole: bool = True  # False: the file ends within it
+    is_complete: bool = True  # False: the file ends within it
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Damage:
     bytes: int
 
 
-def chunks(data: Content) -> Iterator[Chunk | Damage]:
+def read_chunks(data: Content) -> Iterator[Chunk | Damage]:
     """Yield the chunks of a file in their order, and what is none.
 
     Raises `TacpipeError` for what does not begin as an XDF file does.
@@ -54,24 +54,24 @@ def chunks(data: Content) -> Iterator[Chunk | Damage]:
         raise TacpipeError(f"it begins with {data[:4]!r}, and an XDF file with {MAGIC!r}")
     at = len(MAGIC)
     while at < len(data):
-        found = _chunk(data, at)
-        if found is not None and found[0].whole:
-            chunk, at = found
+        parsed = _parse_chunk(data, at)
+        if parsed is not None and parsed[0].is_complete:
+            chunk, at = parsed
             if chunk.tag != BOUNDARY:
                 yield chunk
             continue
-        again = data.find(MARK, at)
-        if found is not None and again < 0:  # the file was cut off
-            yield found[0]
+        next_mark = data.find(MARK, at)
+        if parsed is not None and next_mark < 0:  # the file was cut off
+            yield parsed[0]
             return
-        stop = len(data) if again < 0 else again + len(MARK)
+        stop = len(data) if next_mark < 0 else next_mark + len(MARK)
         yield Damage(at, stop - at)
         at = stop
 
 
-def _chunk(data: Content, at: int) -> tuple[Chunk, int] | None:
+def _parse_chunk(data: Content, at: int) -> tuple[Chunk, int] | None:
     """Return the chunk at a place and where the next one begins; None where there is none."""
-    length = varint(data, at)
+    length = read_length(data, at)
     if length is None:
         return None
     size, begin = length
@@ -83,13 +83,13 @@ def _chunk(data: Content, at: int) -> tuple[Chunk, int] | None:
     if not FILE_HEADER <= tag <= STREAM_FOOTER or size < head or begin + head > len(data):
         return None
     stream = struct.unpack_from("<I", data, begin + 2)[0] if head == 6 else None
-    return Chunk(at, tag, stream, data[begin + head : stop], whole=stop <= len(data)), stop
+    return Chunk(at, tag, stream, data[begin + head : stop], is_complete=stop <= len(data)), stop
 
 
-def varint(data: Content, at: int) -> tuple[int, int] | None:
+def read_length(data: Content, at: int) -> tuple[int, int] | None:
     """Return a length of 1, 4 or 8 bytes and where it ends; None where there is none.
 
-    >>> varint(b"\\x01\\x05...", 0), varint(b"\\x02\\x05", 0)
+    >>> read_length(b"\\x01\\x05...", 0), read_length(b"\\x02\\x05", 0)
     ((5, 2), None)
     """
     width = data[at] if at < len(data) else 0
@@ -107,40 +107,40 @@ class Samples:
     missing: int = 0
 
 
-def numbers(content: bytes, kind: np.dtype[np.generic], channels: int) -> Samples | None:
+def parse_numbers(content: bytes, kind: np.dtype[np.generic], channels: int) -> Samples | None:
     """Return the samples of a chunk of numbers, as many as are whole; None where even their count is not there."""
-    count = varint(content, 0)
+    count = read_length(content, 0)
     if count is None:
         return None
     declared, begin = count
     body = content[begin:]
     wide = kind.newbyteorder("<")
     for stamped in (declared, 1 if declared else 0, 0):  # all have a stamp, the first alone, none
-        found = _regular(body, wide, channels, declared, stamped)
-        if found is not None:
-            return found
-    return _irregular(body, wide, channels, declared)
+        samples = _parse_regular(body, wide, channels, declared, stamped)
+        if samples is not None:
+            return samples
+    return _parse_irregular(body, wide, channels, declared)
 
 
-def _regular(body: bytes, kind: np.dtype[np.generic], channels: int, count: int, stamped: int) -> Samples | None:
+def _parse_regular(body: bytes, kind: np.dtype[np.generic], channels: int, count: int, stamped: int) -> Samples | None:
     """Return samples of which the first ``stamped`` have a stamp and the others none; None where it is not so."""
     full = np.dtype([("width", "u1"), ("stamp", "<f8"), ("values", kind, (channels,))])
     bare = np.dtype([("width", "u1"), ("values", kind, (channels,))])
     if len(body) != stamped * full.itemsize + (count - stamped) * bare.itemsize:
         return None
     first = np.frombuffer(body, full, stamped)
-    rest = np.frombuffer(body, bare, count - stamped, offset=stamped * full.itemsize)
-    if (first["width"] != 8).any() or rest["width"].any():
+    unstamped = np.frombuffer(body, bare, count - stamped, offset=stamped * full.itemsize)
+    if (first["width"] != 8).any() or unstamped["width"].any():
         return None
-    stamps = np.concatenate([first["stamp"], np.full(len(rest), np.nan)])
-    return Samples(stamps, np.concatenate([first["values"], rest["values"]]).astype(kind.newbyteorder("=")))
+    stamps = np.concatenate([first["stamp"], np.full(len(unstamped), np.nan)])
+    return Samples(stamps, np.concatenate([first["values"], unstamped["values"]]).astype(kind.newbyteorder("=")))
 
 
-def _irregular(body: bytes, kind: np.dtype[np.generic], channels: int, count: int) -> Samples:
+def _parse_irregular(body: bytes, kind: np.dtype[np.generic], channels: int, count: int) -> Samples:
     """Return samples one by one, up to the first that is not whole."""
     stamps, values, at, size = [], [], 0, channels * kind.itemsize
     for _ in range(count):
-        stamp = _stamp(body, at)
+        stamp = _read_stamp(body, at)
         if stamp is None or stamp[1] + size > len(body):
             break
         stamps.append(stamp[0])
@@ -150,17 +150,17 @@ def _irregular(body: bytes, kind: np.dtype[np.generic], channels: int, count: in
     return Samples(np.array(stamps, dtype=np.float64), read, count - len(stamps))
 
 
-def texts(content: bytes, channels: int) -> Samples | None:
+def parse_texts(content: bytes, channels: int) -> Samples | None:
     """Return the samples of a chunk of texts, as many as are whole; None where even their count is not there."""
-    count = varint(content, 0)
+    count = read_length(content, 0)
     if count is None:
         return None
     declared, at = count
     stamps: list[float] = []
     rows: list[list[str]] = []
     while len(rows) < declared:
-        stamp = _stamp(content, at)
-        words = None if stamp is None else _words(content, stamp[1], channels)
+        stamp = _read_stamp(content, at)
+        words = None if stamp is None else _read_words(content, stamp[1], channels)
         if stamp is None or words is None:
             break
         stamps.append(stamp[0])
@@ -170,18 +170,18 @@ def texts(content: bytes, channels: int) -> Samples | None:
     return Samples(np.array(stamps, dtype=np.float64), table, declared - len(rows))
 
 
-def _words(content: bytes, at: int, count: int) -> tuple[list[str], int] | None:
-    found = []
+def _read_words(content: bytes, at: int, count: int) -> tuple[list[str], int] | None:
+    words = []
     for _ in range(count):
-        length = varint(content, at)
+        length = read_length(content, at)
         if length is None or length[1] + length[0] > len(content):
             return None
         at = length[1] + length[0]
-        found.append(content[length[1] : at].decode(errors="replace"))
-    return found, at
+        words.append(content[length[1] : at].decode(errors="replace"))
+    return words, at
 
 
-def _stamp(content: bytes, at: int) -> tuple[float, int] | None:
+def _read_stamp(content: bytes, at: int) -> tuple[float, int] | None:
     """Return a sample's stamp (NaN where it has none) and where its values begin; None where there is none."""
     if at >= len(content) or content[at] not in (0, 8) or at + 1 + content[at] > len(content):
         return None
@@ -190,19 +190,19 @@ def _stamp(content: bytes, at: int) -> tuple[float, int] | None:
     return struct.unpack_from("<d", content, at + 1)[0], at + 9
 
 
-def deduced(stamps: Floats, last: float, period_s: float) -> Floats:
+def fill_stamps(stamps: Floats, last: float, period_s: float) -> Floats:
     """Return stamps (sample,) with those filled in that are not written: a period after the one before.
 
-    >>> deduced(np.array([np.nan, 5.0, np.nan]), 1.0, 0.5).tolist()
+    >>> fill_stamps(np.array([np.nan, 5.0, np.nan]), 1.0, 0.5).tolist()
     [1.5, 5.0, 5.5]
     """
     absent = np.isnan(stamps)
     if not absent.any():
         return stamps
     filled = stamps.copy()
-    written = np.flatnonzero(~absent).tolist()
-    before = [last, *stamps[written].tolist()]
-    edges = [-1, *written, len(stamps)]
+    stamped_rows = np.flatnonzero(~absent).tolist()
+    before = [last, *stamps[stamped_rows].tolist()]
+    edges = [-1, *stamped_rows, len(stamps)]
     for begin, (row, stop) in zip(before, itertools.pairwise(edges), strict=True):
         steps = np.concatenate([[begin], np.full(stop - row - 1, period_s)])
         filled[row + 1 : stop] = np.add.accumulate(steps)[1:]

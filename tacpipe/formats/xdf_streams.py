@@ -1,4 +1,4 @@
-"""An XDF file as a container: each stream of LSL with its stamps on the recorder's clock, and the clock offsets beside it.
+"""Read an XDF file as a container: each stream of LSL with stamps on the recorder's clock, and its clock offsets.
 
 ``lsl_ns`` is when a sample was taken, on the clock of the computer that recorded: the stamp as it was sent, moved by our own
 fit of the offsets that were measured meanwhile. The stamp as it was sent stays in ``t_device_ns``. Both count from when a
@@ -35,20 +35,20 @@ from tacpipe.signals import clock_offsets, clocks
 
 STAMP = "lsl_ns"
 RAW = "t_device_ns"
-OFFSETS = " clock offsets"  # what the name of a stream's offsets ends with
+OFFSETS = " clock offsets"  # end of the name of a stream's offsets
 UNDESCRIBED = "the file does not describe it"
 CLOCK = "LSL's, of the computer that recorded"
-ASIDE_ROWS = 1 << 16  # samples of a stream, before they are put aside
-PASSED_BYTES = 1 << 26  # of a file that was read, before memory lets go of them
-COMPRESSED_BYTES = 1 << 20  # that are decompressed at once
+SPILL_ROWS = 1 << 16  # samples of a stream in memory before they go to the spill
+PASSED_BYTES = 1 << 26  # bytes read before their pages are released
+COMPRESSED_BYTES = 1 << 20  # bytes decompressed at once
 
 
 @dataclass
-class _Stream:
-    """What was read of a stream so far."""
+class _StreamReading:
+    """The samples, stamps and offsets of a stream read so far."""
 
     about: lsl.Description
-    aside: Spill
+    spill: Spill
     stamps: list[Floats] = field(default_factory=list)
     values: list[AnyArray] = field(default_factory=list)  # (sample, channel), of samples that are not put aside
     pieces: list[Piece] = field(default_factory=list)
@@ -59,80 +59,86 @@ class _Stream:
     missing: int = 0  # samples of chunks that are not whole
     declared: int | None = None  # samples that the footer counts
 
-    def take(self, content: bytes) -> None:
+    def add_samples(self, content: bytes) -> None:
         """Take the samples of a chunk."""
         channels = len(self.about.channels)
-        found = (
-            xdf_chunks.texts(content, channels)
+        samples = (
+            xdf_chunks.parse_texts(content, channels)
             if self.about.is_text
-            else xdf_chunks.numbers(content, np.dtype(self.about.dtype), channels)
+            else xdf_chunks.parse_numbers(content, np.dtype(self.about.dtype), channels)
         )
-        if found is None:
+        if samples is None:
             self.missing += 1
             return
         last = float(self.stamps[-1][-1]) if self.rows else 0.0
         period_s = 1 / self.about.rate_hz if self.about.rate_hz else 0.0
-        self.missing += found.missing
-        if len(found.stamps):
-            self.stamps.append(xdf_chunks.deduced(found.stamps, last, period_s))
-            self.values.append(found.values)
-            self.rows += len(found.stamps)
-            self.waiting += len(found.stamps)
-            if self.waiting >= ASIDE_ROWS:
-                self.pieces.append(self.aside.add(pa.table(self._columns(), pa.schema(self.fields))))
+        self.missing += samples.missing
+        if len(samples.stamps):
+            self.stamps.append(xdf_chunks.fill_stamps(samples.stamps, last, period_s))
+            self.values.append(samples.values)
+            self.rows += len(samples.stamps)
+            self.waiting += len(samples.stamps)
+            if self.waiting >= SPILL_ROWS:
+                self.pieces.append(self.spill.add(pa.table(self._columns(), pa.schema(self.fields))))
                 self.values, self.waiting = [], 0
 
     @property
     def fields(self) -> list[pa.Field]:
         """The fields of the channels."""
-        taken = [STAMP, RAW, "t_ns"]
+        reserved = [STAMP, RAW, "t_ns"]
         kind = pa.string() if self.about.is_text else pa.from_numpy_dtype(self.about.dtype)
         return [
-            pa.field(one.name if one.name not in taken else f"{one.name}_channel", kind, metadata=one.metadata)
-            for one in self.about.channels
+            pa.field(
+                channel.name if channel.name not in reserved else f"{channel.name}_channel",
+                kind,
+                metadata=channel.metadata,
+            )
+            for channel in self.about.channels
         ]
 
     def channels(self) -> Iterator[list[pa.ChunkedArray]]:
         """Yield the values of the channels, some samples at a time."""
         for piece in self.pieces:
-            yield self.aside.read(piece).columns
+            yield self.spill.read(piece).columns
         if self.waiting:
             yield self._columns()
 
     def _columns(self) -> list[pa.ChunkedArray]:
         values = np.concatenate(self.values)
-        return [pa.chunked_array([pa.array(values[:, at], one.type)]) for at, one in enumerate(self.fields)]
+        return [pa.chunked_array([pa.array(values[:, at], field.type)]) for at, field in enumerate(self.fields)]
 
 
 @dataclass
-class _Read:
-    """What was read of a file."""
+class _FileReading:
+    """The streams, header and damage of a file."""
 
-    aside: Spill = field(default_factory=Spill)
-    streams: dict[int, _Stream] = field(default_factory=dict)
+    spill: Spill = field(default_factory=Spill)
+    streams: dict[int, _StreamReading] = field(default_factory=dict)
     headers: dict[int, bytes] = field(default_factory=dict)  # XML descriptions of the streams
     unknown: dict[int, str] = field(default_factory=dict)  # streams whose description cannot be read, with the reason
     header: bytes = b""
     damage: list[Damage] = field(default_factory=list)
-    cut_at: int | None = None  # where the chunk begins that the file ends within
+    cut_at: int | None = None  # offset of the incomplete chunk at the end of a truncated file
 
     def notes(self, path: Path) -> list[str]:
         """Return what is missing, in words."""
-        found = []
+        sentences = []
         if self.damage:
-            size, first = sum(one.bytes for one in self.damage), self.damage[0].at
+            size, first = sum(damage.bytes for damage in self.damage), self.damage[0].at
             places = (
                 f"in {len(self.damage)} places, the first at byte {first:,},"
                 if len(self.damage) > 1
                 else f"from byte {first:,} on"
             )
-            found.append(f"{path}: {size:,} bytes {places} are not XDF and were left out.")
+            sentences.append(f"{path}: {size:,} bytes {places} are not XDF and were left out.")
         if self.cut_at is not None:
-            found.append(f"{path} was cut off at byte {self.cut_at:,}, within a chunk; what stands before is read.")
-        undescribed = sum(why == UNDESCRIBED for why in self.unknown.values())
+            sentences.append(f"{path} was cut off at byte {self.cut_at:,}, within a chunk; what stands before is read.")
+        undescribed = sum(reason == UNDESCRIBED for reason in self.unknown.values())
         if undescribed:
-            found.append(f"{path} has samples of {undescribed} streams that it does not describe; they were left out.")
-        return found
+            sentences.append(
+                f"{path} has samples of {undescribed} streams that it does not describe; they were left out."
+            )
+        return sentences
 
 
 @dataclass(frozen=True)
@@ -155,39 +161,43 @@ class XdfFile:
         Raises `TacpipeError` for a file that is not XDF.
         """
         read = self._read()
-        named = _sources(read.streams)
-        names = kinds.identifiers([one for source in named.values() for one in (source, source + OFFSETS)])
-        found: list[SourceStream] = []
-        attributes = _attributes(read.header)
+        sources_by_number = _stream_sources(read.streams)
+        names = kinds.identifiers(
+            [name for source in sources_by_number.values() for name in (source, source + OFFSETS)]
+        )
+        streams: list[SourceStream] = []
+        attributes = _file_attributes(read.header)
         notes = read.notes(self.path)
-        skipped = {f"stream {number}": why for number, why in read.unknown.items() if why != UNDESCRIBED}
-        for number, source in named.items():
+        skipped = {f"stream {number}": reason for number, reason in read.unknown.items() if reason != UNDESCRIBED}
+        for number, source in sources_by_number.items():
             stream = read.streams[number]
             if not stream.rows:
                 skipped[source] = "it has no samples"
                 continue
-            made = _timed(stream)
-            if isinstance(made, str):
-                skipped[source] = made
+            timed = _recorder_times(stream)
+            if isinstance(timed, str):
+                skipped[source] = timed
                 continue
-            t_ns, facts, described = made
-            notes += [f"{self.path}: {plain(source)} {one}" for one in [*described, *_losses(stream)]]
+            t_ns, facts, described = timed
+            notes += [f"{self.path}: {plain(source)} {name}" for name in [*described, *_describe_losses(stream)]]
             attributes |= {f"{names[source]}_{name}": value for name, value in facts.items()}
-            found.append(SourceStream(source, names[source], Time(STAMP, "ns"), _content_of(stream, t_ns), stream.rows))
+            streams.append(
+                SourceStream(source, names[source], Time(STAMP, "ns"), _content_of(stream, t_ns), stream.rows)
+            )
             if stream.offsets:
                 source += OFFSETS
                 offsets = _offsets_table(stream)
-                found.append(SourceStream(source, names[source], Time(STAMP, "ns"), offsets, offsets.num_rows))
-        chosen = [one for one in found if sources is None or one.source in sources]
+                streams.append(SourceStream(source, names[source], Time(STAMP, "ns"), offsets, offsets.num_rows))
+        chosen = [name for name in streams if sources is None or name.source in sources]
         return Contents(chosen, attributes, skipped, notes)
 
-    def _read(self) -> _Read:
-        read = _Read()
+    def _read(self) -> _FileReading:
+        read = _FileReading()
         try:
-            content = _content(self.path)
+            content = _open_content(self.path)
             passed = 0  # bytes
-            for chunk in xdf_chunks.chunks(content):
-                _take(read, chunk, self.path)
+            for chunk in xdf_chunks.read_chunks(content):
+                _add_chunk(read, chunk, self.path)
                 if isinstance(content, mmap.mmap) and chunk.at >= passed + PASSED_BYTES:
                     content.madvise(
                         mmap.MADV_DONTNEED, passed, PASSED_BYTES
@@ -202,13 +212,13 @@ class XdfFile:
         return read
 
 
-def _content(path: Path) -> xdf_chunks.Content:
+def _open_content(path: Path) -> xdf_chunks.Content:
     """Return the bytes of a file, decompressed; of a compressed one that was cut off those that are there."""
     with regular.failing(path), regular.opened(path) as file, tempfile.TemporaryFile() as unpacked:
         head = file.read(2)
         if head == b"\x1f\x8b":
             file.seek(0)
-            unpack(_unpacked(file), unpacked, path)
+            unpack(_gzip_blocks(file), unpacked, path)
             unpacked.flush()
             head = b"" if not unpacked.tell() else head
         if not head:
@@ -216,7 +226,7 @@ def _content(path: Path) -> xdf_chunks.Content:
         return mmap.mmap((unpacked if head == b"\x1f\x8b" else file).fileno(), 0, access=mmap.ACCESS_READ)
 
 
-def _unpacked(file: BinaryIO) -> Iterator[bytes]:
+def _gzip_blocks(file: BinaryIO) -> Iterator[bytes]:
     """Yield what a file of gzip holds, of which several may follow one another, up to where it was cut off."""
     stream = zlib.decompressobj(wbits=31)
     while data := file.read(COMPRESSED_BYTES):
@@ -229,12 +239,12 @@ def _unpacked(file: BinaryIO) -> Iterator[bytes]:
         yield block
 
 
-def _take(read: _Read, chunk: Chunk | Damage, path: Path) -> None:
+def _add_chunk(read: _FileReading, chunk: Chunk | Damage, path: Path) -> None:
     """Take a chunk into what was read."""
     if isinstance(chunk, Damage):
         read.damage.append(chunk)
         return
-    if not chunk.whole:
+    if not chunk.is_complete:
         read.cut_at = chunk.at
     if chunk.tag == xdf_chunks.FILE_HEADER:
         read.header = chunk.content
@@ -245,22 +255,22 @@ def _take(read: _Read, chunk: Chunk | Damage, path: Path) -> None:
     elif chunk.stream not in read.streams:
         read.unknown.setdefault(chunk.stream, UNDESCRIBED)
     elif chunk.tag == xdf_chunks.SAMPLES:
-        read.streams[chunk.stream].take(chunk.content)
+        read.streams[chunk.stream].add_samples(chunk.content)
     elif chunk.tag == xdf_chunks.CLOCK_OFFSET and len(chunk.content) >= 16:
-        one = read.streams[chunk.stream]
-        one.offsets.append(struct.unpack_from("<dd", chunk.content))
-        one.rows_before.append(one.rows)
+        stream = read.streams[chunk.stream]
+        stream.offsets.append(struct.unpack_from("<dd", chunk.content))
+        stream.rows_before.append(stream.rows)
     elif chunk.tag == xdf_chunks.STREAM_FOOTER:
-        read.streams[chunk.stream].declared = _counted(chunk.content)
+        read.streams[chunk.stream].declared = _sample_count(chunk.content)
 
 
-def _describe(read: _Read, stream: int, chunk: Chunk, path: Path) -> None:
+def _describe(read: _FileReading, stream: int, chunk: Chunk, path: Path) -> None:
     """Take the description of a stream. Raises `UsageError` for a second one that differs."""
     before = read.headers.get(stream)
     if before is None:
         read.headers[stream] = chunk.content
         try:
-            read.streams[stream] = _Stream(lsl.parse(chunk.content), read.aside)
+            read.streams[stream] = _StreamReading(lsl.parse(chunk.content), read.spill)
         except TacpipeError as error:
             read.unknown[stream] = str(error)
     elif before != chunk.content:
@@ -270,7 +280,7 @@ def _describe(read: _Read, stream: int, chunk: Chunk, path: Path) -> None:
         )
 
 
-def _counted(footer: bytes) -> int | None:
+def _sample_count(footer: bytes) -> int | None:
     try:
         text = ET.fromstring(footer.decode(errors="replace")).findtext("sample_count", "")
     except ET.ParseError:
@@ -278,14 +288,14 @@ def _counted(footer: bytes) -> int | None:
     return int(text) if text.isdecimal() else None
 
 
-def _sources(streams: Mapping[int, _Stream]) -> dict[int, str]:
+def _stream_sources(streams: Mapping[int, _StreamReading]) -> dict[int, str]:
     """Return how each stream is named: by its name, with its number where two share one."""
-    named = {number: one.about.name or one.about.kind or f"stream {number}" for number, one in streams.items()}
-    several = list(named.values())
-    return {number: name if several.count(name) == 1 else f"{name} {number}" for number, name in named.items()}
+    names = {number: stream.about.name or stream.about.kind or f"stream {number}" for number, stream in streams.items()}
+    name_list = list(names.values())
+    return {number: name if name_list.count(name) == 1 else f"{name} {number}" for number, name in names.items()}
 
 
-def _attributes(header: bytes) -> dict[str, Attribute]:
+def _file_attributes(header: bytes) -> dict[str, Attribute]:
     try:
         stamp = ET.fromstring(header.decode(errors="replace")).findtext("datetime", "").strip()
     except ET.ParseError:
@@ -293,15 +303,15 @@ def _attributes(header: bytes) -> dict[str, Attribute]:
     return {"recorded_at": stamp} if stamp else {}
 
 
-def _losses(stream: _Stream) -> list[str]:
+def _describe_losses(stream: _StreamReading) -> list[str]:
     """Return what of a stream is not there, in words."""
-    found = [f"lacks {stream.missing} samples of a chunk that is not whole."] if stream.missing else []
+    losses = [f"lacks {stream.missing} samples of a chunk that is not whole."] if stream.missing else []
     if stream.declared is not None and stream.declared != stream.rows:
-        found.append(f"has {stream.rows:,} samples, and its footer counts {stream.declared:,}.")
-    return found
+        losses.append(f"has {stream.rows:,} samples, and its footer counts {stream.declared:,}.")
+    return losses
 
 
-def _timed(stream: _Stream) -> tuple[Times, dict[str, Attribute], list[str]] | str:
+def _recorder_times(stream: _StreamReading) -> tuple[Times, dict[str, Attribute], list[str]] | str:
     """Return when samples were taken on the recorder's clock (sample,), facts about the clocks, and what is odd.
 
     Instead a reason where that cannot be known.
@@ -310,7 +320,7 @@ def _timed(stream: _Stream) -> tuple[Times, dict[str, Attribute], list[str]] | s
     if not (np.abs(raw_s) < lsl.LATEST_S).all():
         return f"its stamp {excerpt(float(raw_s[~(np.abs(raw_s) < lsl.LATEST_S)][0]))} is not a time in seconds"
     raw_ns = lsl.nanoseconds(raw_s)
-    measured = _measured(stream)
+    measured = _valid_offsets(stream)
     facts: dict[str, Attribute] = {}
     described: list[str] = []
     t_ns = raw_ns
@@ -337,22 +347,22 @@ def _timed(stream: _Stream) -> tuple[Times, dict[str, Attribute], list[str]] | s
     return t_ns + back_ns, facts, described
 
 
-def _measured(stream: _Stream) -> Int64s:
+def _valid_offsets(stream: _StreamReading) -> Int64s:
     """Return the clock offsets (measurement, reading and offset in ns) that are numbers."""
     offsets_s = np.array(stream.offsets, dtype=np.float64).reshape(-1, 2)
-    return np.column_stack([lsl.nanoseconds(column) for column in offsets_s[_sound(offsets_s)].T])
+    return np.column_stack([lsl.nanoseconds(column) for column in offsets_s[_is_valid(offsets_s)].T])
 
 
-def _sound(offsets_s: Floats) -> AnyArray:
+def _is_valid(offsets_s: Floats) -> AnyArray:
     return np.asarray((np.abs(offsets_s) < lsl.LATEST_S).all(axis=1))
 
 
-def _reset_row(stream: _Stream, raw_ns: Times, measured: Int64s, first: int) -> int:
+def _reset_row(stream: _StreamReading, raw_ns: Times, measured: Int64s, first: int) -> int:
     """Return the first sample after the sender's clock was reset: the measurement ``first`` is the first one after it.
 
     It stands between that measurement and the one before, or, as samples are written late, the one behind.
     """
-    sound = np.flatnonzero(_sound(np.array(stream.offsets, dtype=np.float64)))
+    sound = np.flatnonzero(_is_valid(np.array(stream.offsets, dtype=np.float64)))
     rows = [*(stream.rows_before[place] for place in sound.tolist()), len(raw_ns)]
     low, high = rows[first - 1], min(rows[first + 1], len(raw_ns))
     steps = np.diff(raw_ns[max(low - 1, 0) : high])
@@ -365,7 +375,7 @@ def _reset_row(stream: _Stream, raw_ns: Times, measured: Int64s, first: int) -> 
     return max(low - 1, 0) + jump + 1
 
 
-def _content_of(stream: _Stream, t_ns: Times) -> pa.Table | Batched:
+def _content_of(stream: _StreamReading, t_ns: Times) -> pa.Table | Batched:
     """Return the samples with their stamps: a table of few, else as they were put aside. The stamps are in memory."""
     schema = pa.schema([_time_field(STAMP), _time_field(RAW), *stream.fields])
     raw_ns = lsl.nanoseconds(np.concatenate(stream.stamps))
@@ -385,10 +395,10 @@ def _time_field(name: str) -> pa.Field:
     return pa.field(name, pa.int64(), metadata=about)
 
 
-def _offsets_table(stream: _Stream) -> pa.Table:
+def _offsets_table(stream: _StreamReading) -> pa.Table:
     """Return the clock offsets as they were measured: when on both clocks, and what was to be added."""
     offsets_s = np.array(stream.offsets, dtype=np.float64).reshape(-1, 2)
-    offsets_s = offsets_s[_sound(offsets_s)]
+    offsets_s = offsets_s[_is_valid(offsets_s)]
     sent_ns, offset_ns = (lsl.nanoseconds(column) for column in offsets_s.T)
     field = pa.field("offset_s", pa.float64(), metadata={"unit": "s", "quantity": "time"})
     columns = [pa.array(np.maximum.accumulate(sent_ns + offset_ns)), pa.array(sent_ns), pa.array(offsets_s[:, 1])]

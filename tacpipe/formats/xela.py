@@ -1,4 +1,4 @@
-"""What the published XELA trials have in common: a folder a trial, uSkin counts, markers, one line about the trial."""
+"""Read the parts that the published XELA trials share: uSkin counts, markers, and one line about the trial."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 SENSORS = {"xela1": "xela_sensor1.csv", "xela2": "xela_sensor2.csv"}
 META = "meta_data.csv"
-UNSEEN = 10.0  # in all seven columns of a marker that the camera did not see; found in the recordings
-UNIT_TOLERANCE = 1e-3  # by how much a quaternion's length may differ from 1; the recordings stay below 1e-6
+UNSEEN = 10.0  # value of all seven columns of a marker that the camera did not see
+UNIT_TOLERANCE = 1e-3  # tolerance of a quaternion's length; the recordings stay below 1e-6
 
 
 def read_uskin(path: Path) -> list[Counts]:
@@ -82,7 +82,7 @@ def check_rows(trial: str, rows: Mapping[str, int], tactile: str, missing_allowe
             )
 
 
-class Meta:
+class TrialMeta:
     """The line of text that describes a trial, read cell by cell with what each must hold."""
 
     def __init__(self, path: Path) -> None:
@@ -120,21 +120,28 @@ class Meta:
 
         return self._read(name, moment, "a date and time as 2021-11-24 15:20:42.172409")
 
-    def _read(self, name: str, read: Callable[[str], T], wanted: str) -> T:
+    def _read(self, name: str, read: Callable[[str], T], expected: str) -> T:
         cell = self.cells.get(name, "")
         try:
             if cell:
                 return read(cell)
         except (ValueError, KeyError):
             pass
-        held = f"holds {excerpt(cell)}" if cell else "is missing or empty"
-        raise TacpipeError(f"{self.path}, column {name} {held}; it must be {wanted}. Put the file right and try again.")
+        problem = f"holds {excerpt(cell)}" if cell else "is missing or empty"
+        raise TacpipeError(
+            f"{self.path}, column {name} {problem}; it must be {expected}. Put the file right and try again."
+        )
 
 
-def tactile_streams(columns: Mapping[str, Sequence[Counts]], t_ns: Times, made: str | None) -> dict[str, pa.Table]:
+def tactile_streams(
+    columns: Mapping[str, Sequence[Counts]], t_ns: Times, stamp_source: str | None
+) -> dict[str, pa.Table]:
     """Return the tables of the sensors by stream name."""
     fields = schema.uskin_fields()
-    return {name: schema.stream(t_ns[: len(found[0])], found, fields, made) for name, found in columns.items()}
+    return {
+        name: schema.stream(t_ns[: len(channels[0])], channels, fields, stamp_source)
+        for name, channels in columns.items()
+    }
 
 
 def authors_role(role: str) -> dict[str, Attribute]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tacpipe.formats.folders import Params, trials
+from tacpipe.formats.published import Params, trials
 from tacpipe.plugins.stage import Files, RecordingOutput, stage
 
 if TYPE_CHECKING:
@@ -34,11 +34,11 @@ def xela_flat(params: Params, files: Files) -> RecordingOutput:
     import numpy as np
 
     from tacpipe.channels import schema
-    from tacpipe.formats import folders, published, xela
+    from tacpipe.formats import published, xela
     from tacpipe.signals.resampling import uniform_grid
 
-    trial = folders.require(files, NAMES)
-    meta = xela.Meta(files[xela.META])
+    trial = published.require(files, NAMES)
+    meta = xela.TrialMeta(files[xela.META])
     rate_hz = meta.number("frequency_hz")
     tactile = {stream: xela.read_uskin(files[name]) for stream, name in xela.SENSORS.items()}
     joints = [f"panda_joint{n}" for n in range(1, 8)]
@@ -78,7 +78,7 @@ def xela_flat(params: Params, files: Files) -> RecordingOutput:
             "rate_hz": rate_hz,
             "trial": trial,
             **{f"{name}_unseen_ratio": round(unseen, 4) for name, (_, unseen) in markers.items()},
-            **published.mark("xela-flat", meta.utc_ns("start_time")),
+            **published.published_attribute("xela-flat", meta.utc_ns("start_time")),
             **xela.authors_role(params.authors_role),
         },
     )

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tacpipe.errors import TacpipeError
-from tacpipe.formats.folders import Params, trials
+from tacpipe.formats.published import Params, trials
 from tacpipe.plugins.stage import Files, RecordingOutput, stage
 
 if TYPE_CHECKING:
@@ -39,12 +39,12 @@ def xela_psc(params: Params, files: Files) -> RecordingOutput:
     import pyarrow as pa
 
     from tacpipe.channels import schema
-    from tacpipe.formats import folders, xela
+    from tacpipe.formats import published, xela
     from tacpipe.formats.csv_table import read_csv
     from tacpipe.signals.holds import mean_rate_hz
 
-    trial = folders.require(files, NAMES)
-    meta = xela.Meta(files[xela.META])
+    trial = published.require(files, NAMES)
+    meta = xela.TrialMeta(files[xela.META])
     tactile = {stream: xela.read_uskin(files[name]) for stream, name in xela.SENSORS.items()}
     joints = [f"joint{n}" for n in range(1, 8)]
     moving = [f"position_{joint}" for joint in joints] + [f"velocity_{joint}" for joint in joints]

@@ -14,7 +14,7 @@ from tacpipe.arrays import Bytes, Float32s, Floats, Times
 from tacpipe.channels.streams import COUNT, EVENTS, TRUTH, rate_hz, read_clocks
 from tacpipe.clouds.cloud import COLOUR, POSITION
 from tacpipe.datasets.streams import split_tables
-from tacpipe.formats.arrays.frames import encoding
+from tacpipe.formats.arrays.columns import picture_encoding
 from tacpipe.signals import contact
 from tacpipe.traces import curves, forecasts, named, paths, spans, taxels
 from tacpipe.traces.curves import TIME, Curves, described
@@ -294,7 +294,7 @@ def _frames(stream: str, table: pa.Table) -> list[Frames]:
         if not str(column.type).endswith("binary"):
             continue
         content = [bytes(one or b"") for one in table.column(column.name).to_pylist()]
-        kind = next(filter(None, map(encoding, content)), "")
+        kind = next(filter(None, map(picture_encoding, content)), "")
         if kind:
             found.append(Frames(stream, table.column(TIME).to_numpy(), content, f"image/{kind}"))
     return found

@@ -12,7 +12,7 @@ import pytest
 
 from tacpipe.errors import TacpipeError
 from tacpipe.formats.biotac_slide import biotac_slide, discover
-from tacpipe.formats.folders import Params
+from tacpipe.formats.published import Params
 from tacpipe.plugins.stage import RecordingOutput
 from tests.formats.slide_files import SECOND, write_biotac
 

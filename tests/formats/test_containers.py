@@ -69,9 +69,9 @@ def test_a_layout_of_a_table_reads_a_container_beside_a_csv(tmp_path: Path) -> N
     time = { column = "time" }
     columns = [{ match = "x" }]
     """
-    made = layout.parse(text)
-    found = contained.sources(made, tmp_path, recordings.found(made, tmp_path))
-    output = contained.recording(made, None, found["t1"].files, found["t1"].values)
+    made = layout.parse_layout(text)
+    found = contained.discover_sources(made, tmp_path, recordings.find_recordings(made, tmp_path))
+    output = contained.read_recording(made, None, found["t1"].files, found["t1"].values)
     assert {name: len(table.read_all() if name == "arm" else table) for name, table in output.streams.items()} == {
         "skin": 2,
         "arm": 1,
@@ -133,10 +133,12 @@ def test_a_folder_with_a_mark_is_one_container_whose_files_all_count(tmp_path: P
     for name in ("meta/mark", "data/a.fake", "data/b.fake"):
         (tmp_path / "set" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "set" / name).write_text("{}")
-    assert kinds.found("xdf", tmp_path) == kinds.found("xdf", tmp_path / "set") == [tmp_path / "set"]
-    files = contained.members({"container": tmp_path / "set"})
+    assert (
+        kinds.find_containers("xdf", tmp_path) == kinds.find_containers("xdf", tmp_path / "set") == [tmp_path / "set"]
+    )
+    files = contained.member_files({"container": tmp_path / "set"})
     assert sorted(files) == ["container/data/a.fake", "container/data/b.fake", "container/meta/mark"]
-    assert contained.containers(files) == {"container": tmp_path / "set"}
+    assert contained.container_paths(files) == {"container": tmp_path / "set"}
 
 
 @pytest.mark.parametrize(

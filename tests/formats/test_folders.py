@@ -20,7 +20,7 @@ from tacpipe.datasets import paths, recording_names
 from tacpipe.engine import computing
 from tacpipe.engine.task import Done, Task
 from tacpipe.errors import UsageError
-from tacpipe.formats.folders import PREFIX, trials, valid
+from tacpipe.formats.published import PREFIX, trials, valid
 from tacpipe.io import files, regular
 from tests.conftest import Lab
 from tests.formats import grasp_files, slide_files, xela_files

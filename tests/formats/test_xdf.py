@@ -19,8 +19,8 @@ import pyxdf
 
 from tacpipe.errors import TacpipeError
 from tacpipe.formats import xdf_streams
+from tacpipe.formats.container_commands import XDF, xdf
 from tacpipe.formats.table.contained import Params
-from tacpipe.formats.xdf import COMMAND, xdf
 from tacpipe.plugins.stage import RecordingOutput
 from tests.formats.xdf_writer import Writer
 
@@ -35,7 +35,7 @@ def _quiet() -> None:
 
 def read(path: Path, layout: str = "") -> RecordingOutput:
     params = Params(json.dumps(tomllib.loads(layout)) if layout else "")
-    (source,) = COMMAND.discover(params, path.parent).values()
+    (source,) = XDF.discover(params, path.parent).values()
     return xdf(params, source.files, source.values)
 
 
@@ -297,7 +297,7 @@ def test_a_published_file_reads_as_pyxdf_does() -> None:
 def test_samples_that_were_put_aside_are_those_that_were_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     force(tmp_path / "run.xdf", rows=1000)
     expected = read(tmp_path / "run.xdf").streams["force"]
-    monkeypatch.setattr(xdf_streams, "ASIDE_ROWS", 64)
+    monkeypatch.setattr(xdf_streams, "SPILL_ROWS", 64)
     monkeypatch.setattr(xdf_streams, "PASSED_BYTES", mmap.PAGESIZE)
     made = read(tmp_path / "run.xdf").streams["force"]
     assert isinstance(made, pa.RecordBatchReader)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from tacpipe.errors import TacpipeError
-from tacpipe.formats.folders import Params
+from tacpipe.formats.published import Params
 from tacpipe.formats.xela_flat import discover, xela_flat
 from tacpipe.plugins.stage import RecordingOutput
 

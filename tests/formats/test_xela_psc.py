@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tacpipe.errors import TacpipeError
-from tacpipe.formats.folders import Params
+from tacpipe.formats.published import Params
 from tacpipe.formats.xela_psc import discover, xela_psc
 from tacpipe.plugins.stage import RecordingOutput
 

@@ -1,10 +1,11 @@
-"""Which recordings a tree of arrays holds: a group each, rows of arrays that hold all of them, or one."""
+"""Find the recordings of a tree of arrays, the arrays of each stream, and their stamps or rate."""
 
 from __future__ import annotations
 
+import json
 import re
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,7 +13,8 @@ import numpy as np
 
 from tacpipe.arrays import AnyArray
 from tacpipe.errors import TacpipeError
-from tacpipe.formats.arrays.tree import Array, Tree
+from tacpipe.formats.arrays.tree import Array, Tree, is_frames, reason_left_out, walk
+from tacpipe.formats.containers.container import Time, TimeUnit
 from tacpipe.io import memory
 from tacpipe.printable import plain
 
@@ -31,51 +33,53 @@ class Episode:
     group: str = ""
     start: int = 0
     stop: int | None = None  # None: to the end of each array
-    number: int = 0  # among those that share arrays, of which there are ``count``
+    number: int = 0  # position among the ``count`` recordings that share arrays
     count: int = 0
     total: int = 0  # rows of all of them
-    beside: str | None = None  # the group of the array that states where they end
+    ends_group: str | None = None  # the group of the array that states where they end
     labels: Mapping[str, Any] = field(default_factory=dict)
-    stated: bool = False  # whether its name is one that the file states
+    name_is_stated: bool = False  # True where the file states its name
 
     def inside(self, path: str) -> str:
         """Return the path of a group or an array within the recording's group."""
         return path[len(self.group) :].strip("/")
 
 
-def found(tree: Tree) -> list[Episode]:
+def find_episodes(tree: Tree) -> list[Episode]:
     """Return the recordings of a tree, in order: by number where names have one. Raises `TacpipeError`."""
-    cut = _cut(tree)
+    cut = _episodes_from_ends(tree)
     if cut:
         return cut
     groups: list[str] = []
     for group in tree.members("")[1]:  # the groups of recordings lie here, or one level below
         groups += [group] if _is_numbered(group) else filter(_is_numbered, tree.members(group)[1])
     names = Counter(group.rpartition("/")[2] for group in groups)
-    return [Episode(_name(group, names), group) for group in sorted(groups, key=_order)] or [Episode(None)]
+    return [Episode(_episode_name(group, names), group) for group in sorted(groups, key=_natural_order)] or [
+        Episode(None)
+    ]
 
 
 def _is_numbered(group: str) -> bool:
     return NUMBERED.fullmatch(group.rpartition("/")[2]) is not None
 
 
-def _name(group: str, names: Mapping[str, int]) -> str:
+def _episode_name(group: str, names: Mapping[str, int]) -> str:
     """Return the name of a recording's group, with the group above where two have the same last part."""
     last = group.rpartition("/")[2]
     return last if names[last] == 1 else group
 
 
-def named(tree: Tree, name: str | None) -> Episode:
+def find_episode(tree: Tree, name: str | None) -> Episode:
     """Return the recording of this name, without a look at the others. Raises `TacpipeError` where there is none."""
     if name is None:
-        (*several, one) = found(tree)
-        if several or one.name is not None:
-            raise TacpipeError(f"{tree.path} holds {len(several) + 1} recordings. Name one of them.")
-        return one
-    cut = _cut(tree)
-    for one in cut:
-        if one.name == name:
-            return one
+        (*others, episode) = find_episodes(tree)
+        if others or episode.name is not None:
+            raise TacpipeError(f"{tree.path} holds {len(others) + 1} recordings. Name one of them.")
+        return episode
+    cut = _episodes_from_ends(tree)
+    for episode in cut:
+        if episode.name == name:
+            return episode
     for group in ["", *(tree.members("")[1] if "/" not in name else ())] if not cut else ():
         path = f"{group}/{name}" if group else name
         if tree.is_group(path):
@@ -83,34 +87,47 @@ def named(tree: Tree, name: str | None) -> Episode:
     raise TacpipeError(f"{tree.path} holds no recording {plain(name)}.")
 
 
-def _cut(tree: Tree) -> list[Episode]:
+def _episodes_from_ends(tree: Tree) -> list[Episode]:
     """Return the recordings that an array cuts all others into; none where there is no such array."""
     for path in ENDS:
         group = path.rpartition("/")[0]
         array = (
-            next((one for one in tree.members(group)[0] if one.path == path), None) if tree.is_group(group) else None
+            next((array for array in tree.members(group)[0] if array.path == path), None)
+            if tree.is_group(group)
+            else None
         )
         if array is not None:
-            ends = [int(end) for end in _checked(tree, array)]
+            ends = [int(end) for end in _read_ends(tree, array)]
             about = tree.attributes(group)
-            names, stated = about.get(NAMES), True
-            if not isinstance(names, list) or len({str(one) for one in names}) != len(ends):
-                names = [f"episode_{number:06d}" for number in range(len(ends))]  # as LeRobot counts them
-                stated = False
+            names, names_stated = about.get(NAMES), True
+            if not isinstance(names, list) or len({str(array) for array in names}) != len(ends):
+                names = [f"episode_{number:06d}" for number in range(len(ends))]  # LeRobot's names
+                names_stated = False
             labels = about.get(LABELS)
             return [
-                Episode(str(name), "", start, stop, number, len(ends), ends[-1], group, _of(labels, str(name)), stated)
+                Episode(
+                    str(name),
+                    "",
+                    start,
+                    stop,
+                    number,
+                    len(ends),
+                    ends[-1],
+                    group,
+                    _labels_of_episode(labels, str(name)),
+                    names_stated,
+                )
                 for number, (name, start, stop) in enumerate(zip(names, [0, *ends], ends, strict=False))
             ]
     return []
 
 
-def _of(labels: Any, name: str) -> Mapping[str, Any]:
-    own = labels.get(name) if isinstance(labels, dict) else None
-    return own if isinstance(own, dict) else {}
+def _labels_of_episode(labels: Any, name: str) -> Mapping[str, Any]:
+    values = labels.get(name) if isinstance(labels, dict) else None
+    return values if isinstance(values, dict) else {}
 
 
-def _checked(tree: Tree, array: Array) -> AnyArray:
+def _read_ends(tree: Tree, array: Array) -> AnyArray:
     if array.problem:
         raise TacpipeError(f"{tree.path}: {array.path} {array.problem}.")
     if len(array.shape) != 1 or array.dtype.kind not in "iu":
@@ -129,5 +146,212 @@ def _checked(tree: Tree, array: Array) -> AnyArray:
     return ends
 
 
-def _order(path: str) -> list[int | str]:
+def _natural_order(path: str) -> list[int | str]:
     return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path)]
+
+
+TIME = re.compile(
+    r"(t|time|times|timestamps?|time_?stamps?|stamps?|clock|unix_?time|epoch)(_?(s|sec|seconds|ms|us|ns))?",
+    re.IGNORECASE,
+)
+SENSOR_TIME = re.compile(r"\w+_(time_?stamps?|stamps?|time)(_?(s|sec|seconds|ms|us|ns))?", re.IGNORECASE)
+LENGTHS = "compress_len"  # ALOHA: lengths of frames before padding
+NEXT = "next_obs"  # robomimic: obs, one step later
+ROOT = "/"  # the source of arrays that lie in the recording's own group
+
+
+@dataclass(frozen=True)
+class Part:
+    """The arrays of one stream: ``source`` names it within the recording, ``time`` is the array of its stamps."""
+
+    source: str
+    arrays: Sequence[Array]
+    time: Array | None
+    frames: bool = False  # True where its one array holds encoded pictures
+
+    @property
+    def all_arrays(self) -> Sequence[Array]:
+        """The arrays with that of the stamps."""
+        return [*([] if self.time is None else [self.time]), *self.arrays]
+
+    @property
+    def clock(self) -> str:
+        """The column with the stamps: an array, or a field of a compound one; empty where there is none."""
+        if self.time is not None:
+            return self.time.name
+        kind = self.arrays[0].dtype
+        return next((name for name in kind.names or () if TIME.fullmatch(name) and kind[name].kind in "iuf"), "")
+
+
+@dataclass(frozen=True)
+class StreamParts:
+    """The streams of a recording, arrays of one value, and what is left out with the reason."""
+
+    parts: Sequence[Part]
+    scalars: Sequence[Array] = ()
+    skipped: Mapping[str, str] = field(default_factory=dict)
+
+
+def group_into_parts(tree: Tree, episode: Episode) -> StreamParts:
+    """Return the streams of a recording, in the order of the file."""
+    parts: list[Part] = []
+    scalars: list[Array] = []
+    skipped: dict[str, str] = {}
+    stamps: list[Array] = []  # stamps in groups above, for arrays of their length without own stamps
+    for group, arrays in walk(tree, episode.group):
+        inside = episode.inside(group)
+        if inside.rpartition("/")[2] == NEXT:
+            skipped[inside] = "repeats obs, one step later"
+        columns_of_group: list[Array] = []
+        for array in arrays:
+            reason = _reason_left_out(array, episode)
+            if NEXT in inside.split("/"):
+                continue
+            if reason:
+                skipped[episode.inside(array.path)] = reason
+            elif group == episode.ends_group and array.shape == (episode.count,):
+                scalars += [array] if array.path not in ENDS else []
+            else:
+                (columns_of_group if _is_column(array, arrays, episode) else scalars).append(array)
+        parts += _divide_by_length(columns_of_group, inside or ROOT, episode, stamps)
+        stamps += filter(_is_time, columns_of_group)
+    return StreamParts(parts, scalars, skipped)
+
+
+def _reason_left_out(array: Array, episode: Episode) -> str:
+    """Return why an array is left out; empty where it is not."""
+    if array.name == LENGTHS:
+        return "holds the lengths of padded frames"
+    one_each = array.group == episode.ends_group and array.shape == (episode.count,)
+    short = episode.stop is not None and not one_each and array.shape[:1] < (episode.total,)
+    return reason_left_out(array) or (
+        f"has {array.shape[0] if array.shape else 1} rows, fewer than its recordings" if short else ""
+    )
+
+
+def _is_column(array: Array, neighbours: Sequence[Array], episode: Episode) -> bool:
+    """Return whether an array has a value a row rather than one of the recording."""
+    lengths = {neighbour.shape[0] for neighbour in neighbours if neighbour.shape}
+    return bool(array.shape) and (array.shape != (1,) or lengths == {1} or episode.stop is not None)
+
+
+def _divide_by_length(arrays: Sequence[Array], group: str, episode: Episode, above: Sequence[Array]) -> Iterator[Part]:
+    """Yield the streams of one group's arrays, named by the group where it holds one, else by the first array of each."""
+    single_streams = [
+        array
+        for array in arrays
+        if array.dtype.kind == "V" or (is_frames(array) and "quantity" not in array.attributes)
+    ]
+    by_length: dict[int, list[Array]] = {}
+    for array in arrays:
+        if array not in single_streams:
+            by_length.setdefault(array.shape[0], []).append(array)
+    is_divided = sum(any(not _is_time(array) for array in same) for same in by_length.values()) > 1
+    for same in by_length.values():
+        time = _clock_array(same, above)
+        columns = [array for array in same if array is not time]
+        if columns:
+            named_by_array = is_divided or (group == ROOT and len(columns) == 1)
+            yield Part(episode.inside(columns[0].path) if named_by_array else group, columns, time)
+    for array in single_streams:
+        time = _clock_array(
+            by_length.get(array.shape[0], []), [clock for clock in above if clock.shape[0] == array.shape[0]]
+        )
+        yield Part(episode.inside(array.path), [array], time, is_frames(array))
+
+
+def _clock_array(same: Sequence[Array], above: Sequence[Array]) -> Array | None:
+    """Return the array that holds the stamps of arrays of one length: among them, else in a group above."""
+    clocks = [array for array in same if _is_time(array)]
+    clock = next((array for array in clocks if TIME.fullmatch(array.name)), next(iter(clocks), None))
+    length = same[0].shape[0] if same else None
+    return clock or next((array for array in reversed(above) if length is None or array.shape[0] == length), None)
+
+
+def _is_time(array: Array) -> bool:
+    narrow = len(array.shape) == 1 or array.shape[1:] == (1,)
+    return (
+        narrow
+        and array.dtype.kind in "iuf"
+        and (TIME.fullmatch(array.name) is not None or SENSOR_TIME.fullmatch(array.name) is not None)
+    )
+
+
+RATES = ("rate_hz", "fps", "frequency_hz", "frequency", "control_freq", "sampling_rate", "sample_rate", "rate", "hz")
+UNITS: Mapping[str, TimeUnit] = {
+    **{"s": "s", "sec": "s", "second": "s", "seconds": "s", "ms": "ms", "millisecond": "ms", "milliseconds": "ms"},
+    **{"us": "us", "µs": "us", "microsecond": "us", "microseconds": "us", "ns": "ns", "nanosecond": "ns"},
+    "nanoseconds": "ns",
+}
+SINCE_1970: tuple[tuple[float, TimeUnit], ...] = ((1e11, "s"), (1e14, "ms"), (1e17, "us"), (float("inf"), "ns"))
+MIN_UNIX_S = 1e8  # seconds since 1970: what is less counts from the start of a recording
+
+
+def time_of_part(tree: Tree, episode: Episode, part: Part) -> Time:
+    """Return where the stamps of a stream come from; an empty `Time` where the file states neither stamps nor a rate."""
+    if part.clock:
+        unit = _stamp_unit(part, size := _last_stamp(tree, episode, part))
+        if unit is not None:
+            declared = part.time is not None and part.time.attributes.get("quantity") == "time"
+            since_1970 = declared or size >= MIN_UNIX_S * 10 ** {"s": 0, "ms": 3, "us": 6, "ns": 9}[unit]
+            return Time(column=part.clock, unit=unit, origin="unix" if since_1970 else "start")
+    rate = declared_rate_hz(tree, episode, part)
+    return Time() if rate is None else Time(rate_hz=rate)
+
+
+def row_count(episode: Episode, part: Part) -> int:
+    """Return how many rows of a stream belong to a recording."""
+    length = part.arrays[0].shape[0]
+    return max((length if episode.stop is None else min(episode.stop, length)) - episode.start, 0)
+
+
+def parent_groups(group: str) -> list[str]:
+    """Return a group and those above it, the root first.
+
+    >>> parent_groups("data/demo_0")
+    ['', 'data', 'data/demo_0']
+    """
+    names = group.split("/") if group else []
+    return ["/".join(names[:count]) for count in range(len(names) + 1)]
+
+
+def _last_stamp(tree: Tree, episode: Episode, part: Part) -> float:
+    """Return the last stamp of a stream as its file holds it, without sign; 0 where there is none."""
+    array = part.time or part.arrays[0]
+    last = episode.start + row_count(episode, part)
+    last_row = np.asarray(tree.read(array, max(last - 1, 0), last))
+    values = (last_row if part.time is not None else last_row[part.clock]).reshape(-1)
+    return abs(float(values[0])) if len(values) and np.isfinite(values[0]) else 0.0
+
+
+def _stamp_unit(part: Part, size: float) -> TimeUnit | None:
+    """Return the unit of stamps, as an attribute, the name or their size shows it; None where nothing does."""
+    attributes = part.time.attributes if part.time is not None else {}
+    declared = next((str(attributes[key]) for key in ("unit", "units") if isinstance(attributes.get(key), str)), "")
+    suffix = re.search(r"_(ns|us|ms|s|sec|seconds)$", part.clock, re.IGNORECASE)
+    unit = UNITS.get(declared.strip().lower()) or (UNITS.get(suffix[1].lower()) if suffix else None)
+    return unit or (next(unit for limit, unit in SINCE_1970 if size < limit) if size >= MIN_UNIX_S else None)
+
+
+def declared_rate_hz(tree: Tree, episode: Episode, part: Part | None) -> float | None:
+    """Return the rate that attributes of a stream's arrays, its group or one above state, or that all recordings have."""
+    arrays = part.arrays if part is not None else ()
+    groups = [*reversed(parent_groups(arrays[0].group))] if arrays else []
+    attribute_sets = [*(attributes.attributes for attributes in arrays), *map(tree.attributes, groups)]
+    attribute_sets += [tree.attributes(episode.ends_group)] if episode.ends_group is not None else []
+    return next((rate for attributes in attribute_sets if (rate := _declared_rate(attributes)) is not None), None)
+
+
+def _declared_rate(attributes: Mapping[str, Any]) -> float | None:
+    for name in RATES:
+        value = attributes.get(name)
+        if isinstance(value, int | float | np.number) and np.isfinite(value) and 0 < value <= 1e9:
+            return float(value)
+    environment = attributes.get("env_args")  # robomimic: a text of JSON
+    if isinstance(environment, str | bytes):
+        try:
+            inner = json.loads(environment)["env_kwargs"]
+        except (ValueError, KeyError, TypeError, RecursionError):
+            return None
+        return _declared_rate({"control_freq": inner.get("control_freq")}) if isinstance(inner, dict) else None
+    return None

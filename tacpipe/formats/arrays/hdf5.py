@@ -28,7 +28,7 @@ BROKEN = (
     RuntimeError,
     ValueError,
     TypeError,
-)  # what h5py raises for bytes that are not as they should
+)  # errors of h5py for damaged bytes
 ATTRIBUTE_BYTES = 1 << 27  # memory limit for reading an attribute
 MOST_RATIO = 10_000  # bytes of values that a byte of the file may hold
 FILTERS = {  # HDF5 numbers of the accepted filters; others may need libraries of the file's author
@@ -42,16 +42,16 @@ class Hdf5Tree:
     """An opened HDF5 file; ``bytes_left`` of one that is cut short are there, None of a whole one."""
 
     def __init__(self, path: Path, file: h5py.File, bytes_left: int | None = None) -> None:
-        self.path, self._file, self._left = path, file, bytes_left
-        self._members: dict[str, tuple[list[Array], list[str]]] = {}  # of groups that were listed
-        self._stated: dict[str, dict[str, Any]] = {}  # attributes of groups
+        self.path, self._file, self._available = path, file, bytes_left
+        self._members: dict[str, tuple[list[Array], list[str]]] = {}  # members by listed group
+        self._attributes_by_group: dict[str, dict[str, Any]] = {}  # attributes of groups
 
     @property
     def notes(self) -> list[str]:
         """Return a sentence about what is missing."""
-        if self._left is None:
+        if self._available is None:
             return []
-        return [f"{self.path} is cut short after {self._left:,} bytes, and the rest is missing. Copy it again."]
+        return [f"{self.path} is cut short after {self._available:,} bytes, and the rest is missing. Copy it again."]
 
     def members(self, group: str) -> tuple[list[Array], list[str]]:
         """Return the arrays in a group and the paths of the groups in it."""
@@ -65,7 +65,7 @@ class Hdf5Tree:
                 try:
                     member = _member(parent, name, path, self.path)
                 except BROKEN:
-                    if self._left is None:
+                    if self._available is None:
                         raise
                     member = path  # a path beyond the cut is listed and refused when it is opened
                 if isinstance(member, Array):
@@ -84,9 +84,9 @@ class Hdf5Tree:
     def attributes(self, group: str) -> Mapping[str, Any]:
         """Return the attributes of a group, but those that cannot be read."""
         with self._reading(group or "its root"):
-            if group not in self._stated:
-                self._stated[group] = _attributes(self._file[group or "/"], self.path)
-            return self._stated[group]
+            if group not in self._attributes_by_group:
+                self._attributes_by_group[group] = _read_attributes(self._file[group or "/"], self.path)
+            return self._attributes_by_group[group]
 
     def read(self, array: Array, start: int, stop: int) -> AnyArray:
         """Return the rows of an array; text as ``str`` objects. Raises `TacpipeError` where they are damaged."""
@@ -98,8 +98,8 @@ class Hdf5Tree:
             self._reading(array.path),
         ):
             dataset = self._file[array.path]
-            if self._left is not None:
-                _expect_there(dataset, self._left)
+            if self._available is not None:
+                _expect_there(dataset, self._available)
             text = h5py.check_string_dtype(dataset.dtype) is not None
             rows = (*(slice(None),) * array.time_axis, slice(start, stop)) if array.shape else ()
             values = (dataset.asstr(errors="replace") if text else dataset)[rows]
@@ -108,11 +108,11 @@ class Hdf5Tree:
     def files(self, array: Array, start: int, stop: int) -> None:
         """Return None: all arrays lie in one file."""
 
-    def stated(self, array: Array) -> None:
+    def encoding_metadata(self, array: Array) -> None:
         """Return nothing, as the file states it."""
 
     @contextlib.contextmanager
-    def _reading(self, what: str) -> Iterator[None]:
+    def _reading(self, place: str) -> Iterator[None]:
         """Raise what h5py raises in the block as a `TacpipeError` that names file and place."""
         try:
             yield
@@ -120,23 +120,23 @@ class Hdf5Tree:
             if isinstance(error, OSError) and error.errno is not None:
                 with regular.failing(self.path):
                     raise
-            if self._left is not None:
-                cut = f"{self.path} is cut short after {self._left:,} bytes"
-                raise TacpipeError(f"{cut}, and {plain(what, 200)} lies behind. Copy it again.") from error
-            why = plain(str(error.args[0] if error.args else error), 200)
+            if self._available is not None:
+                cut = f"{self.path} is cut short after {self._available:,} bytes"
+                raise TacpipeError(f"{cut}, and {plain(place, 200)} lies behind. Copy it again.") from error
+            reason = plain(str(error.args[0] if error.args else error), 200)
             raise TacpipeError(
-                f"{self.path}: {plain(what, 200)} cannot be read: {why}. Copy the file again."
+                f"{self.path}: {plain(place, 200)} cannot be read: {reason}. Copy the file again."
             ) from error
 
     def _names(self, group: h5py.Group) -> list[str]:
         """Return the names in a group; of a file that is cut short as many as can be listed."""
-        if self._left is None:
+        if self._available is None:
             return list(group)
-        found: list[bytes] = []
+        names: list[bytes] = []
         place = group.id  # kept: the links do not
         with contextlib.suppress(*BROKEN):
-            place.links.iterate(found.append)  # a callback that returns nothing continues
-        return [name.decode(errors="surrogateescape") for name in found]
+            place.links.iterate(names.append)  # a callback that returns nothing continues
+        return [name.decode(errors="surrogateescape") for name in names]
 
     def identity(self, group: str) -> Any:
         """Return what the paths of one group share: where it lies in the file."""
@@ -148,16 +148,16 @@ class Hdf5Tree:
 
 
 @contextlib.contextmanager
-def opened(path: Path) -> Iterator[Hdf5Tree]:
+def open_hdf5(path: Path) -> Iterator[Hdf5Tree]:
     """Open an HDF5 file for reading, also one that is cut short. Raises `TacpipeError` for what is not HDF5."""
     with regular.failing(path), regular.opened(path) as file:  # not a pipe, and what the system answers
         size = file.seek(0, io.SEEK_END)
     try:
-        found = h5py.File(path, "r", locking=False)
+        file_h5 = h5py.File(path, "r", locking=False)
     except BROKEN as error:
         cut = _TRUNCATED.search(str(error))
         if cut:
-            with _padded(path, int(cut[1]), int(cut[2])) as tree:
+            with _open_truncated(path, int(cut[1]), int(cut[2])) as tree:
                 yield tree
             return
         if not size:
@@ -168,33 +168,33 @@ def opened(path: Path) -> Iterator[Hdf5Tree]:
                 f"`h5clear -s {path}` on a copy."
             ) from error
         raise TacpipeError(f"{path} is not an HDF5 file: {plain(str(error), 200)}.") from error
-    with found:
-        yield Hdf5Tree(path, found)
+    with file_h5:
+        yield Hdf5Tree(path, file_h5)
 
 
 @contextlib.contextmanager
-def _padded(path: Path, left: int, size: int) -> Iterator[Hdf5Tree]:
+def _open_truncated(path: Path, available: int, size: int) -> Iterator[Hdf5Tree]:
     """Open a file of which ``left`` of ``size`` bytes are there. Raises `TacpipeError` where that is not enough."""
     with regular.failing(path), regular.opened(path) as file:
         try:
-            found = h5py.File(_Padded(file, left, size), "r")
-            with found:
-                tree = Hdf5Tree(path, found, left)
+            file_h5 = h5py.File(_PaddedFile(file, available, size), "r")
+            with file_h5:
+                tree = Hdf5Tree(path, file_h5, available)
                 tree.members("")
                 yield tree
         except BROKEN as error:
             if isinstance(error, OSError) and error.errno is not None:
                 raise
             raise TacpipeError(
-                f"{path} is cut short: it has {left:,} bytes, and its header states {size:,}. Copy it again."
+                f"{path} is cut short: it has {available:,} bytes, and its header states {size:,}. Copy it again."
             ) from error
 
 
-class _Padded(io.RawIOBase):
+class _PaddedFile(io.RawIOBase):
     """A file that is cut short, with zeros to the size that it should have."""
 
-    def __init__(self, file: io.BufferedReader, left: int, size: int) -> None:
-        self._file, self._left, self._size, self._at = file, left, size, 0
+    def __init__(self, file: io.BufferedReader, available: int, size: int) -> None:
+        self._file, self._available, self._size, self._at = file, available, size, 0
 
     def seekable(self) -> bool:
         return True
@@ -207,26 +207,26 @@ class _Padded(io.RawIOBase):
         return self._at
 
     def readinto(self, buffer: Any) -> int:
-        wanted = max(0, min(len(buffer), self._size - self._at))
-        self._file.seek(min(self._at, self._left))
-        given = self._file.read(wanted)
-        buffer[: len(given)] = given
-        buffer[len(given) : wanted] = bytes(wanted - len(given))
-        self._at += wanted
-        return wanted
+        count = max(0, min(len(buffer), self._size - self._at))
+        self._file.seek(min(self._at, self._available))
+        content = self._file.read(count)
+        buffer[: len(content)] = content
+        buffer[len(content) : count] = bytes(count - len(content))
+        self._at += count
+        return count
 
 
-def _expect_there(found: h5py.Dataset, left: int) -> None:
+def _expect_there(dataset: h5py.Dataset, available: int) -> None:
     """Raise `OSError` where bytes of an array lie behind the end of a file that is cut short: they would read as zeros."""
-    if found.chunks is None:
-        offset = found.id.get_offset()
-        ends = [offset + found.id.get_storage_size()] if offset is not None else []
+    if dataset.chunks is None:
+        offset = dataset.id.get_offset()
+        ends = [offset + dataset.id.get_storage_size()] if offset is not None else []
     else:
-        chunks = (found.id.get_chunk_info(number) for number in range(found.id.get_num_chunks()))
-        ends = [one.byte_offset + one.size for one in chunks]
-        if not ends and found.size:
+        chunks = (dataset.id.get_chunk_info(number) for number in range(dataset.id.get_num_chunks()))
+        ends = [chunk.byte_offset + chunk.size for chunk in chunks]
+        if not ends and dataset.size:
             raise OSError("its chunks are not listed")
-    if max(ends, default=0) > left:
+    if max(ends, default=0) > available:
         raise OSError("its values lie behind the end")
 
 
@@ -239,25 +239,25 @@ def _member(group: h5py.Group, name: str, path: str, file: Path) -> Array | str:
         )
     if isinstance(link, h5py.SoftLink) and name not in group:
         return Array(path, (), np.dtype("V"), problem="is a link to what is not there")
-    found = group[name]
-    if isinstance(found, h5py.Group):
+    member = group[name]
+    if isinstance(member, h5py.Group):
         return path
-    if not isinstance(found, h5py.Dataset):
+    if not isinstance(member, h5py.Dataset):
         return ""
     problem = ""
-    if found.is_virtual or found.external:
+    if member.is_virtual or member.external:
         problem = "has its values in another file, which is not read"
-    elif found.shape is None:
+    elif member.shape is None:
         problem = "holds nothing"
-    elif unknown := [number for number in _filters(found) if number not in FILTERS]:
+    elif unknown := [number for number in _filters(member) if number not in FILTERS]:
         problem = f"is stored with the filter {unknown[0]}, which is not read"
-    elif found.chunks and (chunk_bytes := int(np.prod(found.chunks)) * found.dtype.itemsize) > memory.MOST_BLOCK:
+    elif member.chunks and (chunk_bytes := int(np.prod(member.chunks)) * member.dtype.itemsize) > memory.MOST_BLOCK:
         problem = f"has chunks of {memory.readable_size(chunk_bytes)}, which are not read"
-    elif found.nbytes > max(memory.MOST_BLOCK, MOST_RATIO * found.id.get_storage_size()):
-        stored = memory.readable_size(found.id.get_storage_size())
-        problem = f"declares {memory.readable_size(found.nbytes)} of values and holds {stored}"
-    chunk_rows = found.chunks[0] if found.chunks else 0
-    return Array(path, found.shape or (), found.dtype, _attributes(found, file), chunk_rows, problem)
+    elif member.nbytes > max(memory.MOST_BLOCK, MOST_RATIO * member.id.get_storage_size()):
+        stored = memory.readable_size(member.id.get_storage_size())
+        problem = f"declares {memory.readable_size(member.nbytes)} of values and holds {stored}"
+    chunk_rows = member.chunks[0] if member.chunks else 0
+    return Array(path, member.shape or (), member.dtype, _read_attributes(member, file), chunk_rows, problem)
 
 
 def _filters(dataset: h5py.Dataset) -> Iterator[int]:
@@ -267,7 +267,7 @@ def _filters(dataset: h5py.Dataset) -> Iterator[int]:
         yield about.get_filter(place)[0]
 
 
-def _attributes(owner: Any, file: Path) -> dict[str, Any]:
+def _read_attributes(owner: Any, file: Path) -> dict[str, Any]:
     attributes = {}
     for name in owner.attrs:
         place = f"{file}, the attribute {plain(name)},"

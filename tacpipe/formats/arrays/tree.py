@@ -13,8 +13,8 @@ import numpy as np
 from tacpipe.arrays import AnyArray
 from tacpipe.printable import plain
 
-MOST_COLUMNS = 4096  # of one array; one that has more is a picture or a mistake
-LONGEST_TEXT = 200  # characters of an attribute; longer ones are files of their own, as a simulator's model
+MAX_COLUMNS = 4096  # an array with more values per row is a picture or a mistake
+MAX_TEXT = 200  # characters of an attribute; longer ones are files of their own, as a simulator's model
 IMAGE_SIDE = 32  # pixels that a picture has at least
 IMAGE_NAMES = ("image", "img", "rgb", "depth", "cam", "video", "frame", "pixel")
 COLOURS = (1, 3, 4)  # channels of a picture
@@ -22,9 +22,9 @@ COLOURS = (1, 3, 4)  # channels of a picture
 
 @dataclass(frozen=True)
 class Array:
-    """What a file states of one array; ``dtype`` is that of numpy, object where elements have no fixed length."""
+    """The description of one array; ``dtype`` is that of numpy, object where elements have no fixed length."""
 
-    path: str  # within the file, as "data/demo_0/actions"
+    path: str  # path within the file, as "data/demo_0/actions"
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
     attributes: Mapping[str, Any] = field(default_factory=dict)
@@ -53,17 +53,17 @@ class Tree(Protocol):
 
     @property
     def path(self) -> Path:
-        """Where it lies."""
+        """The path of the file or folder."""
 
     @property
     def notes(self) -> Sequence[str]:
-        """What is missing of a file that is cut short, in sentences."""
+        """Sentences about the missing part of a truncated file."""
 
     def members(self, group: str) -> tuple[list[Array], list[str]]:
         """The arrays in a group, and the paths of the groups in it."""
 
     def is_group(self, path: str) -> bool:
-        """Whether there is a group of this path."""
+        """Return True where a group has this path."""
 
     def identity(self, group: str) -> Any:
         """Return a value that is equal for all paths of one group; links can give a group several paths."""
@@ -77,7 +77,7 @@ class Tree(Protocol):
     def files(self, array: Array, start: int, stop: int) -> Mapping[str, Path] | None:
         """The files that hold rows of an array, by path within the store; None where all lies in one file."""
 
-    def stated(self, array: Array) -> Any:
+    def encoding_metadata(self, array: Array) -> Any:
         """How the rows of an array are encoded, as JSON, without how many there are."""
 
 
@@ -154,10 +154,10 @@ def is_image(array: Array) -> bool:
     return coloured or _named_as_image(array.path)
 
 
-def left_out(array: Array) -> str:
+def reason_left_out(array: Array) -> str:
     """Return why an array is not read as columns, as in "NAME …"; empty where it is.
 
-    >>> left_out(Array("a/cam", (5, 480, 640, 3), np.dtype("uint8")))
+    >>> reason_left_out(Array("a/cam", (5, 480, 640, 3), np.dtype("uint8")))
     'holds decoded pictures (480 x 640 x 3), which are not read'
     """
     if array.problem:
@@ -168,8 +168,10 @@ def left_out(array: Array) -> str:
         return f"has the type {array.dtype}, which is not read"
     if array.dtype.kind == "O" and not is_text(array) and not is_frames(array):
         return "has elements of no fixed length, which are not read"
-    if not is_frames(array) and int(np.prod(array.shape[1:], dtype=np.int64)) > MOST_COLUMNS:
-        return f"has {int(np.prod(array.shape[1:], dtype=np.int64))} values a row, more than the {MOST_COLUMNS} of a stream"
+    if not is_frames(array) and int(np.prod(array.shape[1:], dtype=np.int64)) > MAX_COLUMNS:
+        return (
+            f"has {int(np.prod(array.shape[1:], dtype=np.int64))} values a row, more than the {MAX_COLUMNS} of a stream"
+        )
     return ""
 
 
@@ -179,14 +181,14 @@ def is_text(array: Array) -> bool:
     return array.dtype.kind in "SUT" or (about is not None and about.get("vlen") in (str, bytes))
 
 
-def plain_attributes(found: Mapping[str, Any]) -> dict[str, str | int | float | bool]:
+def plain_attributes(attributes: Mapping[str, Any]) -> dict[str, str | int | float | bool]:
     """Return the attributes that are a text of some length, a number, or true or false, as plain values.
 
     >>> plain_attributes({"a": np.float32(0.5), "b": b"x", "c": np.array([1, 2]), "d": np.array([3])})
     {'a': 0.5, 'b': 'x', 'd': 3}
     """
-    made: dict[str, str | int | float | bool] = {}
-    for name, value in found.items():
+    values: dict[str, str | int | float | bool] = {}
+    for name, value in attributes.items():
         if isinstance(value, np.ndarray) and value.size == 1:
             value = value.reshape(-1)[0]
         if isinstance(value, np.generic):
@@ -194,9 +196,9 @@ def plain_attributes(found: Mapping[str, Any]) -> dict[str, str | int | float | 
         if isinstance(value, bytes):
             value = value.decode(errors="replace")
         finite = not isinstance(value, float) or math.isfinite(value)
-        if isinstance(value, str | int | float | bool) and finite and len(str(value)) <= LONGEST_TEXT:
-            made[plain(str(name))] = value
-    return made
+        if isinstance(value, str | int | float | bool) and finite and len(str(value)) <= MAX_TEXT:
+            values[plain(str(name))] = value
+    return values
 
 
 def _named_as_image(path: str) -> bool:

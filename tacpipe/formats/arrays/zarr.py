@@ -32,12 +32,12 @@ from tacpipe.io import files as file_system
 from tacpipe.io import memory, regular
 from tacpipe.printable import excerpt, listed, plain
 
-MARKS = (".zgroup", ".zarray", "zarr.json")  # what makes a folder a group or an array
+MARKS = (".zgroup", ".zarray", "zarr.json")  # files that mark a folder as a group or an array
 MOST_CHUNKS = 1 << 20  # chunks per array
 UNPACKED_BYTES = 1 << 27  # memory limit for reading chunks, in addition to their values
 MOST_BYTES = 1 << 26  # size of a metadata file
 BROKEN_ZIP = (zipfile.BadZipFile, zlib.error, EOFError, KeyError, ValueError, RuntimeError, NotImplementedError)
-BROKEN = (  # what zarr and its codecs raise for bytes that are not as they should be
+BROKEN = (  # errors of zarr and its codecs for damaged bytes
     *(*BROKEN_ZIP, OSError, LookupError, TypeError, AttributeError, ArithmeticError, AssertionError, ImportError),
     SystemError,  # raised by blosc
 )
@@ -46,7 +46,7 @@ CODECS = {  # accepted codecs of numcodecs and zarr: none runs stored code, as p
     *("fletcher32", "gzip", "jenkins_lookup3", "lz4", "lzma", "packbits", "quantize", "sharding_indexed", "shuffle"),
     *("transpose", "vlen-utf8", "zlib", "zstd"),
 }
-_filled: ContextVar[bool] = ContextVar("filled", default=False)  # whether a chunk that is not there holds fill values
+_filled: ContextVar[bool] = ContextVar("filled", default=False)  # True: a missing chunk holds fill values
 _KINDS = re.compile(r"bool|u?int(8|16|32|64)|float(16|32|64)")
 
 
@@ -57,24 +57,24 @@ class ZarrTree:
     path: Path
     names: frozenset[str] | None
     notes: Sequence[str] = ()
-    _found: dict[str, tuple[dict[str, Any], dict[str, Any]] | None] = field(default_factory=dict)  # metadata by path
+    _nodes: dict[str, tuple[dict[str, Any], dict[str, Any]] | None] = field(default_factory=dict)  # metadata by path
 
     def members(self, group: str) -> tuple[list[Array], list[str]]:
         """Return the arrays in a group and the paths of the groups in it, sorted."""
         arrays, below = [], []
         for name in self._below(group):
             path = f"{group}/{name}" if group else name
-            found = self._node(path)
-            if found is not None and "shape" in found[0]:
-                arrays.append(_array(path, *found))
-            elif found is not None:
+            node = self._node(path)
+            if node is not None and "shape" in node[0]:
+                arrays.append(_parse_array(path, *node))
+            elif node is not None:
                 below.append(path)
         return arrays, below
 
     def is_group(self, path: str) -> bool:
         """Return whether there is a group of this path."""
-        found = self._node(path)
-        return found is not None and "shape" not in found[0]
+        node = self._node(path)
+        return node is not None and "shape" not in node[0]
 
     def identity(self, group: str) -> str:
         """Return the path of a group: it has no other."""
@@ -82,8 +82,8 @@ class ZarrTree:
 
     def attributes(self, group: str) -> Mapping[str, Any]:
         """Return the attributes of a group."""
-        found = self._node(group)
-        return found[1] if found is not None else {}
+        node = self._node(group)
+        return node[1] if node is not None else {}
 
     def read(self, array: Array, start: int, stop: int) -> AnyArray:
         """Return the rows of an array. Raises `TacpipeError` for what is damaged, and for a chunk that is not there."""
@@ -105,11 +105,11 @@ class ZarrTree:
             )
         try:
             with contextlib.ExitStack() as stack, self._store() as store:
-                found = zarr.open_array(store, path=array.path, mode="r")
-                chunk_bytes = math.prod(found.chunks) * max(array.dtype.itemsize, 1)
+                zarr_array = zarr.open_array(store, path=array.path, mode="r")
+                chunk_bytes = math.prod(zarr_array.chunks) * max(array.dtype.itemsize, 1)
                 limit_bytes = UNPACKED_BYTES + array.row_bytes * max(stop - start, 1) + 4 * chunk_bytes
                 stack.enter_context(memory.bounded(limit_bytes, f"{self.path}, {plain(array.path, 200)},"))
-                return np.asarray(found[() if not array.shape else slice(start, stop)])
+                return np.asarray(zarr_array[() if not array.shape else slice(start, stop)])
         except BROKEN as error:
             if isinstance(error, OSError) and error.errno is not None:
                 with regular.failing(self.path):
@@ -121,9 +121,9 @@ class ZarrTree:
 
     def chunks(self, array: Array, start: int, stop: int) -> list[str]:
         """Return the names, within the store, of the files that hold rows of an array."""
-        found = self._node(array.path)
-        assert found is not None
-        shape, key = _grid(found[0])
+        node = self._node(array.path)
+        assert node is not None
+        shape, key = _chunk_grid(node[0])
         if math.prod(array.shape) == 0 or stop <= start:
             return []
         spans = [range(math.ceil(size / step)) for size, step in zip(array.shape, shape, strict=True)]
@@ -142,10 +142,10 @@ class ZarrTree:
             return None
         return {name: self.path / name for name in self.chunks(array, start, stop) if self._has(name)}
 
-    def stated(self, array: Array) -> Any:
+    def encoding_metadata(self, array: Array) -> Any:
         """Return the metadata of an array but for its shape, which grows with each recording that is added."""
-        found = self._node(array.path)
-        return {key: value for key, value in found[0].items() if key != "shape"} if found is not None else None
+        node = self._node(array.path)
+        return {key: value for key, value in node[0].items() if key != "shape"} if node is not None else None
 
     def _has(self, name: str) -> bool:
         if self.names is not None:
@@ -157,7 +157,7 @@ class ZarrTree:
         """Return the names of the folders in a group."""
         if self.names is None:
             with regular.failing(self.path), os.scandir(self.path / group) as entries:
-                return sorted(one.name for one in entries if one.is_dir(follow_symlinks=False))
+                return sorted(entry.name for entry in entries if entry.is_dir(follow_symlinks=False))
         start = f"{group}/" if group else ""
         return sorted(
             {
@@ -169,11 +169,11 @@ class ZarrTree:
 
     def _node(self, path: str) -> tuple[dict[str, Any], dict[str, Any]] | None:
         """Return metadata and attributes of a group or an array; None where there is neither."""
-        if path not in self._found:
-            self._found[path] = self._looked_up(path)
-        return self._found[path]
+        if path not in self._nodes:
+            self._nodes[path] = self._read_node(path)
+        return self._nodes[path]
 
-    def _looked_up(self, path: str) -> tuple[dict[str, Any], dict[str, Any]] | None:
+    def _read_node(self, path: str) -> tuple[dict[str, Any], dict[str, Any]] | None:
         for mark in MARKS:
             name = f"{path}/{mark}" if path else mark
             if self._has(name):
@@ -181,19 +181,19 @@ class ZarrTree:
                 if mark == MARKS[-1]:
                     attributes = about.get("attributes", {})
                 else:
-                    beside = f"{path}/.zattrs" if path else ".zattrs"
-                    attributes = self._json(beside) if self._has(beside) else {}
+                    attributes_name = f"{path}/.zattrs" if path else ".zattrs"
+                    attributes = self._json(attributes_name) if self._has(attributes_name) else {}
                 return about, attributes if isinstance(attributes, dict) else {}
         return None
 
     def _json(self, name: str) -> dict[str, Any]:
         try:
-            found = json.loads(self._content(name))
+            content = json.loads(self._content(name))
         except (*BROKEN_ZIP, RecursionError) as error:
             raise TacpipeError(f"{self.path}: {plain(name, 200)} cannot be read: {plain(str(error), 200)}.") from error
-        if not isinstance(found, dict):
-            raise TacpipeError(f"{self.path}: {plain(name, 200)} holds {excerpt(found)}; it must be a JSON object.")
-        return found
+        if not isinstance(content, dict):
+            raise TacpipeError(f"{self.path}: {plain(name, 200)} holds {excerpt(content)}; it must be a JSON object.")
+        return content
 
     def _content(self, name: str) -> bytes:
         if self.names is None:
@@ -219,7 +219,7 @@ class ZarrTree:
 
 
 @contextlib.contextmanager
-def missing_chunks(*, filled: bool) -> Iterator[None]:
+def allow_missing_chunks(*, filled: bool) -> Iterator[None]:
     """Have chunks that are not there read as fill values in the block, or refused, as they are without it."""
     before = _filled.set(filled)
     try:
@@ -229,7 +229,7 @@ def missing_chunks(*, filled: bool) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def opened(path: Path) -> Iterator[ZarrTree]:
+def open_zarr(path: Path) -> Iterator[ZarrTree]:
     """Open a Zarr store, folder or zip file. Raises `TacpipeError` where it is neither."""
     names = None
     if not path.is_dir():
@@ -241,10 +241,10 @@ def opened(path: Path) -> Iterator[ZarrTree]:
                 f"{path} is not a whole zip file: {plain(str(error), 200)}. Its table of contents lies at its end: copy the "
                 f"file again."
             ) from error
-    found = ZarrTree(path, names)
-    if not found.is_group(""):
+    tree = ZarrTree(path, names)
+    if not tree.is_group(""):
         raise TacpipeError(f"{path} is not a Zarr group: it has no .zgroup or zarr.json of one at its top.")
-    yield found
+    yield tree
 
 
 @functools.cache
@@ -283,23 +283,23 @@ def _archive(path: Path) -> Iterator[zipfile.ZipFile]:
             raise zipfile.BadZipFile("its table of contents leads out of the file") from error
 
 
-def _array(path: str, about: Mapping[str, Any], attributes: Mapping[str, Any]) -> Array:
+def _parse_array(path: str, about: Mapping[str, Any], attributes: Mapping[str, Any]) -> Array:
     problem = ""
     shape = about.get("shape")
     if not isinstance(shape, list) or not all(isinstance(size, int) and size >= 0 for size in shape):
         return Array(path, (), np.dtype("V"), problem=f"has the shape {excerpt(shape)}, which is none")
     try:
-        kind = _dtype(about)
+        kind = _parse_dtype(about)
     except (TypeError, ValueError, LookupError, AttributeError):
         kind, problem = np.dtype("V"), f"has the type {excerpt(about.get('dtype', about.get('data_type')))}"
     try:
-        steps, _ = _grid(about)
+        steps, _ = _chunk_grid(about)
     except (TypeError, ValueError, LookupError, AttributeError):
         steps = []
     if len(steps) != len(shape) or not all(isinstance(step, int) and step > 0 for step in steps):
         problem, steps = "has chunks of no known shape", []
     try:
-        codecs = {str(codec) for codec in _codecs(about)}
+        codecs = {str(codec) for codec in _codec_names(about)}
     except (TypeError, AttributeError):
         codecs = {"unnamed"}
     if math.prod(steps) * kind.itemsize > memory.MOST_BLOCK and "sharding_indexed" not in codecs:
@@ -312,7 +312,7 @@ def _array(path: str, about: Mapping[str, Any], attributes: Mapping[str, Any]) -
     return Array(path, tuple(shape), kind, attributes, steps[0] if steps else 0, reason)
 
 
-def _dtype(about: Mapping[str, Any]) -> np.dtype[Any]:
+def _parse_dtype(about: Mapping[str, Any]) -> np.dtype[Any]:
     if about.get("zarr_format") == 3:
         called = about["data_type"]
         if called in ("string", "variable_length_utf8"):
@@ -322,13 +322,13 @@ def _dtype(about: Mapping[str, Any]) -> np.dtype[Any]:
         return np.dtype(str(called))
     kind: Any = about["dtype"]
     if kind == "|O":
-        texts = [one.get("id") for one in about.get("filters") or ()]
+        texts = [entry.get("id") for entry in about.get("filters") or ()]
         return np.dtype("O", metadata={"vlen": str} if "vlen-utf8" in texts else {})
-    found: np.dtype[Any] = np.dtype([tuple(one) for one in kind] if isinstance(kind, list) else kind)
-    return found
+    dtype: np.dtype[Any] = np.dtype([tuple(entry) for entry in kind] if isinstance(kind, list) else kind)
+    return dtype
 
 
-def _codecs(about: Mapping[str, Any]) -> Iterator[Any]:
+def _codec_names(about: Mapping[str, Any]) -> Iterator[Any]:
     """Yield the names of the codecs of an array, without the prefix of those that zarr has from numcodecs."""
     if about.get("zarr_format") != 3:
         yield from (_entry(codec, "id") for codec in (about.get("compressor"), *(about.get("filters") or ())) if codec)
@@ -347,7 +347,7 @@ def _entry(codec: Any, key: str) -> Any:
     return codec.get(key) if isinstance(codec, dict) else codec
 
 
-def _grid(about: Mapping[str, Any]) -> tuple[Sequence[int], Any]:
+def _chunk_grid(about: Mapping[str, Any]) -> tuple[Sequence[int], Any]:
     """Return the shape of a chunk, and a function from its place in the grid to its name within the array."""
     if about.get("zarr_format") == 3:
         encoding = about.get("chunk_key_encoding", {"name": "default"})

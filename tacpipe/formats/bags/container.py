@@ -306,7 +306,7 @@ class _BagReading:
         if metadata.name == EXPORT_KEY:
             self.attributes |= exported_attributes(metadata.values)
             return
-        from tacpipe.formats.table.label_texts import plain_value
+        from tacpipe.formats.table.label_table import plain_value
 
         for name, value in metadata.values.items():
             self.attributes.setdefault(plain(name), plain_value(value))

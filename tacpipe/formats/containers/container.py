@@ -1,4 +1,4 @@
-"""What a container of streams gives: its episodes, and the streams of one, as the file itself declares them."""
+"""The interface of containers: episodes, and the streams of one as the file itself declares them."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ TimeUnit = Literal["s", "ms", "us", "ns", "iso8601"]
 
 @dataclass(frozen=True)
 class Time:
-    """Where the stamps of a stream come from: a column, a file next to the stream's own, or a rate."""
+    """The origin of the stamps of a stream: a column, a file next to the stream's own, or a rate."""
 
     column: str = ""
     unit: TimeUnit = "s"
     rate_hz: Rate | None = None
-    origin: Literal["unix", "start"] = "unix"  # what a number counts from: 1970, or the start of the recording
+    origin: Literal["unix", "start"] = "unix"  # zero of numbers: 1970, or the start of the recording
     zone: str = "UTC"  # time zone of ISO 8601 stamps that name none, as Europe/Berlin
     start: str = ""  # UTC, ISO 8601: the first stamp of recordings that count from their start, the day of times of day
     file: str = ""  # pattern of a file that holds the stamps of all rows, one after another
@@ -35,8 +35,8 @@ class Time:
         return bool(self.format) or self.unit == "iso8601"
 
     @property
-    def given(self) -> bool:
-        """Whether it states where stamps come from."""
+    def is_declared(self) -> bool:
+        """True where a column, a file or a rate is named."""
         return bool(self.column or self.file) or self.rate_hz is not None
 
 
@@ -63,7 +63,7 @@ class SourceStream:
     """
 
     source: str  # its name inside the file: a topic, a group, a dataset
-    name: str  # of the stream: an identifier
+    name: str  # name of the stream, an identifier
     time: Time
     content: pa.Table | Batched  # all rows, or the first few where it was looked at
     rows: int | None = None  # how many there are, where a look shows it
@@ -92,20 +92,20 @@ class SourceStream:
 
 @dataclass(frozen=True)
 class Contents:
-    """What a container holds of one episode."""
+    """The streams and attributes of one episode of a container."""
 
     streams: Sequence[SourceStream]
-    attributes: Mapping[str, Attribute] = field(default_factory=dict)  # of the recording, as the file states them
-    skipped: Mapping[str, str] = field(default_factory=dict)  # what cannot be read, by source: the reason
+    attributes: Mapping[str, Attribute] = field(default_factory=dict)  # attributes of the recording in the file
+    skipped: Mapping[str, str] = field(default_factory=dict)  # reasons by source that cannot be read
     notes: Sequence[str] = ()  # sentences about what is missing, as of a file that was cut off
 
 
 @dataclass(frozen=True)
 class Share:
-    """What one episode of a container is read from, where that is less than all of its files: what its key rests on."""
+    """The files and values that one episode of a container, and its key, depend on."""
 
-    files: Mapping[str, Path]  # by their path within the container
-    values: Mapping[str, Any] = field(default_factory=dict)  # of JSON: what else it depends on
+    files: Mapping[str, Path]  # files by their path within the container
+    values: Mapping[str, Any] = field(default_factory=dict)  # further JSON values that it depends on
 
 
 @runtime_checkable
@@ -122,7 +122,7 @@ class Naming(Protocol):
 
     @property
     def names_itself(self) -> bool:
-        """Whether its episodes are named without the container's name before theirs."""
+        """True where its episodes are named without the container's name before theirs."""
 
 
 class Container(Protocol):

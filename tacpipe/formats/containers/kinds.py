@@ -1,4 +1,4 @@
-"""Which containers there are: how their files are recognised, and what opens them."""
+"""The formats of containers: how their files are recognised, and their openers."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ class Kind:
     """A format of containers: files with an ending, folders with a mark, or both."""
 
     opener: str  # module:function, imported when a file is opened, as it may need an extra
-    endings: tuple[str, ...] = ()  # of files, in lower case
+    endings: tuple[str, ...] = ()  # endings of files, in lower case
     marks: tuple[str, ...] = ()  # a folder that holds one of these files is one container
-    marked: bytes = b""  # what the first 4 KiB of such a file hold
+    marked: bytes = b""  # content of the first 4 KiB of such a file
 
 
 KINDS: Mapping[str, Kind] = {
@@ -32,23 +32,27 @@ KINDS: Mapping[str, Kind] = {
         ("metadata.yaml",),
         b"rosbag2_bagfile_information",
     ),
-    "hdf5": Kind("tacpipe.formats.hdf5:opened", (".hdf5", ".h5")),
-    "zarr": Kind("tacpipe.formats.zarr:opened", (".zarr.zip", ".zarr"), (".zgroup", ".zarray", "zarr.json")),
-    "xdf": Kind("tacpipe.formats.xdf:opened", (".xdf", ".xdfz", ".xdf.gz")),
-    "lerobot": Kind("tacpipe.formats.lerobot.container:opened", (), ("meta/info.json",)),
+    "hdf5": Kind("tacpipe.formats.arrays.container:open_hdf5", (".hdf5", ".h5")),
+    "zarr": Kind(
+        "tacpipe.formats.arrays.container:open_zarr",
+        (".zarr.zip", ".zarr"),
+        (".zgroup", ".zarray", "zarr.json"),
+    ),
+    "xdf": Kind("tacpipe.formats.xdf_streams:XdfFile", (".xdf", ".xdfz", ".xdf.gz")),
+    "lerobot": Kind("tacpipe.formats.lerobot.container:open_lerobot", (), ("meta/info.json",)),
 }
 
 
-def opened(kind: str, path: Path) -> Container:
+def open_container(kind: str, path: Path) -> Container:
     """Return the container at ``path``."""
     module, _, function = KINDS[kind].opener.partition(":")
     return cast(Container, getattr(importlib.import_module(module), function)(path))
 
 
-def is_one(kind: str, path: Path) -> bool:
+def is_container(kind: str, path: Path) -> bool:
     """Return whether a path looks like a container of this kind."""
     if path.is_dir():
-        return any(_marks(path / mark, KINDS[kind].marked) for mark in KINDS[kind].marks)
+        return any(_has_mark(path / mark, KINDS[kind].marked) for mark in KINDS[kind].marks)
     return path.name.lower().endswith(KINDS[kind].endings)
 
 
@@ -57,18 +61,18 @@ def has_ending(kind: str, name: str) -> bool:
     return bool(KINDS[kind].endings) and name.lower().endswith(KINDS[kind].endings)
 
 
-def _marks(path: Path, content: bytes) -> bool:
+def _has_mark(path: Path, content: bytes) -> bool:
     if not content or not path.is_file():
         return path.is_file()
     with regular.failing(path), regular.opened(path) as file:
         return content in file.read(4096)
 
 
-def found(kind: str, source: Path) -> list[Path]:
+def find_containers(kind: str, source: Path) -> list[Path]:
     """Return the containers of this kind at or below ``source``, sorted; what lies within one is part of it."""
-    paths = [source] if not source.is_dir() and is_one(kind, source) else []
+    paths = [source] if not source.is_dir() and is_container(kind, source) else []
     for place, folders, names in file_system.walk(source) if source.is_dir() else ():
-        if is_one(kind, Path(place)):
+        if is_container(kind, Path(place)):
             paths.append(Path(place))
             folders.clear()
             continue
@@ -76,23 +80,27 @@ def found(kind: str, source: Path) -> list[Path]:
     return sorted(paths)
 
 
-def described(kind: str) -> str:
+def describe_kind(kind: str) -> str:
     """Return how containers of this kind are recognised, for errors."""
-    one = KINDS[kind]
-    files = [f"files named {', '.join(f'*{ending}' for ending in one.endings)}"] if one.endings else []
-    folders = [f"folders with {' or '.join(one.marks)}"] if one.marks else []
+    container_kind = KINDS[kind]
+    files = (
+        [f"files named {', '.join(f'*{ending}' for ending in container_kind.endings)}"]
+        if container_kind.endings
+        else []
+    )
+    folders = [f"folders with {' or '.join(container_kind.marks)}"] if container_kind.marks else []
     return " or ".join([*files, *folders])
 
 
-def none(kind: str, source: Path) -> UsageError:
+def no_container_error(kind: str, source: Path) -> UsageError:
     """Return the error for a source without a container of this kind."""
     if not source.exists():
         return UsageError(f"There is no {source} to read recordings from.")
     verb = "holds no" if source.is_dir() else "is not a"
-    return UsageError(f"{source} {verb} recording for ingest {kind}, which reads {described(kind)}.")
+    return UsageError(f"{source} {verb} recording for ingest {kind}, which reads {describe_kind(kind)}.")
 
 
-def members(path: Path) -> dict[str, Path]:
+def container_files(path: Path) -> dict[str, Path]:
     """Return the files of a container: "" and its path, or of a folder each file by its path within."""
     if not path.is_dir():
         return {"": path}
@@ -103,9 +111,9 @@ def members(path: Path) -> dict[str, Path]:
     }
 
 
-def names(paths: Sequence[Path], source: Path) -> dict[Path, str]:
+def container_names(paths: Sequence[Path], source: Path) -> dict[Path, str]:
     """Return a name for each container: that of its file without the ending, with folders above where two share one."""
-    stems = {path: _stem(path) for path in paths}
+    stems = {path: _name_stem(path) for path in paths}
     shared = [stem.casefold() for stem in stems.values()]
     return {
         path: stem if shared.count(stem.casefold()) == 1 else "-".join([*path.relative_to(source).parts[:-1], stem])
@@ -113,9 +121,11 @@ def names(paths: Sequence[Path], source: Path) -> dict[Path, str]:
     }
 
 
-def _stem(path: Path) -> str:
+def _name_stem(path: Path) -> str:
     ending = max(
-        (one for kind in KINDS.values() for one in kind.endings if path.name.lower().endswith(one)), key=len, default=""
+        (ending for kind in KINDS.values() for ending in kind.endings if path.name.lower().endswith(ending)),
+        key=len,
+        default="",
     )
     return path.resolve().name.removesuffix(ending) if path.is_dir() else path.name[: len(path.name) - len(ending)]
 
@@ -126,16 +136,18 @@ def identifiers(sources: Sequence[str]) -> dict[str, str]:
     >>> identifiers(["/left/skin", "/joint_states", "left.skin", "3d"])
     {'/left/skin': 'left_skin', '/joint_states': 'joint_states', 'left.skin': 'left_skin_2', '3d': 'stream_3d'}
     """
-    made: dict[str, str] = {}
-    taken: set[str] = set()
+    names: dict[str, str] = {}
+    used: set[str] = set()
     for source in sources:
-        letters = "".join(one if one.isascii() and (one.isalnum() or one == "_") else " " for one in source)
+        letters = "".join(
+            letter if letter.isascii() and (letter.isalnum() or letter == "_") else " " for letter in source
+        )
         name = "_".join(letters.split()).strip("_") or "stream"
         name = f"stream_{name}" if name[0].isdigit() else name
         number = 2
         candidate = name
-        while candidate.casefold() in taken:
+        while candidate.casefold() in used:
             candidate, number = f"{name}_{number}", number + 1
-        taken.add(candidate.casefold())
-        made[source] = candidate
-    return made
+        used.add(candidate.casefold())
+        names[source] = candidate
+    return names

@@ -20,8 +20,8 @@ import pyarrow.parquet as pq
 from tacpipe.arrays import Int64s
 from tacpipe.errors import TacpipeError
 from tacpipe.formats import unique_names
-from tacpipe.formats.arrays import known
-from tacpipe.formats.arrays.frames import NAME as PICTURE
+from tacpipe.formats.arrays import array_names
+from tacpipe.formats.arrays.columns import PICTURE as PICTURE
 from tacpipe.formats.containers import kinds
 from tacpipe.formats.containers.container import Batched, Contents, Share, SourceStream, Time
 from tacpipe.formats.lerobot import description
@@ -33,10 +33,10 @@ from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import plain
 
 NATIVE = "tacpipe"  # the folder with the streams that a dataset was exported from, a folder a recording
-TOLERANCE_S = 1e-4  # as LeRobot's own
+TOLERANCE_S = 1e-4  # LeRobot's own tolerance
 INDEX, FRAME, STAMP = "episode_index", "frame_index", "timestamp"
-OWN = (INDEX, FRAME, STAMP, "index", "task_index")  # features that count frames
-TOGETHER = ("next", NATIVE)  # features that begin so are one stream, as next.reward and next.done
+COUNTING_FEATURES = (INDEX, FRAME, STAMP, "index", "task_index")  # features that count frames
+SHARED_STREAMS = ("next", NATIVE)  # features that begin so are one stream, as next.reward and next.done
 EXACT = f"{NATIVE}.t_ns"  # the feature with the stamps in ns, of datasets that tacpipe exported
 CLOCK = Time(column="t_ns", unit="ns", origin="start")
 FROM_RATE, FROM_STAMPS = "frame_index / fps", "timestamp, float32 seconds"
@@ -54,32 +54,32 @@ class LeRobotContainer:
 
     def look(self, episode: str | None) -> Contents:
         """Return the streams of an episode, without rows."""
-        return self._contents(self._named(episode), None, rows=False)
+        return self._contents(self._find_episode(episode), None, rows=False)
 
     def read(self, sources: Collection[str] | None, episode: str | None) -> Contents:
         """Return the streams of an episode, all or those of some features."""
-        return self._contents(self._named(episode), sources, rows=True)
+        return self._contents(self._find_episode(episode), sources, rows=True)
 
     @property
     def names_itself(self) -> bool:
-        """Whether the episodes have the names of the recordings that they were exported from."""
-        return all(one.original is not None for one in self._episodes.values())
+        """True where the episodes have the names of the recordings that they were exported from."""
+        return all(episode.original is not None for episode in self._episodes.values())
 
     def share(self, sources: Collection[str] | None, episode: str | None) -> Share:
         """Return what an episode is read from: its file, its native streams, and what meta states of it alone."""
-        one = self._named(episode)
+        entry = self._find_episode(episode)
         about = self._about
-        paths = [regular.inside(self.path, one.file), *self._native(one).values()]
+        paths = [regular.inside(self.path, entry.file), *self._native(entry).values()]
         with regular.failing(self.path):
             files = {path.relative_to(self.path).as_posix(): path for path in paths if file_system.present(path)}
-        stated = {"fps": about.fps, "robot": about.robot, "features": about.info["features"], "index": one.index}
-        stated |= {"tasks": list(one.tasks), "videos": dict(one.videos), "attributes": dict(one.attributes)}
-        stated |= {"length": one.length}
-        return Share(files or {description.INFO: self.path / description.INFO}, stated)
+        values = {"fps": about.fps, "robot": about.robot, "features": about.info["features"], "index": entry.index}
+        values |= {"tasks": list(entry.tasks), "videos": dict(entry.videos), "attributes": dict(entry.attributes)}
+        values |= {"length": entry.length}
+        return Share(files or {description.INFO: self.path / description.INFO}, values)
 
     @functools.cached_property
     def _about(self) -> Description:
-        return description.read(self.path)
+        return description.read_description(self.path)
 
     @functools.cached_property
     def _episodes(self) -> dict[str, Episode]:
@@ -97,7 +97,7 @@ class LeRobotContainer:
             f"{self.path} describes {len(self._episodes)} episodes, and {description.INFO} states {declared_count}."
         ]
 
-    def _named(self, name: str | None) -> Episode:
+    def _find_episode(self, name: str | None) -> Episode:
         if name not in self._episodes:
             raise TacpipeError(f"{self.path} holds no episode {plain(str(name))}.")
         return self._episodes[name]
@@ -105,13 +105,15 @@ class LeRobotContainer:
     def _native(self, episode: Episode) -> dict[str, Path]:
         """Return the files of the streams that an episode was exported from, by stream; "" where it was one table."""
         folder, file = (regular.inside(self.path, f"{NATIVE}/{episode.name}{end}") for end in ("", ".parquet"))
-        found = {path.stem: path for path in file_system.listed(folder, "*.parquet")}
-        return {"": file} if file.is_file() and not found else found
+        paths = {path.stem: path for path in file_system.listed(folder, "*.parquet")}
+        return {"": file} if file.is_file() and not paths else paths
 
     def _contents(self, episode: Episode, sources: Collection[str] | None, *, rows: bool) -> Contents:
         native = self._native(episode)
         if native:
-            streams = [self._exact(name, path) for name, path in native.items() if _wanted(name, sources)]
+            streams = [
+                self._exported_stream(name, path) for name, path in native.items() if _is_selected(name, sources)
+            ]
             return Contents(streams, episode.original or {}, notes=self._notes(episode))
         attributes: dict[str, Attribute] = {**episode.attributes, "episode_index": episode.index}
         attributes |= episode.original or {}
@@ -124,7 +126,7 @@ class LeRobotContainer:
         streams = self._streams(episode, sources, rows=rows)
         return Contents(streams, attributes | {"fps": self._about.fps}, skipped, self._notes(episode))
 
-    def _exact(self, name: str, path: Path) -> SourceStream:
+    def _exported_stream(self, name: str, path: Path) -> SourceStream:
         """Return a stream as it was before the export, to the bit; the rows of a long one are decoded as they are read."""
         with _copied_again(path):
             stored = ParquetTable(regular.source(path))
@@ -140,70 +142,76 @@ class LeRobotContainer:
     def _streams(self, episode: Episode, sources: Collection[str] | None, *, rows: bool) -> list[SourceStream]:
         by_source: dict[str, list[Feature]] = {}
         for feature in self._about.features.values():
-            if feature.key not in (*OWN, EXACT) and feature.dtype != "video":
+            if feature.key not in (*COUNTING_FEATURES, EXACT) and feature.dtype != "video":
                 first = feature.key.partition(".")[0]
-                by_source.setdefault(first if first in TOGETHER else feature.key, []).append(feature)
-        names = kinds.identifiers([_called(source) for source in by_source])
-        chosen = {source: features for source, features in by_source.items() if _wanted(source, sources)}
+                by_source.setdefault(first if first in SHARED_STREAMS else feature.key, []).append(feature)
+        names = kinds.identifiers([_stream_stem(source) for source in by_source])
+        chosen = {source: features for source, features in by_source.items() if _is_selected(source, sources)}
         exact = [EXACT] if EXACT in self._about.features else []
-        frames = self._frames(episode, [*exact, *(one.key for features in chosen.values() for one in features)])
+        frames = self._frames(episode, [*exact, *(feature.key for features in chosen.values() for feature in features)])
         if exact:
-            t_ns, made = frames.column(EXACT).to_numpy(), {}
+            t_ns, time_metadata = frames.column(EXACT).to_numpy(), {}
         else:
-            t_ns, how = _stamps(frames, self._about.fps, self.path / episode.file)
-            made = {"made": how}
-        clock = pa.field(CLOCK.column, pa.int64(), metadata=made)
+            t_ns, stamp_source = _frame_stamps(frames, self._about.fps, self.path / episode.file)
+            time_metadata = {"made": stamp_source}
+        clock = pa.field(CLOCK.column, pa.int64(), metadata=time_metadata)
         frames = frames if rows else frames.slice(0, 0)
-        found = []
+        streams = []
         for source, features in chosen.items():
             columns = [(clock, pa.array(t_ns[: frames.num_rows]))]
             for feature in features:
                 columns += self._columns(episode, feature, frames.column(feature.key))
             table = pa.table([values for _, values in columns], pa.schema([field for field, _ in columns]))
             time = replace(CLOCK, origin="unix") if exact else CLOCK
-            found.append(SourceStream(source, names[_called(source)], time, table, episode.length))
-        return found
+            streams.append(SourceStream(source, names[_stream_stem(source)], time, table, episode.length))
+        return streams
 
     def _frames(self, episode: Episode, keys: Sequence[str]) -> pa.Table:
         """Return the rows of an episode. Raises `TacpipeError` where its file is damaged or has other columns or rows."""
         path = regular.inside(self.path, episode.file)
         with description.parquet_errors(path), regular.opened(path) as source:
             file = pq.ParquetFile(source, page_checksum_verification=True)
-            there = set(file.schema_arrow.names)
-            missing = [key for key in (INDEX, FRAME, STAMP, *keys) if key not in there]
+            column_names = set(file.schema_arrow.names)
+            missing = [key for key in (INDEX, FRAME, STAMP, *keys) if key not in column_names]
             if missing:
                 raise TacpipeError(f"{path} has no column {plain(missing[0])}, which {description.INFO} names.")
-            groups = _groups(file, episode.index)
+            groups = _row_groups_of_episode(file, episode.index)
             share = sum(file.metadata.row_group(group).num_rows for group in groups) / max(file.metadata.num_rows, 1)
             parquet.require_claims(path, [INDEX, FRAME, STAMP, *keys], share=share)
             columns = [INDEX, FRAME, STAMP, *keys]
-            found = file.read_row_groups([], columns=columns, use_threads=False)
+            frames = file.read_row_groups([], columns=columns, use_threads=False)
             for group in groups:  # others' rows of one go before the next is read
                 rows = file.read_row_group(group, columns=columns, use_threads=False)
-                found = pa.concat_tables([found, rows.filter(pc.equal(rows.column(INDEX), episode.index))])
-        if found.num_rows != episode.length:
+                frames = pa.concat_tables([frames, rows.filter(pc.equal(rows.column(INDEX), episode.index))])
+        if frames.num_rows != episode.length:
             raise TacpipeError(
-                f"{path} holds {found.num_rows} frames of episode {episode.index}, and the folder meta states "
+                f"{path} holds {frames.num_rows} frames of episode {episode.index}, and the folder meta states "
                 f"{episode.length}. Copy the dataset again."
             )
-        return found
+        return frames
 
     def _columns(
         self, episode: Episode, feature: Feature, values: pa.ChunkedArray
     ) -> list[tuple[pa.Field, pa.Array | pa.ChunkedArray]]:
         if feature.dtype == "image":
-            return [(pa.field(PICTURE, pa.binary(), metadata={"quantity": "image"}), _pictures(values))]
+            return [(pa.field(PICTURE, pa.binary(), metadata={"quantity": "image"}), _picture_bytes(values))]
         last = feature.key.rpartition(".")[2]
-        about = known.meanings(last, feature.width, feature.dtype.startswith(("int", "uint", "bool")))
+        about = array_names.meanings(last, feature.width, feature.dtype.startswith(("int", "uint", "bool")))
         names = feature.names or ([last] if feature.width == 1 else [f"{last}_{at}" for at in range(feature.width)])
-        found: list[tuple[pa.Field, pa.Array | pa.ChunkedArray]] = []
+        columns: list[tuple[pa.Field, pa.Array | pa.ChunkedArray]] = []
         for at, column in enumerate(self._flat(episode, feature, values)):
-            one = about[at] if about[at] != known.NOTHING else known.of_name(names[at], feature.dtype)
-            metadata = {"quantity": one.quantity, "unit": one.unit, "component": one.component}
+            meaning = (
+                about[at]
+                if about[at] != array_names.NO_MEANING
+                else array_names.meaning_from_name(names[at], feature.dtype)
+            )
+            metadata = {"quantity": meaning.quantity, "unit": meaning.unit, "component": meaning.component}
             if feature.quantities:
                 metadata = {"quantity": feature.quantities[at], "unit": feature.units[at] if feature.units else ""}
-            found.append((pa.field(names[at], column.type, metadata={k: v for k, v in metadata.items() if v}), column))
-        return found
+            columns.append(
+                (pa.field(names[at], column.type, metadata={k: v for k, v in metadata.items() if v}), column)
+            )
+        return columns
 
     def _flat(
         self, episode: Episode, feature: Feature, values: pa.ChunkedArray
@@ -230,7 +238,7 @@ class LeRobotContainer:
         return [pa.array(np.ascontiguousarray(flat[:, at])) for at in range(feature.width)]
 
 
-def opened(path: Path) -> LeRobotContainer:
+def open_lerobot(path: Path) -> LeRobotContainer:
     """Return the dataset in the folder ``path``."""
     return LeRobotContainer(path)
 
@@ -244,52 +252,54 @@ def _copied_again(path: Path) -> Iterator[None]:
         raise TacpipeError(f"{path} cannot be read: {error} Copy it again.") from error
 
 
-def _wanted(source: str, sources: Collection[str] | None) -> bool:
+def _is_selected(source: str, sources: Collection[str] | None) -> bool:
     return sources is None or source in sources
 
 
-def _called(source: str) -> str:
+def _stream_stem(source: str) -> str:
     """Return what a stream is named after: its feature without the parts that all have.
 
-    >>> _called("observation.state"), _called("observation.tactile.xela1"), _called("action")
+    >>> _stream_stem("observation.state"), _stream_stem("observation.tactile.xela1"), _stream_stem("action")
     ('state', 'xela1', 'action')
     """
     return source.removeprefix("observation.").removeprefix("tactile.").removeprefix("images.")
 
 
-def _groups(file: pq.ParquetFile, episode: int) -> list[int]:
+def _row_groups_of_episode(file: pq.ParquetFile, episode: int) -> list[int]:
     """Return the row groups that may hold an episode, by the statistics of its index."""
     metadata = file.metadata
-    column = [metadata.schema.column(one).path for one in range(metadata.num_columns)].index(INDEX)
+    column = [metadata.schema.column(statistics).path for statistics in range(metadata.num_columns)].index(INDEX)
     about = [metadata.row_group(group).column(column).statistics for group in range(metadata.num_row_groups)]
     return [
-        group for group, one in enumerate(about) if one is None or not one.has_min_max or one.min <= episode <= one.max
+        group
+        for group, statistics in enumerate(about)
+        if statistics is None or not statistics.has_min_max or statistics.min <= episode <= statistics.max
     ]
 
 
-def _stamps(frames: pa.Table, fps: float, path: Path) -> tuple[Int64s, str]:
+def _frame_stamps(frames: pa.Table, fps: float, path: Path) -> tuple[Int64s, str]:
     """Return the stamps of frames (time,) in ns from the start of the episode, and what they are made from."""
     index = frames.column(FRAME).to_numpy().astype(np.int64)  # (time,)
     seconds = frames.column(STAMP).to_numpy().astype(np.float64)
     if not np.isfinite(seconds).all():
         row = int((~np.isfinite(seconds)).argmax())
         raise TacpipeError(f"{path}: {STAMP} of frame {row + 1} is {seconds[row]}; it must be a number of seconds.")
-    allowed_s = TOLERANCE_S + np.spacing(np.abs(seconds).astype(np.float32))  # what float32 cannot state
+    allowed_s = TOLERANCE_S + np.spacing(np.abs(seconds).astype(np.float32))  # adds the rounding of float32
     if (np.abs(index / fps - seconds) <= allowed_s).all():
-        return _quotients(index, fps), FROM_RATE
+        return _exact_stamps(index, fps), FROM_RATE
     return np.rint(seconds * 1e9).astype(np.int64), FROM_STAMPS
 
 
-def _quotients(index: Int64s, fps: float) -> Int64s:
+def _exact_stamps(index: Int64s, fps: float) -> Int64s:
     """Return ``index / fps`` in ns (frame,), rounded, in whole numbers: ``fps`` is exactly a quotient of two.
 
-    >>> _quotients(np.array([1, 2, 3]), 30.0).tolist()
+    >>> _exact_stamps(np.array([1, 2, 3]), 30.0).tolist()
     [33333333, 66666667, 100000000]
     """
     above, below = fps.as_integer_ratio()
-    return np.array([(2 * int(one) * 10**9 * below + above) // (2 * above) for one in index], np.int64)
+    return np.array([(2 * int(frame) * 10**9 * below + above) // (2 * above) for frame in index], np.int64)
 
 
-def _pictures(values: pa.ChunkedArray) -> pa.ChunkedArray:
+def _picture_bytes(values: pa.ChunkedArray) -> pa.ChunkedArray:
     """Return the bytes of pictures, which are kept with a path beside them."""
     return pc.struct_field(values, "bytes") if pa.types.is_struct(values.type) else values

@@ -1,4 +1,4 @@
-"""What the folder ``meta`` of a LeRobot dataset states: its rate, its features, and where the frames of each episode lie."""
+"""Read the folder ``meta`` of a LeRobot dataset: its rate, features, and the file of each episode."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import excerpt, plain
 
 INFO = "meta/info.json"
-MOST_BYTES = 1 << 28  # of a file in meta
+MAX_META_BYTES = 1 << 28  # largest file in meta
 VERSIONS = ("v2.0", "v2.1", "v3.0")
-DATA_PATHS = {  # where versions keep the frames, if info.json does not state it
+DATA_PATHS = {  # default paths of the frames by version
     "v2": "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet",
     "v3": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
 }
-OWN = (
+LOCATION_PREFIXES = (
     "stats/",
     "data/",
     "videos/",
     "meta/",
     "dataset_",
-)  # how columns of meta/episodes begin that state where things are
+)  # prefixes of columns of meta/episodes that locate files
 NAME, ATTRIBUTES = "tacpipe/recording", "tacpipe/attributes"  # columns with what an episode was before its export
 ABOUT = "meta/tacpipe.json"  # the name, unit and quantity of each value of a feature, of exported datasets
 _PLACE = re.compile(r"\{(\w+)(?::0?(\d{1,2})d)?\}")  # other braces stay as they are, and name no file
@@ -41,12 +41,12 @@ _PLACE = re.compile(r"\{(\w+)(?::0?(\d{1,2})d)?\}")  # other braces stay as they
 
 @dataclass(frozen=True)
 class Feature:
-    """What info.json states of one column of the frames."""
+    """The description of one column of the frames in info.json."""
 
     key: str
     dtype: str
     shape: tuple[int, ...]
-    names: tuple[str, ...] = ()  # of its values; empty: none are given, or not as many as there are values
+    names: tuple[str, ...] = ()  # names of its values; empty where their number is not that of the values
     units: tuple[str, ...] = ()
     quantities: tuple[str, ...] = ()
 
@@ -68,17 +68,17 @@ class Episode:
 
     name: str
     index: int
-    file: str  # within the dataset
+    file: str  # path within the dataset
     length: int
     tasks: tuple[str, ...] = ()
-    videos: Mapping[str, str] = field(default_factory=dict)  # by feature: the path within the dataset
+    videos: Mapping[str, str] = field(default_factory=dict)  # path within the dataset by feature
     attributes: Mapping[str, Attribute] = field(default_factory=dict)
     original: Mapping[str, Attribute] | None = None
 
 
 @dataclass(frozen=True)
 class Description:
-    """What a LeRobot dataset states of itself."""
+    """The description of a LeRobot dataset in its folder meta."""
 
     root: Path
     version: str
@@ -89,33 +89,35 @@ class Description:
 
     def episodes(self) -> list[Episode]:
         """Return all episodes, by index. Raises `TacpipeError`, naming the file, for what cannot be read."""
-        found = self._of_parquet() if self.version == "v3.0" else self._of_lines()
-        return sorted(found, key=lambda one: one.index)
+        episodes = self._episodes_from_parquet() if self.version == "v3.0" else self._episodes_from_lines()
+        return sorted(episodes, key=lambda episode: episode.index)
 
-    def _of_lines(self) -> Iterator[Episode]:
+    def _episodes_from_lines(self) -> Iterator[Episode]:
         path = self.root / "meta/episodes.jsonl"
         size = self.info.get("chunks_size") or 1000
         if not isinstance(size, int) or size < 1:
             raise TacpipeError(
                 f"{self.root / INFO}: chunks_size is {excerpt(size)}; it must be a whole number above 0."
             )
-        for entry in _lines(regular.inside(self.root, "meta/episodes.jsonl")):
+        for entry in _read_json_lines(regular.inside(self.root, "meta/episodes.jsonl")):
             index, length = entry.get("episode_index"), entry.get("length")
             if not isinstance(index, int) or not isinstance(length, int):
                 raise TacpipeError(f"{path}: {excerpt(entry)} has no whole numbers episode_index and length.")
             values = {"episode_chunk": index // size, "episode_index": index}
-            others = {key: value for key, value in entry.items() if key not in ("episode_index", "length", "tasks")}
+            extra_values = {
+                key: value for key, value in entry.items() if key not in ("episode_index", "length", "tasks")
+            }
             yield Episode(
-                _name(index, others),
+                _episode_name(index, extra_values),
                 index,
                 self._place("data_path", DATA_PATHS["v2"], values),
                 length,
                 tuple(map(str, entry.get("tasks") or ())),
                 {key: self._place("video_path", "", {**values, "video_key": key}) for key in self._videos},
-                _plain(others),
+                _plain_attributes(extra_values),
             )
 
-    def _of_parquet(self) -> Iterator[Episode]:
+    def _episodes_from_parquet(self) -> Iterator[Episode]:
         folders = file_system.walk(self.root / "meta/episodes")
         paths = sorted(Path(place, name) for place, _, names in folders for name in names if name.endswith(".parquet"))
         if not paths:
@@ -124,55 +126,64 @@ class Description:
             )
         regular.expect_inside(self.root, paths)
         for path in paths:
-            names = [name for name in _schema(path) if not name.startswith("stats/")]
-            for one in _table(path, names).to_pylist():
-                yield self._of_row(path, one)
+            names = [name for name in _column_names(path) if not name.startswith("stats/")]
+            for row in _read_table(path, names).to_pylist():
+                yield self._episode_from_row(path, row)
 
-    def _of_row(self, path: Path, one: Mapping[str, Any]) -> Episode:
+    def _episode_from_row(self, path: Path, row: Mapping[str, Any]) -> Episode:
         try:
-            index, length = int(one["episode_index"]), int(one["length"])
-            values = {"chunk_index": int(one["data/chunk_index"]), "file_index": int(one["data/file_index"])}
+            index, length = int(row["episode_index"]), int(row["length"])
+            values = {"chunk_index": int(row["data/chunk_index"]), "file_index": int(row["data/file_index"])}
         except (KeyError, TypeError, ValueError) as error:
             raise TacpipeError(
                 f"{path}: a row has no whole number {plain(str(error).strip(chr(39)))}; it names episode_index, length, "
                 f"data/chunk_index and data/file_index."
             ) from error
-        others = {
+        extra_values = {
             key: value
-            for key, value in one.items()
-            if key not in ("episode_index", "length", "tasks") and not key.startswith(OWN)
+            for key, value in row.items()
+            if key not in ("episode_index", "length", "tasks") and not key.startswith(LOCATION_PREFIXES)
         }
         videos = {}
         for key in self._videos:
-            at = {name: one.get(f"videos/{key}/{name}") for name in ("chunk_index", "file_index")}
+            at = {name: row.get(f"videos/{key}/{name}") for name in ("chunk_index", "file_index")}
             if None not in at.values():
                 videos[key] = self._place("video_path", "", {**at, "video_key": key})
         file = self._place("data_path", DATA_PATHS["v3"], values)
-        tasks = tuple(map(str, one.get("tasks") or ()))
-        original = _original(path, one.get(ATTRIBUTES))
-        return Episode(_name(index, others), index, file, length, tasks, videos, _plain(others), original)
+        tasks = tuple(map(str, row.get("tasks") or ()))
+        original = _original_attributes(path, row.get(ATTRIBUTES))
+        return Episode(
+            _episode_name(index, extra_values),
+            index,
+            file,
+            length,
+            tasks,
+            videos,
+            _plain_attributes(extra_values),
+            original,
+        )
 
     @property
     def _videos(self) -> list[str]:
-        return [key for key, one in self.features.items() if one.dtype == "video"]
+        return [key for key, feature in self.features.items() if feature.dtype == "video"]
 
     def _place(self, key: str, usual: str, values: Mapping[str, object]) -> str:
         """Return a path within the dataset, of a pattern in info.json."""
         pattern = str(self.info.get(key) or usual)
         try:
-            found = _PLACE.sub(lambda one: _filled(values[one[1]], one[2]), pattern)
+            path = _PLACE.sub(lambda match: _format_number(values[match[1]], match[2]), pattern)
         except (KeyError, ValueError) as error:
             raise TacpipeError(
                 f"{self.root / INFO}: {key} is {excerpt(pattern)}, which names {plain(str(error))}; there are "
                 f"{', '.join(values)}."
             ) from error
-        return found
+        return path
 
 
-def read(root: Path) -> Description:
+def read_description(root: Path) -> Description:
     """Return what a dataset states of itself. Raises `TacpipeError`, naming file and entry, for what is not as it should."""
     path = root / INFO
-    info = _json(root, INFO)
+    info = _read_json(root, INFO)
     version, fps = info.get("codebase_version"), info.get("fps")
     if version not in VERSIONS:
         raise TacpipeError(
@@ -184,10 +195,12 @@ def read(root: Path) -> Description:
     features = info.get("features")
     if not isinstance(features, dict) or not features:
         raise TacpipeError(f"{path}: features is {excerpt(features)}; it must name the columns of the frames.")
-    about = _json(root, ABOUT).get("features") if (root / ABOUT).is_file() else None
+    about = _read_json(root, ABOUT).get("features") if (root / ABOUT).is_file() else None
     about = about if isinstance(about, dict) else {}
-    made = {str(key): _feature(path, str(key), value, about.get(key)) for key, value in features.items()}
-    return Description(root, version, float(fps), str(info.get("robot_type") or ""), made, info)
+    parsed_features = {
+        str(key): _parse_feature(path, str(key), value, about.get(key)) for key, value in features.items()
+    }
+    return Description(root, version, float(fps), str(info.get("robot_type") or ""), parsed_features, info)
 
 
 @contextlib.contextmanager
@@ -206,19 +219,24 @@ def parquet_errors(path: Path) -> Iterator[None]:
         ) from error
 
 
-def _feature(path: Path, key: str, value: Any, about: Any) -> Feature:
+def _parse_feature(path: Path, key: str, value: Any, about: Any) -> Feature:
     shape = value.get("shape") if isinstance(value, dict) else None
-    if not isinstance(value, dict) or not isinstance(shape, list) or not all(isinstance(one, int) for one in shape):
+    if not isinstance(value, dict) or not isinstance(shape, list) or not all(isinstance(size, int) for size in shape):
         raise TacpipeError(f"{path}: the feature {plain(key)} is {excerpt(value)}; it must have dtype and shape.")
-    made = Feature(key, str(value.get("dtype")), tuple(shape))
+    feature = Feature(key, str(value.get("dtype")), tuple(shape))
     about = about if isinstance(about, dict) else {}
 
-    def each(found: Any) -> tuple[str, ...]:
-        return tuple(leaves) if len(leaves := _leaves(found)) == made.width else ()
+    def texts_per_value(texts: Any) -> tuple[str, ...]:
+        return tuple(leaves) if len(leaves := _leaves(texts)) == feature.width else ()
 
-    names = each(about.get("columns")) or each(value.get("names"))
+    names = texts_per_value(about.get("columns")) or texts_per_value(value.get("names"))
     unique = names if len(set(names)) == len(names) else ()
-    return replace(made, names=unique, units=each(about.get("units")), quantities=each(about.get("quantities")))
+    return replace(
+        feature,
+        names=unique,
+        units=texts_per_value(about.get("units")),
+        quantities=texts_per_value(about.get("quantities")),
+    )
 
 
 def _leaves(names: Any) -> list[str]:
@@ -238,16 +256,16 @@ def _leaves(names: Any) -> list[str]:
     return leaves
 
 
-def _name(index: int, others: Mapping[str, Any]) -> str:
-    return str(others[NAME]) if others.get(NAME) else f"episode_{index:06d}"
+def _episode_name(index: int, extra_values: Mapping[str, Any]) -> str:
+    return str(extra_values[NAME]) if extra_values.get(NAME) else f"episode_{index:06d}"
 
 
-def _plain(values: Mapping[str, Any]) -> dict[str, Attribute]:
-    others = {key: value for key, value in values.items() if key not in (NAME, ATTRIBUTES)}
-    return dict(plain_attributes(others))
+def _plain_attributes(values: Mapping[str, Any]) -> dict[str, Attribute]:
+    extra_values = {key: value for key, value in values.items() if key not in (NAME, ATTRIBUTES)}
+    return dict(plain_attributes(extra_values))
 
 
-def _original(path: Path, text: Any) -> dict[str, Attribute] | None:
+def _original_attributes(path: Path, text: Any) -> dict[str, Attribute] | None:
     if not isinstance(text, str):
         return None
     try:
@@ -258,14 +276,14 @@ def _original(path: Path, text: Any) -> dict[str, Attribute] | None:
     return {str(key): value for key, value in values if value is None or isinstance(value, str | int | float | bool)}
 
 
-def _filled(value: object, width: str | None) -> str:
+def _format_number(value: object, width: str | None) -> str:
     return f"{int(value):0{int(width)}d}" if width else str(value)  # type: ignore[call-overload]
 
 
-def _json(root: Path, name: str) -> dict[str, Any]:
+def _read_json(root: Path, name: str) -> dict[str, Any]:
     path = regular.inside(root, name)
     with regular.failing(path):
-        content = regular.content(path, MOST_BYTES)
+        content = regular.content(path, MAX_META_BYTES)
     try:
         content_json = unique_names.json_value(content, path)
     except (ValueError, RecursionError) as error:
@@ -275,10 +293,10 @@ def _json(root: Path, name: str) -> dict[str, Any]:
     return content_json
 
 
-def _lines(path: Path) -> Iterator[dict[str, Any]]:
+def _read_json_lines(path: Path) -> Iterator[dict[str, Any]]:
     """Yield the objects of a file of JSON lines."""
     with regular.failing(path):
-        content = regular.content(path, MOST_BYTES)
+        content = regular.content(path, MAX_META_BYTES)
     for number, line in enumerate(content.splitlines(), 1):
         if not line.strip():
             continue
@@ -293,12 +311,12 @@ def _lines(path: Path) -> Iterator[dict[str, Any]]:
         yield entry
 
 
-def _schema(path: Path) -> Sequence[str]:
+def _column_names(path: Path) -> Sequence[str]:
     with parquet_errors(path), regular.opened(path) as file:
         return list(pq.ParquetFile(file).schema_arrow.names)
 
 
-def _table(path: Path, names: Sequence[str] | None = None) -> Any:
+def _read_table(path: Path, names: Sequence[str] | None = None) -> Any:
     parquet.require_claims(path, names, max_bytes=memory.MOST_BLOCK)
     with parquet_errors(path), regular.opened(path) as file:
         return pq.ParquetFile(file).read(columns=list(names) if names is not None else None)

@@ -23,18 +23,18 @@ import pyarrow.parquet as pq
 
 from tacpipe.errors import TacpipeError
 from tacpipe.formats import unique_names
-from tacpipe.formats.table import compressed
+from tacpipe.formats.table import text
 from tacpipe.formats.table.layout import GZIP
 from tacpipe.io import memory, regular
 from tacpipe.io.parquet import BROKEN, owned, require_claims
 from tacpipe.printable import plain
 
-BATCH_ROWS = 1 << 18  # of Parquet, at most
-BLOCK_BYTES = 1 << 24  # of JSON lines, or of a block of arrays
+BATCH_ROWS = 1 << 18  # largest batch of a Parquet file
+BLOCK_BYTES = 1 << 24  # size of a block of JSON lines or arrays
 READ_BYTES = 1 << 20  # bytes read at once per Parquet column, whatever its row groups' size
-MOST_COLUMNS = 1 << 20  # columns per array
-LONGEST_LINE = 1 << 26  # bytes of one JSON object
-_BEGUN = re.compile(rb"\S")
+MAX_COLUMNS = 1 << 20  # columns per array
+MAX_LINE_BYTES = 1 << 26  # bytes of one JSON object
+_NOT_BLANK = re.compile(rb"\S")
 _ZIP_ERRORS = (ValueError, OSError, EOFError, zipfile.BadZipFile, zlib.error, KeyError, RuntimeError)
 
 
@@ -60,7 +60,7 @@ class ParquetFile:
                 opened = pq.ParquetFile(file, buffer_size=READ_BYTES, pre_buffer=False, page_checksum_verification=True)
                 rows = min(BATCH_ROWS, BLOCK_BYTES // max(1, len(types)))
                 for batch in opened.iter_batches(rows, columns=list(types)):
-                    yield _flat(self.path, pa.Table.from_batches([batch]))
+                    yield _refuse_nested(self.path, pa.Table.from_batches([batch]))
         except BROKEN as error:
             raise TacpipeError(f"{self.path} cannot be read: {plain(str(error), 200)}. Copy it again.") from error
 
@@ -82,8 +82,8 @@ class NumpyArchive:
 
     def batches(self, types: Mapping[str, pa.DataType]) -> Iterator[pa.Table]:
         """Yield the columns that ``types`` names, some rows at a time."""
-        wanted = {self._places[name][0] for name in types}
-        arrays = {name: array for name, array in self._arrays.items() if name in wanted}
+        array_names = {self._places[name][0] for name in types}
+        arrays = {name: array for name, array in self._arrays.items() if name in array_names}
         rows = max(1, BLOCK_BYTES // max(1, sum(array.row_bytes for array in arrays.values())))
         self._expect_same_length(arrays)
         with contextlib.ExitStack() as stack, self._reading():
@@ -130,10 +130,10 @@ class NumpyArchive:
         """Raise `TacpipeError` where arrays of one stream have different numbers of rows."""
         lengths = {name: array.rows for name, array in arrays.items()}
         if len(set(lengths.values())) > 1:
-            first, other = next((a, b) for a in lengths for b in lengths if lengths[a] != lengths[b])
+            first, second = next((a, b) for a in lengths for b in lengths if lengths[a] != lengths[b])
             raise TacpipeError(
-                f"{self.path}: {plain(first)} has {lengths[first]} rows and {plain(other)} has {lengths[other]}; arrays of "
-                f"one stream have one length. Skip those of another rate, and read them as a stream of their own."
+                f"{self.path}: {plain(first)} has {lengths[first]} rows and {plain(second)} has {lengths[second]}; arrays "
+                f"of one stream have one length. Skip those of another rate, and read them as a stream of their own."
             )
 
     @contextlib.contextmanager
@@ -172,7 +172,7 @@ class _LoneArray:
         return [info]
 
     def open(self, name: str, /) -> contextlib.AbstractContextManager[IO[bytes]]:
-        return compressed.opened(self.path)
+        return text.open_text(self.path)
 
 
 @dataclass(frozen=True)
@@ -180,7 +180,7 @@ class ArrayMember:
     """An array within an archive: what its header declares."""
 
     name: str
-    member: str  # of the archive
+    member: str  # name of the file in the archive
     shape: tuple[int, ...]
     columnwise: bool  # Fortran's order: its rows are not one after another
     dtype: np.dtype[Any]
@@ -190,7 +190,7 @@ class ArrayMember:
     def from_archive(cls, archive: Archive, member: zipfile.ZipInfo, time_axis: int = 0) -> ArrayMember:
         """Return what the header declares. Raises `ValueError` for what is not an array, or holds Python objects."""
         with archive.open(member.filename) as file:
-            shape, columnwise, dtype = _header(file)
+            shape, columnwise, dtype = _read_header(file)
         if dtype.hasobject:
             raise ValueError(f"{member.filename} holds Python objects, which are not read: they can run programs")
         if max(1, math.prod(shape)) * dtype.itemsize > member.file_size:
@@ -198,8 +198,8 @@ class ArrayMember:
         if shape and time_axis >= len(shape):
             raise ValueError(f"{member.filename} has the shape {shape}, without a dimension {time_axis} (time_axis)")
         width = math.prod(size for axis, size in enumerate(shape) if axis != time_axis)
-        if width > MOST_COLUMNS:
-            raise ValueError(f"{member.filename} has {width:,} values a row, {MOST_COLUMNS:,} are allowed")
+        if width > MAX_COLUMNS:
+            raise ValueError(f"{member.filename} has {width:,} values a row, {MAX_COLUMNS:,} are allowed")
         name = member.filename.removesuffix(".npy")
         return cls(name, member.filename, shape, columnwise and len(shape) > 1, dtype, time_axis)
 
@@ -227,7 +227,7 @@ class ArrayMember:
     def reading(self, archive: Archive) -> Iterator[Callable[[int], np.ndarray]]:
         """Yield a function that returns the next rows (time, value); raises `ValueError` where there are fewer."""
         with archive.open(self.member) as file:
-            _header(file)
+            _read_header(file)
             if self.columnwise or self.time_axis:
                 memory.require(self.rows * self.row_bytes, f"{self.member}, whose rows are not one after another,")
                 order: Literal["F", "C"] = "F" if self.columnwise else "C"
@@ -244,7 +244,7 @@ class ArrayMember:
         return content
 
 
-def _header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+def _read_header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
     version = np.lib.format.read_magic(file)
     read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     if version not in read:
@@ -266,7 +266,7 @@ def _column(blocks: Mapping[str, np.ndarray], array: str, position: int | None) 
 
 @dataclass(frozen=True)
 class JsonLines:
-    """A file with one JSON object a line; lists within it are columns NAME_0, NAME_1, …."""
+    """A file with one JSON object per line; lists within it are columns NAME_0, NAME_1, …."""
 
     path: Path
 
@@ -277,13 +277,13 @@ class JsonLines:
     def batches(self, types: Mapping[str, pa.DataType]) -> Iterator[pa.Table]:
         """Yield the columns that ``types`` names, some lines at a time; of the same types in each block."""
         for block in map(self._unfolded, self._blocks()):
-            made = {
+            columns = {
                 name: block.column(name).cast(self._kinds[name], safe=False)  # whole numbers of a column of floats too
                 if name in block.column_names
                 else pa.nulls(block.num_rows, self._kinds[name])
                 for name in types
             }
-            yield _flat(self.path, pa.table(made))
+            yield _refuse_nested(self.path, pa.table(columns))
 
     def head(self) -> pa.Table:
         """Return the first lines."""
@@ -302,25 +302,25 @@ class JsonLines:
             self._widths(block, widths)
             schemas.append(self._unfolded(block.slice(0, 1)).schema)
         try:
-            whole = pa.unify_schemas(schemas, promote_options="permissive") if schemas else pa.schema([])
+            full_schema = pa.unify_schemas(schemas, promote_options="permissive") if schemas else pa.schema([])
         except pa.ArrowException as error:
             raise TacpipeError(f"{self.path} is not JSON lines: {plain(str(error), 200)}.") from error
-        return {one.name: one.type for one in whole}
+        return {field.name: field.type for field in full_schema}
 
     def _blocks(self) -> Iterator[pa.Table]:
-        with compressed.opened(self.path) as file:
-            rest = b""
+        with text.open_text(self.path) as file:
+            remainder = b""
             while new := file.read(BLOCK_BYTES):
                 end = new.rfind(b"\n") + 1
                 if end:
-                    yield from self._parsed(rest, memoryview(new)[:end])
-                rest = new[end:] if end else rest + new
-                if len(rest) > LONGEST_LINE:
-                    raise TacpipeError(f"{self.path} is not JSON lines: a line has over {LONGEST_LINE} bytes.")
-            yield from self._parsed(rest)
+                    yield from self._parsed(remainder, memoryview(new)[:end])
+                remainder = new[end:] if end else remainder + new
+                if len(remainder) > MAX_LINE_BYTES:
+                    raise TacpipeError(f"{self.path} is not JSON lines: a line has over {MAX_LINE_BYTES} bytes.")
+            yield from self._parsed(remainder)
 
     def _parsed(self, *pieces: bytes | memoryview) -> Iterator[pa.Table]:
-        if not any(_BEGUN.search(piece) for piece in pieces):
+        if not any(_NOT_BLANK.search(piece) for piece in pieces):
             return
         try:
             table = pj.read_json(pa.BufferReader(owned(*pieces)), pj.ReadOptions(use_threads=False)).flatten()
@@ -329,18 +329,18 @@ class JsonLines:
             raise TacpipeError(f"{self.path} is not JSON lines: {plain(str(error), 200)}.") from error
         yield table
 
-    def _widths(self, block: pa.Table, found: dict[str, int]) -> None:
-        """Add the length that the lists of each column have. Raises `TacpipeError` where they differ."""
+    def _widths(self, block: pa.Table, widths: dict[str, int]) -> None:
+        """Add the length of the lists of each column to ``widths``. Raises `TacpipeError` where lengths differ."""
         for field in block.schema:
             if pa.types.is_list(field.type):
                 lengths = set(pc.list_value_length(block.column(field.name)).to_pylist())
-                lengths |= {found[field.name]} if field.name in found else set()
+                lengths |= {widths[field.name]} if field.name in widths else set()
                 if len(lengths) != 1 or None in lengths:
                     raise TacpipeError(
                         f"{self.path}: lists of {plain(field.name)} have {len(lengths)} lengths; a column holds one value a "
                         f"row."
                     )
-                (found[field.name],) = lengths
+                (widths[field.name],) = lengths
 
     def _unfolded(self, block: pa.Table) -> pa.Table:
         """Return a table whose columns of lists of one length are columns of their own."""
@@ -355,7 +355,7 @@ class JsonLines:
         return pa.table(unique_names.by_name(columns, self.path, "column"))
 
 
-def _flat(path: Path, table: pa.Table) -> pa.Table:
+def _refuse_nested(path: Path, table: pa.Table) -> pa.Table:
     for field in table.schema:
         if pa.types.is_nested(field.type):
             raise TacpipeError(
@@ -364,7 +364,7 @@ def _flat(path: Path, table: pa.Table) -> pa.Table:
     return table
 
 
-def opened(path: Path, kind: str, time_axis: int = 0) -> ParquetFile | NumpyArchive | JsonLines:
+def open_table(path: Path, kind: str, time_axis: int = 0) -> ParquetFile | NumpyArchive | JsonLines:
     """Return the reader of a file of this kind; ``time_axis`` is that of arrays."""
     if kind in ("npz", "npy"):
         return (NumpyArchive if kind == "npz" else NumpyFile)(path, time_axis)

@@ -1,4 +1,4 @@
-"""Which columns of a file are read, as what: the rules of a stream applied to the names that a file has."""
+"""Choose and convert the columns of a file by the rules of a stream."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pyarrow as pa
 
 from tacpipe.errors import TacpipeError
 from tacpipe.formats.table import pattern
-from tacpipe.formats.table.layout import Column, Stream
+from tacpipe.formats.table.layout import ColumnRule, StreamLayout
 from tacpipe.printable import listed, plain
 
 TIME = "t_ns"
@@ -28,17 +28,17 @@ TYPES = {
         "binary": pa.binary(),
     },
 }
-Declared = Mapping[str, pa.Field]  # by the name of a column: its type and what its metadata say
-NOTHING: Declared = {}
+Declared = Mapping[str, pa.Field]  # field with type and metadata by the name of a column
+NO_DECLARATION: Declared = {}
 
 
 @dataclass(frozen=True)
-class Chosen:
+class ChosenColumn:
     """A column that is read: its name in the file, what it becomes, and the rule that states it."""
 
     name: str
     field: pa.Field
-    rule: Column
+    rule: ColumnRule
 
     @property
     def read_as(self) -> pa.DataType:
@@ -54,14 +54,16 @@ class CellError(ValueError):
         self.row = row
 
 
-def chosen(stream: Stream, names: Sequence[str], path: Path, declared: Declared = NOTHING) -> list[Chosen]:
+def choose_columns(
+    stream: StreamLayout, names: Sequence[str], path: Path, declared: Declared = NO_DECLARATION
+) -> list[ChosenColumn]:
     """Return the columns to read among those that ``path`` has, in the file's order.
 
     ``declared`` are the columns that the file itself describes: where no rule matches they are read so, and a rule replaces
     only what it states. Raises `TacpipeError` for a column that neither describes, a rule that matches none, and
     two columns of one name.
     """
-    chosen_columns: list[Chosen] = []
+    chosen_columns: list[ChosenColumn] = []
     used = set()
     for name in names:
         matches = ((rule, pattern.match(rule.match, name)) for rule in stream.columns)
@@ -72,17 +74,17 @@ def chosen(stream: Stream, names: Sequence[str], path: Path, declared: Declared 
                     f"{path} has a column {plain(name)}, which no entry of [streams.{stream.name}] columns matches. "
                     f'Add {{ match = "{plain(name)}", quantity = "…" }} or {{ match = "{plain(name)}", skip = true }}.'
                 )
-            rule, values = Column(match=name), {}
+            rule, values = ColumnRule(match=name), {}
         used.add(rule)
         if not rule.skip:
-            chosen_columns.append(Chosen(name, _field(rule, name, values, declared.get(name)), rule))
-    chosen_columns = _places(chosen_columns, path, stream)
+            chosen_columns.append(ChosenColumn(name, _column_field(rule, name, values, declared.get(name)), rule))
+    chosen_columns = _place_cells(chosen_columns, path, stream)
     idle = [rule.match for rule in stream.columns if rule not in used]
     if idle:
         raise TacpipeError(
             f"{path} has no column that matches {listed(idle, 3)} of [streams.{stream.name}]; it has {listed(names, 6)}."
         )
-    out = [one.field.name for one in chosen_columns]
+    out = [column.field.name for column in chosen_columns]
     doubled = sorted({name for name in out if out.count(name) > 1})
     if doubled or TIME in out:
         raise TacpipeError(
@@ -94,12 +96,12 @@ def chosen(stream: Stream, names: Sequence[str], path: Path, declared: Declared 
     return chosen_columns
 
 
-def _places(columns_read: Sequence[Chosen], path: Path, stream: Stream) -> list[Chosen]:
+def _place_cells(columns_read: Sequence[ChosenColumn], path: Path, stream: StreamLayout) -> list[ChosenColumn]:
     """Return columns that are cells of an array with the metadata of their place in its shape, and named by it.
 
     Raises `TacpipeError` where a rule matches another number of columns than its shape has cells.
     """
-    by_rule: dict[Column, list[Chosen]] = {}
+    by_rule: dict[ColumnRule, list[ChosenColumn]] = {}
     for column in columns_read:
         by_rule.setdefault(column.rule, []).append(column)
     for rule, cells in by_rule.items():
@@ -111,13 +113,13 @@ def _places(columns_read: Sequence[Chosen], path: Path, stream: Stream) -> list[
     cells_before = dict.fromkeys(by_rule, 0)
     placed = []
     for column in columns_read:
-        field = _placed(column, cells_before[column.rule]) if column.rule.shape else column.field
+        field = _cell_field(column, cells_before[column.rule]) if column.rule.shape else column.field
         cells_before[column.rule] += 1
         placed.append(replace(column, field=field))
     return placed
 
 
-def _placed(column: Chosen, cell: int) -> pa.Field:
+def _cell_field(column: ChosenColumn, cell: int) -> pa.Field:
     """Return the field of the cell with this number in the array of a rule's shape.
 
     A tactile cell has a taxel and an axis, another one an index and a component; both count from 1.
@@ -139,35 +141,35 @@ def _placed(column: Chosen, cell: int) -> pa.Field:
     values = pattern.match(rule.match, column.name) or {}
     stem = "taxel" if tactile else column.name.rstrip("0123456789").rstrip("_")
     plain_name = f"{stem}{padded if tactile or count > 1 else ''}{f'_{axis}' if axis else ''}"
-    name = pattern.filled(rule.name, {**values, "taxel": padded, "axis": axis}) if rule.name else plain_name
+    name = pattern.fill_pattern(rule.name, {**values, "taxel": padded, "axis": axis}) if rule.name else plain_name
     declared_metadata = {key.decode(): value.decode() for key, value in (column.field.metadata or {}).items()}
     retained = {key: value for key, value in declared_metadata.items() if key not in values}
     return pa.field(name, column.field.type, metadata={**retained, **about, **dict(rule.about)})
 
 
-def _field(rule: Column, name: str, values: dict[str, str], declared: pa.Field | None) -> pa.Field:
-    column_name = pattern.filled(rule.name, values) if rule.name and not rule.shape else name.strip()
+def _column_field(rule: ColumnRule, name: str, values: dict[str, str], declared: pa.Field | None) -> pa.Field:
+    column_name = pattern.fill_pattern(rule.name, values) if rule.name and not rule.shape else name.strip()
     about = {"unit": rule.unit, "quantity": rule.quantity, "component": rule.component, **values, **dict(rule.about)}
     about = {key: value for key, value in about.items() if value}
     if declared is None:
         return pa.field(column_name, TYPES[rule.type or "float64"], metadata=about)
     kind = TYPES[rule.type] if rule.type else (declared.type if rule.scale == 1.0 else pa.float64())
-    own = {key.decode(): value.decode() for key, value in (declared.metadata or {}).items()}
-    return pa.field(column_name, kind, metadata={**own, **about})
+    declared_metadata = {key.decode(): value.decode() for key, value in (declared.metadata or {}).items()}
+    return pa.field(column_name, kind, metadata={**declared_metadata, **about})
 
 
-def converted(
-    column: pa.ChunkedArray, one: Chosen, nan_allowed: bool, inf_allowed: bool = False
+def convert_column(
+    column: pa.ChunkedArray, target: ChosenColumn, nan_allowed: bool, inf_allowed: bool = False
 ) -> pa.Array | pa.ChunkedArray:
     """Return a parsed column as its declared type, scaled; a missing value is NaN in floats and empty in text.
 
     Raises `CellError` for a value that is missing where there is no NaN, infinite, or beyond the type; and for NaN unless
     ``nan_allowed``, since such a cell may be a sensor that failed.
     """
-    kind = one.field.type
-    if column.type == kind and pa.types.is_binary(kind):  # of chunks, since an array of bytes has 2 GiB at most
+    kind = target.field.type
+    if column.type == kind and pa.types.is_binary(kind):  # stays chunked: an array of bytes has 2 GiB at most
         return column
-    if column.type == kind == pa.float64() and one.rule.scale == 1.0 and _finite(column):
+    if column.type == kind == pa.float64() and target.rule.scale == 1.0 and _is_finite(column):
         return column
     array = column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
     if pa.types.is_string(kind) or pa.types.is_binary(kind):
@@ -187,12 +189,12 @@ def converted(
     if bad.any():
         row = int(bad.argmax())
         raise CellError(row, f"holds {values[row]}. Declare it in missing if it is to be read as a missing value")
-    scaled = values if one.rule.scale == 1.0 else values * one.rule.scale
+    scaled = values if target.rule.scale == 1.0 else values * target.rule.scale
     with np.errstate(over="ignore"):
         return pa.array(scaled.astype(kind.to_pandas_dtype()))
 
 
-def _finite(column: pa.ChunkedArray) -> bool:
+def _is_finite(column: pa.ChunkedArray) -> bool:
     """Return whether a column of floats holds numbers alone, as nearly all do: such a one is never copied."""
     chunks = column.chunks if isinstance(column, pa.ChunkedArray) else [column]
     return not column.null_count and all(np.isfinite(chunk.to_numpy()).all() for chunk in chunks)

@@ -1,4 +1,4 @@
-"""What the commands of containers share: finding recordings, describing and reading them, with or without a layout."""
+"""Find, describe and read the recordings of containers and tables, with or without a layout."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     from tacpipe.formats.containers.container import Share
     from tacpipe.formats.table import recordings
 
-WITHIN = "recording"  # among a source's values: which of the recordings that its files hold
+EPISODE = "recording"  # key of a source's values: the name of the recording within its files
 LABELS = "labels"
-STATED = "stated"  # what else a container states of the recording, where not all of its files are the recording's
+CONTAINER_VALUES = "stated"  # key of a source's values: what a shared container states of the recording
 
 
 @dataclass(frozen=True)
@@ -55,23 +55,23 @@ class Command:
 
     def parsed(self, params: Params) -> layouts.Layout:
         """Return the layout, one that leaves everything to the files where none is given."""
-        return layouts.of(json.loads(params.layout or "{}"), "The layout", self.kind)
+        return layouts.layout_from_tables(json.loads(params.layout or "{}"), "The layout", self.kind)
 
     def discover(self, params: Params, source: Path) -> dict[str, Source]:
         """Return the files and labels of each recording at or below ``source``."""
         layout = self.parsed(params)
-        return sources(layout, source, self._found(layout, source), self.kind)
+        return discover_sources(layout, source, self._find_recordings(layout, source), self.kind)
 
     def preview(self, params: Params, source: Path) -> str:
         """Return what would be read, in words."""
         layout = self.parsed(params)
-        return preview_text(layout, source, self._found(layout, source), self.kind)
+        return preview_text(layout, source, self._find_recordings(layout, source), self.kind)
 
     def guess(self, source: Path) -> str:
         """Return the text of the layout that states what the first file itself declares."""
         from tacpipe.formats.table import declared
 
-        return declared.layout(self.kind, source)
+        return declared.declared_layout(self.kind, source)
 
     def why_unread(self, params: Params, source: Path) -> Callable[[str], str]:
         """Return a function from the path of a file below ``source`` to the reason why no recording is read from it."""
@@ -79,18 +79,18 @@ class Command:
 
     def read(self, params: Params, files: Files, values: Values) -> RecordingOutput:
         """Return one recording."""
-        return recording(self.parsed(params), self.kind, files, values)
+        return read_recording(self.parsed(params), self.kind, files, values)
 
-    def _found(self, layout: layouts.Layout, source: Path) -> list[recordings.Source]:
+    def _find_recordings(self, layout: layouts.Layout, source: Path) -> list[recordings.Source]:
         from tacpipe.formats.table import recordings
 
         if layout.found_by_format:
-            return recordings.contained(layout, self.kind, source)
-        return recordings.found(layout, source)
+            return recordings.find_contained(layout, self.kind, source)
+        return recordings.find_recordings(layout, source)
 
 
-def sources(
-    layout: layouts.Layout, source: Path, found: Sequence[recordings.Source], kind: layouts.Format | None = None
+def discover_sources(
+    layout: layouts.Layout, source: Path, recordings: Sequence[recordings.Source], kind: layouts.Format | None = None
 ) -> dict[str, Source]:
     """Return recordings as a stage's ``discover`` does: their files, labels, and which one of a file each is.
 
@@ -98,52 +98,59 @@ def sources(
     """
     from tacpipe.formats.table import labels
 
-    labelled = labels.found(layout, source if source.is_dir() else source.parent, found)
-    shares = _Shares(layout, kind)
-    made = {}
-    for one in found:
-        files, stated = shares.of(one)
-        within = {} if one.within is None else {WITHIN: one.within}
-        made[one.name] = Source(files, {LABELS: labelled[one.name], **within, **({STATED: stated} if stated else {})})
-    return made
+    labelled = labels.find_labels(layout, source if source.is_dir() else source.parent, recordings)
+    shares = _ContainerShares(layout, kind)
+    sources_by_name = {}
+    for recording in recordings:
+        files, extra_values = shares.files_and_values(recording)
+        recording_value = {} if recording.episode is None else {EPISODE: recording.episode}
+        sources_by_name[recording.name] = Source(
+            files,
+            {
+                LABELS: labelled[recording.name],
+                **recording_value,
+                **({CONTAINER_VALUES: extra_values} if extra_values else {}),
+            },
+        )
+    return sources_by_name
 
 
-class _Shares:
-    """Which files each recording is read from, with what else containers state of it; each container is opened once."""
+class _ContainerShares:
+    """The files of each recording, and the values that containers state of it; each container is opened once."""
 
     def __init__(self, layout: layouts.Layout, kind: layouts.Format | None) -> None:
         self._layout, self._kind = layout, kind
         self._opened: dict[Path, object] = {}
 
-    def of(self, one: recordings.Source) -> tuple[dict[str, Path], dict[str, object]]:
+    def files_and_values(self, recording: recordings.Source) -> tuple[dict[str, Path], dict[str, object]]:
         files: dict[str, Path] = {}
-        stated: dict[str, object] = {}
+        values: dict[str, object] = {}
         by_place: dict[Path, list[str]] = {}
-        for name, place in one.files.items():
+        for name, place in recording.files.items():
             by_place.setdefault(place, []).append(name)
         for place, names in by_place.items():
-            share = self._share(place, names, one.within) if place.is_dir() else None
+            share = self._share(place, names, recording.episode) if place.is_dir() else None
             if share is None:
-                files |= members(dict.fromkeys(names, place))
+                files |= member_files(dict.fromkeys(names, place))
                 continue
-            files |= {f"{name}/{within}": path for name in names for within, path in share.files.items()}
+            files |= {f"{name}/{inner_path}": path for name in names for inner_path, path in share.files.items()}
             if share.values:
-                stated[names[0]] = dict(share.values)
-        return files, stated
+                values[names[0]] = dict(share.values)
+        return files, values
 
     def _share(self, place: Path, names: Sequence[str], episode: str | None) -> Share | None:
         """Return what streams of a container are read from; None: all of its files."""
         from tacpipe.formats.containers import kinds
         from tacpipe.formats.containers.container import Sharing
 
-        streams = {one.name: one for one in self._layout.streams if one.name in names}
-        kind = next((str(one.format) for one in streams.values()), self._kind)
+        streams = {stream.name: stream for stream in self._layout.streams if stream.name in names}
+        kind = next((str(stream.format) for stream in streams.values()), self._kind)
         if place not in self._opened:
-            self._opened[place] = kinds.opened(str(kind), place)
+            self._opened[place] = kinds.open_container(str(kind), place)
         container = self._opened[place]
-        wanted = [one.source for one in streams.values()] or None
+        requested = [stream.source for stream in streams.values()] or None
         try:
-            return container.share(wanted, episode) if isinstance(container, Sharing) else None
+            return container.share(requested, episode) if isinstance(container, Sharing) else None
         except TacpipeError as error:
             if not is_input_error(error):
                 raise
@@ -162,7 +169,7 @@ def preview_text(
 
     paths = [path for recording in listed_sources for path in recording.files.values()]
     left_out = unread.describe(source, paths, why_unread(layout, source, kind))
-    return "\n".join([preview.text(layout, source, listed_sources, kind), *left_out])
+    return "\n".join([preview.describe_sources(layout, source, listed_sources, kind), *left_out])
 
 
 def why_unread(layout: layouts.Layout, source: Path, kind: layouts.Format | None = None) -> Callable[[str], str]:
@@ -173,7 +180,7 @@ def why_unread(layout: layouts.Layout, source: Path, kind: layouts.Format | None
     from tacpipe.formats.containers import kinds
 
     formats = {str(stream.format) for stream in layout.streams if stream.contained} or {str(kind)} & set(kinds.KINDS)
-    folders = [path for name in formats for path in kinds.found(name, source) if path.is_dir()]
+    folders = [path for name in formats for path in kinds.find_containers(name, source) if path.is_dir()]
 
     def reason(path: str) -> str:
         if any(pattern.match(labels.file, path) is not None for labels in layout.labels):
@@ -185,43 +192,45 @@ def why_unread(layout: layouts.Layout, source: Path, kind: layouts.Format | None
     return reason
 
 
-def recording(
+def read_recording(
     layout: layouts.Layout, kind: layouts.Format | None, files: Files, values: Values, shared: Shared | None = None
 ) -> RecordingOutput:
     """Return one recording of ``files``, as `sources` found it; without streams in the layout all of a container.
 
     With ``shared`` a table of many recordings is cut into these once.
     """
-    from tacpipe.formats.table import recorded
+    from tacpipe.formats.table import recordings
     from tacpipe.formats.table.recordings import CONTAINER
 
-    paths = containers(files)
+    paths = container_paths(files)
     if layout.streams:
-        made = recorded.of(layout.streams, paths, values.get(WITHIN), shared)
+        recorded_streams = recordings.read_streams(layout.streams, paths, values.get(EPISODE), shared)
     else:
-        made = recorded.all_of(str(kind), paths[CONTAINER], values.get(WITHIN))
-    return RecordingOutput(made.streams, {**made.attributes, **values[LABELS]}, made.notes)
+        recorded_streams = recordings.read_container(str(kind), paths[CONTAINER], values.get(EPISODE))
+    return RecordingOutput(
+        recorded_streams.streams, {**recorded_streams.attributes, **values[LABELS]}, recorded_streams.notes
+    )
 
 
-def members(paths: Mapping[str, Path]) -> dict[str, Path]:
+def member_files(paths: Mapping[str, Path]) -> dict[str, Path]:
     """Return all files of a recording by name: of a path that is a folder each file in it, by ``name/path within``."""
     from tacpipe.formats.containers import kinds
 
     return {
-        f"{name}/{within}" if within else name: path
+        f"{name}/{inner_path}" if inner_path else name: path
         for name, place in paths.items()
-        for within, path in kinds.members(place).items()
+        for inner_path, path in kinds.container_files(place).items()
     }
 
 
-def containers(files: Files) -> dict[str, Path]:
+def container_paths(files: Files) -> dict[str, Path]:
     """Return the paths whose `members` these files are.
 
-    >>> containers({"skin": Path("a.csv"), "container/meta/info.json": Path("lab/run/meta/info.json")})
+    >>> container_paths({"skin": Path("a.csv"), "container/meta/info.json": Path("lab/run/meta/info.json")})
     {'skin': PosixPath('a.csv'), 'container': PosixPath('lab/run')}
     """
-    found: dict[str, Path] = {}
+    paths: dict[str, Path] = {}
     for key, path in files.items():
-        name, _, within = key.partition("/")
-        found.setdefault(name, path.parents[within.count("/")] if within else path)
-    return found
+        name, _, inner_path = key.partition("/")
+        paths.setdefault(name, path.parents[inner_path.count("/")] if inner_path else path)
+    return paths

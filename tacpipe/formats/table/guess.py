@@ -14,9 +14,8 @@ from pathlib import Path
 
 from tacpipe.errors import MissingModuleError, TacpipeError, UsageError
 from tacpipe.formats import unread
-from tacpipe.formats.table import column_names, file_sample, guess_columns, guess_stamps, label_table, pattern
-from tacpipe.formats.table.dialect import LINES
-from tacpipe.formats.table.file_sample import FileSample
+from tacpipe.formats.table import column_names, file_sample, guess_columns, label_table, pattern
+from tacpipe.formats.table.file_sample import SAMPLE_LINES, FileSample
 from tacpipe.formats.table.layout import EXTENSIONS, TREES, UNKNOWN, extension, quoted, why_unreadable
 from tacpipe.io import files as file_system
 from tacpipe.printable import shown
@@ -40,7 +39,7 @@ class _Group:
     skipped: tuple[str, ...] = ()  # arrays of the file that belong to other streams
 
 
-def layout(folder: Path) -> str:
+def guess_layout(folder: Path) -> str:
     """Return the text of a layout for the files below ``folder``. Raises `UsageError` where no file can be a stream."""
     all_paths = [
         Path(place, name).relative_to(folder) for place, _, names in file_system.walk(folder) for name in names
@@ -48,7 +47,7 @@ def layout(folder: Path) -> str:
     data = [path for path in all_paths if extension(path) in EXTENSIONS]
     if not data:
         raise UsageError(f"{folder} holds no file of {', '.join(EXTENSIONS)}; there is nothing to guess from.")
-    groups, labels, damaged = _grouped(folder, data)
+    groups, labels, damaged = _group_files(folder, data)
     groups, stamps = _with_stamps(groups)
     if not groups:
         raise UsageError(f"{folder} holds no table with rows and stamps. {' '.join(damaged.values())}".rstrip())
@@ -74,7 +73,7 @@ def layout(folder: Path) -> str:
     return "\n\n".join(["\n".join(head), *parts]) + "\n"
 
 
-def _grouped(folder: Path, data: Sequence[Path]) -> tuple[list[_Group], list[_Group], dict[str, str]]:
+def _group_files(folder: Path, data: Sequence[Path]) -> tuple[list[_Group], list[_Group], dict[str, str]]:
     """Return the groups of files that are streams, the groups that hold labels, and by path why others cannot be read."""
     by_template: dict[str, list[Path]] = {}
     for path in sorted(data):
@@ -85,7 +84,7 @@ def _grouped(folder: Path, data: Sequence[Path]) -> tuple[list[_Group], list[_Gr
     used: set[str] = set()
     for paths in itertools.chain.from_iterable(map(_by_file_name, by_template.values())):
         try:
-            sample = file_sample.read(folder / paths[0])
+            sample = file_sample.read_sample(folder / paths[0])
         except MissingModuleError:
             raise
         except TacpipeError as error:
@@ -131,7 +130,7 @@ def _with_stamps(groups: Sequence[_Group]) -> tuple[list[_Group], list[_Group]]:
             if clock.pattern.rpartition("/")[0] == group.pattern.rpartition("/")[0]
             and (group.first.row_count is None or clock.first.row_count in (None, group.first.row_count))
         ]
-        if guess_stamps.time_column(group.first) is None and candidates:
+        if guess_columns.time_column(group.first) is None and candidates:
             clock = max(candidates, key=lambda clock: group.stream in clock.stream)
             used.append(clock)
             streams.append(replace(group, stamps=clock.pattern, clock=clock.first))
@@ -145,7 +144,7 @@ def _is_clock(group: _Group) -> bool:
     stem = group.paths[0].name.partition(".")[0]
     match = column_names.TIME_NAME.fullmatch(stem) or column_names.TIME_ENDING.fullmatch(stem)
     (values,) = group.first.values.values()
-    return bool(match) and (guess_stamps.rises(values) or any(isinstance(value, str) for value in values))
+    return bool(match) and (guess_columns.rises(values) or any(isinstance(value, str) for value in values))
 
 
 def _stream_name(paths: Sequence[Path], used: set[str]) -> str:
@@ -172,7 +171,9 @@ def _label_files(folder: Path, paths: Sequence[Path], streams: Sequence[_Group])
         if not placeholders:
             is_labels = _is_table_of_labels(folder / same[0])
         else:
-            is_labels = placeholders <= shared and {pattern.filled(text, values) for values in recordings} <= names
+            is_labels = (
+                placeholders <= shared and {pattern.fill_pattern(text, values) for values in recordings} <= names
+            )
         if is_labels:
             labels[text] = same
     return labels
@@ -181,7 +182,7 @@ def _label_files(folder: Path, paths: Sequence[Path], streams: Sequence[_Group])
 def _is_table_of_labels(path: Path) -> bool:
     """Return whether a YAML or JSON file holds labels by the name of their recording."""
     try:
-        return bool(label_table.read(path).rows)
+        return bool(label_table.read_label_table(path).rows)
     except TacpipeError:
         return False
 
@@ -207,7 +208,7 @@ def _is_labels(sample: FileSample) -> bool:
     if sample.text is None:
         return False
     texts = any(isinstance(value, str) for values in sample.values.values() for value in values)
-    return texts and guess_stamps.time_column(sample) is None and 0 < len(sample.text.rows) < LINES - 1
+    return texts and guess_columns.time_column(sample) is None and 0 < len(sample.text.rows) < SAMPLE_LINES - 1
 
 
 def _labels_text(group: _Group) -> str:
@@ -224,7 +225,7 @@ def _labels_text(group: _Group) -> str:
 def _stream_text(group: _Group) -> str:
     """Return the text of a ``[streams.NAME]`` entry."""
     sample = group.first
-    time = None if group.stamps else guess_stamps.time_column(sample)
+    time = None if group.stamps else guess_columns.time_column(sample)
     reserved = {time} if time else set()
     lines = [
         f"[streams.{group.stream}]",
@@ -241,10 +242,10 @@ def _stream_text(group: _Group) -> str:
         reserved.add(recording_column)
     if group.clock is not None:
         file = f"file = {quoted(group.stamps)}"
-        lines.append(f"time = {guess_stamps.time_entry(group.clock, group.clock.names[0], file)}")
+        lines.append(f"time = {guess_columns.time_entry(group.clock, group.clock.names[0], file)}")
     else:
-        lines.append(f"time = {guess_stamps.time_entry(sample, time)}")
-    rules = guess_columns.entries(sample, reserved)
+        lines.append(f"time = {guess_columns.time_entry(sample, time)}")
+    rules = guess_columns.column_entries(sample, reserved)
     rules += [f"{{ match = {quoted(f'{name}*')}, skip = true }}," for name in group.skipped]
     lines += ["columns = [", *(f"    {rule}" for rule in rules), "]"]
     return "\n".join(lines)

@@ -35,7 +35,7 @@ class Params(StreamSelection):
         """Return the layout."""
         if not self.layout:
             raise UsageError("--layout must be given: the file that describes the tables. --guess prints a first one.")
-        return layouts.of(json.loads(self.layout), "The layout")
+        return layouts.layout_from_tables(json.loads(self.layout), "The layout")
 
 
 def discover(params: Params, source: Path) -> dict[str, Source]:
@@ -43,7 +43,7 @@ def discover(params: Params, source: Path) -> dict[str, Source]:
     from tacpipe.formats.table import contained, recordings
 
     layout = params.parsed()
-    return contained.sources(layout, source, recordings.found(layout, source))
+    return contained.discover_sources(layout, source, recordings.find_recordings(layout, source))
 
 
 def preview(params: Params, source: Path) -> str:
@@ -51,14 +51,14 @@ def preview(params: Params, source: Path) -> str:
     from tacpipe.formats.table import contained, recordings
 
     layout = params.parsed()
-    return contained.preview_text(layout, source, recordings.found(layout, source))
+    return contained.preview_text(layout, source, recordings.find_recordings(layout, source))
 
 
 def guess(source: Path) -> str:
     """Return the text of a first layout."""
     from tacpipe.formats.table import guess
 
-    return guess.layout(source)
+    return guess.guess_layout(source)
 
 
 def why_unread(params: Params, source: Path) -> Callable[[str], str]:
@@ -79,4 +79,4 @@ def table(params: Params, files: Files, values: Values, shared: Shared | None = 
     """
     from tacpipe.formats.table import contained
 
-    return contained.recording(params.parsed(), None, files, values, shared)
+    return contained.read_recording(params.parsed(), None, files, values, shared)

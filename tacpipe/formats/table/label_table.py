@@ -1,8 +1,10 @@
-"""A table of labels with a row a recording, as `tacpipe label --from` reads it: CSV, TSV, Parquet, JSON or YAML."""
+"""Files of labels as text: rows of a CSV, cells as the values that they are written as."""
 
 from __future__ import annotations
 
+import csv
 import datetime
+import io
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -11,20 +13,75 @@ from typing import Any
 
 from tacpipe.errors import DamagedError, TacpipeError, UsageError
 from tacpipe.formats import unique_names
-from tacpipe.formats.table import label_texts
 from tacpipe.formats.table.layout import TREES
-from tacpipe.io import yaml_text
+from tacpipe.io import regular, yaml_text
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import excerpt, listed, plain
 
+MAX_LABEL_BYTES = 1 << 26  # largest file of labels
+
+
+def plain_value(text: str) -> Attribute:
+    """Return what a cell's text means: true, false, a number where it is written as one, else text.
+
+    A number with leading zeros is text, as it is most often a name.
+
+    >>> [plain_value(text) for text in ("3", "0.5", "007", "true", "cork", "", "nan")]
+    [3, 0.5, '007', True, 'cork', None, 'nan']
+    """
+    text = text.strip()
+    if text.lower() in ("true", "false"):
+        return text.lower() == "true"
+    if not text:
+        return None
+    digits = text.lstrip("-")
+    if digits.isascii() and digits.isdigit() and (digits == "0" or not digits.startswith("0")):
+        return int(text) if len(digits) < 19 else text
+    try:
+        number = float(text)
+    except ValueError:
+        return text
+    finite = number == number and abs(number) != float("inf")
+    return number if finite and not digits.startswith("00") and "_" not in text and not digits.isdigit() else text
+
+
+def read_rows(path: Path) -> Iterator[tuple[int, list[str]]]:
+    """Yield the number and the cells of each line that holds some, the header first; all are as wide as it."""
+    text = read_text(path)
+    separator = "\t" if path.suffix.lower() == ".tsv" else (";" if ";" in text.partition("\n")[0] else ",")
+    reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator)
+    header: list[str] = []
+    for cells in reader:
+        if not any(cell.strip() for cell in cells):
+            continue
+        header = header or cells
+        if len(cells) != len(header):
+            raise TacpipeError(
+                f"{path}, line {reader.line_num} has {len(cells)} cells under a header of {len(header)}."
+            )
+        yield reader.line_num, [cell.strip() for cell in cells]
+
+
+def read_text(path: Path) -> str:
+    """Return the text of a file of labels. Raises `TacpipeError` for one that is too large or not UTF-8."""
+    with regular.failing(path):
+        content = regular.content(path, MAX_LABEL_BYTES)
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise TacpipeError(
+            f"{path} is not UTF-8: byte {error.start} is {excerpt(content[error.start : error.end])}."
+        ) from error
+
+
 EXTENSIONS = (".csv", ".tsv", ".parquet", *TREES)
 RECORDING = re.compile(r"(recording|trial|episode|run|session)(_?(id|name|nr|no|number))?", re.IGNORECASE)
-NAME = "recording"  # what the names of a YAML or JSON mapping are
+NAME = "recording"  # column for the names of a YAML or JSON mapping
 
 
 @dataclass(frozen=True)
-class Row:
-    """What a row holds: where it stands, the name of its recording, and its labels; an empty cell is not among them."""
+class LabelRow:
+    """A row: its place in the file, the name of its recording, and its labels without those of empty cells."""
 
     place: str
     recording: str
@@ -37,48 +94,53 @@ class LabelTable:
 
     path: Path
     key: str
-    rows: tuple[Row, ...]
+    rows: tuple[LabelRow, ...]
 
-    def by_recording(self, known: Mapping[str, Mapping[str, Attribute]]) -> dict[str, dict[str, Attribute]]:
-        """Return the labels of each row by the name of its recording; ``known`` maps names to attributes.
+    def by_recording(
+        self, attributes_by_name: Mapping[str, Mapping[str, Attribute]]
+    ) -> dict[str, dict[str, Attribute]]:
+        """Return the labels of each row by recording, given the attributes of the recordings by name.
 
         A row names its recording, or else the attribute called as the key column, as ``trial``. Raises `UsageError` for
         rows of unknown recordings, and for two rows of one.
         """
         by_attribute: dict[str, list[str]] = {}
-        for name, attributes in known.items():
-            by_attribute.setdefault(written(attributes.get(self.key)), []).append(name)
-        found: dict[str, dict[str, Attribute]] = {}
+        for name, attributes in attributes_by_name.items():
+            by_attribute.setdefault(cell_text(attributes.get(self.key)), []).append(name)
+        labels_by_name: dict[str, dict[str, Attribute]] = {}
         unknown: list[str] = []
         for row in self.rows:
-            names = [row.recording] if row.recording in known else by_attribute.get(row.recording, [])
+            names = [row.recording] if row.recording in attributes_by_name else by_attribute.get(row.recording, [])
             if not names or not row.recording:
                 unknown.append(row.recording)
             for name in names:
-                if name in found:
+                if name in labels_by_name:
                     raise UsageError(f"{self.path}, {row.place}: {plain(name)} has a row already. Keep one of them.")
-                found[name] = dict(row.labels)
+                labels_by_name[name] = dict(row.labels)
         if unknown:
             raise UsageError(
                 f"{self.path} names recordings that are not there: {listed(unknown, 10)} (column "
-                f"{plain(self.key)}); there are {listed(known, 6)}. Correct these names, or choose the column with --key."
+                f"{plain(self.key)}); there are {listed(attributes_by_name, 6)}. Correct these names, or "
+                "choose the column with --key."
             )
-        return found
+        return labels_by_name
 
 
-def written(value: Any) -> str:
+def cell_text(value: Any) -> str:
     """Return the name of a recording as a cell has it: text, '' where the cell is empty.
 
-    >>> written("trial-01"), written(7), written(None)
+    >>> cell_text("trial-01"), cell_text(7), cell_text(None)
     ('trial-01', '7', '')
     """
     return "" if value is None else str(value).strip()
 
 
-def read(path: Path, key: str = "", known: Mapping[str, Mapping[str, Attribute]] | None = None) -> LabelTable:
+def read_label_table(
+    path: Path, key: str = "", attributes_by_name: Mapping[str, Mapping[str, Attribute]] | None = None
+) -> LabelTable:
     """Return the table of labels in a file; ``key`` names the column of the recordings' names, found where it is empty.
 
-    It is the column whose values are all names of ``known`` recordings, else the first called recording, trial, episode …
+    It is the column whose values are all in ``attributes_by_name``, else the first named recording, trial, episode …
     Numbers, true and false keep their types. Raises `UsageError` for another kind of file and where no column can be the
     key, `TacpipeError` naming file and row for what cannot be a label.
     """
@@ -88,38 +150,40 @@ def read(path: Path, key: str = "", known: Mapping[str, Mapping[str, Attribute]]
     if not path.is_file():
         raise UsageError(f"There is no file {path}.")
     texts = suffix in (".csv", ".tsv")
-    rows = list(_cells(path) if texts else _parquet(path) if suffix == ".parquet" else _tree(path))
+    rows = list(_read_text_rows(path) if texts else _read_parquet(path) if suffix == ".parquet" else _read_tree(path))
     if not rows:
         raise UsageError(f"{path} holds no row; nothing would change.")
     columns = list(dict.fromkeys(name for _, row in rows for name in row))
     if key and key not in columns:
         raise UsageError(f"{path} has no column {plain(key)}; it has {listed(columns)}.")
-    key = key or _key(path, columns, rows, set(known or ()))
-    return LabelTable(path, key, tuple(_row(path, place, key, row, texts) for place, row in rows))
+    key = key or _find_key_column(path, columns, rows, set(attributes_by_name or ()))
+    return LabelTable(path, key, tuple(_checked_row(path, place, key, row, texts) for place, row in rows))
 
 
-def _key(path: Path, columns: list[str], rows: list[tuple[str, dict[str, Any]]], known: set[str]) -> str:
-    named = [name for name in columns if {written(row.get(name)) for _, row in rows} <= known]
+def _find_key_column(
+    path: Path, columns: list[str], rows: list[tuple[str, dict[str, Any]]], recording_names: set[str]
+) -> str:
+    matching_columns = [name for name in columns if {cell_text(row.get(name)) for _, row in rows} <= recording_names]
     called = [name for name in columns if RECORDING.fullmatch(name)]
-    if not named + called:
+    if not matching_columns + called:
         raise UsageError(
             f"No column of {path} is called recording or trial or holds names of recordings; name it with --key: "
             f"{listed(columns)}."
         )
-    return (named + called)[0]
+    return (matching_columns + called)[0]
 
 
-def _row(path: Path, place: str, key: str, row: Mapping[str, Any], texts: bool) -> Row:
-    name = written(row.get(key))
+def _checked_row(path: Path, place: str, key: str, row: Mapping[str, Any], texts: bool) -> LabelRow:
+    name = cell_text(row.get(key))
     if not name:
         raise TacpipeError(f"{path}, {place} has no {plain(key)}. Write the name of its recording, or remove the row.")
     values = {label: value for label, value in row.items() if label != key}
     if texts:
-        values = {label: label_texts.plain_value(value) for label, value in values.items() if value}
-    return Row(place, name, {label: _value(path, place, label, value) for label, value in values.items()})
+        values = {label: plain_value(value) for label, value in values.items() if value}
+    return LabelRow(place, name, {label: _label_value(path, place, label, value) for label, value in values.items()})
 
 
-def _value(path: Path, place: str, label: str, value: Any) -> Attribute:
+def _label_value(path: Path, place: str, label: str, value: Any) -> Attribute:
     if isinstance(value, datetime.date | datetime.datetime):
         return value.isoformat()
     finite = not isinstance(value, float) or value - value == 0
@@ -130,19 +194,19 @@ def _value(path: Path, place: str, label: str, value: Any) -> Attribute:
     )
 
 
-def _cells(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+def _read_text_rows(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield the cells of each row of a text table by the names of its header."""
-    numbered = label_texts.read_rows(path)
+    numbered = read_rows(path)
     header = next(numbered, (0, []))[1]
     for line, cells in numbered:
         yield f"line {line}", dict(zip(header, cells, strict=True))
 
 
-def _parquet(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+def _read_parquet(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
     from tacpipe.io import parquet, regular
 
     with regular.failing(path):
-        content = regular.content(path, label_texts.MOST_BYTES)
+        content = regular.content(path, MAX_LABEL_BYTES)
     try:
         table = parquet.from_parquet(content)
     except DamagedError as error:
@@ -151,23 +215,28 @@ def _parquet(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
         yield f"row {number}", {name: value for name, value in row.items() if value is not None}
 
 
-def _tree(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+def _read_tree(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield the entries of a mapping of names to labels, or of a list of labels."""
-    text = label_texts.read_text(path)
+    text = read_text(path)
     try:
         tree = unique_names.json_value(text, path) if path.suffix.lower() == ".json" else yaml_text.load(text)
     except (ValueError, RecursionError) as error:
         raise TacpipeError(f"{path} cannot be read: {plain(str(error), 200)}. Correct it.") from error
     entries = (
-        [(plain(str(name)), {NAME: str(name), **one} if isinstance(one, dict) else one) for name, one in tree.items()]
+        [
+            (plain(str(name)), {NAME: str(name), **labels} if isinstance(labels, dict) else labels)
+            for name, labels in tree.items()
+        ]
         if isinstance(tree, dict)
-        else [(f"entry {number}", one) for number, one in enumerate(tree)]
+        else [(f"entry {number}", labels) for number, labels in enumerate(tree)]
         if isinstance(tree, list)
         else []
     )
-    for place, one in entries:
-        if not isinstance(one, dict):
-            raise TacpipeError(f"{path}, {place} is {excerpt(one)}; write NAME: VALUE for each label of a recording.")
-        yield place, {str(name): value for name, value in one.items()}
+    for place, labels in entries:
+        if not isinstance(labels, dict):
+            raise TacpipeError(
+                f"{path}, {place} is {excerpt(labels)}; write NAME: VALUE for each label of a recording."
+            )
+        yield place, {str(name): value for name, value in labels.items()}
     if not entries:
         raise TacpipeError(f"{path} holds {excerpt(tree)}; write labels by the name of their recording.")

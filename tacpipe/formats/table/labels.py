@@ -11,8 +11,8 @@ from typing import Any
 from tacpipe.errors import TacpipeError
 from tacpipe.formats import unique_names
 from tacpipe.formats.table import label_table, pattern
-from tacpipe.formats.table.label_texts import plain_value, read_rows, read_text
-from tacpipe.formats.table.layout import TREES, Labels, Layout
+from tacpipe.formats.table.label_table import plain_value, read_rows, read_text
+from tacpipe.formats.table.layout import TREES, LabelSource, Layout
 from tacpipe.formats.table.recordings import Source
 from tacpipe.io import yaml_text
 from tacpipe.plugins.stage import Attribute
@@ -21,33 +21,38 @@ from tacpipe.printable import excerpt, listed, plain
 RECORDING = "recording"  # the placeholder of a recording's name
 
 
-def found(layout: Layout, folder: Path, sources: Sequence[Source]) -> dict[str, dict[str, Attribute]]:
+def find_labels(layout: Layout, folder: Path, sources: Sequence[Source]) -> dict[str, dict[str, Attribute]]:
     """Return the labels of each recording: of the layout, of its files' names, then of each source of labels.
 
     Values are read as numbers, true and false where they are written so. Raises `TacpipeError`, naming file and row, for
     a recording without a row or a file, two rows of one recording, a missing column, and a value that is not plain.
     """
-    made: dict[str, dict[str, Attribute]] = {
-        one.name: {**layout.attributes, **{name: plain_value(value) for name, value in _named(one)}} for one in sources
+    labels_by_name: dict[str, dict[str, Attribute]] = {
+        source.name: {**layout.attributes, **{name: plain_value(value) for name, value in _placeholder_values(source)}}
+        for source in sources
     }
     for labels in layout.labels:
         shared = not pattern.placeholders(labels.file)
-        rows = _table(folder / labels.file, labels) if shared else {}
-        for one in sources:
-            called = _called(layout, one)
-            values = _row(rows, one, called, folder / labels.file) if shared else _file(folder, labels, one)
-            made[one.name] |= _picked(values, labels, one.name)
-    return made
+        rows = _labels_by_key(folder / labels.file, labels) if shared else {}
+        for source in sources:
+            called = _alternative_names(layout, source)
+            values = (
+                _find_row(rows, source, called, folder / labels.file)
+                if shared
+                else _read_label_file(folder, labels, source)
+            )
+            labels_by_name[source.name] |= _select_columns(values, labels, source.name)
+    return labels_by_name
 
 
-def _named(source: Source) -> Iterator[tuple[str, str]]:
+def _placeholder_values(source: Source) -> Iterator[tuple[str, str]]:
     """Yield the placeholders of a recording's files with their text; one that is the recording's name is no label."""
     for name, value in source.values.items():
         if (name, value) != (RECORDING, source.name):
             yield name, value
 
 
-def _only_row(path: Path) -> dict[str, Attribute]:
+def _read_single_row(path: Path) -> dict[str, Attribute]:
     """Return the one row of a table that describes one recording."""
     rows = list(read_rows(path))
     if len(rows) != 2:
@@ -57,14 +62,14 @@ def _only_row(path: Path) -> dict[str, Attribute]:
     return {name: plain_value(cell) for name, cell in zip(rows[0][1], rows[1][1], strict=True)}
 
 
-def _table(path: Path, labels: Labels) -> dict[str, dict[str, Attribute]]:
+def _labels_by_key(path: Path, labels: LabelSource) -> dict[str, dict[str, Attribute]]:
     """Return the rows of a table of labels by the value of its key; a mapping of YAML or JSON has its names for keys."""
     if path.suffix.lower() in TREES:
-        found = label_table.read(path, labels.key)
-        doubled = [name for name, count in Counter(row.recording for row in found.rows).items() if count > 1]
+        label_rows = label_table.read_label_table(path, labels.key)
+        doubled = [name for name, count in Counter(row.recording for row in label_rows.rows).items() if count > 1]
         if doubled:
             raise TacpipeError(f"{path}: {plain(doubled[0])} has an entry already. Keep one of them.")
-        return {row.recording: dict(row.labels) for row in found.rows}
+        return {row.recording: dict(row.labels) for row in label_rows.rows}
     numbered = read_rows(path)
     header = next(numbered, (0, []))[1]
     if labels.key not in header:
@@ -79,24 +84,24 @@ def _table(path: Path, labels: Labels) -> dict[str, dict[str, Attribute]]:
     return rows
 
 
-def _called(layout: Layout, source: Source) -> list[str]:
-    """Return what else a table may call a recording: the folders and files that its placeholders are part of.
+def _alternative_names(layout: Layout, source: Source) -> list[str]:
+    """Return other names of a recording in a table: the folders and files that its placeholders are part of.
 
     ``run_07/skin.csv`` of the pattern ``run_{trial}/skin.csv`` is run_07 too, whose trial is 07.
     """
     segments = {segment for stream in layout.streams for segment in stream.files.split("/")}
     return sorted(
-        pattern.filled(one, source.values).partition(".")[0]
-        for one in segments
-        if (names := pattern.placeholders(one)) and "*" not in one and set(names) <= set(source.values)
+        pattern.fill_pattern(part, source.values).partition(".")[0]
+        for part in segments
+        if (names := pattern.placeholders(part)) and "*" not in part and set(names) <= set(source.values)
     )
 
 
-def _row(
+def _find_row(
     rows: Mapping[str, dict[str, Attribute]], source: Source, called: list[str], path: Path
 ) -> dict[str, Attribute]:
-    given = (source.within, source.name, *source.values.values(), *called)
-    names = list(dict.fromkeys(name for name in given if name is not None))
+    candidates = (source.episode, source.name, *source.values.values(), *called)
+    names = list(dict.fromkeys(name for name in candidates if name is not None))
     for name in names:
         if name in rows:
             return rows[name]
@@ -106,10 +111,10 @@ def _row(
     )
 
 
-def _file(folder: Path, labels: Labels, source: Source) -> dict[str, Attribute]:
-    path = folder / pattern.filled(labels.file, {**source.values, "recording": source.within or source.name})
+def _read_label_file(folder: Path, labels: LabelSource, source: Source) -> dict[str, Attribute]:
+    path = folder / pattern.fill_pattern(labels.file, {**source.values, "recording": source.episode or source.name})
     if path.suffix.lower() in (".csv", ".tsv"):
-        return _only_row(path)
+        return _read_single_row(path)
     text = read_text(path)
     try:
         values = unique_names.json_value(text, path) if path.suffix.lower() == ".json" else yaml_text.load(text)
@@ -117,18 +122,18 @@ def _file(folder: Path, labels: Labels, source: Source) -> dict[str, Attribute]:
         raise TacpipeError(f"{path} cannot be read: {plain(str(error), 200)}. Correct it.") from error
     if not isinstance(values, dict):
         raise TacpipeError(f"{path} holds {excerpt(values)}; labels are NAME: VALUE, one a line.")
-    return {plain(str(name)): _checked(value, name, path) for name, value in _flat(values).items()}
+    return {plain(str(name)): _label_value(value, name, path) for name, value in _flatten(values).items()}
 
 
-def _flat(values: Mapping[Any, Any], before: str = "") -> dict[str, Any]:
+def _flatten(values: Mapping[Any, Any], before: str = "") -> dict[str, Any]:
     """Return nested mappings as one, with dots between the names."""
-    found: dict[str, Any] = {}
+    flat: dict[str, Any] = {}
     for name, value in values.items():
-        found |= _flat(value, f"{before}{name}.") if isinstance(value, dict) else {f"{before}{name}": value}
-    return found
+        flat |= _flatten(value, f"{before}{name}.") if isinstance(value, dict) else {f"{before}{name}": value}
+    return flat
 
 
-def _checked(value: Any, name: Any, path: Path) -> Attribute:
+def _label_value(value: Any, name: Any, path: Path) -> Attribute:
     if isinstance(value, datetime.date | datetime.datetime):
         return value.isoformat()
     if value is None or isinstance(value, str | int | float | bool):
@@ -136,7 +141,7 @@ def _checked(value: Any, name: Any, path: Path) -> Attribute:
     raise TacpipeError(f"{path}: {plain(str(name))} is {excerpt(value)}; a label is text, a number, or true or false.")
 
 
-def _picked(values: dict[str, Attribute], labels: Labels, recording: str) -> dict[str, Attribute]:
+def _select_columns(values: dict[str, Attribute], labels: LabelSource, recording: str) -> dict[str, Attribute]:
     if not labels.columns:
         return values
     missing = [name for name in labels.columns if name not in values]

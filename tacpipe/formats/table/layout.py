@@ -24,7 +24,7 @@ from tacpipe.plugins import fields
 from tacpipe.plugins.constraints import NonNegativeInt, PositiveInt
 from tacpipe.printable import excerpt, plain
 
-MOST_BYTES = 1 << 20  # of a layout file
+MAX_LAYOUT_BYTES = 1 << 20  # largest layout file
 Format = Literal["csv", "parquet", "npz", "npy", "xlsx", "jsonl", "mcap", "rosbag", "hdf5", "zarr", "xdf", "lerobot"]
 Kind = Literal[
     "int8",
@@ -58,16 +58,16 @@ TABLES = ("recordings", "streams", "labels", "attributes", "vocabulary")
 STAMPS = ".stamps"  # suffix of a stream's name that marks the file of its stamps
 GZIP = ".gz"
 FILE = "file"  # the placeholder of a container's name, where containers are found by their format
-UNKNOWN = "?"  # what a guessed layout could not know
-OPEN = 4  # of such entries that are named at once
+UNKNOWN = "?"  # marks an entry that a guessed layout leaves to a person
+MAX_NAMED = 4  # unknown entries named in one error
 
 
 DECLARED = Time()  # neither a column nor a rate: the container declares it
 
 
 @dataclass(frozen=True)
-class Column:
-    """What the columns are whose names match a pattern; placeholders become field metadata, as taxel and axis."""
+class ColumnRule:
+    """A rule for the columns whose names match a pattern; placeholders become field metadata, as taxel and axis."""
 
     match: str
     name: str = ""  # pattern; empty: as in the file
@@ -83,40 +83,40 @@ class Column:
 
 
 @dataclass(frozen=True)
-class Long:
-    """Columns of a table in long form: one row a channel and moment."""
+class LongColumns:
+    """Columns of a table in long form: one row per channel and moment."""
 
     channel: str
     value: str
 
 
 @dataclass(frozen=True)
-class Stream:
+class StreamLayout:
     """One stream of each recording."""
 
     name: str
     files: str = ""  # empty: each container found in the folder
-    time: Time = DECLARED  # without a column or a rate: as the container declares it
-    columns: tuple[Column, ...] = ()  # of a container: where what it declares is to be replaced
+    time: Time = DECLARED  # the container's own time unless a column or a rate is named
+    columns: tuple[ColumnRule, ...] = ()  # containers: only rules that replace what the file declares
     format: Format | None = None  # None: by the extension
     source: str = ""  # the topic, group or dataset inside a container
     separator: str = ""  # empty: a comma, or a tab in a .tsv
     decimal: Literal[".", ","] = "."
-    comment: str = ""  # what lines begin with that hold no row
+    comment: str = ""  # start of lines that hold no row
     header: bool = True  # False: columns are named by ``names``, or column1, column2, …
     names: tuple[str, ...] = ()  # column names, where the layout's ``header`` is a list
     encoding: str = "utf-8"  # text files only
     sheet: str = ""  # workbooks only; empty: the first sheet
     time_axis: NonNegativeInt = 0  # arrays only: the dimension of the rows
-    skip_lines: NonNegativeInt = 0  # before the header
+    skip_lines: NonNegativeInt = 0  # number of lines above the header
     missing: tuple[str, ...] = ()  # cells that hold no value: NaN
     recording: str = ""  # the column that names the recording, where a file holds many
-    long: Long | None = None
-    optional: bool = False  # whether recordings without this stream are read
+    long: LongColumns | None = None
+    optional: bool = False  # True: recordings without this stream are read too
 
     @property
     def contained(self) -> bool:
-        """Whether the stream is one of several in a container."""
+        """True where the stream is one of several in a container."""
         return self.format in kinds.KINDS
 
     def format_of(self, path: Path) -> Format:
@@ -131,7 +131,7 @@ class Stream:
         return EXTENSIONS[last]
 
     def separator_of(self, path: Path) -> str:
-        """Return what stands between the cells of a text file."""
+        """Return the separator of the cells of a text file."""
         return self.separator or ("\t" if ".tsv" in [suffix.lower() for suffix in path.suffixes] else ",")
 
 
@@ -156,13 +156,13 @@ def why_unreadable(path: str, unmatched: str, kind: str | None = None) -> str:
         return unmatched
     if readable and kind not in readable:
         return f"`tacpipe ingest {readable[0]}` reads such files"
-    reads = kinds.described(kind) if kind is not None else ", ".join(f"*{ending}" for ending in EXTENSIONS)
+    reads = kinds.describe_kind(kind) if kind is not None else ", ".join(f"*{ending}" for ending in EXTENSIONS)
     return f"the command reads {reads}"
 
 
 @dataclass(frozen=True)
-class Labels:
-    """A source of labels: a table with a row a recording, or YAML or JSON, one file a recording or one of all."""
+class LabelSource:
+    """A source of labels: a table with one row per recording, or YAML or JSON files, one per recording or one for all."""
 
     file: str
     key: str = ""  # the table's column that names the recording
@@ -181,81 +181,83 @@ class Vocabulary:
 class Layout:
     """Everything that a layout file states."""
 
-    streams: tuple[Stream, ...]
+    streams: tuple[StreamLayout, ...]
     name: str = ""  # pattern of a recording's name; empty: all placeholders with dashes between
-    labels: tuple[Labels, ...] = ()
+    labels: tuple[LabelSource, ...] = ()
     attributes: Mapping[str, str | int | float | bool] = field(default_factory=dict)
 
     @property
     def found_by_format(self) -> bool:
-        """Whether recordings are the containers in a folder, rather than files that match patterns."""
-        return all(not one.files for one in self.streams)
+        """True where recordings are the containers in a folder, rather than files that match patterns."""
+        return all(not stream.files for stream in self.streams)
 
     @property
     def placeholders(self) -> tuple[str, ...]:
         """The placeholders that every stream which must be there has, in the order of the first."""
         if self.found_by_format:
             return ()
-        required = [one for one in self.streams if not one.optional] or list(self.streams)
-        shared = set.intersection(*(set(pattern.placeholders(one.files)) for one in required))
+        required = [stream for stream in self.streams if not stream.optional] or list(self.streams)
+        shared = set.intersection(*(set(pattern.placeholders(stream.files)) for stream in required))
         return tuple(name for name in pattern.placeholders(required[0].files) if name in shared)
 
 
-def read(path: Path) -> Layout:
+def read_layout(path: Path) -> Layout:
     """Return the layout in a file. Raises `UsageError`, naming file and entry, for what is not one."""
-    content = regular.content(path, MOST_BYTES)
+    content = regular.content(path, MAX_LAYOUT_BYTES)
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise UsageError(
             f"{path} is not UTF-8: byte {error.start} is {excerpt(content[error.start : error.end])}."
         ) from error
-    return parse(text, str(path))
+    return parse_layout(text, str(path))
 
 
-def parse(text: str, where: str = "The layout") -> Layout:
+def parse_layout(text: str, place: str = "The layout") -> Layout:
     """Return the layout in a TOML text; ``where`` names it in errors."""
     try:
         tables = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise UsageError(f"{where} is not TOML: {plain(str(error), 200)}.") from error
-    return of(tables, where)
+        raise UsageError(f"{place} is not TOML: {plain(str(error), 200)}.") from error
+    return layout_from_tables(tables, place)
 
 
-def of(tables: Mapping[str, Any], where: str = "The layout", container: Format | None = None) -> Layout:
-    """Return the layout that these tables of TOML are.
+def layout_from_tables(tables: Mapping[str, Any], place: str = "The layout", container: Format | None = None) -> Layout:
+    """Return the layout that tables of TOML describe.
 
     Of a layout for a ``container`` format streams have that format where they name none, and need neither files, time
     nor columns, as the container declares them; without a stream it is about all that a container holds.
     """
-    _refuse_unknown(tables, where)
+    _refuse_unknown(tables, place)
     for key in tables:
         if key not in TABLES:
-            raise UsageError(f"{where}: there is no table [{plain(key)}]; there are {', '.join(TABLES)}.")
-    streams = _table(tables.get("streams", {}), where, "streams")
+            raise UsageError(f"{place}: there is no table [{plain(key)}]; there are {', '.join(TABLES)}.")
+    streams = _expect_table(tables.get("streams", {}), place, "streams")
     if not streams and container is None:
-        raise UsageError(f"{where} has no stream. Add a table such as [streams.skin] with files, time and columns.")
-    recordings = _table(tables.get("recordings", {}), where, "recordings")
+        raise UsageError(f"{place} has no stream. Add a table such as [streams.skin] with files, time and columns.")
+    recordings = _expect_table(tables.get("recordings", {}), place, "recordings")
     for key in recordings:
         if key != "name":
-            raise fields.unknown(key, {"name": str}, f"{where}, [recordings]", "entry")
-    name = fields.check(recordings.get("name", ""), str, "name", f"{where}, [recordings]")
+            raise fields.unknown(key, {"name": str}, f"{place}, [recordings]", "entry")
+    name = fields.check(recordings.get("name", ""), str, "name", f"{place}, [recordings]")
     labels = tables.get("labels", [])
     if not isinstance(labels, list):
-        raise UsageError(f"{where}: labels is a list of tables. Write [[labels]].")
-    made = Layout(
-        tuple(_stream(stream, value, where, container) for stream, value in streams.items()),
+        raise UsageError(f"{place}: labels is a list of tables. Write [[labels]].")
+    layout = Layout(
+        tuple(_parse_stream(stream, value, place, container) for stream, value in streams.items()),
         name,
-        tuple(_labels(one, f"{where}, [[labels]] {number}") for number, one in enumerate(labels, 1)),
-        _attributes(_table(tables.get("attributes", {}), where, "attributes"), where),
+        tuple(_parse_labels(value, f"{place}, [[labels]] {number}") for number, value in enumerate(labels, 1)),
+        _parse_attributes(_expect_table(tables.get("attributes", {}), place, "attributes"), place),
     )
-    _expect_known_words(made, _table(tables.get("vocabulary", {}), where, "vocabulary"), where)
-    named = [one.name for one in made.streams if one.files]
-    if named and len(named) < len(made.streams):
-        raise UsageError(f"{where}: [streams.{named[0]}] has files and others have none. Give files to all of them.")
-    known = [*made.placeholders, "recording", *((FILE,) if made.found_by_format else ())]
-    pattern.filled(name, dict.fromkeys(known, "x"))
-    return made
+    _expect_known_words(layout, _expect_table(tables.get("vocabulary", {}), place, "vocabulary"), place)
+    with_files = [value.name for value in layout.streams if value.files]
+    if with_files and len(with_files) < len(layout.streams):
+        raise UsageError(
+            f"{place}: [streams.{with_files[0]}] has files and others have none. Give files to all of them."
+        )
+    available = [*layout.placeholders, "recording", *((FILE,) if layout.found_by_format else ())]
+    pattern.fill_pattern(name, dict.fromkeys(available, "x"))
+    return layout
 
 
 def _expect_known_words(layout: Layout, vocabulary_table: Mapping[str, Any], place: str) -> None:
@@ -278,58 +280,64 @@ def _expect_known_words(layout: Layout, vocabulary_table: Mapping[str, Any], pla
                     )
 
 
-def _refuse_unknown(value: Any, where: str) -> None:
+def _refuse_unknown(value: Any, place: str) -> None:
     """Raise `UsageError` where entries still hold what a guess could not know, naming the first few."""
-    found = list(_unknown(value, where))
-    if found:
-        more = f"; and {len(found) - OPEN} more" if len(found) > OPEN else ""
-        raise UsageError(f"{'; '.join(found[:OPEN])}{more}. Write what it is, or skip = true for a column.")
+    unknown_entries = list(_unknown_entries(value, place))
+    if unknown_entries:
+        ending = f"; and {len(unknown_entries) - MAX_NAMED} more" if len(unknown_entries) > MAX_NAMED else ""
+        raise UsageError(
+            f"{'; '.join(unknown_entries[:MAX_NAMED])}{ending}. Write what it is, or skip = true for a column."
+        )
 
 
-def _unknown(value: Any, where: str) -> Iterator[str]:
+def _unknown_entries(value: Any, place: str) -> Iterator[str]:
     """Yield each entry that still holds what a guess could not know, with what is next to it."""
     for key, inner in value.items() if isinstance(value, dict) else ():
-        for one in inner if isinstance(inner, list) else [inner]:
-            if one == UNKNOWN:
-                known = ", ".join(f"{name} = {excerpt(found)}" for name, found in value.items() if found != UNKNOWN)
-                yield f'{where}: {plain(key)} is "?"' + (f" ({known})" if known else "")
+        for element in inner if isinstance(inner, list) else [inner]:
+            if element == UNKNOWN:
+                context = ", ".join(f"{name} = {excerpt(text)}" for name, text in value.items() if text != UNKNOWN)
+                yield f'{place}: {plain(key)} is "?"' + (f" ({context})" if context else "")
             else:
-                yield from _unknown(one, f"{where}, {plain(key)}")
+                yield from _unknown_entries(element, f"{place}, {plain(key)}")
 
 
-def _stream(name: str, value: Any, where: str, container: Format | None) -> Stream:
-    where = f"{where}, [streams.{plain(name)}]"
-    values = dict(_table(value, where, ""))
+def _parse_stream(name: str, value: Any, place: str, container: Format | None) -> StreamLayout:
+    place = f"{place}, [streams.{plain(name)}]"
+    values = dict(_expect_table(value, place, ""))
     if not name.isidentifier():
-        raise UsageError(f"{where}: a stream's name is letters, digits and underscores, as it becomes a file's name.")
+        raise UsageError(f"{place}: a stream's name is letters, digits and underscores, as it becomes a file's name.")
     if container is not None:
         values.setdefault("format", container)
-    _expect_given(values, where, container)
+    _expect_required(values, place, container)
     if "time" in values:
-        values["time"] = _time(_table(values["time"], where, "time"), f"{where}, time")
+        values["time"] = _parse_time(_expect_table(values["time"], place, "time"), f"{place}, time")
     columns = values.get("columns", [])
     if not isinstance(columns, list):
-        raise UsageError(f"{where}: columns is {excerpt(columns)}; it must be a list of tables.")
-    values["columns"] = tuple(_column(one, f"{where}, columns {number}") for number, one in enumerate(columns, 1))
+        raise UsageError(f"{place}: columns is {excerpt(columns)}; it must be a list of tables.")
+    values["columns"] = tuple(
+        _parse_column(column, f"{place}, columns {number}") for number, column in enumerate(columns, 1)
+    )
     if "long" in values:
-        values["long"] = fields.filled(Long, _table(values["long"], where, "long"), f"{where}, long", "entry")
+        values["long"] = fields.filled(
+            LongColumns, _expect_table(values["long"], place, "long"), f"{place}, long", "entry"
+        )
     if isinstance(values.get("header"), list):
         values["names"], values["header"] = values["header"], False
     if "missing" in values and isinstance(values["missing"], list):
         values["missing"] = tuple(values["missing"])
-    made: Stream = fields.filled(Stream, {"name": name, **values}, where, "entry")
-    if len(made.separator) > 1:
-        raise UsageError(f"{where}: separator is {excerpt(made.separator)}; it must be one character.")
-    if made.separator and made.separator == made.decimal:
-        raise UsageError(f"{where}: separator and decimal are both {made.decimal!r}; a number could not be read.")
-    _expect_encoding(made, where)
-    absent = set(pattern.placeholders(made.time.file)) - set(pattern.placeholders(made.files))
+    stream: StreamLayout = fields.filled(StreamLayout, {"name": name, **values}, place, "entry")
+    if len(stream.separator) > 1:
+        raise UsageError(f"{place}: separator is {excerpt(stream.separator)}; it must be one character.")
+    if stream.separator and stream.separator == stream.decimal:
+        raise UsageError(f"{place}: separator and decimal are both {stream.decimal!r}; a number could not be read.")
+    _expect_encoding(stream, place)
+    absent = set(pattern.placeholders(stream.time.file)) - set(pattern.placeholders(stream.files))
     if absent:
-        raise UsageError(f"{where}: time.file names {{{min(absent)}}}, which files does not have.")
-    return made
+        raise UsageError(f"{place}: time.file names {{{min(absent)}}}, which files does not have.")
+    return stream
 
 
-def _expect_encoding(stream: Stream, place: str) -> None:
+def _expect_encoding(stream: StreamLayout, place: str) -> None:
     """Raise `UsageError` for an encoding that Python does not have."""
     try:
         codecs.lookup(stream.encoding)
@@ -339,85 +347,86 @@ def _expect_encoding(stream: Stream, place: str) -> None:
         ) from None
 
 
-def _expect_given(values: Mapping[str, Any], where: str, container: Format | None) -> None:
+def _expect_required(values: Mapping[str, Any], place: str, container: Format | None) -> None:
     """Raise `UsageError` for an entry that is missing: a container declares what a table does not."""
     if values.get("format") in kinds.KINDS:
         if not values.get("source"):
-            raise UsageError(f"{where}: source must be given: the topic, group or stream inside the file.")
+            raise UsageError(f"{place}: source must be given: the topic, group or stream inside the file.")
         if values.get("recording"):
-            raise UsageError(f"{where}: recording is for tables; a container names the recordings in it itself.")
+            raise UsageError(f"{place}: recording is for tables; a container names the recordings in it itself.")
         if isinstance(values.get("time"), dict) and values["time"].get("file"):
-            raise UsageError(f"{where}: time.file is for tables; a container holds its stamps. Name their column.")
+            raise UsageError(f"{place}: time.file is for tables; a container holds its stamps. Name their column.")
         if "files" not in values and container is None:
-            raise UsageError(f'{where}: files must be given, as files = "{{trial}}.{values["format"]}".')
+            raise UsageError(f'{place}: files must be given, as files = "{{trial}}.{values["format"]}".')
         return
     if values.get("source"):
-        raise UsageError(f"{where}: source is for containers ({', '.join(kinds.KINDS)}). Set format to one of them.")
+        raise UsageError(f"{place}: source is for containers ({', '.join(kinds.KINDS)}). Set format to one of them.")
     if "files" not in values:
-        raise UsageError(f"{where}: entry files must be given.")
+        raise UsageError(f"{place}: entry files must be given.")
     if "time" not in values:
         raise UsageError(
-            f'{where}: time must be given, as time = {{ column = "t", unit = "s" }}, {{ file = "{{trial}}/stamps.npy" }} or '
+            f'{place}: time must be given, as time = {{ column = "t", unit = "s" }}, {{ file = "{{trial}}/stamps.npy" }} or '
             "{ rate_hz = 100 }."
         )
     if not values.get("columns"):
-        raise UsageError(f'{where}: columns must be given: a list of tables such as {{ match = "taxel{{taxel}}" }}.')
+        raise UsageError(f'{place}: columns must be given: a list of tables such as {{ match = "taxel{{taxel}}" }}.')
 
 
-def _time(values: Mapping[str, Any], where: str) -> Time:
-    made: Time = fields.filled(Time, values, where, "entry")
-    if bool(made.column or made.file) == (made.rate_hz is not None):
-        raise UsageError(f"{where}: give either the column or the file with the stamps, or rate_hz.")
-    if made.format:
-        stamp_formats.check(made.format, where)
-    elif made.start and made.origin != "start" and made.rate_hz is None:
+def _parse_time(values: Mapping[str, Any], place: str) -> Time:
+    time: Time = fields.filled(Time, values, place, "entry")
+    if bool(time.column or time.file) == (time.rate_hz is not None):
+        raise UsageError(f"{place}: give either the column or the file with the stamps, or rate_hz.")
+    if time.format:
+        stamp_formats.check_format(time.format, place)
+    elif time.start and time.origin != "start" and time.rate_hz is None:
         raise UsageError(
-            f'{where}: start is for stamps that count from a recording\'s start. Set origin = "start" too.'
+            f'{place}: start is for stamps that count from a recording\'s start. Set origin = "start" too.'
         )
-    return made
+    return time
 
 
-def _column(value: Any, where: str) -> Column:
-    values = dict(_table(value, where, ""))
+def _parse_column(value: Any, place: str) -> ColumnRule:
+    values = dict(_expect_table(value, place, ""))
     if "about" in values:
-        values["about"] = tuple(sorted(_table(values["about"], where, "about").items()))
-    made: Column = fields.filled(Column, values, where, "entry")
-    places = ("taxel", "axis") if made.shape else ()
-    pattern.filled(made.name, dict.fromkeys((*pattern.placeholders(made.match), *places), "x"))
-    if made.axes and (not made.shape or len(made.axes) not in (made.shape[-1], made.shape[0])):
+        values["about"] = tuple(sorted(_expect_table(values["about"], place, "about").items()))
+    column: ColumnRule = fields.filled(ColumnRule, values, place, "entry")
+    places = ("taxel", "axis") if column.shape else ()
+    pattern.fill_pattern(column.name, dict.fromkeys((*pattern.placeholders(column.match), *places), "x"))
+    if column.axes and (not column.shape or len(column.axes) not in (column.shape[-1], column.shape[0])):
         raise UsageError(
-            f"{where}: axes has {len(made.axes)} names, and shape is {list(made.shape)}. Its last dimension needs one each."
+            f"{place}: axes has {len(column.axes)} names, and shape is {list(column.shape)}. Its last dimension needs one "
+            "each."
         )
-    if made.type in ("bool", "text", "binary") and made.scale != 1.0:
-        raise UsageError(f"{where}: scale is {made.scale}; only numbers have one.")
-    return made
+    if column.type in ("bool", "text", "binary") and column.scale != 1.0:
+        raise UsageError(f"{place}: scale is {column.scale}; only numbers have one.")
+    return column
 
 
-def _labels(value: Any, where: str) -> Labels:
-    values = dict(_table(value, where, ""))
+def _parse_labels(value: Any, place: str) -> LabelSource:
+    values = dict(_expect_table(value, place, ""))
     if isinstance(values.get("columns"), list):
         values["columns"] = tuple(values["columns"])
-    made: Labels = fields.filled(Labels, values, where, "entry")
-    is_tree = made.file.lower().endswith(TREES)  # the names in a tree are those of recordings
-    if not pattern.placeholders(made.file) and not made.key and not is_tree:
+    labels: LabelSource = fields.filled(LabelSource, values, place, "entry")
+    is_tree = labels.file.lower().endswith(TREES)  # the names in a tree are those of recordings
+    if not pattern.placeholders(labels.file) and not labels.key and not is_tree:
         raise UsageError(
-            f"{where}: {plain(made.file)} is one file for all recordings. Set key to the column that names them."
+            f"{place}: {plain(labels.file)} is one file for all recordings. Set key to the column that names them."
         )
-    return made
+    return labels
 
 
-def _attributes(values: Mapping[str, Any], where: str) -> Mapping[str, str | int | float | bool]:
+def _parse_attributes(values: Mapping[str, Any], place: str) -> Mapping[str, str | int | float | bool]:
     for key, value in values.items():
         if not isinstance(value, str | int | float | bool):
             raise UsageError(
-                f"{where}, [attributes]: {plain(key)} is {excerpt(value)}; it must be text, a number or true or false."
+                f"{place}, [attributes]: {plain(key)} is {excerpt(value)}; it must be text, a number or true or false."
             )
     return dict(values)
 
 
-def _table(value: Any, where: str, key: str) -> Mapping[str, Any]:
+def _expect_table(value: Any, place: str, key: str) -> Mapping[str, Any]:
     if not isinstance(value, dict):
-        raise UsageError(f"{where}: {key or 'this'} is {excerpt(value)}; it must be a table.")
+        raise UsageError(f"{place}: {key or 'this'} is {excerpt(value)}; it must be a table.")
     return value
 
 

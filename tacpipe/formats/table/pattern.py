@@ -1,4 +1,4 @@
-"""Patterns with placeholders: ``{trial}/skin_{hand}.csv`` matches paths and gives what was in the place of the braces.
+"""Match paths with patterns such as ``{trial}/skin_{hand}.csv`` and return the text of their placeholders.
 
 ``{name}`` is any text without a slash, at least one character; ``*`` is any text without a slash, ``**`` any folders. A
 placeholder that comes twice has the same text both times.
@@ -26,28 +26,28 @@ _COUNTED = (  # words before numbers that count recordings rather than parts of 
 )
 _COUNTER = re.compile(rf"(?:^|[^a-z])({_COUNTED})[-_ #.]*$", re.IGNORECASE)
 _Token = tuple[str, str]  # its kind (a letter of a name is of its own kind), and its text
-MOST_STEPS = 10_000_000  # limit of steps for matching a text
+MAX_STEPS = 10_000_000  # limit of steps for matching a text
 _PART = re.compile(r"\{(\w+)\}|(\*\*/?)|(\*)|([^{}*]+)|(.)", re.DOTALL)
 
 
 @functools.lru_cache(maxsize=1024)
-def compiled(pattern: str) -> re.Pattern[str]:
+def compile_pattern(pattern: str) -> re.Pattern[str]:
     """Return the regular expression of a pattern. Raises `UsageError` where a brace has no partner."""
-    found, seen = [], set()
+    parts, names = [], set()
     for name, folders, any_text, literal, stray in _PART.findall(pattern):
         if stray:
             raise UsageError(
                 f"The pattern {plain(pattern)} has a brace without its partner. Write placeholders as {{name}}."
             )
         if name:
-            found.append(f"(?P={name})" if name in seen else f"(?P<{name}>[^/]+?)")
-            seen.add(name)
+            parts.append(f"(?P={name})" if name in names else f"(?P<{name}>[^/]+?)")
+            names.add(name)
         elif folders:
-            found.append("(?:.*/)?" if folders.endswith("/") else ".*")
+            parts.append("(?:.*/)?" if folders.endswith("/") else ".*")
         else:
-            found.append("[^/]*" if any_text else re.escape(literal))
+            parts.append("[^/]*" if any_text else re.escape(literal))
     try:
-        return re.compile("".join(found), re.DOTALL)
+        return re.compile("".join(parts), re.DOTALL)
     except re.error as error:
         raise UsageError(f"The pattern {plain(pattern)} cannot be read: {error}.") from error
 
@@ -60,16 +60,16 @@ def match(pattern: str, text: str) -> dict[str, str] | None:
     >>> match("**/{trial}.csv", "a/b/t1.csv"), match("*.csv", "a/t1.csv"), match("{a}-{a}", "x-y")
     ({'trial': 't1'}, None, None)
     """
-    if _most_steps(pattern, text) > MOST_STEPS:
+    if _max_steps(pattern, text) > MAX_STEPS:
         raise UsageError(
             f"{plain(text)} of {len(text):,} characters can match the pattern {plain(pattern)} in too many ways. Rename it, "
             f"or use fewer placeholders."
         )
-    found = compiled(pattern).fullmatch(text)
-    return None if found is None else found.groupdict()
+    matched = compile_pattern(pattern).fullmatch(text)
+    return None if matched is None else matched.groupdict()
 
 
-def _most_steps(pattern: str, text: str) -> int:
+def _max_steps(pattern: str, text: str) -> int:
     """Return how many ways there are, at most, to divide a text among the placeholders of a pattern."""
     parts = _PART.findall(pattern)
     wild = sum(not literal for *_, literal, _ in parts)
@@ -84,20 +84,20 @@ def placeholders(pattern: str) -> tuple[str, ...]:
     >>> placeholders("{trial}/skin_{hand}.csv")
     ('trial', 'hand')
     """
-    return tuple(compiled(pattern).groupindex)
+    return tuple(compile_pattern(pattern).groupindex)
 
 
-def filled(pattern: str, values: Mapping[str, str]) -> str:
+def fill_pattern(pattern: str, values: Mapping[str, str]) -> str:
     """Return a pattern with its placeholders replaced. Raises `UsageError` where one has no value.
 
-    >>> filled("{object}-{trial}", {"object": "cup", "trial": "3"})
+    >>> fill_pattern("{object}-{trial}", {"object": "cup", "trial": "3"})
     'cup-3'
     """
     missing = [name for name in placeholders(pattern) if name not in values]
     if missing:
-        known = ", ".join(values) or "none"
-        raise UsageError(f"{plain(pattern)} names {{{missing[0]}}}, which no file pattern has; there are {known}.")
-    return re.sub(r"\{(\w+)\}", lambda found: values[found[1]], pattern)
+        available = ", ".join(values) or "none"
+        raise UsageError(f"{plain(pattern)} names {{{missing[0]}}}, which no file pattern has; there are {available}.")
+    return re.sub(r"\{(\w+)\}", lambda placeholder: values[placeholder[1]], pattern)
 
 
 def generalize(paths: Sequence[PurePath]) -> str:
@@ -119,7 +119,7 @@ def generalize(paths: Sequence[PurePath]) -> str:
     names_in_use: dict[str, tuple[str, ...]] = {}
     level_patterns = []
     for level, names in enumerate(levels):
-        text = _level([_tokens(name) for name in names], level, names_in_use, is_last=level == last)
+        text = _level_pattern([_tokens(name) for name in names], level, names_in_use, is_last=level == last)
         level_patterns.append(f"{{{TRIAL}}}" if level == last and "{" not in text else text)
     return "/".join(level_patterns)
 
@@ -135,9 +135,11 @@ def _tokens(name: str) -> list[_Token]:
     return tokens + [(letter, letter) for letter in name[end:]]
 
 
-def _level(names: Sequence[list[_Token]], level: int, in_use: dict[str, tuple[str, ...]], *, is_last: bool) -> str:
+def _level_pattern(
+    names: Sequence[list[_Token]], level: int, in_use: dict[str, tuple[str, ...]], *, is_last: bool
+) -> str:
     """Return the pattern of one level of paths; ``in_use`` maps placeholders to their texts and grows by this level's."""
-    parts = _parts(names)
+    parts = _common_parts(names)
     differing = [index for index, (_, texts) in enumerate(parts) if len(set(texts)) > 1]
     pattern = ""
     for index, (kind, texts) in enumerate(parts):
@@ -169,14 +171,14 @@ def _level(names: Sequence[list[_Token]], level: int, in_use: dict[str, tuple[st
     return pattern
 
 
-def _parts(names: Sequence[list[_Token]]) -> list[tuple[str, tuple[str, ...]]]:
+def _common_parts(names: Sequence[list[_Token]]) -> list[tuple[str, tuple[str, ...]]]:
     """Return what names have in common, with the texts of each part: what is not in common is one part, ``text``."""
     kinds = [[kind for kind, _ in tokens] for tokens in names]
-    before = _common(kinds)
+    before = _count_common_start(kinds)
     after = 0
     if any(tokens != kinds[0] for tokens in kinds):
         before = _without_slots(kinds[0], before)
-        after = _without_slots(kinds[0][::-1], _common([tokens[before:][::-1] for tokens in kinds]))
+        after = _without_slots(kinds[0][::-1], _count_common_start([tokens[before:][::-1] for tokens in kinds]))
         while any(len(tokens) == before + after for tokens in kinds):  # a placeholder is at least one character
             if before:
                 before = _without_slots(kinds[0], before - 1)
@@ -190,7 +192,7 @@ def _parts(names: Sequence[list[_Token]]) -> list[tuple[str, tuple[str, ...]]]:
     return parts
 
 
-def _common(sequences: Sequence[Sequence[str]]) -> int:
+def _count_common_start(sequences: Sequence[Sequence[str]]) -> int:
     """Return how many of their first elements all sequences share."""
     return sum(1 for _ in itertools.takewhile(lambda elements: len(set(elements)) == 1, zip(*sequences, strict=False)))
 

@@ -1,4 +1,4 @@
-"""What a layout would read from a folder, described before anything is written: streams, rates, gaps, ranges, first rows."""
+"""Describe the streams that a layout would read from a folder: rates, gaps, ranges, first rows."""
 
 from __future__ import annotations
 
@@ -12,24 +12,82 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from tacpipe.arrays import Int64s
 from tacpipe.errors import TacpipeError, is_input_error
-from tacpipe.formats.table import labels, recorded
+from tacpipe.formats.table import labels, recordings
 from tacpipe.formats.table.columns import TIME, TYPES
 from tacpipe.formats.table.layout import Layout
 from tacpipe.formats.table.recordings import CONTAINER, Source
-from tacpipe.formats.table.steps import Steps
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import listed
 
+MAX_DIFFERENT = 1 << 18  # different steps that are counted each by itself
+
+
+class Steps:
+    """How often each step between stamps came; where more than `MOST` differ, neighbours are counted as one.
+
+    >>> steps = Steps()
+    >>> steps.add(np.array([10, 10, 11, 70]))
+    >>> steps.median_ns(), steps.longer(30.0), steps.longest_ns()
+    (10.5, 1, 70)
+    """
+
+    def __init__(self) -> None:
+        self._waiting: list[Int64s] = []
+        self._steps: Int64s = np.zeros(0, np.int64)  # (step,), rising
+        self._counts: Int64s = np.zeros(0, np.int64)  # (step,)
+        self._longest_ns = 0
+        self._coarse_bits = 0  # how many of the last bits of a step do not count
+
+    def add(self, steps_ns: Int64s) -> None:
+        """Count steps (time,)."""
+        self._longest_ns = max(self._longest_ns, int(steps_ns.max(initial=0)))
+        self._waiting.append(steps_ns)
+        if sum(map(len, self._waiting)) > MAX_DIFFERENT:
+            self._count()
+
+    def _count(self) -> None:
+        steps_ns = np.concatenate([self._steps, *self._waiting])
+        counts = np.concatenate([self._counts, *(np.ones(len(steps_ns), np.int64) for steps_ns in self._waiting)])
+        self._waiting = []
+        while True:
+            self._steps, at = np.unique(steps_ns >> self._coarse_bits << self._coarse_bits, return_inverse=True)
+            if len(self._steps) <= MAX_DIFFERENT:
+                break
+            self._coarse_bits += 1
+        self._counts = np.zeros(len(self._steps), np.int64)
+        np.add.at(self._counts, at, counts)
+
+    def median_ns(self) -> float:
+        """Return the median, 0 where there is no step."""
+        self._count()
+        total = int(self._counts.sum())
+        if not total:
+            return 0.0
+        ends = np.cumsum(self._counts)
+        low, high = np.searchsorted(ends, [(total - 1) // 2, total // 2], side="right")
+        return float(self._steps[low] + self._steps[high]) / 2
+
+    def longer(self, than_ns: float) -> int:
+        """Return how many steps are longer."""
+        self._count()
+        return int(self._counts[self._steps > than_ns].sum())
+
+    def longest_ns(self) -> int:
+        """Return the longest step."""
+        return self._longest_ns
+
+
 GAP = 3.0  # times the usual step
-ROWS = 3  # that are shown
-COLUMNS = 6  # that are shown
-_KINDS = {kind: name for name, kind in TYPES.items()}  # what a layout calls them
+SHOWN_ROWS = 3
+SHOWN_COLUMNS = 6
+_KINDS = {kind: name for name, kind in TYPES.items()}  # names of types in a layout
 
 
 @dataclass(frozen=True)
-class Read:
-    """What a stream of one recording holds."""
+class StreamSummary:
+    """Rows, rate, gaps, ranges and first rows of a stream of one recording."""
 
     rows: int
     first_ns: int
@@ -40,39 +98,42 @@ class Read:
     first: pa.Table  # the first rows
 
 
-def of(rows: pa.Table | pa.RecordBatchReader) -> Read:
-    """Return what a stream holds, of batches without holding them.
+def summarize_stream(rows: pa.Table | pa.RecordBatchReader) -> StreamSummary:
+    """Return a summary of a stream; batches are read one at a time.
 
-    >>> found = of(pa.table({"t_ns": [0, 10**7, 2 * 10**7, 9 * 10**7], "a": [1, 5, 2, 3]}))
+    >>> found = summarize_stream(pa.table({"t_ns": [0, 10**7, 2 * 10**7, 9 * 10**7], "a": [1, 5, 2, 3]}))
     >>> found.rows, found.rate_hz, found.gaps, found.columns["a"][3:]
     (4, 100.0, 1, (1, 5))
     """
     first: pa.Table = rows.schema.empty_table()
     ends: dict[str, list[Any]] = {}
-    stamps: list[int] = []  # of the first row, and of the last one so far
+    stamps: list[int] = []  # stamps of the first and the latest row
     count, steps = 0, Steps()
     for batch in rows.to_batches() if isinstance(rows, pa.Table) else rows:
         if not batch.num_rows:
             continue
         count += batch.num_rows
-        if first.num_rows < ROWS:
-            first = pa.concat_tables([first, pa.Table.from_batches([batch.slice(0, ROWS)])]).slice(0, ROWS)
+        if first.num_rows < SHOWN_ROWS:
+            first = pa.concat_tables([first, pa.Table.from_batches([batch.slice(0, SHOWN_ROWS)])]).slice(0, SHOWN_ROWS)
         t_ns = batch.column(TIME).to_numpy()
         steps.add(np.diff(t_ns, prepend=stamps[-1]) if stamps else np.diff(t_ns))
         stamps = [stamps[0] if stamps else int(t_ns[0]), int(t_ns[-1])]
-        for field in _measured(rows.schema):
+        for field in _measured_fields(rows.schema):
             column = batch.column(field.name)
-            found = pc.min_max(pc.binary_length(column) if pa.types.is_binary(field.type) else column).as_py()
-            both = [*ends.get(field.name, []), *(one for one in found.values() if one is not None and one == one)]
-            ends[field.name] = [min(both), max(both)] if both else []
+            limits = pc.min_max(pc.binary_length(column) if pa.types.is_binary(field.type) else column).as_py()
+            extremes = [
+                *ends.get(field.name, []),
+                *(value for value in limits.values() if value is not None and value == value),
+            ]
+            ends[field.name] = [min(extremes), max(extremes)] if extremes else []
     usual_ns = steps.median_ns()
     columns = {}
-    for field in _measured(rows.schema):
+    for field in _measured_fields(rows.schema):
         about = {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
         kind = _KINDS.get(field.type, str(field.type))
-        least, most = ends.get(field.name) or (math.nan, math.nan)
-        columns[field.name] = about.get("quantity", ""), about.get("unit", ""), kind, least, most
-    return Read(
+        lowest, highest = ends.get(field.name) or (math.nan, math.nan)
+        columns[field.name] = about.get("quantity", ""), about.get("unit", ""), kind, lowest, highest
+    return StreamSummary(
         count,
         stamps[0] if stamps else 0,
         1e9 / usual_ns if usual_ns else 0.0,
@@ -83,22 +144,22 @@ def of(rows: pa.Table | pa.RecordBatchReader) -> Read:
     )
 
 
-def _measured(schema: pa.Schema) -> list[pa.Field]:
+def _measured_fields(schema: pa.Schema) -> list[pa.Field]:
     return [field for field in schema if field.name != TIME and not pa.types.is_string(field.type)]
 
 
-def text(layout: Layout, folder: Path, sources: Sequence[Source], kind: str | None = None) -> str:
+def describe_sources(layout: Layout, folder: Path, sources: Sequence[Source], kind: str | None = None) -> str:
     """Return what would be read as lines: all recordings and labels, and the streams of the first that can be read.
 
     ``kind`` is the format of containers whose streams are read as they declare them where the layout has none.
     """
-    labelled = labels.found(layout, folder if folder.is_dir() else folder.parent, sources)
+    labelled = labels.find_labels(layout, folder if folder.is_dir() else folder.parent, sources)
     count = f"{len(sources)} recording{'s' * (len(sources) != 1)}"
-    lines = [f"{count}: {listed([one.name for one in sources], 6)}"]
-    lines += _labels(labelled)
+    lines = [f"{count}: {listed([source.name for source in sources], 6)}"]
+    lines += _describe_labels(labelled)
     for source in sources:
         try:
-            return "\n".join([*lines, *_first(layout, source, kind)])
+            return "\n".join([*lines, *_describe_recording(layout, source, kind)])
         except TacpipeError as error:
             if not is_input_error(error):
                 raise
@@ -106,54 +167,56 @@ def text(layout: Layout, folder: Path, sources: Sequence[Source], kind: str | No
     raise TacpipeError("\n".join([*lines, "\nNo recording can be read."]))
 
 
-def _first(layout: Layout, source: Source, kind: str | None) -> list[str]:
+def _describe_recording(layout: Layout, source: Source, kind: str | None) -> list[str]:
     """Return the streams, attributes and notes of a recording as lines."""
     lines = [f"\n{source.name}, the first:"]
     if layout.streams:
-        recording = recorded.of(layout.streams, source.files, source.within)
+        recording = recordings.read_streams(layout.streams, source.files, source.episode)
     else:
-        recording = recorded.all_of(str(kind), source.files[CONTAINER], source.within)
-    for name in [one.name for one in layout.streams] or recording.streams:
+        recording = recordings.read_container(str(kind), source.files[CONTAINER], source.episode)
+    for name in [stream.name for stream in layout.streams] or recording.streams:
         if name not in recording.streams:
             lines.append(f"  {name}: not there")
             continue
-        lines += _stream(name, recording.streams[name], source.files[name if layout.streams else CONTAINER])
+        lines += _describe_stream(name, recording.streams[name], source.files[name if layout.streams else CONTAINER])
     lines += [f"  attribute {name}: {value}" for name, value in recording.attributes.items()]
     return [*lines, *(f"  {note}" for note in recording.notes)]
 
 
-def _labels(labelled: Mapping[str, Mapping[str, Attribute]]) -> list[str]:
+def _describe_labels(labelled: Mapping[str, Mapping[str, Attribute]]) -> list[str]:
     names = sorted({name for values in labelled.values() for name in values})
     lines = []
     for name in names:
-        found: Sequence[object] = sorted({str(values[name]) for values in labelled.values() if name in values})
-        lines.append(f"  label {name}: {listed(found, 6)}")
+        values_of_label: Sequence[object] = sorted(
+            {str(values[name]) for values in labelled.values() if name in values}
+        )
+        lines.append(f"  label {name}: {listed(values_of_label, 6)}")
     return lines
 
 
-def _stream(name: str, rows: pa.Table | pa.RecordBatchReader, path: Path) -> list[str]:
-    found = of(rows)
-    start = np.datetime64(found.first_ns, "ns")
+def _describe_stream(name: str, rows: pa.Table | pa.RecordBatchReader, path: Path) -> list[str]:
+    summary = summarize_stream(rows)
+    start = np.datetime64(summary.first_ns, "ns")
     lines = [
-        f"  {name}: {found.rows} rows from {path}, {found.rate_hz:.6g} Hz, first stamp {start} UTC, {found.gaps} gaps, "
-        f"longest step {found.longest_s:.6g} s"
+        f"  {name}: {summary.rows} rows from {path}, {summary.rate_hz:.6g} Hz, first stamp {start} UTC, {summary.gaps} "
+        f"gaps, longest step {summary.longest_s:.6g} s"
     ]
     by_kind: dict[tuple[str, str, str], list[str]] = {}
-    for column, (quantity, unit, kind, _, _) in found.columns.items():
+    for column, (quantity, unit, kind, _, _) in summary.columns.items():
         by_kind.setdefault((quantity, unit, kind), []).append(column)
     for (quantity, unit, kind), columns in by_kind.items():
-        least = min(found.columns[column][3] for column in columns)
-        most = max(found.columns[column][4] for column in columns)
+        lowest = min(summary.columns[column][3] for column in columns)
+        highest = max(summary.columns[column][4] for column in columns)
         about = f"{quantity or 'no quantity'}, {unit or 'no unit'}, {kind}"
         measure = " bytes" if kind == "binary" else ""
         lines.append(
-            f"    {len(columns)} x {about}, from {least:.6g} to {most:.6g}{measure}: {listed(columns, COLUMNS)}"
+            f"    {len(columns)} x {about}, from {lowest:.6g} to {highest:.6g}{measure}: {listed(columns, SHOWN_COLUMNS)}"
         )
-    shown = found.first.select(found.first.column_names[: COLUMNS + 1]).to_pylist()
-    return lines + ["    " + "  ".join(map(_cell, row.values())) for row in shown]
+    first_rows = summary.first.select(summary.first.column_names[: SHOWN_COLUMNS + 1]).to_pylist()
+    return lines + ["    " + "  ".join(map(_cell_text, row.values())) for row in first_rows]
 
 
-def _cell(value: object) -> str:
+def _cell_text(value: object) -> str:
     if isinstance(value, bytes):
         return f"{len(value)} bytes"
     return f"{value:.7g}" if isinstance(value, float) else str(value)

@@ -1,33 +1,142 @@
-"""One stream of one recording, read from its file: stamps, declared types and units, wide or long form."""
+"""Read one stream of a recording from its file: stamps, declared types and units, wide or long form.
+
+A table in long form has one row per channel and moment. Rows of a moment may be anywhere in the file, as where one channel
+follows another. So runs of rows are sorted, put in a spill file and merged, in bounded memory.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 
-from tacpipe.arrays import Times
+from tacpipe.arrays import AnyArray, Floats, Times
 from tacpipe.channels import schema
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.formats.containers.container import SourceStream
-from tacpipe.formats.table import columns, long_form, rows, stamp_formats
-from tacpipe.formats.table.columns import CellError, Chosen, Declared
-from tacpipe.formats.table.layout import Stream
-from tacpipe.formats.table.rows import ContainedRows, Place, Rows
+from tacpipe.formats.table import columns, rows, stamp_formats
+from tacpipe.formats.table.columns import CellError, ChosenColumn, Declared
+from tacpipe.formats.table.layout import StreamLayout
+from tacpipe.formats.table.rows import ContainedRows, Place, RowFile
+from tacpipe.io.spill import Piece, Spill, in_order
 from tacpipe.plugins.stage import Shared
 from tacpipe.printable import excerpt, listed, plain
 from tacpipe.signals import resampling
 
+RUN_ROWS = 1 << 21  # rows sorted at once
+MAX_CHANNELS = 1 << 14  # a column with more names does not hold channels
+GRID_VALUES = 1 << 22  # values in memory at once, moments times channels
+MOMENT, CHANNEL, VALUE, ROW_INDEX = "t_ns", "channel", "value", "row"
+
+
+@dataclass(frozen=True)
+class LongTable:
+    """The sorted rows of a file in long form, in a spill file, and its channels in the order of their first rows."""
+
+    file: RowFile
+    channels: Sequence[str]
+    pieces: Sequence[Piece]
+    spill: Spill
+
+    def blocks(self, channels: Sequence[ChosenColumn]) -> Iterator[tuple[Times, list[pa.Array]]]:
+        """Yield stamps in ns and one column per chosen channel, NaN where there is no value, moment by moment.
+
+        Raises `TacpipeError` for two values of a channel at one moment, and as `columns.converted` does.
+        """
+        moments = 0
+        for table in in_order(self.pieces, self.spill.read, MOMENT):
+            t_ns, at = np.unique(table.column(MOMENT).to_numpy(), return_inverse=True)
+            codes, values = table.column(CHANNEL).to_numpy(), table.column(VALUE).to_numpy()
+            self._expect_single(at * len(self.channels) + codes, codes, table)
+            step = max(1, GRID_VALUES // len(self.channels))
+            for start in range(0, len(t_ns), step):
+                first, last = np.searchsorted(at, [start, start + step])
+                grid = np.full((len(self.channels), len(t_ns[start : start + step])), np.nan)  # (channel, time)
+                grid[codes[first:last], at[first:last] - start] = values[first:last]
+                yield t_ns[start : start + step], [self._column(grid, channel, moments + start) for channel in channels]
+            moments += len(t_ns)
+
+    def _column(self, grid: Floats, channel: ChosenColumn, before: int) -> pa.Array:
+        values = pa.chunked_array([pa.array(grid[self.channels.index(channel.name)])])
+        try:
+            return columns.convert_column(values, channel, nan_allowed=True)
+        except CellError as error:
+            place = f"{self.file.path}, channel {plain(channel.name)}, moment {before + error.row + 1}"
+            raise TacpipeError(f"{place} {error}.") from error
+
+    def _expect_single(self, cells: AnyArray, codes: AnyArray, table: pa.Table) -> None:
+        """Raise `TacpipeError` where two rows have the same moment and channel, ``cells``."""
+        order = np.argsort(cells, kind="stable")
+        doubled = np.flatnonzero(np.diff(cells[order]) == 0)
+        if not len(doubled):
+            return
+        row_of = table.column(ROW_INDEX).to_numpy()
+        second = order[doubled + 1]
+        row = int(second[row_of[second].argmin()])
+        raise TacpipeError(
+            f"{self.file.path} has two values of {plain(self.channels[codes[row]])} at one moment, the second in "
+            f"{self.file.place(int(row_of[row]))}. Name the column that distinguishes them, or remove one."
+        )
+
+
+def read_long_table(file: RowFile, stream: StreamLayout, recording: str | None, shared: Shared | None) -> LongTable:
+    """Return the rows of a table in long form. Raises as `rows.blocks` does, and for too many channels."""
+    assert stream.long is not None
+    if not stream.time.column:
+        raise UsageError(
+            f"[streams.{stream.name}] is in long form, so rows share moments: give the column of their stamps."
+        )
+    types = {**rows.reserved_types(file, stream), stream.long.channel: pa.string(), stream.long.value: pa.float64()}
+    spill = Spill()
+    codes: dict[str, int] = {}
+    pieces: list[Piece] = []
+    waiting: list[pa.Table] = []
+    for block, in_file, place in rows.row_blocks(file, stream, types, recording, shared):
+        columns = {
+            MOMENT: rows.stamps_of_column(block.column(stream.time.column), stream, place),
+            CHANNEL: _channel_codes(block.column(stream.long.channel), codes, stream, place),
+            VALUE: block.column(stream.long.value).cast(pa.float64()).to_numpy(),
+            ROW_INDEX: np.ascontiguousarray(in_file),
+        }
+        if len(codes) > MAX_CHANNELS:
+            raise TacpipeError(
+                f"{file.path}, column {plain(stream.long.channel)} names more than {MAX_CHANNELS} channels. Correct "
+                f"channel in [streams.{stream.name}] long."
+            )
+        waiting.append(pa.table(columns))
+        if sum(table.num_rows for table in waiting) >= RUN_ROWS:
+            pieces += spill.add_run(pa.concat_tables(waiting), MOMENT)
+            waiting = []
+    pieces += spill.add_run(pa.concat_tables(waiting), MOMENT) if waiting else []
+    return LongTable(file, list(codes), pieces, spill)
+
+
+def _channel_codes(column: pa.ChunkedArray, codes: dict[str, int], stream: StreamLayout, place: Place) -> AnyArray:
+    """Return the number of each row's channel (row,); new ones are added to ``codes``."""
+    encoded = column.cast(pa.string()).fill_null("").combine_chunks().dictionary_encode()
+    names = encoded.dictionary.to_pylist()
+    if "" in names:
+        row = int((encoded.indices.to_numpy() == names.index("")).argmax())
+        assert stream.long is not None
+        raise TacpipeError(
+            f"{place(row)}, column {plain(stream.long.channel)}: the row names no channel. Fill the cell, or take the row "
+            f"away."
+        )
+    channel_codes = [codes.setdefault(name, len(codes)) for name in names]
+    numbers: AnyArray = np.array(channel_codes, np.int32)[encoded.indices.to_numpy()]
+    return numbers
+
+
 Block = tuple[Times | None, list[pa.Array]]  # stamps, if rows have some, and columns
 
 
-def batches(
-    file: Rows,
-    stream: Stream,
+def stream_batches(
+    file: RowFile,
+    stream: StreamLayout,
     recording: str | None = None,
     shared: Shared | None = None,
     stamps_path: Path | None = None,
@@ -41,43 +150,43 @@ def batches(
     and for a file without rows; also as batches are taken. One block is in memory; of a table in long form one run.
     """
     stamps_ns = None if stamps_path is None else rows.stamps_of_file(stamps_path, stream)
-    return _batches(file, stream, recording, columns.NOTHING, {}, shared, stamps_ns)
+    return _batches(file, stream, recording, columns.NO_DECLARATION, {}, shared, stamps_ns)
 
 
-def table(path: Path, stream: Stream, recording: str | None = None) -> pa.Table:
+def read_stream_table(path: Path, stream: StreamLayout, recording: str | None = None) -> pa.Table:
     """Return `batches` of a file as one table."""
-    return batches(rows.opened(path, stream), stream, recording).read_all()
+    return stream_batches(rows.open_rows(path, stream), stream, recording).read_all()
 
 
-def contained(path: Path, found: SourceStream, stream: Stream) -> pa.Table | pa.RecordBatchReader:
+def read_contained_stream(path: Path, source: SourceStream, stream: StreamLayout) -> pa.Table | pa.RecordBatchReader:
     """Return the rows of a stream of the container at ``path`` with ``t_ns``: a table of one that is in memory already.
 
     Raises as `batches` does. Where the layout's ``stream`` states neither time nor columns, they are as the container
     declares them. What the container states of the column with the stamps is stated of ``t_ns``.
     """
-    stream = stream if stream.time.given else replace(stream, time=found.time)
-    if not stream.time.given:
+    stream = stream if stream.time.is_declared else replace(stream, time=source.time)
+    if not stream.time.is_declared:
         raise TacpipeError(
-            f"{path} does not state when the rows of {plain(found.source)} were measured. Give time in "
+            f"{path} does not state when the rows of {plain(source.source)} were measured. Give time in "
             f"[streams.{stream.name}]: a column, or rate_hz."
         )
-    declared = {one.name: one for one in found.schema}
-    for one in found.schema:
-        if one.type not in columns.TYPES.values():
-            raise TacpipeError(f"{path}: column {plain(one.name)} of {plain(found.source)} holds {one.type}.")
+    declared = {field.name: field for field in source.schema}
+    for field in source.schema:
+        if field.type not in columns.TYPES.values():
+            raise TacpipeError(f"{path}: column {plain(field.name)} of {plain(source.source)} holds {field.type}.")
     stamped = declared.get(stream.time.column)
-    other = stamped is not None and stream.time.column != found.time.column
+    is_other_clock = stamped is not None and stream.time.column != source.time.column
     is_number = stamped is not None and (pa.types.is_integer(stamped.type) or pa.types.is_floating(stamped.type))
-    file = ContainedRows(path, found, stream.time.column if other and is_number else "")
+    file = ContainedRows(path, source, stream.time.column if is_other_clock and is_number else "")
     about = {key.decode(): value.decode() for key, value in (stamped.metadata or {}).items()} if stamped else {}
-    stated = {key: value for key, value in about.items() if key not in ("unit", "quantity")}
-    made = _batches(file, stream, None, declared, stated)
-    return made.read_all() if isinstance(found.content, pa.Table) else made
+    time_metadata = {key: value for key, value in about.items() if key not in ("unit", "quantity")}
+    reader = _batches(file, stream, None, declared, time_metadata)
+    return reader.read_all() if isinstance(source.content, pa.Table) else reader
 
 
 def _batches(
-    file: Rows,
-    stream: Stream,
+    file: RowFile,
+    stream: StreamLayout,
     recording: str | None,
     declared: Declared,
     about_time: Mapping[str, str],
@@ -98,27 +207,29 @@ def _batches(
     from_start = stream.time.origin == "start" or stream.time.rate_hz is not None
     start_ns = _start_ns(stream) if from_start and not stream.time.format else 0
     if stream.long is not None:
-        long = long_form.read(file, stream, recording, shared)
-        wanted = columns.chosen(stream, long.channels, path) if long.channels else []
-        blocks = long.blocks(wanted)
+        long = read_long_table(file, stream, recording, shared)
+        chosen_columns = columns.choose_columns(stream, long.channels, path) if long.channels else []
+        blocks = long.blocks(chosen_columns)
     else:
-        wanted = columns.chosen(stream, [name for name in names if name not in reserved], path, declared)
-        types = {**rows.types(file, stream), **{one.name: one.read_as for one in wanted}}
+        chosen_columns = columns.choose_columns(
+            stream, [name for name in names if name not in reserved], path, declared
+        )
+        types = {**rows.reserved_types(file, stream), **{column.name: column.read_as for column in chosen_columns}}
         as_is = bool(declared)  # a container's own NaN and infinity are values
         blocks = (
-            _converted(stream, block, wanted, place, as_is)
-            for block, _, place in rows.blocks(file, stream, types, recording, shared)
+            _convert_block(stream, block, chosen_columns, place, as_is)
+            for block, _, place in rows.row_blocks(file, stream, types, recording, shared)
         )
     if stamps_ns is not None:
-        blocks = _stamped_apart(blocks, stamps_ns, file, stream)
-    made = pa.schema([_time_field(stream, about_time), *(one.field for one in wanted)])
-    stamped = _stamps_checked(blocks, file, stream, recording, start_ns)
+        blocks = _add_stamps_of_file(blocks, stamps_ns, file, stream)
+    output_schema = pa.schema([_time_field(stream, about_time), *(column.field for column in chosen_columns)])
+    stamped = _check_stamps(blocks, file, stream, recording, start_ns)
     return pa.RecordBatchReader.from_batches(
-        made, (batch for columns_of in stamped for batch in pa.table(columns_of, made).to_batches())
+        output_schema, (batch for columns_of in stamped for batch in pa.table(columns_of, output_schema).to_batches())
     )
 
 
-def _time_field(stream: Stream, about: Mapping[str, str]) -> pa.Field:
+def _time_field(stream: StreamLayout, about: Mapping[str, str]) -> pa.Field:
     """Return the field of ``t_ns``, with what else is stated of it."""
     if stream.time.rate_hz is not None:
         field = schema.time_field("from rate")
@@ -129,35 +240,35 @@ def _time_field(stream: Stream, about: Mapping[str, str]) -> pa.Field:
     return field.with_metadata({**{key.decode(): value.decode() for key, value in field.metadata.items()}, **about})
 
 
-def _stamps_checked(
-    blocks: Iterable[Block], file: Rows, stream: Stream, recording: str | None, start_ns: int
+def _check_stamps(
+    blocks: Iterable[Block], file: RowFile, stream: StreamLayout, recording: str | None, start_ns: int
 ) -> Iterator[list[pa.Array]]:
-    """Yield the columns of blocks behind their stamps, which must not run backwards, and must be there."""
-    done, last_ns = 0, None
+    """Yield stamps and columns of blocks. Raises `TacpipeError` for stamps that run backwards and for no rows."""
+    row_count, last_ns = 0, None
     of_day = bool(stream.time.format) and not stamp_formats.has_date(stream.time.format)
     for t_ns, arrays in blocks:
         count = len(arrays[0])
         if not count:
             continue
         if t_ns is not None and of_day:
-            t_ns = _past_midnight(t_ns, last_ns)
+            t_ns = _add_days_past_midnight(t_ns, last_ns)
         if t_ns is None:
             assert stream.time.rate_hz is not None
-            t_ns = resampling.uniform_offsets(done, count, stream.time.rate_hz)
+            t_ns = resampling.uniform_offsets(row_count, count, stream.time.rate_hz)
         else:
-            _expect_rising(t_ns, last_ns, done, file, recording)
+            _expect_rising(t_ns, last_ns, row_count, file, recording)
             last_ns = int(t_ns[-1])
-        done += count
+        row_count += count
         yield [pa.array(t_ns + start_ns if start_ns else t_ns), *arrays]
-    if not done:
-        of = f" of recording {plain(recording)}" if recording else ""
-        raise TacpipeError(f"{file.path} holds no row{of}. Take it away, or record it again.")
+    if not row_count:
+        place = f" of recording {plain(recording)}" if recording else ""
+        raise TacpipeError(f"{file.path} holds no row{place}. Take it away, or record it again.")
 
 
-def _past_midnight(t_ns: Times, last_ns: int | None) -> Times:
+def _add_days_past_midnight(t_ns: Times, last_ns: int | None) -> Times:
     """Return times of day with a day added where they begin again; ``last_ns`` is the one above them.
 
-    >>> _past_midnight(np.array([86_399, 1]) * 10**9, None)
+    >>> _add_days_past_midnight(np.array([86_399, 1]) * 10**9, None)
     array([86399000000000, 86401000000000])
     """
     day_ns = stamp_formats.DAY_NS
@@ -167,55 +278,61 @@ def _past_midnight(t_ns: Times, last_ns: int | None) -> Times:
     return t_ns + np.cumsum(np.diff(t_ns, prepend=t_ns[0]) < -day_ns // 2) * day_ns
 
 
-def _stamped_apart(blocks: Iterable[Block], stamps_ns: Times, file: Rows, stream: Stream) -> Iterator[Block]:
-    """Yield blocks with the stamps of a file of their own. Raises `TacpipeError` where there are more or fewer than rows."""
+def _add_stamps_of_file(
+    blocks: Iterable[Block], stamps_ns: Times, file: RowFile, stream: StreamLayout
+) -> Iterator[Block]:
+    """Yield blocks with stamps of another file. Raises `TacpipeError` where their number is not that of the rows."""
     row_count = 0
     for _, arrays in blocks:
         count = len(arrays[0])
         if row_count + count > len(stamps_ns):
-            raise TacpipeError(_unequal(file, stream, "more rows", stamps_ns))
+            raise TacpipeError(_unequal_lengths(file, stream, "more rows", stamps_ns))
         yield stamps_ns[row_count : row_count + count], arrays
         row_count += count
     if row_count < len(stamps_ns):
-        raise TacpipeError(_unequal(file, stream, f"{row_count} rows", stamps_ns))
+        raise TacpipeError(_unequal_lengths(file, stream, f"{row_count} rows", stamps_ns))
 
 
-def _unequal(file: Rows, stream: Stream, rows_there: str, stamps_ns: Times) -> str:
+def _unequal_lengths(file: RowFile, stream: StreamLayout, rows_there: str, stamps_ns: Times) -> str:
     return f"{file.path} has {rows_there}, and {plain(stream.time.file)} has {len(stamps_ns)} stamps. Copy both again."
 
 
-def _expect_rising(t_ns: Times, last_ns: int | None, before: int, file: Rows, recording: str | None) -> None:
+def _expect_rising(t_ns: Times, last_ns: int | None, before: int, file: RowFile, recording: str | None) -> None:
     """Raise `TacpipeError` where stamps run backwards; ``last_ns`` is that above them, after ``before`` rows."""
     steps_ns = np.diff(t_ns, prepend=t_ns[0] if last_ns is None else last_ns)
     backwards = np.flatnonzero(steps_ns < 0)
     if not len(backwards):
         return
     row = before + int(backwards[0])
-    where = (
+    place = (
         f"{file.path}, {file.place(row)}" if recording is None else f"{file.path}, row {row + 1} of {plain(recording)}"
     )
     raise TacpipeError(
-        f"{where}: the stamp is {-steps_ns[backwards[0]] / 1e9:g} s before that of the row above. Sort the rows, or "
+        f"{place}: the stamp is {-steps_ns[backwards[0]] / 1e9:g} s before that of the row above. Sort the rows, or "
         f"cut the file where its clock was set."
     )
 
 
-def _converted(stream: Stream, block: pa.Table, wanted: list[Chosen], place: Place, as_is: bool) -> Block:
+def _convert_block(
+    stream: StreamLayout, block: pa.Table, chosen_columns: list[ChosenColumn], place: Place, as_is: bool
+) -> Block:
     """Return the stamps of a block, where it has some, and its columns as their declared types."""
     clock = "" if stream.time.file else stream.time.column
-    t_ns = rows.stamped(block.column(clock), stream, place) if clock else None
-    made = []
-    for one in wanted:
+    t_ns = rows.stamps_of_column(block.column(clock), stream, place) if clock else None
+    arrays = []
+    for column in chosen_columns:
         try:
-            made.append(
-                columns.converted(block.column(one.name), one, as_is or "nan" in map(str.lower, stream.missing), as_is)
+            arrays.append(
+                columns.convert_column(
+                    block.column(column.name), column, as_is or "nan" in map(str.lower, stream.missing), as_is
+                )
             )
         except CellError as error:
-            raise TacpipeError(f"{place(error.row)}, column {plain(one.name)} {error}.") from error
-    return t_ns, made
+            raise TacpipeError(f"{place(error.row)}, column {plain(column.name)} {error}.") from error
+    return t_ns, arrays
 
 
-def _start_ns(stream: Stream) -> int:
+def _start_ns(stream: StreamLayout) -> int:
     if not stream.time.start:
         return 0
     try:

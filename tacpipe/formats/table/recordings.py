@@ -1,22 +1,29 @@
-"""Which files below a folder make which recording, by the patterns of a layout."""
+"""Find the recordings below a folder by the patterns of a layout, and read their streams and attributes."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
 
 from tacpipe.datasets import recording_names
 from tacpipe.errors import TacpipeError, UsageError, is_input_error
+from tacpipe.formats import unique_names
 from tacpipe.formats.containers import kinds
-from tacpipe.formats.containers.container import Naming
+from tacpipe.formats.containers.container import Contents, Naming
 from tacpipe.formats.table import pattern, rows
-from tacpipe.formats.table.layout import FILE, STAMPS, Format, Layout, Stream
+from tacpipe.formats.table.columns import TIME
+from tacpipe.formats.table.layout import FILE, STAMPS, Format, Layout, StreamLayout
+from tacpipe.formats.table.reading import read_contained_stream, stream_batches
 from tacpipe.io import files as file_system
+from tacpipe.plugins.stage import Attribute, Shared
 from tacpipe.printable import listed, plain
 
-CONTAINER = "container"  # among a source's files: the one that holds all streams
+CONTAINER = "container"  # key of the file that holds all streams of a source
 
 
 @dataclass(frozen=True)
@@ -26,10 +33,10 @@ class Source:
     name: str
     files: Mapping[str, Path]
     values: Mapping[str, str]
-    within: str | None = None  # what its rows hold in the column ``recording``
+    episode: str | None = None  # value of the column ``recording``, or episode of a container
 
 
-def found(layout: Layout, folder: Path) -> list[Source]:
+def find_recordings(layout: Layout, folder: Path) -> list[Source]:
     """Return the recordings below ``folder``, sorted by name.
 
     Raises `UsageError` where none is found, where one lacks a stream that is not optional, where two files of one stream
@@ -39,9 +46,9 @@ def found(layout: Layout, folder: Path) -> list[Source]:
         raise UsageError("The layout has no stream with files.")
     if not folder.is_dir():
         raise UsageError(f"{folder} is not a folder. Give the folder that the patterns of the layout start from.")
-    every = _every(layout, folder)
-    matched = {stream.name: _matched(stream, every) for stream in layout.streams}
-    _refuse_idle(layout, matched, every, folder)
+    candidates = _candidate_paths(layout, folder)
+    matched = {stream.name: _matching_paths(stream, candidates) for stream in layout.streams}
+    _refuse_idle(layout, matched, candidates, folder)
     shared = layout.placeholders
     groups: dict[tuple[str, ...], dict[str, list[Path]]] = {}
     stamps: dict[Path, Path] = {}  # the file of the rows to the file of their stamps
@@ -52,22 +59,24 @@ def found(layout: Layout, folder: Path) -> list[Source]:
                     f"[streams.{stream.name}] files has no {{{shared[0]}}}, by which files belong to a recording. Add it."
                 )
             if stream.time.file:
-                stamps[path] = Path(pattern.filled(stream.time.file, values))
-            groups.setdefault(tuple(values[one] for one in shared), {}).setdefault(stream.name, []).append(path)
+                stamps[path] = Path(pattern.fill_pattern(stream.time.file, values))
+            groups.setdefault(tuple(values[placeholder] for placeholder in shared), {}).setdefault(
+                stream.name, []
+            ).append(path)
     sources = []
     for key, by_stream in sorted(groups.items()):
         for name, paths in by_stream.items():
             if len(paths) > 1:
                 raise UsageError(
-                    f"{listed(paths, 3)} are all the stream {name} of one recording ({_described(shared, key)}). Add a "
-                    f"placeholder to every files pattern that distinguishes them."
+                    f"{listed(paths, 3)} are all the stream {name} of one recording ({_describe_values(shared, key)}). Add "
+                    f"a placeholder to every files pattern that distinguishes them."
                 )
-        lacking = [one.name for one in layout.streams if not one.optional and one.name not in by_stream]
+        lacking = [stream.name for stream in layout.streams if not stream.optional and stream.name not in by_stream]
         if lacking:
-            there = next(iter(by_stream.values()))[0]
+            present_path = next(iter(by_stream.values()))[0]
             raise UsageError(
-                f"The recording of {there} ({_described(shared, key)}) has no file of the stream {listed(lacking, 3)}. Add "
-                f"it, or set optional = true in [streams.{lacking[0]}]."
+                f"The recording of {present_path} ({_describe_values(shared, key)}) has no file of the stream "
+                f"{listed(lacking, 3)}. Add it, or set optional = true in [streams.{lacking[0]}]."
             )
         files = {name: folder / paths[0] for name, paths in by_stream.items()}
         files |= {
@@ -75,34 +84,34 @@ def found(layout: Layout, folder: Path) -> list[Source]:
             for name, (rows_path,) in by_stream.items()
             if rows_path in stamps
         }
-        sources += _named(layout, files, dict(zip(shared, key, strict=True)))
-    recording_names.refuse_shared((one.name, next(iter(one.files.values()))) for one in sources)
-    return sorted(sources, key=lambda one: one.name)
+        sources += _recordings_in_files(layout, files, dict(zip(shared, key, strict=True)))
+    recording_names.refuse_shared((placeholder.name, next(iter(placeholder.files.values()))) for placeholder in sources)
+    return sorted(sources, key=lambda placeholder: placeholder.name)
 
 
-def contained(layout: Layout, kind: Format, source: Path) -> list[Source]:
+def find_contained(layout: Layout, kind: Format, source: Path) -> list[Source]:
     """Return the recordings in the containers of a format at or below ``source``, sorted by name.
 
     They are named after their file, and after the episode where it holds several. Raises `UsageError` where there is no
     container, and where two recordings get one name.
     """
-    paths = kinds.found(kind, source)
+    paths = kinds.find_containers(kind, source)
     if not paths:
-        raise kinds.none(kind, source)
+        raise kinds.no_container_error(kind, source)
     sources = []
-    for path, stem in kinds.names(paths, source).items():
+    for path, stem in kinds.container_names(paths, source).items():
         stem = os.fsencode(stem).decode(errors="replace")
-        files = {one.name: path for one in layout.streams} or {CONTAINER: path}
-        episodes, whole = _episodes(kind, path)
+        files = {stream.name: path for stream in layout.streams} or {CONTAINER: path}
+        episodes, names_are_complete = _episodes(kind, path)
         for episode in episodes:
             values = {FILE: stem, **({} if episode is None else {"recording": episode})}
-            plain_name = stem if episode is None else episode if whole else f"{stem}-{episode}"
-            name = recording_names.valid(pattern.filled(layout.name, values) if layout.name else plain_name)
+            plain_name = stem if episode is None else episode if names_are_complete else f"{stem}-{episode}"
+            name = recording_names.valid(pattern.fill_pattern(layout.name, values) if layout.name else plain_name)
             if not name:
                 raise UsageError(f"{path} gives no name for a recording. Set name in [recordings], or rename the file.")
             sources.append(Source(name, files, {}, episode))
-    recording_names.refuse_shared((one.name, next(iter(one.files.values()))) for one in sources)
-    return sorted(sources, key=lambda one: one.name)
+    recording_names.refuse_shared((stream.name, next(iter(stream.files.values()))) for stream in sources)
+    return sorted(sources, key=lambda stream: stream.name)
 
 
 def _episodes(kind: str, path: Path) -> tuple[Sequence[str | None], bool]:
@@ -111,7 +120,7 @@ def _episodes(kind: str, path: Path) -> tuple[Sequence[str | None], bool]:
     A container that cannot be read is one: reading it shows what is wrong, and others are not kept from being read.
     """
     try:
-        container = kinds.opened(kind, path)
+        container = kinds.open_container(kind, path)
         return container.episodes() or [None], isinstance(container, Naming) and container.names_itself
     except TacpipeError as error:
         if not is_input_error(error):
@@ -119,55 +128,66 @@ def _episodes(kind: str, path: Path) -> tuple[Sequence[str | None], bool]:
         return [None], False
 
 
-def _every(layout: Layout, folder: Path) -> list[Path]:
+def _candidate_paths(layout: Layout, folder: Path) -> list[Path]:
     """Return what patterns are matched with: all files below a folder, and folders that are containers of the layout."""
-    containers = {str(one.format) for one in layout.streams if one.contained}
-    found: list[Path] = []
+    containers = {str(stream.format) for stream in layout.streams if stream.contained}
+    paths: list[Path] = []
     for place, folders, names in file_system.walk(folder):
-        if any(kinds.is_one(kind, Path(place)) for kind in containers):
-            found.append(Path(place))
+        if any(kinds.is_container(kind, Path(place)) for kind in containers):
+            paths.append(Path(place))
             folders.clear()
             continue
-        found += [Path(place, name) for name in names]
-    return [path.relative_to(folder) for path in found]
+        paths += [Path(place, name) for name in names]
+    return [path.relative_to(folder) for path in paths]
 
 
-def _matched(stream: Stream, every: list[Path]) -> list[tuple[Path, Mapping[str, str]]]:
-    found: list[tuple[Path, Mapping[str, str]]] = []
-    for path in every:
+def _matching_paths(stream: StreamLayout, candidates: list[Path]) -> list[tuple[Path, Mapping[str, str]]]:
+    matches: list[tuple[Path, Mapping[str, str]]] = []
+    for path in candidates:
         values = pattern.match(stream.files, path.as_posix())
         if values is not None:
-            found.append((path, {name: os.fsencode(value).decode(errors="replace") for name, value in values.items()}))
-    return found
+            matches.append(
+                (path, {name: os.fsencode(value).decode(errors="replace") for name, value in values.items()})
+            )
+    return matches
 
 
-def _refuse_idle(layout: Layout, matched: Mapping[str, object], every: list[Path], folder: Path) -> None:
+def _refuse_idle(layout: Layout, matched: Mapping[str, object], candidates: list[Path], folder: Path) -> None:
     for stream in layout.streams:
         if not matched[stream.name] and not stream.optional:
             raise UsageError(
                 f"No file below {folder} matches {plain(stream.files, 120)} of [streams.{stream.name}]. There are "
-                f"{len(every)} files, as {listed(every, 3)}; patterns start from {folder}."
+                f"{len(candidates)} files, as {listed(candidates, 3)}; patterns start from {folder}."
             )
 
 
-def _named(layout: Layout, files: Mapping[str, Path], values: Mapping[str, str]) -> list[Source]:
+def _recordings_in_files(layout: Layout, files: Mapping[str, Path], values: Mapping[str, str]) -> list[Source]:
     """Return the recording of these files, or those that they hold."""
-    several = [one for one in layout.streams if (one.recording or one.contained) and one.name in files]
-    within = {one.name: found for one in several if (found := _within(files[one.name], one)) is not None}
-    if not within:
-        return [Source(_name(layout, values, files), files, values)]
-    first = next(iter(within.values()))
-    for stream, names in within.items():
+    shared_streams = [
+        stream for stream in layout.streams if (stream.recording or stream.contained) and stream.name in files
+    ]
+    names_by_stream = {
+        stream.name: names_in_file
+        for stream in shared_streams
+        if (names_in_file := _names_in_file(files[stream.name], stream)) is not None
+    }
+    if not names_by_stream:
+        return [Source(_recording_name(layout, values, files), files, values)]
+    first = next(iter(names_by_stream.values()))
+    for stream, names in names_by_stream.items():
         if names != first:
             odd = sorted(names ^ first)
             raise UsageError(
-                f"{files[stream]} and {files[next(iter(within))]} hold different recordings: {listed(odd, 3)} is in one "
-                f"of them alone."
+                f"{files[stream]} and {files[next(iter(names_by_stream))]} hold different recordings: {listed(odd, 3)} is "
+                f"in one of them alone."
             )
-    return [Source(_name(layout, {**values, "recording": one}, files), files, values, one) for one in sorted(first)]
+    return [
+        Source(_recording_name(layout, {**values, "recording": name}, files), files, values, name)
+        for name in sorted(first)
+    ]
 
 
-def _within(path: Path, stream: Stream) -> set[str] | None:
+def _names_in_file(path: Path, stream: StreamLayout) -> set[str] | None:
     """Return the recordings that a file holds: what is in its column ``recording``, or a container's episodes.
 
     None of a container that is one recording.
@@ -176,26 +196,26 @@ def _within(path: Path, stream: Stream) -> set[str] | None:
     import pyarrow.compute as pc
 
     if stream.contained:
-        return {one for one in _episodes(str(stream.format), path)[0] if one is not None} or None
-    file = rows.opened(path, stream)
+        return {name for name in _episodes(str(stream.format), path)[0] if name is not None} or None
+    file = rows.open_rows(path, stream)
     if stream.recording not in file.names():
         raise TacpipeError(
             f"{path} has no column {plain(stream.recording)}, which [streams.{stream.name}] recording names."
         )
-    found: set[str] = set()
+    names_in_file: set[str] = set()
     for block in file.batches({stream.recording: pa.string()}):
         names = pc.unique(block.column(stream.recording).cast(pa.string())).to_pylist()
         if None in names or "" in names:
             raise TacpipeError(
                 f"{path}, column {plain(stream.recording)}: a row names no recording. Fill the cell, or take the row away."
             )
-        found |= set(names)
-    return found
+        names_in_file |= set(names)
+    return names_in_file
 
 
-def _name(layout: Layout, values: Mapping[str, str], files: Mapping[str, Path]) -> str:
+def _recording_name(layout: Layout, values: Mapping[str, str], files: Mapping[str, Path]) -> str:
     if layout.name:
-        text = pattern.filled(layout.name, values)
+        text = pattern.fill_pattern(layout.name, values)
     elif values:
         text = "-".join(f"{name}-{value}" if value.isdigit() else value for name, value in values.items())
     else:
@@ -206,5 +226,126 @@ def _name(layout: Layout, values: Mapping[str, str], files: Mapping[str, Path]) 
     return name
 
 
-def _described(names: tuple[str, ...], values: tuple[str, ...]) -> str:
+def _describe_values(names: tuple[str, ...], values: tuple[str, ...]) -> str:
     return ", ".join(f"{name} {plain(value)}" for name, value in zip(names, values, strict=True)) or "no placeholder"
+
+
+LOWEST_HZ, HIGHEST_HZ = 0.2, 20_000.0  # rates beyond these are probably stamps in another unit
+FEWEST_ROWS = 10  # rows needed to estimate a rate
+SKIPPED = "skipped"  # the attribute of a recording that names what could not be read
+
+
+@dataclass(frozen=True)
+class RecordedStreams:
+    """The streams, attributes and notes of one recording."""
+
+    streams: Mapping[str, pa.Table | pa.RecordBatchReader]
+    attributes: Mapping[str, Attribute] = field(default_factory=dict)  # attributes that containers state
+    notes: Sequence[str] = ()  # omissions and missing parts; notes on rates are added as streams are read
+
+
+def read_streams(
+    streams: Sequence[StreamLayout], paths: Mapping[str, Path], episode: str | None, shared: Shared | None = None
+) -> RecordedStreams:
+    """Return the recording whose files are ``paths`` by stream; ``episode`` is its name where a file holds many.
+
+    Streams of one container are read in one pass. Raises as `table` does, and for a stream that its container lacks,
+    unless it is optional.
+    """
+    tables: dict[str, pa.Table | pa.RecordBatchReader] = {}
+    attributes: dict[str, Attribute] = {}
+    notes: list[str] = []
+    contained_streams: dict[tuple[str, Path], list[StreamLayout]] = {}
+    for stream in streams:
+        if stream.name not in paths:
+            continue
+        if stream.contained:
+            contained_streams.setdefault((str(stream.format), paths[stream.name]), []).append(stream)
+        else:
+            tables[stream.name] = stream_batches(
+                rows.open_rows(paths[stream.name], stream), stream, episode, shared, paths.get(f"{stream.name}{STAMPS}")
+            )
+    for (kind, path), container_streams in contained_streams.items():
+        contents = kinds.open_container(kind, path).read([stream.source for stream in container_streams], episode)
+        stream_by_source = unique_names.by_name(
+            ((stream.source, stream) for stream in contents.streams), path, "stream"
+        )
+        for stream in container_streams:
+            if stream.source in stream_by_source:
+                tables[stream.name] = read_contained_stream(path, stream_by_source[stream.source], stream)
+            elif not stream.optional:
+                raise _missing_stream_error(path, stream, contents, kinds.open_container(kind, path).look(episode))
+        attributes |= contents.attributes
+        prefixes = tuple(f"{stream.source}/" for stream in container_streams)
+        inner = {source: problem for source, problem in contents.skipped.items() if source.startswith(prefixes)}
+        notes += [*contents.notes, *_skipped_notes(path, inner)]
+    tables = {
+        stream.name: _with_rate_noted(tables[stream.name], stream.name, notes)
+        for stream in streams
+        if stream.name in tables
+    }
+    return RecordedStreams(tables, attributes, notes)
+
+
+def _with_rate_noted(
+    rows: pa.Table | pa.RecordBatchReader, name: str, notes: list[str]
+) -> pa.Table | pa.RecordBatchReader:
+    """Return the rows of a stream; as its first ones are read, a rate that no sensor has is added to ``notes``."""
+    if isinstance(rows, pa.Table):
+        if rows.num_rows:
+            _note_rate(rows, name, notes)
+        return rows
+
+    def read() -> Iterator[pa.RecordBatch]:
+        for number, batch in enumerate(rows):
+            if not number:
+                _note_rate(batch, name, notes)
+            yield batch
+
+    return pa.RecordBatchReader.from_batches(rows.schema, read())
+
+
+def _note_rate(rows: pa.Table | pa.RecordBatch, name: str, notes: list[str]) -> None:
+    measured = [field for field in rows.schema if field.name != TIME and not pa.types.is_string(field.type)]
+    step_ns = float(np.median(np.diff(rows.column(TIME).to_numpy()))) if rows.num_rows >= FEWEST_ROWS else 0.0
+    if measured and step_ns and not LOWEST_HZ <= 1e9 / step_ns <= HIGHEST_HZ:
+        notes.append(
+            f"The stamps of {name} are {step_ns / 1e9:g} s apart, {1e9 / step_ns:,.6g} Hz, which few sensors have. Check "
+            f"the unit of its time."
+        )
+
+
+def read_container(kind: str, path: Path, episode: str | None) -> RecordedStreams:
+    """Return all readable streams of a container, or of its ``episode``; the notes name the others.
+
+    The attribute ``skipped`` of the recording names them too. Raises `TacpipeError` where nothing can be read.
+    """
+    contents = kinds.open_container(kind, path).read(None, episode)
+    notes = [*contents.notes, *_skipped_notes(path, contents.skipped)]
+    stream_by_name = unique_names.by_name(((stream.name, stream) for stream in contents.streams), path, "stream")
+    tables = {
+        name: _with_rate_noted(
+            read_contained_stream(path, stream, StreamLayout(name, source=stream.source)), name, notes
+        )
+        for name, stream in stream_by_name.items()
+        if stream.rows is None or stream.rows
+    }
+    if not tables:
+        raise TacpipeError(" ".join([f"{path} holds no stream that can be read.", *notes]))
+    skipped = "; ".join(f"{plain(source)}: {reason}" for source, reason in contents.skipped.items())
+    return RecordedStreams(tables, {**contents.attributes, **({SKIPPED: skipped} if skipped else {})}, notes)
+
+
+def _skipped_notes(path: Path, skipped: Mapping[str, str]) -> list[str]:
+    return [f"{path}: {plain(source)} is left out: {problem}." for source, problem in skipped.items()]
+
+
+def _missing_stream_error(path: Path, stream: StreamLayout, contents: Contents, look: Contents) -> TacpipeError:
+    """Return the error for a stream of a layout that its container does not have."""
+    reason = contents.skipped.get(stream.source) or look.skipped.get(stream.source)
+    if reason:
+        return TacpipeError(f"{path}: {plain(stream.source)} of [streams.{stream.name}] cannot be read: {reason}.")
+    return TacpipeError(
+        f"{path} has no {plain(stream.source)}, which [streams.{stream.name}] names; it has "
+        f"{listed([source_stream.source for source_stream in look.streams], 6)}. Correct source, or set optional = true."
+    )

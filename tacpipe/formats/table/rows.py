@@ -1,11 +1,19 @@
-"""The rows of a file, block by block: of one recording alone where a file holds many, and how errors name a row."""
+"""Read the rows of a file block by block, only those of one recording where a file holds many.
+
+The rows of a file of many recordings are cut apart once: each recording then reads only its own rows. The cut is a file of
+Arrow's record batches (https://arrow.apache.org/docs/format/Columnar.html), one for each recording in a block, followed by
+an index in JSON and the index's length in eight bytes.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+import base64
+import json
+from collections.abc import Callable, Generator, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 import pyarrow as pa
@@ -14,24 +22,98 @@ import pyarrow.compute as pc
 from tacpipe.arrays import Indices, Times
 from tacpipe.errors import TacpipeError
 from tacpipe.formats.containers.container import SourceStream
-from tacpipe.formats.table import ahead, binary, dialect, parted, stamps
-from tacpipe.formats.table.layout import EXTENSIONS, Stream, extension
+from tacpipe.formats.table import binary, file_sample, stamps
+from tacpipe.formats.table.layout import EXTENSIONS, StreamLayout, extension
 from tacpipe.formats.table.text import TextTable
 from tacpipe.formats.table.workbook import Workbook
-from tacpipe.io.drafts import Draft
+from tacpipe.io import regular
+from tacpipe.io.drafts import Draft, Hashed
+from tacpipe.io.parquet import owned
 from tacpipe.io.spill import Spill, in_order
 from tacpipe.plugins.stage import Shared
 from tacpipe.printable import excerpt, listed, plain
 
-Place = Callable[[int], str]  # of a row in a block: how errors name it
+Item = TypeVar("Item")
 
 
-class Rows(Protocol):
+def read_ahead(items: Iterator[Item]) -> Generator[Item, None, None]:
+    """Yield ``items``; a thread computes each while the caller uses the item before it. Errors are raised here.
+
+    >>> list(read_ahead(iter([1, 2, 3])))
+    [1, 2, 3]
+    """
+    with ThreadPoolExecutor(1, "ahead") as thread:
+        following = thread.submit(next, items, None)
+        while (item := following.result()) is not None:
+            following = thread.submit(next, items, None)
+            yield item
+
+
+ROW_COLUMN = "row"  # the last column: the position of each row in the file
+_LENGTH = 8  # bytes
+
+
+def cut_by_recording(blocks: Iterator[pa.Table], recording: str, draft: Hashed) -> None:
+    """Write the rows of ``blocks`` to ``draft``, apart for each recording that the column ``recording`` names."""
+    places: dict[str, list[tuple[int, int]]] = {}
+    schema, start_row = None, 0
+    for block in blocks:
+        for name, rows in _rows_by_recording(block, recording, start_row):
+            schema = rows.schema
+            for batch in rows.combine_chunks().to_batches():
+                content = memoryview(batch.serialize())
+                places.setdefault(name, []).append((draft.tell(), len(content)))
+                draft.write(content)
+        start_row += block.num_rows
+    described = "" if schema is None else base64.b64encode(schema.serialize().to_pybytes()).decode()
+    index = json.dumps({"schema": described, "places": places}).encode()
+    draft.write(index)
+    draft.write(len(index).to_bytes(_LENGTH, "little"))
+
+
+def read_cut_rows(path: Path, recording: str) -> Iterator[tuple[pa.Table, Indices]]:
+    """Yield the rows of one recording of a `cut`, block by block, and which rows of the file they were."""
+    with regular.failing(path), regular.opened(path, follow=False) as file:
+        file.seek(-_LENGTH, 2)
+        length = int.from_bytes(file.read(_LENGTH), "little")
+        file.seek(-_LENGTH - length, 2)
+        index: Mapping[str, Any] = json.loads(file.read(length))
+        for place, size in index["places"].get(recording, ()):
+            file.seek(place)
+            schema = pa.ipc.read_schema(owned(base64.b64decode(index["schema"])))
+            table = pa.Table.from_batches([pa.ipc.read_record_batch(owned(file.read(size)), schema)])
+            yield table.drop_columns([ROW_COLUMN]), table.column(table.num_columns - 1).to_numpy()
+
+
+def _rows_by_recording(block: pa.Table, recording: str, start_row: int) -> Iterator[tuple[str, pa.Table]]:
+    """Yield the rows of each recording in a block, in their order."""
+    column = block.column(recording).cast(pa.string()).combine_chunks().dictionary_encode()
+    codes, names = column.indices.fill_null(-1).to_numpy(zero_copy_only=False), column.dictionary.to_pylist()
+    order = np.argsort(codes, kind="stable")
+    block_columns = [block.column(name) for name in block.column_names]
+    plain = [
+        values.cast(values.type.value_type) if pa.types.is_dictionary(values.type) else values
+        for values in block_columns
+    ]
+    rows = pa.Table.from_arrays(
+        [*plain, pa.array(np.arange(start_row, start_row + len(block)))], [*block.column_names, ROW_COLUMN]
+    )
+    if (np.diff(codes) < 0).any():  # else each recording's rows lie together, and nothing is copied
+        rows = rows.take(pa.array(order))
+    edges = np.searchsorted(codes[order], np.arange(len(names) + 1))
+    for name, start, stop in zip(names, edges, edges[1:], strict=False):
+        yield name, rows.slice(start, stop - start)
+
+
+Place = Callable[[int], str]  # maps a row of a block to its name in errors
+
+
+class RowFile(Protocol):
     """A file of rows."""
 
     @property
     def path(self) -> Path:
-        """Where it lies."""
+        """The path of the file."""
 
     def names(self) -> list[str]:
         """The names of its columns."""
@@ -61,36 +143,36 @@ class ContainedRows:
         if not self.clock:
             yield from blocks
             return
-        aside = Spill()
-        pieces = [piece for block in blocks for piece in aside.add_run(block, self.clock)]
-        yield from in_order(pieces, aside.read, self.clock)
+        spill = Spill()
+        pieces = [piece for block in blocks for piece in spill.add_run(block, self.clock)]
+        yield from in_order(pieces, spill.read, self.clock)
 
     def place(self, index: int) -> str:
         """Return how the row ``index`` (from 0) is named in errors."""
         return f"{plain(self.stream.source)}, row {index + 1}"
 
 
-def opened(path: Path, stream: Stream) -> Rows:
+def open_rows(path: Path, stream: StreamLayout) -> RowFile:
     """Return the reader of a file of this stream."""
     kind = stream.format_of(path)
     if kind == "csv":
         return TextTable(path, stream)
     if kind == "xlsx":
         return Workbook(path, stream)
-    return binary.opened(path, kind, stream.time_axis)
+    return binary.open_table(path, kind, stream.time_axis)
 
 
-def stamps_of_file(path: Path, stream: Stream) -> Times:
+def stamps_of_file(path: Path, stream: StreamLayout) -> Times:
     """Return the stamps in a file that holds those of all rows of ``stream``, in ns (row,).
 
     They are in the column that the stream's time names, or in the only one of the file. Raises `TacpipeError` for a file
     with several columns where none is named, and as `stamped` does.
     """
     kind = EXTENSIONS.get(extension(path), "csv")
-    clock = Stream(stream.name, format=kind, time=replace(stream.time, file=""), encoding=stream.encoding)
+    clock = StreamLayout(stream.name, format=kind, time=replace(stream.time, file=""), encoding=stream.encoding)
     if kind == "csv":
-        lines = dialect.first_lines(path, stream.encoding)
-        clock_dialect = dialect.of(lines)
+        lines = file_sample.first_lines(path, stream.encoding)
+        clock_dialect = file_sample.detect_dialect(lines)
         clock = replace(
             clock,
             separator=clock_dialect.separator,
@@ -99,7 +181,7 @@ def stamps_of_file(path: Path, stream: Stream) -> Times:
             header=clock_dialect.header,
             skip_lines=clock_dialect.skip_lines,
         )
-    file = opened(path, clock)
+    file = open_rows(path, clock)
     names = file.names()
     column = stream.time.column or names[0]
     if column not in names or (len(names) > 1 and not stream.time.column):
@@ -109,30 +191,34 @@ def stamps_of_file(path: Path, stream: Stream) -> Times:
         )
     clock = replace(clock, time=replace(clock.time, column=column))
     stamps_ns = [
-        stamped(block.column(column), clock, place)
-        for block, _, place in blocks(file, clock, types(file, clock), None, None)
+        stamps_of_column(block.column(column), clock, place)
+        for block, _, place in row_blocks(file, clock, reserved_types(file, clock), None, None)
     ]
     return np.concatenate(stamps_ns) if stamps_ns else np.zeros(0, np.int64)
 
 
-def types(file: Rows, stream: Stream) -> dict[str, pa.DataType]:
+def reserved_types(file: RowFile, stream: StreamLayout) -> dict[str, pa.DataType]:
     """Return as what the columns are parsed that are no channels."""
-    found: dict[str, pa.DataType] = {}
+    parsed_types: dict[str, pa.DataType] = {}
     if stream.time.column and not stream.time.file:
-        found[stream.time.column] = pa.string() if stream.time.is_text else stamps.DECIMAL
+        parsed_types[stream.time.column] = pa.string() if stream.time.is_text else stamps.DECIMAL
     if stream.recording:
-        found[stream.recording] = pa.string()
-    return found
+        parsed_types[stream.recording] = pa.string()
+    return parsed_types
 
 
-def blocks(
-    file: Rows, stream: Stream, wanted: Mapping[str, pa.DataType], recording: str | None, shared: Shared | None
+def row_blocks(
+    file: RowFile,
+    stream: StreamLayout,
+    column_types: Mapping[str, pa.DataType],
+    recording: str | None,
+    shared: Shared | None,
 ) -> Iterator[tuple[pa.Table, Indices, Place]]:
     """Yield the blocks of a file, of one recording alone where it holds many, with which rows of the file they are.
 
     The third is how errors name a row of the block.
     """
-    for block, in_file in _picked(file, stream, wanted, recording, shared):
+    for block, in_file in _select_rows(file, stream, column_types, recording, shared):
 
         def place(row: int, in_file: Indices = in_file) -> str:
             return f"{file.path}, {file.place(int(in_file[row]))}"
@@ -140,32 +226,36 @@ def blocks(
         yield block, in_file, place
 
 
-def _picked(
-    file: Rows, stream: Stream, wanted: Mapping[str, pa.DataType], recording: str | None, shared: Shared | None
+def _select_rows(
+    file: RowFile,
+    stream: StreamLayout,
+    column_types: Mapping[str, pa.DataType],
+    recording: str | None,
+    shared: Shared | None,
 ) -> Iterator[tuple[pa.Table, Indices]]:
     """Yield the blocks of a file, or of a recording in it, and which rows of the file they are."""
     if stream.recording and shared is not None:
 
         def cut(draft: Draft) -> None:
-            parted.cut(ahead.of(file.batches(wanted)), stream.recording, draft)
+            cut_by_recording(read_ahead(file.batches(column_types)), stream.recording, draft)
 
-        yield from parted.rows(shared.file([str(file.path), stream.name], cut), str(recording))
+        yield from read_cut_rows(shared.file([str(file.path), stream.name], cut), str(recording))
         return
-    begun = 0
-    for block in ahead.of(file.batches(wanted)):
+    start_row = 0
+    for block in read_ahead(file.batches(column_types)):
         rows = np.arange(block.num_rows)
         if stream.recording:
             rows = np.flatnonzero(pc.equal(block.column(stream.recording).cast(pa.string()), recording).to_numpy())
-        yield (block.take(pa.array(rows)) if stream.recording else block), rows + begun
-        begun += block.num_rows
+        yield (block.take(pa.array(rows)) if stream.recording else block), rows + start_row
+        start_row += block.num_rows
 
 
-def stamped(column: pa.ChunkedArray, stream: Stream, place: Place) -> Times:
+def stamps_of_column(column: pa.ChunkedArray, stream: StreamLayout, place: Place) -> Times:
     """Return the stamps of a column in ns (row,). Raises `TacpipeError`, naming the row, for what is not one."""
     try:
         return stamps.nanoseconds(column, stream.time)
     except stamps.StampError as error:
         raise TacpipeError(
-            f"{place(error.row)}, column {plain(stream.time.column)} holds {excerpt(error.found)}; it must be "
-            f"{error.wanted}."
+            f"{place(error.row)}, column {plain(stream.time.column)} holds {excerpt(error.value)}; it must be "
+            f"{error.expected}."
         ) from error

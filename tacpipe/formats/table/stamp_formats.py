@@ -27,7 +27,7 @@ _MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct",
 DAY_NS = 86_400 * 10**9
 
 
-def check(text: str, place: str) -> None:
+def check_format(text: str, place: str) -> None:
     """Raise `UsageError` for a format with a directive that is not read, or without an hour."""
     letters = re.findall(r"%(.)", text.replace("%%", ""), re.DOTALL)
     unread = sorted({f"%{letter}" for letter in letters} - {f"%{letter}" for letter in _DIRECTIVES})
@@ -47,7 +47,7 @@ def has_date(text: str) -> bool:
     return bool(re.search("%[Yy]", text))
 
 
-def expression(text: str) -> str:
+def format_expression(text: str) -> str:
     """Return the regular expression of a format, with a group for each directive.
 
     A fraction of a second may be left out, as Python does where it is zero.
@@ -68,19 +68,19 @@ def expression(text: str) -> str:
     return f"^{regex}$"
 
 
-def nanoseconds(column: pa.Array, text: str) -> tuple[Int64s, Bools]:
+def parse_stamps(column: pa.Array, text: str) -> tuple[Int64s, Bools]:
     """Return stamps as nanoseconds since 1970 without regard to a zone, or since midnight, and whether each is a time.
 
     ``column`` holds text of the format ``text``; both results have the shape (row,).
 
     >>> import pyarrow as pa
-    >>> nanoseconds(pa.array(["01.02.1970 00:00:01.5", "31.02.1970 00:00:00", "x"]), "%d.%m.%Y %H:%M:%S.%f")
+    >>> parse_stamps(pa.array(["01.02.1970 00:00:01.5", "31.02.1970 00:00:00", "x"]), "%d.%m.%Y %H:%M:%S.%f")
     (array([2678401500000000,                0,                0]), array([ True, False, False]))
     """
     import numpy as np
     import pyarrow.compute as pc
 
-    groups = pc.extract_regex(pc.utf8_trim_whitespace(column), expression(text))
+    groups = pc.extract_regex(pc.utf8_trim_whitespace(column), format_expression(text))
     valid = groups.is_valid().to_numpy(zero_copy_only=False)
     parts = {field.name: pc.struct_field(groups, field.name).fill_null("") for field in groups.type}
 

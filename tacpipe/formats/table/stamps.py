@@ -1,4 +1,4 @@
-"""Stamps of any unit as whole nanoseconds, int64: exact where the file's own digits are.
+"""Convert stamps of any unit to whole nanoseconds, int64, without loss of the file's digits.
 
 Text is read as decimal numbers and never through float64, in which a Unix time of today has steps of 238 ns.
 """
@@ -16,23 +16,23 @@ from tacpipe.arrays import Bools, Int64s, Times
 from tacpipe.formats.containers.container import Time
 from tacpipe.formats.table import stamp_formats
 
-IN_RANGE = "a time before the year 2262"  # where 64 bits of nanoseconds end
+IN_RANGE = "a time before the year 2262"  # 64 bits of nanoseconds end then
 DIGITS = {"s": 9, "ms": 6, "us": 3, "ns": 0}  # decimals of a unit that are nanoseconds
-DECIMAL = pa.decimal128(38, 18)  # as which text is read
+DECIMAL = pa.decimal128(38, 18)  # the type that text is parsed as
 _UNIT = 10**9  # a nanosecond, in the last digit of seconds as `DECIMAL` has them
-_USUAL = 450_000_000  # of the high word of seconds: before the year 2233, and no product below is beyond 64 bits
-_BEYOND = 10**37 >> 64  # of the high word: later than 2262 in every unit
+_USUAL = 450_000_000  # limit for the high word of seconds (year 2233) below which products fit 64 bits
+_BEYOND = 10**37 >> 64  # limit for the high word, later than 2262 in every unit
 _LARGEST = 1e19  # later than 2262 in every unit, and below the least number that Arrow reads as another decimal
 _ZONED = re.compile(r".*(Z|[+-]\d\d:?\d\d)\s*", re.IGNORECASE)
-_LOGGED = r"(\d{2}:\d{2}:\d{2}),(\d+)"  # as Python's logging writes seconds
+_LOGGED = r"(\d{2}:\d{2}:\d{2}),(\d+)"  # seconds with a comma, written by Python's logging
 
 
 class StampError(ValueError):
     """A stamp that is none: the index of its row within the column, and what is there."""
 
-    def __init__(self, row: int, found: str, wanted: str) -> None:
-        super().__init__(found)
-        self.row, self.found, self.wanted = row, found, wanted
+    def __init__(self, row: int, value: str, expected: str) -> None:
+        super().__init__(value)
+        self.row, self.value, self.expected = row, value, expected
 
 
 def nanoseconds(column: pa.Array, time: Time) -> Int64s:
@@ -46,44 +46,44 @@ def nanoseconds(column: pa.Array, time: Time) -> Int64s:
     array([500000000])
     """
     column = column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
-    _refuse(column.is_null(), column, "a time; the cell is empty")
+    _refuse_flagged(column.is_null(), column, "a time; the cell is empty")
     if pa.types.is_timestamp(column.type):
         if column.type.tz is None and time.zone != "UTC":
             column = pc.assume_timezone(column, time.zone)
         stamps = _cast(column, pa.timestamp("ns", column.type.tz), IN_RANGE).cast(pa.int64())
         return np.asarray(stamps.to_numpy(zero_copy_only=False), np.int64)
     if pa.types.is_time(column.type):
-        return _zoned(np.asarray(column.cast(pa.time64("ns")).cast(pa.int64()).to_numpy()) + _day_ns(time), time.zone)
+        return _to_utc(np.asarray(column.cast(pa.time64("ns")).cast(pa.int64()).to_numpy()) + _day_ns(time), time.zone)
     if time.format:
-        return _of_format(column, time)
+        return _from_format(column, time)
     if time.unit == "iso8601":
-        return _of_text(column, time.zone)
+        return _from_iso_text(column, time.zone)
     unit = time.unit
     if pa.types.is_decimal(column.type):
-        return _of_decimals(column, DIGITS[unit])
+        return _from_decimals(column, DIGITS[unit])
     if pa.types.is_integer(column.type):
-        return _of_integers(column, 10 ** DIGITS[unit])
-    return _of_floats(column, 10 ** DIGITS[unit])
+        return _from_integers(column, 10 ** DIGITS[unit])
+    return _from_floats(column, 10 ** DIGITS[unit])
 
 
-def _of_text(column: pa.Array, zone: str) -> Int64s:
+def _from_iso_text(column: pa.Array, zone: str) -> Int64s:
     text = pc.replace_substring_regex(pc.utf8_trim_whitespace(column.cast(pa.string())), _LOGGED, r"\1.\2")
-    zoned = [bool(_ZONED.fullmatch(one)) for one in text[:1].to_pylist()]
+    zoned = [bool(_ZONED.fullmatch(first)) for first in text[:1].to_pylist()]
     if zoned == [True]:
-        wanted = "a time in ISO 8601, with a zone, as the first row has one"
-        stamps = _cast(text, pa.timestamp("ns", "UTC"), wanted)
+        expected = "a time in ISO 8601, with a zone, as the first row has one"
+        stamps = _cast(text, pa.timestamp("ns", "UTC"), expected)
     else:
-        wanted = "a time in ISO 8601, without a zone, as the first row has none"
-        stamps = pc.assume_timezone(_cast(text, pa.timestamp("ns"), wanted), zone)
-    found: Int64s = stamps.cast(pa.int64()).to_numpy(zero_copy_only=False)
-    return found
+        expected = "a time in ISO 8601, without a zone, as the first row has none"
+        stamps = pc.assume_timezone(_cast(text, pa.timestamp("ns"), expected), zone)
+    t_ns: Int64s = stamps.cast(pa.int64()).to_numpy(zero_copy_only=False)
+    return t_ns
 
 
-def _of_format(column: pa.Array, time: Time) -> Int64s:
+def _from_format(column: pa.Array, time: Time) -> Int64s:
     """Return stamps that are text in the format of ``time``."""
-    t_ns, valid = stamp_formats.nanoseconds(column.cast(pa.string()), time.format)
-    _refuse(pa.array(~valid), column, f"a time in the format {time.format}")
-    return _zoned(t_ns if stamp_formats.has_date(time.format) else t_ns + _day_ns(time), time.zone)
+    t_ns, valid = stamp_formats.parse_stamps(column.cast(pa.string()), time.format)
+    _refuse_flagged(pa.array(~valid), column, f"a time in the format {time.format}")
+    return _to_utc(t_ns if stamp_formats.has_date(time.format) else t_ns + _day_ns(time), time.zone)
 
 
 def _day_ns(time: Time) -> int:
@@ -91,7 +91,7 @@ def _day_ns(time: Time) -> int:
     return int(np.datetime64(time.start[:10], "D").astype("datetime64[ns]").astype(np.int64)) if time.start else 0
 
 
-def _zoned(t_ns: Int64s, zone: str) -> Int64s:
+def _to_utc(t_ns: Int64s, zone: str) -> Int64s:
     """Return nanoseconds that clocks in a zone show as those of UTC."""
     if zone == "UTC":
         return t_ns
@@ -99,17 +99,17 @@ def _zoned(t_ns: Int64s, zone: str) -> Int64s:
     return np.asarray(stamps.cast(pa.int64()).to_numpy(zero_copy_only=False), np.int64)
 
 
-def _of_decimals(column: pa.Array, digits: int) -> Int64s:
+def _from_decimals(column: pa.Array, digits: int) -> Int64s:
     if column.type == DECIMAL:
-        high, low = _words(column)
-        _refuse(pa.array(np.abs(high) > _BEYOND), column, IN_RANGE)
+        high, low = _decimal_words(column)
+        _refuse_flagged(pa.array(np.abs(high) > _BEYOND), column, IN_RANGE)
         in_seconds = digits == DIGITS["s"] and bool((np.abs(high) < _USUAL).all())
         if in_seconds:
-            return _of_seconds(high, low)
+            return _from_seconds(high, low)
     t_ns, fits = last_digits(
         pc.round(column, ndigits=digits, round_mode="half_to_even").cast(pa.decimal128(38, digits))
     )
-    _refuse(pa.array(~fits), column, IN_RANGE)
+    _refuse_flagged(pa.array(~fits), column, IN_RANGE)
     return t_ns
 
 
@@ -119,9 +119,9 @@ def last_digits(column: pa.Array) -> tuple[Int64s, Bools]:
     >>> last_digits(pa.array(["1.25", "-3"]).cast(pa.decimal128(19, 2)))[0]
     array([ 125, -300])
     """
-    high, low = _words(column)
-    found: Int64s = low.astype(np.int64)
-    return found, high == found >> 63
+    high, low = _decimal_words(column)
+    digits: Int64s = low.astype(np.int64)
+    return digits, high == digits >> 63
 
 
 def overflows(rounded: pa.ChunkedArray) -> Bools:
@@ -136,27 +136,27 @@ def overflows(rounded: pa.ChunkedArray) -> Bools:
     return np.asarray(np.abs(rounded.fill_null(0).to_numpy()) >= _LARGEST)
 
 
-def _words(column: pa.Array) -> tuple[Int64s, np.ndarray[Any, np.dtype[np.uint64]]]:
+def _decimal_words(column: pa.Array) -> tuple[Int64s, np.ndarray[Any, np.dtype[np.uint64]]]:
     """Return the two words of eight bytes that a decimal128 is as a whole number of its last digit."""
     words = np.frombuffer(column.buffers()[1], dtype="<i8").reshape(-1, 2)[column.offset :][: len(column)]
     return words[:, 1], words[:, 0].view(np.uint64)
 
 
-def _of_seconds(high: Int64s, low: np.ndarray[Any, np.dtype[np.uint64]]) -> Int64s:
+def _from_seconds(high: Int64s, low: np.ndarray[Any, np.dtype[np.uint64]]) -> Int64s:
     """Return seconds with 18 decimals, in two words, as nanoseconds, rounded half to even."""
-    whole, left = divmod(1 << 64, _UNIT)  # the high word counts 2^64
+    high_whole, high_remainder = divmod(1 << 64, _UNIT)  # the high word counts 2^64
     low_whole, low_left = np.divmod(low, np.uint64(_UNIT))
-    carried, rest = np.divmod(high * left + low_left.astype(np.int64), _UNIT)
-    t_ns: Int64s = high * whole + low_whole.astype(np.int64) + carried
-    t_ns += (rest > _UNIT // 2) | ((rest == _UNIT // 2) & (t_ns & 1 == 1))
+    carried, remainder = np.divmod(high * high_remainder + low_left.astype(np.int64), _UNIT)
+    t_ns: Int64s = high * high_whole + low_whole.astype(np.int64) + carried
+    t_ns += (remainder > _UNIT // 2) | ((remainder == _UNIT // 2) & (t_ns & 1 == 1))
     return t_ns
 
 
-def _of_integers(column: pa.Array, factor: int) -> Int64s:
+def _from_integers(column: pa.Array, factor: int) -> Int64s:
     values = column.to_numpy(zero_copy_only=False)
-    most = np.iinfo(np.int64).max // factor
-    _refuse(
-        pa.array((values > most) | (values < -most if values.dtype.kind == "i" else False)),
+    limit = np.iinfo(np.int64).max // factor
+    _refuse_flagged(
+        pa.array((values > limit) | (values < -limit if values.dtype.kind == "i" else False)),
         column,
         IN_RANGE,
     )
@@ -164,30 +164,30 @@ def _of_integers(column: pa.Array, factor: int) -> Int64s:
     return t_ns
 
 
-def _of_floats(column: pa.Array, factor: int) -> Int64s:
+def _from_floats(column: pa.Array, factor: int) -> Int64s:
     values = column.cast(pa.float64()).to_numpy(zero_copy_only=False)
     bad = ~np.isfinite(values) | (np.abs(values) > np.iinfo(np.int64).max / factor)
-    _refuse(pa.array(bad), column, IN_RANGE)
-    whole = np.floor(values)  # apart from the rest: their product with the factor would be rounded
-    t_ns: Times = whole.astype(np.int64) * factor + np.rint((values - whole) * factor).astype(np.int64)
+    _refuse_flagged(pa.array(bad), column, IN_RANGE)
+    floors = np.floor(values)  # apart from the rest: their product with the factor would be rounded
+    t_ns: Times = floors.astype(np.int64) * factor + np.rint((values - floors) * factor).astype(np.int64)
     return t_ns
 
 
-def _cast(column: pa.Array, kind: pa.DataType, wanted: str) -> pa.Array:
+def _cast(column: pa.Array, kind: pa.DataType, expected: str) -> pa.Array:
     """Return a column as ``kind``; raises `StampError`, with what is ``wanted``, for the first that cannot be."""
     try:
         return column.cast(kind)
     except pa.ArrowInvalid:
-        for row, one in enumerate(column):
+        for row, value in enumerate(column):
             try:
-                one.cast(kind)
+                value.cast(kind)
             except pa.ArrowInvalid:
-                raise StampError(row, str(one.as_py()), wanted) from None
+                raise StampError(row, str(value.as_py()), expected) from None
         raise
 
 
-def _refuse(bad: Any, column: pa.Array, wanted: str) -> None:
+def _refuse_flagged(bad: Any, column: pa.Array, expected: str) -> None:
     flags = bad.to_numpy(zero_copy_only=False)
     if flags.any():
         row = int(flags.argmax())
-        raise StampError(row, str(column[row].as_py()), wanted)
+        raise StampError(row, str(column[row].as_py()), expected)

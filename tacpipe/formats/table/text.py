@@ -1,12 +1,16 @@
-"""Text tables: CSV, TSV and their like, read in blocks as numbers of declared types.
+"""Read text tables (CSV, TSV and others) in blocks as numbers of declared types.
 
-pyarrow parses block by block, with all cores; where it refuses a block, the file is gone through once more in Python to
-name the line and the cell. Lines are counted from 1, as an editor shows them.
+Text may be compressed with gzip and have any encoding. pyarrow parses block by block, with all cores; where it refuses a
+block, the file is read once more in Python to name the line and the cell. Lines are counted from 1, as an editor shows them.
 """
 
 from __future__ import annotations
 
+import codecs
+import contextlib
 import csv
+import gzip
+import io
 import itertools
 import re
 from collections import Counter
@@ -14,21 +18,77 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import IO
+from typing import IO, cast
 
 import pyarrow as pa
 import pyarrow.csv as pc
 
 from tacpipe.errors import TacpipeError
-from tacpipe.formats.table import compressed, stamps
-from tacpipe.formats.table.layout import Stream
+from tacpipe.formats.table import stamps
+from tacpipe.formats.table.layout import GZIP, StreamLayout
+from tacpipe.io import regular
 from tacpipe.io.parquet import owned
 from tacpipe.printable import excerpt, listed, plain
 
+RECODED_BYTES = 1 << 20  # bytes decoded at once
+
+
+@contextlib.contextmanager
+def open_text(path: Path, encoding: str = "utf-8") -> Iterator[IO[bytes]]:
+    """Open a file for reading, unpacked where its name ends in .gz, and as UTF-8 where it is text of another ``encoding``.
+
+    Raises `TacpipeError` for a file that cannot be read.
+    """
+    with regular.failing(path), regular.opened(path) as raw:
+        try:
+            with contextlib.ExitStack() as stack:
+                file = cast("IO[bytes]", raw)
+                if path.suffix.lower() == GZIP:
+                    file = cast("IO[bytes]", stack.enter_context(gzip.GzipFile(fileobj=raw)))
+                yield file if is_utf8(encoding) else io.BufferedReader(_Recoded(file, encoding), RECODED_BYTES)
+        except (gzip.BadGzipFile, EOFError) as error:
+            raise TacpipeError(f"{path} is not a whole gzip file: {plain(str(error), 200)}. Copy it again.") from error
+        except UnicodeDecodeError as error:
+            raise TacpipeError(
+                f"{path} is not text in {encoding}: {plain(str(error), 200)}. Correct encoding."
+            ) from error
+
+
+def is_utf8(encoding: str) -> bool:
+    """Return whether text in an encoding is UTF-8 as it stands.
+
+    >>> is_utf8("UTF8"), is_utf8("cp1252")
+    (True, False)
+    """
+    return codecs.lookup(encoding).name == "utf-8"
+
+
+class _Recoded(io.RawIOBase):
+    """The text of a file as bytes in UTF-8."""
+
+    def __init__(self, file: IO[bytes], encoding: str) -> None:
+        self._file, self._decoder = file, codecs.getincrementaldecoder(encoding)()
+        self._waiting = b""
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: memoryview) -> int:  # type: ignore[override]
+        while not self._waiting:
+            block = self._file.read(RECODED_BYTES)
+            self._waiting = self._decoder.decode(block, final=not block).removeprefix("\ufeff").encode()
+            if not block:
+                break
+        count = min(len(buffer), len(self._waiting))
+        buffer[:count] = self._waiting[:count]
+        self._waiting = self._waiting[count:]
+        return count
+
+
 BLOCK_BYTES = 1 << 24  # below what the C library gives back to the system each time
-BOM = b"\xef\xbb\xbf"  # before the text of some editors
-LONGEST_LINE = 1 << 24  # bytes; a file without line ends is none
-_BEGUN = re.compile(rb"\S")
+BOM = b"\xef\xbb\xbf"  # mark that some editors write at the start
+MAX_LINE_BYTES = 1 << 24  # bytes; a file without line ends is none
+_NOT_BLANK = re.compile(rb"\S")
 
 
 @dataclass(frozen=True)
@@ -36,14 +96,14 @@ class TextTable:
     """A text file of cells, as the layout's stream describes it."""
 
     path: Path
-    stream: Stream
+    stream: StreamLayout
 
     def names(self) -> list[str]:
         """Return the names of the columns: those of the header, or column1, column2, ….
 
         Raises `TacpipeError` for a file without a row, and for a name that comes twice.
         """
-        for line, cells in self._rows():
+        for line, cells in self._read_rows():
             if self.stream.names:
                 self._expect_width(line, cells)
                 return list(self.stream.names)
@@ -82,7 +142,7 @@ class TextTable:
                 ):
                     raise pa.ArrowInvalid("A number is too large")
             except (pa.ArrowInvalid, UnicodeDecodeError) as error:
-                fault = self._fault(names, types)
+                fault = self._first_fault(names, types)
                 raise TacpipeError(fault or f"{self.path} cannot be read: {plain(str(error), 200)}.") from error
             yield table
 
@@ -106,7 +166,7 @@ class TextTable:
 
     def place(self, index: int) -> str:
         """Return the line that holds the data row ``index`` (from 0), as errors name it."""
-        for position, (line, _) in enumerate(self._rows()):
+        for position, (line, _) in enumerate(self._read_rows()):
             if position == index + self.stream.header:
                 return f"line {line}"
         raise IndexError(f"{self.path} has no row {index}.")
@@ -115,53 +175,53 @@ class TextTable:
         """Yield the bytes below the header, whole lines at a time, without comments; each in pieces."""
         comment = self.stream.comment.encode()
         drop = re.compile(rb"^[ \t]*" + re.escape(comment) + rb".*(?:\n|\Z)", re.MULTILINE) if comment else None
-        with compressed.opened(self.path, self.stream.encoding) as file:
+        with open_text(self.path, self.stream.encoding) as file:
             self._skip_header(file)
-            rest = b""
+            remainder = b""
             while new := file.read(BLOCK_BYTES):
                 end = new.rfind(b"\n") + 1
                 if end:
-                    yield from self._without(drop, rest, memoryview(new)[:end])
-                rest = new[end:] if end else rest + new
-                if len(rest) > LONGEST_LINE:
-                    raise self._endless()
-            yield from self._without(drop, rest)
+                    yield from self._without_comments(drop, remainder, memoryview(new)[:end])
+                remainder = new[end:] if end else remainder + new
+                if len(remainder) > MAX_LINE_BYTES:
+                    raise self._endless_line()
+            yield from self._without_comments(drop, remainder)
 
-    def _without(
+    def _without_comments(
         self, drop: re.Pattern[bytes] | None, *pieces: bytes | memoryview
     ) -> Iterator[tuple[bytes | memoryview, ...]]:
         """Yield pieces that end with a line without what matches ``drop``; nothing where no line holds anything."""
         if drop is not None:
             pieces = (drop.sub(b"", b"".join(pieces)),)
-        if any(_BEGUN.search(piece) for piece in pieces):
+        if any(_NOT_BLANK.search(piece) for piece in pieces):
             yield pieces
 
     def _skip_header(self, file: IO[bytes]) -> None:
         """Read up to the first line below the header."""
         if not (self.stream.header or self.stream.skip_lines):
-            if compressed.is_utf8(self.stream.encoding) and file.read(len(BOM)) != BOM:
+            if is_utf8(self.stream.encoding) and file.read(len(BOM)) != BOM:
                 file.seek(0)
             return
         comment, header = self.stream.comment.encode(), self.stream.header
         for number in itertools.count():
             if number >= self.stream.skip_lines and not header:
                 return
-            line = file.readline(LONGEST_LINE)
+            line = file.readline(MAX_LINE_BYTES)
             if not line:
                 return
             text = (line.removeprefix(BOM) if not number else line).strip()
             commented = bool(comment) and text.startswith(comment)
             header &= number < self.stream.skip_lines or not text or commented
 
-    def _rows(self) -> Iterator[tuple[int, list[str]]]:
+    def _read_rows(self) -> Iterator[tuple[int, list[str]]]:
         """Yield the number and the cells of each line that holds some, the header among them."""
         comment = self.stream.comment
         separator = self.stream.separator_of(self.path)
-        with compressed.opened(self.path, self.stream.encoding) as file:
+        with open_text(self.path, self.stream.encoding) as file:
             try:
-                for number, line in enumerate(iter(partial(file.readline, LONGEST_LINE + 1), b""), 1):
-                    if len(line) > LONGEST_LINE:
-                        raise self._endless()
+                for number, line in enumerate(iter(partial(file.readline, MAX_LINE_BYTES + 1), b""), 1):
+                    if len(line) > MAX_LINE_BYTES:
+                        raise self._endless_line()
                     text = line.removeprefix(BOM if number == 1 else b"").decode(errors="replace").strip("\r\n")
                     if number <= self.stream.skip_lines or not text.strip():
                         continue
@@ -171,28 +231,28 @@ class TextTable:
             except csv.Error as error:
                 raise TacpipeError(f"{self.path} cannot be read: {plain(str(error), 200)}. Copy it again.") from error
 
-    def _endless(self) -> TacpipeError:
-        return TacpipeError(f"{self.path} has a line of over {LONGEST_LINE} bytes; it is not a text table.")
+    def _endless_line(self) -> TacpipeError:
+        return TacpipeError(f"{self.path} has a line of over {MAX_LINE_BYTES} bytes; it is not a text table.")
 
-    def _fault(self, names: Sequence[str], types: Mapping[str, pa.DataType]) -> str | None:
+    def _first_fault(self, names: Sequence[str], types: Mapping[str, pa.DataType]) -> str | None:
         """Return a sentence about the first row that is not as declared, or None."""
-        rows = self._rows()
+        rows = self._read_rows()
         if self.stream.header:
             next(rows)
-        wanted = [(index, name, types[name]) for index, name in enumerate(names) if name in types]
+        checked_columns = [(index, name, types[name]) for index, name in enumerate(names) if name in types]
         for line, cells in rows:
             if len(cells) != len(names):
                 cause = "it was cut short" if len(cells) < len(names) else "a cell or a separator is too much"
                 wide = f"{self.path}, line {line} has {len(cells)} cells instead of {len(names)}; {cause}."
                 return f"{wide} Correct the line, or copy the file again."
-            for index, name, kind in wanted:
-                if not self._allowed(cells[index], kind):
+            for index, name, kind in checked_columns:
+                if not self._is_allowed(cells[index], kind):
                     place = f"{self.path}, line {line}, column {plain(name)}"
-                    found = f"{place} holds {excerpt(cells[index])}, which is not {described(kind)}."
-                    return f"{found} Correct the cell, or declare it in missing."
+                    sentence = f"{place} holds {excerpt(cells[index])}, which is not {describe_type(kind)}."
+                    return f"{sentence} Correct the cell, or declare it in missing."
         return None
 
-    def _allowed(self, cell: str, kind: pa.DataType) -> bool:
+    def _is_allowed(self, cell: str, kind: pa.DataType) -> bool:
         if cell in self.stream.missing:
             return True
 
@@ -209,16 +269,16 @@ class TextTable:
             return False
 
 
-def described(kind: pa.DataType) -> str:
+def describe_type(kind: pa.DataType) -> str:
     """Return what a cell of a type is, as in "which is not …".
 
-    >>> described(pa.uint16()), described(pa.float64())
+    >>> describe_type(pa.uint16()), describe_type(pa.float64())
     ('a whole number from 0 to 65535', 'a number')
     """
     if pa.types.is_integer(kind):
         bits, signed = kind.bit_width, pa.types.is_signed_integer(kind)
-        least, most = (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1) if signed else (0, 2**bits - 1)
-        return f"a whole number from {least} to {most}"
+        lowest, highest = (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1) if signed else (0, 2**bits - 1)
+        return f"a whole number from {lowest} to {highest}"
     if pa.types.is_boolean(kind):
         return "true or false"
     if pa.types.is_decimal(kind):

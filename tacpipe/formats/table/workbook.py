@@ -13,8 +13,8 @@ from typing import Any
 import pyarrow as pa
 
 from tacpipe.errors import TacpipeError
-from tacpipe.formats.table.layout import Stream
-from tacpipe.formats.table.text import described
+from tacpipe.formats.table.layout import StreamLayout
+from tacpipe.formats.table.text import describe_type
 from tacpipe.io import regular
 from tacpipe.plugins import extras
 from tacpipe.printable import excerpt, listed, plain
@@ -27,7 +27,7 @@ class Workbook:
     """One sheet of a workbook, as the layout's stream describes it."""
 
     path: Path
-    stream: Stream
+    stream: StreamLayout
 
     def names(self) -> list[str]:
         """Return the names of the columns: those of the header or the layout, or column1, column2, …."""
@@ -81,7 +81,7 @@ class Workbook:
                 if not isinstance(cell, int | float | None)
             )
             raise TacpipeError(
-                f"{self.path}, row {row}, column {plain(name)} holds {excerpt(cell)}, which is not {described(kind)}. "
+                f"{self.path}, row {row}, column {plain(name)} holds {excerpt(cell)}, which is not {describe_type(kind)}. "
                 f"Correct the cell, or declare it in missing."
             ) from None
 

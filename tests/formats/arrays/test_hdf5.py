@@ -12,8 +12,8 @@ import pyarrow as pa
 import pytest
 
 from tacpipe.errors import TacpipeError
-from tacpipe.formats import hdf5
 from tacpipe.formats.arrays import container
+from tacpipe.formats.container_commands import HDF5, hdf5
 from tacpipe.formats.table import layout, reading
 from tacpipe.formats.table.contained import Params
 from tacpipe.io.parquet import to_parquet
@@ -28,8 +28,8 @@ def given(text: str) -> Params:
 
 
 def read(folder: Path, params: Params = NONE) -> dict[str, RecordingOutput]:
-    found = hdf5.COMMAND.discover(params, folder)
-    return {name: hdf5.hdf5(params, one.files, one.values) for name, one in found.items()}
+    found = HDF5.discover(params, folder)
+    return {name: hdf5(params, one.files, one.values) for name, one in found.items()}
 
 
 def about(table: pa.Table, column: str) -> dict[str, str]:
@@ -214,11 +214,11 @@ def test_a_damaged_file_is_one_sentence_and_keeps_no_other_from_being_read(
     assert callable(damage)
     files.lab(tmp_path / "good.h5")
     (tmp_path / "bad.h5").write_bytes(damage((tmp_path / "good.h5").read_bytes()))
-    found = hdf5.COMMAND.discover(NONE, tmp_path)
+    found = HDF5.discover(NONE, tmp_path)
     assert set(found) == {"bad", "good"}
-    assert hdf5.hdf5(NONE, found["good"].files, found["good"].values).streams
+    assert hdf5(NONE, found["good"].files, found["good"].values).streams
     with pytest.raises(TacpipeError, match=r"bad\.h5") as raised:
-        hdf5.hdf5(NONE, found["bad"].files, found["bad"].values)
+        hdf5(NONE, found["bad"].files, found["bad"].values)
     assert all(part in str(raised.value) for part in parts)
 
 
@@ -227,12 +227,12 @@ def test_of_a_file_that_is_cut_short_all_is_read_whose_bytes_are_there_and_nothi
     files.robomimic(path, demos=40)
     content = path.read_bytes()
     path.write_bytes(content[: len(content) * 6 // 10])
-    found = hdf5.COMMAND.discover(NONE, tmp_path)
+    found = HDF5.discover(NONE, tmp_path)
     whole = 0
     for name, one in found.items():
         number = int(name.rpartition("_")[2])
         try:
-            made = hdf5.hdf5(NONE, one.files, one.values)
+            made = hdf5(NONE, one.files, one.values)
         except TacpipeError as error:
             assert "lift.hdf5" in str(error)
             continue
@@ -254,15 +254,15 @@ def test_a_damaged_array_is_named_and_costs_its_own_recording(tmp_path: Path) ->
     content = bytearray(path.read_bytes())
     content[place.byte_offset + 500 : place.byte_offset + 700] = bytes(200)
     path.write_bytes(content)
-    found = hdf5.COMMAND.discover(NONE, tmp_path)
-    assert hdf5.hdf5(NONE, found["lift-demo_0"].files, found["lift-demo_0"].values).streams["x"].num_rows == 4000
+    found = HDF5.discover(NONE, tmp_path)
+    assert hdf5(NONE, found["lift-demo_0"].files, found["lift-demo_0"].values).streams["x"].num_rows == 4000
     with pytest.raises(TacpipeError, match=r"lift\.hdf5: demo_1/x"):
-        hdf5.hdf5(NONE, found["lift-demo_1"].files, found["lift-demo_1"].values)
+        hdf5(NONE, found["lift-demo_1"].files, found["lift-demo_1"].values)
 
 
 def test_the_layout_that_a_guess_prints_reads_the_same(tmp_path: Path) -> None:
     files.lab(tmp_path / "run.h5")
-    (plain,), (laid,) = read(tmp_path).values(), read(tmp_path, given(hdf5.COMMAND.guess(tmp_path))).values()
+    (plain,), (laid,) = read(tmp_path).values(), read(tmp_path, given(HDF5.guess(tmp_path))).values()
     assert plain.streams == laid.streams
     for name, table in plain.streams.items():
         assert table.schema.equals(laid.streams[name].schema, check_metadata=True)
@@ -270,7 +270,7 @@ def test_the_layout_that_a_guess_prints_reads_the_same(tmp_path: Path) -> None:
 
 def test_a_guess_marks_a_rate_that_no_file_states(tmp_path: Path) -> None:
     files.aloha(tmp_path / "episode_0.hdf5")
-    assert 'rate_hz = "?"' in hdf5.COMMAND.guess(tmp_path)
+    assert 'rate_hz = "?"' in HDF5.guess(tmp_path)
 
 
 def test_the_same_data_give_the_same_table_from_csv_and_hdf5(tmp_path: Path) -> None:
@@ -294,7 +294,9 @@ def test_the_same_data_give_the_same_table_from_csv_and_hdf5(tmp_path: Path) -> 
         { match = "fx", quantity = "force", unit = "N", component = "x" },
     ]
     """
-    text = reading.table(tmp_path / "run.csv", layout.parse(f'[streams.skin]\nfiles = "run.csv"\n{columns}').streams[0])
+    text = reading.read_stream_table(
+        tmp_path / "run.csv", layout.parse_layout(f'[streams.skin]\nfiles = "run.csv"\n{columns}').streams[0]
+    )
     (found,) = read(tmp_path, given(f'[streams.skin]\nsource = "skin"\n{columns}')).values()
     assert to_parquet(found.streams["skin"].select(text.column_names)) == to_parquet(text)
 
@@ -347,5 +349,5 @@ def test_labels_and_clocks_of_a_sensor_are_no_channels_and_time_is_the_longest_d
         if clock:
             assert about(table, "tactile_slips_label")["quantity"] == "label"
             assert table.column("t_ns").to_pylist() == [1_700_000_000 * 10**9 + row * 15_625_000 for row in range(400)]
-            rules = [line for line in hdf5.COMMAND.guess(tmp_path).splitlines() if 'quantity = "tactile"' in line]
+            rules = [line for line in HDF5.guess(tmp_path).splitlines() if 'quantity = "tactile"' in line]
             assert rules and not any("label" in line or "timestamps" in line for line in rules)

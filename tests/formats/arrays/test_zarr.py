@@ -15,8 +15,9 @@ from zarr import open_group
 
 import tacpipe
 from tacpipe.errors import TacpipeError
-from tacpipe.formats import zarr
+from tacpipe.formats import container_commands
 from tacpipe.formats.arrays import container
+from tacpipe.formats.container_commands import ZARR, ZarrParams
 from tacpipe.plugins.stage import RecordingOutput
 from tests.conftest import Lab
 from tests.conftest import tacpipe as in_a_process
@@ -26,14 +27,14 @@ LAYOUT = '[streams.hand]\nsource = "data"\ntime = { rate_hz = 60 }'
 INGEST = "ingest zarr stores --layout layout.toml -o data/rec"
 
 
-def given(text: str = LAYOUT, *, fill: bool = False) -> zarr.Params:
-    return zarr.Params(json.dumps(tomllib.loads(text)), fill_missing_chunks=fill)
+def given(text: str = LAYOUT, *, fill: bool = False) -> ZarrParams:
+    return ZarrParams(json.dumps(tomllib.loads(text)), fill_missing_chunks=fill)
 
 
-def read(folder: Path, params: zarr.Params | None = None) -> dict[str, RecordingOutput]:
+def read(folder: Path, params: ZarrParams | None = None) -> dict[str, RecordingOutput]:
     params = params or given()
-    found = zarr.COMMAND.discover(params, folder)
-    return {name: zarr.zarr(params, one.files, one.values) for name, one in found.items()}
+    found = ZARR.discover(params, folder)
+    return {name: container_commands.zarr(params, one.files, one.values) for name, one in found.items()}
 
 
 @pytest.mark.parametrize("zarr_format", [2, 3])
@@ -80,12 +81,17 @@ def test_a_store_without_episodes_is_one_recording(tmp_path: Path) -> None:
 def test_a_lost_chunk_is_not_read_as_zeros(tmp_path: Path) -> None:
     files.replay(tmp_path / "replay.zarr")
     (tmp_path / "replay.zarr" / "data" / "robot0_eef_pos" / "3.0").unlink()
-    found = zarr.COMMAND.discover(given(), tmp_path)
+    found = ZARR.discover(given(), tmp_path)
     first, last = found["replay-episode_000000"], found["replay-episode_000002"]
-    assert zarr.zarr(given(), first.files, first.values).streams["hand"].num_rows == 30
+    assert container_commands.zarr(given(), first.files, first.values).streams["hand"].num_rows == 30
     with pytest.raises(TacpipeError, match=r"replay\.zarr lacks data/robot0_eef_pos/3\.0.*--fill-missing-chunks"):
-        zarr.zarr(given(), last.files, last.values)
-    filled = zarr.zarr(given(fill=True), last.files, last.values).streams["hand"].column("robot0_eef_pos_x").to_pylist()
+        container_commands.zarr(given(), last.files, last.values)
+    filled = (
+        container_commands.zarr(given(fill=True), last.files, last.values)
+        .streams["hand"]
+        .column("robot0_eef_pos_x")
+        .to_pylist()
+    )
     assert filled[15:] == [0.0] * 20 and 0.0 not in filled[:15]
 
 

@@ -16,7 +16,7 @@ import pytest
 import tacpipe
 from tacpipe.channels import schema
 from tacpipe.errors import TacpipeError
-from tacpipe.formats.lerobot.ingest import COMMAND, lerobot
+from tacpipe.formats.container_commands import LEROBOT, lerobot
 from tacpipe.formats.table.contained import Params
 from tacpipe.io.parquet import to_parquet
 from tacpipe.plugins.stage import RecordingOutput
@@ -32,7 +32,7 @@ def given(text: str) -> Params:
 
 
 def read(folder: Path, params: Params = NONE) -> dict[str, RecordingOutput]:
-    return {name: lerobot(params, one.files, one.values) for name, one in COMMAND.discover(params, folder).items()}
+    return {name: lerobot(params, one.files, one.values) for name, one in LEROBOT.discover(params, folder).items()}
 
 
 def about(table: pa.Table, column: str) -> dict[str, str]:
@@ -177,7 +177,7 @@ def test_a_damaged_file_costs_its_own_episode(
 ) -> None:
     files.write_v2(tmp_path / "pick")
     damage(tmp_path / "pick")
-    found = COMMAND.discover(NONE, tmp_path)
+    found = LEROBOT.discover(NONE, tmp_path)
     assert len(found) == 3
     for name, one in found.items():
         if name != EPISODE.format(1):
@@ -259,5 +259,5 @@ def test_names_that_are_nested_deep_are_names(tmp_path: Path) -> None:
     info = json.loads(path.read_text())
     info["features"]["action"]["names"] = json.loads("[" * 800 + json.dumps([f"a{n}" for n in range(7)]) + "]" * 800)
     path.write_text(json.dumps(info))
-    (source,) = COMMAND.discover(NONE, tmp_path).values()
+    (source,) = LEROBOT.discover(NONE, tmp_path).values()
     assert "a6" in lerobot(NONE, source.files, source.values).streams["action"].schema.names

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from tacpipe.formats.table import layout
-from tacpipe.formats.table.layout import Layout, Stream
+from tacpipe.formats.table.layout import Layout, StreamLayout
 
 START_S = 1_700_000_000
 
@@ -34,7 +34,7 @@ def write(folder: Path, trials: int = 3, **options: Any) -> list[pd.DataFrame]:
     return made
 
 
-def stream(extra: str = "", columns: str = "", files: str = "trial_{trial}/skin.csv") -> Stream:
+def stream(extra: str = "", columns: str = "", files: str = "trial_{trial}/skin.csv") -> StreamLayout:
     """Return the stream of a layout with some entries of its own."""
     return of(extra, columns, files).streams[0]
 
@@ -46,4 +46,4 @@ def of(extra: str = "", columns: str = "", files: str = "trial_{trial}/skin.csv"
         '{ match = "fx", name = "force_x_n", quantity = "force", unit = "N", component = "x" }'
     )
     time = "" if "time =" in extra else 'time = { column = "time" }'
-    return layout.parse(f'[streams.skin]\nfiles = "{files}"\n{time}\n{extra}\ncolumns = [{columns}]\n{rest}')
+    return layout.parse_layout(f'[streams.skin]\nfiles = "{files}"\n{time}\n{extra}\ncolumns = [{columns}]\n{rest}')

@@ -9,7 +9,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from tacpipe.errors import UsageError
-from tacpipe.formats.table import dialect, guess, labels, layout, pattern, reading, recordings
+from tacpipe.formats.table import file_sample, guess, labels, layout, pattern, reading, recordings
 from tests.formats.table import labs
 
 
@@ -17,16 +17,16 @@ def answered(text: str, **answers: str) -> layout.Layout:
     """Return a guessed layout in which what it could not know is replaced, in order."""
     for wanted, answer in answers.items():
         text = text.replace(f'{wanted} = "?"', f'{wanted} = "{answer}"')
-    return layout.parse(text)
+    return layout.parse_layout(text)
 
 
 def test_a_guess_with_its_questions_answered_reads_what_pandas_wrote(tmp_path: Path) -> None:
     frames = labs.write(tmp_path, sep=";", decimal=",")
-    text = guess.layout(tmp_path)
+    text = guess.guess_layout(tmp_path)
     found = answered(text, unit="N", sensor="mine")
     assert found.streams[0].separator == ";" and found.streams[0].decimal == ","
-    for one, frame in zip(recordings.found(found, tmp_path), frames, strict=True):
-        table = reading.table(one.files["skin"], found.streams[0])
+    for one, frame in zip(recordings.find_recordings(found, tmp_path), frames, strict=True):
+        table = reading.read_stream_table(one.files["skin"], found.streams[0])
         assert np.array_equal(table.column("fx").to_numpy(), frame["fx"].to_numpy())
         assert table.column("taxel3").to_pylist() == frame["taxel3"].tolist()
         assert abs(table.column("t_ns")[0].as_py() - labs.START_S * 10**9) == 0
@@ -35,7 +35,7 @@ def test_a_guess_with_its_questions_answered_reads_what_pandas_wrote(tmp_path: P
 def test_what_a_file_cannot_say_is_refused_until_somebody_writes_it(tmp_path: Path) -> None:
     labs.write(tmp_path, 1)
     with pytest.raises(UsageError, match="unit is"):
-        layout.parse(guess.layout(tmp_path))
+        layout.parse_layout(guess.guess_layout(tmp_path))
 
 
 @pytest.mark.parametrize(
@@ -50,14 +50,14 @@ def test_what_a_file_cannot_say_is_refused_until_somebody_writes_it(tmp_path: Pa
 )
 def test_the_unit_of_stamps_is_found_by_their_size(tmp_path: Path, stamps: object, unit: str) -> None:
     pd.DataFrame({"stamp": stamps}).assign(taxel1=1).to_csv(tmp_path / "skin_1.csv", index=False)
-    assert f'column = "stamp", unit = "{unit}" }}' in guess.layout(tmp_path)
+    assert f'column = "stamp", unit = "{unit}" }}' in guess.guess_layout(tmp_path)
 
 
 def test_stamps_that_count_from_a_start_have_a_unit_only_if_their_name_says_it(tmp_path: Path) -> None:
     pd.DataFrame({"time_ms": [0, 10, 20], "taxel1": 1}).to_csv(tmp_path / "skin_1.csv", index=False)
-    assert 'unit = "ms", origin = "start"' in guess.layout(tmp_path)
+    assert 'unit = "ms", origin = "start"' in guess.guess_layout(tmp_path)
     pd.DataFrame({"time": [0, 10, 20], "taxel1": 1}).to_csv(tmp_path / "skin_1.csv", index=False)
-    assert 'unit = "?", origin = "start"' in guess.layout(tmp_path)
+    assert 'unit = "?", origin = "start"' in guess.guess_layout(tmp_path)
 
 
 def test_tables_and_files_of_labels_are_found(tmp_path: Path) -> None:
@@ -65,8 +65,8 @@ def test_tables_and_files_of_labels_are_found(tmp_path: Path) -> None:
     pd.DataFrame({"trial": [0, 1], "material": ["cork", "felt"]}).to_csv(tmp_path / "labels.csv", index=False)
     for trial in range(2):
         (tmp_path / f"trial_{trial}" / "meta.yaml").write_text("object: cup\n")
-    found = answered(guess.layout(tmp_path), unit="N", sensor="mine")
-    made = labels.found(found, tmp_path, recordings.found(found, tmp_path))
+    found = answered(guess.guess_layout(tmp_path), unit="N", sensor="mine")
+    made = labels.find_labels(found, tmp_path, recordings.find_recordings(found, tmp_path))
     assert made["trial-1"] == {"sensor": "mine", "trial": 1, "material": "felt", "object": "cup"}
 
 
@@ -75,7 +75,7 @@ def test_two_sensors_of_a_trial_are_two_streams(tmp_path: Path) -> None:
         for sensor in (1, 2):
             (tmp_path / f"t{trial}").mkdir(exist_ok=True)
             labs.frame().to_csv(tmp_path / f"t{trial}" / f"skin{sensor}.csv", index=False)
-    found = answered(guess.layout(tmp_path), unit="N", sensor="mine")
+    found = answered(guess.guess_layout(tmp_path), unit="N", sensor="mine")
     assert [(one.name, one.files) for one in found.streams] == [
         ("skin1", "t{trial}/skin1.csv"),
         ("skin2", "t{trial}/skin2.csv"),
@@ -87,13 +87,13 @@ def test_two_sensors_of_a_trial_are_two_streams(tmp_path: Path) -> None:
 def test_how_a_file_is_written_is_found_from_its_lines(separator: str, header: bool) -> None:
     rows = [[f"{row / 100:.2f}", str(row), "1.5"] for row in range(5)]
     lines = [separator.join(row) for row in ([["t", "a", "b"]] if header else []) + rows]
-    found = dialect.of(lines)
+    found = file_sample.detect_dialect(lines)
     assert (found.separator, found.header, len(found.rows)) == (separator, header, 5)
 
 
 def test_whole_numbers_that_are_written_as_decimal_ones_are_floats(tmp_path: Path) -> None:
     (tmp_path / "skin_1.csv").write_text("time,force_x_n,taxel1\n1700000000,3.0,3\n1700000001,4.0,4\n")
-    printed = guess.layout(tmp_path)
+    printed = guess.guess_layout(tmp_path)
     assert 'match = "force_x_n", quantity = "force", unit = "N", type = "float64"' in printed
     assert 'unit = "count", type = "uint16"' in printed
 
@@ -101,13 +101,13 @@ def test_whole_numbers_that_are_written_as_decimal_ones_are_floats(tmp_path: Pat
 def test_a_folder_without_tables_is_refused(tmp_path: Path) -> None:
     (tmp_path / "notes.md").write_text("nothing")
     with pytest.raises(UsageError, match=r"\.csv"):
-        guess.layout(tmp_path)
+        guess.guess_layout(tmp_path)
 
 
 def columns_of(folder: Path, frame: pd.DataFrame) -> dict[str, str]:
     """Return the rules that are guessed for the columns of a table, by what they match."""
     frame.to_csv(folder / "skin_1.csv", index=False)
-    lines = [line.strip() for line in guess.layout(folder).splitlines()]
+    lines = [line.strip() for line in guess.guess_layout(folder).splitlines()]
     return {line.split('"')[1]: line for line in lines if line.startswith("{ match")}
 
 
@@ -140,7 +140,7 @@ def test_a_place_beside_a_quaternion_is_a_position_and_one_alone_is_asked_for(tm
 
 def test_a_guess_lists_quantities_and_units_to_choose_from(tmp_path: Path) -> None:
     labs.write(tmp_path, 1)
-    head = guess.layout(tmp_path).partition("[streams")[0]
+    head = guess.guess_layout(tmp_path).partition("[streams")[0]
     assert all(line.startswith("#") for line in head.splitlines() if line)
     for word in ("tactile", "position", "orientation", "count", "kPa", "--requirements", "{taxel}"):
         assert word in head
@@ -160,7 +160,7 @@ def test_a_guessed_pattern_matches_the_files_of_a_later_day(tmp_path: Path, path
     for path in paths:
         (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
         labs.frame().to_csv(tmp_path / path, index=False)
-    (stream,) = answered(guess.layout(tmp_path), unit="N", sensor="mine").streams
+    (stream,) = answered(guess.guess_layout(tmp_path), unit="N", sensor="mine").streams
     assert all(pattern.match(stream.files, path) is not None for path in [*paths, later])
     assert pattern.match(stream.files, later.replace("skin", "arm").replace("trial", "arm")) is None
 
@@ -181,7 +181,9 @@ def test_a_guess_names_every_file_that_it_does_not_read_and_why(tmp_path: Path) 
     (tmp_path / "trial_1" / "broken.parquet").write_bytes(b"no table")
     (tmp_path / "rig" / "deep" / "down").mkdir(parents=True)
     (tmp_path / "rig" / "deep" / "down" / "calibration.yaml").write_text("gain: 2\n")
-    comments = [line for line in guess.layout(tmp_path).splitlines() if line.startswith("#") and "not read" in line]
+    comments = [
+        line for line in guess.guess_layout(tmp_path).splitlines() if line.startswith("#") and "not read" in line
+    ]
     for path, why in (
         ("trial_0/camera.mp4", "*.csv"),
         ("trial_0/bag.mcap", "tacpipe ingest mcap"),

@@ -23,14 +23,14 @@ SHAPE = "shape = [4, 3], axes = ['x', 'y', 'z']"
 
 def streams_of(text: str, folder: Path) -> dict[str, pa.Table]:
     """Return the streams of the first recording below a folder, read with a layout."""
-    made = layout.parse(text)
-    source = next(iter(contained.sources(made, folder, recordings.found(made, folder)).values()))
-    output = contained.recording(made, None, source.files, source.values)
+    made = layout.parse_layout(text)
+    source = next(iter(contained.discover_sources(made, folder, recordings.find_recordings(made, folder)).values()))
+    output = contained.read_recording(made, None, source.files, source.values)
     return {name: table.read_all() for name, table in output.streams.items() if isinstance(table, pa.RecordBatchReader)}
 
 
 def guessed(folder: Path, **answers: str) -> str:
-    text = guess.layout(folder)
+    text = guess.guess_layout(folder)
     for name, answer in {"sensor": "mine", **answers}.items():
         text = text.replace(f'{name} = "?"', f'{name} = "{answer}"')
     return text
@@ -125,16 +125,16 @@ def test_columns_without_a_header_are_placed_in_an_array_by_one_rule(tmp_path: P
     with pytest.raises(TacpipeError, match=r"12 columns.*\[5, 3\]"):
         streams_of(text.replace("[4, 3]", "[5, 3]"), tmp_path)
     with pytest.raises(UsageError, match="axes"):
-        layout.parse(text.replace("'z'", "'z', 'v', 'w'"))
+        layout.parse_layout(text.replace("'z'", "'z', 'v', 'w'"))
 
 
 def test_a_list_names_the_columns_of_a_file_without_a_header(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("0.5,3\n1.5,4\n")
     stream = labs.stream('header = ["time", "fx"]', '{ match = "fx" }', "{trial}.csv")
-    assert reading.table(tmp_path / "a.csv", stream).column("fx").to_pylist() == [3.0, 4.0]
+    assert reading.read_stream_table(tmp_path / "a.csv", stream).column("fx").to_pylist() == [3.0, 4.0]
     (tmp_path / "a.csv").write_text("0.5,3,1\n1.5,4,1\n")
     with pytest.raises(TacpipeError, match=r"3 cells.*2 columns"):
-        reading.table(tmp_path / "a.csv", stream)
+        reading.read_stream_table(tmp_path / "a.csv", stream)
 
 
 @pytest.mark.parametrize("encoding", ["cp1252", "utf-16", "utf-8-sig", "utf-8"])
@@ -234,7 +234,7 @@ def test_times_of_day_go_on_past_midnight_and_have_the_day_that_the_layout_state
     rows = ["23:59:59.5,1", "23:59:59.75,2", "00:00:00,3", "00:00:00.25,4"]
     (tmp_path / "a.csv").write_text("\n".join(["clock,fx", *rows]))
     extra = 'time = { column = "clock", format = "%H:%M:%S.%f", start = "1970-01-02", zone = "Europe/Berlin" }'
-    table = reading.table(tmp_path / "a.csv", labs.stream(extra, '{ match = "fx" }', "{trial}.csv"))
+    table = reading.read_stream_table(tmp_path / "a.csv", labs.stream(extra, '{ match = "fx" }', "{trial}.csv"))
     midnight_ns = (2 * 86_400 - 3600) * 10**9  # of the third of January in Berlin
     assert table.column("t_ns").to_pylist() == [midnight_ns + part * 250_000_000 for part in (-2, -1, 0, 1)]
 
@@ -245,7 +245,7 @@ def test_a_guess_finds_the_format_of_stamps_that_are_text(tmp_path: Path) -> Non
     for text in ("%d.%m.%Y %H:%M:%S.%f", "%H:%M:%S.%f", "%m/%d/%Y %H:%M:%S.%f"):
         times = [(start + datetime.timedelta(seconds=row / 8)).strftime(text) for row in range(20)]
         pd.DataFrame({"Time": times, "pad1": range(20)}).to_csv(tmp_path / "t1" / "skin.csv", index=False)
-        assert f'format = "{text}"' in guess.layout(tmp_path)
+        assert f'format = "{text}"' in guess.guess_layout(tmp_path)
         (table,) = streams_of(guessed(tmp_path), tmp_path).values()
         assert set(np.diff(table.column("t_ns").to_numpy())) == {125_000_000}
 
@@ -253,4 +253,4 @@ def test_a_guess_finds_the_format_of_stamps_that_are_text(tmp_path: Path) -> Non
 @pytest.mark.parametrize("text", ["%d.%m.%Y", "%H:%M:%Q", "noon"])
 def test_a_format_without_an_hour_or_with_an_unknown_directive_is_refused(text: str) -> None:
     with pytest.raises(UsageError, match="format"):
-        stamp_formats.check(text, "here")
+        stamp_formats.check_format(text, "here")

@@ -12,7 +12,8 @@ from tests.formats.table import labs
 def found(folder: Path, rest: str) -> dict[str, dict[str, object]]:
     layout = labs.of(rest=rest)
     return {
-        name: dict(values) for name, values in labels.found(layout, folder, recordings.found(layout, folder)).items()
+        name: dict(values)
+        for name, values in labels.find_labels(layout, folder, recordings.find_recordings(layout, folder)).items()
     }
 
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from tacpipe.errors import TacpipeError
 from tacpipe.formats.containers.container import Time, TimeUnit
 from tacpipe.formats.table import reading, stamps
-from tacpipe.formats.table.layout import Column, Stream
+from tacpipe.formats.table.layout import ColumnRule, StreamLayout
 
 YEAR_2262_NS = 2**63 - 1
 
@@ -96,9 +96,9 @@ def test_a_stamp_that_is_none_is_named_by_its_row(column: pa.Array, unit: TimeUn
 def test_a_stamp_beyond_every_range_is_refused_and_names_its_row(tmp_path: Path, text: str, unit: TimeUnit) -> None:
     path = tmp_path / "skin.csv"
     path.write_text(f"time,a\n0,1\n{text},2\n")
-    stream = Stream("skin", time=Time(column="time", unit=unit), columns=(Column(match="a"),))
+    stream = StreamLayout("skin", time=Time(column="time", unit=unit), columns=(ColumnRule(match="a"),))
     with pytest.raises(TacpipeError, match=r"line 3, column time holds .*2262"):
-        reading.table(path, stream)
+        reading.read_stream_table(path, stream)
 
 
 @given(
@@ -115,10 +115,10 @@ def test_a_number_with_any_exponent_is_its_exact_time_or_refused(
     text = f"{digits}e{exponent}" if exponent else digits
     path = tmp_path / "skin.csv"
     path.write_text(f"time,a\n{text},2\n")
-    stream = Stream("skin", time=Time(column="time", unit=unit), columns=(Column(match="a"),))
+    stream = StreamLayout("skin", time=Time(column="time", unit=unit), columns=(ColumnRule(match="a"),))
     exact = Fraction(text) * 10 ** stamps.DIGITS[unit]
     try:
-        t_ns = reading.table(path, stream)["t_ns"].to_pylist()
+        t_ns = reading.read_stream_table(path, stream)["t_ns"].to_pylist()
     except TacpipeError as error:
         assert "line 2, column time" in str(error)
         return
@@ -130,6 +130,6 @@ def test_a_number_that_128_bits_hold_as_a_stamp_of_today_is_refused(tmp_path: Pa
     assert int(Decimal(cell)) * 10**18 % 2**128 // 10**18 == 1_744_849_152
     path = tmp_path / "skin.csv"
     path.write_text(f"time,a\n0,1\n{cell},2\n")
-    stream = Stream("skin", time=Time(column="time"), columns=(Column(match="a"),))
+    stream = StreamLayout("skin", time=Time(column="time"), columns=(ColumnRule(match="a"),))
     with pytest.raises(TacpipeError, match=r"line 3, column time holds .*2262"):
-        reading.table(path, stream)
+        reading.read_stream_table(path, stream)

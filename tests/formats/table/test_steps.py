@@ -4,8 +4,8 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from tacpipe.formats.table import preview, steps
-from tacpipe.formats.table.steps import Steps
+from tacpipe.formats.table import preview
+from tacpipe.formats.table.preview import Steps
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 5, 1000])
@@ -19,7 +19,7 @@ def test_steps_that_are_counted_have_the_median_of_all(count: int) -> None:
 
 
 def test_steps_that_all_differ_are_counted_in_bounded_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(steps, "MOST", 500)
+    monkeypatch.setattr(preview, "MAX_DIFFERENT", 500)
     values = np.random.default_rng(0).normal(1e6, 1e4, 20_000).astype(np.int64)
     found = Steps()
     for part in np.array_split(values, 50):
@@ -36,8 +36,8 @@ def test_a_preview_of_batches_is_that_of_their_table() -> None:
     fx[100:300] = np.nan
     table = pa.table({"t_ns": t_ns, "fx": fx, "on": rng.random(1000) > 0.5, "note": ["x"] * 1000})
     batches = pa.RecordBatchReader.from_batches(table.schema, iter(table.to_batches(max_chunksize=7)))
-    found = preview.of(batches)
-    assert found == preview.of(table)
+    found = preview.summarize_stream(batches)
+    assert found == preview.summarize_stream(table)
     assert (found.rows, found.rate_hz, found.gaps) == (1000, 1e9 / 10, int((np.diff(t_ns) > 30).sum()))
     assert found.columns["fx"][3:] == (np.nanmin(fx), np.nanmax(fx))
-    assert found.first.equals(table.slice(0, preview.ROWS))
+    assert found.first.equals(table.slice(0, preview.SHOWN_ROWS))

@@ -1,0 +1,106 @@
+"""The stages that ingest containers: bags, MCAP, HDF5, Zarr, XDF and LeRobot datasets. Imports nothing heavy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from tacpipe.formats.table import contained
+from tacpipe.formats.table.contained import Command, Params
+from tacpipe.plugins.stage import Files, RecordingOutput, Values, stage
+
+ROSBAG, MCAP, HDF5 = Command("rosbag"), Command("mcap"), Command("hdf5")
+XDF, LEROBOT, ZARR = Command("xdf"), Command("lerobot"), Command("zarr")
+
+
+@stage(version=2, discover=ROSBAG.discover, preview=ROSBAG.preview, guess=ROSBAG.guess, why_unread=ROSBAG.why_unread)
+def rosbag(params: Params, files: Files, values: Values) -> RecordingOutput:
+    """Read ROS bags (ROS 1, ROS 2 with SQLite or MCAP).
+
+    Each bag is a recording, each topic a stream. Usual messages have names, quantities and units of their own; others
+    are read by their definition. The time of a row is its header's stamp, or the log time where there is none.
+
+    Example: tacpipe ingest rosbag FOLDER -o data/recordings
+    """
+    return ROSBAG.read(params, files, values)
+
+
+@stage(version=2, discover=MCAP.discover, preview=MCAP.preview, guess=MCAP.guess, why_unread=MCAP.why_unread)
+def mcap(params: Params, files: Files, values: Values) -> RecordingOutput:
+    """Read MCAP files (ROS, JSON or protobuf messages).
+
+    Each file is a recording, each topic a stream. Usual messages have names, quantities and units of their own; others
+    are read by their definition. The time of a row is its header's stamp, or the log time where there is none.
+
+    Example: tacpipe ingest mcap FOLDER -o data/recordings
+    """
+    return MCAP.read(params, files, values)
+
+
+@stage(version=2, discover=HDF5.discover, preview=HDF5.preview, guess=HDF5.guess, why_unread=HDF5.why_unread)
+def hdf5(params: Params, files: Files, values: Values) -> RecordingOutput:
+    """Read HDF5 files of robomimic, ALOHA or a lab's own.
+
+    A group such as demo_0 is a recording, else the file is one. A group of arrays of one length is a stream, with the stamps
+    that lie next to them or a rate that an attribute states. ``--guess`` prints what the files declare as a layout file,
+    to which rates, quantities and units can be added.
+
+    Example: tacpipe ingest hdf5 demos -o data/recordings
+    """
+    return HDF5.read(params, files, values)
+
+
+@stage(version=1, discover=XDF.discover, preview=XDF.preview, guess=XDF.guess, why_unread=XDF.why_unread)
+def xdf(params: Params, files: Files, values: Values) -> RecordingOutput:
+    """Read recordings of Lab Streaming Layer (XDF).
+
+    Streams, channels and units are as the file declares them; a layout file replaces what is wrong. Stamps are on the
+    clock of the computer that recorded, and as they were sent in ``t_device_ns``.
+
+    Example: tacpipe ingest xdf sessions -o data/recordings
+    """
+    return XDF.read(params, files, values)
+
+
+@stage(
+    version=2, discover=LEROBOT.discover, preview=LEROBOT.preview, guess=LEROBOT.guess, why_unread=LEROBOT.why_unread
+)
+def lerobot(params: Params, files: Files, values: Values) -> RecordingOutput:
+    """Read LeRobot datasets, version 2.0, 2.1 and 3.0.
+
+    An episode is a recording, a feature a stream, the task a label. Stamps are frame_index / fps where the timestamps agree
+    with it. Videos are named and not read. A dataset that tacpipe exported gives the streams back as they were.
+
+    Example: tacpipe ingest lerobot datasets/pusht -o data/recordings
+    """
+    return LEROBOT.read(params, files, values)
+
+
+@dataclass(frozen=True)
+class ZarrParams(contained.Params):
+    """Settings that Zarr stores do not declare."""
+
+    fill_missing_chunks: bool = False  # read chunks that are not there as fill values, which zarr 3 does not write
+
+
+def preview_zarr(params: ZarrParams, source: Path) -> str:
+    """Return a description of the streams that would be read from Zarr stores."""
+    from tacpipe.formats.arrays.zarr import allow_missing_chunks
+
+    with allow_missing_chunks(filled=params.fill_missing_chunks):
+        return ZARR.preview(params, source)
+
+
+@stage(version=2, discover=ZARR.discover, preview=preview_zarr, guess=ZARR.guess, why_unread=ZARR.why_unread)
+def zarr(params: ZarrParams, files: Files, values: Values) -> RecordingOutput:
+    """Read Zarr stores, as replay buffers of UMI.
+
+    Folders and .zarr.zip files, format 2 and 3. Where meta/episode_ends cuts the arrays into episodes each is a recording,
+    else the store is one. The rate, which replay buffers do not hold, comes from a layout file; ``--guess`` prints one.
+
+    Example: tacpipe ingest zarr replay.zarr.zip --layout layout.toml -o data/recordings
+    """
+    from tacpipe.formats.arrays.zarr import allow_missing_chunks
+
+    with allow_missing_chunks(filled=params.fill_missing_chunks):
+        return ZARR.read(params, files, values)
