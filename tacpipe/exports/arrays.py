@@ -50,7 +50,7 @@ def from_table(table: pa.Table, actions: str = "") -> list[Array]:
         names, units = [channel.name for channel in members], [channel.unit for channel in members]
         arrays.append(Array(name, flat, names, units, observed=any(channel.observed for channel in members)))
     if actions:
-        members, values = frames.action_of(table, channels, actions)
+        members, values = frames.actions(table, channels, actions)
         names, units = [channel.name for channel in members], [channel.unit for channel in members]
         arrays.append(Array(ACTIONS, values, names, units, actions=True))
     return arrays
@@ -58,7 +58,7 @@ def from_table(table: pa.Table, actions: str = "") -> list[Array]:
 
 def describe(recording: Recording) -> dict[str, pa.Table]:
     """Return the tables that describe a synchronized recording and what these arrays do not hold of it."""
-    table = frames.table(recording)
+    table = frames.synchronized_table(recording)
     losses = [
         Loss("rates of the streams and what happened between frames: one frame rate for all"),
         Loss("stream events and types of the recorded streams"),

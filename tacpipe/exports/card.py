@@ -10,12 +10,13 @@ Example: tacpipe export card data/recordings -o exports/card --license cc-by-4.0
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from tacpipe.exports import contents, croissant, readme
-from tacpipe.exports.contents import Contents, Loss, shown
+from tacpipe.exports import contents, readme
+from tacpipe.exports.contents import Column, Contents, Loss, stream_label
 from tacpipe.exports.files import Content, Files
 from tacpipe.plugins.constraints import Names
 from tacpipe.plugins.stage import RecordingName, RecordingOutput, Result, stage
@@ -28,6 +29,134 @@ if TYPE_CHECKING:
 
     Parts = Dataset
 
+NAME = "croissant.json"
+CONFORMS = "http://mlcommons.org/croissant/1.0"
+_TYPES = {"bool": "sc:Boolean", "string": "sc:Text", "float": "sc:Float", "double": "sc:Float", "halffloat": "sc:Float"}
+_TERMS = (  # terms of Croissant's own vocabulary
+    *("citeAs", "column", "equivalentProperty", "extract", "field", "fileProperty", "fileObject", "fileSet", "format"),
+    *("includes", "isLiveDataset", "jsonPath", "key", "md5", "parentField", "path", "recordSet", "references", "regex"),
+    *("repeated", "replace", "samplingRate", "separator", "source", "subField", "transform"),
+)
+CONTEXT: Mapping[str, Any] = {
+    "@language": "en",
+    "@vocab": "https://schema.org/",
+    **{term: f"cr:{term}" for term in _TERMS},
+    "conformsTo": "dct:conformsTo",
+    "cr": "http://mlcommons.org/croissant/",
+    "rai": "http://mlcommons.org/croissant/RAI/",
+    "data": {"@id": "cr:data", "@type": "@json"},
+    "dataType": {"@id": "cr:dataType", "@type": "@vocab"},
+    "dct": "http://purl.org/dc/terms/",
+    "examples": {"@id": "cr:examples", "@type": "@json"},
+    "sc": "https://schema.org/",
+}
+
+
+@dataclass(frozen=True)
+class About:
+    """The publisher's statements about the data; empty where unknown."""
+
+    name: str
+    description: str
+    license: str = ""
+    creators: Sequence[str] = ()
+    url: str = ""
+    published: str = ""  # ISO 8601
+    version: str = "1.0.0"
+    cite_as: str = ""
+
+
+def croissant_json(about: About, described: Contents, patterns: Mapping[str, str]) -> bytes:
+    """Return ``croissant.json``; ``patterns`` are the paths of each stream's files."""
+    value = {
+        "@context": dict(CONTEXT),
+        "@type": "sc:Dataset",
+        "conformsTo": CONFORMS,
+        "name": about.name,
+        "description": about.description,
+        "license": about.license,
+        "creator": [{"@type": "sc:Organization", "name": name} for name in about.creators],
+        "url": about.url,
+        "datePublished": about.published,
+        "version": about.version,
+        "citeAs": about.cite_as,
+        "distribution": [_file_set(stream_label(stream), patterns[stream]) for stream in described.streams],
+        "recordSet": [_record_set(stream_label(entry.name), entry.columns) for entry in described.streams.values()],
+    }
+    return (
+        json.dumps({key: entry for key, entry in value.items() if entry}, indent=1, ensure_ascii=False).encode() + b"\n"
+    )
+
+
+def _file_set(stream: str, pattern: str) -> dict[str, Any]:
+    return {
+        "@type": "cr:FileSet",
+        "@id": f"{stream}-files",
+        "name": f"{stream}-files",
+        "encodingFormat": "application/x-parquet",
+        "includes": pattern,
+    }
+
+
+def _record_set(stream: str, columns: Sequence[Column]) -> dict[str, Any]:
+    recording = Column("recording", "string", {"quantity": "name of the recording"})
+    described_columns = [
+        recording,
+        *(column for column in columns if column.name != recording.name and croissant_type(column.type)),
+    ]
+    ids = column_ids([column.name for column in described_columns])
+    return {
+        "@type": "cr:RecordSet",
+        "@id": stream,
+        "name": stream,
+        "description": f"Rows of the stream {stream}, of all recordings.",
+        "field": [_field(stream, column, ids[column.name]) for column in described_columns],
+    }
+
+
+def column_ids(names: Sequence[str]) -> dict[str, str]:
+    """Return an identifier for each column, without spaces and brackets, which readers refuse; no two alike.
+
+    >>> column_ids(["taxel01_x", "Force X [N]", "Force X (N)"])
+    {'taxel01_x': 'taxel01_x', 'Force X [N]': 'Force_X__N_', 'Force X (N)': 'Force_X__N__2'}
+    """
+    ids: dict[str, str] = {}
+    for name in names:
+        letters = re.sub(r"[^A-Za-z0-9_.-]", "_", name)
+        candidate, number = letters, 2
+        while candidate in ids.values():
+            candidate, number = f"{letters}_{number}", number + 1
+        ids[name] = candidate
+    return ids
+
+
+def _field(stream: str, column: Column, identifier: str) -> dict[str, Any]:
+    return {
+        "@type": "cr:Field",
+        "@id": f"{stream}/{identifier}",
+        "name": f"{stream}/{identifier}",
+        "description": describe_column(column),
+        "dataType": croissant_type(column.type),
+        "source": {"fileSet": {"@id": f"{stream}-files"}, "extract": {"column": column.name}},
+    }
+
+
+def describe_column(column: Column) -> str:
+    """Return what a column holds: quantity, unit, and whatever else its metadata state.
+
+    >>> describe_column(Column("taxel01_x", "uint16", {"quantity": "tactile", "unit": "count", "taxel": "1", "axis": "x"}))
+    'tactile (count), axis x, taxel 1'
+    """
+    details = [f"{key} {value}" for key, value in sorted(column.about.items()) if key not in ("quantity", "unit")]
+    unit = f" ({column.unit})" if column.unit else ""
+    return ", ".join([f"{column.quantity or column.name}{unit}", *details])
+
+
+def croissant_type(arrow_type: str) -> str:
+    """Return the name of a type in Croissant; empty for one that it does not have."""
+    return "sc:Integer" if arrow_type.lstrip("u").startswith("int") else _TYPES.get(arrow_type, "")
+
+
 LABELS = "labels"
 RECORDING = "recording"
 UNKNOWN = "unknown"  # the Hub's name for a licence that is not stated
@@ -36,13 +165,13 @@ TAGS = ("tactile", "robotics", "timeseries")
 
 @dataclass(frozen=True)
 class Params:
-    """What the publisher states of the data."""
+    """The publisher's statements about the data."""
 
     title: str = "Tactile recordings"  # heading of the card and name of the dataset
     description: str = ""  # a paragraph
     license: str = ""  # identifier of the licence, as cc-by-4.0
-    creators: Names = ""  # who recorded it
-    url: str = ""  # where it is published
+    creators: Names = ""  # people who recorded it
+    url: str = ""  # address of the publication
     published: str = ""  # date, ISO 8601
     cite_as: str = ""  # how to cite it
 
@@ -55,7 +184,7 @@ def part(params: Params, recording: Recording, name: RecordingName) -> Result:
     files, losses = {}, []
     for stream in recording.streams:
         table = recording.table(stream)
-        files[f"data/{shown(stream)}/{name}.parquet"] = to_parquet(_named(table, name))
+        files[f"data/{stream_label(stream)}/{name}.parquet"] = to_parquet(_with_recording_column(table, name))
         losses += list(_losses(stream, table.schema))
     return Result({"": RecordingOutput(contents.part(recording, losses))}, files)
 
@@ -68,43 +197,43 @@ def card(params: Params, recordings: Dataset, parts: Parts) -> Result:
 
     Example: tacpipe export card data/recordings -o exports/card --license cc-by-4.0
     """
-    found = contents.of_parts(parts)
-    patterns = {stream: f"data/{shown(stream)}/*.parquet" for stream in found.streams}
-    about = croissant.About(
+    described = contents.contents_from_parts(parts)
+    patterns = {stream: f"data/{stream_label(stream)}/*.parquet" for stream in described.streams}
+    about = About(
         name=params.title,
-        description=params.description or f"{len(recordings)} recordings of touch, {found.seconds:.0f} s.",
+        description=params.description or f"{len(recordings)} recordings of touch, {described.seconds:.0f} s.",
         license=params.license,
-        creators=[one.strip() for one in params.creators.split(",") if one.strip()],
+        creators=[name.strip() for name in params.creators.split(",") if name.strip()],
         url=params.url,
         published=params.published,
         cite_as=params.cite_as,
     )
     files: dict[str, Content] = {
-        readme.NAME: _readme(params, recordings, found, patterns),
-        croissant.NAME: croissant.text(about, found, patterns),
+        readme.NAME: _readme(params, recordings, described, patterns),
+        NAME: croissant_json(about, described, patterns),
         f"{LABELS}.parquet": _labels(recordings),
     }
     differing = [
-        f"not alike: stream {shown(one.name)} has other columns in {len(one.others)} recordings than in the first one, so "
-        f"readers of all files at once need to unite schemas"
-        for one in found.streams.values()
-        if one.others
+        f"not alike: stream {stream_label(stream.name)} has other columns in {len(stream.differing)} recordings "
+        f"than in the first one, so readers of all files at once need to unite schemas"
+        for stream in described.streams.values()
+        if stream.differing
     ]
     licence = [] if params.license else ["no licence is stated: give --license, as cc-by-4.0"]
-    return Result(files=Files(files), notes=[*licence, *differing, *readme.notes(recordings, found)])
+    return Result(files=Files(files), notes=[*licence, *differing, *readme.loss_notes(recordings, described)])
 
 
 def _losses(stream: str, schema: pa.Schema) -> Iterator[Loss]:
     """Yield what of a stream the card does not hold."""
     for field in schema:
-        if not croissant.type_of(str(field.type)):
-            reason = f"{croissant.NAME} has no type for {field.type}; the Parquet files have the column"
+        if not croissant_type(str(field.type)):
+            reason = f"{NAME} has no type for {field.type}; the Parquet files have the column"
             yield Loss(reason, stream, field.name)
     if RECORDING in schema.names:
         yield Loss("the recording's name, as the stream has a column of this name", stream, RECORDING)
 
 
-def _named(table: pa.Table, name: str) -> pa.Table:
+def _with_recording_column(table: pa.Table, name: str) -> pa.Table:
     """Return a table after a first column with the recording's name, but where it has one."""
     import pyarrow as pa
 
@@ -120,31 +249,35 @@ def _labels(recordings: Dataset) -> bytes:
     from tacpipe.datasets import frames
     from tacpipe.io.parquet import to_parquet
 
-    rows = {one.name: pa.table({RECORDING: pa.array([one.name], pa.string())}) for one in recordings}
-    names = [name for name in dict.fromkeys(name for one in recordings for name in one.attributes) if name != RECORDING]
+    rows = {recording.name: pa.table({RECORDING: pa.array([recording.name], pa.string())}) for recording in recordings}
+    names = [
+        name
+        for name in dict.fromkeys(name for recording in recordings for name in recording.attributes)
+        if name != RECORDING
+    ]
     return to_parquet(pa.concat_tables(frames.labelled(recordings, rows, names).values()))
 
 
-def _readme(params: Params, recordings: Dataset, found: Contents, patterns: dict[str, str]) -> bytes:
-    front = "\n".join(["---", *_front(params, patterns), "---"])
+def _readme(params: Params, recordings: Dataset, described: Contents, patterns: dict[str, str]) -> bytes:
+    front = "\n".join(["---", *_front_matter(params, patterns), "---"])
     parts = [
         front,
         f"# {plain(params.title, 200)}",
         params.description,
-        _opening(found),
-        *readme.sections(recordings, found),
+        _opening(described),
+        *readme.sections(recordings, described),
     ]
     return "\n\n".join(filter(None, parts)).encode() + b"\n"
 
 
-def _front(params: Params, patterns: dict[str, str]) -> Iterator[str]:
+def _front_matter(params: Params, patterns: dict[str, str]) -> Iterator[str]:
     """Yield the lines of the card's metadata, YAML: a configuration a stream."""
     yield f"license: {json.dumps(params.license or UNKNOWN)}"
     yield f"pretty_name: {json.dumps(params.title)}"
     yield f"tags: {json.dumps(list(TAGS))}"
     yield "configs:"
     for number, (stream, pattern) in enumerate(patterns.items()):
-        yield f"- config_name: {json.dumps(shown(stream))}"
+        yield f"- config_name: {json.dumps(stream_label(stream))}"
         yield f"  data_files: {json.dumps(pattern)}"
         if not number:
             yield "  default: true"
@@ -152,8 +285,8 @@ def _front(params: Params, patterns: dict[str, str]) -> Iterator[str]:
     yield f"  data_files: {LABELS}.parquet"
 
 
-def _opening(found: Contents) -> str:
-    stream = next((shown(one) for one in found.streams), "STREAM")
+def _opening(described: Contents) -> str:
+    stream = next((stream_label(name) for name in described.streams), "STREAM")
     return f"""```python
 import datasets, duckdb, polars
 
@@ -162,4 +295,4 @@ frame = polars.read_parquet("FOLDER/data/{stream}/*.parquet")
 table = duckdb.sql("select * from 'FOLDER/data/{stream}/*.parquet' join 'FOLDER/{LABELS}.parquet' using ({RECORDING})")
 ```
 
-Each row has the name of its recording. `{croissant.NAME}` describes every column with unit and quantity."""
+Each row has the name of its recording. `{NAME}` describes every column with unit and quantity."""

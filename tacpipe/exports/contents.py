@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 TABLE = "data"  # how the only table of a recording is named where a name is needed
 TIME = "t_ns"
 COLUMNS, STREAMS, LOSSES = "columns", "streams", "losses"  # tables of a part
-Name = tuple[str, str]  # stream and column
+ColumnName = tuple[str, str]  # stream and column
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Loss:
     """A loss of a format: a column, a stream (``column`` is empty), or a property of the whole recording."""
 
     reason: str
-    stream: str | None = None  # None: of the whole recording
+    stream: str | None = None  # None: the loss concerns the whole recording
     column: str = ""
 
 
@@ -47,7 +47,7 @@ class Column:
 
     @property
     def quantity(self) -> str:
-        """What it measures, empty where that is not stated."""
+        """The measured quantity, empty where that is not stated."""
         return self.about.get("quantity", "")
 
     @property
@@ -61,33 +61,33 @@ class Stream:
     """One stream over all recordings."""
 
     name: str
-    columns: Sequence[Column]  # of the first recording that has it
+    columns: Sequence[Column]  # columns in the first recording that has it
     recordings: Sequence[str]
     rows: int
     rates_hz: Sequence[float]  # lowest and highest; empty without stamps
-    others: Sequence[str] = ()  # recordings in which it has other columns
+    differing: Sequence[str] = ()  # recordings in which it has other columns
     shared: Sequence[str] = ()  # columns that it has in all of its recordings, of one type
-    nan: bool = False  # whether a float is NaN somewhere
+    nan: bool = False  # True where a float is NaN somewhere
     all_columns: Sequence[str] = ()  # those that it has in any of its recordings
 
 
 @dataclass(frozen=True)
 class Contents:
-    """What all recordings hold together."""
+    """The streams, duration and losses of all recordings together."""
 
     streams: Mapping[str, Stream]
-    seconds: float  # from first to last stamp, over all recordings
+    seconds: float  # time between first and last stamp, summed over recordings
     first_ns: int | None
     losses: Mapping[str, Sequence[str]] = field(default_factory=dict)  # sentence, names of the recordings that lose it
 
 
-def shown(stream: str) -> str:
+def stream_label(stream: str) -> str:
     """Return the name of a stream as files and groups are named by it."""
     return stream or TABLE
 
 
 def part(
-    recording: Recording, losses: Iterable[Loss] = (), carried: Collection[Name] | None = None
+    recording: Recording, losses: Iterable[Loss] = (), carried: Collection[ColumnName] | None = None
 ) -> dict[str, pa.Table]:
     """Return the tables that describe one recording.
 
@@ -100,7 +100,7 @@ def part(
     columns, rows = [], []
     for name in recording.streams:
         table = recording.columns(name)
-        described = _columns(table.schema)
+        described = _describe_columns(table.schema)
         columns += [
             (name, column.name, column.type, json.dumps(dict(column.about), sort_keys=True)) for column in described
         ]
@@ -112,10 +112,10 @@ def part(
         rows.append((name, table.num_rows, *ends, rate_hz, nan))
     all_losses = list(losses)
     if carried is not None:
-        all_losses += unwritten([(stream, column) for stream, column, *_ in columns], carried, all_losses)
+        all_losses += unwritten_losses([(stream, column) for stream, column, *_ in columns], carried, all_losses)
     return {
-        COLUMNS: _table(columns, stream=pa.string(), column=pa.string(), type=pa.string(), about=pa.string()),
-        STREAMS: _table(
+        COLUMNS: _make_table(columns, stream=pa.string(), column=pa.string(), type=pa.string(), about=pa.string()),
+        STREAMS: _make_table(
             rows,
             stream=pa.string(),
             rows=pa.int64(),
@@ -124,7 +124,7 @@ def part(
             rate_hz=pa.float64(),
             nan=pa.bool_(),
         ),
-        LOSSES: _table(
+        LOSSES: _make_table(
             [(loss.reason, loss.stream, loss.column) for loss in dict.fromkeys(all_losses)],
             reason=pa.string(),
             stream=pa.string(),
@@ -133,9 +133,9 @@ def part(
     }
 
 
-def unwritten(
-    names: Sequence[Name],
-    carried: Collection[Name],
+def unwritten_losses(
+    names: Sequence[ColumnName],
+    carried: Collection[ColumnName],
     losses: Iterable[Loss] = (),
     reason: str = "the format has no place for it",
 ) -> list[Loss]:
@@ -151,13 +151,13 @@ def unwritten(
     return list(dict.fromkeys(Loss(reason, stream, "" if stream in empty else column) for stream, column in missing))
 
 
-def sentences(losses: Iterable[tuple[str, Loss]]) -> dict[str, list[str]]:
+def loss_sentences(losses: Iterable[tuple[str, Loss]]) -> dict[str, list[str]]:
     """Return a sentence for each thing that is lost, with the recordings that lose it.
 
     ``losses`` are pairs of a recording and a loss. Columns of a stream that share a reason share a sentence, which names
     all of them.
 
-    >>> sentences([("a", Loss("no type", "cam", "x")), ("b", Loss("no type", "cam", "y")), ("b", Loss("rates"))])
+    >>> loss_sentences([("a", Loss("no type", "cam", "x")), ("b", Loss("no type", "cam", "y")), ("b", Loss("rates"))])
     {'columns x, y of stream cam: no type': ['a', 'b'], 'rates': ['b']}
     """
     groups: dict[tuple[str | None, bool, str], tuple[dict[str, None], dict[str, None]]] = {}
@@ -170,12 +170,12 @@ def sentences(losses: Iterable[tuple[str, Loss]]) -> dict[str, list[str]]:
 def _sentence(stream: str | None, columns: Collection[str], reason: str) -> str:
     if stream is None:
         return reason
-    place = f"stream {plain(shown(stream))}"
+    place = f"stream {plain(stream_label(stream))}"
     names = [plain(column) for column in columns if column]
     return f"column{'s' * (len(names) > 1)} {', '.join(names)} of {place}: {reason}" if names else f"{place}: {reason}"
 
 
-def of_parts(parts: Dataset) -> Contents:
+def contents_from_parts(parts: Dataset) -> Contents:
     """Return what all recordings hold together."""
     columns: dict[str, tuple[Column, ...]] = {}
     totals: dict[str, dict[str, Any]] = {}
@@ -185,12 +185,12 @@ def of_parts(parts: Dataset) -> Contents:
     for part in parts:
         key = part.digests[COLUMNS]
         if key not in tables:
-            tables[key] = _by_stream(part.table(COLUMNS).to_pylist())
+            tables[key] = _columns_by_stream(part.table(COLUMNS).to_pylist())
         for row in part.table(STREAMS).to_pylist():
             name = row["stream"]
             first = columns.setdefault(name, tables[key][name])
             total = totals.setdefault(
-                name, {**_none(), "shared": first, "all_columns": dict.fromkeys(c.name for c in first)}
+                name, {**_empty_totals(), "shared": first, "all_columns": dict.fromkeys(c.name for c in first)}
             )
             total["recordings"].append(part.name)
             total["rows"] += row["rows"]
@@ -220,31 +220,33 @@ def of_parts(parts: Dataset) -> Contents:
         )
         for name, total in sorted(totals.items())
     }
-    return Contents(merged, seconds, min(starts, default=None), sentences(losses))
+    return Contents(merged, seconds, min(starts, default=None), loss_sentences(losses))
 
 
-def _none() -> dict[str, Any]:
+def _empty_totals() -> dict[str, Any]:
     return {"recordings": [], "rows": 0, "rates": [], "others": [], "nan": False}
 
 
-def about(field: pa.Field) -> dict[str, str]:
+def field_metadata(field: pa.Field) -> dict[str, str]:
     """Return the metadata of a field as text, without what Parquet adds."""
-    given = field.metadata or {}
-    return {key.decode(): value.decode() for key, value in given.items() if not key.startswith(b"PARQUET:")}
+    metadata = field.metadata or {}
+    return {key.decode(): value.decode() for key, value in metadata.items() if not key.startswith(b"PARQUET:")}
 
 
-def _columns(schema: pa.Schema) -> list[Column]:
-    return [Column(field.name, str(field.type), about(field)) for field in schema]
+def _describe_columns(schema: pa.Schema) -> list[Column]:
+    return [Column(field.name, str(field.type), field_metadata(field)) for field in schema]
 
 
-def _by_stream(rows: Iterable[Mapping[str, Any]]) -> dict[str, tuple[Column, ...]]:
-    found: dict[str, list[Column]] = {}
+def _columns_by_stream(rows: Iterable[Mapping[str, Any]]) -> dict[str, tuple[Column, ...]]:
+    columns_by_name: dict[str, list[Column]] = {}
     for row in rows:
-        found.setdefault(row["stream"], []).append(Column(row["column"], row["type"], json.loads(row["about"])))
-    return {name: tuple(columns) for name, columns in found.items()}
+        columns_by_name.setdefault(row["stream"], []).append(
+            Column(row["column"], row["type"], json.loads(row["about"]))
+        )
+    return {name: tuple(columns) for name, columns in columns_by_name.items()}
 
 
-def _table(rows: Sequence[Sequence[Any]], /, **types: pa.DataType) -> pa.Table:
+def _make_table(rows: Sequence[Sequence[Any]], /, **types: pa.DataType) -> pa.Table:
     import pyarrow as pa
 
     columns = list(zip(*rows, strict=True)) if rows else [()] * len(types)

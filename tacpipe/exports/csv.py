@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from tacpipe.exports import contents, readme
-from tacpipe.exports.contents import TIME, Contents, Loss, Stream, shown
+from tacpipe.exports.contents import TIME, Contents, Loss, Stream, stream_label
 from tacpipe.exports.files import Content, Files
 from tacpipe.plugins.stage import RecordingName, RecordingOutput, Result, stage
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     Parts = Dataset
 
 LAYOUT, LABELS = "layout.toml", "labels.json"
-TYPES = {"float": "float32", "double": "float64", "string": "text"}  # of arrow, where the layout's name differs
+TYPES = {"float": "float32", "double": "float64", "string": "text"}  # Arrow types with another name in a layout
 READ = ("int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "float", "double", "bool", "string")
 _OPENING = f"""
 One CSV file a stream, in a folder a recording. `{TIME}` is the time in nanoseconds of UTC. tacpipe reads them back with
@@ -54,7 +54,7 @@ def part(params: Params, recording: Recording, name: RecordingName) -> Result:
     losses: list[Loss] = []
     for stream in recording.streams:
         losses += list(_losses(stream, recording.columns(stream)))
-        writers[f"{name}/{shown(stream)}.csv"] = functools.partial(_write, recording, stream)
+        writers[f"{name}/{stream_label(stream)}.csv"] = functools.partial(_write, recording, stream)
     return Result({"": RecordingOutput(contents.part(recording, losses))}, written=writers)
 
 
@@ -67,53 +67,57 @@ def csv(params: Params, recordings: Dataset, parts: Parts) -> Result:
 
     Example: tacpipe export csv data/recordings -o exports/csv
     """
-    found = contents.of_parts(parts)
+    described = contents.contents_from_parts(parts)
     files: dict[str, Content] = {
-        f"{one.name}/{LABELS}": json.dumps(dict(one.attributes), indent=1, sort_keys=True).encode() + b"\n"
-        for one in recordings
+        f"{recording.name}/{LABELS}": json.dumps(dict(recording.attributes), indent=1, sort_keys=True).encode() + b"\n"
+        for recording in recordings
     }
-    files[LAYOUT] = layout(found).encode()
-    files[readme.NAME] = readme.text("Tactile recordings as CSV", _OPENING, recordings, found)
-    return Result(files=Files(files), notes=readme.notes(recordings, found))
+    files[LAYOUT] = layout_text(described).encode()
+    files[readme.NAME] = readme.readme_text("Tactile recordings as CSV", _OPENING, recordings, described)
+    return Result(files=Files(files), notes=readme.loss_notes(recordings, described))
 
 
-def layout(found: Contents) -> str:
+def layout_text(described: Contents) -> str:
     """Return the layout file that reads the files of an export back."""
     lines = ["# Reads these files back: tacpipe ingest table FOLDER --layout FOLDER/layout.toml -o data/recordings"]
     lines += ["", "[recordings]", 'name = "{recording}"']
-    count = max((len(one.recordings) for one in found.streams.values()), default=0)
-    for one in found.streams.values():
-        if any(column.name == TIME for column in one.columns):
-            lines += _stream(one, optional=len(one.recordings) < count)
+    count = max((len(stream.recordings) for stream in described.streams.values()), default=0)
+    for stream in described.streams.values():
+        if any(column.name == TIME for column in stream.columns):
+            lines += _stream_lines(stream, optional=len(stream.recordings) < count)
     return "\n".join([*lines, "", "[[labels]]", f'file = "{{recording}}/{LABELS}"', ""])
 
 
-def _stream(one: Stream, *, optional: bool) -> Iterator[str]:
+def _stream_lines(stream: Stream, *, optional: bool) -> Iterator[str]:
     yield ""
-    yield f"[streams.{shown(one.name)}]"
-    yield f"files = {json.dumps(f'{{recording}}/{shown(one.name)}.csv')}"
+    yield f"[streams.{stream_label(stream.name)}]"
+    yield f"files = {json.dumps(f'{{recording}}/{stream_label(stream.name)}.csv')}"
     yield f'time = {{ column = "{TIME}", unit = "ns" }}'
     if optional:
         yield "optional = true"
-    if one.nan:
+    if stream.nan:
         yield 'missing = ["nan"]'
     yield "columns = ["
-    for column in one.columns:
+    for column in stream.columns:
         if column.name == TIME:
             continue
         if column.type not in READ:
-            yield f"    {{ match = {_text(column.name)}, skip = true }},"
+            yield f"    {{ match = {_quoted(column.name)}, skip = true }},"
             continue
-        entries = {"match": _text(column.name), "type": _text(TYPES.get(column.type, column.type))}
-        entries |= {key: _text(column.about[key]) for key in ("quantity", "unit", "component") if key in column.about}
-        more = {key: value for key, value in column.about.items() if key not in ("quantity", "unit", "component")}
-        if more:
-            entries["about"] = f"{{ {', '.join(f'{_text(key)} = {_text(value)}' for key, value in more.items())} }}"
+        entries = {"match": _quoted(column.name), "type": _quoted(TYPES.get(column.type, column.type))}
+        entries |= {key: _quoted(column.about[key]) for key in ("quantity", "unit", "component") if key in column.about}
+        extra_metadata = {
+            key: value for key, value in column.about.items() if key not in ("quantity", "unit", "component")
+        }
+        if extra_metadata:
+            entries["about"] = (
+                f"{{ {', '.join(f'{_quoted(key)} = {_quoted(value)}' for key, value in extra_metadata.items())} }}"
+            )
         yield f"    {{ {', '.join(f'{key} = {value}' for key, value in entries.items())} }},"
     yield "]"
 
 
-def _text(value: str) -> str:
+def _quoted(value: str) -> str:
     return json.dumps(value, ensure_ascii=True)  # a basic string of TOML is written alike
 
 
@@ -122,28 +126,28 @@ def _write(recording: Recording, stream: str, sink: Any) -> None:
     import pyarrow.csv as pc
 
     stored = recording.columns(stream)
-    with pc.CSVWriter(sink, _bare(stored.schema.empty_table()).schema) as writer:
+    with pc.CSVWriter(sink, _writable_table(stored.schema.empty_table()).schema) as writer:
         for table in stored.batches():
-            writer.write_table(_bare(table))
+            writer.write_table(_writable_table(table))
 
 
-def _bare(table: pa.Table) -> pa.Table:
+def _writable_table(table: pa.Table) -> pa.Table:
     """Return a table whose columns can be written, without metadata."""
     import pyarrow as pa
 
-    return pa.Table.from_arrays([_written(column) for column in table.columns], names=table.column_names)
+    return pa.Table.from_arrays([_writable_column(column) for column in table.columns], names=table.column_names)
 
 
-def _written(column: pa.ChunkedArray) -> pa.ChunkedArray:
+def _writable_column(column: pa.ChunkedArray) -> pa.ChunkedArray:
     """Return a column as it can be written: bytes as hex digits, whatever else has no form in CSV as text."""
     import pyarrow as pa
 
     if pa.types.is_binary(column.type) or pa.types.is_large_binary(column.type):
         return pa.chunked_array(
-            [pa.array([None if one is None else one.hex() for one in column.to_pylist()], pa.string())]
+            [pa.array([None if value is None else value.hex() for value in column.to_pylist()], pa.string())]
         )
     if pa.types.is_nested(column.type):
-        return pa.chunked_array([pa.array([json.dumps(one) for one in column.to_pylist()], pa.string())])
+        return pa.chunked_array([pa.array([json.dumps(value) for value in column.to_pylist()], pa.string())])
     return column.cast(column.type.value_type) if pa.types.is_dictionary(column.type) else column
 
 
@@ -158,7 +162,7 @@ def _losses(stream: str, table: Columns) -> Iterator[Loss]:
     if TIME not in table.column_names:
         yield Loss(f"it has no time, so {LAYOUT} leaves it out", stream)
         return
-    about: Mapping[str, str] = contents.about(table.schema.field(TIME))
+    about: Mapping[str, str] = contents.field_metadata(table.schema.field(TIME))
     if "made" in about:
         yield Loss(f"how its stamps were made ({about['made']})", stream)
     for field in table.schema:

@@ -83,7 +83,7 @@ class Scratch(io.RawIOBase):
         return self._file
 
 
-def copied(file: IO[bytes]) -> Callable[[Any], None]:
+def copy_to_sink(file: IO[bytes]) -> Callable[[Any], None]:
     """Return a function that copies a file to the one that it is given, and closes it."""
 
     def write(sink: Any) -> None:

@@ -64,20 +64,20 @@ class Channel:
 
     @property
     def signal(self) -> bool:
-        """Whether it is a number that a sensor or a robot measured."""
+        """True for a number that a sensor or a robot measured."""
         return (
             bool(self.stream) and self.number and self.type != "bool" and self.quantity not in CLOCKS and not self.truth
         )
 
 
-def synchronized(rate_hz: float | None, master: str) -> dict[str, dict[str, Any]]:
+def synchronize_stage(rate_hz: float | None, master: str) -> dict[str, dict[str, Any]]:
     """Return the stage that gives recordings one rate, with its params; none without a rate."""
     if rate_hz is None:
         return {}
     return {SYNCHRONIZE: {"rate_hz": rate_hz, **({"master": master} if master else {})}}
 
 
-def table(recording: Recording) -> pa.Table:
+def synchronized_table(recording: Recording) -> pa.Table:
     """Return the table of a synchronized recording. Raises `UsageError` for one that is not."""
     if set(recording.streams) != {""} or GRID not in recording.attributes:
         raise UsageError(
@@ -87,20 +87,20 @@ def table(recording: Recording) -> pa.Table:
     return recording.table()
 
 
-def columns(described: Contents, *, common: bool) -> tuple[list[str], Contents]:
+def frame_columns(described: Contents, *, common: bool) -> tuple[list[str], Contents]:
     """Return the columns of the frames, and ``described`` with the columns that are left out among its losses.
 
     Recordings whose columns differ are refused, or, where ``common``, those that all have are kept. Raises `UsageError`.
     """
     (stream,) = described.streams.values()
-    if not stream.others:
+    if not stream.differing:
         return list(stream.shared), described
     if not common:
         missing = [column.name for column in stream.columns if column.name not in stream.shared]
         difference = f"lacks {listed(missing, 3)}" if missing else "has more columns than"
         raise UsageError(
-            f"Recording {stream.others[0]} {difference}{', unlike' if missing else ''} the first one "
-            f"({len(stream.others)} of {len(stream.recordings)} recordings differ), and the format has the same in all. "
+            f"Recording {stream.differing[0]} {difference}{', unlike' if missing else ''} the first one "
+            f"({len(stream.differing)} of {len(stream.recordings)} recordings differ), and the format has the same in all. "
             f"Export recordings of one rig at a time, or give --common to leave out what not all of them have."
         )
     uncommon = [plain(name) for name in stream.all_columns if name not in stream.shared]
@@ -108,7 +108,7 @@ def columns(described: Contents, *, common: bool) -> tuple[list[str], Contents]:
     return list(stream.shared), replace(described, losses={**described.losses, sentence: list(stream.recordings)})
 
 
-def without_frames(described: Contents, recordings: Dataset, originals: Dataset, retained: str = "") -> Contents:
+def add_frame_losses(described: Contents, recordings: Dataset, originals: Dataset, retained: str = "") -> Contents:
     """Return ``described`` with the streams and columns that the frames lack among its losses.
 
     ``originals`` are the recordings before this export synchronized them; ``retained`` ends each sentence.
@@ -124,9 +124,9 @@ def without_frames(described: Contents, recordings: Dataset, originals: Dataset,
         carried = [(channel.stream, channel.short) for channel in channels(recording.columns())]
         carried += [(stream, TIME) for stream in original.streams]
         losses += [
-            (recording.name, loss) for loss in contents.unwritten(columns, carried, reason=_NO_FRAMES + retained)
+            (recording.name, loss) for loss in contents.unwritten_losses(columns, carried, reason=_NO_FRAMES + retained)
         ]
-    return replace(described, losses={**described.losses, **contents.sentences(losses)})
+    return replace(described, losses={**described.losses, **contents.loss_sentences(losses)})
 
 
 def channels(table: pa.Table | Columns) -> list[Channel]:
@@ -134,33 +134,39 @@ def channels(table: pa.Table | Columns) -> list[Channel]:
     result = []
     for field in table.schema:
         if field.name != TIME:
-            metadata = contents.about(field)
+            metadata = contents.field_metadata(field)
             described = (metadata.get("stream", ""), metadata.get("quantity", ""), metadata.get("unit", ""))
             result.append(Channel(field.name, *described, str(field.type)))
     return result
 
 
-def state_of(every: Sequence[Channel], streams: Sequence[str]) -> list[Channel]:
+def state_channels(all_channels: Sequence[Channel], streams: Sequence[str]) -> list[Channel]:
     """Return the channels of the robot's state: of these streams, or of all that have joints or a pose.
 
     Raises `UsageError` for a stream that is not there.
     """
-    there = list(dict.fromkeys(one.stream for one in every if one.stream))
+    streams_present = list(dict.fromkeys(channel.stream for channel in all_channels if channel.stream))
     for name in streams:
-        if name not in there:
-            raise UsageError(f"There is no stream {plain(name)} in these frames; there are {listed(there)}.")
-    robots = streams or [one for one in there if any(c.stream == one and c.quantity in ROBOT for c in every)]
-    return [one for one in every if one.stream in robots and one.signal and not one.quantity.startswith(TARGETS)]
+        if name not in streams_present:
+            raise UsageError(f"There is no stream {plain(name)} in these frames; there are {listed(streams_present)}.")
+    robots = streams or [
+        channel for channel in streams_present if any(c.stream == channel and c.quantity in ROBOT for c in all_channels)
+    ]
+    return [
+        channel
+        for channel in all_channels
+        if channel.stream in robots and channel.signal and not channel.quantity.startswith(TARGETS)
+    ]
 
 
-def action_of(table: pa.Table, every: Sequence[Channel], stream: str) -> tuple[list[Channel], AnyArray]:
+def actions(table: pa.Table, all_channels: Sequence[Channel], stream: str) -> tuple[list[Channel], AnyArray]:
     """Return the channels of the actions and their values (time, channel), float32.
 
     These are the targets that ``stream`` recorded, at the same frame; without targets its measured state one frame later,
     where the last frame repeats its own. Raises `UsageError` for a stream that is not there.
     """
-    targets = [one for one in every if one.stream == stream and one.quantity.startswith(TARGETS)]
-    chosen = targets or state_of(every, [stream])
+    targets = [channel for channel in all_channels if channel.stream == stream and channel.quantity.startswith(TARGETS)]
+    chosen = targets or state_channels(all_channels, [stream])
     values = matrix(table, chosen, np.dtype(np.float32))
     return chosen, values if targets else np.concatenate([values[1:], values[-1:]])
 
@@ -168,25 +174,25 @@ def action_of(table: pa.Table, every: Sequence[Channel], stream: str) -> tuple[l
 def matrix(table: pa.Table, chosen: Sequence[Channel], kind: np.dtype[np.generic] | None = None) -> AnyArray:
     """Return channels as one array (time, channel), of their common type or of ``kind``."""
     with np.errstate(over="ignore"):
-        made = np.column_stack([table.column(one.name).to_numpy() for one in chosen])
-        return made if kind is None else made.astype(kind)
+        values = np.column_stack([table.column(channel.name).to_numpy() for channel in chosen])
+        return values if kind is None else values.astype(kind)
 
 
-def rounded(table: pa.Table, chosen: Sequence[Channel]) -> list[Channel]:
+def rounded_channels(table: pa.Table, chosen: Sequence[Channel]) -> list[Channel]:
     """Return the channels that float32 does not hold exactly."""
-    found = []
-    for one in chosen:
-        values = table.column(one.name).to_numpy()
+    lossy = []
+    for channel in chosen:
+        values = table.column(channel.name).to_numpy()
         with np.errstate(over="ignore"):
             back = values.astype(np.float32).astype(values.dtype)
         if not np.array_equal(values, back, equal_nan=values.dtype.kind == "f"):
-            found.append(one)
-    return found
+            lossy.append(channel)
+    return lossy
 
 
-def rate_hz(recordings: Sequence[Recording]) -> float:
+def common_rate_hz(recordings: Sequence[Recording]) -> float:
     """Return the rate that all recordings share. Raises `UsageError` where they have several."""
-    rates = sorted({_rate(one) for one in recordings})
+    rates = sorted({_rate(recording) for recording in recordings})
     if len(rates) > 1:
         raise UsageError(
             f"The recordings have rates of {listed([f'{rate:g}' for rate in rates], 4)} Hz, and the format has one. Give "

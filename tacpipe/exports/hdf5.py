@@ -17,8 +17,8 @@ from typing import IO, TYPE_CHECKING, Any, Literal
 
 from tacpipe.errors import UsageError
 from tacpipe.exports import contents, readme
-from tacpipe.exports.contents import TIME, Loss, Name, shown
-from tacpipe.exports.files import Files, Scratch, copied
+from tacpipe.exports.contents import TIME, ColumnName, Loss, stream_label
+from tacpipe.exports.files import Files, Scratch, copy_to_sink
 from tacpipe.plugins.constraints import Rate
 from tacpipe.plugins.stage import ALL, Attribute, RecordingName, RecordingOutput, Result, stage
 from tacpipe.printable import listed
@@ -37,9 +37,9 @@ if TYPE_CHECKING:
 DEMOS = "demos.hdf5"
 MASKS = {"train": "train", "val": "valid", "test": "test"}  # role: name that robomimic has for it
 EXTRA = "tacpipe"  # group of a demonstration with what no policy may read
-VERSION = ("v110", "v110")  # of HDF5, from 2016: many small columns take half of what they take in older ones
+VERSION = ("v110", "v110")  # HDF5 of 2016 stores many small columns in half the space of older versions
 CHUNK_ROWS = 1 << 16
-LEVEL = 4  # of gzip; higher ones take twice the time for 1 %
+LEVEL = 4  # gzip; higher levels take twice the time for 1 %
 _STREAMS = f"""
 One HDF5 file a recording: the group `STREAM` has a dataset a column; `{TIME}` is the time in nanoseconds of UTC.
 Attributes of a dataset are its unit and quantity, attributes of the file the labels:
@@ -84,7 +84,7 @@ def first(params: Params) -> Mapping[str, Mapping[str, Any]]:
     """Return the stage that recordings go through first, where a rate is given."""
     from tacpipe.exports import frames
 
-    return frames.synchronized(params.rate_hz, params.master)
+    return frames.synchronize_stage(params.rate_hz, params.master)
 
 
 @stage(version=2, reads=ALL)
@@ -95,10 +95,10 @@ def part(params: Params, recording: Recording, name: RecordingName) -> Result:
 
         return Result({"": RecordingOutput(arrays.describe(recording))})
     losses: list[Loss] = []
-    columns: list[Name] = []
+    columns: list[ColumnName] = []
     content = _recording(recording, losses, columns)
     tables = contents.part(recording, losses, columns)
-    return Result({"": RecordingOutput(tables)}, written={f"{name}.h5": copied(content)})
+    return Result({"": RecordingOutput(tables)}, written={f"{name}.h5": copy_to_sink(content)})
 
 
 @stage(version=2, part=part, first=first)
@@ -110,19 +110,19 @@ def hdf5(params: Params, recordings: Dataset, parts: Parts, originals: Dataset, 
 
     Example: tacpipe export hdf5 data/recordings -o exports/hdf5
     """
-    described = contents.of_parts(parts)
-    written: dict[str, Callable[[Any], object]] = {}
+    described = contents.contents_from_parts(parts)
+    writers: dict[str, Callable[[Any], object]] = {}
     opening, notes = _STREAMS, []
     if params.structure == "robomimic":
         from tacpipe.exports import frames
 
         roles = {recording: role for (recording, _), role in (split or {}).items()}
-        columns, described = frames.columns(described, common=params.common)
-        described = frames.without_frames(described, recordings, originals)
+        columns, described = frames.frame_columns(described, common=params.common)
+        described = frames.add_frame_losses(described, recordings, originals)
         losses: list[tuple[str, Loss]] = []
         content = _demos(params, recordings, columns, roles, losses)
-        described = replace(described, losses={**described.losses, **contents.sentences(losses)})
-        opening, written[DEMOS] = _DEMOS, copied(content)
+        described = replace(described, losses={**described.losses, **contents.loss_sentences(losses)})
+        opening, writers[DEMOS] = _DEMOS, copy_to_sink(content)
         missing = [recording.name for recording in recordings if roles and recording.name not in roles]
         notes += (
             [f"{len(missing)} recordings have no role in the split and are in no mask: {listed(missing)}"]
@@ -131,12 +131,12 @@ def hdf5(params: Params, recordings: Dataset, parts: Parts, originals: Dataset, 
         )
     elif split:
         raise UsageError("split belongs to --structure robomimic; files of single recordings have no masks.")
-    text = readme.text("Tactile recordings as HDF5", opening, recordings, described)
-    notes += readme.notes(recordings, described)
-    return Result(files=Files({readme.NAME: text}), notes=notes, written=written)
+    text = readme.readme_text("Tactile recordings as HDF5", opening, recordings, described)
+    notes += readme.loss_notes(recordings, described)
+    return Result(files=Files({readme.NAME: text}), notes=notes, written=writers)
 
 
-def _recording(recording: Recording, losses: list[Loss], columns: list[Name]) -> IO[bytes]:
+def _recording(recording: Recording, losses: list[Loss], columns: list[ColumnName]) -> IO[bytes]:
     """Return a temporary file with a recording, as HDF5 goes back and forth in what it writes.
 
     What it does not carry is added to ``losses``, what it carries to ``columns``.
@@ -147,7 +147,7 @@ def _recording(recording: Recording, losses: list[Loss], columns: list[Name]) ->
     with h5py.File(sink, "w", track_order=True, libver=VERSION) as file:
         losses += _attributes(file, recording.attributes)
         for stream in recording.streams:
-            group = file.create_group(shown(stream), track_order=True)
+            group = file.create_group(stream_label(stream), track_order=True)
             table = recording.columns(stream)
             for field in table.schema:
                 losses += _column(group, field, table.column(field.name), stream)
@@ -182,12 +182,12 @@ def _column(group: h5py.Group, field: pa.Field, column: pa.ChunkedArray, stream:
     elif pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind):
         from tacpipe.exports import ros
 
-        values = ros.numbers(column)
+        values = ros.column_numbers(column)
         dataset = group.create_dataset(field.name, data=values, **_storage(values))
     else:
         yield Loss(f"HDF5 has no type for {kind}", stream, field.name)
         return
-    for key, value in contents.about(field).items():
+    for key, value in contents.field_metadata(field).items():
         dataset.attrs[key] = value
     if column.null_count:
         yield Loss("missing values are written as NaN, 0 or empty text", stream, field.name)
@@ -213,7 +213,7 @@ def _demos(
 
     from tacpipe.exports import arrays, frames
 
-    rate_hz = frames.rate_hz(list(recordings))
+    rate_hz = frames.common_rate_hz(list(recordings))
     masks: dict[str, list[bytes]] = {}
     sink = Scratch()
     with h5py.File(sink, "w", track_order=True, libver=VERSION) as file:
@@ -221,7 +221,7 @@ def _demos(
         total = 0
         for number, recording in enumerate(recordings):
             demo = data.create_group(f"demo_{number}", track_order=True)
-            table = frames.table(recording).select(columns)
+            table = frames.synchronized_table(recording).select(columns)
             for array in arrays.from_table(table, params.actions):
                 dataset = demo.create_dataset(_demo_path(array), data=array.values, **_storage(array.values))
                 dataset.attrs["columns"], dataset.attrs["units"] = list(array.columns), list(array.units)

@@ -14,17 +14,27 @@ import io
 import json
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from tacpipe.channels.masks import GRID
 from tacpipe.errors import UsageError
 from tacpipe.exports import contents, readme
-from tacpipe.exports import lerobot_statistics as statistics
 from tacpipe.exports.contents import TIME, Loss
 from tacpipe.exports.files import Content, Files
-from tacpipe.exports.lerobot_features import ACTION, ORIGINALS, Feature, features
-from tacpipe.plugins.constraints import Names, Rate
+from tacpipe.exports.lerobot_features import (
+    ACTION,
+    ORIGINALS,
+    STATISTICS,
+    STATISTICS_TABLE,
+    Feature,
+    Params,
+    column_statistics,
+    dataset_statistics,
+    episode_statistics,
+    features_from_table,
+    index_statistics,
+)
 from tacpipe.plugins.stage import RecordingOutput, Result, stage
 from tacpipe.printable import listed, plain
 
@@ -38,9 +48,8 @@ if TYPE_CHECKING:
 
 VERSION = "v3.0"
 RECORDING, ATTRIBUTES = "tacpipe/recording", "tacpipe/attributes"  # columns of the episodes; the second is JSON
-CHUNK_FILES, FILE_BYTES = 1000, 100 << 20  # of LeRobot's own writer
+CHUNK_FILES, FILE_BYTES = 1000, 100 << 20  # LeRobot's own limits
 _PLACE = re.compile(r"\{([^{}]+)\}")
-_NUMPY = {"float": "float32", "double": "float64", "halffloat": "float16"}  # of arrow, where numpy's name differs
 _OPENING = """
 A LeRobot dataset, v3.0:
 
@@ -57,26 +66,11 @@ quantity of each column.
 """
 
 
-@dataclass(frozen=True)
-class Params:
-    """What the frames are made of."""
-
-    rate_hz: Rate | None = None  # synchronize to this rate first; without it the recordings must be synchronized
-    master: str = ""  # stream whose samples start and end the frames; without it the first tactile one
-    state: Names = ""  # streams of observation.state; without it those with joints or a pose
-    tactile_in_state: bool = False  # append tactile channels to observation.state, for policies that read nothing else
-    actions: str = ""  # stream of the actions: its targets, else its state one frame later
-    common: bool = False  # leave out columns that not all recordings have
-    task: str = "touch"  # text of the task, with labels in braces
-    robot_type: str = ""  # what info.json states as the robot
-    originals: bool = True  # put the shards as they were given under tacpipe/
-
-
 def first(params: Params) -> Mapping[str, Mapping[str, Any]]:
     """Return the stage that recordings go through first, where a rate is given."""
     from tacpipe.exports import frames
 
-    return frames.synchronized(params.rate_hz, params.master)
+    return frames.synchronize_stage(params.rate_hz, params.master)
 
 
 def shards(params: Params) -> str:
@@ -91,21 +85,21 @@ def part(params: Params, recording: Recording) -> RecordingOutput:
 
     from tacpipe.exports import frames
 
-    table = frames.table(recording)
+    table = frames.synchronized_table(recording)
     losses = list(_losses(params, table, str(recording.attributes[GRID])))
-    params = params if not params.actions or _has(table, params.actions) else replace(params, actions="")
-    frame_features = features(params, table)
+    params = params if not params.actions or _has_stream(table, params.actions) else replace(params, actions="")
+    frame_features = features_from_table(params, table)
     rows = [
         (feature.name == ACTION, column, *values)
         for feature in frame_features
-        for column, values in statistics.by_column(feature)
+        for column, values in column_statistics(feature)
     ]
     columns = list(zip(*rows, strict=True))
-    names = [ACTION, "column", *statistics.STATISTICS]
+    names = [ACTION, "column", *STATISTICS]
     rows_of_statistics = pa.Table.from_arrays([pa.array(column) for column in columns], names=names)
     carried = [("", column) for feature in frame_features for column in feature.columns]
     carried += [("", channel.name) for channel in _without_feature(frames.channels(table))]  # named above
-    return RecordingOutput({**contents.part(recording, losses, carried), statistics.TABLE: rows_of_statistics})
+    return RecordingOutput({**contents.part(recording, losses, carried), STATISTICS_TABLE: rows_of_statistics})
 
 
 @stage(version=2, part=part, first=first, originals=shards)
@@ -119,38 +113,42 @@ def lerobot(params: Params, recordings: Dataset, parts: Parts, originals: Datase
     """
     from tacpipe.exports import frames
 
-    every = list(recordings)
-    fps = frames.rate_hz(every)
-    columns, described = frames.columns(contents.of_parts(parts), common=params.common)
-    described = frames.without_frames(described, recordings, originals, _retained(params))
-    made = features(params, frames.table(every[0]).select(columns).slice(0, 2))
-    tasks = _tasks(params, every)
-    lengths = {one.name: _rows(parts, one.name) for one in every}
-    bundles = list(_bundles(every, lengths, sum(one.values[:1].nbytes for one in made)))
+    all_recordings = list(recordings)
+    fps = frames.common_rate_hz(all_recordings)
+    columns, described = frames.frame_columns(contents.contents_from_parts(parts), common=params.common)
+    described = frames.add_frame_losses(described, recordings, originals, _shards_note(params))
+    frame_features = features_from_table(
+        params, frames.synchronized_table(all_recordings[0]).select(columns).slice(0, 2)
+    )
+    tasks = _tasks(params, all_recordings)
+    lengths = {recording.name: _row_count(parts, recording.name) for recording in all_recordings}
+    bundles = list(
+        _group_by_size(all_recordings, lengths, sum(recording.values[:1].nbytes for recording in frame_features))
+    )
     files: dict[str, Content] = {}
     starts: dict[str, int] = {}
     places: dict[str, tuple[int, int]] = {}
     number = start = 0
     for index, bundle in enumerate(bundles):
         chunk, file = divmod(index, CHUNK_FILES)
-        for one in bundle:
-            starts[one.name], places[one.name] = start, (chunk, file)
-            start += lengths[one.name]
-        files[f"data/chunk-{chunk:03d}/file-{file:03d}.parquet"] = _data(
+        for recording in bundle:
+            starts[recording.name], places[recording.name] = start, (chunk, file)
+            start += lengths[recording.name]
+        files[f"data/chunk-{chunk:03d}/file-{file:03d}.parquet"] = _data_file(
             params, columns, bundle, number, starts, tasks, fps
         )
         number += len(bundle)
     files["meta/episodes/chunk-000/file-000.parquet"] = _episodes(
-        made, every, parts, originals, starts, places, lengths, tasks, fps
+        frame_features, all_recordings, parts, originals, starts, places, lengths, tasks, fps
     )
     files["meta/tasks.parquet"] = _task_table(tasks)
-    files["meta/info.json"] = _json(_info(params, made, lengths, tasks, fps))
+    files["meta/info.json"] = _json_bytes(_info(params, frame_features, lengths, tasks, fps))
     order = _task_order(tasks)
     indices = {name: order[task] for name, task in tasks.items()}
-    files["meta/stats.json"] = _json(statistics.of_all(parts, made, starts, lengths, indices, fps))
-    files["meta/tacpipe.json"] = _json(_about(made, described))
-    files[readme.NAME] = readme.text("Tactile recordings as a LeRobot dataset", _OPENING, recordings, described)
-    return Result(files=Files(files), notes=readme.notes(recordings, described))
+    files["meta/stats.json"] = _json_bytes(dataset_statistics(parts, frame_features, starts, lengths, indices, fps))
+    files["meta/tacpipe.json"] = _json_bytes(_feature_metadata(frame_features, described))
+    files[readme.NAME] = readme.readme_text("Tactile recordings as a LeRobot dataset", _OPENING, recordings, described)
+    return Result(files=Files(files), notes=readme.loss_notes(recordings, described))
 
 
 def _losses(params: Params, table: pa.Table, grid: str) -> Iterator[Loss]:
@@ -158,14 +156,14 @@ def _losses(params: Params, table: pa.Table, grid: str) -> Iterator[Loss]:
     from tacpipe.exports import frames
 
     channels = frames.channels(table)
-    place = _retained(params)
+    place = _shards_note(params)
     yield Loss(f"rates of the streams and what happened between frames: one frame rate for all{place}")
     if not params.originals:
         yield Loss("stream events, and types and units of the recorded streams (with --originals they are carried)")
     if grid != "uniform":
         times = f"{ORIGINALS}.{TIME} has the times"
         yield Loss(f"distances between frames: timestamp is frame / fps, and the grid is {grid}; {times}")
-    lossy = frames.rounded(table, [channel for channel in channels if channel.signal])
+    lossy = frames.rounded_channels(table, [channel for channel in channels if channel.signal])
     for stream in dict.fromkeys(channel.stream for channel in lossy):
         yield Loss(f"digits beyond float32{place}", stream)
     for channel in _without_feature(channels):
@@ -177,54 +175,61 @@ def _without_feature(channels: Sequence[Channel]) -> list[Channel]:
     return [channel for channel in channels if not channel.number and channel.type != "string"]
 
 
-def _retained(params: Params) -> str:
+def _shards_note(params: Params) -> str:
     """Return the end of a loss where the recorded shards are part of the export."""
     return f"; the shards under {ORIGINALS}/ keep it" if params.originals else ""
 
 
-def _has(table: pa.Table, stream: str) -> bool:
+def _has_stream(table: pa.Table, stream: str) -> bool:
     from tacpipe.exports import frames
 
-    return any(one.stream == stream for one in frames.channels(table))
+    return any(channel.stream == stream for channel in frames.channels(table))
 
 
-def _rows(parts: Dataset, name: str) -> int:
+def _row_count(parts: Dataset, name: str) -> int:
     return int(parts[name].table(contents.STREAMS)["rows"][0].as_py())
 
 
-def _tasks(params: Params, every: Sequence[Recording]) -> dict[str, str]:
+def _tasks(params: Params, recordings: Sequence[Recording]) -> dict[str, str]:
     """Return the task of each recording. Raises `UsageError` for a label that a recording does not have."""
-    found = {}
-    for one in every:
+    tasks = {}
+    for recording in recordings:
         for label in _PLACE.findall(params.task):
-            if one.attributes.get(label) is None:
+            if recording.attributes.get(label) is None:
                 raise UsageError(
-                    f"The task names {{{plain(label)}}}, and recording {one.name} has no such label; it has "
-                    f"{listed(one.attributes)}."
+                    f"The task names {{{plain(label)}}}, and recording {recording.name} has no such label; it has "
+                    f"{listed(recording.attributes)}."
                 )
-        found[one.name] = _PLACE.sub(lambda match, one=one: str(one.attributes[match[1]]), params.task)  # type: ignore[misc]
-    return found
+        tasks[recording.name] = _fill_task(params.task, recording.attributes)
+    return tasks
 
 
-def _bundles(every: Sequence[Recording], lengths: Mapping[str, int], row_bytes: int) -> Iterator[list[Recording]]:
+def _fill_task(task: str, labels: Mapping[str, Any]) -> str:
+    """Return the text of a task with the values of its labels."""
+    return _PLACE.sub(lambda match: str(labels[match[1]]), task)
+
+
+def _group_by_size(
+    recordings: Sequence[Recording], lengths: Mapping[str, int], row_bytes: int
+) -> Iterator[list[Recording]]:
     """Yield the recordings of each data file."""
     bundle: list[Recording] = []
     size = 0
-    for one in every:
-        bytes_ = lengths[one.name] * row_bytes
+    for recording in recordings:
+        bytes_ = lengths[recording.name] * row_bytes
         if bundle and size + bytes_ > FILE_BYTES:
             yield bundle
             bundle, size = [], 0
-        bundle.append(one)
+        bundle.append(recording)
         size += bytes_
     yield bundle
 
 
-def _data(
+def _data_file(
     params: Params,
     columns: Sequence[str],
     bundle: Sequence[Recording],
-    number: int,
+    first_episode: int,
     starts: Mapping[str, int],
     tasks: Mapping[str, str],
     fps: float,
@@ -240,10 +245,12 @@ def _data(
         order = _task_order(tasks)
         sink = pa.BufferOutputStream()
         writer = None
-        for episode, one in enumerate(bundle, start=number):
-            made = features(params, frames.table(one).select(columns))
-            arrays = {feature.name: _arrow(feature) for feature in made}
-            arrays |= _index(len(made[0].values), episode, starts[one.name], order[tasks[one.name]], fps)
+        for episode, recording in enumerate(bundle, start=first_episode):
+            frame_features = features_from_table(params, frames.synchronized_table(recording).select(columns))
+            arrays = {feature.name: _feature_array(feature) for feature in frame_features}
+            arrays |= _index_columns(
+                len(frame_features[0].values), episode, starts[recording.name], order[tasks[recording.name]], fps
+            )
             table = pa.table(arrays)
             writer = writer or pq.ParquetWriter(sink, table.schema, compression="zstd")
             writer.write_table(table, row_group_size=max(1, table.num_rows))
@@ -254,7 +261,7 @@ def _data(
     return content
 
 
-def _index(rows: int, episode: int, start: int, task: int, fps: float) -> dict[str, pa.Array]:
+def _index_columns(rows: int, episode: int, start: int, task: int, fps: float) -> dict[str, pa.Array]:
     import numpy as np
     import pyarrow as pa
 
@@ -268,7 +275,7 @@ def _index(rows: int, episode: int, start: int, task: int, fps: float) -> dict[s
     }
 
 
-def _arrow(feature: Feature) -> pa.Array:
+def _feature_array(feature: Feature) -> pa.Array:
     import pyarrow as pa
 
     values = feature.values
@@ -292,8 +299,8 @@ def _task_table(tasks: Mapping[str, str]) -> bytes:
 
 
 def _episodes(
-    made: Sequence[Feature],
-    every: Sequence[Recording],
+    frame_features: Sequence[Feature],
+    recordings: Sequence[Recording],
     parts: Dataset,
     originals: Dataset,
     starts: Mapping[str, int],
@@ -307,23 +314,25 @@ def _episodes(
 
     order = _task_order(tasks)
     rows = []
-    for episode, one in enumerate(every):
-        chunk, file = places[one.name]
+    for episode, recording in enumerate(recordings):
+        chunk, file = places[recording.name]
         row: dict[str, Any] = {
             "episode_index": episode,
-            "tasks": [tasks[one.name]],
-            "length": lengths[one.name],
+            "tasks": [tasks[recording.name]],
+            "length": lengths[recording.name],
             "data/chunk_index": chunk,
             "data/file_index": file,
-            "dataset_from_index": starts[one.name],
-            "dataset_to_index": starts[one.name] + lengths[one.name],
+            "dataset_from_index": starts[recording.name],
+            "dataset_to_index": starts[recording.name] + lengths[recording.name],
             "meta/episodes/chunk_index": 0,
             "meta/episodes/file_index": 0,
-            RECORDING: one.name,
-            ATTRIBUTES: json.dumps(dict(originals[one.name].attributes), sort_keys=True),
+            RECORDING: recording.name,
+            ATTRIBUTES: json.dumps(dict(originals[recording.name].attributes), sort_keys=True),
         }
-        stats = statistics.of_episode(made, parts[one.name], lengths[one.name])
-        stats |= statistics.of_index(lengths[one.name], episode, starts[one.name], order[tasks[one.name]], fps)
+        stats = episode_statistics(frame_features, parts[recording.name], lengths[recording.name])
+        stats |= index_statistics(
+            lengths[recording.name], episode, starts[recording.name], order[tasks[recording.name]], fps
+        )
         row |= {f"stats/{name}/{key}": value for name, values in stats.items() for key, value in values.items()}
         rows.append(row)
     sink = pa.BufferOutputStream()
@@ -332,11 +341,15 @@ def _episodes(
 
 
 def _info(
-    params: Params, made: Sequence[Feature], lengths: Mapping[str, int], tasks: Mapping[str, str], fps: float
+    params: Params, frame_features: Sequence[Feature], lengths: Mapping[str, int], tasks: Mapping[str, str], fps: float
 ) -> dict[str, Any]:
     described: dict[str, Any] = {
-        one.name: {"dtype": one.dtype, "shape": one.shape, "names": list(one.names) if one.shape != [1] else None}
-        for one in made
+        feature.name: {
+            "dtype": feature.dtype,
+            "shape": feature.shape,
+            "names": list(feature.names) if feature.shape != [1] else None,
+        }
+        for feature in frame_features
     }
     described["timestamp"] = {"dtype": "float32", "shape": [1], "names": None}
     for name in ("frame_index", "episode_index", "index", "task_index"):
@@ -358,20 +371,24 @@ def _info(
     }
 
 
-def _about(made: Sequence[Feature], found: contents.Contents) -> dict[str, Any]:
+def _feature_metadata(frame_features: Sequence[Feature], described: contents.Contents) -> dict[str, Any]:
     """Return units and quantities of each feature, and the columns of the synchronized table."""
     return {
         "features": {
-            one.name: {"columns": list(one.columns), "units": list(one.units), "quantities": list(one.quantities)}
-            for one in made
+            feature.name: {
+                "columns": list(feature.columns),
+                "units": list(feature.units),
+                "quantities": list(feature.quantities),
+            }
+            for feature in frame_features
         },
         "columns": {
             column.name: {"type": column.type, **column.about}
-            for stream in found.streams.values()
+            for stream in described.streams.values()
             for column in stream.columns
         },
     }
 
 
-def _json(value: Any) -> bytes:
+def _json_bytes(value: Any) -> bytes:
     return json.dumps(value, indent=4, ensure_ascii=False).encode() + b"\n"

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from tacpipe.exports import contents, readme
-from tacpipe.exports.contents import TIME, Loss, Name
+from tacpipe.exports.contents import TIME, ColumnName, Loss
 from tacpipe.exports.files import Files
 from tacpipe.plugins.stage import ALL, RecordingName, RecordingOutput, Result, stage
 
@@ -48,7 +48,7 @@ reads the files back with `tacpipe ingest mcap`.
 
 @dataclass(frozen=True)
 class Params:
-    """What is written in addition to the streams."""
+    """Messages in addition to the streams."""
 
     # poses, wrenches, twists, joint and tactile states and encoded images as messages of these types too
     usual_messages: bool = True
@@ -73,9 +73,9 @@ def mcap(params: Params, recordings: Dataset, parts: Parts) -> Result:
 
     Example: tacpipe export mcap data/recordings -o exports/mcap
     """
-    found = contents.of_parts(parts)
-    text = readme.text("Tactile recordings as MCAP", _OPENING, recordings, found)
-    return Result(files=Files({readme.NAME: text}), notes=readme.notes(recordings, found))
+    described = contents.contents_from_parts(parts)
+    text = readme.readme_text("Tactile recordings as MCAP", _OPENING, recordings, described)
+    return Result(files=Files({readme.NAME: text}), notes=readme.loss_notes(recordings, described))
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class _Stream:
 
     topics: Callable[[pa.Table], Sequence[Topic]]
     name: str
-    columns: Sequence[Name]  # carried by the messages
+    columns: Sequence[ColumnName]  # carried by the messages
     ordered: bool  # True: the rows are in the order of time
 
 
@@ -96,8 +96,8 @@ def _write(recording: Recording, name: str, streams: Sequence[_Stream], sink: An
     writer.start(profile="ros2", library="tacpipe")
     record = {"recording": name, "attributes": json.dumps(dict(recording.attributes), sort_keys=True)}
     writer.add_metadata(RECORD, record)
-    messages = [one for stream in streams for one in _messages(writer, recording, stream)]
-    for number, (log_ns, channel, content) in enumerate(heapq.merge(*messages, key=lambda one: one[0])):
+    messages = [message for stream in streams for message in _messages(writer, recording, stream)]
+    for number, (log_ns, channel, content) in enumerate(heapq.merge(*messages, key=lambda message: message[0])):
         writer.add_message(channel, log_ns, content, log_ns, number)
     writer.finish()  # type: ignore[no-untyped-call]
 
@@ -116,7 +116,7 @@ def _streams(params: Params, recording: Recording, losses: list[Loss]) -> Iterat
                 columns = [(stream, name) for name in ros.cloud_columns(table.schema)]
                 yield _Stream(functools.partial(_cloud, stream, min(starts)), stream, columns, ordered=False)
                 losses.append(Loss("it has no time: its one message is stamped with the recording's start", stream))
-                losses += contents.unwritten([(stream, name) for name in table.column_names], columns)
+                losses += contents.unwritten_losses([(stream, name) for name in table.column_names], columns)
             else:
                 losses.append(Loss("it has no time, and a message needs one", stream))
             continue
@@ -148,7 +148,7 @@ def _cloud(stream: str, start_ns: int, table: pa.Table) -> list[Topic]:
     """Return the topic of a cloud of points, whose one message has all rows."""
     from tacpipe.exports import ros
 
-    return [ros.cloud(stream, table, start_ns)]
+    return [ros.cloud_topic(stream, table, start_ns)]
 
 
 def _topics(params: Params, stream: str, images: Sequence[str], table: pa.Table) -> list[Topic]:
@@ -176,18 +176,19 @@ def _messages(writer: Writer, recording: Recording, stream: _Stream) -> list[Ite
     tables = stored.batches() if stream.ordered else iter([recording.table(stream.name)])
     head = next(tables, stored.schema.empty_table())
     first = stream.topics(head)
-    blocks = _shared(itertools.chain([first], map(stream.topics, tables)), len(first))
+    blocks = _share_values(itertools.chain([first], map(stream.topics, tables)), len(first))
     channels = []
     for topic in first:
         schema = writer.register_schema(topic.type, "ros2msg", topic.definition.encode())
         metadata = {"tacpipe": json.dumps(topic.metadata, sort_keys=True)}
         channels.append(writer.register_channel(topic.name, "cdr", schema, metadata))
     return [
-        _of_topic(number, channel, mine) for number, (channel, mine) in enumerate(zip(channels, blocks, strict=True))
+        _topic_messages(number, channel, mine)
+        for number, (channel, mine) in enumerate(zip(channels, blocks, strict=True))
     ]
 
 
-def _shared(values: Iterator[Any], readers: int) -> list[Iterator[Any]]:
+def _share_values(values: Iterator[Any], readers: int) -> list[Iterator[Any]]:
     """Return iterators over the same values: one stays until all have had it (that of itertools keeps 57 together)."""
     waiting: list[deque[Any]] = [deque() for _ in range(readers)]
 
@@ -198,28 +199,28 @@ def _shared(values: Iterator[Any], readers: int) -> list[Iterator[Any]]:
                     value = next(values)
                 except StopIteration:
                     return
-                for one in waiting:
-                    one.append(value)
+                for queue in waiting:
+                    queue.append(value)
                 del value
             yield mine.popleft()
 
     return [read(mine) for mine in waiting]
 
 
-def _of_topic(number: int, channel: int, blocks: Iterable[Sequence[Topic]]) -> Iterator[tuple[int, int, bytes]]:
+def _topic_messages(number: int, channel: int, blocks: Iterable[Sequence[Topic]]) -> Iterator[tuple[int, int, bytes]]:
     """Yield log time, channel and content of the messages of the topic of this number."""
     import numpy as np
 
-    from tacpipe.exports import cdr
+    from tacpipe.exports import ros
 
     for topics in blocks:
         topic = topics[number]
         t_ns = topic.t_ns
-        stamps, messages = t_ns.tolist(), cdr.packed(topic.parts, len(t_ns))
+        stamps, messages = t_ns.tolist(), ros.pack_messages(topic.parts, len(t_ns))
         del topics, topic
         if np.any(np.diff(t_ns) < 0):  # events come stream by stream
-            every = list(messages)
-            yield from ((stamps[row], channel, every[row]) for row in np.argsort(t_ns, kind="stable").tolist())
+            all_messages = list(messages)
+            yield from ((stamps[row], channel, all_messages[row]) for row in np.argsort(t_ns, kind="stable").tolist())
         else:
             yield from zip(stamps, (channel for _ in stamps), messages, strict=True)
 

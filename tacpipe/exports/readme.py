@@ -8,18 +8,18 @@ from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
-from tacpipe.exports.contents import Contents, shown
+from tacpipe.exports.contents import Contents, stream_label
 from tacpipe.printable import listed, plain
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
 
 NAME = "README.md"
-_VALUES = 8  # of an attribute that are listed
+_VALUES = 8  # listed values per attribute
 _SHOWN = 3  # recordings that a line names
 
 
-def text(title: str, opening: str, recordings: Dataset, contents: Contents) -> bytes:
+def readme_text(title: str, opening: str, recordings: Dataset, contents: Contents) -> bytes:
     """Return the README as Markdown: ``title``, how to open the export (Markdown), and the sections of `sections`."""
     return "\n\n".join([f"# {title}", opening.strip(), *sections(recordings, contents)]).encode() + b"\n"
 
@@ -29,9 +29,9 @@ def sections(recordings: Dataset, contents: Contents) -> list[str]:
     return [_contents(recordings, contents), _streams(contents), _losses(recordings, contents), provenance(recordings)]
 
 
-def notes(recordings: Dataset, contents: Contents) -> list[str]:
+def loss_notes(recordings: Dataset, contents: Contents) -> list[str]:
     """Return what the format does not carry, a sentence each, for the command's output."""
-    return [f"not carried: {what}{_of(names, recordings)}" for what, names in contents.losses.items()]
+    return [f"not carried: {loss}{_affected_recordings(names, recordings)}" for loss, names in contents.losses.items()]
 
 
 def provenance(recordings: Dataset) -> str:
@@ -39,7 +39,7 @@ def provenance(recordings: Dataset) -> str:
     source = recordings.source
     steps = [step for step in source.chain if step["stage"] != source.stage]
     steps.append({"stage": source.stage, "version": source.version, "params": source.params})
-    rows = [f"| `{one['stage']}` | {one['version']} | {_params(one['params'])} |" for one in steps]
+    rows = [f"| `{stage['stage']}` | {stage['version']} | {_params(stage['params'])} |" for stage in steps]
     return "\n".join(
         [
             "## Where it comes from",
@@ -67,12 +67,12 @@ def _contents(recordings: Dataset, contents: Contents) -> str:
 
 
 def _labels(recordings: Dataset) -> Mapping[str, Counter[str]]:
-    found: dict[str, Counter[str]] = {}
-    for one in recordings:
-        for name, value in one.attributes.items():
+    counts: dict[str, Counter[str]] = {}
+    for recording in recordings:
+        for name, value in recording.attributes.items():
             if isinstance(value, str | bool) and not name.startswith("gt_"):
-                found.setdefault(name, Counter())[str(value)] += 1
-    return found
+                counts.setdefault(name, Counter())[str(value)] += 1
+    return counts
 
 
 def _streams(contents: Contents) -> str:
@@ -82,25 +82,27 @@ def _streams(contents: Contents) -> str:
         "| stream | recordings | rows | rate (Hz) | columns: quantity (unit) |",
         "| --- | --- | --- | --- | --- |",
     ]
-    for one in contents.streams.values():
-        rates = [f"{rate:g}" for rate in dict.fromkeys(one.rates_hz)]
-        kinds = Counter((column.quantity or "not stated", column.unit or "not stated") for column in one.columns)
+    for stream in contents.streams.values():
+        rates = [f"{rate:g}" for rate in dict.fromkeys(stream.rates_hz)]
+        kinds = Counter((column.quantity or "not stated", column.unit or "not stated") for column in stream.columns)
         about = ", ".join(f"{count} {_cell(quantity)} ({_cell(unit)})" for (quantity, unit), count in kinds.items())
         rate = " to ".join(rates) or "none"
-        lines.append(f"| {_cell(shown(one.name))} | {len(one.recordings)} | {one.rows} | {rate} | {about} |")
+        lines.append(
+            f"| {_cell(stream_label(stream.name))} | {len(stream.recordings)} | {stream.rows} | {rate} | {about} |"
+        )
     return "\n".join(lines)
 
 
 def _losses(recordings: Dataset, contents: Contents) -> str:
-    lines = [f"- {what}{_of(names, recordings)}" for what, names in contents.losses.items()]
+    lines = [f"- {loss}{_affected_recordings(names, recordings)}" for loss, names in contents.losses.items()]
     return "\n".join(
         ["## Not carried", "", *(lines or ["Nothing: values, types, units and labels are all in these files."])]
     )
 
 
-def _of(names: Sequence[str], recordings: Dataset) -> str:
-    whole = len(names) == len(recordings)
-    return "" if whole else f" ({len(names)} of {len(recordings)} recordings: {listed(names, _SHOWN)})"
+def _affected_recordings(names: Sequence[str], recordings: Dataset) -> str:
+    is_everywhere = len(names) == len(recordings)
+    return "" if is_everywhere else f" ({len(names)} of {len(recordings)} recordings: {listed(names, _SHOWN)})"
 
 
 def _params(params: Mapping[str, object]) -> str:

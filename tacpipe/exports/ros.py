@@ -3,13 +3,18 @@
 The message of a stream has one field per column, so values keep their bits. Where columns make up a usual message (joint
 states, a pose, a wrench, a twist, tactile states, an encoded image), that is written too, for programs that read nothing
 else.
+
+Messages are packed in CDR, little endian, for all rows of a stream at once. A message is a sequence of parts: `Constant`
+bytes of each message, `Values` with one number per message, `Texts` of any length. A message without `Texts` has the same
+size in every row, so numpy lays out all of them as one array.
 """
 
 from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Mapping, Sequence
+import struct
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -17,18 +22,131 @@ import numpy as np
 
 from tacpipe.arrays import AnyArray, Int64s
 from tacpipe.channels.schema import AXES, COMPONENTS
-from tacpipe.exports import cdr
-from tacpipe.exports.cdr import Constant, Part, Texts, Values
-from tacpipe.exports.contents import TIME, about, shown
+from tacpipe.exports.contents import TIME, field_metadata, stream_label
 from tacpipe.formats.arrays.columns import picture_encoding
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
+HEADER = b"\x00\x01\x00\x00"  # start of each message: CDR, little endian; positions are counted after it
+NS = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class Constant:
+    """Bytes that each message has, at a multiple of ``align`` bytes."""
+
+    content: bytes
+    align: int = 1
+
+
+@dataclass(frozen=True)
+class Values:
+    """A number of each message, (time,), in the type that it is written in."""
+
+    values: AnyArray
+
+
+@dataclass(frozen=True)
+class Texts:
+    """A text or bytes of each message; texts end with a zero byte."""
+
+    values: Sequence[str] | Sequence[bytes]
+
+
+Part = Constant | Values | Texts
+
+
+def text_part(value: str) -> Constant:
+    """Return a text that each message has."""
+    content = value.encode() + b"\0"
+    return Constant(struct.pack("<I", len(content)) + content, 4)
+
+
+def count_part(number: int) -> Constant:
+    """Return the length of a sequence."""
+    return Constant(struct.pack("<I", number), 4)
+
+
+def header_parts(t_ns: Int64s, frame: str) -> list[Part]:
+    """Return the parts of a std_msgs/Header: the stamp in seconds and nanoseconds, and the frame's name."""
+    seconds, rest_ns = np.divmod(t_ns, NS)
+    return [Values(seconds.astype("<i4")), Values(rest_ns.astype("<u4")), text_part(frame)]
+
+
+def sequence_parts(columns: Iterable[AnyArray], kind: str = "<f8") -> list[Part]:
+    """Return the parts of a sequence of numbers, one a column; ``kind`` is the numpy type of its items."""
+    values = [Values(column.astype(kind)) for column in columns]
+    return [count_part(len(values)), *values]
+
+
+def pack_messages(parts: Sequence[Part], rows: int) -> Iterator[bytes]:
+    """Yield the bytes of each message."""
+    if any(isinstance(part, Texts) for part in parts):
+        yield from _pack_each(parts, rows)
+        return
+    content = _pack_fixed(parts, rows).tobytes()
+    size = len(content) // rows if rows else 0
+    for begin in range(0, len(content), size or 1):
+        yield content[begin : begin + size]
+
+
+def _pack_fixed(parts: Sequence[Part], rows: int) -> AnyArray:
+    """Return all messages as one array of bytes (message, byte)."""
+    places, position = [], 0
+    for part in parts:
+        align, size = _shape(part)
+        position = _align_up(position, align)
+        places.append(position)
+        position += size
+    messages = np.zeros((rows, len(HEADER) + position), dtype=np.uint8)
+    messages[:, : len(HEADER)] = np.frombuffer(HEADER, np.uint8)
+    for part, place in zip(parts, places, strict=True):
+        begin = len(HEADER) + place
+        if isinstance(part, Constant):
+            messages[:, begin : begin + len(part.content)] = np.frombuffer(part.content, np.uint8)
+        elif isinstance(part, Values):
+            wide = np.ascontiguousarray(part.values).view(np.uint8).reshape(rows, part.values.itemsize)
+            messages[:, begin : begin + part.values.itemsize] = wide
+    return messages
+
+
+def _shape(part: Part) -> tuple[int, int]:
+    """Return alignment and size of a part in bytes."""
+    if isinstance(part, Constant):
+        return part.align, len(part.content)
+    assert isinstance(part, Values)
+    return part.values.itemsize, part.values.itemsize
+
+
+def _pack_each(parts: Sequence[Part], rows: int) -> Iterator[bytes]:
+    for row in range(rows):
+        message = bytearray()
+        for part in parts:
+            if isinstance(part, Texts):
+                value = part.values[row]
+                content = value.encode() + b"\0" if isinstance(value, str) else value
+                message += bytes(_align_up(len(message), 4) - len(message)) + struct.pack("<I", len(content)) + content
+                continue
+            align, _ = _shape(part)
+            message += bytes(_align_up(len(message), align) - len(message))
+            message += part.content if isinstance(part, Constant) else part.values[row].tobytes()
+        yield HEADER + bytes(message)
+
+
+def _align_up(position: int, to: int) -> int:
+    """Return the first multiple of ``to`` at or after ``position``.
+
+    >>> _align_up(5, 4), _align_up(8, 8)
+    (8, 8)
+    """
+    return -(-position // to) * to
+
+
 PACKAGE = "tacpipe_msgs"
 POINT, COLOURS = ("x_m", "y_m", "z_m"), ("red", "green", "blue")  # columns of a cloud
 _FLOAT32 = 7  # a constant of sensor_msgs/PointField
-LATEST_S = 2**31 - 1  # of a stamp's seconds, which are int32
+LATEST_S = 2**31 - 1  # largest int32, the type of a stamp's seconds
 TYPES = {  # arrow type to type of a message's field
     **{f"{sign}int{bits}": f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)},
     **{"float": "float32", "double": "float64", "bool": "bool", "string": "string", "binary": "uint8[]"},
@@ -68,7 +186,7 @@ class Topic:
     definition: str
     t_ns: Int64s
     parts: Sequence[Part]
-    metadata: Mapping[str, Any] = field(default_factory=dict)  # of JSON
+    metadata: Mapping[str, Any] = field(default_factory=dict)  # JSON values
 
 
 def stream_topic(stream: str, table: pa.Table) -> Topic:
@@ -82,25 +200,25 @@ def stream_topic(stream: str, table: pa.Table) -> Topic:
     t_ns = table.column(TIME).to_numpy()
     names = [field.name for field in table.schema if field.name != TIME and str(field.type) in TYPES]
     fields = field_names(names)
-    parts: list[Part] = list(cdr.header(t_ns, shown(stream)))
+    parts: list[Part] = list(header_parts(t_ns, stream_label(stream)))
     lines = []
     columns = []
     for name in names:
         column, kind = table.column(name), table.schema.field(name).type
         lines.append(f"{TYPES[str(kind)]} {fields[name]}\n")
         columns.append(
-            {"field": fields[name], "name": name, "type": str(kind), "about": about(table.schema.field(name))}
+            {"field": fields[name], "name": name, "type": str(kind), "about": field_metadata(table.schema.field(name))}
         )
         if pa.types.is_string(kind) or pa.types.is_binary(kind):
             empty: Any = "" if pa.types.is_string(kind) else b""
             parts.append(Texts([empty if value is None else value for value in column.to_pylist()]))
         else:
-            parts.append(Values(numbers(column)))
-    message = f"{PACKAGE}/{_camel(shown(stream))}"
+            parts.append(Values(column_numbers(column)))
+    message = f"{PACKAGE}/{_camel(stream_label(stream))}"
     definitions = {**_DEFINITIONS, message: _HEADER + "".join(lines)}
-    metadata = {"stream": stream, "columns": columns, "time": about(table.schema.field(TIME))}
-    name = f"/{topic_part(shown(stream))}"
-    return Topic(name, _full(message), _definition(message, definitions), t_ns, parts, metadata)
+    metadata = {"stream": stream, "columns": columns, "time": field_metadata(table.schema.field(TIME))}
+    name = f"/{topic_part(stream_label(stream))}"
+    return Topic(name, _full_type(message), _definition(message, definitions), t_ns, parts, metadata)
 
 
 def usual_topics(stream: str, table: pa.Table, images: Sequence[str] = ()) -> list[Topic]:
@@ -109,13 +227,15 @@ def usual_topics(stream: str, table: pa.Table, images: Sequence[str] = ()) -> li
     ``images`` are the columns of encoded images. Rows without an image have no message.
     """
     topics = []
-    top = f"/{topic_part(shown(stream))}"
+    top = f"/{topic_part(stream_label(stream))}"
     t_ns = table.column(TIME).to_numpy()
 
     def add(name: str, kind: str, stamps_ns: Int64s, parts: Sequence[Part]) -> None:
-        values = [*cdr.header(stamps_ns, shown(stream)), *parts]
+        values = [*header_parts(stamps_ns, stream_label(stream)), *parts]
         metadata = {"derived_from": top}
-        topics.append(Topic(f"{top}/{name}", _full(kind), _definition(kind, _DEFINITIONS), stamps_ns, values, metadata))
+        topics.append(
+            Topic(f"{top}/{name}", _full_type(kind), _definition(kind, _DEFINITIONS), stamps_ns, values, metadata)
+        )
 
     for column in images:
         values = [value or b"" for value in table.column(column).to_pylist()]
@@ -124,25 +244,30 @@ def usual_topics(stream: str, table: pa.Table, images: Sequence[str] = ()) -> li
         image: list[Part] = [Texts([encodings[row] for row in rows]), Texts([values[row] for row in rows])]
         name = "image" if len(images) == 1 else f"image/{topic_part(column)}"
         add(name, "sensor_msgs/CompressedImage", t_ns[rows], image)
-    place, turn = vector(table, "position", AXES), vector(table, "orientation", COMPONENTS)
+    place, turn = vector_parts(table, "position", AXES), vector_parts(table, "orientation", COMPONENTS)
     if place and turn:
         add("pose", "geometry_msgs/PoseStamped", t_ns, [*place, *turn])
-    force, torque = vector(table, "force", AXES), vector(table, "torque", AXES)
+    force, torque = vector_parts(table, "force", AXES), vector_parts(table, "torque", AXES)
     if force:
         add("wrench", "geometry_msgs/WrenchStamped", t_ns, [*force, *(torque or [Values(np.zeros(len(t_ns)))] * 3)])
-    linear, angular = vector(table, "velocity", AXES), vector(table, "angular_velocity", AXES)
+    linear, angular = vector_parts(table, "velocity", AXES), vector_parts(table, "angular_velocity", AXES)
     if linear and angular:
         add("twist", "geometry_msgs/TwistStamped", t_ns, [*linear, *angular])
-    joints = [of_quantity(table, f"joint_{name}") for name in ("position", "velocity", "torque")]
+    joints = [columns_of_quantity(table, f"joint_{name}") for name in ("position", "velocity", "torque")]
     if joints[0]:
         names = [_joint(name) for name in joints[0]]
-        sequences = [cdr.sequence([numbers(table.column(name)) for name in columns]) for columns in joints]
-        texts = [cdr.count(len(names)), *(cdr.text(name) for name in names)]
+        sequences = [sequence_parts([column_numbers(table.column(name)) for name in columns]) for columns in joints]
+        texts = [count_part(len(names)), *(text_part(name) for name in names)]
         add("joint_states", "sensor_msgs/JointState", t_ns, [*texts, *itertools.chain(*sequences)])
-    taxels = of_quantity(table, "tactile")
+    taxels = columns_of_quantity(table, "tactile")
     if taxels:
-        readings = cdr.sequence([numbers(table.column(name)) for name in taxels], "<f4")
-        add("tactile", "tactile_msgs/TactileState", t_ns, [cdr.count(1), cdr.text(shown(stream)), *readings])
+        readings = sequence_parts([column_numbers(table.column(name)) for name in taxels], "<f4")
+        add(
+            "tactile",
+            "tactile_msgs/TactileState",
+            t_ns,
+            [count_part(1), text_part(stream_label(stream)), *readings],
+        )
     return topics
 
 
@@ -151,46 +276,62 @@ def cloud_columns(schema: pa.Schema) -> list[str]:
     return [*POINT, *(COLOURS if set(COLOURS) <= set(schema.names) else ())]
 
 
-def cloud(stream: str, table: pa.Table, t_ns: int) -> Topic:
+def cloud_topic(stream: str, table: pa.Table, t_ns: int) -> Topic:
     """Return the topic of a cloud of points: one message with x, y, z and, where there are colours, rgb, as float32."""
     coloured = len(cloud_columns(table.schema)) > len(POINT)
     names = ["x", "y", "z", *(["rgb"] if coloured else [])]
-    made = np.zeros((table.num_rows, len(names)), "<f4")  # (point, field)
+    points = np.zeros((table.num_rows, len(names)), "<f4")  # (point, field)
     for place, name in enumerate(POINT):
-        made[:, place] = numbers(table.column(name))
+        points[:, place] = column_numbers(table.column(name))
     if coloured:
-        red, green, blue = (numbers(table.column(name)).astype("<u4") for name in COLOURS)
-        made[:, 3] = (red << 16 | green << 8 | blue).view("<f4")
-    step = made.itemsize * len(names)
-    fields: list[Part] = [cdr.count(len(names))]
+        red, green, blue = (column_numbers(table.column(name)).astype("<u4") for name in COLOURS)
+        points[:, 3] = (red << 16 | green << 8 | blue).view("<f4")
+    step = points.itemsize * len(names)
+    fields: list[Part] = [count_part(len(names))]
     for place, name in enumerate(names):
-        fields += [cdr.text(name), cdr.count(place * made.itemsize), Constant(bytes([_FLOAT32])), cdr.count(1)]
+        fields += [
+            text_part(name),
+            count_part(place * points.itemsize),
+            Constant(bytes([_FLOAT32])),
+            count_part(1),
+        ]
     parts = [
-        *cdr.header(np.array([t_ns]), shown(stream)),
-        *(cdr.count(1), cdr.count(len(made)), *fields, Constant(b"\0"), cdr.count(step), cdr.count(step * len(made))),
-        *(Texts([made.tobytes()]), Constant(b"\1")),
+        *header_parts(np.array([t_ns]), stream_label(stream)),
+        *(
+            count_part(1),
+            count_part(len(points)),
+            *fields,
+            Constant(b"\0"),
+            count_part(step),
+            count_part(step * len(points)),
+        ),
+        *(Texts([points.tobytes()]), Constant(b"\1")),
     ]
     kind = "sensor_msgs/PointCloud2"
-    name = f"/{topic_part(shown(stream))}"
-    return Topic(name, _full(kind), _definition(kind, _DEFINITIONS), np.array([t_ns]), parts, {"stream": stream})
+    name = f"/{topic_part(stream_label(stream))}"
+    return Topic(name, _full_type(kind), _definition(kind, _DEFINITIONS), np.array([t_ns]), parts, {"stream": stream})
 
 
-def vector(table: pa.Table, quantity: str, components: Sequence[str]) -> list[Part]:
+def vector_parts(table: pa.Table, quantity: str, components: Sequence[str]) -> list[Part]:
     """Return the components of a quantity as float64 in their order; empty unless each is there once."""
     by_component: dict[str, list[str]] = {}
-    for name in of_quantity(table, quantity):
-        by_component.setdefault(about(table.schema.field(name)).get("component", ""), []).append(name)
+    for name in columns_of_quantity(table, quantity):
+        by_component.setdefault(field_metadata(table.schema.field(name)).get("component", ""), []).append(name)
     if sorted(by_component) != sorted(components) or any(len(names) > 1 for names in by_component.values()):
         return []
-    return [Values(numbers(table.column(by_component[one][0])).astype("<f8")) for one in components]
+    return [Values(column_numbers(table.column(by_component[component][0])).astype("<f8")) for component in components]
 
 
-def of_quantity(table: pa.Table, quantity: str) -> list[str]:
+def columns_of_quantity(table: pa.Table, quantity: str) -> list[str]:
     """Return the columns of numbers that hold a quantity."""
-    return [one.name for one in table.schema if about(one).get("quantity") == quantity and _number(one.type)]
+    return [
+        field_.name
+        for field_ in table.schema
+        if field_metadata(field_).get("quantity") == quantity and _is_number(field_.type)
+    ]
 
 
-def numbers(column: pa.ChunkedArray) -> AnyArray:
+def column_numbers(column: pa.ChunkedArray) -> AnyArray:
     """Return a column as numbers, little endian (time,); where one is missing NaN, or 0 in integers."""
     import pyarrow as pa
 
@@ -206,16 +347,16 @@ def field_names(columns: Sequence[str]) -> dict[str, str]:
     >>> field_names(["taxel01_x", "Force X [N]", "header"])
     {'taxel01_x': 'taxel01_x', 'Force X [N]': 'force_x_n', 'header': 'header_2'}
     """
-    taken, made = {"header"}, {}
+    used, names = {"header"}, {}
     for column in columns:
         name = re.sub(r"_+", "_", re.sub(r"[^a-z0-9]", "_", column.lower())).strip("_") or "value"
         name = name if name[0].isalpha() else f"value_{name}"
         candidate, number = name, 2
-        while candidate in taken:
+        while candidate in used:
             candidate, number = f"{name}_{number}", number + 1
-        taken.add(candidate)
-        made[column] = candidate
-    return made
+        used.add(candidate)
+        names[column] = candidate
+    return names
 
 
 def topic_part(stream: str) -> str:
@@ -224,7 +365,7 @@ def topic_part(stream: str) -> str:
     return name if name[:1].isalpha() else f"stream_{name}"
 
 
-def _number(kind: pa.DataType) -> bool:
+def _is_number(kind: pa.DataType) -> bool:
     import pyarrow as pa
 
     return bool(pa.types.is_integer(kind) or pa.types.is_floating(kind))
@@ -239,7 +380,7 @@ def _camel(stream: str) -> str:
     return letters if letters[:1].isalpha() else f"Stream{letters}"
 
 
-def _full(name: str) -> str:
+def _full_type(name: str) -> str:
     package, _, kind = name.partition("/")
     return f"{package}/msg/{kind}"
 
@@ -249,9 +390,11 @@ def _definition(name: str, definitions: Mapping[str, str]) -> str:
     needed: list[str] = []
     pending = [name]
     while pending:
-        one = pending.pop(0)
-        if one not in needed:
-            needed.append(one)
-            types = (line.split()[0].removesuffix("[]") for line in definitions[one].splitlines())
+        type_name = pending.pop(0)
+        if type_name not in needed:
+            needed.append(type_name)
+            types = (line.split()[0].removesuffix("[]") for line in definitions[type_name].splitlines())
             pending += [kind for kind in types if "/" in kind]
-    return definitions[name] + "".join(f"{_SEPARATOR}MSG: {one}\n{definitions[one]}" for one in needed[1:])
+    return definitions[name] + "".join(
+        f"{_SEPARATOR}MSG: {type_name}\n{definitions[type_name]}" for type_name in needed[1:]
+    )

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 STORE = "replay.zarr"  # the folder of the store
 ENDS = "meta/episode_ends"
-CHUNK_BYTES = 1 << 20  # of an array before compression
+CHUNK_BYTES = 1 << 20  # size of a chunk before compression
 _OPENING = f"""
 A Zarr store (format 2), `{STORE}`, as UMI's and diffusion policy's `ReplayBuffer` reads it:
 
@@ -44,7 +44,7 @@ rate, the name of each recording and its labels.
 
 @dataclass(frozen=True)
 class Params:
-    """What the arrays are made of."""
+    """The contents of the arrays."""
 
     rate_hz: Rate | None = None  # synchronize to this rate first; without it the recordings must be synchronized
     master: str = ""  # stream whose samples start and end the frames; without it the first tactile one
@@ -56,7 +56,7 @@ def first(params: Params) -> Mapping[str, Mapping[str, Any]]:
     """Return the stage that recordings go through first, where a rate is given."""
     from tacpipe.exports import frames
 
-    return frames.synchronized(params.rate_hz, params.master)
+    return frames.synchronize_stage(params.rate_hz, params.master)
 
 
 @stage(version=2, reads=("grid", "grid_rate_hz"))
@@ -79,11 +79,14 @@ def zarr(params: Params, recordings: Dataset, parts: Parts, originals: Dataset) 
 
     from tacpipe.exports import arrays, frames
 
-    every = list(recordings)
-    rate_hz = frames.rate_hz(every)
-    columns, described = frames.columns(contents.of_parts(parts), common=params.common)
-    described = frames.without_frames(described, recordings, originals)
-    episodes = [arrays.from_table(frames.table(recording).select(columns), params.actions) for recording in every]
+    all_recordings = list(recordings)
+    rate_hz = frames.common_rate_hz(all_recordings)
+    columns, described = frames.frame_columns(contents.contents_from_parts(parts), common=params.common)
+    described = frames.add_frame_losses(described, recordings, originals)
+    episodes = [
+        arrays.from_table(frames.synchronized_table(recording).select(columns), params.actions)
+        for recording in all_recordings
+    ]
     files: dict[str, Content] = {}
     for episode_arrays in zip(*episodes, strict=True):
         first_array = episode_arrays[0]
@@ -91,18 +94,20 @@ def zarr(params: Params, recordings: Dataset, parts: Parts, originals: Dataset) 
         values = np.concatenate([array.values for array in episode_arrays])
         files |= _array(f"data/{first_array.name}", values, attributes)
     files |= _array(ENDS, np.cumsum([len(episode[0].values) for episode in episodes], dtype=np.int64), {})
-    names = [recording.name for recording in every]
+    names = [recording.name for recording in all_recordings]
     files |= {".zgroup": _GROUP, "data/.zgroup": _GROUP, "meta/.zgroup": _GROUP}
     files["meta/.zattrs"] = _json(
         {
             "rate_hz": rate_hz,
             "recordings": names,
-            "labels": {recording.name: dict(recording.attributes) for recording in every},
+            "labels": {recording.name: dict(recording.attributes) for recording in all_recordings},
         }
     )
     files = {f"{STORE}/{name}": content for name, content in files.items()}
-    files[readme.NAME] = readme.text("Tactile recordings as a Zarr replay buffer", _OPENING, recordings, described)
-    return Result(files=Files(files), notes=readme.notes(recordings, described))
+    files[readme.NAME] = readme.readme_text(
+        "Tactile recordings as a Zarr replay buffer", _OPENING, recordings, described
+    )
+    return Result(files=Files(files), notes=readme.loss_notes(recordings, described))
 
 
 def _array(path: str, values: AnyArray, attributes: Mapping[str, Any]) -> dict[str, Content]:
@@ -113,7 +118,7 @@ def _array(path: str, values: AnyArray, attributes: Mapping[str, Any]) -> dict[s
     row_bytes = max(1, values[:1].nbytes)
     rows = max(1, min(len(values), CHUNK_BYTES // row_bytes))
     store: dict[str, Any] = {}
-    made = zarr.create_array(
+    array = zarr.create_array(
         MemoryStore(store),
         shape=values.shape,
         dtype=values.dtype,
@@ -122,7 +127,7 @@ def _array(path: str, values: AnyArray, attributes: Mapping[str, Any]) -> dict[s
         attributes=dict(attributes),
         config={"write_empty_chunks": True},
     )
-    made[:] = values
+    array[:] = values
     return {f"{path}/{name}": content.to_bytes() for name, content in store.items()}
 
 

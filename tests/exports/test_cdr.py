@@ -10,7 +10,7 @@ import pyarrow as pa
 import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from tacpipe.exports import cdr, ros
+from tacpipe.exports import ros
 from tests.exports import recordings
 
 T_NS = np.array([0, 1, 1_700_000_000_987_654_321], np.int64)
@@ -31,7 +31,7 @@ def test_a_stream_s_own_messages_are_those_that_rosbags_would_write(table: pa.Ta
     topic = ros.stream_topic("Skin 1", table)
     types = store(topic)
     names = ros.field_names(table.column_names[1:])
-    messages = list(cdr.packed(topic.parts, table.num_rows))
+    messages = list(ros.pack_messages(topic.parts, table.num_rows))
     assert len(messages) == table.num_rows
     for row in (0, 3, table.num_rows - 1):
         message = types.deserialize_cdr(messages[row], topic.type)
@@ -50,7 +50,7 @@ def test_usual_messages_are_those_that_rosbags_would_write() -> None:
         assert topics
         for topic in topics:
             types = store(topic)
-            for message in list(cdr.packed(topic.parts, len(topic.t_ns)))[:2]:
+            for message in list(ros.pack_messages(topic.parts, len(topic.t_ns)))[:2]:
                 assert bytes(types.serialize_cdr(types.deserialize_cdr(message, topic.type), topic.type)) == message
 
 
@@ -61,7 +61,7 @@ def test_joint_states_name_each_joint_and_hold_its_angle() -> None:
         pa.schema([pa.field("t_ns", pa.int64()), *fields]),
     )
     (topic,) = ros.usual_topics("arm", table)
-    message = store(topic).deserialize_cdr(list(cdr.packed(topic.parts, 3))[1], topic.type)
+    message = store(topic).deserialize_cdr(list(ros.pack_messages(topic.parts, 3))[1], topic.type)
     assert (message.name, list(message.position), list(message.velocity)) == (["joint1", "joint2"], [2.0, 5.0], [])
 
 
