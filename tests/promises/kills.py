@@ -32,9 +32,8 @@ from tests.promises.counts import count
 from tests.promises.warm import Warm, serving
 
 PATIENCE_S = 60.0  # after which a process that should have ended counts as hanging
-NOTE = re.compile(
-    r"tacpipe: (not carried|[\w-]+|all \d+ recordings): "
-)  # on recordings: how a stage took them, or what is left out, which is no failure
+# Notes, which are not errors: on recordings, what an export does not carry, and a new store.
+NOTE = re.compile(r"tacpipe: (?:(?:not carried|[\w-]+|all \d+ recordings): |created the store )")
 
 
 class Running(Protocol):

@@ -243,7 +243,9 @@ def shared(scene: Scene) -> Iterator[Scene]:
             folder.mkdir(exist_ok=True)
             os.chown(folder, -1, GROUP)
             folder.chmod(0o2775)
-        yield Scene(lab, server, {"PYTHONPATH": str(lab / "plugin"), "TEST_GROUP": str(GROUP)})
+        # A store of another user is only used where TACPIPE_STORE names it.
+        environment = {"PYTHONPATH": str(lab / "plugin"), "TACPIPE_STORE": str(lab / "project/.tacpipe")}
+        yield Scene(lab, server, {**environment, "TEST_GROUP": str(GROUP)})
 
 
 @pytest.mark.long
