@@ -1,9 +1,12 @@
 """Measure how uncertain a trained model is.
 
 Writes the model with what it needs to state that. Models of the tasks ``forward`` and ``touch`` get quantiles: fitted to
-their errors on training recordings, then corrected on validation recordings, so that a band holds as often as it states.
+their errors on training recordings, then corrected on calibration recordings, so that a band holds as often as it states.
 Models of the task ``material`` get probabilities that are frequencies, and a threshold for the answer ``unknown``. The
 model's predictions stay as they are.
+
+Calibration recordings have the role calibration in the split, which `tacpipe split --calibration` gives; without any, those
+with the role val. Recordings that the model learned from are refused.
 
 Example: tacpipe calibrate models/forward data/segments --split data/split -o models/forward-calibrated
 """
@@ -35,8 +38,10 @@ class Params:
     seed: Seed = 0  # random seed of what is fitted
 
 
-@stage(version=3)
-def calibrate(params: Params, model: Model, train: Dataset, val: Dataset) -> Result:
+@stage(version=4)
+def calibrate(
+    params: Params, model: Model, train: Dataset, val: Dataset | None, calibration: Dataset | None
+) -> Result:
     """Return the model's files and what states its uncertainty."""
     from tacpipe.datasets import model_files
     from tacpipe.errors import UsageError
@@ -44,10 +49,15 @@ def calibrate(params: Params, model: Model, train: Dataset, val: Dataset) -> Res
     from tacpipe.tasks.calibrated import Asked
 
     task = model_files.task(model.files)
-    calibration = task.calibration
-    if calibration is None:
+    task_calibration = task.calibration
+    if task_calibration is None:
         raise UsageError(f"Models of the task {task.name} cannot be calibrated. Give a model of another task.")
     asked = Asked(tuple(LEVELS.items(params.quantiles)), params.promise, params.false_unknown, params.seed)
     files = {name: model.files[name] for name in model.files}
+    recordings = calibration if calibration is not None and calibration.recordings else val
+    if recordings is None or not recordings.recordings:
+        raise UsageError(
+            "No recording has the role calibration or val. Make a split with some: `tacpipe split --calibration 0.15`."
+        )
     with model_files.validated("the model"):
-        return Result(files=calibration.calibrate(files, asked, train, val))
+        return Result(files=task_calibration.calibrate(files, asked, train, recordings))

@@ -1,4 +1,4 @@
-"""Assign each recording a role: train, val or test.
+"""Assign each recording a role: train, val, calibration or test.
 
 Example: tacpipe split data/segments -o data/split
 """
@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tacpipe.errors import UsageError
 from tacpipe.plugins.constraints import Names, NonNegativeInt, PositiveInt, Range, Seed
+from tacpipe.plugins.params import added
 from tacpipe.plugins.stage import RecordingOutput, Result, stage
 
 if TYPE_CHECKING:
@@ -28,6 +29,8 @@ class Split:
     scheme: str
     # fraction of the recordings to validate on; where the scheme picks the test ones, of the others
     val: Annotated[float, Range(0, below=1)] = 0.15
+    # fraction, as val, that only `tacpipe calibrate` uses; forward needs some for it
+    calibration: Annotated[float, Range(0, below=1)] = added(0.0)
     seed: Seed = 0  # random seed of every draw
     stratify: Names = ""  # attributes whose values are spread evenly over the roles; empty for none
     few: NonNegativeInt = 0  # maximum number of recordings to train on, those left over are unused; 0 for all
@@ -54,9 +57,10 @@ class Tested(Split):
     def check(self) -> None:
         """Refuse fractions that leave nothing to train on."""
         super().check()
-        if self.val + self.test >= 1:
+        if self.val + self.calibration + self.test >= 1:
             raise UsageError(
-                f"val is {self.val:g} and test is {self.test:g}, which leave nothing to train on; their sum must be below 1."
+                f"val is {self.val:g}, calibration is {self.calibration:g} and test is {self.test:g}, which leave nothing to "
+                f"train on; their sum must be below 1."
             )
 
 
@@ -81,7 +85,7 @@ class Kfold(Split):
 
 @dataclass(frozen=True)
 class Blocked(Tested):
-    """Recordings in the order of names, which is that of time for most sets: train, then val, then test."""
+    """Recordings in the order of names, which is that of time for most sets: train, then calibration, val and test."""
 
     # blocked: in the order of names
     scheme: Literal["blocked"] = "blocked"
@@ -110,7 +114,7 @@ Params = Random | Kfold | Blocked | LeaveOneOut | Authors
 
 @stage(version=1)
 def split(params: Params, recordings: Dataset, extend: Roles | None = None) -> Result:
-    """Give each recording its role: train, val or test.
+    """Give each recording its role: train, val, calibration or test.
 
     Returns one table, ``split``, with a row a recording and fold: recording, fold, role. Recordings that have a role in
     the older split ``extend`` keep it. A note names folds without validation recordings, unless ``val`` is 0.

@@ -32,6 +32,21 @@ def test_random_gives_every_recording_one_role_and_the_shares_asked_for(
     assert Counter(roles.values())["val"] == round(val * count)
 
 
+@pytest.mark.parametrize("name", ["random", "kfold", "blocked", "leave-one-out", "authors"])
+def test_a_share_to_calibrate_on_is_taken_from_training_and_leaves_the_other_roles_as_they_are(name: str) -> None:
+    labelled = {f"{at}-{found}": one | {"authors_role": at} for at in ("train", "test") for found, one in recordings(30).items()}
+    without, roles = (assign(labelled, Scheme(name, calibration=share)) for share in (0, 0.2))
+    aside = {key for key, role in roles.items() if role == "calibration"}
+    trained = Counter(fold for (_, fold), role in without.items() if role in ("train", "val"))
+    assert {key: role for key, role in without.items() if key not in aside} == {
+        key: role for key, role in roles.items() if key not in aside
+    }
+    for fold in trained:
+        total = 60 if name in ("random", "blocked") else trained[fold]
+        assert sum(at == fold for _, at in aside) == round(0.2 * total)
+    assert {without[key] for key in aside} == {"train"}
+
+
 def test_the_order_in_which_recordings_come_does_not_matter_and_the_seed_does() -> None:
     found = recordings(30)
     reverse = dict(reversed(found.items()))

@@ -168,9 +168,10 @@ def _recordings_text(value: dict[str, Any], full: bool) -> list[str]:
 def _split_text(value: dict[str, Any]) -> list[str]:
     """Return how many recordings have each role, a line a fold."""
     roles = sorted({role for counts in value["folds"].values() for role in counts}, key=_role_order)
-    lines = [f"{'fold':<6}" + "".join(f"{role:>8}" for role in roles)]
+    widths = {role: max(8, len(role) + 2) for role in roles}
+    lines = [f"{'fold':<6}" + "".join(f"{role:>{width}}" for role, width in widths.items())]
     for fold, counts in value["folds"].items():
-        lines.append(f"{fold:<6}" + "".join(f"{counts.get(role, 0):>8}" for role in roles))
+        lines.append(f"{fold:<6}" + "".join(f"{counts.get(role, 0):>{width}}" for role, width in widths.items()))
     return [*lines, f"params: {model_overview.flat(value['params'])}"]
 
 

@@ -236,7 +236,7 @@ class Dataset:
         self,
         *names: str,
         split: Path | str | Dataset | None = None,
-        role: Literal["train", "val", "test"] | str | None = None,
+        role: Literal["train", "val", "calibration", "test"] | str | None = None,
         fold: int = 0,
         labels: Mapping[str, Wanted] | None = None,
         **more: Wanted,

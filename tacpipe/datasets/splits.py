@@ -32,6 +32,7 @@ class Scheme:
 
     name: str = "random"
     val: float = 0.15  # fraction of the recordings, or of those left for training where the scheme picks the test ones
+    calibration: float = 0.0  # as val: fraction to calibrate on
     test: float = 0.15  # fraction of the recordings; of no effect where the scheme picks them
     seed: int = 0
     folds: int = 5  # of kfold
@@ -49,14 +50,16 @@ def assign(attributes: Mapping[str, Attributes], scheme: Scheme, keep: Mapping[t
     """Return the role of each recording in each fold; ``attributes`` holds those of each recording by name.
 
     ============== =====================================================================================
-    random         shares ``test`` and ``val`` drawn at random, anew in each of ``repeats`` folds
+    random         shares ``test``, ``val`` and ``calibration`` drawn at random, anew in each of ``repeats`` folds
     kfold          in fold k the k-th of ``folds`` even parts is tested, ``val`` of the others drawn at random
-    blocked        in the order of names, which is that of time for most sets: train, then val, then test;
-                   with ``reverse`` test, then val, then train
+    blocked        in the order of names, which is that of time for most sets: train, then calibration, val, test;
+                   with ``reverse`` the other way round
     leave-one-out  in fold k the recordings of the k-th value of ``by`` are tested
     authors        what the attribute ``authors_role`` states; with no val among them, ``val`` of train is drawn.
                    Where some have ``authors_fold``, a fold a block: see below
     ============== =====================================================================================
+
+    In all schemes ``calibration`` is a share of the same recordings as ``val``.
 
     Blocks of ``authors_fold`` take turns: where some recordings have the ``authors_role`` test, these are tested in every
     fold, and the k-th block is val in fold k. Where none has, the k-th block is tested, and ``val`` of the others is
@@ -128,10 +131,11 @@ def _check(attributes: Mapping[str, Attributes], scheme: Scheme) -> None:
         raise TacpipeError(f"There is no split scheme {scheme.name}; there are {', '.join(SCHEMES)}.")
     if not attributes:
         raise TacpipeError("A split of no recordings has no roles to give; give it a dataset with recordings.")
-    if not (0 <= scheme.val < 1 and 0 <= scheme.test < 1 and scheme.val + scheme.test < 1):
+    shares = (scheme.val, scheme.calibration, scheme.test)
+    if min(shares) < 0 or sum(shares) >= 1:
         raise TacpipeError(
-            f"val {scheme.val} and test {scheme.test} leave nothing to train on; both must lie in [0, 1) "
-            f"and their sum below 1."
+            f"val {scheme.val}, calibration {scheme.calibration} and test {scheme.test} leave nothing to train on; each "
+            f"must be 0 or more, and their sum below 1."
         )
     if scheme.name == "kfold" and not 2 <= scheme.folds <= len(attributes):
         raise TacpipeError(
@@ -163,10 +167,17 @@ def _check_options(scheme: Scheme) -> None:
 
 
 def _drawn(names: Sequence[str], attributes: Mapping[str, Attributes], scheme: Scheme, draw: int) -> dict[str, str]:
-    """Return roles with the shares ``test`` and ``val``, each value of ``stratify`` spread evenly over them."""
+    """Return roles with the shares of the scheme, each value of ``stratify`` spread evenly over them."""
     order = _order(names, attributes, scheme, np.random.default_rng([scheme.seed, draw]))
-    tests, vals = round(scheme.test * len(names)), round(scheme.val * len(names))
-    return {name: "test" if i < tests else "val" if i < tests + vals else "train" for i, name in enumerate(order)}
+    return _in_turn(order, scheme, ("test", "val", "calibration", "train"))
+
+
+def _in_turn(order: Sequence[str], scheme: Scheme, roles: Sequence[str]) -> dict[str, str]:
+    """Return the role of each recording: the first recordings of the order have the first role, and so on."""
+    shares = {"val": scheme.val, "calibration": scheme.calibration, "test": scheme.test}
+    counts = {role: round(share * len(order)) for role, share in shares.items()}
+    counts["train"] = len(order) - sum(counts.values())
+    return dict(zip(order, (role for role in roles for _ in range(counts[role])), strict=False))
 
 
 def _order(
@@ -207,17 +218,15 @@ def _few(
 
 
 def _val_of(names: Sequence[str], attributes: Mapping[str, Attributes], scheme: Scheme, draw: int) -> dict[str, str]:
-    """Return roles of recordings that are not tested: the share ``val`` of them, the rest train."""
-    return _drawn(names, attributes, Scheme(val=scheme.val, test=0, seed=scheme.seed, stratify=scheme.stratify), draw)
+    """Return roles of recordings that are not tested: the shares ``val`` and ``calibration`` of them, the rest train."""
+    return _drawn(names, attributes, replace(scheme, test=0), draw)
 
 
 def _blocked(names: Sequence[str], attributes: Mapping[str, Attributes], scheme: Scheme) -> dict[str, str]:
     roles: dict[str, str] = {}
     for stratum in _strata(names, attributes, scheme).values():
-        tests, vals = round(scheme.test * len(stratum)), round(scheme.val * len(stratum))
-        trains = len(stratum) - tests - vals
-        order = reversed(stratum) if scheme.reverse else stratum
-        roles |= {n: "train" if i < trains else "val" if i < trains + vals else "test" for i, n in enumerate(order)}
+        order = stratum[::-1] if scheme.reverse else stratum
+        roles |= _in_turn(order, scheme, ("train", "calibration", "val", "test"))
     return roles
 
 
@@ -235,9 +244,8 @@ def _authors(names: Sequence[str], attributes: Mapping[str, Attributes], scheme:
                 f"--authors-role, set it with `tacpipe label`, or choose another scheme."
             )
         roles[name] = str(role)
-    if "val" not in roles.values():
-        roles |= _val_of([name for name in names if roles[name] == "train"], attributes, scheme, 0)
-    return [roles]
+    scheme = replace(scheme, val=0) if "val" in roles.values() else scheme
+    return [roles | _val_of([name for name in names if roles[name] == "train"], attributes, scheme, 0)]
 
 
 def _authors_folds(
@@ -255,7 +263,8 @@ def _authors_folds(
         turn = [name for name in names if name not in fixed and part[name] == fold]
         rest = [name for name in names if name not in fixed and part[name] != fold]
         if published:
-            folds.append(fixed | dict.fromkeys(rest, "train") | dict.fromkeys(turn, "val"))
+            trained = _val_of(rest, attributes, replace(scheme, val=0), fold + 1)
+            folds.append(fixed | trained | dict.fromkeys(turn, "val"))
         else:
             folds.append(fixed | _val_of(rest, attributes, scheme, fold + 1) | dict.fromkeys(turn, "test"))
     return folds

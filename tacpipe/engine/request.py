@@ -29,7 +29,7 @@ OPTIONS = {
     "executor": str,
     "device": Device,
     "fold": NonNegativeInt,
-    "role": Literal["train", "val", "test"] | None,
+    "role": Literal["train", "val", "calibration", "test"] | None,
 }
 
 

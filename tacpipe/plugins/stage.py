@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from tacpipe.io.drafts import Draft
     from tacpipe.plugins.requirements import Requirements
 
-ROLES = ("train", "val", "test")
+ROLES = ("train", "val", "calibration", "test")
 ORIGINALS = "originals"
 Attribute = str | int | float | bool | None
 Files = Mapping[str, Path]  # name within the source, path to read

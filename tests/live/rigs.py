@@ -81,21 +81,21 @@ def model(
     """The files of a small model, and the chain that it was trained behind; ``values`` are params of both."""
     names = {"grid", "rate_hz", "gap_ms", "unwrap", "values", "master"}
     sync = {name: value for name, value in values.items() if name in names}
-    shards = [segmented(recording(seed), **sync) for seed in range(3)]
+    shards = [segmented(recording(seed), **sync) for seed in range(4)]
     steps = [step("synchronize", **sync), step("segment.contacts")]
-    parts = [dataset(*shards[:2]), dataset(shards[2])]
+    parts = [dataset(*shards[:2]), *map(dataset, shards[2:])]
     if codec == "pca":
         compress = registry.load("compress.pca")
         asked = compress.params(components=3, representation=representation)
         assert compress.fit is not None
         files = dict(compress.fit(asked, parts[0]).files)
         made = [FakeShard(one.name, compress(asked, one, files), one.attributes) for one in shards]
-        parts = [dataset(*made[:2], files=files), dataset(made[2], files=files)]
+        parts = [dataset(*made[:2], files=files), *(dataset(shard, files=files) for shard in made[2:])]
         steps.append(step("compress.pca", components=3, representation=representation))
     trained = {name: value for name, value in values.items() if name not in names}
     params = fitting("train.forward", {**SMALL, **trained})
     files = half_shrunk(forward_training.train(params, parts[0], parts[1], folder))
-    return (forward_calibration.calibrate(files, ASKED, parts[0], parts[1]) if calibrated else files), steps
+    return (forward_calibration.calibrate(files, ASKED, parts[0], parts[2]) if calibrated else files), steps
 
 
 def half_shrunk(files: dict[str, bytes]) -> dict[str, bytes]:

@@ -23,10 +23,10 @@ MODULES = (b"tacpipe.live.process", b"tests.live.persistent")  # that a model's 
 
 # commands that train a small forecaster, models/f, on simulated recordings
 TRAINED = (
-    "simulate forward --trials 3 --duration-s 4 --robot-rate-hz 200 -o data/r",
+    "simulate forward --trials 4 --duration-s 4 --robot-rate-hz 200 -o data/r",
     "synchronize data/r -o data/synced",
     "segment contacts data/synced -o data/c",
-    "split data/c -o data/split --scheme random --val 0.34 --test 0",
+    "split data/c -o data/split --scheme random --val 0.25 --calibration 0.25 --test 0",
     "train forward data/c --split data/split -o models/f --architecture gru --hidden 4 --epochs 1 --context 3 --horizon 2",
 )
 

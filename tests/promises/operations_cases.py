@@ -145,7 +145,7 @@ FORWARD = (
     "simulate forward --trials 4 --duration-s 4 --robot-rate-hz 200 -o data/r",
     "synchronize data/r -o data/synced",
     "segment contacts data/synced -o data/c",
-    "split data/c -o data/split --scheme random --val 0.25 --test 0.25",
+    "split data/c -o data/split --scheme random --val 0.25 --calibration 0.25 --test 0.25",
     "train forward data/c --split data/split -o models/f --architecture gru --hidden 4 --epochs 2 --batch 64 "
     "--context 3 --horizon 2",
     "evaluate models/f data/c --split data/split -o results/f",

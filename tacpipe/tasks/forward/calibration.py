@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from tacpipe.errors import UsageError
 from tacpipe.io import progress
 from tacpipe.metrics import conformal
 from tacpipe.metrics.quantiles import check_levels
@@ -26,27 +27,40 @@ FITTED = 5000  # windows that quantiles are fitted on, evenly spread over traini
 CORRECTED = 400  # windows of each calibration recording
 
 
-def calibrate(model: Mapping[str, bytes], asked: Asked, training: Dataset, validation: Dataset) -> dict[str, bytes]:
-    """Return the files of a model with quantiles of its error, fitted on training and corrected on validation recordings.
+def calibrate(model: Mapping[str, bytes], asked: Asked, training: Dataset, calibration: Dataset) -> dict[str, bytes]:
+    """Return the files of a model with quantiles of its error, fitted on training and corrected on calibration recordings.
 
-    Raises `TacpipeError` where the recordings are not what the model reads or hold no window, and for too few of them.
+    Raises `UsageError` where the model was trained or stopped by a calibration recording, and `TacpipeError` where the
+    recordings are not what the model reads or hold no window, and for too few of them.
     """
     check_levels(asked.quantiles)
     forecaster = Forecaster.load(model)
-    known = errors_of(forecaster, training, max(1, FITTED // max(1, len(training.recordings))))
-    watched = errors_of(forecaster, validation, CORRECTED)
+    _check_unused(forecaster, calibration)
+    training_errors = errors_of(forecaster, training, max(1, FITTED // max(1, len(training.recordings))))
+    errors = errors_of(forecaster, calibration, CORRECTED)
     levels = np.array(asked.quantiles) / 100
-    made = Uncertainty.fit(levels, known, watched, promised=asked.promise, seed=asked.seed)
-    count = len(np.unique(watched.recordings))
+    uncertainty = Uncertainty.fit(levels, training_errors, errors, promised=asked.promise, seed=asked.seed)
+    count = len(np.unique(errors.recordings))
     config = dict(forecaster.config)
     config["quantiles"] = {
         "levels": list(asked.quantiles),
         "method": "promised" if asked.promise else "pooled",
-        "recordings": {"fitted": len(np.unique(known.recordings)), "corrected": count},
+        "recordings": {"fitted": len(np.unique(training_errors.recordings)), "corrected": count},
         "most_promised": conformal.most_promised(count),
     }
-    config["trained_on"] = _seen(config["trained_on"], training, validation)
-    return {**model, CONFIG: (json.dumps(config, indent=1, sort_keys=True) + "\n").encode(), FILE: made.to_bytes()}
+    config["trained_on"] = _seen(config["trained_on"], training, calibration)
+    return {**model, CONFIG: (json.dumps(config, indent=1, sort_keys=True) + "\n").encode(), FILE: uncertainty.to_bytes()}
+
+
+def _check_unused(forecaster: Forecaster, calibration: Dataset) -> None:
+    """Refuse calibration recordings that the model was trained, stopped or shrunk by."""
+    digests = set(forecaster.config["trained_on"].values())
+    used = sorted(name for name, shard in calibration.recordings.items() if shard.digest in digests)
+    if used:
+        raise UsageError(
+            f"The model was trained, stopped or calibrated with the recording {used[0]}, so its errors there are too small to "
+            f"calibrate on. Make a split with `tacpipe split --calibration 0.15`, and train and calibrate with that split."
+        )
 
 
 def errors_of(forecaster: Forecaster, recordings: Dataset, most: int) -> Errors:

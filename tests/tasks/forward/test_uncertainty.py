@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from tacpipe.errors import TacpipeError
+from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.tasks.calibrated import Asked
 from tacpipe.tasks.forward import calibration as forward_calibration
 from tacpipe.tasks.forward import evaluation as forward_evaluation
@@ -24,7 +24,7 @@ from tests.tasks.forward.trials import ENSEMBLE, HORIZON, asked, compressed, eva
 
 TEST = motion(20)
 PERCENTS = (10, 50, 90)
-TRAINING, CALIBRATION = [motion(seed) for seed in range(3)], [motion(seed) for seed in range(10, 14)]
+TRAINING, CALIBRATION = [motion(seed) for seed in range(3)], [motion(seed) for seed in range(11, 15)]
 
 
 @pytest.fixture(scope="module")
@@ -123,6 +123,15 @@ def test_pinball_in_metrics_is_that_of_the_predicted_table(model: dict[str, byte
             above = some.truth.count[:, 1, channel] - table[f"{name}_t2_q{percent}"].to_numpy()
             lost.append(np.maximum(percent / 100 * above, (percent / 100 - 1) * above).mean())
     assert tree["quantiles"]["model"]["pinball"]["t2"] == pytest.approx(np.mean(lost), rel=1e-5)
+
+
+@pytest.mark.parametrize("seed", [0, 10])  # a training recording and the validation recording of `trained`
+def test_a_recording_that_trained_or_stopped_the_model_does_not_calibrate_it(
+    plain: dict[str, bytes], seed: int
+) -> None:
+    recordings = dataset(*CALIBRATION[:3], motion(seed))
+    with pytest.raises(UsageError, match=f"{motion(seed).name}.*tacpipe split --calibration"):
+        forward.calibrate(plain, Asked(PERCENTS, False, 0.05, 0), dataset(*TRAINING), recordings)
 
 
 def test_a_model_without_quantiles_is_evaluated_as_before_and_has_none_to_give(plain: dict[str, bytes]) -> None:
