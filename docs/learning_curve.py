@@ -29,9 +29,10 @@ from tacpipe.metrics import intervals
 ROOT = Path(__file__).parents[1]
 WORK, TABLE = ROOT / ".cache" / "learning-curve", ROOT / "docs" / "tasks" / "forward-learning.csv"
 STEPS = (1, 5, 10)
+PREDICTORS = ("model", "persistence")
 EPOCHS = 6  # on `MOST` recordings or more
 MOST = 40  # recordings on which `EPOCHS` are made; of fewer, as many more epochs
-Sums = dict[str, AnyFloats]  # of a recording, (3, step + 1)
+Sums = dict[str, AnyFloats]  # by recording: absolute errors of model and persistence, (2, step + 1), values in the last column
 
 
 class Point(NamedTuple):
@@ -47,20 +48,22 @@ class Point(NamedTuple):
 def point(draws: Sequence[Sums], trained: float) -> Point:
     """Return skill with its interval and mean absolute errors, from the error sums of recordings in each draw.
 
-    Sums are (3, step + 1): squared errors of model and persistence, absolute ones of the model, values in the last column.
+    The skill is that of `tacpipe evaluate`: 1 - the geometric mean over recordings of the model's absolute error divided by
+    persistence's. A recording that several draws test counts once, with the sum of its errors.
     """
-    names = sorted({name for one in draws for name in one})
-    pooled = np.stack(
-        [sum((one[name] for one in draws if name in one), np.zeros((3, len(STEPS) + 1))) for name in names]
-    )
-    found = intervals.skill_interval(pooled[:, 0, :-1], pooled[:, 1, :-1])
-    skill = [(float(found.mean[at]), float(found.low[at]), float(found.high[at])) for at in range(len(STEPS))]
-    total = pooled.sum(axis=0)
-    mae = [float(one) for one in total[2, :-1] / total[2, -1]]
-    by_draw = [sum(one.values(), np.zeros((3, len(STEPS) + 1)))[:, :-1] for one in draws]
-    skills = [intervals.skill(one[0], one[1]) for one in by_draw]
-    spread = np.std(skills, axis=0, ddof=1) if len(draws) > 1 else np.full(len(STEPS), np.nan)
-    return Point(trained, len(names), skill, mae, [float(one) for one in spread])
+    names = sorted({name for draw in draws for name in draw})
+    pooled = np.stack([np.sum([draw[name] for draw in draws if name in draw], axis=0) for name in names])
+    interval = _skill(pooled)
+    skill = [(float(mean), float(low), float(high)) for mean, low, high in zip(*vars(interval).values(), strict=True)]
+    total = pooled[:, 0].sum(axis=0)
+    by_draw = [_skill(np.stack(list(draw.values()))).mean for draw in draws]
+    spread = np.std(by_draw, axis=0, ddof=1) if len(draws) > 1 else np.full(len(STEPS), np.nan)
+    return Point(trained, len(names), skill, (total[:-1] / total[-1]).tolist(), spread.tolist())
+
+
+def _skill(errors: AnyFloats) -> intervals.Interval:
+    """Return the skill at each of `STEPS` of error sums (recording, 2, step + 1)."""
+    return intervals.geometric_skill_interval(errors[:, 0, :-1], errors[:, 1, :-1])
 
 
 def per_doubling(points: Sequence[Point], step: int) -> float:
@@ -79,17 +82,15 @@ def sums(result: Path) -> Sums:
     import pyarrow.parquet as pq
 
     table = pq.read_table(result / "errors.parquet").to_pylist()
-    found: Sums = {}
+    by_recording: Sums = {}
     for row in table:
         if row["seen"] or row["group"] != "both" or row["step"] not in STEPS or not row["windows"]:
             continue
-        own = found.setdefault(row["recording"], np.zeros((3, len(STEPS) + 1)))
-        at = STEPS.index(row["step"])
-        if row["predictor"] == "model":
-            own[0, at], own[2, at], own[2, -1] = row["squared"], row["absolute"], row["windows"] * row["channels"]
-        elif row["predictor"] == "persistence":
-            own[1, at] = row["squared"]
-    return found
+        if row["predictor"] in PREDICTORS:
+            errors = by_recording.setdefault(row["recording"], np.zeros((2, len(STEPS) + 1)))
+            values = errors[PREDICTORS.index(row["predictor"])]
+            values[STEPS.index(row["step"])], values[-1] = row["absolute"], row["windows"] * row["channels"]
+    return by_recording
 
 
 def run(*words: object) -> None:

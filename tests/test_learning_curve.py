@@ -17,13 +17,14 @@ from tests.test_docs import module
 def test_draws_are_pooled_by_recording_and_intervals_are_over_recordings() -> None:
     made: Any = module("learning_curve")
     rng = np.random.default_rng(0)
-    draws = [{name: rng.uniform(1, 2, (3, 4)) for name in names} for names in (("a", "b", "c"), ("b", "d"))]
+    draws = [{name: rng.uniform(1, 2, (2, 4)) for name in names} for names in (("a", "b", "c"), ("b", "d"))]
     found = made.point(draws, 8.5)
     pooled = np.stack([draws[0]["a"], draws[0]["b"] + draws[1]["b"], draws[0]["c"], draws[1]["d"]])
-    wanted = intervals.skill_interval(pooled[:, 0, :3], pooled[:, 1, :3])
+    skill = 1 - np.exp(np.log(pooled[:, 0, 1] / pooled[:, 1, 1]).mean())  # the one definition of skill
+    interval = intervals.geometric_skill_interval(pooled[:, 0, :3], pooled[:, 1, :3])
     assert (found.trained, found.tested) == (8.5, 4)
-    assert found.skill[1] == pytest.approx((wanted.mean[1], wanted.low[1], wanted.high[1]))
-    assert found.mae[2] == pytest.approx(pooled[:, 2, 2].sum() / pooled[:, 2, 3].sum())
+    assert found.skill[1] == pytest.approx((skill, interval.low[1], interval.high[1]))
+    assert found.mae[2] == pytest.approx(pooled[:, 0, 2].sum() / pooled[:, 0, 3].sum())
     alone = [made.point([one], 8.5).skill[1][0] for one in draws]
     assert found.spread[1] == pytest.approx(np.std(alone, ddof=1))
     assert np.isnan(made.point(draws[:1], 8.5).spread).all()
@@ -42,7 +43,7 @@ def test_error_sums_of_a_result_are_those_of_its_unseen_recordings(
     found = made.sums(tmp_path)
     assert sorted(found) == ["trial-20", "trial-21"]
     one = made.point([found], 3.0)
-    assert one.skill[0][0] == pytest.approx(metrics["skill"]["mse_counts"]["t1"]["mean"], rel=1e-6)
+    assert one.skill[0][0] == pytest.approx(metrics["skill"]["mae_counts_geometric"]["t1"]["mean"], rel=1e-6)
     assert one.mae[1] == pytest.approx(metrics["model"]["mae_counts"]["both"]["t3"], rel=1e-6)
 
 
@@ -64,7 +65,7 @@ def test_the_commands_train_smaller_sets_for_more_epochs_on_the_same_split(
 
     monkeypatch.setattr(made, "WORK", tmp_path)
     monkeypatch.setattr(made, "run", run)
-    monkeypatch.setattr(made, "sums", lambda _: {"a": np.ones((3, 4)), "b": np.ones((3, 4))})
+    monkeypatch.setattr(made, "sums", lambda _: {"a": np.ones((2, 4)), "b": np.ones((2, 4))})
     points = [made.measured(tmp_path / "data", size, 1, ["--hidden", "8"]) for size in (8, 0)]
     assert [one.trained for one in points] == [8, 45]
     assert [one[0] for one in given] == ["split", "train", "evaluate"] * 2
