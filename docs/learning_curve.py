@@ -32,7 +32,8 @@ STEPS = (1, 5, 10)
 PREDICTORS = ("model", "persistence")
 EPOCHS = 6  # on `MOST` recordings or more
 MOST = 40  # recordings on which `EPOCHS` are made; of fewer, as many more epochs
-Sums = dict[str, AnyFloats]  # by recording: absolute errors of model and persistence, (2, step + 1), values in the last column
+# By recording, absolute errors of model and persistence, shape (2, step + 1); the last column counts the values.
+Sums = dict[str, AnyFloats]
 
 
 class Point(NamedTuple):

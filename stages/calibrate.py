@@ -39,9 +39,7 @@ class Params:
 
 
 @stage(version=4)
-def calibrate(
-    params: Params, model: Model, train: Dataset, val: Dataset | None, calibration: Dataset | None
-) -> Result:
+def calibrate(params: Params, model: Model, train: Dataset, val: Dataset | None, calibration: Dataset | None) -> Result:
     """Return the model's files and what states its uncertainty."""
     from tacpipe.datasets import model_files
     from tacpipe.errors import UsageError

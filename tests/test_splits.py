@@ -34,7 +34,9 @@ def test_random_gives_every_recording_one_role_and_the_shares_asked_for(
 
 @pytest.mark.parametrize("name", ["random", "kfold", "blocked", "leave-one-out", "authors"])
 def test_a_share_to_calibrate_on_is_taken_from_training_and_leaves_the_other_roles_as_they_are(name: str) -> None:
-    labelled = {f"{at}-{found}": one | {"authors_role": at} for at in ("train", "test") for found, one in recordings(30).items()}
+    labelled = {
+        f"{at}-{found}": one | {"authors_role": at} for at in ("train", "test") for found, one in recordings(30).items()
+    }
     without, roles = (assign(labelled, Scheme(name, calibration=share)) for share in (0, 0.2))
     aside = {key for key, role in roles.items() if role == "calibration"}
     trained = Counter(fold for (_, fold), role in without.items() if role in ("train", "val"))

@@ -66,7 +66,9 @@ def _shared(stage: AnyStage) -> list[inspect.Parameter]:
         ]
     if stage.reads_model and not stage.needs_split:
         found.append(
-            _parameter("role", str | None, typer.Option(None, "--role", help="Role to read: train, val, calibration or test."))
+            _parameter(
+                "role", str | None, typer.Option(None, "--role", help="Role to read: train, val, calibration or test.")
+            )
         )
     if stage.fit is not None:
         text = "A dataset whose fitted codec to apply."

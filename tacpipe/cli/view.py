@@ -41,7 +41,9 @@ def view(
         list[str] | None, typer.Option("--where", help="Only recordings with this label, as name=value.")
     ] = None,
     split: Annotated[Path | None, typer.Option("--split", help="Only recordings of this split.")] = None,
-    role: Annotated[str | None, typer.Option("--role", help="Only those with this role: train, val, calibration or test.")] = None,
+    role: Annotated[
+        str | None, typer.Option("--role", help="Only those with this role: train, val, calibration or test.")
+    ] = None,
     fold: Annotated[int, typer.Option("--fold", help="Fold of the split.")] = 0,
     predictions: Annotated[
         Path | None, typer.Option("--predictions", help="What `tacpipe predict` or `tacpipe evaluate` wrote of them.")

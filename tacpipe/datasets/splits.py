@@ -32,7 +32,7 @@ class Scheme:
 
     name: str = "random"
     val: float = 0.15  # fraction of the recordings, or of those left for training where the scheme picks the test ones
-    calibration: float = 0.0  # as val: fraction to calibrate on
+    calibration: float = 0.0  # fraction to calibrate on, of the same recordings as val
     test: float = 0.15  # fraction of the recordings; of no effect where the scheme picks them
     seed: int = 0
     folds: int = 5  # of kfold

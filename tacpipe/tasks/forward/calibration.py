@@ -49,7 +49,11 @@ def calibrate(model: Mapping[str, bytes], asked: Asked, training: Dataset, calib
         "most_promised": conformal.most_promised(count),
     }
     config["trained_on"] = _seen(config["trained_on"], training, calibration)
-    return {**model, CONFIG: (json.dumps(config, indent=1, sort_keys=True) + "\n").encode(), FILE: uncertainty.to_bytes()}
+    return {
+        **model,
+        CONFIG: (json.dumps(config, indent=1, sort_keys=True) + "\n").encode(),
+        FILE: uncertainty.to_bytes(),
+    }
 
 
 def _check_unused(forecaster: Forecaster, calibration: Dataset) -> None:
@@ -58,8 +62,8 @@ def _check_unused(forecaster: Forecaster, calibration: Dataset) -> None:
     used = sorted(name for name, shard in calibration.recordings.items() if shard.digest in digests)
     if used:
         raise UsageError(
-            f"The model was trained, stopped or calibrated with the recording {used[0]}, so its errors there are too small to "
-            f"calibrate on. Make a split with `tacpipe split --calibration 0.15`, and train and calibrate with that split."
+            f"The model was trained, stopped or calibrated with the recording {used[0]}, so its errors there are too small "
+            f"to calibrate on. Make a split with `tacpipe split --calibration 0.15`; train and calibrate with it."
         )
 
 

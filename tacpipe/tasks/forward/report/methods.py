@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from tacpipe.report import contents
 from tacpipe.report.contents import Tree
+from tacpipe.tasks.forward.params import Recurrent
 from tacpipe.tasks.forward.report import error_sums
 from tacpipe.tasks.forward.report.error_sums import ErrorSums
 
@@ -55,13 +56,22 @@ class Result(contents.Result):
         codec = self.config["codec"]["name"]
         return {**params, "codec": codec, "actions": self.actions, "timeline": self.timeline}
 
+    @property
+    def part_of_schedule(self) -> str:
+        """The epochs of the paper's network, where they are fewer than the paper's, as "12 of 50 epochs"; else empty."""
+        epochs, published = int(self.given.get("epochs", 0)), int(str(Recurrent.PRESETS["paper"]["epochs"]))
+        shortened = self.config["architecture"] == "recurrent" and 0 < epochs < published
+        return f"{epochs} of {published} epochs" if shortened else ""
+
     def name(self, usual: str) -> str:
-        """Return what its method is called, with a timeline that is not the ``usual`` one."""
+        """Return what its method is called, with a timeline that is not the ``usual`` one and a shortened schedule."""
         parts = [str(self.config["architecture"]).replace("_", " "), str(self.config["codec"]["name"])]
         if self.actions != "planned":
             parts.append("no actions" if self.actions == "none" else f"{self.actions} actions")
         if self.timeline != usual:
             parts.append(self.timeline)
+        if self.part_of_schedule:
+            parts.append(self.part_of_schedule)
         return " · ".join(parts)
 
 

@@ -96,7 +96,7 @@ def result(
         "rate_hz": 50.0,
         "validation": {"mse_feature": 0.01 * (1 + seed)},
         **config,
-        "params": {"seed": seed, "hidden": 200, "epochs": 5, "actions": "planned", **config.get("params", {})},
+        "params": {"seed": seed, "hidden": 200, "epochs": 50, "actions": "planned", **config.get("params", {})},
     }
     made = {
         "config.json": json.dumps(shown).encode(),

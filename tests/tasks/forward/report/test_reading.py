@@ -194,3 +194,12 @@ def test_most_runs_decide_which_timeline_is_the_main_one() -> None:
     fresh, uniform, logged = (methods.Result(result(timeline=name)) for name in ("fresh", "uniform", "logged"))
     assert methods.main_timeline([fresh, uniform, fresh]) == "fresh"
     assert methods.main_timeline([fresh, uniform, logged]) == "uniform"
+
+
+def test_the_papers_network_trained_for_a_part_of_its_schedule_is_named_with_that_part() -> None:
+    shortened = [result(params={"epochs": 12}), result(architecture="tcn", params={"epochs": 12})]
+    assert sorted(named(*shortened, result("raw"))) == [
+        "recurrent · PCA-20 · 12 of 50 epochs",
+        "recurrent · raw",
+        "tcn · PCA-20",
+    ]
