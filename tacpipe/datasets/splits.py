@@ -59,7 +59,7 @@ def assign(attributes: Mapping[str, Attributes], scheme: Scheme, keep: Mapping[t
                    Where some have ``authors_fold``, a fold a block: see below
     ============== =====================================================================================
 
-    In all schemes ``calibration`` is a share of the same recordings as ``val``.
+    In all schemes ``calibration`` is a fraction, of the same recordings as ``val``.
 
     Blocks of ``authors_fold`` take turns: where some recordings have the ``authors_role`` test, these are tested in every
     fold, and the k-th block is val in fold k. Where none has, the k-th block is tested, and ``val`` of the others is
@@ -167,7 +167,7 @@ def _check_options(scheme: Scheme) -> None:
 
 
 def _drawn(names: Sequence[str], attributes: Mapping[str, Attributes], scheme: Scheme, draw: int) -> dict[str, str]:
-    """Return roles with the shares of the scheme, each value of ``stratify`` spread evenly over them."""
+    """Return roles with the fractions that the scheme states, each value of ``stratify`` spread evenly over them."""
     order = _order(names, attributes, scheme, np.random.default_rng([scheme.seed, draw]))
     return _in_turn(order, scheme, ("test", "val", "calibration", "train"))
 
