@@ -131,7 +131,7 @@ def test_a_recording_that_trained_or_stopped_the_model_does_not_calibrate_it(
 ) -> None:
     recordings = dataset(*CALIBRATION[:3], motion(seed))
     with pytest.raises(UsageError, match=f"{motion(seed).name}.*tacpipe split --calibration"):
-        forward.calibrate(plain, Asked(PERCENTS, False, 0.05, 0), dataset(*TRAINING), recordings)
+        forward_calibration.calibrate(plain, Asked(PERCENTS, False, 0.05, 0), dataset(*TRAINING), recordings)
 
 
 def test_a_model_without_quantiles_is_evaluated_as_before_and_has_none_to_give(plain: dict[str, bytes]) -> None:
