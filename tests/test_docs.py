@@ -355,6 +355,16 @@ def test_every_page_is_in_the_navigation_and_every_link_leads_to_a_page() -> Non
 
 @pytest.mark.long
 @pytest.mark.skipif(importlib.util.find_spec("mkdocs") is None, reason="the extra docs is not installed")
+def test_every_page_is_at_most_two_links_from_the_readme() -> None:
+    reached = {ROOT / "README.md"}
+    for _ in range(2):
+        for page in list(reached):
+            targets = re.findall(r"\]\(([^)#\s]+\.md)(?:#[^)]*)?\)", page.read_text())
+            reached |= {path for target in targets if (path := (page.parent / target).resolve()).exists()}
+    pages = {page for page in DOCS if page.parent.name != "decisions"}
+    assert {str(page.relative_to(ROOT)) for page in pages - reached} == set()
+
+
 def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "-d", str(tmp_path / "site")],
