@@ -80,5 +80,8 @@ def column(table: pa.Table, name: str) -> np.ndarray[Any, Any]:
 
 def decode_few_rows_at_a_time(monkeypatch: pytest.MonkeyPatch, rows: int) -> None:
     """Make every stored table yield batches of ``rows`` rows, whichever number its reader asks for."""
-    batches = ParquetTable.batches
-    monkeypatch.setattr(ParquetTable, "batches", lambda table, columns=None, _=0: batches(table, columns, rows))
+    for kind in (ParquetTable, Columns):
+        batches = kind.batches
+        monkeypatch.setattr(
+            kind, "batches", lambda self, columns=None, _=0, batches=batches, **_rows: batches(self, columns, rows)
+        )

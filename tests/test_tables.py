@@ -2,6 +2,7 @@ import ast
 import errno
 import io
 import itertools
+import re
 import tempfile
 import weakref
 from pathlib import Path
@@ -17,8 +18,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tacpipe.errors import DamagedError, StorageError
-from tacpipe.io import parquet, row_groups
-from tacpipe.io.parquet import from_parquet, owned, to_parquet, with_metadata
+from tacpipe.io import parquet, parquet_claims, row_groups
+from tacpipe.io.parquet import ParquetTable, from_parquet, owned, to_parquet, with_metadata
 from tests.any_table import bits, tables
 
 drawn = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
@@ -64,7 +65,7 @@ def test_whatever_is_read_as_parquet_lies_in_memory_of_arrow_s_own() -> None:
                 given = ast.unparse(call.args[0])  # `self._content` is what `ParquetTable` got from `owned`
                 assert given.startswith("owned(") or given == "self._content", f"{file}:{call.lineno}"
                 found += 1
-    assert found == 8
+    assert found == 7
 
 
 @given(tables(), st.data())
@@ -212,3 +213,27 @@ def test_held_frames_are_stored_plain_and_smooth_ones_delta_packed_and_both_with
 def test_bytes_that_are_no_parquet_file_are_named_so() -> None:
     with pytest.raises(DamagedError, match="no Parquet file"):
         from_parquet(b"PAR1 but not really")
+
+
+@given(tables())
+@drawn
+def test_a_footer_declares_the_same_whether_its_usual_forms_are_matched_or_each_field_is_read(table: pa.Table) -> None:
+    content = to_parquet(table)
+    schema = pq.ParquetFile(io.BytesIO(content)).schema
+    matched = parquet_claims.Claims(schema, content).count(content)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(parquet_claims, "_usual", lambda *_: None)
+        patch.setattr(parquet_claims, "_USUAL", re.compile(rb"(?!)"))
+        assert parquet_claims.Claims(schema, content).count(content) == matched
+
+
+@given(tables(), st.data())
+@drawn
+def test_a_table_that_is_read_from_its_file_is_the_one_of_its_bytes(table: pa.Table, data: st.DataObject) -> None:
+    names = data.draw(st.lists(st.sampled_from(table.column_names), unique=True)) if table.num_columns else []
+    with tempfile.NamedTemporaryFile() as file:
+        file.write(to_parquet(table))
+        file.flush()
+        stored = ParquetTable(Path(file.name))
+        assert bits(stored.read(names)) == bits(table.select(names))
+        assert bits(pa.concat_tables([table.slice(0, 0), *stored.batches(rows=7)])) == bits(table)

@@ -8,6 +8,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
+from weakref import WeakValueDictionary
 
 from tacpipe.datasets.manifest import Entry, Manifest
 from tacpipe.datasets.pages import Pages
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
 
 Reader = Callable[[str, str], bytes]  # digest, path within the dataset directory -> verified content
 Wanted = Attribute | Collection[Attribute] | Callable[[Any], bool]  # value of a label, values, or a test of one
+LARGE_BYTES = 1 << 24  # A shard of this size or more is read from its file
 _NAMED = 5  # recordings that an error names
 
 
@@ -43,6 +45,7 @@ class Recording:
         self._shards = entry["shards"]
         self._read = read
         self._dataset = dataset
+        self._opened: WeakValueDictionary[str, Columns] = WeakValueDictionary()
 
     def __repr__(self) -> str:
         streams = ", ".join(filter(None, self.streams))
@@ -107,27 +110,38 @@ class Recording:
 
         if stream in self._shards:
             return from_parquet(self._content(stream), columns)
-        from tacpipe.datasets.streams import streams_of
+        from tacpipe.datasets.streams import stored_columns
 
-        within = streams_of(self) if self.streams == ("",) else {}
-        if stream not in within:
-            raise self._without(stream, [name for name in within if name])
-        return within[stream] if columns is None else within[stream].select(list(columns))
+        stored = self.columns() if self.streams == ("",) else None
+        names_by_stream = {} if stored is None else stored_columns(stored.schema)
+        if stored is None or stream not in names_by_stream:
+            raise self._without(stream, [name for name in names_by_stream if name])
+        names = names_by_stream[stream]
+        if columns is not None:
+            names = {name: names[name] for name in columns}
+        return stored.read(list(names.values())).rename_columns(list(names))
 
     def columns(self, stream: str = "") -> Columns:
         """Return a stream whose columns are decoded when asked for, some at a time; its bytes are verified first.
 
         It reads like an arrow table (``schema``, ``num_rows``, ``column_names``, ``column(name)``), and of a long
-        recording it takes a fraction of the memory.
+        recording it takes a fraction of the memory. As long as the result is in use, the next call returns it again.
         """
         from tacpipe.io.columns import Columns
 
-        return Columns(self._content(stream))
+        columns = self._opened.get(stream)
+        if columns is None:
+            columns = self._opened[stream] = Columns(self._content(stream))
+        return columns
 
-    def _content(self, stream: str) -> bytes:
+    def _content(self, stream: str) -> bytes | Path:
+        """Return the verified bytes of a stream, or the path of a large one in the store, which memory need not hold."""
         if stream not in self._shards:
             raise self._without(stream, [])
-        return self._read(self._shards[stream]["digest"], shard_path(self.name, stream))
+        name, path = self._shards[stream]["digest"], shard_path(self.name, stream)
+        large_file = getattr(self._read, "large_file", None)
+        file: Path | None = large_file and large_file(name, path, LARGE_BYTES)
+        return file or self._read(name, path)
 
     def _without(self, stream: str, within: Sequence[str]) -> UsageError:
         if self.streams == ("",) and not within:

@@ -37,16 +37,22 @@ def split_tables(tables: Mapping[str, pa.Table]) -> dict[str, pa.Table]:
     if set(tables) != {""}:
         return {name: table for name, table in tables.items() if name not in NO_SIGNALS}
     table = tables[""]
-    columns: dict[str, list[str]] = {}
-    for field in table.schema:
+    return {
+        stream: table.select(list(names.values())).rename_columns(list(names))
+        for stream, names in stored_columns(table.schema).items()
+    }
+
+
+def stored_columns(schema: pa.Schema) -> dict[str, dict[str, str]]:
+    """Return the columns of each stream of a synchronized table: recorded name to stored name, times first."""
+    columns: dict[str, dict[str, str]] = {}
+    for field in schema:
         metadata = field.metadata or {}
         signal = field.name != "t_ns" and not field.name.startswith(TRUTH) and metadata.get(b"quantity") != b"mask"
         if signal:
-            columns.setdefault(metadata.get(b"stream", b"").decode(), []).append(field.name)
-    return {
-        stream: table.select(["t_ns", *names]).rename_columns(["t_ns", *(_recorded(name, stream) for name in names)])
-        for stream, names in columns.items()
-    }
+            stream = metadata.get(b"stream", b"").decode()
+            columns.setdefault(stream, {"t_ns": "t_ns"})[_recorded(field.name, stream)] = field.name
+    return columns
 
 
 def _recorded(name: str, stream: str) -> str:

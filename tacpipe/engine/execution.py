@@ -134,6 +134,20 @@ class _Reader:
                     raise unread from error
             return _remake(self._store, name, path, str(error), size) if content is None else content
 
+    def large_file(self, name: str, path: str, least_bytes: int) -> Path | None:
+        """Return the path of an object of so many bytes in the store, verified and repaired; None for a smaller one."""
+        file = Path(self._store.object_path(name))
+        try:
+            if file.stat().st_size < least_bytes:
+                return None
+            for _ in self._store.blocks(name):
+                pass
+        except OSError:  # reading it whole states what is wrong
+            return None
+        except MissingError:
+            self(name, path)
+        return file
+
     def __reduce__(self) -> tuple[Any, ...]:
         sizes = self._sizes if isinstance(self._sizes, Manifest) else dict(self._sizes)
         return _reader_at, (self._store.place, self._beside, sizes)

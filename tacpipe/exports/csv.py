@@ -53,8 +53,9 @@ def part(params: Params, recording: Recording, name: RecordingName) -> Result:
     writers: dict[str, Callable[[Any], object]] = {}
     losses: list[Loss] = []
     for stream in recording.streams:
-        losses += list(_losses(stream, recording.columns(stream)))
-        writers[f"{name}/{stream_label(stream)}.csv"] = functools.partial(_write, recording, stream)
+        stored = recording.columns(stream)
+        losses += list(_losses(stream, stored))
+        writers[f"{name}/{stream_label(stream)}.csv"] = functools.partial(_write, stored)
     return Result({"": RecordingOutput(contents.part(recording, losses))}, written=writers)
 
 
@@ -121,11 +122,10 @@ def _quoted(value: str) -> str:
     return json.dumps(value, ensure_ascii=True)  # a basic string of TOML is written alike
 
 
-def _write(recording: Recording, stream: str, sink: Any) -> None:
+def _write(stored: Columns, sink: Any) -> None:
     """Write a stream as CSV: floats with the fewest digits that give the same bits back, NaN as ``nan``."""
     import pyarrow.csv as pc
 
-    stored = recording.columns(stream)
     with pc.CSVWriter(sink, _writable_table(stored.schema.empty_table()).schema) as writer:
         for table in stored.batches():
             writer.write_table(_writable_table(table))

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import ctypes
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 
 import pyarrow as pa
 
@@ -21,11 +23,24 @@ class Columns:
     neighbouring columns, and one of bytes, as of images, alone. Raises `DamagedError` as `from_parquet` does.
     """
 
-    def __init__(self, content: bytes, block_bytes: int = BLOCK_BYTES) -> None:
-        self._file = ParquetTable(content)
-        self.schema = self._file.schema
-        self._blocks = {name: block for block in _blocks(self.schema, self.num_rows, block_bytes) for name in block}
+    def __init__(self, content: bytes | Path, block_bytes: int = BLOCK_BYTES) -> None:
+        self._file, self._block_bytes = ParquetTable(content), block_bytes
+        self._set_schema(self._file.schema)
+
+    def _set_schema(self, schema: pa.Schema) -> None:
+        self.schema = schema
+        needed = [self.num_rows * _needed_bytes(field.type, self._block_bytes) for field in schema]
+        self._small = len(needed) > 0 and sum(needed) <= self._block_bytes
+        blocks = _blocks(schema.names, needed, self._block_bytes)
+        self._blocks = {name: block for block in blocks for name in block}
         self._decoded = pa.table({})
+        self._places: dict[str, int] = {}  # position of each decoded column
+
+    def select(self, names: Sequence[str]) -> Columns:
+        """Return the columns of these names alone."""
+        selected = copy.copy(self)
+        selected._set_schema(pa.schema([self.schema.field(name) for name in names]))
+        return selected
 
     @property
     def num_rows(self) -> int:
@@ -39,20 +54,56 @@ class Columns:
 
     def column(self, name: str) -> pa.ChunkedArray:
         """Return one column. Raises `KeyError` where there is none of this name."""
-        if name not in self._decoded.column_names:
+        place = self._places.get(name)
+        if place is None:
             block = self._blocks[name]
             self.forget()  # before the next block is decoded
             self._decoded = self._file.read(block)
-        return self._decoded.column(name)
+            self._places = {column: place for place, column in enumerate(block)}
+            place = self._places[name]
+        return self._decoded.column(place)
+
+    def read(self, columns: Sequence[str]) -> pa.Table:
+        """Return a table of some columns."""
+        if self._small and self._decoded.num_columns:
+            return self._decoded.select(list(columns))
+        return self._file.read(columns)
 
     def batches(self, columns: Sequence[str] | None = None, rows: int = SOME_ROWS) -> Iterator[pa.Table]:
-        """Yield tables of up to ``rows`` rows each, in order, decoded as they are asked for; only ``columns``."""
-        return self._file.batches(columns, rows)
+        """Yield tables of up to ``rows`` rows each, in order, decoded as they are asked for; only ``columns``.
+
+        A stream of up to `BLOCK_BYTES` is decoded once, however often it is read.
+        """
+        names = self.column_names if columns is None else list(columns)
+        if not self._small:
+            yield from self._file.batches(names, rows)
+            return
+        self.column(self.column_names[0])
+        table = self._decoded.select(names)
+        for first in range(0, self.num_rows, rows):
+            yield table.slice(first, rows)
 
     def forget(self) -> None:
         """Let go of what was decoded last, unless it is the whole of a small stream."""
         if self._decoded.num_columns < len(self._blocks):
-            self._decoded = pa.table({})
+            self._decoded, self._places = pa.table({}), {}
+
+
+def change(columns: Columns, change_rows: Callable[[pa.Table, int], pa.Table]) -> pa.Table | pa.RecordBatchReader:
+    """Return the rows of a stream as ``change_rows`` makes them of tables and of the number of their first row.
+
+    The result is a table of up to `SOME_ROWS` rows, or batches that are made as they are asked for.
+    """
+    if columns.num_rows <= SOME_ROWS:
+        return change_rows(columns.read(columns.column_names), 0)
+
+    def changed() -> Iterator[pa.RecordBatch]:
+        first = 0
+        for table in columns.batches(rows=SOME_ROWS):
+            yield from change_rows(table, first).combine_chunks().to_batches()
+            first += table.num_rows
+
+    return pa.RecordBatchReader.from_batches(change_rows(columns.schema.empty_table(), 0).schema, changed())
 
 
 def release() -> None:
@@ -62,21 +113,23 @@ def release() -> None:
         ctypes.CDLL(None).malloc_trim(0)
 
 
-def _blocks(schema: pa.Schema, rows: int, block_bytes: int) -> list[Sequence[str]]:
+def _blocks(names: Sequence[str], needed_bytes: Sequence[int], block_bytes: int) -> list[Sequence[str]]:
     """Return the names of neighbouring columns that take up to ``block_bytes`` together, or one column each."""
-    found: list[list[str]] = []
+    blocks: list[list[str]] = []
     room = 0
-    for field in schema:
-        needed = rows * (block_bytes if pa.types.is_binary(field.type) else _width_bytes(field.type))
-        if not found or needed > room:
-            found.append([])
+    for name, needed in zip(names, needed_bytes, strict=True):
+        if not blocks or needed > room:
+            blocks.append([])
             room = block_bytes
-        found[-1].append(field.name)
+        blocks[-1].append(name)
         room -= needed
-    return list(found)
+    return list(blocks)
 
 
-def _width_bytes(kind: pa.DataType) -> int:
+def _needed_bytes(kind: pa.DataType, block_bytes: int) -> int:
+    """Return about how many bytes a value takes once decoded; bytes, as of images, take a block each."""
+    if pa.types.is_binary(kind):
+        return block_bytes
     try:
         return max(1, int(kind.bit_width) // 8)
     except ValueError:  # a text

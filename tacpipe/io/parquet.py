@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 
 from tacpipe.errors import DamagedError, ShortageError, TacpipeError
 from tacpipe.io import memory, regular, row_groups
-from tacpipe.io.parquet_claims import claimed, counted
+from tacpipe.io.parquet_claims import Claims
 from tacpipe.printable import plain
 
 ROW_GROUP_ROWS = 1 << 20
@@ -102,8 +102,8 @@ def write(source: pa.Table | pa.RecordBatchReader, sink: Any) -> int:
     return count
 
 
-def from_parquet(content: bytes, columns: Sequence[str] | None = None) -> pa.Table:
-    """Return the table of a Parquet file's bytes, with field metadata; ``columns`` reads those alone.
+def from_parquet(content: bytes | Path, columns: Sequence[str] | None = None) -> pa.Table:
+    """Return the table of a Parquet file's bytes, or of the file at a path, with field metadata; of ``columns`` if given.
 
     Raises `DamagedError` when the bytes are no Parquet file, and where what they declare is not there, and
     `ShortageError` where it is more than the memory that is left, which a sound file may hold too.
@@ -128,8 +128,9 @@ def require_claims(
         try:
             schema = pq.ParquetFile(file).schema
             with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as mapped, memoryview(mapped) as content:
-                encoded, largest, _ = counted(schema, content, columns, shared=True)
-                total, _, _ = counted(schema, content, columns)
+                claims = Claims(schema, content)
+                encoded, largest, _ = claims.count(content, columns, shared=True)
+                total, _, _ = claims.count(content, columns)
         except BROKEN as error:
             raise TacpipeError(
                 f"{path} is not a whole Parquet file: {plain(' '.join(str(error).split()), 200)}. Copy it again."
@@ -174,20 +175,45 @@ def _text_bytes(file: Any, schema: Any, columns: Collection[str] | None, rows: i
 
 
 class ParquetTable:
-    """The table of a Parquet file's bytes, of which columns are decoded when asked for; raises as `from_parquet` does.
+    """The table of a Parquet file, of which columns are decoded when they are asked for; raises as `from_parquet` does.
 
+    It takes the bytes of a file, or the path of a file that does not change, of which memory then holds what is decoded.
     A buffer of Arrow's own is read as it is, bytes of Python's are copied into one.
     """
 
-    def __init__(self, content: bytes | pa.Buffer) -> None:
-        self._content = content if isinstance(content, pa.Buffer) else owned(content)
+    def __init__(self, content: bytes | pa.Buffer | Path) -> None:
+        if isinstance(content, Path):
+            self._source: pa.NativeFile = pa.OSFile(str(content))
+            with content.open("rb") as file:
+                self._content: Any = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        else:
+            self._content = content if isinstance(content, pa.Buffer) else owned(content)
+            self._source = pa.BufferReader(self._content)
+        self._size = self._source.size()
+        self._claims: Claims | None = None
         try:
-            self._file = pq.ParquetFile(pa.BufferReader(self._content))
+            self._file = self._opened()
             stored = (self._file.metadata.metadata or {}).get(_KEY)
             self._fields = None if stored is None else json.loads(stored)
             self.schema = self._with_fields(self._file.schema_arrow)
         except BROKEN as error:
-            raise _unread(self._content.size, error) from error
+            raise _unread(self._size, error) from error
+
+    def _opened(self) -> pq.ParquetFile:
+        """Return a reader of the file, which checks the pages of one that memory does not hold."""
+        if isinstance(self._content, pa.Buffer):
+            return pq.ParquetFile(self._source)
+        return pq.ParquetFile(self._source, buffer_size=1 << 16, page_checksum_verification=True)
+
+    def _count(self, columns: Sequence[str] | None) -> tuple[int, int, int]:
+        """Return what `Claims.count` does."""
+        content = memoryview(self._content).cast("B") if isinstance(self._content, pa.Buffer) else self._content
+        try:
+            if self._claims is None:
+                self._claims = Claims(self._file.schema, content)
+            return self._claims.count(content, columns)
+        except BROKEN as error:
+            raise _unread(self._size, error) from error
 
     @property
     def num_rows(self) -> int:
@@ -196,33 +222,35 @@ class ParquetTable:
 
     def read(self, columns: Sequence[str] | None = None) -> pa.Table:
         """Return the table, of ``columns`` alone where they are named, with field metadata."""
+        total, largest, _ = self._count(columns)
+        memory.require(total + largest, f"A Parquet file of {self._size} bytes", error=ShortageError)
         try:
-            needed = claimed(self._file.schema, memoryview(self._content).cast("B"), columns)
+            return self._described(self._file.read(columns=list(columns) if columns is not None else None))
         except BROKEN as error:
-            raise _unread(self._content.size, error) from error
-        memory.require(needed, f"A Parquet file of {self._content.size} bytes", error=ShortageError)
-        try:
-            table = self._file.read(columns=list(columns) if columns is not None else None)
-            return table if self._fields is None else table.cast(self._with_fields(table.schema))
-        except BROKEN as error:
-            raise _unread(self._content.size, error) from error
+            raise _unread(self._size, error) from error
 
     def batches(self, columns: Sequence[str] | None = None, rows: int = SOME_ROWS) -> Iterator[pa.Table]:
         """Yield tables of up to ``rows`` rows, decoded as they are asked for, with field metadata."""
-        try:
-            total, page, count = counted(self._file.schema, memoryview(self._content).cast("B"), columns)
-        except BROKEN as error:
-            raise _unread(self._content.size, error) from error
+        total, page, count = self._count(columns)
         at_once = total * min(rows, self.num_rows) // max(1, self.num_rows)
-        memory.require(at_once + page * count, f"A Parquet file of {self._content.size} bytes", error=ShortageError)
-        wanted = list(columns) if columns is not None else None
-        file = pq.ParquetFile(pa.BufferReader(self._content), pre_buffer=False)
+        memory.require(at_once + page * count, f"A Parquet file of {self._size} bytes", error=ShortageError)
+        names = list(columns) if columns is not None else None
         try:
-            for batch in file.iter_batches(rows, columns=wanted, use_threads=False):
-                table = pa.Table.from_batches([batch])
-                yield table if self._fields is None else table.cast(self._with_fields(table.schema))
+            for batch in self._opened().iter_batches(rows, columns=names, use_threads=False):
+                yield self._described(pa.Table.from_batches([batch]))
         except BROKEN as error:
-            raise _unread(self._content.size, error) from error
+            raise _unread(self._size, error) from error
+
+    def _described(self, table: pa.Table) -> pa.Table:
+        """Return a table of some columns with their field metadata."""
+        if self._fields is None:
+            return table
+        if not table.num_columns:  # its rows count all the same
+            return table.replace_schema_metadata(None)
+        schema = self.schema
+        if table.column_names != schema.names:
+            schema = pa.schema([schema.field(name) for name in table.column_names])
+        return pa.Table.from_arrays(table.columns, schema=schema)
 
     def _with_fields(self, schema: pa.Schema) -> pa.Schema:
         return schema if self._fields is None else _with_fields(schema, self._file.schema_arrow.names, self._fields)
@@ -317,11 +345,14 @@ def _held_share(table: pa.Table, release: Callable[[], None]) -> float:
 
 def _fields_to_json(schema: pa.Schema) -> bytes:
     """Return all field metadata as JSON: key to value to the positions of the columns that carry it."""
-    fields: dict[str, dict[str, list[int]]] = {}
+    carriers: dict[tuple[bytes, bytes], list[int]] = {}
     for position, field in enumerate(schema):
-        for key, value in (field.metadata or {}).items():
-            if not key.startswith(b"PARQUET:"):
-                fields.setdefault(key.decode(), {}).setdefault(value.decode(), []).append(position)
+        for pair in (field.metadata or {}).items():
+            carriers.setdefault(pair, []).append(position)
+    fields: dict[str, dict[str, list[int]]] = {}
+    for (key, value), positions in carriers.items():
+        if not key.startswith(b"PARQUET:"):
+            fields.setdefault(key.decode(), {})[value.decode()] = positions
     return json.dumps({"fields": fields}, sort_keys=True, separators=(",", ":")).encode()
 
 

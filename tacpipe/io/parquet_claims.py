@@ -8,6 +8,7 @@ differences or runs may be as many as one likes, so what they would take is comp
 
 from __future__ import annotations
 
+import mmap
 import re
 from collections.abc import Collection, Iterator, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -15,6 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 if TYPE_CHECKING:
     from pyarrow.parquet import ParquetSchema
 
+Bytes = bytes | memoryview | mmap.mmap
 DATA, DICTIONARY = 0, 2  # kinds of pages
 PLAIN, DELTA_LENGTH = 0, 6  # encodings of texts that are as long as what represents them
 INDEXES = (2, 8)  # encodings of texts that stand in a dictionary
@@ -22,11 +24,31 @@ INDEX = 4  # bytes of a place in a dictionary, in memory
 WIDTHS = {"BOOLEAN": 1, "INT32": 4, "INT64": 8, "INT96": 12, "FLOAT": 4, "DOUBLE": 8}  # bytes of a value in memory
 OFFSET = 8  # bytes that a text takes beside its own
 _VARINT = rb"([\x80-\xff]*[\x00-\x7f])"
+_SMALL = rb"[\x00-\x7f]"  # a number of one byte
+_CHUNK, _ELEMENT, _ORDER = b"&\x15\x1c"  # first bytes of a column's chunk, of its element in the schema, of its order
+# A column's chunk: offset 0, type, 2 encodings, name, codec, values, sizes, where pages begin, statistics of pages
+_USUAL_CHUNK = re.compile(
+    rb"&\x00\x1c\x15%b\x19\x25%b%b\x19\x18(%b)([ -~]*)\x15%b\x16%b\x16%b\x16%b&%b"
+    rb"\x49\x1c\x15%b\x15%b\x15%b\x00\x3c(?:\x16%b)?[\x19)]\x06(?:\x19\x26%b%b)?\x00\x00\x00"
+    % (*(_SMALL,) * 5, *(_VARINT,) * 4, *(_SMALL,) * 3, *(_VARINT,) * 3),
+)
+_USUAL_NAME = re.compile(rb"\x15%b\x25%b\x18(%b)" % ((_SMALL,) * 3))  # type, repetition, length of the name
+_USUAL_KIND = re.compile(  # converted type; logical type: none, of text, or of integers
+    rb"(?:\x25%b)?(?:\x4c(?:\x1c\x00|\xac\x13%b[\x11\x12]\x00)\x00)?\x00" % ((_SMALL,) * 2)
+)
 _USUAL = re.compile(  # kind 0, unpacked size, size, maybe a check sum, and of its values the number and the encoding
-    rb"\x15\x00\x15%b\x15%b(?:\x15%b\x1c|\x2c)\x15%b\x15(.)\x15.\x15.(?:\x1c\x00)?\x00\x00" % ((_VARINT,) * 4),
-    re.DOTALL,
+    rb"\x15\x00\x15%b\x15%b(?:\x15%b\x1c|\x2c)\x15%b\x15(%b)\x15%b\x15%b(?:\x1c\x00)?\x00\x00"
+    % (*(_VARINT,) * 4, *(_SMALL,) * 3),
 )
 DEEPEST = 8  # structures within one another in a page's header
+
+
+class _Leaf(NamedTuple):
+    """A column of values, as the schema describes it."""
+
+    path: str
+    kind: str  # physical type
+    length: int  # bytes of a value of fixed length
 
 
 class Page(NamedTuple):
@@ -39,54 +61,68 @@ class Page(NamedTuple):
     encoding: int
 
 
-def claimed(schema: ParquetSchema, content: bytes | memoryview, columns: Collection[str] | None = None) -> int:
-    """Return how many bytes the ``columns`` of a file (None: all) are in memory by what they declare, at least.
-
-    Raises `ValueError` as `counted` does.
-    """
-    total, largest, _ = counted(schema, content, columns)
-    return total + largest
-
-
-def counted(
-    schema: ParquetSchema, content: bytes | memoryview, columns: Collection[str] | None = None, *, shared: bool = False
-) -> tuple[int, int, int]:
-    """Return how many bytes all values of ``columns`` are, how many the largest page is, and how many columns there are.
-
-    Where ``shared``, texts in a dictionary are as they are in the file: each is there once.
+class Claims:
+    """Count the bytes that the columns of one file declare, each column once.
 
     The footer is read here, because pyarrow's own look at it ends the process where its parts contradict one another.
-    Raises `ValueError` where a column states another number of values than its pages, or of pages that are not there.
+    Raises `ValueError` where the footer contradicts itself, and where a column that is asked for declares another number
+    of values than its pages hold, or pages that the file does not have.
     """
-    length = int.from_bytes(content[-8:-4], "little")
-    told, _ = _struct(content, len(content) - 8 - length, len(content) - 8, 0)
-    leaves = list(_leaves(schema, columns))
-    total = largest = rows = 0
-    for group in told.get(4) or ():
-        rows += _whole(group.get(3))
-        chunks = group.get(1) or ()
-        for place, name, width in leaves:
+
+    def __init__(self, schema: ParquetSchema, content: Bytes) -> None:
+        length = int.from_bytes(content[-8:-4], "little")
+        footer, _ = _struct(content, len(content) - 8 - length, len(content) - 8, 0)
+        leaves = (schema.column(place) for place in range(len(schema)))
+        self._leaves = [_Leaf(leaf.path, leaf.physical_type, leaf.length) for leaf in leaves]
+        self._groups: list[list[Any]] = [group.get(1) or [] for group in footer.get(4) or ()]
+        self._counted: dict[tuple[int, bool], tuple[int, int]] = {}  # column and `shared`: its bytes, its largest page
+        rows = sum(_whole(group.get(3)) for group in footer.get(4) or ())
+        if footer.get(3) != rows:
+            raise ValueError(f"it declares {footer.get(3)} rows, and its groups of {rows}")
+
+    def count(
+        self, content: Bytes, columns: Collection[str] | None = None, *, shared: bool = False
+    ) -> tuple[int, int, int]:
+        """Return how many bytes all values of ``columns`` are, how many the largest page is, and the number of columns.
+
+        ``content`` is that of the file. Where ``shared``, texts in a dictionary are as they are in the file: each is there
+        once.
+        """
+        places = [
+            place
+            for place, leaf in enumerate(self._leaves)
+            if columns is None or leaf.path in columns or leaf.path.partition(".")[0] in columns
+        ]
+        for place in places:
+            if (place, shared) not in self._counted:
+                self._counted[place, shared] = self._count_column(content, place, shared=shared)
+                if isinstance(content, mmap.mmap):
+                    content.madvise(mmap.MADV_DONTNEED)
+        counts = [self._counted[place, shared] for place in places]
+        return sum(total for total, _ in counts), max((largest for _, largest in counts), default=0), len(places)
+
+    def _count_column(self, content: Bytes, place: int, *, shared: bool) -> tuple[int, int]:
+        """Return the bytes of a column in memory, and those of its largest page."""
+        leaf, total, largest = self._leaves[place], 0, 0
+        for chunks in self._groups:
             if place >= len(chunks):
-                raise ValueError(f"column {name!r:.60} is not in a group of rows")
+                raise ValueError(f"column {leaf.path!r:.60} is not in a group of rows")
             chunk = chunks[place].get(3) or {}
-            pages = list(_pages(content, *_span(chunk, len(content), name)))
+            start, stop = _span(chunk, len(content), leaf.path)
+            only = _USUAL.match(content, start, stop)
+            if only is not None and only.end() + _varint(only[2]) == stop and leaf.kind in WIDTHS:  # most have one page
+                values, unpacked = _varint(only[4]), _varint(only[1])
+                if values == chunk.get(5) and values >= 0 and unpacked >= 0:
+                    total, largest = total + values * WIDTHS[leaf.kind], max(largest, unpacked)
+                    continue
+            pages = list(_pages(content, start, stop))
             values = sum(page.values for page in pages if page.kind != DICTIONARY)
             if values != chunk.get(5):
-                raise ValueError(f"column {name!r:.60} declares {chunk.get(5)} values and holds {values}")
+                raise ValueError(f"column {leaf.path!r:.60} declares {chunk.get(5)} values and holds {values}")
+            width = leaf.length if leaf.kind == "FIXED_LEN_BYTE_ARRAY" else WIDTHS.get(leaf.kind, 0)
             total += values * width if width else _texts(pages, shared=shared)
             largest = max(largest, *(page.unpacked for page in pages), 0)
-    if told.get(3) != rows:
-        raise ValueError(f"it declares {told.get(3)} rows, and its groups of {rows}")
-    return total, largest, len(leaves)
-
-
-def _leaves(schema: ParquetSchema, columns: Collection[str] | None) -> Iterator[tuple[int, str, int]]:
-    """Yield place, name and bytes of a value in memory of each column that is read; 0 for texts, which vary."""
-    for place in range(len(schema)):
-        leaf = schema.column(place)
-        if columns is None or leaf.path.partition(".")[0] in columns or leaf.path in columns:
-            kind = leaf.physical_type
-            yield place, leaf.path, leaf.length if kind == "FIXED_LEN_BYTE_ARRAY" else WIDTHS.get(kind, 0)
+        return total, largest
 
 
 def _span(chunk: Mapping[int, Any], end: int, name: str) -> tuple[int, int]:
@@ -113,7 +149,7 @@ def _texts(pages: Collection[Page], *, shared: bool) -> int:
     return total
 
 
-def _pages(content: bytes | memoryview, place: int, stop: int) -> Iterator[Page]:
+def _pages(content: Bytes, place: int, stop: int) -> Iterator[Page]:
     while place < stop:
         usual = _USUAL.match(content, place, stop)
         if usual is not None:
@@ -138,7 +174,7 @@ def _whole(value: Any) -> int:
     return value
 
 
-def _varint(text: bytes | memoryview) -> int:
+def _varint(text: Bytes) -> int:
     """Return a number of Thrift's compact protocol: seven bits a byte, the low ones first, in zigzag.
 
     >>> _varint(bytes([0x96, 0x01])), _varint(bytes([1]))
@@ -150,7 +186,7 @@ def _varint(text: bytes | memoryview) -> int:
     return (number >> 1) ^ -(number & 1)
 
 
-def _struct(content: bytes | memoryview, place: int, stop: int, depth: int) -> tuple[dict[int, Any], int]:
+def _struct(content: Bytes, place: int, stop: int, depth: int) -> tuple[dict[int, Any], int]:
     """Return the fields of a structure by number, whole numbers and structures alone, and where it ends."""
     found: dict[int, Any] = {}
     number = 0
@@ -172,7 +208,7 @@ def _struct(content: bytes | memoryview, place: int, stop: int, depth: int) -> t
     raise ValueError("its footer or a page's header was cut off")
 
 
-def _value(content: bytes | memoryview, place: int, stop: int, kind: int, depth: int) -> tuple[Any, int]:
+def _value(content: Bytes, place: int, stop: int, kind: int, depth: int) -> tuple[Any, int]:
     if kind in (1, 2):  # true, false
         return kind == 1, place
     if kind == 3:
@@ -191,14 +227,19 @@ def _value(content: bytes | memoryview, place: int, stop: int, kind: int, depth:
     raise ValueError("its footer or a page's header is none")
 
 
-def _list(content: bytes | memoryview, place: int, stop: int, depth: int) -> tuple[list[Any], int]:
+def _list(content: Bytes, place: int, stop: int, depth: int) -> tuple[list[Any], int]:
     head, place = _byte(content, place, stop)
     count, kind = head >> 4, head & 15
     if count == 15:
         length, place = _number(content, place, stop)
         count = 2 * length if length >= 0 else -2 * length - 1
-    found = []
+    found: list[Any] = []
     for _ in range(count):
+        usual = _usual(content, place, stop) if kind == 12 else None
+        if usual is not None:
+            found.append(usual[0])
+            place = usual[1]
+            continue
         value, place = _byte(content, place, stop) if kind in (1, 2) else _value(content, place, stop, kind, depth)
         if place > stop:
             raise ValueError("its footer or a page's header was cut off")
@@ -206,13 +247,26 @@ def _list(content: bytes | memoryview, place: int, stop: int, depth: int) -> tup
     return found, place
 
 
-def _byte(content: bytes | memoryview, place: int, stop: int) -> tuple[int, int]:
+def _usual(content: Bytes, place: int, stop: int) -> tuple[dict[int, Any], int] | None:
+    """Return what is needed of a structure of the footer that has a usual form, and where it ends; None for another."""
+    first = content[place] if place < stop else 0
+    if first == _CHUNK and (chunk := _USUAL_CHUNK.match(content, place, stop)) and len(chunk[2]) == chunk[1][0]:
+        return {3: {5: _varint(chunk[3]), 7: _varint(chunk[5]), 9: _varint(chunk[6])}}, chunk.end()
+    if first == _ELEMENT and (name := _USUAL_NAME.match(content, place, stop)):
+        kind = _USUAL_KIND.match(content, name.end() + name[1][0], stop)
+        return None if kind is None else ({}, kind.end())
+    if first == _ORDER and content[place : min(place + 3, stop)] == b"\x1c\x00\x00":
+        return {}, place + 3
+    return None
+
+
+def _byte(content: Bytes, place: int, stop: int) -> tuple[int, int]:
     if place >= stop:
         raise ValueError("a page's header was cut off")
     return content[place], place + 1
 
 
-def _number(content: bytes | memoryview, place: int, stop: int) -> tuple[int, int]:
+def _number(content: Bytes, place: int, stop: int) -> tuple[int, int]:
     end = place
     while end < stop and content[end] & 128:
         end += 1

@@ -19,6 +19,7 @@ from tacpipe.io.files import sentence, write_all
 
 IN_MEMORY = 1 << 25  # bytes of rows, before a file is made of them
 AT_ONCE = 1 << 22  # bytes of rows that are then written at once
+BYTES_TYPES = (pa.lib.Type_BINARY, pa.lib.Type_LARGE_BINARY)
 BESIDE_BYTES = 32  # that an encoded frame may take in memory beside its own: offsets, whether it is there
 
 
@@ -35,7 +36,7 @@ def of(source: pa.Table | pa.RecordBatchReader, most: int, group_bytes: int) -> 
 
 def holds_bytes(field: pa.Field) -> bool:
     """Return whether a column holds bytes, as encoded frames."""
-    return bool(pa.types.is_binary(field.type) or pa.types.is_large_binary(field.type))
+    return field.type.id in BYTES_TYPES
 
 
 class Rows:

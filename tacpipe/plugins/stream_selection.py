@@ -16,6 +16,8 @@ from tacpipe.printable import suggestion
 if TYPE_CHECKING:
     import pyarrow as pa
 
+    from tacpipe.io.columns import Columns
+
 WILDCARDS = "*?["
 
 
@@ -37,15 +39,15 @@ class StreamSelection:
             return recording
         if set(recording.streams) != {""}:
             return _Narrowed(recording, self._select(recording.name, recording.streams))
-        table = recording.table()
-        owners = [(field.metadata or {}).get(b"stream", b"").decode() for field in table.schema]
+        columns = recording.columns()
+        owners = [(field.metadata or {}).get(b"stream", b"").decode() for field in columns.schema]
         selected = self._select(recording.name, sorted({owner for owner in owners if owner}))
         names = [
             field.name
-            for field, owner in zip(table.schema, owners, strict=True)
+            for field, owner in zip(columns.schema, owners, strict=True)
             if not owner or owner in selected or field.name == "t_ns"
         ]
-        return _Narrowed(recording, [""], table.select(names))
+        return _Narrowed(recording, [""], columns.select(names))
 
     def narrow_output(self, output: RecordingOutput) -> RecordingOutput:
         """Return the selected streams of a recording that was read from files; raises as `narrow`."""
@@ -82,10 +84,10 @@ def _described(recording: str) -> str:
 
 
 class _Narrowed:
-    """A recording with some of its streams; ``table`` is the only one of a synchronized recording."""
+    """A recording with some of its streams; of a synchronized one with some of its ``columns``."""
 
-    def __init__(self, recording: Any, streams: Sequence[str], table: pa.Table | None = None) -> None:
-        self._recording, self._table = recording, table
+    def __init__(self, recording: Any, streams: Sequence[str], columns: Columns | None = None) -> None:
+        self._recording, self._columns = recording, columns
         self.streams = tuple(streams)
 
     def __getattr__(self, name: str) -> Any:
@@ -93,7 +95,14 @@ class _Narrowed:
 
     def table(self, stream: str = "", columns: Sequence[str] | None = None) -> pa.Table:
         """Return a stream, as `tacpipe.datasets.dataset.Recording.table` does."""
-        if self._table is None or stream:
+        if self._columns is None or stream:
             table: pa.Table = self._recording.table(stream, columns)
             return table
-        return self._table if columns is None else self._table.select(list(columns))
+        return self._columns.read(self._columns.column_names if columns is None else columns)
+
+    def columns(self, stream: str = "") -> Columns:
+        """Return a stream, as `tacpipe.datasets.dataset.Recording.columns` does."""
+        if self._columns is None or stream:
+            columns: Columns = self._recording.columns(stream)
+            return columns
+        return self._columns
