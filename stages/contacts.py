@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -18,7 +18,7 @@ from tacpipe.plugins.stream_selection import StreamSelection
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from tacpipe.arrays import Floats
+    from tacpipe.arrays import AnyArray, Floats
     from tacpipe.datasets.dataset import Recording
     from tacpipe.signals.contact import Thresholds
 
@@ -84,36 +84,44 @@ def contacts(params: Params, recording: Recording) -> RecordingOutput:
     import numpy as np
     import pyarrow as pa
 
+    from tacpipe.io.columns import change
     from tacpipe.io.parquet import with_metadata
     from tacpipe.signals.contact import (
         Thresholds,
         at_rest,
         contact_intervals,
-        load,
+        load_in_blocks,
         noise_thresholds,
         tared,
     )
 
-    table = recording.table()
-    t_ns = table.column("t_ns").to_numpy()  # (time,)
+    columns = recording.columns()
+    t_ns = columns.column("t_ns").to_numpy()  # (time,)
+    columns.forget()
     loads: list[Floats] = []
     limits: list[Thresholds] = []
     rest: dict[str, dict[str, str]] = {}
-    sensors = _sensors(recording.name, table)
-    units = {stream: unit_of(table, names) for stream, names in sensors.items()}
+    schema = columns.schema
+    sensors = _sensors(recording.name, schema)
+    units = {stream: unit_of(schema, names) for stream, names in sensors.items()}
     fixed = {stream for stream, unit in units.items() if unit == COUNT and params.thresholds == "unit"}
     _check_levels(params, recording.name, units, fixed)
     for stream, names in sensors.items():
-        values = np.column_stack([table.column(name).to_numpy() for name in names])  # (time, channel)
-        axes = axes_of(table, names)
-        level, rows = at_rest(params.rest, values, t_ns, params.rest_s)
-        loads.append(load(values, level, axes))
+
+        def blocks(names: Sequence[str] = names) -> Iterator[AnyArray]:
+            for table in columns.batches(names):
+                yield np.column_stack([table.column(name).to_numpy() for name in names])  # (time, channel)
+
+        axes = axes_of(schema, names)
+        level, rows = at_rest(params.rest, blocks, t_ns, params.rest_s)
+        load, repeated = load_in_blocks(blocks, level, axes)
+        loads.append(load)
         if stream in fixed:
             limits.append(Thresholds(params.on_count, params.off_count))
         else:
-            limits.append(_given(params, noise_thresholds(values, loads[-1], t_ns, params.rest_s, rows)))
-        written = tared(params.tare, values, level, axes)
-        rest |= {name: {"rest": repr(float(value))} for name, value in zip(names, written, strict=True)}
+            limits.append(_given(params, noise_thresholds(repeated, load, t_ns, params.rest_s, rows)))
+        zero = tared(params.tare, next(blocks()), level, axes)
+        rest |= {name: {"rest": repr(float(value))} for name, value in zip(names, zero, strict=True)}
     if params.begins == "grasped":
         intervals = np.array([[0, len(t_ns)]])
     else:
@@ -125,8 +133,12 @@ def contacts(params: Params, recording: Recording) -> RecordingOutput:
     field = pa.field("contact", pa.int32(), metadata={"unit": "1", "quantity": "label"})
     largest = [float(np.nanmax(one, initial=0.0)) for one in loads]
     notes = [] if len(intervals) else [_no_contact(params, units, limits, largest, fixed)]
-    marked = with_metadata(table.append_column(field, pa.array(numbers)), rest)
-    return RecordingOutput(marked, _threshold_attributes(units, limits, fixed), notes)
+
+    def mark(table: pa.Table, first: int) -> pa.Table:
+        contact = pa.array(numbers[first : first + table.num_rows])
+        return with_metadata(table.append_column(field, contact), rest)
+
+    return RecordingOutput(change(columns, mark), _threshold_attributes(units, limits, fixed), notes)
 
 
 def _check_levels(params: Params, name: str, units: Mapping[str, str], fixed: Collection[str]) -> None:
@@ -194,13 +206,13 @@ def _number(value: float) -> str:
     return f"{float(f'{value:.3g}'):g}"
 
 
-def _sensors(name: str, table: pa.Table) -> dict[str, list[str]]:
+def _sensors(name: str, schema: pa.Schema) -> dict[str, list[str]]:
     """Return the tactile columns of each stream, taxel by taxel."""
     found: dict[str, list[str]] = {}
-    for field in table.schema:
+    for field in schema:
         metadata = field.metadata or {}
         if metadata.get(b"quantity") == b"tactile":
             found.setdefault(metadata.get(b"stream", b"").decode(), []).append(field.name)
     if not found:
-        raise absent(name, "tactile", table.schema)
+        raise absent(name, "tactile", schema)
     return found

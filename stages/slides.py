@@ -156,15 +156,15 @@ def _slide_by_load(params: Params, name: str, streams: Mapping[str, pa.Table], t
     from tacpipe.channels import arm
     from tacpipe.channels.finger import without_spikes
     from tacpipe.signals import slides as found
-    from tacpipe.signals.contact import ENDS, Thresholds, at_rest, load, noise_thresholds
+    from tacpipe.signals.contact import ENDS, Thresholds, at_rest, load_in_blocks, noise_thresholds
 
     t_ns, names = table.column("t_ns").to_numpy(), of_quantity(table, "tactile")
     values = np.column_stack([table.column(one).to_numpy() for one in names])  # (time, channel)
     axes = axes_of(table, names)
-    level, rows = at_rest(params.rest, values, t_ns, params.rest_s)
-    loaded = load(values, level, axes)
+    level, rows = at_rest(params.rest, lambda: [values], t_ns, params.rest_s)
+    loaded, repeated = load_in_blocks(lambda: [values], level, axes)
     if params.load_trigger is None:
-        limits = noise_thresholds(values, loaded, t_ns, params.rest_s, rows)
+        limits = noise_thresholds(repeated, loaded, t_ns, params.rest_s, rows)
     else:
         limits = Thresholds(params.load_trigger, ENDS * params.load_trigger)
     unit = unit_of(table, names)

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
     from tacpipe.arrays import Times
     from tacpipe.datasets.dataset import Recording
+    from tacpipe.io.columns import Columns
 
 EVEN = 0.01  # of a step between rows, by which it may differ from the others for a filter of even steps
 
@@ -61,7 +62,7 @@ class Params(StreamSelection):
 
 
 @stage(version=2)
-def slips(params: Params, recording: Recording) -> pa.Table:
+def slips(params: Params, recording: Recording) -> pa.Table | pa.RecordBatchReader:
     """Mark slips and drops of a held object.
 
     They are detected by the object's distance from the wrist. Adds the labels ``slip``, detected in the whole
@@ -74,14 +75,15 @@ def slips(params: Params, recording: Recording) -> pa.Table:
     import numpy as np
     import pyarrow as pa
 
+    from tacpipe.io.columns import change
     from tacpipe.signals import slip
 
-    table = recording.table()
+    table = recording.columns()
     if "slip" in table.column_names:
         raise TacpipeError(f"Recording {recording.name} has a column slip already; give what was there before it.")
     channel = _proximity(recording.name, params.channel, table)
     readings, saturated = table.column(channel).to_numpy().astype(np.float64), params.saturated_count
-    unit = unit_of(table, [channel])
+    unit = unit_of(table.schema, [channel])
     if unit in METRES:
         readings, saturated = readings * (1e3 * METRES[unit] * params.count_per_mm), -math.inf
     elif unit not in (COUNT, ""):
@@ -109,13 +111,18 @@ def slips(params: Params, recording: Recording) -> pa.Table:
         labels["slip"][rows] = held & ~lost & slip.slip_offline(since, rate_hz, params.cutoff_hz, still, limits)
         known = slip.slip_online(since, rate_hz, params.cutoff_hz, still, limits)
         labels["slip_online"][rows] = held & ~known_lost & known
-    for name, marks in labels.items():
-        field = pa.field(name, pa.int8(), metadata={"unit": "1", "quantity": "label"})
-        table = table.append_column(field, pa.array(marks.astype(np.int8)))
-    return table
+    label = {"unit": "1", "quantity": "label"}
+
+    def mark(rows: pa.Table, first: int) -> pa.Table:
+        for name, marks in labels.items():
+            values = pa.array(marks[first : first + rows.num_rows].astype(np.int8))
+            rows = rows.append_column(pa.field(name, pa.int8(), metadata=label), values)
+        return rows
+
+    return change(table, mark)
 
 
-def _proximity(name: str, channel: str, table: pa.Table) -> str:
+def _proximity(name: str, channel: str, table: Columns) -> str:
     """Return the column with the distance of the object."""
     found = of_quantity(table, "proximity")
     if channel:
@@ -134,9 +141,9 @@ def _proximity(name: str, channel: str, table: pa.Table) -> str:
     return found[0]
 
 
-def _no_distance(name: str, channel: str, unit: str, table: pa.Table) -> TacpipeError:
+def _no_distance(name: str, channel: str, unit: str, table: Columns) -> TacpipeError:
     """Return the error of a proximity in another unit than counts or a length."""
-    stream = (table.field(channel).metadata or {}).get(b"stream", b"").decode()
+    stream = (table.schema.field(channel).metadata or {}).get(b"stream", b"").decode()
     return TacpipeError(
         f"Recording {name}: {channel} is in {unit}, and slip is detected in counts or in {', '.join(METRES)}. Set unit in "
         f"{entry(stream)} of the layout file, with scale where the file has another unit, and ingest again."

@@ -10,7 +10,7 @@ Example: tacpipe synchronize data/recordings -o data/synced
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from tacpipe.synchronization.streams import Stream
 
 
+IN_MEMORY = 1 << 25  # bytes of finished columns, beyond which they are put aside in a temporary file
+BATCH_ROWS = 1 << 15  # rows of a batch of a long table
 Timeline = Literal["uniform", "logged", "fresh"]
 
 
@@ -91,6 +93,8 @@ def synchronize(params: Params, recording: Recording) -> RecordingOutput:
     import pyarrow as pa
 
     from tacpipe.channels import masks
+    from tacpipe.io.columns import release
+    from tacpipe.io.mapped import MappedArrays
     from tacpipe.signals.holds import fresh_rate_hz, mean_rate_hz
     from tacpipe.signals.resampling import default_gap_ns
     from tacpipe.synchronization import grids, streams
@@ -100,6 +104,7 @@ def synchronize(params: Params, recording: Recording) -> RecordingOutput:
     every = {name: recording.columns(name) for name in sorted(recording.streams) if name != EVENTS}
     found = {name: columns for name, columns in every.items() if streams.is_signal(columns)} or every
     hold_values = params.values == "hold"
+    storage = MappedArrays(IN_MEMORY)
     placed: dict[str, Stream] = {}
     for name, stored in found.items():
         placed[name] = streams.on_host_clock(recording.name, name, stored, "arrival" if hold_values else params.clock)
@@ -116,13 +121,14 @@ def synchronize(params: Params, recording: Recording) -> RecordingOutput:
     if len(grid_ns) > 1:
         attributes["step_ms"] = round(float(np.median(np.diff(grid_ns))) / 1e6, 3)
     ahead_ns = np.zeros(len(grid_ns), np.int64)  # (grid,)
-    for name, stream in placed.items():
+    for name in list(placed):
+        stream = placed.pop(name)
         exact = None if hold_values else grids.rows_at(stream.t_ns, grid_ns, rows)
         if params.unwrap:
-            stream, wrapped = streams.without_wraps(stream)
+            stream, wrapped = streams.without_wraps(stream, storage.put_aside)
             attributes |= {f"{name}_wrapped_channels": wrapped} if wrapped else {}
         gap_ns = default_gap_ns(stream.t_ns) if params.gap_ms is None else round(params.gap_ms * 1e6)
-        columns += _on_grid(params, stream, grid_ns, exact, gap_ns)
+        columns += _on_grid(params, stream, grid_ns, exact, gap_ns, storage.put_aside)
         if not stream.truth:
             if not hold_values:
                 ahead_ns = np.maximum(ahead_ns, look_ahead_ns(stream, grid_ns, exact))
@@ -131,21 +137,35 @@ def synchronize(params: Params, recording: Recording) -> RecordingOutput:
             attributes[f"{name}_fresh_hz"] = round(fresh_rate_hz(stream.t_ns, stream.held), 3)
             attributes |= stream.attributes
         stream.columns.forget()
+        if not storage.in_memory:
+            release()
     attributes[masks.LOOK_AHEAD_MEAN] = round(float(ahead_ns.mean()) / 1e6, 3)
     attributes[masks.LOOK_AHEAD_MAX] = round(float(ahead_ns.max()) / 1e6, 3)
-    arrays = [pa.array(values, kind.type) for kind, values in columns]
-    table = pa.Table.from_arrays(arrays, schema=pa.schema([kind for kind, _ in columns]))
-    return RecordingOutput(table, attributes, masks.describe_gaps(table))
+    schema = pa.schema([kind for kind, _ in columns])
+
+    def table(rows: slice) -> pa.Table:
+        return pa.Table.from_arrays([pa.array(values[rows], kind.type) for kind, values in columns], schema=schema)
+
+    def batches() -> Iterator[pa.RecordBatch]:
+        for first in range(0, len(grid_ns), BATCH_ROWS):
+            yield from (batch := table(slice(first, first + BATCH_ROWS))).to_batches()
+            storage.read(batch.nbytes)
+
+    gaps = {kind.name: pa.array(values) for kind, values in columns if kind.name.endswith(masks.GAP)}
+    result = table(slice(None)) if storage.in_memory else pa.RecordBatchReader.from_batches(schema, batches())
+    return RecordingOutput(result, attributes, masks.describe_gaps(pa.table(gaps)))
 
 
 def _on_grid(
-    params: Params, stream: Stream, grid_ns: Times, exact: Int64s | None, gap_ns: int
+    params: Params, stream: Stream, grid_ns: Times, exact: Int64s | None, gap_ns: int, keep: Callable[[Any], Any]
 ) -> list[tuple[pa.Field, Any]]:
     """Return field and values of a stream's channels on the grid, and of its masks; ground truth has none."""
     from tacpipe.synchronization import columns
 
     if params.values == "hold":
+        channels = columns.held_channels(stream, grid_ns, keep)
         masks = [] if stream.truth else columns.held_masks(stream, grid_ns, gap_ns)
-        return columns.held_channels(stream, grid_ns) + masks
-    masks = [] if stream.truth else columns.masks(stream, grid_ns, exact, gap_ns)
-    return columns.channels(stream, grid_ns, exact) + masks
+    else:
+        channels = columns.channels(stream, grid_ns, exact, keep)
+        masks = [] if stream.truth else columns.masks(stream, grid_ns, exact, gap_ns)
+    return channels + [(field, keep(values)) for field, values in masks]

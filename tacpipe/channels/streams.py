@@ -94,20 +94,20 @@ def gaps_before(table: pa.Table, median_ns: float | None = None) -> Indices:
     return np.flatnonzero(step_ns > _GAP_FACTOR * typical_ns) + 1
 
 
-def of_quantity(table: pa.Table, quantity: str) -> list[str]:
+def of_quantity(table: pa.Table | Columns, quantity: str) -> list[str]:
     """Return the columns of a stream that hold ``quantity``."""
     return [field.name for field in table.schema if (field.metadata or {}).get(b"quantity") == quantity.encode()]
 
 
-def unit_of(table: pa.Table, names: Sequence[str]) -> str:
+def unit_of(source: pa.Table | pa.Schema, names: Sequence[str]) -> str:
     """Return the unit of columns; the empty text where they have none, or not all the same."""
-    units = {(table.field(name).metadata or {}).get(b"unit", b"").decode() for name in names}
+    units = {(source.field(name).metadata or {}).get(b"unit", b"").decode() for name in names}
     return next(iter(units)) if len(units) == 1 else ""
 
 
-def axes_of(table: pa.Table, names: Sequence[str]) -> int:
+def axes_of(source: pa.Table | pa.Schema, names: Sequence[str]) -> int:
     """Return how many axes the taxels of these columns have."""
-    return len({(table.field(name).metadata or {}).get(b"axis") for name in names})
+    return len({(source.field(name).metadata or {}).get(b"axis") for name in names})
 
 
 def signal(streams: Mapping[str, pa.Table], quantity: str) -> tuple[Int64s, AnyArray] | None:

@@ -5,12 +5,15 @@ from __future__ import annotations
 import mmap
 import os
 import tempfile
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from tacpipe.arrays import AnyArray
 from tacpipe.io.files import sentence
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 SEGMENT_BYTES = 1 << 28  # of a file, of which there are few: each takes a descriptor
 MOST_READ = 1 << 26  # bytes, after which what was read is let go of
@@ -37,6 +40,20 @@ class MappedArrays:
         made[...] = values
         self.release()
         return made
+
+    def put_aside(self, column: AnyArray | pa.Array) -> AnyArray | pa.Array:
+        """Return a column of the same values; one of texts, or with nulls, stays in memory. Raises as `empty`."""
+        if isinstance(column, np.ndarray):
+            return self.kept(column)
+        import pyarrow.types as kinds
+
+        number = kinds.is_integer(column.type) or kinds.is_floating(column.type)
+        return self.kept(column.to_numpy()) if number and not column.null_count else column
+
+    @property
+    def in_memory(self) -> bool:
+        """Return whether no array lies in a file."""
+        return not self._segments
 
     def empty(self, shape: tuple[int, ...], dtype: Any) -> AnyArray:
         """Return an array to be filled. Raises `StorageError` where the disk is full."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -13,6 +14,9 @@ from tacpipe.signals.runs import latched, runs
 
 NOISE_FEWEST, NOISE_USUAL = 10.0, 40.0  # times the noise at rest: least, and usual, load at which contact starts
 PEAK_LEAST, PEAK_MOST = 0.05, 0.25  # of the largest load: least, and most, where the noise would ask for more
+WITHOUT_ROWS = "The level at rest cannot be distinguished from a recording without rows."
+# Yields the channels of a recording (time, channel) in blocks of one row or more, from the first row on.
+Blocks = Callable[[], Iterable[AnyArray]]
 ENDS = 2 / 3  # of the load at which contact starts, below which it ends
 LARGEST = 0.99  # quantile of the load that is its largest: a single wrong frame is none
 
@@ -31,42 +35,55 @@ def rest_level(values: AnyArray, t_ns: Times, rest_s: float) -> Floats:
     Raises `TacpipeError` if there are no rows.
     """
     if not len(t_ns):
-        raise TacpipeError("The level at rest cannot be distinguished from a recording without rows.")
+        raise TacpipeError(WITHOUT_ROWS)
     rows = int(np.searchsorted(t_ns, t_ns[0] + round(rest_s * 1e9), side="right"))
     level: Floats = np.median(values[: max(rows, 1)], axis=0).astype(np.float64)
     return level
 
 
-def lowest_part(values: AnyArray, t_ns: Times, rest_s: float) -> Bools:
-    """Return the rows (time,) of the ``rest_s`` seconds in which the channels (time, channel) are lowest together.
+def lowest_part(total: AnyArray, t_ns: Times, rest_s: float) -> Bools:
+    """Return the rows (time,) of the ``rest_s`` seconds in which ``total`` (time,), of all channels, is lowest.
 
-    For recordings that begin in contact, of sensors that rise under load. Rows that are not finite never count.
+    For recordings that begin in contact, of sensors that rise under load. Rows whose total is infinite never count.
 
-    >>> lowest_part(np.array([[9], [9], [1], [2], [9]]), np.arange(5) * 10**9, rest_s=1.0).tolist()
+    >>> lowest_part(np.array([9, 9, 1, 2, 9]), np.arange(5) * 10**9, rest_s=1.0).tolist()
     [False, False, True, True, False]
     """
-    total = np.where(np.isfinite(values).all(axis=1), values.sum(axis=1), np.inf)  # (time,)
     stop = np.searchsorted(t_ns, t_ns + round(rest_s * 1e9), side="right")
     whole = np.flatnonzero(t_ns + round(rest_s * 1e9) <= t_ns[-1]) if len(t_ns) else np.zeros(0, int)
     if not len(whole):
         return np.ones(len(t_ns), bool)
-    means = [float(np.mean(total[first : stop[first]])) for first in whole]
+    means = np.fromiter((np.mean(total[first : stop[first]]) for first in whole), np.float64, len(whole))
     first = int(whole[int(np.argmin(means))])
-    found = np.zeros(len(t_ns), bool)
-    found[first : stop[first]] = True
-    return found
+    rows = np.zeros(len(t_ns), bool)
+    rows[first : stop[first]] = True
+    return rows
 
 
-def at_rest(which: str, values: AnyArray, t_ns: Times, rest_s: float) -> tuple[Floats, Bools | None]:
+def at_rest(which: str, blocks: Blocks, t_ns: Times, rest_s: float) -> tuple[Floats, Bools | None]:
     """Return each channel's level without load (channel,), and the rows (time,) it is of, None for those of the start.
 
-    ``which`` is ``start``, for the first ``rest_s`` seconds, or ``lowest``, for those of `lowest_part`. Raises
-    `TacpipeError` if there are no rows.
+    ``blocks`` yields the channels. ``which`` is ``start``, for the first ``rest_s`` seconds, or ``lowest``, for those of
+    `lowest_part`. Raises `TacpipeError` if there are no rows.
     """
-    if which == "start" or not len(t_ns):
-        return rest_level(values, t_ns, rest_s), None
-    rows = lowest_part(values, t_ns, rest_s)
-    level: Floats = np.median(values[rows], axis=0).astype(np.float64)
+    if not len(t_ns):
+        raise TacpipeError(WITHOUT_ROWS)
+    if which == "start":
+        first_rows: list[AnyArray] = []
+        for values in blocks():
+            first_rows.append(values)
+            count = sum(map(len, first_rows))
+            if t_ns[count - 1] > t_ns[0] + round(rest_s * 1e9):
+                break
+        values = np.concatenate(first_rows)
+        return rest_level(values, t_ns[: len(values)], rest_s), None
+    totals = [np.where(np.isfinite(values).all(axis=1), values.sum(axis=1), np.inf) for values in blocks()]
+    rows = lowest_part(np.concatenate(totals), t_ns, rest_s)
+    chosen, first = [], 0
+    for values in blocks():
+        chosen.append(values[rows[first : first + len(values)]])
+        first += len(values)
+    level: Floats = np.median(np.concatenate(chosen), axis=0).astype(np.float64)
     return level, rows
 
 
@@ -95,7 +112,7 @@ def axis_mean_level(values: AnyArray, axes: int = 3) -> Floats:
     """
     _require_taxels(values, axes)
     if not len(values):
-        raise TacpipeError("The level at rest cannot be distinguished from a recording without rows.")
+        raise TacpipeError(WITHOUT_ROWS)
     first = values[0].astype(np.float64).reshape(-1, axes)  # (taxel, axis)
     level: Floats = (first - np.trunc(first.mean(axis=0))).ravel()
     return level
@@ -117,13 +134,25 @@ def load(values: AnyArray, rest: Floats, axes: int = 3) -> Floats:
     return distance
 
 
+def load_in_blocks(blocks: Blocks, rest: Floats, axes: int) -> tuple[Floats, Bools]:
+    """Return the `load` of channels that come in blocks, and which rows repeat the one before; each (time,)."""
+    loads: list[Floats] = []
+    repeated: list[Bools] = []
+    last: AnyArray | None = None
+    for values in blocks():
+        loads.append(load(values, rest, axes))
+        repeated.append(held(values if last is None else np.concatenate([last, values]))[-len(values) :])
+        last = values[-1:]
+    return np.concatenate(loads), np.concatenate(repeated)
+
+
 def noise_thresholds(
-    values: AnyArray, load: Floats, t_ns: Times, rest_s: float, rest: Bools | None = None
+    repeated: Bools, load: Floats, t_ns: Times, rest_s: float, rest: Bools | None = None
 ) -> Thresholds:
     """Return thresholds for a sensor of any unit, from its noise at rest.
 
     The noise is the upper quartile of ``load`` (time,) over the first ``rest_s`` seconds, or the rows ``rest`` (time,);
-    samples that repeat the one before in all channels of ``values`` (time, channel) are left out. Contact starts at 40
+    samples that repeat the one before in all channels, ``repeated`` (time,), are left out. Contact starts at 40
     times the noise, but at no more than a quarter of the recording's largest load, at least at a twentieth of that, and
     at least at 10 times the noise; it ends at two thirds of that. On 52 published trials of a XELA uSkin this is 70 to
     230 counts, next to the 120 that were set by hand. Without any load the thresholds are infinite.
@@ -132,7 +161,7 @@ def noise_thresholds(
     largest = float(np.quantile(load[finite], LARGEST)) if finite.any() else 0.0
     if largest <= 0:
         return Thresholds(np.inf, np.inf)
-    at_rest = finite & ~held(values) & (t_ns <= t_ns[0] + round(rest_s * 1e9) if rest is None else rest)
+    at_rest = finite & ~repeated & (t_ns <= t_ns[0] + round(rest_s * 1e9) if rest is None else rest)
     noise = float(np.quantile(load[at_rest], 0.75)) if at_rest.any() else 0.0
     usual = min(NOISE_USUAL * noise, PEAK_MOST * largest)
     on = max(NOISE_FEWEST * noise, PEAK_LEAST * largest, usual)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from tacpipe.synchronization import methods
@@ -10,31 +11,33 @@ from tacpipe.synchronization.streams import Stream
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from tacpipe.arrays import Bools, Floats, Indices, Int64s, Times
+    from tacpipe.arrays import Bools, Floats, Int64s, Times
 
 MEDIAN_NS = (
     10_000_000  # on both sides of a grid point: of a proximity sensor at 400 Hz eight readings, whose noise falls
 )
 PAST_NS = 2 * MEDIAN_NS  # before a causal grid point: as many readings, 10 ms late
+GridColumn = tuple["pa.Field", Any]  # field and values (grid,) of a channel or a mask
+Keep = Callable[[Any], Any]  # puts values (grid,) aside and returns them
 BLOCK_BYTES = 1 << 24  # about as much of a stream's channels is interpolated at once
 
 
-def channels(stream: Stream, grid_ns: Times, exact: Int64s | None) -> list[tuple[pa.Field, Any]]:
-    """Return field and values of each channel on the grid, in the order of the stream."""
+def channels(stream: Stream, grid_ns: Times, exact: Int64s | None, keep: Keep) -> list[GridColumn]:
+    """Return field and values of each channel on the grid, in the order of the stream; ``keep`` takes each as it is made."""
     import pyarrow as pa
 
     from tacpipe.signals.resampling import bracketing_rows, nearest_rows
 
     if exact is not None:
-        return _at_rows(stream, exact, "none")
+        return [_at_rows(stream, name, pa.array(exact), "none", keep) for name in stream.channels]
     groups: dict[str, list[str]] = {}
     for name in stream.channels:
         groups.setdefault(methods.method(stream.columns.schema, name), []).append(name)
-    found: dict[str, tuple[pa.Field, Any]] = {}
+    grid_columns: dict[str, GridColumn] = {}
     if "nearest" in groups:
         rows = pa.array(nearest_rows(stream.t_ns, grid_ns))
         for name in groups.pop("nearest"):
-            found[name] = (methods.grid_field(stream.name, stream.field(name), "nearest"), stream.at(name, rows))
+            grid_columns[name] = _at_rows(stream, name, rows, "nearest", keep)
     used = bracketing_rows(stream.t_ns, grid_ns)
     for method, members in groups.items():
         how = method.partition(" ")[0]
@@ -42,36 +45,38 @@ def channels(stream: Stream, grid_ns: Times, exact: Int64s | None) -> list[tuple
         for some in _blocks(stream, members, how, len(grid_ns)):
             for name, column in zip(some, _between_samples(stream, some, how, grid_ns, rows).T, strict=True):
                 kind = methods.between_type(stream.columns.schema.field(name).type)
-                found[name] = _as_stored(methods.grid_field(stream.name, stream.field(name), how, kind), column)
-    return [found[name] for name in stream.channels]
+                grid_columns[name] = _as_stored(
+                    methods.grid_field(stream.name, stream.field(name), how, kind), column, keep
+                )
+    return [grid_columns[name] for name in stream.channels]
 
 
-def held_channels(stream: Stream, grid_ns: Times) -> list[tuple[pa.Field, Any]]:
+def held_channels(stream: Stream, grid_ns: Times, keep: Keep) -> list[GridColumn]:
     """Return field and values of each channel on the grid, from samples that had come by each point alone.
 
     A channel keeps its newest sample, and its type; a proximity sensor has the median of the last `PAST_NS`. Each point
-    needs a sample before it.
+    needs a sample before it. ``keep`` takes each channel as it is made.
     """
+    import pyarrow as pa
+
     from tacpipe.signals.resampling import median_before, newest_rows
 
-    found = {
-        field.name: (field, values) for field, values in _at_rows(stream, newest_rows(stream.t_ns, grid_ns), "hold")
-    }
+    rows = pa.array(newest_rows(stream.t_ns, grid_ns))
+    grid_columns = []
     for name in stream.channels:
         if methods.method(stream.columns.schema, name) == "median":
             kind = methods.between_type(stream.columns.schema.field(name).type)
             field = methods.grid_field(stream.name, stream.field(name), "median", kind)
             values = median_before(stream.t_ns, stream.values(name)[:, None], grid_ns, PAST_NS)
-            found[field.name] = _as_stored(field, values[:, 0])
-    return list(found.values())
+            grid_columns.append(_as_stored(field, values[:, 0], keep))
+        else:
+            grid_columns.append(_at_rows(stream, name, rows, "hold", keep))
+    return grid_columns
 
 
-def _at_rows(stream: Stream, rows: Indices, how: str) -> list[tuple[pa.Field, Any]]:
-    """Return field and values of each channel at some rows, its type kept; ``how`` names what that is."""
-    import pyarrow as pa
-
-    at = pa.array(rows)
-    return [(methods.grid_field(stream.name, stream.field(name), how), stream.at(name, at)) for name in stream.channels]
+def _at_rows(stream: Stream, name: str, rows: pa.Array, how: str, keep: Keep) -> GridColumn:
+    """Return field and values of a channel at some rows, its type kept; ``how`` names what that is."""
+    return methods.grid_field(stream.name, stream.field(name), how), keep(stream.at(name, rows))
 
 
 def _blocks(stream: Stream, members: list[str], how: str, points: int) -> list[list[str]]:
@@ -99,13 +104,13 @@ def _between_samples(stream: Stream, names: list[str], how: str, grid_ns: Times,
     return linear(t_ns, values, grid_ns)
 
 
-def _as_stored(kind: pa.Field, column: Floats) -> tuple[pa.Field, Any]:
+def _as_stored(kind: pa.Field, column: Floats, keep: Keep) -> GridColumn:
     import numpy as np
 
-    return kind, np.ascontiguousarray(column, dtype=kind.type.to_pandas_dtype())
+    return kind, keep(np.ascontiguousarray(column, dtype=kind.type.to_pandas_dtype()))
 
 
-def masks(stream: Stream, grid_ns: Times, exact: Int64s | None, gap_ns: int) -> list[tuple[pa.Field, Any]]:
+def masks(stream: Stream, grid_ns: Times, exact: Int64s | None, gap_ns: int) -> list[GridColumn]:
     """Return where the nearest sample was held, where there is a gap, and how far the nearest sample is."""
     import numpy as np
 
@@ -128,7 +133,7 @@ def look_ahead_ns(stream: Stream, grid_ns: Times, exact: Int64s | None) -> Times
     return ahead_ns
 
 
-def held_masks(stream: Stream, grid_ns: Times, gap_ns: int) -> list[tuple[pa.Field, Any]]:
+def held_masks(stream: Stream, grid_ns: Times, gap_ns: int) -> list[GridColumn]:
     """Return where the newest sample was held, where it is older than ``gap_ns``, and how old it is."""
     from tacpipe.signals.resampling import is_overdue, newest_rows
 
@@ -137,7 +142,7 @@ def held_masks(stream: Stream, grid_ns: Times, gap_ns: int) -> list[tuple[pa.Fie
     return _masks(stream.name, stream.held[rows], is_overdue(newest_ns, grid_ns, gap_ns), grid_ns - newest_ns)
 
 
-def _masks(name: str, held: Bools, gap: Bools, dt_ns: Times) -> list[tuple[pa.Field, Any]]:
+def _masks(name: str, held: Bools, gap: Bools, dt_ns: Times) -> list[GridColumn]:
     import pyarrow as pa
 
     mask = {"unit": "1", "quantity": "mask", "stream": name}

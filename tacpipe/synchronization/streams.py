@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins.stage import Attribute
@@ -153,8 +153,11 @@ def _stamps(recording: str, stream: str, columns: Columns) -> Int64s:
     return t_ns
 
 
-def without_wraps(stream: Stream) -> tuple[Stream, int]:
-    """Return the stream with the wrap-around of its tactile counts undone, and in how many channels there was any."""
+def without_wraps(stream: Stream, keep: Callable[[Any], Any]) -> tuple[Stream, int]:
+    """Return the stream with the wrap-around of its tactile counts undone, and in how many channels there was any.
+
+    ``keep`` puts the values of such a channel aside and returns them.
+    """
     import pyarrow as pa
 
     from tacpipe.signals.unwrap import unwrapped
@@ -166,7 +169,7 @@ def without_wraps(stream: Stream) -> tuple[Stream, int]:
             values = stream.columns.column(kind.name).to_numpy()
             found = unwrapped(values)
             if found is not values:
-                changed[kind.name] = found
+                changed[kind.name] = keep(found)
     return replace(stream, unwrapped=changed), len(changed)
 
 

@@ -12,8 +12,11 @@ import pyarrow as pa
 import pytest
 
 from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.io import columns
+from tacpipe.io.parquet import to_parquet
 from tacpipe.plugins.params import from_json, to_json
 from tacpipe.plugins.registry import load
+from tests.fake_recordings import decode_few_rows_at_a_time
 
 SAMPLE = Path(os.environ.get("TACPIPE_SAMPLE_DATA", Path(__file__).parents[3] / "shared" / "data"))
 segment = load("segment.contacts")
@@ -46,6 +49,32 @@ def test_contacts_with_their_padding_are_numbered_and_all_rows_stay(shard: Recor
     assert found.column("contact").to_pylist() == [-1] * 45 + [0] * 60 + [-1] * 90 + [1] * 60 + [-1] * 45
     assert found.schema.field("contact").type == pa.int32()
     assert found.drop_columns(["contact"]).equals(given)
+
+
+@pytest.mark.parametrize("rows", [1, 7, 40, 299])
+@pytest.mark.parametrize("options", [{}, {"thresholds": "noise"}, {"rest": "lowest", "thresholds": "noise"}])
+def test_contacts_and_slips_are_the_same_wherever_blocks_of_rows_end(
+    shard: Recording, monkeypatch: pytest.MonkeyPatch, rows: int, options: dict[str, Any]
+) -> None:
+    chance = np.random.default_rng(rows)
+    stored = table((np.repeat([0.0, 500.0, 0.0], 100) + chance.normal(0, 3, 300)).tolist())
+    for name in stored.column_names[1:3]:  # repeated samples, and readings that are not finite
+        values = stored[name].to_numpy().copy()
+        values[20:22], values[150] = values[19], np.nan
+        place = stored.column_names.index(name)
+        stored = stored.set_column(place, stored.schema.field(name), pa.array(values))
+    distance = pa.field("mm", pa.float32(), metadata={"quantity": "proximity", "unit": "mm"})
+    stored = stored.append_column(distance, pa.array(np.cumsum(chance.normal(0, 0.2, 300)), pa.float32()))
+    params = segment.params(**options)
+    whole = segment(params, shard({"": stored}))
+    slipped = slips(slips.params(), shard({"": whole.streams[""]}))
+    decode_few_rows_at_a_time(monkeypatch, rows)
+    monkeypatch.setattr(columns, "SOME_ROWS", rows)
+    parts = segment(params, shard({"": stored}))
+    assert to_parquet(parts.streams[""].read_all()) == to_parquet(whole.streams[""])
+    assert (parts.attributes, parts.notes) == (whole.attributes, whole.notes)
+    slipped_parts = slips(slips.params(), shard({"": whole.streams[""]}))
+    assert to_parquet(slipped_parts.read_all()) == to_parquet(slipped)
 
 
 def test_the_level_at_rest_is_written_beside_each_channel(shard: Recording) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -58,6 +59,22 @@ def run(shard: Any, **values: Any) -> tuple[pa.Table, Any]:
     recording = synchronize(interpolated(**values), shard)
     assert isinstance(recording, RecordingOutput)
     return recording.streams[""], recording.attributes
+
+
+@pytest.mark.parametrize("values", ["hold", "interpolate"])
+@pytest.mark.parametrize("rate_hz", [None, 200.0])
+def test_columns_that_are_put_aside_on_disk_give_the_rows_of_those_in_memory(
+    shard: Recording, monkeypatch: pytest.MonkeyPatch, values: str, rate_hz: float | None
+) -> None:
+    wrapping = (np.arange(400)[:, None] * 700 + np.arange(48)) % 65_536
+    streams = {"robot": robot(np.arange(-30, 395)), "xela1": uskin(np.arange(400), wrapping.astype(np.uint16))}
+    whole = synchronize(params(values=values, rate_hz=rate_hz), shard(streams))
+    module = sys.modules[synchronize.function.__module__]
+    monkeypatch.setattr(module, "IN_MEMORY", 1000)
+    monkeypatch.setattr(module, "BATCH_ROWS", 17)
+    parts = synchronize(params(values=values, rate_hz=rate_hz), shard(streams))
+    assert parts.streams[""].read_all().equals(whole.streams[""], check_metadata=True)
+    assert (parts.attributes, parts.notes) == (whole.attributes, whole.notes)
 
 
 def test_the_grid_starts_with_the_first_tactile_stream_and_ends_where_a_stream_does(shard: Recording) -> None:
