@@ -1,7 +1,8 @@
-"""Stages that the benchmarks install: two that do next to nothing, and one that writes long recordings."""
+"""Stages that the benchmarks install: two that do next to nothing, and two that write long recordings."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -82,3 +83,33 @@ def _channel(params: Long, draw: np.random.Generator) -> np.ndarray:
     if params.kind == "float":
         return np.asarray(values + 30_000, dtype=np.float32)
     return (values.astype(np.int64) % 8192 + 28_000).astype(np.uint16)
+
+
+@dataclass(frozen=True)
+class Repeat:
+    """How often a recording is repeated."""
+
+    times: int = 5  # copies, one after the other
+
+
+@stage(version=1)
+def repeat(params: Repeat, recording: Recording) -> RecordingOutput:
+    """Repeat a recording on one time axis, so that a long one has the contacts and the noise of a short one."""
+    import pyarrow as pa
+
+    tables = {name: recording.table(name) for name in recording.streams}
+    span_ns = max(table["t_ns"][-1].as_py() - table["t_ns"][0].as_py() for table in tables.values()) + 1_000_000
+
+    def batches(table: pa.Table) -> Iterator[pa.RecordBatch]:
+        for copy in range(params.times):
+            later = table
+            for name, step in (("t_ns", span_ns), ("t_device_ns", span_ns), ("seq", table.num_rows)):
+                if name in table.column_names:
+                    place = table.schema.get_field_index(name)
+                    shifted = table[name].to_numpy() + table[name].type.to_pandas_dtype()(copy * step)
+                    later = later.set_column(place, table.schema.field(name), pa.array(shifted))
+            yield from later.combine_chunks().to_batches(1 << 16)
+
+    return RecordingOutput(
+        {name: pa.RecordBatchReader.from_batches(table.schema, batches(table)) for name, table in tables.items()}
+    )
