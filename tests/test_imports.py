@@ -48,6 +48,11 @@ def test_help_imports_nothing_heavy(tmp_path: Path, words: str) -> None:
     assert imported(tmp_path, words) & HEAVY == set()
 
 
+def test_help_of_a_stage_imports_none_of_what_runs_stages(tmp_path: Path) -> None:
+    running = {f"tacpipe.engine.{name}" for name in ("pipeline", "by_recording", "estimate", "grid")}
+    assert imported_modules(tmp_path, "synchronize --help") & running == set()
+
+
 @pytest.mark.parametrize("words", chain.CHAIN, ids=lambda words: words.split()[0])
 def test_a_hit_imports_nothing_heavy(lab: Path, words: str) -> None:
     assert imported(lab, words) & HEAVY == set()

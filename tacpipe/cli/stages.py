@@ -8,14 +8,12 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from pathlib import Path
-from typing import Any, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 import typer
 
 from tacpipe import printable
 from tacpipe.cli import stage_options
-from tacpipe.engine import by_recording, estimate, grid, pipeline
-from tacpipe.engine.outcome import Outcome
 from tacpipe.engine.request import OPTIONS, PATHS, Request
 from tacpipe.errors import FAILED, TacpipeError, UsageError
 from tacpipe.io import progress, terminal
@@ -24,6 +22,9 @@ from tacpipe.plugins import given_params, registry
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins.stage import AnyStage
 from tacpipe.training import devices
+
+if TYPE_CHECKING:
+    from tacpipe.engine.outcome import Outcome
 
 _answering: ContextVar[bool] = ContextVar("answering", default=False)
 
@@ -104,6 +105,8 @@ def _call(name: str, stage: AnyStage, given: dict[str, Any], named: Sequence[str
         return
     if given["output"] is None:
         raise UsageError("Missing option -o. Give the directory to write, as -o data/output.")
+    from tacpipe.engine import grid, pipeline  # help needs neither
+
     requests = grid.requests(_request(name, stage, params, given), grid.folds(given.get("fold") or "0"))
     shown = stage.headline if not (given["check"] or given["compare"]) else None  # these write nothing
     how = {"as_json": given["json_"], "quiet": given["quiet"]}
@@ -141,7 +144,9 @@ def _request(name: str, stage: AnyStage, params: Any, given: Mapping[str, Any]) 
 
 def _report_answers(requests: Sequence[Request], headline: str | None, *, as_json: bool, quiet: bool) -> None:
     """Report what is there already. Raises `UnansweredError` where some is not."""
-    outcomes = [outcome for one in requests if (outcome := pipeline.answered(one)) is not None]
+    from tacpipe.engine import pipeline
+
+    outcomes = [outcome for request in requests if (outcome := pipeline.answered(request)) is not None]
     if len(outcomes) < len(requests):
         raise UnansweredError
     for outcome in outcomes:
@@ -150,13 +155,17 @@ def _report_answers(requests: Sequence[Request], headline: str | None, *, as_jso
 
 def _estimate(requests: Sequence[Request]) -> None:
     """Print how long the models that are missing take, as far as it can be known before."""
-    found = estimate.of(requests, requests[0].jobs)
-    if found is not None:
-        terminal.note(f"tacpipe: {found}")
+    from tacpipe.engine import estimate
+
+    sentence = estimate.of(requests, requests[0].jobs)
+    if sentence is not None:
+        terminal.note(f"tacpipe: {sentence}")
 
 
 def _run_folds(requests: Sequence[Request], headline: str | None, *, as_json: bool, quiet: bool) -> None:
     """Run a request for several folds and report each as it ends. Raises `TacpipeError` at the end where some failed."""
+    from tacpipe.engine import by_recording, grid
+
     failed: list[TacpipeError] = []
     for one, became in grid.run(requests, requests[0].jobs):
         if isinstance(became, TacpipeError):
