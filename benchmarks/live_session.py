@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 import tacpipe
-from tacpipe.live.own_streams import free_ports
+from tacpipe.live.preparation import free_ports
 from tacpipe.recording import rig as rigs
 from tacpipe.recording import rig_text
 from tacpipe.simulation import pick_and_move

@@ -38,8 +38,18 @@ def pages() -> dict[str, str]:
         "reference/cli.md": command_line(),
         "reference/params.md": params(),
         "reference/python.md": python(),
+        "reference/live-messages.md": live_messages(),
         "decisions/index.md": decisions(),
     }
+
+
+def live_messages() -> str:
+    """Return the page of the messages of live sessions, from the declaration of each task."""
+    from tacpipe.live import messages
+    from tacpipe.plugins import registry
+
+    tasks = {name: registry.load_task(name).live for name in registry.tasks()}
+    return messages.reference_page({name: live.declaration for name, live in tasks.items() if live is not None})
 
 
 def stage_names() -> list[str]:

@@ -25,6 +25,7 @@ from tacpipe.plugins.stage import stage
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
     from tacpipe.plugins.stage import Result
+    from tacpipe.tasks.task import Task
 
     Model = Dataset
 
@@ -48,7 +49,7 @@ def evaluate(params: Params, model: Model, recordings: Dataset) -> Result:
 
     task = model_files.task(model.files)
     if params.live:
-        result = _live(model, recordings)
+        result = _evaluate_sessions(task, model, recordings)
     else:
         with model_files.validated("the model"):
             result = task.evaluate(model, recordings)
@@ -58,13 +59,11 @@ def evaluate(params: Params, model: Model, recordings: Dataset) -> Result:
     return dataclasses.replace(result, files={**result.files, summary.FILE: summarized})
 
 
-def _live(model: Model, recordings: Dataset) -> Result:
+def _evaluate_sessions(task: Task, model: Model, recordings: Dataset) -> Result:
     from tacpipe.datasets import model_files
     from tacpipe.errors import UsageError
-    from tacpipe.tasks.forward.live import evaluation
 
-    name = model_files.tree(model.files, model_files.CONFIG)["task"]
-    if name != "forward":
-        raise UsageError(f"live is for models of the task forward, and this one is of {name}; leave --live out.")
+    if task.live is None:
+        raise UsageError(f"Models of the task {task.name} do not run live; leave --live out.")
     with model_files.validated("the model"):
-        return evaluation.evaluate(model, recordings)
+        return task.live.evaluate(model, recordings)

@@ -52,11 +52,11 @@ def predict(params: Params, model: Model, recordings: Dataset) -> Result:
 
     steps = sorted(set(STEPS.items(params.steps)))
     quantiles = sorted(set(CommaList(PositiveInt).items(params.quantiles)))
-    if params.causal:
-        return _causal(params, model, recordings, steps, quantiles)
     task = model_files.task(model.files)
+    request = PredictionRequest(steps, quantiles, params.probabilities, params.allow_look_ahead)
+    if params.causal:
+        return _predict_causally(task, model, recordings, request)
     with model_files.validated("the model"):
-        request = PredictionRequest(steps, quantiles, params.probabilities, params.allow_look_ahead)
         _refuse_unstated(task, request)
         return task.predict(model, recordings, request)
 
@@ -71,19 +71,11 @@ def _refuse_unstated(task: Task, request: PredictionRequest) -> None:
             raise UsageError(f"Models of the task {task.name} have no {name}; leave out --{name}.")
 
 
-def _causal(params: Params, model: Model, recordings: Dataset, steps: list[int], quantiles: list[int]) -> Result:
+def _predict_causally(task: Task, model: Model, recordings: Dataset, request: PredictionRequest) -> Result:
     from tacpipe.datasets import model_files
     from tacpipe.errors import UsageError
-    from tacpipe.tasks.forward.live import replay
-    from tacpipe.tasks.material.live import replay as material_replay
 
-    model_files.task(model.files)
-    name = model_files.tree(model.files, model_files.CONFIG)["task"]
-    if name not in ("forward", "material"):
-        raise UsageError(
-            f"causal is for models of the tasks forward and material, and this one is of {name}; leave --causal out."
-        )
+    if task.live is None:
+        raise UsageError(f"Models of the task {task.name} do not run live; leave --causal out.")
     with model_files.validated("the model"):
-        if name == "material":
-            return material_replay.predict(model, recordings)
-        return replay.predict(model, recordings, steps, quantiles, allow_look_ahead=params.allow_look_ahead)
+        return task.live.predict(model, recordings, request)

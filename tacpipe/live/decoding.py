@@ -1,4 +1,4 @@
-"""One stream of a live session from the bytes of its link to batches, as they will stand in the recording."""
+"""Decode one stream of a live session into batches, as they will stand in the recording."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 class Decoder:
-    """Decodes what came of a stream when it is asked for: many small chunks cost less together than one by one."""
+    """Decodes the bytes of a stream on request: many small chunks cost less together than one by one."""
 
     def __init__(self, sensor: Sensor) -> None:
         self.sensor = sensor
@@ -26,7 +26,7 @@ class Decoder:
         self.failures = 0
         self._reading = Reading(sensor)
         self._waiting: list[Chunks | Note] = []
-        self._schema: pa.Schema | None = None  # of all that it gives
+        self._schema: pa.Schema | None = None  # schema of its batches
         self._places: Places = {}
 
     def columns(self, batch: Batch, offset_ns: int) -> Columns:
@@ -36,7 +36,7 @@ class Decoder:
         return Columns(batch, self._schema, offset_ns, self._places)
 
     def take(self, block: Chunks | Note) -> None:
-        """Take what came."""
+        """Keep a block."""
         if isinstance(block, Chunks):
             self.heard_ns = int(block.t_ns[-1])
         if isinstance(block, Chunks) or block.what == LOST:
@@ -50,30 +50,30 @@ class Decoder:
         return not isinstance(first, Chunks) or int(first.t_ns[0]) <= until_ns or self._reading.account.pending > 0
 
     def batches(self) -> list[Batch]:
-        """Return what is complete now, as `tacpipe.recording.sealing` will decode it."""
+        """Return the samples that are complete now, as `tacpipe.recording.sealing` will decode them."""
         waiting, self._waiting = self._waiting, []
-        found: list[Batch] = []
+        batches: list[Batch] = []
         chunks: list[Chunks] = []
         for block in [*waiting, None]:
             if isinstance(block, Chunks):
                 chunks.append(block)
                 continue
             if chunks:
-                found += self._fed(Chunks.joined(chunks))
+                batches += self._feed(Chunks.joined(chunks))
                 chunks = []
             if block is not None:
-                found.append(self._reading.broken())
-        return [batch for batch in found if len(batch)]
+                batches.append(self._reading.broken())
+        return [batch for batch in batches if len(batch)]
 
     def last(self) -> list[Batch]:
-        """Return what is complete now that nothing more comes, as `batches`."""
-        found = [*self.batches(), self._reading.finish()]
-        return [batch for batch in found if len(batch)]
+        """Return the samples that are complete now that nothing more comes."""
+        batches = [*self.batches(), self._reading.finish()]
+        return [batch for batch in batches if len(batch)]
 
-    def _fed(self, chunks: Chunks) -> list[Batch]:
+    def _feed(self, chunks: Chunks) -> list[Batch]:
         try:
             return [self._reading.feed(chunks)]
-        except Exception:  # of a driver: what comes next is tried again, as it is when the recording is sealed
+        except Exception:  # a driver failed: later bytes are tried again, as when the recording is sealed
             self.failures += 1
             self._reading = Reading(self.sensor)
             return []
@@ -94,7 +94,7 @@ class Columns:
         self.schema, self.num_rows = schema, len(batch)
         self._places: Places = {} if places is None else places
         self._first = [batch.t_ns + offset_ns]
-        self._first += [one for one in (batch.t_device_ns, batch.seq, batch.device_seq) if one is not None]
+        self._first += [column for column in (batch.t_device_ns, batch.seq, batch.device_seq) if column is not None]
         self._blocks = batch.values
 
     def column(self, place: int | str) -> AnyArray:
@@ -102,18 +102,18 @@ class Columns:
         number = self.schema.get_field_index(place) if isinstance(place, str) else place
         if number < len(self._first):
             return self._first[number]
-        ((block, _, places),) = self._found((number,))
-        found: AnyArray = self._blocks[block][:, places[0]]
-        return found
+        ((block, _, places),) = self._find_columns((number,))
+        column: AnyArray = self._blocks[block][:, places[0]]
+        return column
 
-    def several(self, numbers: tuple[int, ...]) -> Floats:
+    def columns_of(self, numbers: tuple[int, ...]) -> Floats:
         """Return columns of values (sample, column) by their numbers."""
-        found = np.empty((self.num_rows, len(numbers)))
-        for block, columns, places in self._found(numbers):
-            found[:, columns] = self._blocks[block][:, places]
-        return found
+        values = np.empty((self.num_rows, len(numbers)))
+        for block, columns, places in self._find_columns(numbers):
+            values[:, columns] = self._blocks[block][:, places]
+        return values
 
-    def _found(self, numbers: tuple[int, ...]) -> list[Place]:
+    def _find_columns(self, numbers: tuple[int, ...]) -> list[Place]:
         """Return each block that columns are in, which of ``numbers`` these are, and where they are in it."""
         if numbers not in self._places:
             ends = np.cumsum([len(self._first), *(block.shape[1] for block in self._blocks)])

@@ -1,7 +1,7 @@
-"""What live sessions publish, and its formats: JSON, msgpack, and the packets of the sensor ``live``.
+"""Messages of a live session and their formats: JSON, msgpack, and the packets of the sensor ``live``.
 
-The fields are those of `Published.to_dict`; docs/howto/live.md describes them. `VERSION` is raised when one changes its
-meaning or goes; new ones may come at any time.
+The values of a task's messages are declared once, in its `Declaration`. `VERSION` is raised when a field changes its meaning
+or goes; fields may be added at any time.
 """
 
 from __future__ import annotations
@@ -9,61 +9,136 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from typing import Any, Protocol
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import numpy as np
 
-from tacpipe.arrays import Float32s
-from tacpipe.sensors.live import Live
+from tacpipe.arrays import AnyArray, Float32s
+from tacpipe.sensors.live import LSL, Declaration, Live, MessageSizes, Value, blocks
 from tacpipe.sensors.sensor import Samples
 
 VERSION = 1
+ABSENT: frozenset[str] = frozenset()
 
 
-class Published(Protocol):
-    """A message of any kind: what publishers and the session's own streams read of it."""
+class Message:
+    """A message of any task. A subclass is a dataclass that has each value of its `declaration` as an attribute."""
 
-    t_ns: int
-    cause: str
+    declaration: ClassVar[Declaration]
+    seq: int
+    t_ns: int  # time that it is about, UTC as the recording has it
+    cause: str  # reason why there is no answer of the model, or what it was made without
+    made_from_t_ns: int  # arrival of the newest sample that was read
     latency_ms: float
+    skipped: int
+    late: int
+    age_ms: float = math.nan
+    compute_ms: float = math.nan
+    flags: int = 0
 
     @property
     def answers(self) -> bool:
-        """Whether there is an answer of the model in it, rather than why there is none."""
+        """True for an answer of the model, False for a reason why there is none."""
+        raise NotImplementedError
 
     @property
     def states(self) -> Mapping[str, str]:
-        """What it states, in words, for the view of the session."""
+        """The answer in words, for the view of the session."""
+        raise NotImplementedError
+
+    @property
+    def absent(self) -> frozenset[str]:
+        """Declared values that this message does not have."""
+        return ABSENT
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the message as JSON and msgpack hold it."""
+        """Return the message as JSON and msgpack hold it; numbers that are not finite are null."""
+        fields = {
+            value.name: _plain(value.read(self), value.digits)
+            for value in self.declaration.values
+            if value.json and value.name not in self.absent
+        }
+        return {"version": VERSION, "kind": self.declaration.kind, **fields}
 
-    def columns(self) -> Float32s:
-        """Return the message as numbers (column,), those that `About.columns` names."""
+    def numbers(self, about: Description) -> Float32s:
+        """Return the numbers (column,) that `Description.columns` names, NaN where a value is None."""
+        parts = []
+        for value in self.declaration.recorded(LSL):
+            content = value.read(self)
+            width = len(value.columns_for(about.sizes))
+            parts.append(np.full(width, np.nan) if content is None else np.ravel(content))
+        return np.concatenate(parts).astype(np.float32)
 
-    def outputs(self, output: str) -> tuple[Any, ...] | None:
-        """Return the blocks of numbers that the session's stream of an output holds; None: nothing now."""
+    def stream_blocks(self, stream: str) -> tuple[AnyArray, ...] | None:
+        """Return the numbers of a recorded stream as blocks (row, column) of one type; None: no row for this message."""
+        values = [(value.type, value.read(self)) for value in self.declaration.recorded(stream)]
+        if any(content is None for _, content in values):
+            return None
+        shape = (self.row_count(stream), -1)
+        return blocks([(kind, np.asarray(content).reshape(shape)) for kind, content in values])
+
+    def row_count(self, stream: str) -> int:
+        """Return how many rows it gives a recorded stream."""
+        return 1
 
 
-class About(Protocol):
-    """What the numbers of messages of one kind are: sent once to each subscriber, before the first message."""
+@dataclass(frozen=True)
+class Sizes:
+    """The lists over which the values of messages repeat (`tacpipe.sensors.live.MessageSizes`)."""
+
+    channels: tuple[str, ...] = ()
+    steps: tuple[int, ...] = ()
+    quantiles: tuple[int, ...] = ()
+    unit: str = "1"
+    alarms: tuple[str, ...] = ()
+
+
+class Description:
+    """Describes the messages of a session; each subscriber gets it once, before the first message."""
+
+    declaration: ClassVar[Declaration]
+    answers: ClassVar[str] = "answers"  # plural noun for answers of the model, in the lines about a session
+    rate_hz: float  # messages per second; 0: irregular
+
+    @property
+    def sizes(self) -> MessageSizes:
+        """The lists over which the values of its messages repeat."""
+        return Sizes()
 
     @property
     def kind(self) -> str:
-        """The kind of the messages, as forecast."""
+        """The kind of the messages."""
+        return self.declaration.kind
 
     @property
-    def rate_hz(self) -> float:
-        """Messages a second."""
+    def absent(self) -> frozenset[str]:
+        """Declared values that messages of this session do not have."""
+        return ABSENT
 
     def columns(self) -> list[tuple[str, str]]:
-        """Return name and unit of each of `Published.columns`."""
+        """Return name and unit of each of `Message.numbers`."""
+        return [(column.name, column.unit) for _, column in self.declaration.columns(LSL, self.sizes)]
 
     def schema(self) -> dict[str, Any]:
-        """Return the properties of `Published.to_dict`, as JSON schema has them."""
+        """Return the properties of `Message.to_dict`, as JSON schema has them."""
+        values = [value for value in self.declaration.values if value.json and value.name not in self.absent]
+        fields = {
+            value.name: {"type": value.json} if value.schema is None else value.schema(self.sizes) for value in values
+        }
+        return {"version": {"type": "integer"}, "kind": {"type": "string"}, **fields}
 
     def to_dict(self) -> dict[str, Any]:
         """Return the description as JSON and msgpack hold it."""
+        raise NotImplementedError
+
+
+def head_values() -> tuple[Value, ...]:
+    """Return the values that messages of every task begin with."""
+    return (
+        Value("seq", "number of the message, from 1", "integer"),
+        Value("t_ns", "time that the message is about, UTC", "integer", unit="ns"),
+    )
 
 
 def to_json(content: Mapping[str, Any]) -> bytes:
@@ -71,9 +146,9 @@ def to_json(content: Mapping[str, Any]) -> bytes:
     return json.dumps(content, separators=(",", ":"), allow_nan=False).encode()
 
 
-def packets(message: Published, sensor: Live, seq: int) -> list[bytes]:
-    """Return the packets of a message for one output, numbered from ``seq`` on; none of a forecast where there is none."""
-    values = message.outputs(sensor.output)
+def packets(message: Message, sensor: Live, seq: int) -> list[bytes]:
+    """Return the packets of a message for one stream, numbered from ``seq`` on; none where it has no row for it."""
+    values = message.stream_blocks(sensor.output)
     if values is None:
         return []
     count = len(values[0])
@@ -81,11 +156,34 @@ def packets(message: Published, sensor: Live, seq: int) -> list[bytes]:
     return [row.tobytes() for row in sensor.encode(Samples(values, seqs, np.full(count, message.t_ns)))]
 
 
-def properties(*integers: str, **types: str) -> dict[str, Any]:
-    """Return properties of JSON schema by their types; those named alone are integers."""
-    return {name: {"type": kind} for name, kind in {**dict.fromkeys(integers, "integer"), **types}.items()}
+def rounded(value: float, digits: int = 4) -> float | None:
+    """Return a number to some digits, None for one that is not finite."""
+    return round(value, digits) if math.isfinite(value) else None
 
 
-def known(value: float) -> float | None:
-    """Return a number to four digits, None for one that is not finite."""
-    return round(value, 4) if math.isfinite(value) else None
+def reference_page(declarations: Mapping[str, Declaration]) -> str:
+    """Return the reference page of the messages of tasks, by the name of the task, as Markdown."""
+    lines = [
+        "# Live messages\n",
+        "Each message is one JSON object (or the same in msgpack) with `version` 1 and its `kind`. The declarations of the "
+        "tasks give the tables below, the recorded streams and the packets.\n",
+    ]
+    for task, declaration in declarations.items():
+        lines += [
+            f"## {task}: `{declaration.kind}`\n",
+            "| value | JSON | unit | recorded in | meaning |",
+            "|" + " --- |" * 5,
+        ]
+        for value in declaration.values:
+            recorded = ", ".join(f"`{stream}`" for stream in value.streams if stream != LSL)
+            json_type = value.json or "no"
+            lines.append(f"| `{value.name}` | {json_type} | {value.unit} | {recorded} | {value.meaning} |")
+        lines.append("")
+    return "\n".join(lines)
+
+
+def _plain(value: Any, digits: int | None) -> Any:
+    """Return a value as JSON can hold it."""
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    return value if digits is None else rounded(value, digits)

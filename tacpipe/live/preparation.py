@@ -1,99 +1,130 @@
-"""What a live session is started with, from a rig and what is asked for."""
+"""Prepare a live session: check rig, model and settings, and add the session's own streams to the rig."""
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
+import socket
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.live import description, own_streams, publishing, scheduling
-from tacpipe.live.description import Described, Grasped, Surfaces
-from tacpipe.live.options import Options
-from tacpipe.live.settings import MEASURED, Settings
-from tacpipe.recording import completing
-from tacpipe.recording.rig import Rig
-from tacpipe.tasks import calibrated
-from tacpipe.tasks.forward.live import plans
+from tacpipe.errors import UsageError
+from tacpipe.links.link import Address
+from tacpipe.live import publishing, scheduling
+from tacpipe.live.settings import SessionOptions, Settings, parse_option
+from tacpipe.live.task import LiveTask
+from tacpipe.plugins import fields
+from tacpipe.printable import plain
+from tacpipe.recording import completing, rig_text
+from tacpipe.recording import rig as rigs
+from tacpipe.recording.rig import Rig, Stream
+
+if TYPE_CHECKING:
+    from tacpipe.datasets.dataset import Dataset
+
+CONFIG = "config.json"
+PATHS = ("model", "alarms_on", "split")
+
+
+class LiveModel(NamedTuple):
+    """A trained model whose task runs live."""
+
+    task: str
+    live: LiveTask
+    dataset: Dataset
 
 
 @dataclass(frozen=True)
-class Prepared:
+class PreparedSession:
     """A live session that may start."""
 
-    rig: Rig  # with the session's own streams
-    options: Options  # what the model's process is asked for
-    model_digest: str
+    rig: Rig  # includes the session's own streams
+    options: SessionOptions
+    attributes: Mapping[str, Any]  # further attributes of the recordings
 
 
-def prepared(rig: Rig, asked: Settings) -> Prepared:
-    """Return what a session is started with.
+def prepare(rig: Rig, where: str, options: Mapping[str, Any]) -> PreparedSession:
+    """Return a session with a rig (read from the file ``where``) and options of the command; None: not given.
 
     Raises `UsageError` that names option, or file and key, for what this computer, the model or the rig does not allow.
     """
-    if asked.realtime:
-        with asked.naming("realtime"):
-            scheduling.check()
-    with asked.naming("publish"):
-        for address in asked.publish:
-            publishing.check(address)
-    with asked.naming("model"):
-        about, digest = description.described(Path(asked.model), allow_look_ahead=asked.allow_look_ahead)
-    about, steps = _forecast(about, asked) if isinstance(about, Described) else (_other(about, asked), ())
-    with asked.naming("plan"):
-        planned = plans.with_plan(rig, asked.plan, asked.plan_from)
-    found = own_streams.added(completing.completed(planned), about, steps)
-    options = Options(
-        _absolute(asked.model),
-        found.text,
-        tuple(planned.streams),
-        steps,
-        about.quantiles if isinstance(about, Described) else (),
-        asked.publish,
-        asked.alarms_per_hour,
-        _absolute(asked.alarms_on),
-        _absolute(asked.split),
-        asked.settle_ms,
-        plan_stream=plans.targets_of(planned, asked.plan),
-        kind=about.kind,
-        sensor=asked.sensor,
-        every_ms=asked.every_ms,
-        least=asked.least,
-        pause_s=asked.pause_s,
-        rank=asked.rank,
-        realtime=asked.realtime,
-        allow_look_ahead=asked.allow_look_ahead,
-    )
-    return Prepared(found, options, digest)
-
-
-def _forecast(about: Described, asked: Settings) -> tuple[Described, tuple[int, ...]]:
-    """Return what a model of forecasts is asked for: itself with these quantiles, and the steps that are published."""
-    with asked.naming("steps"):
-        steps = asked.steps_of(about.horizon)
-    with asked.naming("quantiles"):
-        _check_quantiles(asked.quantiles, about)
-    return replace(about, quantiles=tuple(sorted(set(asked.quantiles)))), steps
-
-
-def _other(about: Surfaces | Grasped, asked: Settings) -> Surfaces | Grasped:
-    """Return a model that forecasts nothing. Raises `UsageError` where it is asked for what only forecasts have."""
-    if asked.steps or asked.quantiles or asked.plan != MEASURED or asked.alarms_per_hour:
+    path = str(options.get("model") or rig.live.get("model", ""))
+    if not path:
         raise UsageError(
-            f"{asked.model} is of the kind {about.kind}; "
-            f"--steps, --quantiles, --plan and --alarms-per-hour are for forecasts."
+            f'A live session needs a model: give --model models/forward, or state model = "models/forward" in the '
+            f"table [live] of {where}."
         )
-    return about
+    common = Settings(path, places={} if options.get("model") else {"model": f"{where}, live"})
+    with common.naming("model"):
+        model = open_model(path)
+    kinds = {**fields.hints(Settings), **fields.hints(model.live.settings)}
+    parsed = {name: parse_option(name, text, kinds[name]) if name in kinds else text for name, text in options.items()}
+    settings = Settings.from_sources(model.live.settings, rig.live, where, parsed)
+    if settings.realtime:
+        with settings.naming("realtime"):
+            scheduling.check()
+    with settings.naming("publish"):
+        for address in settings.publish:
+            publishing.check(address)
+    plan = model.live.plan(model.dataset, rig, settings)
+    streams = {name: {"task": model.task, "output": name, **options} for name, options in plan.streams.items()}
+    complete_rig = add_streams(completing.completed(plan.rig), streams)
+    settings = with_absolute_paths(replace(settings, task=plan.settings))
+    session = SessionOptions(model.task, complete_rig.text, tuple(plan.rig.streams), tuple(streams), settings)
+    return PreparedSession(complete_rig, session, {"live_model": model.dataset.digest, **plan.attributes})
 
 
-def _check_quantiles(percents: tuple[int, ...], about: Described) -> None:
-    """Raise `UsageError` for quantiles that the model does not have."""
-    if not percents:
-        return
-    try:
-        calibrated.quantiles_of(about if about.percents else None, percents)
-    except TacpipeError as error:
-        raise UsageError(str(error)) from error
+def open_model(path: str) -> LiveModel:
+    """Return the model at a path. Raises `UsageError` where it is no model, or its task does not run live."""
+    from tacpipe.datasets import model_files
+    from tacpipe.engine.pipeline import open_dataset
+
+    dataset = open_dataset(path)
+    if CONFIG not in dataset.files:
+        raise UsageError(f"{path} is not a model; give one of `tacpipe train`.")
+    name = str(model_files.tree(dataset.files, CONFIG, {"task": str})["task"])
+    live = model_files.task(dataset.files, path).live
+    if live is None:
+        raise UsageError(f"{path} was trained for {plain(name)}, whose models do not run live.")
+    return LiveModel(name, live, dataset)
 
 
-def _absolute(path: str) -> str:
-    return str(Path(path).absolute()) if path else ""
+def with_absolute_paths(settings: Settings) -> Settings:
+    """Return settings whose paths do not depend on the working directory."""
+    task = {
+        name: str(Path(getattr(settings.task, name)).absolute())
+        for name in PATHS
+        if getattr(settings.task, name, "") and name in {field.name for field in dataclasses.fields(settings.task)}
+    }
+    return replace(settings, model=str(Path(settings.model).absolute()), task=replace(settings.task, **task))
+
+
+def add_streams(rig: Rig, streams: Mapping[str, Mapping[str, Any]]) -> Rig:
+    """Return a rig with further streams of the sensor ``live``, given by their options, at free ports of this computer.
+
+    Raises `UsageError` where the rig has a stream of such a name, and for messages too large for a packet.
+    """
+    taken = [name for name in streams if name in rig.streams]
+    if taken:
+        raise UsageError(f"The rig file has a stream {taken[0]}, as a live session adds itself; give it another name.")
+    added = {
+        name: Stream(
+            name, "live", rigs.make("live", options, "live"), Address("udp", f"127.0.0.1:{port}"), dict(options)
+        )
+        for (name, options), port in zip(streams.items(), free_ports(len(streams)), strict=True)
+    }
+    extended = replace(rig, streams={**rig.streams, **added})
+    return replace(extended, text=rig_text.of(extended))
+
+
+def free_ports(count: int) -> list[int]:
+    """Return UDP ports of this computer that nobody listens on."""
+    with contextlib.ExitStack() as sockets:
+        ports = []
+        for _ in range(count):
+            port = sockets.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+            port.bind(("127.0.0.1", 0))
+            ports.append(int(port.getsockname()[1]))
+    return ports

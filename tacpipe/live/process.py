@@ -1,86 +1,85 @@
-"""The model's process of a live session: it fetches what the links gave, predicts, publishes, and reports.
+"""Run the model of a live session in a process of its own: fetch samples, predict, publish, and report.
 
-It is an interpreter of its own, so neither its lock nor its crash touches the recording. It sleeps until a grid point is
-nearly due and decodes what came since, then until it is due and takes the rest: at 1 kHz that costs a fifth of waking for
-each sample, and the forecast waits for the decoding of a few samples alone.
+Neither its interpreter lock nor a crash of it affects the recording. It sleeps until an answer is nearly due and decodes the
+samples since, then sleeps until it is due and decodes the remaining few. At 1 kHz that costs a fifth of waking for each
+sample.
 """
 
 from __future__ import annotations
 
 import gc
+import math
 import os
 import select
 import socket
 import sys
 import time
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import Any
 
-from tacpipe.errors import TacpipeError
+import numpy as np
+
+from tacpipe.errors import FAILED, TacpipeError, UsageError
 from tacpipe.live import publishing, scheduling, wire
-from tacpipe.live.latency import Latencies
-from tacpipe.live.messages import About, Published
-from tacpipe.live.options import Options
+from tacpipe.live.engine import Continuation, Engine
+from tacpipe.live.messages import Message
 from tacpipe.live.publishing import Publishers
+from tacpipe.live.settings import SessionOptions
 from tacpipe.plugins import extras
 from tacpipe.recording.spool_blocks import Note
 
-REPORT_NS = 250_000_000  # between two reports to the recording process
-FETCH_BYTES = 1 << 18
-SWITCH_S = 0.0005  # that a publisher's thread may hold up a forecast
-LONGEST_S = 0.02  # that a wait lasts at most
+REPORT_NS = 250_000_000  # period of reports to the recording process
+FETCH_BYTES = 1 << 18  # read at once
+SWITCH_S = 0.0005  # time that a publisher's thread may hold up an answer
+LONGEST_WAIT_S = 0.02
 REFUSED = 2  # exit code: the session cannot begin with this model and rig
+SHORTEST_MS, LONGEST_MS = 0.01, 100_000.0
+PER_DECADE = 100  # bins; a quantile is exact to 2.3 %
+BINS = PER_DECADE * round(math.log10(LONGEST_MS / SHORTEST_MS))
 
 
-class Continued(Protocol):
-    """What a process that is started anew needs to continue a recording."""
+class Latencies:
+    """A histogram of latencies: a session of hours needs no more memory than one of seconds."""
 
-    def to_json(self) -> dict[str, Any]:
-        """Return it as the note `wire.CONTINUE` holds it."""
+    def __init__(self) -> None:
+        self.count = 0
+        self.max_ms = 0.0
+        self._bins = np.zeros(BINS, dtype=np.int64)
 
+    def add(self, latency_ms: float) -> None:
+        """Count a latency."""
+        clipped = min(max(latency_ms, SHORTEST_MS), LONGEST_MS * 0.999)
+        self._bins[int(math.log10(clipped / SHORTEST_MS) * PER_DECADE)] += 1
+        self.count += 1
+        self.max_ms = max(self.max_ms, latency_ms)
 
-class Engine(Protocol):
-    """An object that turns blocks of bytes into messages; each task has its own."""
+    def quantile_ms(self, fraction: float) -> float:
+        """Return the latency that this fraction does not exceed, to 2.3 % above it; 0 where there is none.
 
-    skipped: int  # messages so far that were left out under overload
-    overflows: int  # times that blocks were thrown away
+        >>> latencies = Latencies()
+        >>> for latency_ms in (1.0, 2.0, 3.0, 40.0):
+        ...     latencies.add(latency_ms)
+        >>> round(latencies.quantile_ms(0.5), 1), latencies.quantile_ms(1.0), latencies.above(20.0)
+        (2.0, 40.0, 1)
+        """
+        if not self.count:
+            return 0.0
+        place = int(np.searchsorted(np.cumsum(self._bins), math.ceil(fraction * self.count)))
+        return min(SHORTEST_MS * 10 ** ((place + 1) / PER_DECADE), self.max_ms)
 
-    @property
-    def late(self) -> int:
-        """Samples so far that came too late to be read."""
+    def above(self, limit_ms: float) -> int:
+        """Return how many were longer, to the width of a bin."""
+        first = int(math.log10(limit_ms / SHORTEST_MS) * PER_DECADE) + 1
+        return int(self._bins[first:].sum())
 
-    @property
-    def running(self) -> bool:
-        """Whether a recording has begun."""
-
-    @property
-    def offset_ns(self) -> int | None:
-        """What is added to the monotonic clock to have the recording's UTC."""
-
-    @property
-    def beginning(self) -> Continued | None:
-        """What another process needs to continue the recording; None as long as it is not known."""
-
-    def about(self, model: str) -> About:
-        """Return what its messages are."""
-
-    def ready(self) -> dict[str, Any]:
-        """Return what the recording process is to know before the session begins."""
-
-    def take(self, stream: str, block: Any) -> None:
-        """Take a block of a stream, or a note on all."""
-
-    def due_ns(self, now_ns: int) -> int:
-        """Return when `step` is to be called next, on the monotonic clock."""
-
-    def step(self, now_ns: int) -> Sequence[Any]:
-        """Return the messages that are due."""
-
-    def published(self, message: Any, now_ns: int) -> None:
-        """Write into a message how long it took, when it is about to go out."""
-
-    def finish(self) -> Sequence[Any]:
-        """Return the messages that are left when the session is over."""
+    def figures(self) -> dict[str, float]:
+        """Return count, median, 99th percentile and maximum."""
+        return {
+            "count": self.count,
+            "p50_ms": round(self.quantile_ms(0.5), 3),
+            "p99_ms": round(self.quantile_ms(0.99), 3),
+            "max_ms": round(self.max_ms, 3),
+        }
 
 
 class Loop:
@@ -92,7 +91,7 @@ class Loop:
         self.forecasts = 0
         self.cause = ""
         self._reported_ns = 0
-        self._beginning: Any = None  # that was reported
+        self._reported: Continuation | None = None  # the beginning that was reported
         self._ended = False
 
     def run(self) -> None:
@@ -107,17 +106,17 @@ class Loop:
             if now_ns - self._reported_ns > REPORT_NS:
                 self._reported_ns = now_ns
                 self.report()
-                gc.collect(1)  # between forecasts: a collection of all would take longer than a forecast may
+                gc.collect(1)  # a full collection would take longer than an answer may
             wait_s = (self.engine.due_ns(time.monotonic_ns()) - time.monotonic_ns()) / 1e9
             if wait_s > 0:
-                time.sleep(min(wait_s, LONGEST_S))
+                time.sleep(min(wait_s, LONGEST_WAIT_S))
         for message in self.engine.finish():
             self.publish(message)
         self.report()
 
-    def publish(self, message: Published) -> None:
+    def publish(self, message: Message) -> None:
         """Send a message to all subscribers, and count how long it took."""
-        self.publishers.publish(message, lambda one: self.engine.published(one, time.monotonic_ns()))
+        self.publishers.publish(message, lambda sent: self.engine.published(sent, time.monotonic_ns()))
         self.cause = message.cause
         if message.answers:
             self.forecasts += 1
@@ -126,7 +125,8 @@ class Loop:
     def report(self) -> None:
         """Send the recording process what the session did so far; where it does not read, the report is left out."""
         figures = {
-            "kind": self.publishers.kind,
+            "kind": self.publishers.about.kind,
+            "answers": self.publishers.about.answers,
             "forecasts": self.forecasts,
             "skipped": self.engine.skipped,
             "late": self.engine.late,
@@ -141,9 +141,9 @@ class Loop:
         }
         send(self.connection, {"report": figures})
         beginning = self.engine.beginning if self.engine.running else None
-        if beginning is not None and beginning != self._beginning:
+        if beginning is not None and beginning != self._reported:
             send(self.connection, {"beginning": beginning.to_json(), "offset_ns": self.engine.offset_ns})
-        self._beginning = beginning
+        self._reported = beginning
 
     def _fetch(self) -> None:
         while True:
@@ -170,22 +170,31 @@ def send(connection: socket.socket, content: dict[str, Any]) -> None:
         return
 
 
-def engine_of(options: Options) -> Engine:
-    """Return the engine of a session: the model's chain, and alarms with their levels. Raises `TacpipeError`."""
-    from tacpipe.live import opening
+def open_engine(options: SessionOptions) -> Engine:
+    """Return the engine of a session. Raises `UsageError` where model, rig and settings do not belong together."""
+    from tacpipe.live.preparation import open_model
+    from tacpipe.recording import rig as rigs
 
-    return opening.engine(options)
+    model = open_model(options.settings.model)
+    rig = rigs.parse(options.rig)
+    sensors = {name: rig.streams[name].sensor for name in options.streams}
+    try:
+        return model.live.engine(model.dataset, rig, sensors, options.settings)
+    except TacpipeError as error:
+        if error.exit_code != FAILED:
+            raise
+        raise UsageError(str(error)) from error  # the user chose a rig that the model cannot read
 
 
-def main(arguments: Sequence[str], made: Callable[[Options], Engine] = engine_of) -> int:
+def main(arguments: Sequence[str], engine_for: Callable[[SessionOptions], Engine] = open_engine) -> int:
     """Run the model's process on an inherited socket, whose number is given; return its exit code."""
     connection = socket.socket(fileno=int(arguments[0]))
     connection.setblocking(True)
-    options = Options.from_json(_first_line(connection))
+    options = SessionOptions.from_json(_first_line(connection))
     try:
         with extras.named("tacpipe live"):
-            engine = made(options)
-            publishers = publishing.opened(options, engine)
+            engine = engine_for(options)
+            publishers = publishing.open_publishers(options, engine.describe(options.settings.model))
     except TacpipeError as error:
         send(connection, {"refused": str(error), "exit_code": error.exit_code})
         return REFUSED
@@ -194,7 +203,7 @@ def main(arguments: Sequence[str], made: Callable[[Options], Engine] = engine_of
     gc.disable()
     os.nice(options.nice)
     sys.setswitchinterval(SWITCH_S)
-    if options.realtime:
+    if options.settings.realtime:
         scheduling.realtime(scheduling.MODEL)
     send(connection, {"ready": engine.ready()})
     from tacpipe.models.threads import one_thread  # torch, which the engine has loaded

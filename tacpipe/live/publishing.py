@@ -1,17 +1,22 @@
-"""Where forecasts go: to the session's own streams, and to its subscribers. None of them is waited for."""
+"""Publish messages to the session's own streams and to its subscribers. No publisher waits for its readers."""
 
 from __future__ import annotations
 
 import contextlib
+import json
+import queue
 import socket
+import threading
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol, Self
+from urllib.parse import parse_qsl
 
-from tacpipe.errors import UsageError
-from tacpipe.live import messages
-from tacpipe.live.messages import About, Published
-from tacpipe.live.options import OWN, Options
+from tacpipe.errors import DeviceError, UsageError
+from tacpipe.links import lsl, network
+from tacpipe.live.messages import Description, Message, packets, to_json
+from tacpipe.live.settings import SessionOptions
 from tacpipe.plugins import extras
 from tacpipe.printable import excerpt
 from tacpipe.recording import rig as rigs
@@ -23,41 +28,38 @@ EXAMPLES = {
     "lsl": "lsl:tacpipe",
     "mcap": "mcap:session.mcap",
 }
+DESCRIBED_EVERY = 100  # messages from one description to the next, because datagrams may be lost
+LARGEST_DATAGRAM = 65_000  # bytes
+FORMATS = ("json", "msgpack")
+MCAP_QUEUED = 500  # messages that wait for the disk: 10 s at 50 Hz
 
 
 class Publisher(Protocol):
-    """Takes messages without ever waiting for who reads them."""
+    """An address that messages go to; it never waits for its readers."""
 
     dropped: int  # messages that did not go out, over all subscribers
 
-    def publish(self, message: Published) -> None:
+    def publish(self, message: Message) -> None:
         """Send a message, or drop it."""
 
     def close(self) -> None:
         """Send what still waits and close."""
 
 
-class Predicts(Protocol):
-    """What is used of an engine."""
-
-    def about(self, model: str) -> About:
-        """Return what its messages are, made by a model of a path."""
-
-
-class Own:
+class StreamPublisher:
     """The packets that the recording process reads as streams of the rig."""
 
     def __init__(self, places: Mapping[str, tuple[str, int]], sensors: Mapping[str, Live]) -> None:
         self.dropped = 0
         self._places, self._sensors = places, sensors
-        self._sent = dict.fromkeys(sensors, 0)  # packets so far, of each output
+        self._sent = dict.fromkeys(sensors, 0)  # packets of each stream so far
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
 
-    def publish(self, message: Published) -> None:
+    def publish(self, message: Message) -> None:
         """Send the packets of a message."""
         for output, sensor in self._sensors.items():
-            for packet in messages.packets(message, sensor, self._sent[output]):
+            for packet in packets(message, sensor, self._sent[output]):
                 self._sent[output] = (self._sent[output] + 1) % (1 << 32)
                 try:
                     self._socket.sendto(packet, self._places[output])
@@ -72,29 +74,29 @@ class Own:
 class Publishers:
     """All publishers of a session; the session's own streams come last, so that the latency they carry covers the others."""
 
-    def __init__(self, several: list[Publisher], own: Own | None, kind: str = "forecast") -> None:
-        self.kind = kind  # of the messages
-        self._subscribed = several
-        self._own = own
-        self.states: Mapping[str, str] = {}  # what was published last, in words
+    def __init__(self, subscribed: list[Publisher], streams: StreamPublisher | None, about: Description) -> None:
+        self.about = about
+        self._subscribed = subscribed
+        self._streams = streams
+        self.states: Mapping[str, str] = {}  # the last message in words
 
     @property
-    def _several(self) -> list[Publisher]:
-        return [*self._subscribed, *([] if self._own is None else [self._own])]
+    def _all(self) -> list[Publisher]:
+        return [*self._subscribed, *([] if self._streams is None else [self._streams])]
 
     @property
     def dropped(self) -> int:
         """How many messages did not go out."""
-        return sum(one.dropped for one in self._several)
+        return sum(publisher.dropped for publisher in self._all)
 
-    def publish(self, message: Published, stamped: Callable[[Any], None]) -> None:
-        """Send a message to all; ``stamped`` writes into it how long it took so far."""
-        stamped(message)
-        for one in self._subscribed:
-            one.publish(message)
-        stamped(message)
-        if self._own is not None:
-            self._own.publish(message)
+    def publish(self, message: Message, stamp: Callable[[Message], None]) -> None:
+        """Send a message to all; ``stamp`` writes its latency so far into it."""
+        stamp(message)
+        for subscriber in self._subscribed:
+            subscriber.publish(message)
+        stamp(message)
+        if self._streams is not None:
+            self._streams.publish(message)
         self.states = message.states
 
     def __enter__(self) -> Self:
@@ -103,29 +105,45 @@ class Publishers:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        for one in self._several:
+        for opened in self._all:
             with contextlib.suppress(OSError):
-                one.close()
+                opened.close()
 
 
-def opened(options: Options, engine: Predicts) -> Publishers:
-    """Return the publishers of a session. Raises `UsageError` for an address that is none, `DeviceError` for one in use."""
+def open_publishers(options: SessionOptions, about: Description) -> Publishers:
+    """Return the publishers of a session whose messages ``about`` describes.
+
+    Raises `UsageError` for an address that nothing can be published to, `DeviceError` for one in use.
+    """
     rig = rigs.parse(options.rig)
-    own = {name: rig.streams[name] for name in rig.streams if name in OWN}
     places: dict[str, tuple[str, int]] = {}
-    for name, stream in own.items():
+    sensors: dict[str, Live] = {}
+    for name in options.own_streams:
+        stream = rig.streams[name]
+        assert isinstance(stream.sensor, Live)
         host, _, port = stream.address.place.partition("?")[0].rpartition(":")
-        places[name] = (host or "127.0.0.1", int(port))
-    sensors = {name: stream.sensor for name, stream in own.items() if isinstance(stream.sensor, Live)}
-    about = engine.about(options.model)
-    several: list[Publisher] = []
+        places[name], sensors[name] = (host or "127.0.0.1", int(port)), stream.sensor
+    subscribed: list[Publisher] = []
     try:
-        several.extend(publisher(address, about) for address in options.publish)
+        subscribed.extend(publisher(address, about) for address in options.settings.publish)
     except BaseException:
-        for one in several:
-            one.close()
+        for opened in subscribed:
+            opened.close()
         raise
-    return Publishers(several, Own(places, sensors) if own else None, about.kind)
+    return Publishers(subscribed, StreamPublisher(places, sensors) if sensors else None, about)
+
+
+def publisher(address: str, about: Description) -> Publisher:
+    """Return the publisher of an address. Raises `UsageError` and `DeviceError`, as `open_publishers`."""
+    scheme, place = check(address)
+    if scheme == "ws":
+        with extras.named("--publish ws"):
+            from tacpipe.live.websocket import WebsocketPublisher
+
+        return WebsocketPublisher(place, about)
+    if scheme == "udp":
+        return UdpPublisher(place, about)
+    return LslPublisher(place, about) if scheme == "lsl" else McapPublisher(place, about)
 
 
 def check(address: str) -> tuple[str, str]:
@@ -139,39 +157,136 @@ def check(address: str) -> tuple[str, str]:
     return scheme, place
 
 
-def publisher(address: str, about: About) -> Publisher:
-    """Return the publisher of an address. Raises `UsageError` and `DeviceError`, as `opened`."""
-    scheme, place = check(address)
-    made: dict[str, Callable[[str, About], Any]] = {
-        "ws": _websocket,
-        "udp": _udp,
-        "lsl": _lsl,
-        "mcap": _mcap,
-    }
-    found: Publisher = made[scheme](place, about)
-    return found
+class LslPublisher:
+    """An outlet; LSL keeps what its readers have not fetched and drops the oldest, so nobody is waited for."""
+
+    def __init__(self, place: str, about: Description) -> None:
+        with extras.named("--publish lsl"):
+            import pylsl
+        lsl.quiet(pylsl)
+        columns = about.columns()
+        info = pylsl.StreamInfo(
+            place, about.kind.capitalize(), len(columns), about.rate_hz, pylsl.cf_float32, f"tacpipe-{place}"
+        )
+        channels = info.desc().append_child("channels")
+        for name, unit in columns:
+            channel = channels.append_child("channel")
+            channel.append_child_value("label", name)
+            channel.append_child_value("unit", unit)
+        self.dropped = 0
+        self._about = about
+        self._outlet = pylsl.StreamOutlet(info, max_buffered=2)
+
+    def publish(self, message: Message) -> None:
+        """Push a message; numbers that it does not have are NaN."""
+        self._outlet.push_sample(message.numbers(self._about))
+
+    def close(self) -> None:
+        """Take the outlet away."""
+        del self._outlet
 
 
-def _websocket(place: str, about: About) -> Publisher:
-    with extras.named("--publish ws"):
-        from tacpipe.live.publishers.websocket import WebsocketPublisher
+class McapPublisher:
+    """Writes a file that did not exist before."""
 
-    return WebsocketPublisher(place, about)
+    def __init__(self, place: str, about: Description) -> None:
+        with extras.named("--publish mcap"):
+            from mcap.writer import Writer
+
+        path = Path(place)
+        try:
+            self._file = path.open("xb")
+        except FileExistsError:
+            raise UsageError(f"--publish mcap:{place}: the file exists already; give another name.") from None
+        except OSError as error:
+            raise UsageError(f"--publish mcap:{place}: {error.strerror}.") from error
+        self.dropped = 0
+        self._writer = Writer(self._file)
+        self._writer.start(profile="", library="tacpipe")
+        described = {"type": "object", "properties": about.schema()}
+        schema = self._writer.register_schema(
+            f"tacpipe.{about.kind.capitalize()}", "jsonschema", json.dumps(described).encode()
+        )
+        self._about_topic, self._topic = (
+            self._writer.register_channel(f"/{name}", "json", schema) for name in ("description", about.kind)
+        )
+        self._about: bytes | None = to_json(about.to_dict())
+        self._waiting: queue.Queue[tuple[int, Message] | None] = queue.Queue(MCAP_QUEUED)
+        self._thread = threading.Thread(target=self._write, daemon=True)
+        self._thread.start()
+
+    def publish(self, message: Message) -> None:
+        """Have a message written, if the disk keeps up."""
+        try:
+            self._waiting.put_nowait((message.t_ns, message))
+        except queue.Full:
+            self.dropped += 1
+
+    def close(self) -> None:
+        """Write what waits, and end the file."""
+        self._waiting.put(None)
+        self._thread.join()
+        self._writer.finish()  # type: ignore[no-untyped-call]
+        self._file.close()
+
+    def _write(self) -> None:
+        while (entry := self._waiting.get()) is not None:
+            t_ns, message = entry
+            if self._about is not None:
+                self._writer.add_message(self._about_topic, t_ns, self._about, t_ns)
+                self._about = None
+            self._writer.add_message(self._topic, t_ns, to_json(message.to_dict()), t_ns)
 
 
-def _udp(place: str, about: About) -> Publisher:
-    from tacpipe.live.publishers.udp import UdpPublisher
+class UdpPublisher:
+    """Sends each message to one address."""
 
-    return UdpPublisher(place, about)
+    def __init__(self, place: str, about: Description) -> None:
+        place, _, options = place.partition("?")
+        parsed = dict(parse_qsl(options, keep_blank_values=True))
+        kind = parsed.pop("format", "json")
+        if parsed or kind not in FORMATS:
+            raise UsageError(f"--publish udp:{place}?{excerpt(options)}: the only option is format, json or msgpack.")
+        self.dropped = 0
+        self._packed = to_json if kind == "json" else _msgpack()
+        host, port = network.place("udp", place)
+        try:
+            family, *_, target = socket.getaddrinfo(host or "127.0.0.1", port, type=socket.SOCK_DGRAM)[0]
+            self._socket = socket.socket(family, socket.SOCK_DGRAM)
+            self._socket.connect(target)
+        except OSError as error:
+            raise DeviceError(f"--publish udp:{place}: {error.strerror or error}.") from error
+        self._socket.setblocking(False)
+        self._about = self._packed(about.to_dict())
+        self._until_about = 0
+
+    def publish(self, message: Message) -> None:
+        """Send a message; what the network does not take at once is dropped."""
+        if not self._until_about:
+            self._until_about = DESCRIBED_EVERY
+            self._send(self._about)
+        self._until_about -= 1
+        self._send(self._packed(message.to_dict()))
+
+    def _send(self, data: bytes) -> None:
+        try:
+            if len(data) > LARGEST_DATAGRAM:
+                raise OSError
+            self._socket.send(data)
+        except OSError:
+            self.dropped += 1
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
 
 
-def _lsl(place: str, about: About) -> Publisher:
-    from tacpipe.live.publishers.lsl import LslPublisher
+def _msgpack() -> Callable[[Mapping[str, Any]], bytes]:
+    with extras.named("--publish udp with format=msgpack"):
+        import msgpack
 
-    return LslPublisher(place, about)
+    def packed(content: Mapping[str, Any]) -> bytes:
+        datagram: bytes = msgpack.packb(content)
+        return datagram
 
-
-def _mcap(place: str, about: About) -> Publisher:
-    from tacpipe.live.publishers.mcap import McapPublisher
-
-    return McapPublisher(place, about)
+    return packed

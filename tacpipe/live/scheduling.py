@@ -30,7 +30,7 @@ def check() -> None:
 def realtime(priority: int) -> None:
     """Have all threads of this process run before ordinary programs; without the right to, they stay as they are."""
     for thread in _threads():
-        with contextlib.suppress(OSError):  # of a thread that ended, too
+        with contextlib.suppress(OSError):  # the thread may have ended
             _set(thread, priority)
 
 
@@ -46,4 +46,4 @@ def _set(thread: int, priority: int) -> None:
 
 
 def _threads() -> list[int]:
-    return [int(one.name) for one in Path("/proc/self/task").iterdir()]
+    return [int(thread.name) for thread in Path("/proc/self/task").iterdir()]

@@ -1,24 +1,39 @@
-"""A live session: the rig recorded as ever, next to the model's process."""
+"""Run a live session: the rig is recorded as ever, and a process of its own runs the model.
+
+The `Supervisor` starts that process, listens to it, and starts it again when it ends by itself.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import gc
+import json
+import os
+import socket
+import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
-from tacpipe.live.options import Options
-from tacpipe.live.supervisor import Supervisor
-from tacpipe.live.tap import Tap
+from tacpipe.errors import DamagedError, DeviceError, TacpipeError, UsageError
+from tacpipe.live import scheduling, wire
+from tacpipe.live.settings import SessionOptions
+from tacpipe.live.wire import Tap
+from tacpipe.recording import clock
 from tacpipe.recording.recorder import Recorder
+from tacpipe.recording.spool_blocks import Note
+from tacpipe.sensors.framing import Chunks
 
-ANSWERS = {"forecast": "forecasts", "material": "materials named", "touch": "rankings"}  # by kind of message
-SWITCH_S = 0.0005  # that one thread may hold up another: the threads that read must not wait 5 ms for the view
+MODULE = "tacpipe.live.process"  # runs as the model's process
+RESTART_S = (0.5, 10.0)  # wait from its end to the next start: the first, and the longest
+STOP_S = 5.0  # time that it has to end and to close its publishers
+LOOK_S = 0.05
+DIED, RESTARTED = "model_died", "model_restarted"  # notes in the recording
+SWITCH_S = 0.0005  # time that one thread may hold up another: the threads that read must not wait 5 ms for the view
 
 
 @contextlib.contextmanager
-def running(recorder: Recorder, options: Options, ended: Callable[[], bool]) -> Iterator[Supervisor]:
+def run_model(recorder: Recorder, options: SessionOptions, ended: Callable[[], bool]) -> Iterator[Supervisor]:
     """Have the model's process follow a rig while in the block. Raises what it refuses the session with."""
     supervisor = Supervisor(options, Tap(options.streams))
     before_s = sys.getswitchinterval()
@@ -27,7 +42,7 @@ def running(recorder: Recorder, options: Options, ended: Callable[[], bool]) -> 
         supervisor.start(ended)
         recorder.accompany(supervisor, options.streams)
         gc.collect()
-        gc.freeze()  # what is there stays: looking through it all would hold up the threads that read for 20 ms and more
+        gc.freeze()  # a later collection would hold up the threads that read for 20 ms and more
         yield supervisor
     finally:
         gc.unfreeze()
@@ -38,13 +53,14 @@ def running(recorder: Recorder, options: Options, ended: Callable[[], bool]) -> 
 def lines(figures: Mapping[str, Any]) -> list[str]:
     """Return what a session did so far in words.
 
-    >>> lines({"forecasts": 9, "skipped": 1, "restarts": 0, "states": {"load": "off", "slip": "unknown"},
-    ...     "cause": "", "latency": {"count": 9, "p50_ms": 4.2, "p99_ms": 6.0, "max_ms": 6.5}})
+    >>> lines({"answers": "forecasts", "forecasts": 9, "skipped": 1, "restarts": 0, "cause": "",
+    ...     "states": {"load": "off", "slip": "unknown"},
+    ...     "latency": {"count": 9, "p50_ms": 4.2, "p99_ms": 6.0, "max_ms": 6.5}})
     ['forecasts 9, skipped 1; latency median 4.2 ms, 99 % 6.0 ms, largest 6.5 ms; load off, slip unknown']
     """
     latency = figures.get("latency") or {}
-    kind = figures.get("kind", "forecast")
-    parts = [f"{ANSWERS.get(kind, kind)} {figures.get('forecasts', 0)}, skipped {figures.get('skipped', 0)}"]
+    answers = figures.get("answers", "answers")
+    parts = [f"{answers} {figures.get('forecasts', 0)}, skipped {figures.get('skipped', 0)}"]
     if latency.get("count"):
         parts.append(
             f"latency median {latency['p50_ms']:.1f} ms, 99 % {latency['p99_ms']:.1f} ms, "
@@ -52,12 +68,169 @@ def lines(figures: Mapping[str, Any]) -> list[str]:
         )
     states = ", ".join(f"{name} {state}" for name, state in figures.get("states", {}).items())
     parts += [states] if states else []
-    for name, what in (
+    for name, label in (
         ("late", "samples late"),
         ("dropped", "messages not taken by subscribers"),
         ("overflows", "times the model's process did not keep up"),
         ("restarts", "restarts of the model's process"),
     ):
-        parts += [f"{figures[name]} {what}"] if figures.get(name) else []
-    found = ["; ".join(parts)]
-    return [*found, f"{kind}: {figures['cause']}"] if figures.get("cause") else found
+        parts += [f"{figures[name]} {label}"] if figures.get(name) else []
+    line = "; ".join(parts)
+    return [line, f"{figures.get('kind', 'model')}: {figures['cause']}"] if figures.get("cause") else [line]
+
+
+class Supervisor:
+    """Keeps the model's process of a session running: a `tacpipe.recording.recorder.Companion`."""
+
+    def __init__(self, options: SessionOptions, tap: Tap) -> None:
+        self.options, self.tap = options, tap
+        self._noted_stream = options.own_streams[0]  # stream that gets the notes on the process
+        self.report: dict[str, Any] = {}  # the last report of the running process
+        self.alarms: dict[str, Any] = {}  # levels of the alarms
+        self.deaths = 0
+        self.ready = False
+        self._totals = {"forecasts": 0, "skipped": 0, "late": 0, "dropped": 0}  # counts of processes that ended
+        self._process: subprocess.Popen[bytes] | None = None
+        self._socket: socket.socket | None = None
+        self._lines = wire.Lines()
+        self._offset_ns: int | None = None  # offset of the running recording
+        self._beginning: dict[str, Any] | None = None  # state that a new process continues from
+        self._restart_s = RESTART_S[0]
+        self._due_s = 0.0
+        self._refusal: tuple[str, int] | None = None
+
+    def start(self, ended: Callable[[], bool]) -> None:
+        """Start the process and wait until it is ready. Raises what it refuses the session with, as its exit code states."""
+        self._spawn()
+        while not ended() and not self._is_ready():
+            clock.sleep(LOOK_S)
+
+    def _is_ready(self) -> bool:
+        """Return whether the process waits for the rig. Raises what it refuses the session with, or that it ended."""
+        code = None if self._process is None else self._process.poll()
+        self._read()
+        if self._refusal is not None:
+            sentence, number = self._refusal
+            self.stop()
+            kinds = {kind.exit_code: kind for kind in (TacpipeError, UsageError, DeviceError, DamagedError)}
+            raise kinds.get(number, TacpipeError)(sentence)
+        if code is not None:
+            self.stop()
+            raise TacpipeError(f"The model's process ended with {code} before it was ready; see above.")
+        return self.ready
+
+    def put(self, stream: str, content: Chunks | Note) -> None:
+        """Pass a block of a stream to the model's process."""
+        self.tap.put(stream, content)
+
+    def begin(self, clock: Mapping[str, int]) -> None:
+        """Begin a recording, whose UTC is the monotonic clock and a constant."""
+        self._offset_ns = clock["utc_ns"] - clock["monotonic_ns"]
+        self._beginning = None
+        self.tap.note(Note(clock["monotonic_ns"], "", wire.BEGIN, str(self._offset_ns)))
+        if self.options.settings.realtime:
+            scheduling.realtime(scheduling.RECORDER)
+
+    def end(self) -> None:
+        """End the recording: what comes until the next one begins is not predicted."""
+        self._offset_ns = None
+        if self.options.settings.realtime:
+            scheduling.ordinary()  # decoding and writing have no deadline
+        self.tap.note(Note(clock.now_ns(), "", wire.END))
+
+    def look(self) -> list[Note]:
+        """Take what the process reports, start it anew where it ended; return notes on that. Never raises, never waits."""
+        self.tap.flush()
+        self._read()
+        notes = []
+        if self._process is not None and self._process.poll() is not None:
+            code = self._process.returncode
+            self.deaths += 1
+            self._forget()
+            self._due_s = clock.now_s() + self._restart_s
+            self._restart_s = min(2 * self._restart_s, RESTART_S[1])
+            notes.append(Note(clock.now_ns(), self._noted_stream, DIED, f"exit code {code}; it is started anew"))
+        if self._process is None and clock.now_s() >= self._due_s:
+            with contextlib.suppress(OSError):  # too little memory: it is tried again
+                self._spawn()
+                notes.append(
+                    Note(clock.now_ns(), self._noted_stream, RESTARTED, f"restart {self.deaths} of this session")
+                )
+        return notes
+
+    def stop(self) -> None:
+        """End the process in good order; one that does not end is killed."""
+        process = self._process
+        if process is None:
+            return
+        self.tap.note(Note(clock.now_ns(), "", wire.STOP))
+        until_s = clock.now_s() + STOP_S
+        while process.poll() is None and clock.now_s() < until_s:
+            self.tap.flush()
+            self._read()
+            clock.sleep(LOOK_S / 5)
+        self._read()
+        if process.poll() is None:
+            process.kill()
+        process.wait()
+        self.tap.connect(None)
+        if self._socket is not None:
+            self._socket.close()
+        self._process = self._socket = None
+
+    def figures(self) -> dict[str, Any]:
+        """Return what the session did so far, over all its processes."""
+        totals = {name: count + int(self.report.get(name, 0)) for name, count in self._totals.items()}
+        return {**self.report, **totals, "restarts": self.deaths, "overflows": self.tap.overflows}
+
+    def _spawn(self) -> None:
+        ours, theirs = socket.socketpair()
+        threads = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}  # more would only take the recorder's processor
+        environment = {**os.environ, **threads}
+        words = [sys.executable, "-m", MODULE, str(theirs.fileno())]
+        try:
+            self._process = subprocess.Popen(
+                words, pass_fds=[theirs.fileno()], env=environment, stdin=subprocess.DEVNULL, start_new_session=True
+            )
+        finally:
+            theirs.close()
+        self._socket, self._lines, self.ready = ours, wire.Lines(), False
+        ours.sendall(self.options.to_json().encode())
+        ours.setblocking(False)
+        first = [] if self._offset_ns is None else [Note(clock.now_ns(), "", wire.BEGIN, str(self._offset_ns))]
+        if first and self._beginning is not None:
+            first.insert(0, Note(clock.now_ns(), "", wire.CONTINUE, json.dumps(self._beginning)))
+        self.tap.connect(ours, *first)
+        if first:
+            self.tap.put_begins()
+
+    def _forget(self) -> None:
+        self.tap.connect(None)
+        if self._socket is not None:
+            self._socket.close()
+        self._process = self._socket = None
+        for name in self._totals:
+            self._totals[name] += int(self.report.get(name, 0))
+        self.report = {"cause": "the model's process is started anew", "latency": self.report.get("latency", {})}
+
+    def _read(self) -> None:
+        if self._socket is None:
+            return
+        while True:
+            try:
+                data = self._socket.recv(1 << 16)
+            except OSError:
+                return
+            if not data:
+                return
+            for content in self._lines.feed(data):
+                if "ready" in content:
+                    self.ready, self.alarms = True, content["ready"]["alarms"]
+                elif "refused" in content:
+                    self._refusal = content["refused"], content["exit_code"]
+                elif "beginning" in content:
+                    if content["offset_ns"] == self._offset_ns:  # else it is that of the recording before
+                        self._beginning = content["beginning"]
+                elif "report" in content:
+                    self.report = content["report"]
+                    self._restart_s = RESTART_S[0]

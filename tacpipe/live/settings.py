@@ -1,74 +1,88 @@
-"""What a live session is asked for: the table ``[live]`` of a rig file, and options of the command, which win.
+"""Settings of a live session: the table ``[live]`` of a rig file, and options of the command, which win.
 
 [live]
 model = "models/forward"
-plan = "rig:robot"
 publish = ["ws:127.0.0.1:8765"]
-alarms_per_hour = 6
-alarms_on = "data/segments"
-split = "data/split"
+settle_ms = 2
+
+A session has `Settings`, common to all tasks, and those of the task that its model was trained for.
 """
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
+import json
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
-from typing import Annotated, Any
+from dataclasses import asdict, dataclass, field, replace
+from typing import Annotated, Any, Self, get_args, get_origin
 
 from tacpipe.errors import UsageError
-from tacpipe.plugins import fields, params
-from tacpipe.plugins.constraints import PositiveInt, Range
+from tacpipe.plugins import fields, params, registry
+from tacpipe.plugins.constraints import Range
 
-MEASURED = "measured"  # in the place of an address of plans: the recorded motion is taken to continue
-ALARMS = ("alarms_per_hour", "alarms_on", "split")
+NOT_SET = ("task", "places")  # fields of `Settings` that are neither keys nor options
+
+
+@dataclass(frozen=True)
+class TaskSettings:
+    """The settings that only sessions of one task have. A subclass is a frozen dataclass; its comments are the help."""
+
+    @classmethod
+    def override(cls, stated: Mapping[str, Any], options: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Return what a rig file states, without the keys that ``options`` make void."""
+        return stated
+
+    def check(self, settings: Settings) -> None:
+        """Raise `UsageError` for settings that do not go together."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """A live session as it is asked for; names are those of the options, with ``_`` for ``-``."""
+    """Settings that sessions of all tasks have, and those of the task. Names are those of options, with ``_`` for ``-``."""
 
-    model: str = ""  # trained model; a path from the folder in which the command is run
-    plan: str = MEASURED  # source of plans
-    publish: tuple[str, ...] = ()  # addresses
-    steps: tuple[PositiveInt, ...] = ()  # ahead, that are published; empty: all
-    quantiles: tuple[PositiveInt, ...] = ()  # percent, of a calibrated model, that are published too; empty: none
-    alarms_per_hour: Annotated[float, Range(0, below=1e6)] = 0.0  # false alarms; 0: no alarms
-    alarms_on: str = ""  # recordings that levels are set on
-    split: str = ""  # whose validation recordings are meant
-    settle_ms: Annotated[float, Range(0, 1000)] = 2.0
-    realtime: bool = False
-    allow_look_ahead: bool = False  # accept a model that was trained on rows that look ahead
-    sensor: str = ""  # of a model of materials
-    every_ms: Annotated[float, Range(10, 10_000)] = 100.0
-    least: Annotated[float, Range(above=0, most=1)] = 0.25
-    pause_s: Annotated[float, Range(0, 60)] = 0.0  # after which a slide is over; 0: a recording is one slide
-    rank: str = "contact"  # criterion of a model of touch
-    plan_from: str = ""  # IP address whose plans are accepted by UDP
-    places: Mapping[str, str] = field(default_factory=dict, compare=False)  # file and table of what a file states
+    model: str = ""  # Trained model, as of `tacpipe train`
+    publish: tuple[str, ...] = ()  # Address to publish to: ws:HOST:PORT, udp:HOST:PORT, lsl:NAME, mcap:FILE
+    settle_ms: Annotated[float, Range(0, 1000)] = 2.0  # Time after a row in which its samples are awaited, ms
+    realtime: bool = False  # Real-time scheduling of the session, where the system allows it
+    allow_look_ahead: bool = False  # Accept a model that was trained on rows that look ahead
+    task: TaskSettings = field(default_factory=TaskSettings)  # settings of the model's task
+    places: Mapping[str, str] = field(
+        default_factory=dict, compare=False
+    )  # file and table of each key that a file states
 
     @classmethod
-    def of(cls, stated: Mapping[str, Any], where: str, given: Mapping[str, Any]) -> Settings:
-        """Return what a rig file ``where`` states in its table ``[live]``, and over it what the command was ``given``.
+    def from_sources(
+        cls, task_settings: type[TaskSettings], stated: Mapping[str, Any], where: str, options: Mapping[str, Any]
+    ) -> Self:
+        """Return the settings that a rig file ``where`` states in its table ``[live]``, overridden by ``options``.
 
-        What was not given is None. Raises `UsageError` naming file and key, or option, for an unknown key, a value that is
-        not allowed, and for what does not go together.
+        ``task_settings`` is the dataclass of the task's settings; None is an option that was not given.
+        Raises `UsageError` that names file and key, or option, for an unknown key, a value that is not allowed, and
+        settings that do not go together.
         """
-        asked = {name: value for name, value in given.items() if value is not None}
-        known = {name: wanted for name, wanted in fields.hints(cls).items() if name != "places"}
-        for name, value in asked.items():
-            fields.check(value, known[name], option(name))
+        options = {name: value for name, value in options.items() if value is not None}
+        common = {name: kind for name, kind in fields.hints(cls).items() if name not in NOT_SET}
+        task_fields = fields.hints(task_settings)
+        allowed = {**common, **task_fields}
+        for name, value in options.items():
+            if name not in allowed:
+                raise UsageError(
+                    f"{option(name)} is no setting of this model; there are {', '.join(map(option, allowed))}."
+                )
+            fields.check(value, allowed[name], option(name))
         for name in stated:
-            if name not in known:
-                raise fields.unknown(name, known, f"{where}, live", "key")
-        if asked.get("alarms_per_hour") == 0:  # given so, it switches off what the file states
-            stated = {name: value for name, value in stated.items() if name not in ALARMS}
-        if "alarms_on" in asked and "split" not in asked:  # the file's split is of the file's recordings
-            stated = {name: value for name, value in stated.items() if name != "split"}
-        places = {name: f"{where}, live" for name in stated if name not in asked}
-        found: Settings = replace(params.filled(cls, stated, f"{where}, live", "key"), **asked, places=places)
-        found._check(where)
-        return found
+            if name not in allowed:
+                raise fields.unknown(name, allowed, f"{where}, live", "key")
+        stated = task_settings.override(stated, options)
+        places = {name: f"{where}, live" for name in stated if name not in options}
+        values = {**{name: value for name, value in stated.items() if name not in options}, **options}
+        filled_from = f"{where}, live"
+        task = params.filled(task_settings, {n: v for n, v in values.items() if n in task_fields}, filled_from, "key")
+        base = params.filled(cls, {n: v for n, v in values.items() if n in common}, filled_from, "key")
+        settings: Self = replace(base, task=task, places=places)
+        task.check(settings)
+        return settings
 
     @contextlib.contextmanager
     def naming(self, name: str) -> Iterator[None]:
@@ -80,32 +94,43 @@ class Settings:
                 raise
             raise UsageError(f"{self.places[name]}: {str(error).replace(option(name), name)}") from error
 
-    def named(self, name: str) -> str:
+    def name_in_errors(self, name: str) -> str:
         """Return how errors name a key: by the file that states it, else by its option."""
         return f"{self.places[name]}: {name}" if name in self.places else option(name)
 
-    def _check(self, where: str) -> None:
-        if not self.model:
-            raise UsageError(
-                f'A live session needs a model: give --model models/forward, or state model = "models/forward" in the '
-                f"table [live] of {where}."
-            )
-        if bool(self.alarms_per_hour) != bool(self.alarms_on):
-            one, other = ALARMS[:2] if self.alarms_per_hour else ALARMS[1::-1]
-            raise UsageError(
-                f"{self.named(one)} needs {other if one in self.places else option(other)} with it: the levels of alarms "
-                f"are set on recordings, as in `--alarms-per-hour 6 --alarms-on data/segments --split data/split`."
-            )
-        if self.split and not self.alarms_on:
-            raise UsageError(f"{self.named('split')} has no effect without {option('alarms_on')}.")
 
-    def steps_of(self, horizon: int) -> tuple[int, ...]:
-        """Return the steps ahead that are published. Raises `UsageError` for others than the model predicts."""
-        found = tuple(sorted(set(self.steps))) or tuple(range(1, horizon + 1))
-        if found[-1] > horizon:
-            asked = ",".join(map(str, self.steps))
-            raise UsageError(f"The steps {asked} are asked for, and the model predicts 1 to {horizon} steps ahead.")
-        return found
+@dataclass(frozen=True)
+class SessionOptions:
+    """A live session as the recording process hands it to the model's process."""
+
+    task: str  # name of the model's task
+    rig: str  # text of the rig file, with the session's own streams
+    streams: tuple[str, ...]  # streams of the rig that are handed on, in the order of their numbers
+    own_streams: tuple[str, ...]  # streams that the session adds to the rig
+    settings: Settings  # its paths are absolute
+    nice: int = 1  # niceness of the model's process, which stands back behind the recording
+
+    def to_json(self) -> str:
+        """Return the options as one line."""
+        return json.dumps(asdict(self)) + "\n"
+
+    @classmethod
+    def from_json(cls, text: str) -> Self:
+        """Return the options of such a line."""
+        content = json.loads(text)
+        live = registry.load_task(content["task"]).live
+        if live is None:
+            raise UsageError(f"Models of the task {content['task']} do not run live.")
+        stated = content["settings"]
+        task = live.settings(**_tuples(stated["task"]))
+        settings = replace(
+            Settings(**_tuples({name: stated[name] for name in stated if name not in NOT_SET})), task=task
+        )
+        return cls(**{**_tuples(content), "settings": settings})
+
+
+def _tuples(values: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
 
 
 def option(name: str) -> str:
@@ -115,3 +140,31 @@ def option(name: str) -> str:
     '--settle-ms'
     """
     return f"--{name.replace('_', '-')}"
+
+
+def parse_option(name: str, text: Any, annotation: Any) -> Any:
+    """Return the value that an option's text has for an annotation; a list is separated by commas.
+
+    >>> parse_option("steps", "1,5", tuple[int, ...]), parse_option("settle_ms", "3", float)
+    ((1, 5), 3.0)
+
+    Raises `UsageError` where the annotation does not allow it.
+    """
+    if not isinstance(text, str):
+        return text
+    kind = fields.bare(annotation)
+    value: Any = fields.parsed(text, annotation)
+    if get_origin(kind) is tuple:
+        value = tuple(fields.parsed(part, get_args(kind)[0]) for part in text.split(",")) if text else ()
+    return fields.check(value, annotation, option(name))
+
+
+def task_settings() -> dict[str, type[TaskSettings]]:
+    """Return the dataclass of the settings of each task whose models run live, by the name of the task."""
+    tasks = {name: registry.load_task(name).live for name in registry.tasks()}
+    return {name: live.settings for name, live in tasks.items() if live is not None}
+
+
+def keys(settings: type[Any]) -> list[str]:
+    """Return the keys of a dataclass of settings."""
+    return [field.name for field in dataclasses.fields(settings) if field.name not in NOT_SET]

@@ -1,14 +1,22 @@
-"""Params of the stages that a model was trained behind."""
+"""Run the stages that a model was trained behind without a store, and read their params."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
 
 from tacpipe.errors import UsageError
+from tacpipe.io.hashing import digest
 from tacpipe.plugins import params, registry
+from tacpipe.plugins.stage import RecordingOutput
 
-EARLIER_VERSIONS = {"synchronize": (2,)}  # whose params today's stage reads, and for which it gives the same rows
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from tacpipe.datasets.dataset import Dataset, Recording
+
+EARLIER_VERSIONS = {"synchronize": (2,)}  # today's stage reads their params and gives the same rows
 
 
 def stage_params(step: Mapping[str, Any]) -> Any:
@@ -21,3 +29,66 @@ def stage_params(step: Mapping[str, Any]) -> Any:
             f"{stage.version}. Train it again."
         )
     return params.from_json(stage, step["params"])
+
+
+@dataclass(frozen=True)
+class RecordingInMemory:
+    """A recording as a stage reads it, with its tables in memory."""
+
+    name: str
+    tables: Mapping[str, pa.Table]
+    attributes: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def streams(self) -> tuple[str, ...]:
+        """The names of its streams."""
+        return tuple(sorted(self.tables))
+
+    @property
+    def digest(self) -> str:
+        """A digest that no stored recording has."""
+        return digest(["in memory", self.name])
+
+    def table(self, stream: str = "", columns: Sequence[str] | None = None) -> pa.Table:
+        """Return a stream."""
+        return self.tables[stream] if columns is None else self.tables[stream].select(list(columns))
+
+    def columns(self, stream: str = "") -> pa.Table:
+        """Return a stream, whose columns are in memory already."""
+        return self.tables[stream]
+
+
+@dataclass(frozen=True)
+class RecordingsInMemory:
+    """A dataset as a task reads it: recordings by name, and files."""
+
+    recordings: Mapping[str, Any]
+    files: Mapping[str, bytes] = field(default_factory=dict)
+
+
+def streams_as_recorded(recording: Recording) -> dict[str, pa.Table]:
+    """Return the streams of a recording. Raises `UsageError` for one that went through `synchronize` already."""
+    if set(recording.streams) == {""}:
+        raise UsageError(
+            "this recording went through a stage already, and what had arrived when cannot be seen from it. Give the "
+            "recordings themselves; the model's own stages are run on them."
+        )
+    return {name: recording.table(name) for name in recording.streams}
+
+
+def run_stages(recording: Recording, model: Dataset) -> Any:
+    """Return a recording as it is after the stages of a model's chain; it went through none of them yet."""
+    current: Any = recording
+    for step in model.source.chain:
+        stage = registry.load(step["stage"])
+        arguments: dict[str, Any] = {
+            name: current if kind == "Recording" else {file: model.files[file] for file in step["fitted"] or {}}
+            for name, kind in stage.arguments.items()
+        }
+        returned = stage(params.from_json(stage, step["params"]), **arguments)
+        output = returned if isinstance(returned, RecordingOutput) else RecordingOutput(returned)
+        tables: dict[str, Any] = {
+            name: table.read_all() if hasattr(table, "read_all") else table for name, table in output.streams.items()
+        }
+        current = RecordingInMemory(recording.name, tables, {**current.attributes, **output.attributes})
+    return current

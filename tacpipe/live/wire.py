@@ -1,22 +1,32 @@
-"""What goes between the recording process and the model's process: blocks as in a spool one way, lines of JSON back."""
+"""Connect the recording process with the model's process: blocks as in a spool one way, lines of JSON back.
+
+The threads that read the links call `Tap.put`, which never waits and never raises. Blocks that the socket does not accept at
+once wait in a queue of bounded size. When it is full, the whole queue is dropped and counted, and the model's process is
+informed. The recording loses nothing.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+import socket
+import threading
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from tacpipe.errors import TacpipeError
-from tacpipe.recording import spool_blocks
+from tacpipe.recording import clock, spool_blocks
 from tacpipe.recording.spool_blocks import CHUNKS, HEAD, MARK, NOTE, WHOLE, Note
+from tacpipe.recording.station import BEGAN
 from tacpipe.sensors.framing import Chunks
 
 CLOCK = "clock"  # a note on all streams: what is added to the monotonic clock to have the recording's UTC, ns
 BEGIN = "begin"  # a recording begins: what its streams give follows behind a note of each
-CONTINUE = "continue"  # before the next BEGIN: grid and level at rest of a process that ended, which it continues
+CONTINUE = "continue"  # precedes BEGIN: the state that a new process continues from
 END = "end"  # the recording ends
 OVERFLOW = "overflow"  # blocks were thrown away, because the model's process did not fetch them
 STOP = "stop"  # the session is over
+QUEUED_BYTES = 8 << 20  # limit of the bytes that wait for the model's process: many seconds of a rig
 
 
 def block(stream: int | None, content: Chunks | Note) -> bytes:
@@ -50,10 +60,10 @@ class Blocks:
             if stop > len(self._text):
                 break
             stream = "" if number == WHOLE else self._streams[number]
-            found = spool_blocks.content(kind, stream, count, bytes(self._text[place + HEAD.size : stop]))
+            content = spool_blocks.content(kind, stream, count, bytes(self._text[place + HEAD.size : stop]))
             place = stop
-            if found is not None:
-                yield stream, found
+            if content is not None:
+                yield stream, content
         del self._text[:place]
 
 
@@ -72,3 +82,82 @@ class Lines:
 def line(content: dict[str, Any]) -> bytes:
     """Return an object as a line."""
     return json.dumps(content, separators=(",", ":")).encode() + b"\n"
+
+
+class Tap:
+    """The recorder's side of the connection to the model's process, which may be replaced while it is in use."""
+
+    def __init__(self, streams: Sequence[str], most_bytes: int = QUEUED_BYTES) -> None:
+        self.overflows = 0  # how often the queue was thrown away
+        self.bytes_lost = 0
+        self._numbers: Mapping[str, int] = {name: number for number, name in enumerate(streams)}
+        self._most_bytes = most_bytes
+        self._keeping = threading.Lock()
+        self._connection: socket.socket | None = None
+        self._waiting: deque[memoryview] = deque()
+        self._waiting_bytes = 0
+
+    def connect(self, connection: socket.socket | None, *first: Note) -> None:
+        """Send later blocks over a socket, ``first`` before it; None: send nothing until the next call."""
+        with self._keeping:
+            self._waiting.clear()
+            self._waiting_bytes = 0
+            self._connection = connection
+            if connection is not None:
+                connection.setblocking(False)
+            for note in first:
+                self._append(block(None, note))
+
+    def put(self, stream: str, content: Chunks | Note) -> None:
+        """Send a block of a stream, or a note on it; thread-safe."""
+        with self._keeping:
+            if self._connection is not None:
+                self._append(block(self._numbers[stream], content))
+
+    def note(self, note: Note) -> None:
+        """Send a note on all streams."""
+        with self._keeping:
+            if self._connection is not None:
+                self._append(block(None, note))
+
+    def put_begins(self) -> None:
+        """Send the note that each stream begins to a process that is started during a recording."""
+        for stream in self._numbers:
+            self.put(stream, Note(clock.now_ns(), stream, BEGAN))
+
+    def flush(self) -> None:
+        """Send the blocks that wait, as far as the socket accepts them."""
+        with self._keeping:
+            self._send()
+
+    def _append(self, data: bytes) -> None:
+        if self._waiting_bytes + len(data) > self._most_bytes:
+            self._overflow()
+        self._waiting.append(memoryview(data))
+        self._waiting_bytes += len(data)
+        self._send()
+
+    def _overflow(self) -> None:
+        """Throw away all but the rest of a block whose beginning was sent."""
+        is_partly_sent = len(self._waiting) > 0 and self._waiting[0].nbytes < len(self._waiting[0].obj)  # type: ignore[arg-type]
+        retained = [self._waiting[0]] if is_partly_sent else []
+        self.overflows += 1
+        self.bytes_lost += self._waiting_bytes - sum(part.nbytes for part in retained)
+        note = memoryview(block(None, Note(clock.now_ns(), "", OVERFLOW)))
+        self._waiting = deque([*retained, note])
+        self._waiting_bytes = sum(part.nbytes for part in self._waiting)
+
+    def _send(self) -> None:
+        while self._waiting and self._connection is not None:
+            try:
+                sent = self._connection.send(self._waiting[0])
+            except (BlockingIOError, InterruptedError):
+                return
+            except OSError:  # the process is gone; who watches it connects the next one
+                self._connection = None
+                return
+            self._waiting_bytes -= sent
+            if sent == self._waiting[0].nbytes:
+                self._waiting.popleft()
+            else:
+                self._waiting[0] = self._waiting[0][sent:]

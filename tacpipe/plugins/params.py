@@ -272,14 +272,15 @@ def comments(stage: AnyStage) -> dict[str, str]:
     for kind in kinds(stage):
         own: dict[str, str] = {}
         for owner in reversed(kind.__mro__):
-            own |= _comments(owner) if dataclasses.is_dataclass(owner) else {}
+            own |= comments_of(owner) if dataclasses.is_dataclass(owner) else {}
         for name, text in own.items():
             if text not in found.setdefault(name, []) and text:
                 found[name].append(text)
     return {name: "; ".join(texts) for name, texts in found.items()}
 
 
-def _comments(kind: Kind) -> dict[str, str]:
+def comments_of(kind: Kind) -> dict[str, str]:
+    """Return the comment behind each field of a dataclass, or in the lines above it."""
     try:
         lines = inspect.getsource(kind).splitlines()
     except (OSError, TypeError):

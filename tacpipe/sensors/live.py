@@ -1,22 +1,26 @@
-"""What `tacpipe live` publishes, as a stream of a rig: its forecasts, its alarms, or how long they took.
+"""Record what `tacpipe live` publishes, as streams of a rig.
 
-A packet is ``tacL``, the version, what it holds (0 forecast, 1 alarm, 2 latency, 3 material, 4 touch), a counter of 32 bits
-and the time of the grid point in UTC ns, and then numbers, all little-endian: of a forecast float32 by step and channel,
-and the same of each quantile that is published, of
-alarms a state and a score each, of latencies the numbers of `LATENCY`, of materials those of `SLIDE` and a probability each,
-of a grasp's touch `ORDER`, `WORTH` and the predicted values. So what a session publishes is recorded like any sensor, by any
-computer.
+A task declares each value of its messages once (`Value`): name, type, unit and meaning. The JSON, the packets, the columns
+of the recorded streams and the reference page follow from the declaration (`Declaration`).
+
+A packet is ``tacL``, a version, the number of its stream, a counter of 32 bits and the time of the message in UTC ns. The
+declared values follow, in their order. All numbers are little-endian.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Literal
+import functools
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 
 from tacpipe.arrays import AnyArray, Bools, Bytes
 from tacpipe.errors import UsageError
+from tacpipe.plugins import registry
+from tacpipe.printable import listed, plain
 from tacpipe.sensors.framing import Framer
 from tacpipe.sensors.packet_framer import PacketFramer
 from tacpipe.sensors.sensor import Samples, Sensor
@@ -24,127 +28,203 @@ from tacpipe.sensors.sensor import Samples, Sensor
 if TYPE_CHECKING:
     import pyarrow as pa
 
-Output = Literal["forecast", "alarm", "latency", "material", "touch"]
-
 MAGIC, VERSION = b"tacL", 1
-KINDS: dict[str, int] = {"forecast": 0, "alarm": 1, "latency": 2, "material": 3, "touch": 4}
 HEAD = np.dtype([("magic", "S4"), ("version", "u1"), ("kind", "u1"), ("rest", "<u2"), ("seq", "<u4"), ("t_ns", "<i8")])
 UNKNOWN, OFF, ON = -1, 0, 1  # states of an alarm
-MOST = 60_000  # bytes of a packet
-LATENCY = {  # column to unit
-    "latency_ms": "ms",  # from the arrival of the newest sample that was read to when the forecast was published
-    "age_ms": "ms",  # from the arrival of the newest sample of the master to the same moment
-    "compute_ms": "ms",  # of it, what rows, model and alarms took
-    "cause": "1",  # flags of `tacpipe.tasks.forward.live.chain.Cause`
-    "skipped": "1",  # grid points so far whose forecast was left out under overload
-    "late": "1",  # samples so far that came after the row that they belong to
-}
-ORDER = ("request", "grasp", "rank")  # of a touch, 1 for the best of a request
-WORTH = ("score", "level_th", "level_mf")  # of a touch
-SLIDE = {  # column to unit
-    "class": "1",  # number of the material among those of the model, from 0; -1: unknown
-    "rows": "1",  # rows of the slide so far
-    "seen": "1",  # of the rows that the model reads, the fraction that has come
-    "ended": "1",  # whether the slide is over
-    "slide": "1",  # number of the slide in its recording, from 1
-}
+LARGEST_PACKET = 60_000  # bytes
+LATENCY = "latency"  # stream that every session records
+LATENCY_NUMBER = 2  # in its packets
+LSL = "lsl"  # channels of the published LSL stream; not recorded
+
+
+class MessageSizes(Protocol):
+    """Lists over which the values of a message repeat; the sensor `Live` and a task's `Description` have them."""
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Names of the predicted channels or classes."""
+
+    @property
+    def steps(self) -> tuple[int, ...]:
+        """Rows ahead that are predicted."""
+
+    @property
+    def quantiles(self) -> tuple[int, ...]:
+        """Levels of quantiles, percent."""
+
+    @property
+    def unit(self) -> str:
+        """Unit of the channels."""
+
+    @property
+    def alarms(self) -> tuple[str, ...]:
+        """Names of the alarms."""
+
+
+class Column(NamedTuple):
+    """One number of a recorded stream."""
+
+    name: str
+    unit: str = "1"
+    metadata: Mapping[str, str] = {}  # further metadata of the recorded column
+
+
+@dataclass(frozen=True)
+class Value:
+    """One declared value of a message: a field of its JSON, columns of recorded streams, or both."""
+
+    name: str
+    meaning: str
+    json: str = ""  # its JSON type; empty: it is recorded only
+    digits: int | None = None  # digits of a number in JSON, which is null where it is not finite
+    # streams whose columns it gives: recorded ones, and `LSL`
+    streams: tuple[str, ...] = ()
+    type: str = "<f4"  # type of each column, as numpy names it
+    unit: str = ""
+    quantity: str = ""  # metadata of the recorded columns
+    columns: Callable[[MessageSizes], list[Column]] | None = None  # None: one column with the value's name
+    schema: Callable[[MessageSizes], dict[str, Any]] | None = None  # its JSON schema; None: that of its type
+    attribute: str = ""  # attribute of the message that holds it; empty: its name
+
+    def columns_for(self, sizes: MessageSizes) -> list[Column]:
+        """Return its columns in a message of these sizes."""
+        return [Column(self.name, self.unit or "1")] if self.columns is None else self.columns(sizes)
+
+    def read(self, message: object) -> Any:
+        """Return the value that a message holds."""
+        return getattr(message, self.attribute or self.name)
+
+
+LATENCIES = {
+    "latency_ms": "time from the arrival of the newest sample that was read to publishing",
+    "age_ms": "time from the arrival of the newest sample of the master stream to publishing",
+    "compute_ms": "part of the latency that decoding and the model took",
+    "cause": "flags that state why there is no answer, or what it was made without; 0: none",
+    "skipped": "answers so far that were left out under overload",
+    "late": "samples so far that came too late to be read",
+}  # meaning of the columns of the stream `LATENCY`
+
+
+def latency_values(*in_json: str) -> tuple[Value, ...]:
+    """Return the values of the stream `LATENCY`, with those that JSON holds as well."""
+    values = []
+    for name, meaning in LATENCIES.items():
+        is_time = name.endswith("_ms")
+        json = ("number" if is_time else "integer") if name in in_json else ""
+        values.append(
+            Value(
+                name,
+                meaning,
+                json,
+                digits=4 if is_time else None,
+                streams=(LATENCY,),
+                unit="ms" if is_time else "1",
+                quantity=LATENCY,
+                attribute="flags" if name == "cause" else "",
+            )
+        )
+    return tuple(values)
+
+
+@dataclass(frozen=True)
+class Declaration:
+    """The messages of one task: their values in order, and the recorded streams that hold them."""
+
+    kind: str  # of the messages, as JSON names it
+    values: tuple[Value, ...]
+    numbers: Mapping[str, int] = field(default_factory=dict)  # number in packets of each stream but `LATENCY`
+
+    @property
+    def streams(self) -> dict[str, int]:
+        """The number in packets of each recorded stream."""
+        return {**self.numbers, LATENCY: LATENCY_NUMBER}
+
+    def recorded(self, stream: str) -> list[Value]:
+        """Return the values of a stream, in the order of its columns."""
+        return [value for value in self.values if stream in value.streams]
+
+    def columns(self, stream: str, sizes: MessageSizes) -> list[tuple[Value, Column]]:
+        """Return the columns of a stream in messages of these sizes, each with its value."""
+        return [(value, column) for value in self.recorded(stream) for column in value.columns_for(sizes)]
+
+
+COMMON = Declaration("", latency_values())  # without a task: the stream that every session records
+
+
+def blocks(values: Sequence[tuple[str, AnyArray]]) -> tuple[AnyArray, ...]:
+    """Return arrays (row, column) joined to one block per run of equal types; ``values`` are types and arrays."""
+    return tuple(
+        np.hstack([array.astype(kind) for _, array in run])
+        for kind, run in itertools.groupby(values, key=lambda typed: typed[0])
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
 class Live(Sensor):
-    """One of the outputs of a live session."""
+    """One of the streams of a live session."""
 
-    summary: ClassVar[str] = "Forecasts, alarms, materials, rankings or latencies that `tacpipe live` publishes by UDP."
+    summary: ClassVar[str] = "What `tacpipe live` publishes by UDP: answers of a model, alarms or latencies."
     links: ClassVar[tuple[str, ...]] = ("udp",)
     listens: ClassVar[bool] = True
     steady: ClassVar[bool] = False
     counter: ClassVar[int | None] = 1 << 32
 
-    output: Output = "latency"  # what the packets hold: forecast, alarm, latency, material or touch
-    # of a forecast and of touch: what is predicted; of materials: their names
-    channels: tuple[str, ...] = ()
-    steps: tuple[int, ...] = ()  # of a forecast: how many rows ahead
-    quantiles: tuple[int, ...] = ()  # of a forecast: levels in percent
-    unit: str = "count"  # of the channels
-    alarms: tuple[str, ...] = ()  # of alarms: their names
-    rate_hz: float = 0.0  # packets a second; 0: they come when they come
+    task: str = ""  # the task whose messages the packets hold; needed for any output but latency
+    output: str = LATENCY  # the stream of that task's messages
+    channels: tuple[str, ...] = ()  # names of what is predicted
+    steps: tuple[int, ...] = ()  # rows ahead that are predicted
+    quantiles: tuple[int, ...] = ()  # levels of quantiles, percent
+    unit: str = "count"  # unit of the channels
+    alarms: tuple[str, ...] = ()  # names of the alarms
+    rate_hz: float = 0.0  # packets per second; 0: irregular
 
     def __post_init__(self) -> None:
-        missing = {
-            "forecast": not (self.channels and self.steps),
-            "alarm": not self.alarms,
-            "latency": False,
-            "material": not self.channels,
-            "touch": not self.channels,
-        }
-        if missing[self.output]:
-            needed = {"forecast": "channels and steps", "alarm": "alarms"}.get(self.output, "channels")
-            raise UsageError(f"live: a stream of the output {self.output} needs {needed}.")
-        if self.size > MOST:
+        if not self._columns:
+            raise UsageError(f"live: a stream of the output {self.output} needs channels and steps, or alarms.")
+        if self.size > LARGEST_PACKET:
             raise UsageError(
                 f"live: {len(self.channels)} channels at {len(self.steps)} steps with {len(self.quantiles)} quantiles make "
-                f"packets of {self.size} bytes, and UDP carries {MOST}. Give fewer --steps."
+                f"packets of {self.size} bytes, and UDP carries {LARGEST_PACKET}. Give fewer --steps."
             )
+
+    @functools.cached_property
+    def _declaration(self) -> Declaration:
+        live = registry.load_task(self.task).live if self.task else None
+        declaration: Declaration = COMMON if live is None else live.declaration
+        if self.output not in declaration.streams:
+            owner = f"messages of the task {plain(self.task)}" if self.task else "a session without a task"
+            raise UsageError(
+                f"live: there is no output {plain(self.output)} of {owner}; there are {listed(declaration.streams)}."
+            )
+        return declaration
+
+    @functools.cached_property
+    def _columns(self) -> list[tuple[Value, Column]]:
+        return self._declaration.columns(self.output, self)
+
+    @functools.cached_property
+    def _row(self) -> np.dtype[Any]:
+        """The numbers of a packet: one field per run of columns of one type."""
+        runs = itertools.groupby(value.type for value, _ in self._columns)
+        return np.dtype([(f"block{place}", kind, (len(list(run)),)) for place, (kind, run) in enumerate(runs)])
 
     @property
     def size(self) -> int:
         """Bytes of a packet."""
-        return HEAD.itemsize + self._rows(0).itemsize
-
-    def _rows(self, count: int) -> AnyArray:
-        """Return the numbers of ``count`` packets, zeros."""
-        values = len(self.channels) * len(self.steps)
-        levels = [("quantiles", "<f4", (len(self.quantiles) * values,))] if self.quantiles else []
-        parts = {
-            "forecast": [("values", "<f4", (values,)), *levels],
-            "alarm": [("state", "i1", (len(self.alarms),)), ("score", "<f4", (len(self.alarms),))],
-            "latency": [("values", "<f4", (len(LATENCY),))],
-            "touch": [("order", "<i8", (len(ORDER),)), ("values", "<f4", (len(WORTH) + len(self.channels),))],
-            "material": [("slide", "<f4", (len(SLIDE),)), ("probability", "<f4", (len(self.channels),))],
-        }
-        return np.zeros(count, dtype=parts[self.output])
+        return HEAD.itemsize + self._row.itemsize
 
     def fields(self) -> list[pa.Field]:
-        """Return a field for each step and channel and for each quantile of these, for state and score of each alarm, for
-        each of `LATENCY`, or for each of `SLIDE` and the probability of each material.
-        """
+        """Return a field for each declared column, with its unit and quantity."""
         import pyarrow as pa
 
-        if self.output == "latency":
-            return [
-                pa.field(name, pa.float32(), metadata={"unit": unit, "quantity": "latency"})
-                for name, unit in LATENCY.items()
-            ]
-        if self.output == "alarm":
-            about = {"unit": "1", "quantity": "alarm"}
-            states = [pa.field(f"{name}_state", pa.int8(), metadata=about) for name in self.alarms]
-            return states + [pa.field(f"{name}_score", pa.float32(), metadata=about) for name in self.alarms]
-        if self.output == "touch":
-            about = {"unit": "1", "quantity": "prediction"}
-            order = [pa.field(name, pa.int64(), metadata=about) for name in ORDER]
-            worth = [pa.field(name, pa.float32(), metadata=about) for name in WORTH]
-            touch = [pa.field(name, pa.float32(), metadata={**about, "unit": self.unit}) for name in self.channels]
-            return [*order, *worth, *touch]
-        if self.output == "material":
-            about = {"unit": "1", "quantity": "material"}
-            slide = [pa.field(name, pa.float32(), metadata=about) for name in SLIDE]
-            return slide + [
-                pa.field(f"probability_{name}", pa.float32(), metadata={**about, "material": name})
-                for name in self.channels
-            ]
-        found = []
-        for level in (None, *self.quantiles):
-            ending, about = ("", {}) if level is None else (f"_q{level}", {"quantile": f"{level / 100:g}"})
-            found += [
-                pa.field(
-                    f"{channel}_t{step}{ending}",
-                    pa.float32(),
-                    metadata={"unit": self.unit, "quantity": "prediction", "step": str(step), **about},
-                )
-                for step in self.steps
-                for channel in self.channels
-            ]
-        return found
+        return [
+            pa.field(
+                column.name,
+                pa.from_numpy_dtype(np.dtype(value.type)),
+                metadata={"unit": column.unit, "quantity": value.quantity, **column.metadata},
+            )
+            for value, column in self._columns
+        ]
 
     def framer(self) -> Framer:
         """Return a framer that takes packets of this output and size."""
@@ -152,27 +232,27 @@ class Live(Sensor):
 
     def _is_right(self, packets: Bytes) -> Bools:
         heads = np.ascontiguousarray(packets[:, : HEAD.itemsize]).view(HEAD)[:, 0]
-        found: Bools = (
+        right: Bools = (
             (heads["magic"] == MAGIC)
             & (heads["version"] == VERSION)
-            & (heads["kind"] == KINDS[self.output])
+            & (heads["kind"] == self._declaration.streams[self.output])
             & (heads["rest"] == 0)
         )
-        return found
+        return right
 
     def decode(self, frames: Bytes) -> Samples:
-        """Return a sample a packet; the time of the grid point is the device's time."""
+        """Return one sample per packet; the time of the message is the device's time."""
         heads = np.ascontiguousarray(frames[:, : HEAD.itemsize]).view(HEAD)[:, 0]
-        rows = np.ascontiguousarray(frames[:, HEAD.itemsize :]).view(self._rows(0).dtype)[:, 0]
+        rows = np.ascontiguousarray(frames[:, HEAD.itemsize :]).view(self._row)[:, 0]
         values = tuple(rows[name] for name in rows.dtype.names or ())
         return Samples(values, heads["seq"].astype(np.int64), heads["t_ns"].astype(np.int64))
 
     def encode(self, samples: Samples) -> Bytes:
         """Return the packets of samples."""
         heads = np.zeros(len(samples), dtype=HEAD)
-        heads["magic"], heads["version"], heads["kind"] = MAGIC, VERSION, KINDS[self.output]
+        heads["magic"], heads["version"], heads["kind"] = MAGIC, VERSION, self._declaration.streams[self.output]
         heads["seq"], heads["t_ns"] = samples.seq, samples.t_device_ns
-        rows = self._rows(len(samples))
+        rows = np.zeros(len(samples), dtype=self._row)
         for name, block in zip(rows.dtype.names or (), samples.values, strict=True):
             rows[name] = block
-        return np.hstack([one.view(np.uint8).reshape(len(samples), -1) for one in (heads, rows)])
+        return np.hstack([part.view(np.uint8).reshape(len(samples), -1) for part in (heads, rows)])

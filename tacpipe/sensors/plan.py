@@ -31,6 +31,7 @@ VERSION = 1
 MOST_POINTS = 1000  # of a plan
 LARGEST = 1 << 62
 NAME = "plan"  # of the stream of a rig
+MEASURED = "measured"  # in place of an address of plans: the recorded motion is assumed to continue
 POSE = (*(f"position_{axis}_m" for axis in "xyz"), *(f"orientation_{part}" for part in "xyzw"))  # columns
 NUMBERS = len(POSE)  # of a pose
 

@@ -21,12 +21,9 @@ if TYPE_CHECKING:
     from tacpipe.clouds.grasp import Grasp
     from tacpipe.comparison.specification import TaskReport
     from tacpipe.datasets.dataset import Dataset, Model
-    from tacpipe.live.options import Options
-    from tacpipe.live.process import Engine
+    from tacpipe.live.task import LiveTask
     from tacpipe.plugins.requirements import Requirements
     from tacpipe.plugins.stage import AnyStage, Result
-    from tacpipe.recording.rig import Rig
-    from tacpipe.sensors.sensor import Sensor
     from tacpipe.tasks.calibrated import Asked
     from tacpipe.tasks.opened import Chain
 
@@ -69,51 +66,6 @@ class Demo(NamedTuple):
     commands: list[list[str]]  # in their order, each without the leading ``tacpipe``
     results: list[str]  # paths of results that the page shows
     others: Sequence[str] = ()  # paths of datasets that the page uses, which are not results
-
-
-class LiveDescription(Protocol):
-    """What a model publishes in a live session."""
-
-    @property
-    def kind(self) -> str:
-        """The kind of its messages."""
-        ...
-
-    def own(self, steps: Sequence[int]) -> dict[str, Mapping[str, Any]]:
-        """Return the streams that the session adds to the rig, by name with the options of the sensor ``live``."""
-        ...
-
-
-class LiveTask(Protocol):
-    """A task's part of a live session, and what reads the recordings of such sessions."""
-
-    def describe(self, model: Dataset, *, allow_look_ahead: bool) -> LiveDescription:
-        """Return what a model publishes, read from its configuration without torch.
-
-        Raises `TacpipeError` where the model was trained on rows that look ahead, unless ``allow_look_ahead``.
-        """
-        ...
-
-    def engine(self, options: Options, model: Dataset, rig: Rig, sensors: Mapping[str, Sensor]) -> Engine:
-        """Return the engine that turns the samples of ``sensors``, by stream, into messages, in the model's process.
-
-        Raises `UsageError` where model, rig and options do not belong together.
-        """
-        ...
-
-    def predict(self, model: Model, recordings: Dataset, request: PredictionRequest) -> Result:
-        """Return what a live session publishes for recordings as they were recorded (``predict --causal``).
-
-        Raises `UsageError` where the task has no such predictions.
-        """
-        ...
-
-    def evaluate(self, model: Model, recordings: Dataset) -> Result:
-        """Return metrics of what live sessions published in their recordings (``evaluate --live``).
-
-        Raises `UsageError` where the task has no such metrics.
-        """
-        ...
 
 
 class Task(ABC):

@@ -7,6 +7,7 @@ process be slow (``slow:SECONDS`` a grid point) or end by itself (``die:FORECAST
 from __future__ import annotations
 
 import functools
+import json
 import os
 import sys
 import time
@@ -18,14 +19,16 @@ import numpy as np
 import pytest
 
 from tacpipe.errors import UsageError
-from tacpipe.live import process, supervisor
-from tacpipe.live.description import Described
-from tacpipe.live.options import Options
+from tacpipe.live import preparation, process, session
+from tacpipe.live.preparation import LiveModel
+from tacpipe.live.settings import SessionOptions
+from tacpipe.plugins import registry
 from tacpipe.recording import rig as rigs
 from tacpipe.signals.loads import axes
 from tacpipe.tasks.forward.live.alarms import Alarms
 from tacpipe.tasks.forward.live.chain import Beginning, Cause, Forecast
-from tacpipe.tasks.forward.live.engine import Engine
+from tacpipe.tasks.forward.live.engine import ForecastEngine
+from tacpipe.tasks.forward.live.task import ForwardSettings
 
 HORIZON = 3
 PERIOD_NS = 20_000_000
@@ -95,22 +98,43 @@ class Persistence:
         return Forecast(point_ns, at_ns, ahead, now, Cause.NONE, quantiles=band)
 
 
-def engine(options: Options) -> Engine:
+def model_of(task: str, **config: Any) -> LiveModel:
+    """Return a model with this configuration, which states no look-ahead."""
+    text = json.dumps({"task": task, "look_ahead": {"mean_ms": 0, "max_ms": 0}, **config}).encode()
+    live = registry.load_task(task).live
+    assert live is not None
+    dataset: Any = FakeModel({"config.json": text})
+    return LiveModel(task, live, dataset)
+
+
+class FakeModel:
+    """The dataset of a model, with its configuration alone."""
+
+    digest = "0" * 64
+    chain: tuple[Any, ...] = ()
+
+    def __init__(self, files: dict[str, bytes]) -> None:
+        self.files, self.source = files, self
+
+
+def engine(options: SessionOptions) -> ForecastEngine:
     """Return an engine of this chain, with alarms that are never on."""
+    own = options.settings.task
+    assert isinstance(own, ForwardSettings)
     rig = rigs.parse(options.rig)
     layout = axes(Persistence.layout)
     levels = {"load": tuple(1e9 for _ in layout), "slip": (1e9,)}
     sensors = {name: rig.streams[name].sensor for name in options.streams}
-    opened = functools.partial(Persistence, quantiles=options.quantiles)
+    opened = functools.partial(Persistence, quantiles=own.quantiles)
     alarms = Alarms(layout, levels, 1.0, (1.0,))
-    found = Engine(sensors, opened, lambda _: alarms, options.steps or None, quantiles=options.quantiles)
+    found = ForecastEngine(sensors, opened, lambda _: alarms, own.steps or None, quantiles=own.quantiles)
     behaviour, _, value = os.environ.get("BEHAVIOUR", "").partition(":")
     if behaviour:
         _behave(found, behaviour, value)
     return found
 
 
-def _behave(found: Engine, behaviour: str, value: str) -> None:
+def _behave(found: ForecastEngine, behaviour: str, value: str) -> None:
     step, made = found.step, [0]
 
     def other(now_ns: int) -> Any:
@@ -130,9 +154,9 @@ def main() -> None:
     if sys.argv[1:2] and sys.argv[1].isdecimal():
         sys.exit(process.main(sys.argv[1:], engine))
     patch = pytest.MonkeyPatch()
-    patch.setattr(supervisor, "MODULE", "tests.live.persistent")
-    about = Described(CHANNELS, HORIZON, "count", (10, 50, 90))
-    patch.setattr("tacpipe.live.description.described", lambda model, **_: (about, "0" * 64))
+    patch.setattr(session, "MODULE", "tests.live.persistent")
+    described = model_of("forward", horizon=HORIZON, inputs={"tactile": CHANNELS}, quantiles={"levels": [10, 50, 90]})
+    patch.setattr(preparation, "open_model", lambda path: described)
     from tacpipe.cli import main as cli
     from tests.recording import patient
 

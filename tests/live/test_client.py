@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tacpipe.live.publishers.websocket import WebsocketPublisher
+from tacpipe.live.websocket import WebsocketPublisher
 from tacpipe.tasks.forward.live.alarms import State
 from tacpipe.tasks.forward.live.messages import Description, Message
 from tests.live.test_publishers import free_port

@@ -6,11 +6,16 @@ from pathlib import Path
 
 import pytest
 
-from tacpipe.live.description import Described, Surfaces
+from tacpipe.live import preparation
+from tacpipe.live.preparation import LiveModel
 from tests.conftest import Lab
+from tests.live.persistent import model_of
 
 RIG = Path(__file__).parents[2] / "rigs/first-paper.toml"
-CALIBRATED, PLAIN = Described(("skin_taxel01_x",), 3, "count", (10, 50, 90)), Described(("skin_taxel01_x",), 3, "count")
+INPUTS = {"tactile": ["skin_taxel01_x"]}
+PLAIN = model_of("forward", horizon=3, inputs=INPUTS)
+CALIBRATED = model_of("forward", horizon=3, inputs=INPUTS, quantiles={"levels": [10, 50, 90]})
+MATERIAL = model_of("material", classes=[0, 1])
 
 
 @pytest.mark.parametrize(
@@ -18,14 +23,14 @@ CALIBRATED, PLAIN = Described(("skin_taxel01_x",), 3, "count", (10, 50, 90)), De
     [
         (PLAIN, "10,90", "tacpipe calibrate MODEL"),
         (CALIBRATED, "10,25", "10,50,90, not 25"),
-        (CALIBRATED, "ten", "--quantiles ten is not a list of percentages"),
-        (Surfaces(("cork", "felt")), "10,90", "of the kind material; --steps, --quantiles"),
+        (CALIBRATED, "ten", "--quantiles is ('ten',); it must be a list"),
+        (MATERIAL, "10,90", "--quantiles is no setting of this model"),
     ],
 )
 def test_quantiles_that_a_model_does_not_have_are_refused_before_the_session_begins(
-    about: Described | Surfaces, asked: str, named: str, lab: Lab, monkeypatch: pytest.MonkeyPatch
+    about: LiveModel, asked: str, named: str, lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("tacpipe.live.description.described", lambda model, **_: (about, "0" * 64))
+    monkeypatch.setattr(preparation, "open_model", lambda path: about)
     Path("rig.toml").write_text(RIG.read_text())
     ran = lab.call(f"live rig.toml --model models/f --quantiles {asked}")
     assert ran.code == 2 and named in ran.err.replace("\n", " ")

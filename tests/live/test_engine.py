@@ -16,7 +16,7 @@ from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Sensor
 from tacpipe.tasks.forward.live.alarms import Alarms
 from tacpipe.tasks.forward.live.chain import Cause
-from tacpipe.tasks.forward.live.engine import EARLY_NS, Engine
+from tacpipe.tasks.forward.live.engine import EARLY_NS, ForecastEngine
 from tacpipe.tasks.forward.live.messages import Message
 from tests.live.persistent import CHANNELS, HORIZON, PERIOD_NS, Persistence
 from tests.sensors import made
@@ -34,7 +34,7 @@ class Session:
         self.sensor: Sensor = rigs.make("xela", {"rate_hz": 50}, "skin")
         axes = tuple(dict.fromkeys(("skin", name[-1]) for name in CHANNELS))
         alarms = Alarms(axes, {"load": tuple(LEVEL for _ in axes), "slip": (LEVEL,)}, floors=(1.0,))
-        self.engine = Engine({"skin": self.sensor}, Persistence, lambda _: alarms, settle_ns=SETTLE_NS)
+        self.engine = ForecastEngine({"skin": self.sensor}, Persistence, lambda _: alarms, settle_ns=SETTLE_NS)
         samples = made.samples("xela", self.sensor, count, 1)
         self.values = np.hstack(samples.values).astype(np.float32)
         self.packets = made.pieces(self.sensor, self.sensor.encode(samples))
@@ -90,7 +90,9 @@ def test_a_session_that_fell_behind_publishes_the_newest_row_and_counts_the_othe
 def test_quantiles_that_were_asked_for_are_published_at_the_steps_that_are() -> None:
     session = Session()
     opened = functools.partial(Persistence, quantiles=(10, 90))
-    engine = Engine({"skin": session.sensor}, opened, session.engine._alarms_of, (1, 3), quantiles=(10, 90))
+    engine = ForecastEngine(
+        {"skin": session.sensor}, opened, lambda _: session.engine.alarms, (1, 3), quantiles=(10, 90)
+    )
     session.engine = engine
     session.begin()
     session.send(0, 1)
@@ -101,7 +103,7 @@ def test_quantiles_that_were_asked_for_are_published_at_the_steps_that_are() -> 
     found = [one for periods in range(1, 10) for one in session.at(periods)]
     assert any(one.values is None for one in found)
     assert all(one.levels == (10, 90) and (one.quantiles is None) == (one.values is None) for one in found)
-    assert engine.about("m").quantiles == (10, 90)
+    assert engine.describe("m").quantiles == (10, 90)
 
 
 @pytest.mark.parametrize("cut", [1, 3, 7, 50])

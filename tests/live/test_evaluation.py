@@ -12,8 +12,9 @@ import pytest
 
 import tacpipe
 from tacpipe.errors import UsageError
-from tacpipe.live import description
-from tacpipe.tasks.forward.live import evaluation, worth
+from tacpipe.live.preparation import open_model
+from tacpipe.tasks.forward.live import evaluation
+from tacpipe.tasks.forward.live import measures as worth
 from tests.conftest import Lab
 from tests.fake_recordings import FakeRecording
 from tests.live.sessions import CALIBRATED, TRAINED
@@ -90,7 +91,7 @@ def test_the_model_of_the_session_is_known_by_the_digest_that_tacpipe_live_recor
     for command in TRAINED:
         lab.run(command)
     lab.run(TRAINED[-1].replace("models/f", "models/g").replace("--hidden 4", "--hidden 5"))
-    (_, digest), (_, other) = (description.described(Path(model)) for model in ("models/f", "models/g"))
+    digest, other = (open_model(model).dataset.digest for model in ("models/f", "models/g"))
     given: Any = type("Given", (), {"recordings": {"one": Session(digest)}})()
     assert digest != other
     evaluation.check(tacpipe.open("models/f").digest, given)

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tacpipe.live.own_streams import free_ports
-from tacpipe.live.supervisor import DIED, RESTARTED
+from tacpipe.live.preparation import free_ports
+from tacpipe.live.session import DIED, RESTARTED
 from tacpipe.simulation.emulation.byte_faults import Faults
 from tests.conftest import Lab
 from tests.live.persistent import GAP_NS, PERIOD_NS

@@ -13,14 +13,14 @@ import pytest
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.live import wire
 from tacpipe.live.messages import packets
-from tacpipe.live.options import Options
+from tacpipe.live.settings import Settings
 from tacpipe.metrics import calibration
 from tacpipe.plugins import registry
 from tacpipe.recording import rig as rigs_of
 from tacpipe.recording.spool_blocks import Note
 from tacpipe.recording.station import BEGAN, OVER
 from tacpipe.sensors.framing import Chunks
-from tacpipe.sensors.live import SLIDE, Live
+from tacpipe.sensors.live import Live
 from tacpipe.sensors.sensor import Samples
 from tacpipe.simulation.slide import Rig, simulate_trial
 from tacpipe.tasks.calibrated import Asked
@@ -28,11 +28,11 @@ from tacpipe.tasks.material import calibration as material_calibration
 from tacpipe.tasks.material import known, prediction
 from tacpipe.tasks.material import training as material_training
 from tacpipe.tasks.material.classifier import Classifier
-from tacpipe.tasks.material.live import opening as material_opening
 from tacpipe.tasks.material.live import replay as material_replay
 from tacpipe.tasks.material.live.engine import RESTARTED, THROWN, MaterialEngine
 from tacpipe.tasks.material.live.messages import FINAL, SLIDING, WAITING, MaterialMessage
 from tacpipe.tasks.material.live.slide import UNLIKE
+from tacpipe.tasks.material.live.task import MaterialLive, MaterialSettings
 from tests.asked import fitting
 from tests.fake_recordings import FakeDataset, FakeRecording
 from tests.live import rigs
@@ -41,6 +41,8 @@ from tests.simulation.slide_datasets import SEED, indices, slides
 from tests.tasks.material.textures import Slide
 
 FRAMES = 120
+RIG_TEXT = '[[stream]]\nname = "finger"\nsensor = "biotac"\ntransport = "serial:/dev/ttyACM0"\n'
+SLIDE_COLUMNS = ["class", "rows", "seen", "ended", "slide"]
 EVERY_NS = 100_000_000
 SETTLE_NS = 2_000_000
 OFFSET_NS = 10**18
@@ -71,8 +73,10 @@ def models(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Opened]:
     return found
 
 
-def options(**changed: Any) -> Options:
-    return Options("models/material", "", ("finger",), kind="material", **{"least": 0.5, **changed})
+def opened(model: Any, sensors: dict[str, Any], **changed: Any) -> MaterialEngine:
+    """Return the engine of a session with these settings."""
+    settings = Settings("models/material", task=MaterialSettings(**{"least": 0.5, **changed}))
+    return MaterialLive().engine(model, rigs_of.parse(RIG_TEXT), sensors, settings)
 
 
 def trial(kind: int) -> Any:
@@ -85,7 +89,7 @@ class Session:
 
     def __init__(self, model: Any, kind: int = 1, table: Any = None, **changed: Any) -> None:
         self.sensor = rigs_of.make("biotac", {}, "finger")
-        self.engine: MaterialEngine = material_opening.engine(options(**changed), model, {"finger": self.sensor})
+        self.engine = opened(model, {"finger": self.sensor}, **changed)
         self.table = trial(kind) if table is None else table
         names = [field.name for field in self.sensor.fields()]
         values = np.column_stack([self.table.column(name).to_numpy() for name in names]).astype(np.uint16)
@@ -178,7 +182,7 @@ def test_a_calibrated_model_names_what_predict_answers_or_states_that_the_slide_
         last = session.end()
         assert (last.probabilities is None) == bool(cause)
         assert last.cause == cause
-    assert session.engine.about("models/material").to_dict()["confidence"] == "probability"
+    assert session.engine.describe("models/material").to_dict()["confidence"] == "probability"
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -297,9 +301,9 @@ def test_what_was_lost_makes_this_recording_unknown_and_not_the_next(models: dic
 
 
 def test_rows_of_the_sessions_stream_hold_what_was_published() -> None:
-    sensor = rigs_of.make("live", {"output": "material", "channels": ["cork", "felt"]}, "live")
+    sensor = rigs_of.make("live", {"task": "material", "output": "material", "channels": ["cork", "felt"]}, "live")
     assert isinstance(sensor, Live)
-    assert [field.name for field in sensor.fields()] == [*SLIDE, "probability_cork", "probability_felt"]
+    assert [field.name for field in sensor.fields()] == [*SLIDE_COLUMNS, "probability_cork", "probability_felt"]
     for probabilities in (None, np.array([0.25, 0.75], np.float32)):
         message = MaterialMessage(1, 5, ("cork", "felt"), probabilities, SLIDING, 60, 0.5)
         (sent,) = packets(message, sensor, 7)
@@ -307,8 +311,9 @@ def test_rows_of_the_sessions_stream_hold_what_was_published() -> None:
         assert found.seq is not None and found.t_device_ns is not None
         assert (found.seq[0], found.t_device_ns[0]) == (7, 5)
         number = -1 if probabilities is None else 1
-        assert found.values[0][0].tolist() == [number, 60, 0.5, 0, 1]
-        assert np.array_equal(found.values[1][0], message.columns()[5:], equal_nan=True)
+        assert found.values[0][0][:5].tolist() == [number, 60, 0.5, 0, 1]
+        likely = [np.nan, np.nan] if probabilities is None else probabilities
+        assert np.array_equal(found.values[0][0][5:], likely, equal_nan=True)
 
 
 def test_a_rig_that_the_model_cannot_read_is_refused_by_what_is_missing(models: dict[str, Opened]) -> None:
@@ -322,10 +327,10 @@ def test_a_rig_that_the_model_cannot_read_is_refused_by_what_is_missing(models: 
         ({"finger": biotac}, {"sensor": "roboskin"}, "roboskin"),
     ):
         with pytest.raises(TacpipeError, match=named):
-            material_opening.engine(options(**changed), model, sensors)
+            opened(model, sensors, **changed)
     lowest: Any = Opened(model.files, trigger="load", rest="lowest")
     with pytest.raises(TacpipeError, match="lowest"):
-        material_opening.engine(options(), lowest, {"finger": biotac})
+        opened(lowest, {"finger": biotac})
 
 
 def test_a_model_of_several_sensors_needs_the_name_of_the_rigs(tmp_path: Path) -> None:
@@ -336,5 +341,5 @@ def test_a_model_of_several_sensors_needs_the_name_of_the_rigs(tmp_path: Path) -
     )
     sensors = {"finger": rigs_of.make("biotac", {}, "finger")}
     with pytest.raises(UsageError, match="--sensor"):
-        material_opening.engine(options(), model, sensors)
-    assert material_opening.engine(options(sensor="biotac"), model, sensors).about("m").frames == FRAMES
+        opened(model, sensors)
+    assert opened(model, sensors, sensor="biotac").describe("m").frames == FRAMES

@@ -13,7 +13,7 @@ from tacpipe.arrays import Float32s
 from tacpipe.errors import UsageError
 from tacpipe.live import messages
 from tacpipe.sensors.framing import Chunks
-from tacpipe.sensors.live import LATENCY, Live
+from tacpipe.sensors.live import LATENCIES, Live
 from tacpipe.sensors.plan import Plan, is_plan, packet
 from tacpipe.tasks.forward.live.alarms import State
 from tacpipe.tasks.forward.live.messages import Description, Message
@@ -45,9 +45,9 @@ def test_quantiles_are_in_messages_of_sessions_that_publish_them_alone() -> None
     assert sent == json.loads(messages.to_json(plain.to_dict()))
     assert replace(message(None), levels=(10, 90)).to_dict()["quantiles"] is None
     assert about.to_dict()["quantiles"] == [10, 90] and set(about.schema()) == set(found.to_dict())
-    columns = dict(zip([name for name, _ in about.columns()], found.columns().tolist(), strict=True))
+    columns = dict(zip([name for name, _ in about.columns()], found.numbers(about).tolist(), strict=True))
     assert columns["c4_t3"] == VALUES[2, 4] and columns["c4_t3_q10"] == VALUES[2, 4] - 1 and columns["load_state"] == 1
-    sensor = Live(output="forecast", channels=CHANNELS, steps=(1, 2, 3), quantiles=(10, 90))
+    sensor = Live(task="forward", output="forecast", channels=CHANNELS, steps=(1, 2, 3), quantiles=(10, 90))
     (packet,) = messages.packets(found, sensor, 41)
     values = [one for block in decoded(sensor, packet)[0] for one in block]
     named = dict(zip([field.name for field in sensor.fields()], values, strict=True))
@@ -64,7 +64,7 @@ def decoded(sensor: Live, sent: bytes) -> tuple[list[list[float]], int, int]:
 
 
 def test_packets_hold_each_value_to_the_bit_with_number_and_time() -> None:
-    sensor = Live(output="forecast", channels=CHANNELS, steps=(1, 2, 3))
+    sensor = Live(task="forward", output="forecast", channels=CHANNELS, steps=(1, 2, 3))
     (sent,) = messages.packets(message(), sensor, 41)
     assert sent is not None
     assert decoded(sensor, sent) == ([VALUES.ravel().tolist()], 41, 10**18)
@@ -73,29 +73,35 @@ def test_packets_hold_each_value_to_the_bit_with_number_and_time() -> None:
 
 
 def test_alarms_and_latencies_have_packets_too_and_a_missing_forecast_has_none() -> None:
-    (alarm,) = messages.packets(message(), Live(output="alarm", alarms=("load", "slip")), 3)
+    (alarm,) = messages.packets(message(), Live(task="forward", output="alarm", alarms=("load", "slip")), 3)
     assert alarm is not None
-    states, scores = decoded(Live(output="alarm", alarms=("load", "slip")), alarm)[0]
+    states, scores = decoded(Live(task="forward", output="alarm", alarms=("load", "slip")), alarm)[0]
     assert states == [1, -1] and scores[0] == 2.5 and math.isnan(scores[1])
     (latency,) = messages.packets(message(None), Live(), 3)
     assert latency is not None
-    assert dict(zip(LATENCY, decoded(Live(), latency)[0][0], strict=True)) == {
+    assert dict(zip(LATENCIES, decoded(Live(), latency)[0][0], strict=True)) == {
         **{"latency_ms": 3.25, "age_ms": 4.5, "compute_ms": 1.0, "cause": 4.0, "skipped": 2.0, "late": 1.0}
     }
-    assert messages.packets(message(None), Live(output="forecast", channels=CHANNELS, steps=(1, 2, 3)), 3) == []
+    assert (
+        messages.packets(message(None), Live(task="forward", output="forecast", channels=CHANNELS, steps=(1, 2, 3)), 3)
+        == []
+    )
 
 
 def test_packets_of_another_output_or_version_are_refused() -> None:
-    (sent,) = messages.packets(message(), Live(output="alarm", alarms=("load", "slip")), 3)
+    (sent,) = messages.packets(message(), Live(task="forward", output="alarm", alarms=("load", "slip")), 3)
     assert sent is not None
     other = sent[:4] + b"\x02" + sent[5:]
     for wrong in (other, sent[:-1], b"x" + sent[1:]):
-        assert Live(output="alarm", alarms=("load", "slip")).framer().feed(Chunks.of([(0, wrong)]))[0] == []
+        assert (
+            Live(task="forward", output="alarm", alarms=("load", "slip")).framer().feed(Chunks.of([(0, wrong)]))[0]
+            == []
+        )
 
 
 def test_a_forecast_that_is_too_large_for_a_packet_is_refused_with_what_to_do() -> None:
     with pytest.raises(UsageError, match="--steps"):
-        Live(output="forecast", channels=tuple(f"c{n}" for n in range(1000)), steps=tuple(range(1, 20)))
+        Live(task="forward", output="forecast", channels=tuple(f"c{n}" for n in range(1000)), steps=tuple(range(1, 20)))
 
 
 def test_a_plan_is_a_sample_a_point_with_the_arrival_of_its_packet() -> None:

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import tacpipe
-from tacpipe.live.own_streams import free_ports
+from tacpipe.live.preparation import free_ports
 from tacpipe.sensors import plan as plans
 from tests.conftest import Lab
 from tests.live.sessions import TRAINED, commanded, ended, forecasts, subscriber, whole

@@ -15,8 +15,8 @@ import pytest
 
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.live import publishing
-from tacpipe.live.publishers.udp import UdpPublisher
-from tacpipe.live.publishers.websocket import BEHIND, CONNECTIONS, QUEUED, TOKEN, WebsocketPublisher
+from tacpipe.live.publishing import UdpPublisher
+from tacpipe.live.websocket import BEHIND, CONNECTIONS, QUEUED, TOKEN, WebsocketPublisher
 from tacpipe.tasks.forward.live.messages import Description, Message
 from tacpipe.tasks.material.live.messages import SLIDING, MaterialDescription, MaterialMessage
 from tests.recording.live import awaited

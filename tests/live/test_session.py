@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tacpipe.live.own_streams import free_ports
-from tacpipe.live.supervisor import DIED, RESTARTED
+from tacpipe.live.preparation import free_ports
+from tacpipe.live.session import DIED, RESTARTED
 from tacpipe.sensors import plan as plans
 from tests.conftest import Lab, without_created_store
 from tests.live.persistent import CHANNELS, HORIZON

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import re
 import tomllib
 from pathlib import Path
@@ -12,10 +11,11 @@ import pytest
 
 from tacpipe.cli import live as command
 from tacpipe.errors import UsageError
-from tacpipe.live.settings import Settings
+from tacpipe.live.settings import SessionOptions, Settings, keys, task_settings
 from tacpipe.recording import rig as rigs
 from tacpipe.recording import rig_text
 from tacpipe.tasks.forward.live import plans
+from tacpipe.tasks.forward.live.task import ForwardSettings
 from tests.conftest import Lab
 from tests.live.sessions import TRAINED
 from tests.test_docs import fenced
@@ -37,34 +37,39 @@ FULL = {
 
 
 def settings(stated: dict[str, Any], **given: Any) -> Settings:
-    return Settings.of(stated, "rig.toml", given)
+    return Settings.from_sources(ForwardSettings, stated, "rig.toml", given)
+
+
+def forward_settings(stated: dict[str, Any], **given: Any) -> ForwardSettings:
+    own = settings(stated, **given).task
+    assert isinstance(own, ForwardSettings)
+    return own
 
 
 def test_what_the_file_states_counts_and_options_of_the_command_win() -> None:
     found = settings(FULL, plan=None, realtime=False, publish=("lsl:touch",), settle_ms=1.5)
-    assert found == Settings(
-        "models/f", "rig:robot", ("lsl:touch",), (1, 5), (10, 90), 6.0, "data/c", "data/split", 1.5, realtime=False
-    )
-    assert settings({}, model="models/g") == Settings("models/g")
+    own = ForwardSettings("rig:robot", "", (1, 5), (10, 90), 6.0, "data/c", "data/split")
+    assert found == Settings("models/f", ("lsl:touch",), 1.5, realtime=False, task=own)
+    assert settings({}, model="models/g") == Settings("models/g", task=ForwardSettings())
 
 
 def test_alarms_of_the_file_are_switched_off_by_the_option_and_a_split_belongs_to_its_recordings() -> None:
-    off = settings(FULL, alarms_per_hour=0.0)
+    off = forward_settings(FULL, alarms_per_hour=0.0)
     assert (off.alarms_per_hour, off.alarms_on, off.split) == (0.0, "", "")
-    others = settings(FULL, alarms_on="data/others")
+    others = forward_settings(FULL, alarms_on="data/others")
     assert (others.alarms_per_hour, others.alarms_on, others.split) == (6.0, "data/others", "")
 
 
 @pytest.mark.parametrize(
     ("stated", "given", "sentence"),
     [
-        ({"modle": "x"}, {}, "rig.toml, live: there is no key modle; there are model, plan,"),
+        ({"modle": "x"}, {}, "rig.toml, live: there is no key modle; there are model, publish,"),
         ({**FULL, "settle_ms": 5000}, {}, "rig.toml, live: settle_ms is 5000; it must be a number from 0 to 1000."),
         ({**FULL, "publish": "ws:a:1"}, {}, "rig.toml, live: publish is 'ws:a:1'; it must be a list"),
         ({**FULL, "realtime": "yes"}, {}, "rig.toml, live: realtime is 'yes'; it must be true or false"),
         ({**FULL, "places": {}}, {}, "there is no key places"),
         (FULL, {"settle_ms": 5000.0}, "--settle-ms is 5000; it must be a number from 0 to 1000."),
-        ({"plan": "measured"}, {}, 'state model = "models/forward" in the table [live] of rig.toml'),
+        ({"model": "m", "rank": "contact"}, {}, "rig.toml, live: there is no key rank; there are model,"),
         ({"model": "m", "alarms_per_hour": 6}, {}, "rig.toml, live: alarms_per_hour needs alarms_on with it"),
         ({"model": "m", "alarms_on": "d"}, {}, "rig.toml, live: alarms_on needs alarms_per_hour with it"),
         ({"model": "m"}, {"alarms_per_hour": 6.0}, "--alarms-per-hour needs --alarms-on with it"),
@@ -79,10 +84,10 @@ def test_what_is_wrong_is_named_with_its_place(stated: dict[str, Any], given: di
 
 
 def test_steps_beyond_the_horizon_are_refused_and_none_are_all() -> None:
-    assert settings({"model": "m"}).steps_of(3) == (1, 2, 3)
-    assert settings({"model": "m", "steps": [5, 1, 5]}).steps_of(10) == (1, 5)
+    assert forward_settings({"model": "m"}).steps_up_to(3) == (1, 2, 3)
+    assert forward_settings({"model": "m", "steps": [5, 1, 5]}).steps_up_to(10) == (1, 5)
     with pytest.raises(UsageError, match="1 to 4 steps ahead"):
-        settings({"model": "m", "steps": [5]}).steps_of(4)
+        forward_settings({"model": "m", "steps": [5]}).steps_up_to(4)
 
 
 def planned(plan: str, sender: str = "") -> str:
@@ -146,8 +151,8 @@ def test_the_examples_of_the_pages_are_read(page: str) -> None:
 
 def test_the_page_of_the_rig_file_names_every_key() -> None:
     table = (ROOT / "docs" / "rig.md").read_text().split("| key of `[live]` |")[1].split("\n\n")[0]
-    known = {field.name for field in dataclasses.fields(Settings)} - {"places"}
-    assert all(f"`{name}`" in table for name in known)
+    kinds: list[Any] = [Settings, *task_settings().values()]
+    assert all(f"`{name}`" in table for kind in kinds for name in keys(kind))
 
 
 @pytest.mark.long
@@ -158,13 +163,15 @@ def test_a_session_is_what_the_file_states_but_for_the_options_given(lab: Lab, m
     alarms = 'alarms_per_hour = 60\nalarms_on = "data/c"\nsplit = "data/split"\n'
     Path("rig.toml").write_text(f"{STREAM}[live]\n{stated}{alarms}")
     asked: list[Any] = []
-    monkeypatch.setattr(command, "_run", lambda found, options, *rest, **more: asked.append((options, rest)))
+    monkeypatch.setattr(command, "_run", lambda prepared, *rest, **more: asked.append(prepared))
     lab.run("live rig.toml --settle-ms 1 --publish udp:127.0.0.1:9000")
-    ((options, rest),) = asked
-    assert options.model == str(Path("models/f").absolute()) and options.steps == (2,) and options.settle_ms == 1.0
-    assert options.alarms_per_hour == 60 and options.split == str(Path("data/split").absolute())
-    assert options.publish == ("udp:127.0.0.1:9000",) and "plan" in options.streams
-    assert rest[4]["live_plan"] == "udp::9100" and rest[4]["live_alarms_per_hour"] == 60
+    (prepared,) = asked
+    common, own = prepared.options.settings, prepared.options.settings.task
+    assert common.model == str(Path("models/f").absolute()) and own.steps == (2,) and common.settle_ms == 1.0
+    assert own.alarms_per_hour == 60 and own.split == str(Path("data/split").absolute())
+    assert common.publish == ("udp:127.0.0.1:9000",) and "plan" in prepared.options.streams
+    assert prepared.attributes["live_plan"] == "udp::9100" and prepared.attributes["live_alarms_per_hour"] == 60
+    assert SessionOptions.from_json(prepared.options.to_json()) == prepared.options
 
 
 @pytest.mark.long
@@ -180,6 +187,11 @@ def test_a_value_of_the_file_that_the_session_refuses_is_named_with_the_file(lab
         Path("rig.toml").write_text(f'{STREAM}[live]\nmodel = "models/f"\n{line}\n')
         ran = lab.call("live rig.toml")
         assert ran.code == 2 and sentence in ran.err, ran.err
+    Path("rig.toml").write_text(STREAM)
+    ran = lab.call("live rig.toml")
+    assert ran.code == 2 and 'state model = "models/forward" in the table [live] of rig.toml' in " ".join(
+        ran.err.split()
+    )
     Path("rig.toml").write_text(f'{STREAM}[live]\nmodel = "models/none"\n')
     ran = lab.call("live rig.toml")
     assert ran.code == 2 and "rig.toml, live: " in ran.err and "models/none" in ran.err, ran.err

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 
 from tacpipe.live import wire
-from tacpipe.live.tap import Tap
+from tacpipe.live.wire import Tap
 from tacpipe.recording.spool_blocks import Note
 from tacpipe.sensors.framing import Chunks
 
@@ -100,7 +100,7 @@ def test_without_a_process_nothing_is_raised(pair: Pair, gone: str) -> None:
 def test_a_process_that_is_started_in_the_middle_gets_the_beginning_of_each_stream(pair: Pair) -> None:
     tap = Tap(["a", "b"])
     tap.connect(pair[0], Note(1, "", wire.BEGIN, "5"))
-    tap.begun()
+    tap.put_begins()
     assert [(name, block.what) for name, block in received(pair[1], wire.Blocks(["a", "b"]))] == [  # type: ignore[union-attr]
         ("", wire.BEGIN),
         ("a", "began"),

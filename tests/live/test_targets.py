@@ -16,7 +16,7 @@ from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Sensor
 from tacpipe.tasks.forward import planned
 from tacpipe.tasks.forward.live.chain import Cause, Chain
-from tacpipe.tasks.forward.live.targets import Targets
+from tacpipe.tasks.forward.live.plans import Targets
 from tests.fake_recordings import FakeRecording
 from tests.live import rigs
 from tests.live.rigs import MS, T0, Made

@@ -24,7 +24,7 @@ from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.grasps import is_request
 from tacpipe.sensors.live import Live
 from tacpipe.tasks.touch import prediction as touch_prediction
-from tacpipe.tasks.touch.live import ranking as touch_ranking
+from tacpipe.tasks.touch.live import requests as touch_ranking
 from tacpipe.tasks.touch.live.engine import WAITING, TouchEngine
 from tacpipe.tasks.touch.live.messages import COLUMNS, TouchMessage
 from tacpipe.tasks.touch.predictor import Predictor
@@ -208,7 +208,7 @@ def test_what_is_no_request_is_no_frame(change: dict[str, Any]) -> None:
 
 
 def live() -> Live:
-    found = rigs_of.make("live", {"output": "touch", "channels": list(COLUMNS)}, "live")
+    found = rigs_of.make("live", {"task": "touch", "output": "touch", "channels": list(COLUMNS)}, "live")
     assert isinstance(found, Live)
     return found
 

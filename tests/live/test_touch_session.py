@@ -15,8 +15,8 @@ import tacpipe
 from tacpipe.clouds import ply
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
-from tacpipe.live.own_streams import free_ports
-from tacpipe.live.supervisor import DIED, RESTARTED
+from tacpipe.live.preparation import free_ports
+from tacpipe.live.session import DIED, RESTARTED
 from tacpipe.tasks.touch.live.messages import COLUMNS
 from tests.conftest import Lab
 from tests.live.sessions import commanded, ended, model_process, subscriber

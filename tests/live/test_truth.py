@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tacpipe.tasks.forward.live import truth
+from tacpipe.tasks.forward.live import measures as truth
 
 
 def test_rows_are_compared_bit_for_bit_and_only_where_both_have_them() -> None:

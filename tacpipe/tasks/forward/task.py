@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
     from tacpipe.comparison.specification import TaskReport
     from tacpipe.datasets.dataset import Dataset, Model
+    from tacpipe.live.task import LiveTask
     from tacpipe.plugins.stage import Result, Workspace
     from tacpipe.tasks.forward.model import ForwardModel
     from tacpipe.tasks.opened import Chain
@@ -70,6 +71,13 @@ class Forward(Task):
         from tacpipe.tasks.forward.calibration import calibrate
 
         return Calibration("quantiles", calibrate)
+
+    @property
+    def live(self) -> LiveTask:
+        """Forecasts with alarms at each grid point."""
+        from tacpipe.tasks.forward.live.task import ForwardLive
+
+        return ForwardLive()
 
     @property
     def report(self) -> TaskReport:

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
     from tacpipe.comparison.specification import TaskReport
     from tacpipe.datasets.dataset import Dataset, Model
+    from tacpipe.live.task import LiveTask
     from tacpipe.plugins.stage import Result, Workspace
     from tacpipe.tasks.material.model import MaterialModel
     from tacpipe.tasks.opened import Chain
@@ -65,6 +66,13 @@ class Material(Task):
         from tacpipe.tasks.material.calibration import calibrate
 
         return Calibration("probabilities", calibrate)
+
+    @property
+    def live(self) -> LiveTask:
+        """The material of a slide while it lasts."""
+        from tacpipe.tasks.material.live.task import MaterialLive
+
+        return MaterialLive()
 
     @property
     def report(self) -> TaskReport:

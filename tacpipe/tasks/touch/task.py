@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
     from tacpipe.comparison.specification import TaskReport
     from tacpipe.datasets.dataset import Dataset, Model
+    from tacpipe.live.task import LiveTask
     from tacpipe.plugins.stage import Result, Workspace
     from tacpipe.tasks.opened import Chain
     from tacpipe.tasks.touch.model import TouchModel
@@ -71,6 +72,13 @@ class Touch(Task):
         from tacpipe.tasks.touch.calibration import calibrate
 
         return Calibration("quantiles", calibrate)
+
+    @property
+    def live(self) -> LiveTask:
+        """Rankings of candidate grasps on request."""
+        from tacpipe.tasks.touch.live.task import TouchLive
+
+        return TouchLive()
 
     @property
     def report(self) -> TaskReport:

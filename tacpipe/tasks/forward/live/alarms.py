@@ -19,11 +19,13 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from tacpipe.arrays import AnyFloats
+from tacpipe.errors import UsageError
 from tacpipe.sensors.live import OFF, ON, UNKNOWN
 from tacpipe.signals.loads import axes, loads
 from tacpipe.signals.shear import rise_and_fall
 
 if TYPE_CHECKING:
+    from tacpipe.datasets.dataset import Dataset
     from tacpipe.tasks.forward.alarms import Loads
     from tacpipe.tasks.forward.slip_alarms import SlipAlarms
 
@@ -69,7 +71,7 @@ class Alarms:
     def from_json(cls, content: Mapping[str, Any]) -> Self:
         """Return what `to_json` gave. A level for slips of before these had floors is of another score, and left out."""
         levels = {
-            name: tuple(math.inf if one is None else float(one) for one in values)
+            name: tuple(math.inf if level is None else float(level) for level in values)
             for name, values in content["levels"].items()
         }
         if "floors" not in content and SLIP in levels:
@@ -88,9 +90,9 @@ class Alarms:
 
     def _moved(self, ahead: AnyFloats, now: AnyFloats, layout: Sequence[Mapping[str, str]]) -> AnyFloats:
         """Return by how much each load (load,) is predicted to change within the horizon."""
-        last, present = (loads(np.asarray(one, np.float64), layout)[0] for one in (ahead[-1:], now[None]))
-        found: AnyFloats = np.abs(last - present)
-        return found
+        last, present = (loads(np.asarray(counts, np.float64), layout)[0] for counts in (ahead[-1:], now[None]))
+        moved: AnyFloats = np.abs(last - present)
+        return moved
 
     def to_json(self) -> dict[str, Any]:
         """Return the levels as JSON can hold them: null where there is none."""
@@ -107,24 +109,48 @@ def _state(scores: AnyFloats, levels: AnyFloats) -> State:
     """Return the state of an alarm with these scores and levels (one,): the largest of those that have a level counts."""
     set_for = np.isfinite(levels)
     score = float((scores[set_for] / np.maximum(levels[set_for], LEAST)).max(initial=0.0))  # NaN stays one
-    known = bool(set_for.any()) and math.isfinite(score)
-    return State(UNKNOWN if not known else ON if score > 1 else OFF, score if known else math.nan)
+    is_known = bool(set_for.any()) and math.isfinite(score)
+    return State(UNKNOWN if not is_known else ON if score > 1 else OFF, score if is_known else math.nan)
 
 
-def set_on(several: Loads, slipping: SlipAlarms, predictor: str, per_hour: float) -> Alarms:
+def set_on(changes: Loads, slipping: SlipAlarms, predictor: str, per_hour: float) -> Alarms:
     """Return alarms with levels for ``per_hour`` false alarms each, set on the recordings that were added."""
     from tacpipe.signals import anticipation
 
-    truth, groups = np.concatenate(several.truth), np.concatenate(several.groups)
-    places = axes(several.layout)
+    truth, groups = np.concatenate(changes.truth), np.concatenate(changes.groups)
+    places = axes(changes.layout)
     levels = anticipation.calibrate(
         truth,
-        np.concatenate(several.ahead[predictor]),
+        np.concatenate(changes.ahead[predictor]),
         groups,
-        horizon=several.horizon,
-        sd=anticipation.difference_sd(truth, groups, horizon=several.horizon),
-        rate_hz=several.rate_hz,
+        horizon=changes.horizon,
+        sd=anticipation.difference_sd(truth, groups, horizon=changes.horizon),
+        rate_hz=changes.rate_hz,
         per_minute=per_hour / 60 / len(places),
     )
     slip = slipping.level(predictor, per_hour)
     return Alarms(places, {LOAD: tuple(levels.tolist()), SLIP: (slip,)}, per_hour, tuple(slipping.floors.tolist()))
+
+
+def on_recordings(model: Dataset, recordings: Dataset, per_hour: float) -> Alarms:
+    """Return alarms of a model with levels for ``per_hour`` false alarms each on recordings, each row's forecast made."""
+    from tacpipe.tasks.forward import predictors, tracks
+    from tacpipe.tasks.forward.alarms import Loads
+    from tacpipe.tasks.forward.forecaster import Forecaster
+    from tacpipe.tasks.forward.headline import MODEL
+    from tacpipe.tasks.forward.slip_alarms import SlipAlarms
+    from tacpipe.tasks.opened import Chain as Stages
+    from tacpipe.tasks.opened import opened
+
+    forecaster = Forecaster.load(model.files)
+    changes, slipping = Loads(forecaster.codec.layout, forecaster.horizon), SlipAlarms.of(forecaster)
+    for shard in opened(recordings, Stages(model)).recordings.values():
+        track = tracks.track(shard, forecaster.codec, forecaster.pose)
+        changes.begin(track)
+        slipping.begin(track)
+        for batch in predictors.forecasts(forecaster, track, track.starts(forecaster.context, forecaster.horizon)):
+            changes.add_one(MODEL, batch.now, predictors.Prediction(batch.features, batch.count))
+            slipping.add_one(MODEL, batch.now, track.tactile[batch.now], batch.count)
+    if not changes.truth:
+        raise UsageError("There is no validation recording that alarms could be set on; give --alarms-on others.")
+    return set_on(changes, slipping, MODEL, per_hour)

@@ -28,8 +28,8 @@ from tacpipe.tasks.forward import planned, units
 from tacpipe.tasks.forward.causal import Arm, Rolling
 from tacpipe.tasks.forward.forecaster import Forecaster
 from tacpipe.tasks.forward.live.inputs import Layout, plan_table
+from tacpipe.tasks.forward.live.plans import Targets, facing
 from tacpipe.tasks.forward.live.stages import causal_stages, refuse_look_ahead
-from tacpipe.tasks.forward.live.targets import Targets, facing
 from tacpipe.tasks.forward.planned import Plan
 
 if TYPE_CHECKING:
@@ -197,10 +197,10 @@ class Chain:
     @property
     def streams(self) -> tuple[str, ...]:
         """Names of the streams that are read; others may be pushed and are ignored."""
-        several = (
+        readings = (
             self._layout.readings if self._targets is None else {**self._layout.readings, self._targets.stream: None}
         )
-        return tuple(several)
+        return tuple(readings)
 
     @property
     def waiting(self) -> tuple[str, ...]:
@@ -299,24 +299,24 @@ class Chain:
         """
         self._until_ns = t_ns if self._until_ns is None else max(t_ns, self._until_ns)
         rows = self._grid.rows(t_ns)
-        found: list[Forecast] = []
+        forecasts: list[Forecast] = []
         if not len(rows.t_ns):
-            return found
+            return forecasts
         with one_thread():
             for index, at_ns in enumerate(rows.t_ns.tolist()):
                 if not rows.begun[index]:
-                    found.append(Forecast(at_ns, 0, None, None, Cause.START))
+                    forecasts.append(Forecast(at_ns, 0, None, None, Cause.START))
                     continue
                 row = self._row(rows, index, at_ns)
                 skipped = newest_only and index < len(rows.t_ns) - 1
-                found.append(self._forecast(row, skipped=skipped))
-        return found
+                forecasts.append(self._forecast(row, skipped=skipped))
+        return forecasts
 
     def _row(self, rows: Rows, index: int, t_ns: int) -> _Row:
         """Return a row of the grid as the model reads it."""
         gaps = tuple(name for name, gap in rows.gap.items() if gap[index])
         newest_ns = max(int(stamps[index]) for stamps in rows.newest_ns.values())
-        values = {name: found[index] for name, found in rows.values.items()}
+        values = {name: columns[index] for name, columns in rows.values.items()}
         layout = self._layout
         arm = self._arm.row(t_ns, *layout.placed(values))
         return _Row(t_ns, newest_ns, layout.tactile(values), arm, layout.finger_m(values), gaps)
@@ -328,9 +328,11 @@ class Chain:
             if row.t_ns <= first.t_ns + round(self._stages.contacts.rest_s * 1e9) or not self._resting:
                 self._resting.append(row)
                 return Forecast(row.t_ns, row.newest_ns, None, None, Cause.START, row.gaps)
-            self._rest = self._layout.rest(self._stages.contacts, [one.tactile for one in self._resting])
-            for one in self._resting:
-                self._take(one)
+            self._rest = self._layout.rest(
+                self._stages.contacts, [resting_row.tactile for resting_row in self._resting]
+            )
+            for resting_row in self._resting:
+                self._take(resting_row)
             self._resting = None
         finite = self._take(row)
         cause = Cause.GAP if row.gaps else Cause.NONE
@@ -388,10 +390,10 @@ class Chain:
         poses: Floats = np.column_stack([np.asarray(batch.column(names.index(name))) for name in POSE])
         rows = np.column_stack([target, poses])
         for arrived_ns in np.unique(arrived).tolist():
-            some = rows[arrived == arrived_ns]
+            plan_rows = rows[arrived == arrived_ns]
             if self._until_ns is not None and arrived_ns <= self._until_ns:
                 self._late_plans += 1
             if self._plans and self._plans[-1][0] == arrived_ns:
-                self._plans[-1][1].append(some)
+                self._plans[-1][1].append(plan_rows)
             else:
-                self._plans.append((arrived_ns, [some]))
+                self._plans.append((arrived_ns, [plan_rows]))

@@ -1,8 +1,6 @@
-"""A live session's logic: blocks of bytes in, messages out. It reads no clock and does no input or output.
+"""Forecast at each grid point of a live session, as soon as the samples that belong to it have come.
 
-The chain is `chain.Chain`, or any `Chainlike`. `take` keeps what came, `due_ns` states when the next
-grid point can be predicted, and `step` makes what is due. Where several grid points are due, this process fell behind: the
-newest alone is published, the others are counted as skipped.
+Where several grid points are due, this process fell behind: the newest is published, the others are counted as skipped.
 """
 
 from __future__ import annotations
@@ -15,8 +13,9 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from tacpipe.live import wire
+from tacpipe.live import messages
 from tacpipe.live.decoding import Decoder, batch_schema, likely_schema
+from tacpipe.live.engine import SETTLE_NS, Engine
 from tacpipe.recording.spool_blocks import Note
 from tacpipe.recording.station import BEGAN
 from tacpipe.sensors.framing import Chunks
@@ -29,7 +28,6 @@ from tacpipe.tasks.forward.live.messages import Description, Message
 if TYPE_CHECKING:
     import pyarrow as pa
 
-SETTLE_NS = 2_000_000  # after a grid point, in which the samples that belong to it are awaited from the other threads
 PERIODS = 2.0  # without a forecast, after which a message states why there is none
 SLACK_NS = 5_000_000  # of the same, for jitter
 EARLY_NS = (
@@ -39,8 +37,8 @@ LITTLE_NS = 300_000  # a shorter wait until then is not worth waking for
 STARTING_S = 0.005  # between two tries while the grid is not known
 
 
-class Chainlike(Protocol):
-    """What is used of a `tacpipe.tasks.forward.live.chain.Chain`."""
+class CausalChain(Protocol):
+    """The part of `tacpipe.tasks.forward.live.chain.Chain` that an engine uses."""
 
     @property
     def streams(self) -> tuple[str, ...]:
@@ -85,31 +83,30 @@ class Chainlike(Protocol):
         """Return the forecasts up to a time, on request of the newest grid point alone."""
 
 
-Opened = Callable[[Mapping[str, "pa.Schema"], "Beginning | None"], Chainlike]
+Opened = Callable[[Mapping[str, "pa.Schema"], "Beginning | None"], CausalChain]
 
 
-class Engine:
+class ForecastEngine(Engine):
     """One live session: a chain for each recording of it, and for each stretch after blocks were thrown away."""
 
     def __init__(
         self,
         sensors: Mapping[str, Sensor],
         opened: Opened,
-        alarms: Callable[[Chainlike], Alarms],
+        alarms: Callable[[CausalChain], Alarms],
         steps: Sequence[int] | None = None,
         *,
         settle_ns: int = SETTLE_NS,
         quantiles: Sequence[int] = (),
     ) -> None:
-        self.sensors = dict(sensors)
-        self._opened, self._alarms_of = opened, alarms
-        self.settle_ns, self.quantiles = settle_ns, tuple(quantiles)
-        self.chain = opened({name: likely_schema(one) for name, one in self.sensors.items()}, None)
+        super().__init__(sensors, settle_ns)
+        self._open_chain = opened
+        self.quantiles = tuple(quantiles)
+        self.chain = opened({name: likely_schema(sensor) for name, sensor in self.sensors.items()}, None)
         self.alarms = alarms(self.chain)
         self.steps = tuple(steps) if steps else tuple(range(1, self.chain.horizon + 1))
-        self.skipped = self.overflows = self._seq = self._late = 0
+        self._late = 0  # samples that came too late for chains before
         self._first: dict[str, pa.Schema] = {}  # schema of what each stream gave first
-        self._offset_ns: int | None = None  # None: no recording has begun
         self._begun: set[str] = set()
         self._decoders = self._new_decoders()
         self._last_ns: int | None = None  # monotonic, of the last message
@@ -128,16 +125,11 @@ class Engine:
         return self._late + sum(self.chain.late.values())
 
     @property
-    def offset_ns(self) -> int | None:
-        """What is added to the monotonic clock to have the recording's UTC; None where none runs."""
-        return self._offset_ns
-
-    @property
     def beginning(self) -> Beginning | None:
         """What another process needs to continue this recording."""
         return self.chain.beginning
 
-    def about(self, model: str) -> Description:
+    def describe(self, model: str) -> Description:
         """Return what the values of messages are."""
         chain = self.chain
         return Description(chain.channels, self.steps, chain.unit, chain.rate_hz, model, self.quantiles)
@@ -146,33 +138,41 @@ class Engine:
         """Return how many channels are predicted, and the levels of the alarms."""
         return {"channels": len(self.chain.channels), "alarms": self.alarms.to_json()}
 
-    def finish(self) -> list[Message]:
-        """Return the messages that are left when the session is over: none."""
-        return []
+    def continue_recording(self, beginning: str) -> None:
+        """Take grid and level at rest of a process that ended; the next recording continues them."""
+        self._continues = Beginning.from_json(json.loads(beginning))
 
-    @property
-    def running(self) -> bool:
-        """Whether a recording has begun."""
-        return self._offset_ns is not None
+    def begin_recording(self, offset_ns: int) -> None:
+        """Begin a recording with a new chain, or with one that continues the process before."""
+        self._begun = set()
+        self._decoders = self._new_decoders()
+        continues, self._continues = self._continues, None
+        self._restart(
+            "the recording begins" if continues is None else "the model's process was started anew", continues
+        )
 
-    def take(self, stream: str, block: Chunks | Note) -> None:
-        """Take a block of a stream, or a note on all (``stream`` is empty)."""
-        if not stream:
-            assert isinstance(block, Note)
-            if block.what == wire.CONTINUE:
-                self._continues = Beginning.from_json(json.loads(block.detail))
-            elif block.what == wire.BEGIN:
-                self._begin(int(block.detail))
-            elif block.what == wire.END:
-                self._offset_ns = None
-            elif block.what == wire.OVERFLOW and self.running:
-                self.overflows += 1
-                self._restart("blocks were thrown away under overload", self.chain.beginning)
-            return
-        if isinstance(block, Note) and block.what == BEGAN:
-            self._begun.add(stream)
-            self._decoders[stream] = Decoder(self.sensors[stream])
-            return
+    def overflow(self) -> None:
+        """Continue with a chain that lacks the blocks that were thrown away."""
+        if self.running:
+            self.overflows += 1
+            self._restart("blocks were thrown away under overload", self.chain.beginning)
+
+    def begin_stream(self, stream: str) -> None:
+        """Decode a stream from the start of the recording on."""
+        self._begun.add(stream)
+        self._decoders[stream] = Decoder(self.sensors[stream])
+
+    def take_note(self, stream: str, note: Note) -> None:
+        """Take a note on a stream; bytes that were lost go to its decoder."""
+        super().take_note(stream, note)
+        if note.what != BEGAN:
+            self._keep(stream, note)
+
+    def take_chunks(self, stream: str, chunks: Chunks) -> None:
+        """Keep bytes of a stream that the chain reads; before a recording, find out which columns the stream has."""
+        self._keep(stream, chunks)
+
+    def _keep(self, stream: str, block: Chunks | Note) -> None:
         if stream in self.chain.streams or stream == PLAN or stream not in self._first:
             self._decoders[stream].take(block)
         if not self.running and stream not in self._first:
@@ -198,21 +198,21 @@ class Engine:
         until_ns = now_ns - self.settle_ns
         row_ns = self._row_ns
         self._decode(self._offset_ns, until_ns if row_ns is not None and row_ns <= now_ns else None)
-        found = self.chain.advance(until_ns + self._offset_ns, newest_only=True)
-        if not found:
+        forecasts = self.chain.advance(until_ns + self._offset_ns, newest_only=True)
+        if not forecasts:
             return self._silence(now_ns)
         self._why = ""
-        self._point_ns, self._last_ns = found[-1].t_ns, now_ns
-        self.skipped += sum(Cause.SKIPPED in one.cause for one in found)
-        message = self._message(found[-1], now_ns)
+        self._point_ns, self._last_ns = forecasts[-1].t_ns, now_ns
+        self.skipped += sum(Cause.SKIPPED in forecast.cause for forecast in forecasts)
+        message = self._message(forecasts[-1], now_ns)
         message.late, message.compute_ms = self.late, (time.perf_counter() - began_s) * 1e3
         return [message]
 
-    def published(self, message: Message, now_ns: int) -> None:
-        """Write into a message how long it took, when it is about to go out."""
-        if self._offset_ns is None or message.values is None:
+    def published(self, message: messages.Message, now_ns: int) -> None:
+        """Write latency and age into a message that is about to be published."""
+        super().published(message, now_ns)
+        if self._offset_ns is None or not message.answers:
             return
-        message.latency_ms = (now_ns + self._offset_ns - message.made_from_t_ns) / 1e6
         heard_ns = self._decoders[self.chain.master].heard_ns if self.chain.master in self._decoders else None
         message.age_ms = math.nan if heard_ns is None else (now_ns - heard_ns) / 1e6
 
@@ -231,16 +231,15 @@ class Engine:
                     self.chain.push(name, decoder.columns(batch, offset_ns))
 
     def _message(self, forecast: Forecast, now_ns: int) -> Message:
-        self._seq += 1
         values, levels, states = None, None, dict(NOTHING_KNOWN)
         if forecast.count is not None and forecast.now is not None:
-            wanted = [step - 1 for step in self.steps]
-            values = np.ascontiguousarray(forecast.count[wanted], dtype=np.float32)
+            published_rows = [step - 1 for step in self.steps]
+            values = np.ascontiguousarray(forecast.count[published_rows], dtype=np.float32)
             if forecast.quantiles is not None:
-                levels = np.ascontiguousarray(forecast.quantiles[wanted].transpose(2, 0, 1), dtype=np.float32)
+                levels = np.ascontiguousarray(forecast.quantiles[published_rows].transpose(2, 0, 1), dtype=np.float32)
             states = self.alarms.states(forecast.count, forecast.now, self.chain.layout)
         return Message(
-            self._seq,
+            self.next_seq(),
             forecast.t_ns,
             values,
             words(forecast),
@@ -260,7 +259,6 @@ class Engine:
         if now_ns - self._last_ns < PERIODS * self.period_ns + SLACK_NS:
             return []
         self._last_ns = now_ns
-        self._seq += 1
         limit_ns = PERIODS * self.period_ns + SLACK_NS
         silent = [
             name
@@ -269,27 +267,17 @@ class Engine:
         ]
         reasons = [self._why] if self._why else []
         reasons += [f"nothing comes from {', '.join(silent)}"] if silent else []
-        why = "; ".join(reasons) or "no row is complete"
-        message = Message(self._seq, now_ns + self._offset_ns, None, why, skipped=self.skipped, late=self.late)
+        cause = "; ".join(reasons) or "no row is complete"
+        message = Message(self.next_seq(), now_ns + self._offset_ns, None, cause, skipped=self.skipped, late=self.late)
         message.levels = self.quantiles
         return [message]
 
-    def _begin(self, offset_ns: int) -> None:
-        """Begin a recording: from here on `offset_ns` is added to the monotonic clock."""
-        self._offset_ns = offset_ns
-        self._begun = set()
-        self._decoders = self._new_decoders()
-        continues, self._continues = self._continues, None
-        self._restart(
-            "the recording begins" if continues is None else "the model's process was started anew", continues
-        )
-
-    def _restart(self, why: str, beginning: Beginning | None) -> None:
+    def _restart(self, cause: str, beginning: Beginning | None) -> None:
         self._late += sum(self.chain.late.values())
-        layouts = {name: self._first.get(name) or likely_schema(one) for name, one in self.sensors.items()}
-        self.chain = self._opened(layouts, beginning)
+        layouts = {name: self._first.get(name) or likely_schema(sensor) for name, sensor in self.sensors.items()}
+        self.chain = self._open_chain(layouts, beginning)
         self._point_ns = self._last_ns = None
-        self._why = why
+        self._why = cause
 
     def _look(self, stream: str) -> None:
         """Take note of the schema of what a stream gives, before a recording begins."""

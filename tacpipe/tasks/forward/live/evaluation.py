@@ -8,15 +8,17 @@ the published values again, bit for bit.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from tacpipe.arrays import AnyFloats, Int64s, Times
+from tacpipe.arrays import AnyFloats, Float32s, Int64s, Times
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.live.unstored import Recordings, continued, recorded
+from tacpipe.live.stages import RecordingsInMemory, run_stages, streams_as_recorded
 from tacpipe.metrics import headline
 from tacpipe.plugins.stage import Result
 from tacpipe.signals import anticipation
@@ -26,11 +28,10 @@ from tacpipe.tasks.forward import evaluation, tracks, units
 from tacpipe.tasks.forward import headline as headlines
 from tacpipe.tasks.forward.forecaster import Forecaster
 from tacpipe.tasks.forward.levels import Levels
-from tacpipe.tasks.forward.live import replay, truth, worth
+from tacpipe.tasks.forward.live import measures, replay
 from tacpipe.tasks.forward.live.alarms import NAMES, Alarms
 from tacpipe.tasks.forward.live.chain import Chain, Forecast
-from tacpipe.tasks.forward.live.published import Published, times
-from tacpipe.tasks.forward.live.worth import LIVE, LIVE_STILL, OFFLINE, STILL, Session, Sums, summed
+from tacpipe.tasks.forward.live.measures import LIVE, LIVE_STILL, OFFLINE, STILL, Session, Sums, summed
 from tacpipe.tasks.forward.predictors import forecasts
 from tacpipe.tasks.forward.tracks import Track
 
@@ -61,27 +62,27 @@ def evaluate(model: Model, recordings: Dataset) -> Result:
     sessions: dict[str, Session] = {}
     for name, recording in sorted(recordings.recordings.items()):
         try:
-            offline[name] = continued(recording, model)
+            offline[name] = run_stages(recording, model)
             sessions[name] = _session(forecaster, model, recording, offline[name], steps)
         except TacpipeError as error:
             raise type(error)(f"{name}: {error}") from error
-    given: Any = Recordings(offline, model.files)
-    result = evaluation.evaluate(model.files, given)
+    unstored: Any = RecordingsInMemory(offline, model.files)
+    result = evaluation.evaluate(model.files, unstored)
     tree = json.loads(result.files["metrics.json"])
     channels = len(forecaster.codec.channels)
     tree["live"] = {
         **summed(list(sessions.values()), steps, channels),
-        "recordings": {name: summed([one], steps, channels) for name, one in sessions.items()},
+        "recordings": {name: summed([session], steps, channels) for name, session in sessions.items()},
     }
-    found = headline.read(result.files[headline.FILE])
+    headlines_offline = headline.read(result.files[headline.FILE])
     added = _headline(forecaster, sessions, steps, channels)
     files = {
         **result.files,
         "metrics.json": (json.dumps(tree, indent=1, sort_keys=True) + "\n").encode(),
-        "live.csv": worth.table(tree["live"], steps),
-        headline.FILE: headline.write([*found, *added]),
+        "live.csv": measures.table(tree["live"], steps),
+        headline.FILE: headline.write([*headlines_offline, *added]),
     }
-    return dataclasses.replace(result, files=files, notes=[*result.notes, *worth.sentences(tree["live"])])
+    return dataclasses.replace(result, files=files, notes=[*result.notes, *measures.sentences(tree["live"])])
 
 
 def check(digest: str, recordings: Dataset) -> None:
@@ -107,18 +108,18 @@ def check(digest: str, recordings: Dataset) -> None:
 def _session(
     forecaster: Forecaster, model: Model, recording: Recording, offline: Any, steps: tuple[int, ...]
 ) -> Session:
-    tables = recorded(recording)
-    known = () if forecaster.uncertainty is None else forecaster.uncertainty.percents
-    session = Published.of(tables["forecast"], forecaster.codec.channels, known)
+    tables = streams_as_recorded(recording)
+    levels = () if forecaster.uncertainty is None else forecaster.uncertainty.percents
+    session = Published.of(tables["forecast"], forecaster.codec.channels, levels)
     chain = replay.chain_of(forecaster, model.source.chain, recording, tables, session.levels, allow_look_ahead=True)
-    every = list(replay.replayed(chain, tables))
-    made = [one for one in every if one.count is not None]
-    made_ns = np.array([one.t_ns for one in made], np.int64)
-    same, equal = truth.equality(session.t_ns, session.whole(), made_ns, session.alike(made))
+    forecasts = list(replay.replayed(chain, tables))
+    with_values = [forecast for forecast in forecasts if forecast.count is not None]
+    made_ns = np.array([forecast.t_ns for forecast in with_values], np.int64)
+    same, equal = measures.equality(session.t_ns, session.whole(), made_ns, session.alike(with_values))
     latency = tables["latency"]
     track = tracks.track(offline, forecaster.codec, forecaster.pose)
     predicted = _offline(forecaster, track)
-    rows, sums = _errors(forecaster, chain, every, session, track, predicted, steps)
+    rows, sums = _errors(forecaster, chain, forecasts, session, track, predicted, steps)
     late = latency.column("late").to_numpy()
     grew = times(latency)[np.flatnonzero(np.diff(late, prepend=0) > 0)]
     return Session(
@@ -135,17 +136,19 @@ def _session(
 
 def _offline(forecaster: Forecaster, track: Track) -> _Offline:
     starts = track.starts(forecaster.context, forecaster.horizon)
-    some = list(forecasts(forecaster, track, starts))
-    if not some:
-        nothing = np.zeros((0, forecaster.horizon, len(forecaster.codec.channels)))
-        return _Offline(np.zeros(0, np.int64), nothing)
-    return _Offline(np.concatenate([one.now for one in some]), np.concatenate([one.count for one in some]))
+    batches = list(forecasts(forecaster, track, starts))
+    if not batches:
+        empty = np.zeros((0, forecaster.horizon, len(forecaster.codec.channels)))
+        return _Offline(np.zeros(0, np.int64), empty)
+    return _Offline(
+        np.concatenate([batch.now for batch in batches]), np.concatenate([batch.count for batch in batches])
+    )
 
 
 def _errors(
     forecaster: Forecaster,
     chain: Chain,
-    every: Sequence[Forecast],
+    recomputed: Sequence[Forecast],
     session: Published,
     track: Track,
     predicted: _Offline,
@@ -157,31 +160,31 @@ def _errors(
         return 0, {}
     uniform = forecaster.config["timeline"] == "uniform"
     period_ns = 1e9 / float(forecaster.config["rate_hz"])
-    still = {one.t_ns: one.now for one in every if one.now is not None}
-    grid_ns = np.array(sorted(still), np.int64)
+    newest = {forecast.t_ns: forecast.now for forecast in recomputed if forecast.now is not None}
+    grid_ns = np.array(sorted(newest), np.int64)
     counts = track.tactile.stored if isinstance(track.tactile, Levels) else np.asarray(track.tactile)
-    wanted = truth.targets(grid_ns, row_ns, steps, period_ns if uniform else None)
-    flat = truth.at(track.t_ns, counts.astype(np.float64), track.groups, track.usable, wanted.ravel())
+    target_ns = measures.targets(grid_ns, row_ns, steps, period_ns if uniform else None)
+    flat = measures.at(track.t_ns, counts.astype(np.float64), track.groups, track.usable, target_ns.ravel())
     ahead = flat.reshape(len(row_ns), len(steps), -1)  # (row, step, channel)
     now_ns = track.t_ns[predicted.now]
     nearest = np.clip(np.searchsorted(now_ns, row_ns - round(period_ns / 2)), 0, len(now_ns) - 1)
-    kept = np.isfinite(ahead).all(axis=(1, 2)) & (np.abs(now_ns[nearest] - row_ns) <= period_ns / 2)
-    kept &= np.isin(row_ns, grid_ns)
-    if not kept.any():
+    usable = np.isfinite(ahead).all(axis=(1, 2)) & (np.abs(now_ns[nearest] - row_ns) <= period_ns / 2)
+    usable &= np.isin(row_ns, grid_ns)
+    if not usable.any():
         return 0, {}
-    rest = counts[0] - track.tactile[0]  # offline
-    own = [session.steps.index(step) for step in steps]
-    held = np.stack([still[at_ns] for at_ns in row_ns[kept].tolist()])[:, None] + chain.rest
-    windows = nearest[kept]
+    offline_rest = counts[0] - track.tactile[0]  # offline
+    step_places = [session.steps.index(step) for step in steps]
+    persistence = np.stack([newest[at_ns] for at_ns in row_ns[usable].tolist()])[:, None] + chain.rest
+    windows = nearest[usable]
     later = counts[predicted.now[windows][:, None] + np.array(steps)].astype(np.float64)
     now = counts[predicted.now[windows]].astype(np.float64)[:, None]
-    found = {
-        LIVE: truth.sums(values[kept][:, own] + chain.rest, ahead[kept]),
-        LIVE_STILL: truth.sums(held, ahead[kept]),
-        OFFLINE: truth.sums(predicted.ahead[windows][:, [step - 1 for step in steps]] + rest, later),
-        STILL: truth.sums(now, later),
+    errors = {
+        LIVE: measures.sums(values[usable][:, step_places] + chain.rest, ahead[usable]),
+        LIVE_STILL: measures.sums(persistence, ahead[usable]),
+        OFFLINE: measures.sums(predicted.ahead[windows][:, [step - 1 for step in steps]] + offline_rest, later),
+        STILL: measures.sums(now, later),
     }
-    return int(kept.sum()), found
+    return int(usable.sum()), errors
 
 
 def _after(differing_ns: Times, late_ns: Times, forecaster: Forecaster) -> int:
@@ -204,36 +207,36 @@ def _alarms(
     """Return what alarms were worth: by alarm, by event, live and offline."""
     stream = tables["alarm"]
     states = {name: stream.column(f"{name}_state").to_numpy().astype(np.int64) for name in NAMES}
-    if not any((one >= 0).any() for one in states.values()):
+    if not any((measured >= 0).any() for measured in states.values()):
         return {}
     series = {LIVE: (times(stream), states)}
     if LEVELS in recording.attributes and len(predicted.now):
         series[OFFLINE] = (track.t_ns[predicted.now], _offline_states(forecaster, recording, track, predicted))
     period_ns = round(1e9 / float(forecaster.config["rate_hz"]))
-    found: dict[str, dict[str, Leads]] = {}
+    alarms: dict[str, dict[str, Leads]] = {}
     for event, times_ns in _events(forecaster, track).items():
         for name in NAMES:
-            for who, (t_ns, each) in series.items():
-                one = leads(t_ns, each[name], times_ns, forecaster.horizon * period_ns, period_ns)
-                found.setdefault(f"{name} alarm, {event}", {})[who] = one
-    return found
+            for source, (t_ns, states_by_alarm) in series.items():
+                measured = leads(t_ns, states_by_alarm[name], times_ns, forecaster.horizon * period_ns, period_ns)
+                alarms.setdefault(f"{name} alarm, {event}", {})[source] = measured
+    return alarms
 
 
 def _events(forecaster: Forecaster, track: Track) -> dict[str, Times]:
     """Return when loads change, as `tacpipe evaluate` defines it, and when the object slips, if known (event, 2)."""
-    found: dict[str, Times] = {}
+    events_ns: dict[str, Times] = {}
     sd = forecaster.config.get("anticipation", {}).get("sd")
     if sd:
         values = loads(np.where(track.usable[:, None], track.tactile[:], np.nan), forecaster.codec.layout)
         rows = anticipation.changes(values, track.groups, horizon=forecaster.horizon, sd=np.array(sd))
-        begun = np.zeros(len(track.t_ns), bool)
-        for each in rows:
-            for first, stop in each:
-                begun[first:stop] = True
-        found["changes of load"] = events(track.t_ns, begun)
+        changing = np.zeros(len(track.t_ns), bool)
+        for runs in rows:
+            for first, stop in runs:
+                changing[first:stop] = True
+        events_ns["changes of load"] = events(track.t_ns, changing)
     if track.slips is not None:
-        found["slips"] = events(track.t_ns, track.slips)
-    return found
+        events_ns["slips"] = events(track.t_ns, track.slips)
+    return events_ns
 
 
 def _offline_states(
@@ -242,29 +245,80 @@ def _offline_states(
     """Return the states of alarms (window,) with the session's levels, of offline predictions."""
     alarms = Alarms.from_json(json.loads(str(recording.attributes[LEVELS])))
     layout = forecaster.codec.layout
-    found = {name: np.empty(len(predicted.now), np.int64) for name in NAMES}
+    states = {name: np.empty(len(predicted.now), np.int64) for name in NAMES}
     for place, (row, ahead) in enumerate(zip(predicted.now.tolist(), predicted.ahead, strict=True)):
-        for name, one in alarms.states(ahead, track.tactile[row], layout).items():
-            found[name][place] = one.state
-    return found
+        for name, state in alarms.states(ahead, track.tactile[row], layout).items():
+            states[name][place] = state.state
+    return states
 
 
 def _headline(
     forecaster: Forecaster, sessions: Mapping[str, Session], steps: tuple[int, ...], channels: int
 ) -> list[Any]:
     """Return how what was published compares with persistence of the same rows."""
-    held = {name: one for name, one in sessions.items() if one.rows}
-    if not held:
+    compared = {name: session for name, session in sessions.items() if session.rows}
+    if not compared:
         return []
 
     def sums(name: str) -> Any:
         return {
-            (0, recording): headlines.sums(one.sums[name], one.sums[LIVE_STILL], one.rows * channels)
-            for recording, one in held.items()
+            (0, recording): headlines.sums(session.sums[name], session.sums[LIVE_STILL], session.rows * channels)
+            for recording, session in compared.items()
         }
 
     method = f"{forecaster.config['architecture']} · {forecaster.config['codec']['name']} · published live"
-    others = {"persistence": sums(LIVE_STILL)}
+    baselines = {"persistence": sums(LIVE_STILL)}
     unit = units.of_model(forecaster.config)
-    found = headlines.headline(method, steps, sums(LIVE), others, None, unit=unit)
-    return [found] if found else []
+    line = headlines.headline(method, steps, sums(LIVE), baselines, None, unit=unit)
+    return [line] if line else []
+
+
+@dataclass(frozen=True)
+class Published:
+    """The forecasts of a session, and the quantiles that it published next to them."""
+
+    t_ns: Times  # (row,), of the grid points
+    steps: tuple[int, ...]
+    values: Float32s  # (row, step, channel)
+    levels: tuple[int, ...]  # of the quantiles, in percent; empty where it published none
+    quantiles: Float32s  # (row, level x step, channel)
+
+    @classmethod
+    def of(cls, forecast: Any, channels: Sequence[str], trained_levels: Sequence[int] = ()) -> Published:
+        """Return what a stream of forecasts (an arrow table) of some channels holds, and quantiles of ``known`` levels."""
+        ends = {name.rpartition("_t")[2] for name in forecast.column_names if name.rpartition("_t")[0] in channels}
+        steps = sorted({int(end.partition("_q")[0]) for end in ends})
+        levels = [level for level in trained_levels if any(end.endswith(f"_q{level}") for end in ends)]
+
+        def stacked(endings: Sequence[str]) -> Float32s:
+            values_at = np.empty((forecast.num_rows, len(endings), len(channels)), np.float32)
+            for place, ending in enumerate(endings):
+                for channel, name in enumerate(channels):
+                    values_at[:, place, channel] = forecast.column(f"{name}_{ending}").to_numpy()
+            return values_at
+
+        values = stacked([f"t{step}" for step in steps])
+        quantiles = stacked([f"t{step}_q{level}" for level, step in itertools.product(levels, steps)])
+        return cls(times(forecast), tuple(steps), values, tuple(levels), quantiles)
+
+    def whole(self) -> Float32s:
+        """Return values and quantiles (row, step + level x step, channel)."""
+        return np.concatenate([self.values, self.quantiles], axis=1)
+
+    def alike(self, forecasts: Sequence[Forecast]) -> Float32s:
+        """Return the same of other forecasts, which all have values and as many quantiles as were published."""
+        places = [step - 1 for step in self.steps]
+        rows: list[Float32s] = []
+        for forecast in forecasts:
+            assert forecast.count is not None
+            levels: list[Float32s] = []
+            if forecast.quantiles is not None:
+                levels = list(forecast.quantiles[places].transpose(2, 0, 1))
+            rows.append(np.concatenate([forecast.count[places], *levels]))
+        return np.stack(rows) if rows else self.whole()[:0]
+
+
+def times(stream: Any) -> Times:
+    """Return the times of the rows that a stream of a session is about (row,)."""
+    t_ns: Times = stream.column("t_device_ns").to_numpy()
+    return t_ns

@@ -56,9 +56,9 @@ def plan_table(arrived_ns: int, t_ns: Times, poses: AnyFloats) -> pa.Table:
         )
     if (np.diff(t_ns) <= 0).any() or not np.isfinite(poses).all():
         raise TacpipeError("The times of a plan must ascend, and all its numbers be finite.")
-    whole = np.full((len(poses), plan.NUMBERS), np.nan)
-    whole[:, : poses.shape[1]] = poses
-    arrays = [pa.array(np.full(len(t_ns), arrived_ns, np.int64)), pa.array(t_ns), *map(pa.array, whole.T)]
+    rows = np.full((len(poses), plan.NUMBERS), np.nan)
+    rows[:, : poses.shape[1]] = poses
+    arrays = [pa.array(np.full(len(t_ns), arrived_ns, np.int64)), pa.array(t_ns), *map(pa.array, rows.T)]
     return pa.Table.from_arrays(arrays, schema=plan_schema())
 
 
@@ -96,8 +96,8 @@ class Layout:
         }
         grid = pa.schema(
             [
-                methods.grid_field(stream, signals[stream].field(name), "hold").with_name(whole)
-                for whole, (stream, name) in origin.items()
+                methods.grid_field(stream, signals[stream].field(name), "hold").with_name(grid_column)
+                for grid_column, (stream, name) in origin.items()
             ]
         )
         _check(forecaster, signals, grid)
@@ -108,11 +108,11 @@ class Layout:
             if not names:
                 return None
             stream = origin[names[0]][0]
-            own = columns.setdefault(stream, [])
-            for whole in names:
-                if origin[whole][1] not in own:
-                    own.append(origin[whole][1])
-            return stream, np.array([own.index(origin[whole][1]) for whole in names], np.intp)
+            stream_columns = columns.setdefault(stream, [])
+            for grid_column in names:
+                if origin[grid_column][1] not in stream_columns:
+                    stream_columns.append(origin[grid_column][1])
+            return stream, np.array([stream_columns.index(origin[grid_column][1]) for grid_column in names], np.intp)
 
         by_stream: dict[str, list[int]] = {}
         for index, name in enumerate(forecaster.codec.channels):
@@ -131,9 +131,9 @@ class Layout:
         pose = forecaster.pose
         position, orientation = placed(pose.position), placed(pose.orientation)
         angles, speeds = tracks.joints(grid, pose)
-        known = len(angles) == len(speeds) == tracks.JOINTS
+        has_joints = len(angles) == len(speeds) == tracks.JOINTS
         opening = tracks.opening(grid)
-        joints = (placed(angles), placed(speeds)) if known else (None, None)
+        joints = (placed(angles), placed(speeds)) if has_joints else (None, None)
         finger = placed([opening] if opening else [])
         readings = {
             stream: _reading(signals[stream], names, synchronize, is_master=stream == leader)
@@ -159,36 +159,36 @@ class Layout:
 
         Raises `TacpipeError` where a column is absent.
         """
-        known = self._places.get(stream)
-        if known is None or known[0] is not batch.schema:
+        place = self._places.get(stream)
+        if place is None or place[0] is not batch.schema:
             names = batch.schema.names
             absent = [name for name in ("t_ns", *self.columns[stream]) if name not in names]
             if absent:
                 raise TacpipeError(f"Samples of stream {stream} have no column {absent[0]}, which the model reads.")
-            known = (batch.schema, tuple(names.index(name) for name in ("t_ns", *self.columns[stream])))
-            self._places[stream] = known
-        first, *others = known[1]
+            place = (batch.schema, tuple(names.index(name) for name in ("t_ns", *self.columns[stream])))
+            self._places[stream] = place
+        first, *value_columns = place[1]
         t_ns = _array(batch.column(first)).astype(np.int64, copy=False)
         if isinstance(batch, Columns):
-            return t_ns, batch.several(tuple(others))
-        values = np.empty((batch.num_rows, len(others)))
-        for index, number in enumerate(others):
+            return t_ns, batch.columns_of(tuple(value_columns))
+        values = np.empty((batch.num_rows, len(value_columns)))
+        for index, number in enumerate(value_columns):
             values[:, index] = _array(batch.column(number))
         return t_ns, values
 
     def tactile(self, values: Mapping[str, Floats]) -> Floats:
         """Return the tactile channels (channel,) of a row: ``values`` (column,) by stream."""
-        found = np.empty(sum(len(channels) for _, channels in self.tactile_of.values()))
+        row = np.empty(sum(len(channels) for _, channels in self.tactile_of.values()))
         for stream, (columns, channels) in self.tactile_of.items():
-            found[channels] = values[stream][columns]
-        return found
+            row[channels] = values[stream][columns]
+        return row
 
-    def levels(self, rest: Sequence[float]) -> dict[str, Floats]:
+    def levels(self, rest_levels: Sequence[float]) -> dict[str, Floats]:
         """Return levels of channels (channel,) as columns of the streams they are in, (column,), NaN where there is none."""
-        found = {name: np.full(reading.width, np.nan) for name, reading in self.readings.items()}
+        by_stream = {name: np.full(reading.width, np.nan) for name, reading in self.readings.items()}
         for stream, (columns, channels) in self.tactile_of.items():
-            found[stream][columns] = np.asarray(rest)[channels]
-        return found
+            by_stream[stream][columns] = np.asarray(rest_levels)[channels]
+        return by_stream
 
     def placed(self, values: Mapping[str, Floats]) -> tuple[Floats, Floats, Floats | None, Floats | None]:
         """Return position (3,) in m, quaternion (4,), and joint angles and speeds (7,) or None, of a row."""
@@ -213,13 +213,13 @@ class Layout:
 
     def rest(self, contacts: Any, rows: Sequence[Floats]) -> Floats:
         """Return each channel's level at rest (channel,) by the params of `segment contacts` from the rows of the rest."""
-        together = np.stack(rows)  # (row, channel)
-        found = np.empty(together.shape[1])
+        stacked = np.stack(rows)  # (row, channel)
+        levels = np.empty(stacked.shape[1])
         t_ns = np.zeros(len(rows), np.int64)  # all of them count
         for stream, (_, channels) in self.tactile_of.items():
-            values = together[:, channels].astype(self.kinds[stream])
-            found[channels] = tared(contacts.tare, values, rest_level(values, t_ns, 0.0), self.axes[stream])
-        return found
+            values = stacked[:, channels].astype(self.kinds[stream])
+            levels[channels] = tared(contacts.tare, values, rest_level(values, t_ns, 0.0), self.axes[stream])
+        return levels
 
 
 def _reading(schema: pa.Schema, names: list[str], synchronize: Any, *, is_master: bool) -> Reading:
@@ -228,9 +228,9 @@ def _reading(schema: pa.Schema, names: list[str], synchronize: Any, *, is_master
 
     compared: list[int] = []
     if is_master and synchronize.grid == "fresh":
-        every = [name for name in methods.channel_names(schema) if methods.method(schema, name) != "nearest"]
-        names += [name for name in every if name not in names]
-        compared = [names.index(name) for name in every]
+        compared_names = [name for name in methods.channel_names(schema) if methods.method(schema, name) != "nearest"]
+        names += [name for name in compared_names if name not in names]
+        compared = [names.index(name) for name in compared_names]
     wraps = [
         index
         for index, name in enumerate(names)
@@ -248,26 +248,29 @@ def _check(forecaster: Forecaster, signals: Mapping[str, pa.Schema], grid: pa.Sc
     codec, pose = forecaster.codec, forecaster.pose
     for name in (*codec.channels, *pose.columns):
         if name not in grid.names:
-            stream = next((one for one in signals if name.startswith(f"{one}_")), None)
-            where = f"its stream {stream} has no such channel" if stream else f"it records {listed(signals)}"
-            raise TacpipeError(f"The model reads {name}, and this rig does not record it: {where}.")
+            stream = next((stream_name for stream_name in signals if name.startswith(f"{stream_name}_")), None)
+            reason = f"its stream {stream} has no such channel" if stream else f"it records {listed(signals)}"
+            raise TacpipeError(f"The model reads {name}, and this rig does not record it: {reason}.")
     owners = {tactile.metadata(grid.field(name)).get("stream", "") for name in codec.channels}
-    found = [
+    tactile_columns = [
         name
         for name in tactile.columns(grid, "tactile")
         if tactile.metadata(grid.field(name)).get("stream", "") in owners
     ]
-    if sorted(found) != sorted(codec.channels):
-        extra = next((name for name in found if name not in codec.channels), None)
+    if sorted(tactile_columns) != sorted(codec.channels):
+        extra = next((name for name in tactile_columns if name not in codec.channels), None)
         differs = f"{extra} is one that it was not trained on" if extra else "some are not declared tactile"
         raise TacpipeError(
-            f"The tactile channels of this rig are {len(found)} and those of the model {len(codec.channels)}: {differs}. "
+            f"The tactile channels of this rig are {len(tactile_columns)} and those of the model {len(codec.channels)}: "
+            f"{differs}. "
             f"Take the rig that the model was trained on, or train one on recordings of this rig."
         )
-    for name, wanted, has in zip(codec.channels, codec.layout, tactile.layout(grid, codec.channels), strict=True):
-        if dict(wanted) != has:
+    for name, trained_place, has in zip(
+        codec.channels, codec.layout, tactile.layout(grid, codec.channels), strict=True
+    ):
+        if dict(trained_place) != has:
             raise TacpipeError(
-                f"Channel {name} of this rig is at {has}, and of the model's recordings at {dict(wanted)}."
+                f"Channel {name} of this rig is at {has}, and of the model's recordings at {dict(trained_place)}."
             )
     unit = units.of_channels(grid, codec.channels)
     trained = str(forecaster.config["inputs"].get("unit", units.COUNT))

@@ -1,4 +1,4 @@
-"""What is published at each grid point: a forecast with its alarms."""
+"""Declare the messages of a session with a model of forward: a forecast with its alarms at each grid point."""
 
 from __future__ import annotations
 
@@ -9,17 +9,96 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from tacpipe.arrays import Float32s
-from tacpipe.live.messages import VERSION, known, properties
+from tacpipe.arrays import AnyFloats, Float32s
+from tacpipe.live import messages
+from tacpipe.live.messages import ABSENT, VERSION, Sizes, head_values, rounded
+from tacpipe.sensors.live import LSL, Column, Declaration, MessageSizes, Value, latency_values
 from tacpipe.tasks.forward.live.alarms import NAMES, NOTHING_KNOWN, State
+
+FORECAST, ALARM = "forecast", "alarm"  # recorded streams
+MATRIX = {"type": "array", "items": {"type": "array", "items": {"type": "number"}}}  # (step, channel)
+QUANTILES: frozenset[str] = frozenset({"quantiles"})
+
+
+def _value_columns(sizes: MessageSizes) -> list[Column]:
+    return [
+        Column(f"{channel}_t{step}", sizes.unit, {"step": str(step)})
+        for step in sizes.steps
+        for channel in sizes.channels
+    ]
+
+
+def _quantile_columns(sizes: MessageSizes) -> list[Column]:
+    return [
+        Column(f"{name}_q{level}", unit, {**metadata, "quantile": f"{level / 100:g}"})
+        for level in sizes.quantiles
+        for name, unit, metadata in _value_columns(sizes)
+    ]
+
+
+def _alarm_columns(suffix: str, sizes: MessageSizes) -> list[Column]:
+    return [Column(f"{alarm}_{suffix}") for alarm in sizes.alarms]
+
+
+DECLARATION = Declaration(
+    FORECAST,
+    (
+        *head_values(),
+        Value(
+            "values",
+            "forecast above the level at rest, by step and channel; null: none",
+            "array",
+            streams=(FORECAST, LSL),
+            unit="of the channels",
+            quantity="prediction",
+            columns=_value_columns,
+            schema=lambda sizes: MATRIX,
+        ),
+        Value(
+            "quantiles",
+            "quantiles of the forecast by level in percent, as `values`; only in sessions that publish some",
+            "object",
+            unit="of the channels",
+            schema=lambda sizes: {"type": "object", "properties": {str(level): MATRIX for level in sizes.quantiles}},
+            attribute="quantiles_by_level",
+        ),
+        Value(
+            "quantile_columns",
+            "the same, recorded",
+            streams=(FORECAST, LSL),
+            unit="of the channels",
+            quantity="prediction",
+            columns=_quantile_columns,
+        ),
+        Value("cause", "reason why there is no forecast, or what it was made without", "string"),
+        Value("alarms", "`state` (on, off or unknown) and `score` of each alarm", "object", attribute="alarms_by_name"),
+        Value(
+            "alarm_states",
+            "1 on, 0 off, -1 unknown",
+            streams=(ALARM, LSL),
+            type="i1",
+            quantity="alarm",
+            columns=lambda sizes: _alarm_columns("state", sizes),
+        ),
+        Value(
+            "alarm_scores",
+            "score of each alarm in multiples of its level; above 1 it is on",
+            streams=(ALARM,),
+            quantity="alarm",
+            columns=lambda sizes: _alarm_columns("score", sizes),
+        ),
+        *latency_values("latency_ms", "age_ms", "skipped"),
+    ),
+    {FORECAST: 0, ALARM: 1},
+)
 
 
 @dataclass
-class Message:
+class Message(messages.Message):
     """A forecast with its alarms, or why there is none."""
 
     seq: int
-    t_ns: int  # of the grid point, UTC as the recording has it
+    t_ns: int  # time of the grid point, UTC as the recording has it
     values: Float32s | None  # (step, channel), in the channels' unit above rest; None: no forecast
     cause: str = ""  # in words: why there is no forecast, or what it was made without
     flags: int = 0  # the same as `tacpipe.tasks.forward.live.chain.Cause`
@@ -30,30 +109,14 @@ class Message:
     compute_ms: float = math.nan
     skipped: int = 0
     late: int = 0
-    levels: tuple[int, ...] = ()  # of quantiles, in percent, that the session publishes
+    levels: tuple[int, ...] = ()  # levels of quantiles that the session publishes, percent
     quantiles: Float32s | None = None  # (level, step, channel), of a forecast in a session that publishes some
+    declaration: ClassVar[Declaration] = DECLARATION
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the message as JSON and msgpack hold it; what is not known is null."""
-        return {
-            "version": VERSION,
-            "kind": "forecast",
-            "seq": self.seq,
-            "t_ns": self.t_ns,
-            "values": None if self.values is None else self.values.tolist(),
-            **({"quantiles": self._quantiles()} if self.levels else {}),
-            "cause": self.cause,
-            "alarms": {name: {"state": one.word, "score": known(one.score)} for name, one in self.alarms.items()},
-            "latency_ms": known(self.latency_ms),
-            "age_ms": known(self.age_ms),
-            "skipped": self.skipped,
-        }
-
-    def _quantiles(self) -> dict[str, Any] | None:
-        """Return the quantiles by level, None without a forecast."""
-        if self.quantiles is None:
-            return None
-        return {str(level): one.tolist() for level, one in zip(self.levels, self.quantiles, strict=True)}
+    @property
+    def absent(self) -> frozenset[str]:
+        """The quantiles in a session that publishes none."""
+        return ABSENT if self.levels else QUANTILES
 
     @property
     def answers(self) -> bool:
@@ -63,31 +126,41 @@ class Message:
     @property
     def states(self) -> Mapping[str, str]:
         """The state of each alarm."""
-        return {name: one.word for name, one in self.alarms.items()}
+        return {name: alarm.word for name, alarm in self.alarms.items()}
 
-    def columns(self) -> Float32s:
-        """Return values and quantiles (level x step x channel,), empty without a forecast, and the state of each alarm."""
-        values = [one.ravel() for one in (self.values, self.quantiles) if one is not None]
-        return np.concatenate([*values, [self.alarms[name].state for name in NAMES]]).astype(np.float32)
+    @property
+    def quantiles_by_level(self) -> dict[str, Any] | None:
+        """The quantiles (step, channel) by level, None without a forecast."""
+        if self.quantiles is None:
+            return None
+        return {str(level): rows.tolist() for level, rows in zip(self.levels, self.quantiles, strict=True)}
 
-    def outputs(self, output: str) -> tuple[Any, ...] | None:
-        """Return the numbers of the session's stream ``forecast``, ``alarm`` or ``latency``."""
-        if output == "forecast":
-            values = (self.values, *([self.quantiles] if self.levels else []))
-            return None if self.values is None else tuple(one.reshape(1, -1) for one in values if one is not None)
-        if output == "alarm":
-            states = list(self.alarms.values())
-            return (
-                np.array([[one.state for one in states]], dtype=np.int8),
-                np.array([[one.score for one in states]], dtype=np.float32),
-            )
-        numbers = (self.latency_ms, self.age_ms, self.compute_ms, self.flags, self.skipped, self.late)
-        return (np.array([numbers], dtype=np.float32),)
+    @property
+    def quantile_columns(self) -> Float32s | None:
+        """The quantiles (level x step x channel,), None without a forecast."""
+        if self.quantiles is None:
+            return None if self.levels else np.empty(0, np.float32)
+        return self.quantiles.ravel()
+
+    @property
+    def alarms_by_name(self) -> dict[str, dict[str, str | float | None]]:
+        """State and score of each alarm as JSON has them."""
+        return {name: {"state": alarm.word, "score": rounded(alarm.score)} for name, alarm in self.alarms.items()}
+
+    @property
+    def alarm_states(self) -> list[int]:
+        """The state of each alarm, a number."""
+        return [self.alarms[name].state for name in NAMES]
+
+    @property
+    def alarm_scores(self) -> AnyFloats:
+        """The score of each alarm."""
+        return np.array([self.alarms[name].score for name in NAMES], np.float32)
 
 
 @dataclass(frozen=True)
-class Description:
-    """What the values of messages are: sent once to each subscriber, before the first message."""
+class Description(messages.Description):
+    """What the values of forecasts are."""
 
     channels: tuple[str, ...]
     steps: tuple[int, ...]
@@ -95,29 +168,18 @@ class Description:
     rate_hz: float
     model: str
     quantiles: tuple[int, ...] = ()  # levels in percent
-    kind: ClassVar[str] = "forecast"
+    declaration: ClassVar[Declaration] = DECLARATION
+    answers: ClassVar[str] = "forecasts"
 
-    def columns(self) -> list[tuple[str, str]]:
-        """Return each channel at each step with its unit, the same of each quantile, and the state of each alarm."""
-        endings = ["", *(f"_q{level}" for level in self.quantiles)]
-        names = [
-            (f"{channel}_t{step}{ending}", self.unit)
-            for ending in endings
-            for step in self.steps
-            for channel in self.channels
-        ]
-        return names + [(f"{alarm}_state", "1") for alarm in NAMES]
+    @property
+    def sizes(self) -> Sizes:
+        """Channels, steps, quantiles and alarms."""
+        return Sizes(self.channels, self.steps, self.quantiles, self.unit, NAMES)
 
-    def schema(self) -> dict[str, Any]:
-        """Return the properties of a message, as JSON schema has them."""
-        values = {"type": "array", "items": {"type": "array", "items": {"type": "number"}}}
-        levels = {"type": "object", "properties": {str(level): values for level in self.quantiles}}
-        return {
-            **properties("version", "seq", "t_ns", "skipped", kind="string", cause="string"),
-            "values": values,
-            **({"quantiles": levels} if self.quantiles else {}),
-            **properties(alarms="object", latency_ms="number", age_ms="number"),
-        }
+    @property
+    def absent(self) -> frozenset[str]:
+        """The quantiles in a session that publishes none."""
+        return ABSENT if self.quantiles else QUANTILES
 
     def to_dict(self) -> dict[str, Any]:
         """Return the description as JSON and msgpack hold it."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from tacpipe.errors import TacpipeError
 from tacpipe.io import progress
-from tacpipe.live.unstored import recorded
+from tacpipe.live.stages import streams_as_recorded
 from tacpipe.plugins.stage import RecordingOutput, Result
 from tacpipe.sensors.plan import NAME as PLAN
 from tacpipe.tasks.forward.forecaster import Forecaster
@@ -41,27 +41,27 @@ def predict(
     forecaster = Forecaster.load(model.files)
     if quantiles:
         forecaster.quantiles_of(quantiles)
-    found: dict[str, RecordingOutput] = {}
-    without, unplanned, every = [], 0, 0
+    outputs: dict[str, RecordingOutput] = {}
+    without, unplanned, row_count = [], 0, 0
     with progress.bar("predict", len(recordings.recordings)) as advance:
         for name, recording in sorted(recordings.recordings.items()):
             try:
-                found[name], causes = _predicted(
+                outputs[name], causes = _predicted(
                     forecaster, model, recording, steps, quantiles, allow_look_ahead=allow_look_ahead
                 )
             except TacpipeError as error:
                 raise type(error)(f"{name}: {error}") from error
-            if not found[name].streams[""].num_rows:
+            if not outputs[name].streams[""].num_rows:
                 without.append(f"{name}: no forecast could be made at any grid point ({_described(causes)}).")
             unplanned += causes[Cause.NO_PLAN]
-            every += found[name].streams[""].num_rows
+            row_count += outputs[name].streams[""].num_rows
             advance(note=name)
     if unplanned:
         without.append(
-            f"{unplanned} of {every} forecasts are without a plan (there is no stream {PLAN!r} in the recording by then): "
-            f"the hand was assumed to move on as it did."
+            f"{unplanned} of {row_count} forecasts are without a plan (there is no stream {PLAN!r} in the recording by "
+            f"then): the hand was assumed to move on as it did."
         )
-    return Result(found, notes=without)
+    return Result(outputs, notes=without)
 
 
 def _predicted(
@@ -74,19 +74,19 @@ def _predicted(
     allow_look_ahead: bool,
 ) -> tuple[RecordingOutput, Counter[Cause]]:
     """Return the predictions of a recording, and how many grid points each cause had."""
-    tables = recorded(recording)
+    tables = streams_as_recorded(recording)
     chain = chain_of(forecaster, model.source.chain, recording, tables, quantiles, allow_look_ahead=allow_look_ahead)
     check_steps(steps, chain.horizon)
     t_ns, counts, bands, causes = [], [], [], Counter[Cause]()
-    wanted = [step - 1 for step in steps]
-    for one in replayed(chain, tables):
-        causes.update(one.cause)
-        if one.count is not None:
-            t_ns.append(one.t_ns)
-            counts.append(one.count[wanted])
-        if one.quantiles is not None:
-            bands.append(one.quantiles[wanted])
-    shape = len(wanted), len(chain.channels)
+    places = [step - 1 for step in steps]
+    for forecast in replayed(chain, tables):
+        causes.update(forecast.cause)
+        if forecast.count is not None:
+            t_ns.append(forecast.t_ns)
+            counts.append(forecast.count[places])
+        if forecast.quantiles is not None:
+            bands.append(forecast.quantiles[places])
+    shape = len(places), len(chain.channels)
     stacked = np.stack(counts) if counts else np.zeros((0, *shape), np.float32)
     levels = np.stack(bands) if bands else np.zeros((0, *shape, len(quantiles)), np.float32)
     table = prediction_table(
@@ -97,7 +97,8 @@ def _predicted(
         dict(zip(quantiles, levels.transpose(3, 1, 2, 0).copy(), strict=True)),
     )
     described = {
-        f"forecast_{_name(cause)}": count for cause, count in sorted(causes.items(), key=lambda one: one[0].value)
+        f"forecast_{_name(cause)}": count
+        for cause, count in sorted(causes.items(), key=lambda forecast: forecast[0].value)
     }
     return RecordingOutput(table, {"causal": True, **described}), causes
 
@@ -131,7 +132,7 @@ def replayed(chain: Chain, tables: Mapping[str, pa.Table]) -> Iterator[Forecast]
     }
     if not stamps:
         return
-    begins, last = (int(pick(some[end] for some in stamps.values())) for pick, end in ((min, 0), (max, -1)))
+    begins, last = (int(pick(stream_ns[end] for stream_ns in stamps.values())) for pick, end in ((min, 0), (max, -1)))
     rows = dict.fromkeys(stamps, 0)
     for until_ns in (*range(begins, last, PIECE_NS), last):
         for name, t_ns in stamps.items():
@@ -143,8 +144,8 @@ def replayed(chain: Chain, tables: Mapping[str, pa.Table]) -> Iterator[Forecast]
 
 def _described(causes: Mapping[Cause, int]) -> str:
     """Return the causes why there is no forecast, and how often each was."""
-    named = [f"{count} {_name(cause)}" for cause, count in causes.items() if cause & BLOCKING]
-    return ", ".join(named) or "there is none"
+    counted = [f"{count} {_name(cause)}" for cause, count in causes.items() if cause & BLOCKING]
+    return ", ".join(counted) or "there is none"
 
 
 def _name(cause: Cause) -> str:

@@ -29,7 +29,7 @@ def causal_stages(steps: Sequence[Mapping[str, Any]]) -> CausalStages:
 
     Raises `UsageError` where a stage has another version now, `TacpipeError` where one has no causal rule or is absent.
     """
-    found: dict[str, Any] = {}
+    params_by_stage: dict[str, Any] = {}
     for step in steps:
         name = step["stage"]
         if name not in (SYNCHRONIZE, CONTACTS) and not name.startswith(COMPRESS):
@@ -37,19 +37,19 @@ def causal_stages(steps: Sequence[Mapping[str, Any]]) -> CausalStages:
                 f"The model was trained behind `tacpipe {name.replace('.', ' ')}`, which has no rule for samples as they "
                 f"arrive. Train one behind synchronize, segment contacts and, if you like, compress."
             )
-        found[name] = stage_params(step)
-    missing = [name for name in (SYNCHRONIZE, CONTACTS) if name not in found]
+        params_by_stage[name] = stage_params(step)
+    missing = [name for name in (SYNCHRONIZE, CONTACTS) if name not in params_by_stage]
     if missing:
         raise TacpipeError(
             f"The model was not trained behind `tacpipe {missing[0].replace('.', ' ')}`, so it is unknown how samples "
             f"become its rows. Train it on recordings that went through that stage."
         )
-    if found[CONTACTS].rest != "start":
+    if params_by_stage[CONTACTS].rest != "start":
         raise TacpipeError(
-            f"The model was trained with `segment contacts --rest {found[CONTACTS].rest}`, which looks for the rest in "
-            f"the whole recording; samples as they arrive have the rest at their start. Train it with --rest start."
+            f"The model was trained with `segment contacts --rest {params_by_stage[CONTACTS].rest}`, which looks for the "
+            f"rest in the whole recording; samples as they arrive have the rest at their start. Train it with --rest start."
         )
-    return CausalStages(found[SYNCHRONIZE], found[CONTACTS])
+    return CausalStages(params_by_stage[SYNCHRONIZE], params_by_stage[CONTACTS])
 
 
 def refuse_look_ahead(config: Mapping[str, Any], steps: Sequence[Mapping[str, Any]]) -> None:

@@ -12,20 +12,19 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from tacpipe.live import wire
 from tacpipe.live.decoding import Decoder, likely_schema
+from tacpipe.live.engine import SETTLE_NS, Engine
+from tacpipe.live.messages import Message
 from tacpipe.recording.spool_blocks import Note
 from tacpipe.recording.station import BEGAN, OVER
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Sensor
 from tacpipe.tasks.material.live.messages import ENDED, FINAL, SLIDING, WAITING, MaterialDescription, MaterialMessage
-from tacpipe.tasks.material.live.parts import Parting, after, up_to
-from tacpipe.tasks.material.live.slide import Answer, SlideSoFar
+from tacpipe.tasks.material.live.slide import Answer, Parting, SlideSoFar, after, up_to
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-SETTLE_NS = 2_000_000  # after a moment, in which the samples that belong to it are awaited from the other threads
 GAP_NS = 50_000_000  # age of the newest sample of the finger, from which on its stream is silent
 LONGEST_NS = 120_000_000_000  # of a recording, whose rows are kept until it ends
 IDLE_NS = 20_000_000
@@ -42,7 +41,7 @@ class Begun:
         return {}
 
 
-class MaterialEngine:
+class MaterialEngine(Engine):
     """One live session of a model of materials."""
 
     def __init__(
@@ -57,15 +56,14 @@ class MaterialEngine:
         pause_ns: int = 0,
     ) -> None:
         """Take what is read. A pause of 0: a recording is one slide."""
-        self.sensors = dict(sensors)
+        super().__init__(sensors, settle_ns)
         self._parting = Parting(slide, finger, pause_ns) if pause_ns else None
         self._number = 1  # of the slide in its recording
-        self.settle_ns, self.every_ns = settle_ns, every_ns
-        self.skipped = self.overflows = self.late = self._seq = 0
+        self.every_ns = every_ns
+        self._late = 0
         self._finger, self._slide, self._description = finger, slide, description
         self._lacks = ""  # why this recording gives no answer any more
         self._continues = False
-        self.offset_ns: int | None = None  # that is added to the monotonic clock; None: no recording runs
         self._decoders: dict[str, Decoder] = {}
         self._tables: dict[str, pa.Table] = {}
         self._over: set[str] = set()  # streams of which nothing more is of the recording
@@ -73,40 +71,64 @@ class MaterialEngine:
         self._read_ns = 0  # up to which samples were read
 
     @property
-    def running(self) -> bool:
-        """Whether a recording has begun, and is not over."""
-        return self.offset_ns is not None
+    def late(self) -> int:
+        """Samples so far that came after the answer that they belong to."""
+        return self._late
 
     @property
     def beginning(self) -> Begun | None:
         """That a recording has begun."""
         return Begun() if self.running else None
 
-    def about(self, model: str) -> MaterialDescription:
+    def describe(self, model: str) -> MaterialDescription:
         """Return what its messages are."""
         return self._description
 
     def ready(self) -> dict[str, Any]:
         """Return the materials; there are no alarms."""
-        return {"materials": list(self._description.names), "alarms": {}}
+        return {"materials": list(self._description.channels), "alarms": {}}
 
-    def take(self, stream: str, block: Chunks | Note) -> None:
-        """Take a block of a stream, or a note on all (``stream`` is empty)."""
-        if not stream:
-            assert isinstance(block, Note)
-            if block.what == wire.CONTINUE:
-                self._continues = True
-            elif block.what == wire.BEGIN:
-                self._lacks, self._continues = RESTARTED if self._continues else "", False
-                self._begin(int(block.detail))
-            elif block.what == wire.OVERFLOW:
-                self.overflows += 1
-                self._lacks = THROWN
-        elif isinstance(block, Note) and block.what == BEGAN:
-            self._decoders[stream] = Decoder(self.sensors[stream])
-        elif isinstance(block, Note) and block.what == OVER:
-            self._over.add(stream)
-        elif stream in self._decoders and stream not in self._over:
+    def continue_recording(self, beginning: str) -> None:
+        """Take note that the next recording lacks its first samples."""
+        self._continues = True
+
+    def begin_recording(self, offset_ns: int) -> None:
+        """Begin a recording."""
+        self._lacks, self._continues = RESTARTED if self._continues else "", False
+        self._due_ns, self._read_ns = None, 0
+        self._decoders, self._tables, self._over = {}, {}, set()
+        self._number = 1
+        if self._parting is not None:
+            self._parting.begin()
+
+    def end_recording(self) -> None:
+        """Wait for the ends of its streams: a recording is over with the last of them."""
+
+    def overflow(self) -> None:
+        """Give no further answer in this recording, which lacks blocks."""
+        super().overflow()
+        self._lacks = THROWN
+
+    def begin_stream(self, stream: str) -> None:
+        """Decode a stream from the start of the recording on."""
+        self._decoders[stream] = Decoder(self.sensors[stream])
+
+    def end_stream(self, stream: str) -> None:
+        """Take note that nothing more of a stream belongs to the recording."""
+        self._over.add(stream)
+
+    def take_note(self, stream: str, note: Note) -> None:
+        """Take a note on a stream; bytes that were lost go to its decoder."""
+        super().take_note(stream, note)
+        if note.what not in (BEGAN, OVER):
+            self._keep(stream, note)
+
+    def take_chunks(self, stream: str, chunks: Chunks) -> None:
+        """Keep bytes of a stream that is not over."""
+        self._keep(stream, chunks)
+
+    def _keep(self, stream: str, block: Chunks | Note) -> None:
+        if stream in self._decoders and stream not in self._over:
             self._decoders[stream].take(block)
 
     def due_ns(self, now_ns: int) -> int:
@@ -115,7 +137,7 @@ class MaterialEngine:
 
     def step(self, now_ns: int) -> list[MaterialMessage]:
         """Return the answer that is due, behind the final ones of slides that are over."""
-        if self.offset_ns is None:
+        if self._offset_ns is None:
             return []
         if self._over:
             return self.finish() if self._over >= set(self.sensors) else []
@@ -124,27 +146,20 @@ class MaterialEngine:
         if self._due_ns is not None:
             self.skipped += (now_ns - self._due_ns) // self.every_ns
         self._due_ns = now_ns + self.every_ns
-        return self._answered(now_ns + self.offset_ns - self.settle_ns, final=False)
+        return self._answered(now_ns + self._offset_ns - self.settle_ns, final=False)
 
     def finish(self) -> list[MaterialMessage]:
         """Return the final answers that are left of the recording, which is over."""
-        if self.offset_ns is None:
+        if self._offset_ns is None:
             return []
-        found = self._answered(0, final=True)
-        self.offset_ns = None
-        return found
+        messages = self._answered(0, final=True)
+        self._offset_ns = None
+        return messages
 
-    def published(self, message: MaterialMessage, now_ns: int) -> None:
-        """Write into a message how long it took, when it is about to go out."""
-        if self.offset_ns is not None and message.made_from_t_ns:
-            message.latency_ms = (now_ns + self.offset_ns - message.made_from_t_ns) / 1e6
-
-    def _begin(self, offset_ns: int) -> None:
-        self.offset_ns, self._due_ns, self._read_ns = offset_ns, None, 0
-        self._decoders, self._tables, self._over = {}, {}, set()
-        self._number = 1
-        if self._parting is not None:
-            self._parting.begin()
+    def published(self, message: Message, now_ns: int) -> None:
+        """Write the latency into a message that is about to be published, also into one without an answer."""
+        if self._offset_ns is not None and message.made_from_t_ns:
+            message.latency_ms = (now_ns + self._offset_ns - message.made_from_t_ns) / 1e6
 
     def _answered(self, until_ns: int, *, final: bool) -> list[MaterialMessage]:
         """Return the answers from all samples up to a moment; the final one of a recording is from all there are."""
@@ -153,24 +168,24 @@ class MaterialEngine:
         if final:
             last = (table.column("t_ns")[-1].as_py() for table in self._tables.values())
             until_ns = int(max(last, default=self._read_ns))
-        found = self._final_ones(until_ns)
-        if not found or self._finger in self._tables:  # else nothing has come of the next slide
-            found.append(self._message(until_ns, final=final))
-        found[-1].compute_ms = (time.perf_counter() - began_s) * 1e3
-        return found
+        messages = self._final_ones(until_ns)
+        if not messages or self._finger in self._tables:  # else nothing has come of the next slide
+            messages.append(self._message(until_ns, final=final))
+        messages[-1].compute_ms = (time.perf_counter() - began_s) * 1e3
+        return messages
 
     def _final_ones(self, until_ns: int) -> list[MaterialMessage]:
         """Return the final answers of the slides that are over by a moment, and forget what belongs to them."""
-        found: list[MaterialMessage] = []
+        messages: list[MaterialMessage] = []
         while self._parting is not None and not self._lacks:
             end_ns = self._parting.end_ns(self._tables, until_ns)
             if end_ns is None:
                 break
-            found.append(self._message(end_ns, final=True))
+            messages.append(self._message(end_ns, final=True))
             self._tables = after(self._tables, end_ns)
             self._number += 1
             self._parting.begin()
-        return found
+        return messages
 
     def _message(self, until_ns: int, *, final: bool) -> MaterialMessage:
         """Return the answer of the slide from its samples up to a moment."""
@@ -178,11 +193,10 @@ class MaterialEngine:
         newest_ns = {name: int(table.column("t_ns")[-1].as_py()) for name, table in streams.items()}
         answer = self._answer(streams, 0 if final else until_ns - newest_ns.get(self._finger, until_ns))
         self._read_ns = max(self._read_ns, until_ns)
-        self._seq += 1
         return MaterialMessage(
-            self._seq,
+            self.next_seq(),
             until_ns,
-            self._description.names,
+            self._description.channels,
             answer.probabilities,
             FINAL if final else ENDED if answer.ended else SLIDING if answer.rows else WAITING,
             answer.rows,
@@ -190,7 +204,7 @@ class MaterialEngine:
             answer.cause,
             max(newest_ns.values(), default=0),
             skipped=self.skipped,
-            late=self.late,
+            late=self._late,
             slide=self._number,
         )
 
@@ -211,22 +225,22 @@ class MaterialEngine:
         """Put what came behind what is kept, unless nothing can be answered from it."""
         import pyarrow as pa
 
-        assert self.offset_ns is not None
+        assert self._offset_ns is not None
         for name, decoder in self._decoders.items():
             batches = decoder.last() if final else decoder.batches()
-            made = [decoder.columns(batch, self.offset_ns).table() for batch in batches]
-            if not made or self._lacks:
+            new_tables = [decoder.columns(batch, self._offset_ns).table() for batch in batches]
+            if not new_tables or self._lacks:
                 continue
-            self.late += sum(int((table.column("t_ns").to_numpy() <= self._read_ns).sum()) for table in made)
+            self._late += sum(int((table.column("t_ns").to_numpy() <= self._read_ns).sum()) for table in new_tables)
             before = [self._tables[name]] if name in self._tables else []
-            self._tables[name] = pa.concat_tables([*before, *made]).combine_chunks()
+            self._tables[name] = pa.concat_tables([*before, *new_tables]).combine_chunks()
 
 
-def finger_of(sensors: Mapping[str, Sensor]) -> str:
+def find_finger(sensors: Mapping[str, Sensor]) -> str:
     """Return the stream with tactile channels. Raises `TacpipeError` where there is none, or more than one."""
     from tacpipe.channels.finger import finger
 
     schemas = {name: likely_schema(sensor) for name, sensor in sensors.items()}
     tables: Mapping[str, Any] = {name: schema.empty_table() for name, schema in schemas.items()}
-    found = finger("of this rig", tables)
-    return next(name for name, table in tables.items() if table is found)
+    finger_table = finger("of this rig", tables)
+    return next(name for name, table in tables.items() if table is finger_table)

@@ -10,13 +10,13 @@ import numpy as np
 from tacpipe.channels.finger import finger
 from tacpipe.channels.streams import EVENTS
 from tacpipe.errors import TacpipeError
-from tacpipe.live.options import OWN, Options
-from tacpipe.live.unstored import recorded
+from tacpipe.live.stages import streams_as_recorded
 from tacpipe.plugins.stage import RecordingOutput, Result
+from tacpipe.sensors.live import LATENCY
 from tacpipe.tasks.material.classifier import Classifier
 from tacpipe.tasks.material.evaluation import PREDICTIONS
-from tacpipe.tasks.material.live.parts import parts
-from tacpipe.tasks.material.live.slide import Answer, SlideSoFar, slide_params
+from tacpipe.tasks.material.live.messages import LEAST_SEEN, MATERIAL
+from tacpipe.tasks.material.live.slide import Answer, SlideSoFar, parts, slide_params
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset, Model, Recording
 
 PAUSE, LEAST = "live_pause_s", "live_least"  # attributes of a session's recording: what it was asked for
-BESIDE = (*OWN, EVENTS, "truth")  # streams that no session reads
+UNREAD = (MATERIAL, LATENCY, EVENTS, "truth")  # streams that no session reads
 Row = tuple[str, int, int, Answer]  # recording, number of the slide, up to when it was read, answer
 
 
@@ -47,17 +47,19 @@ def predict(model: Model, recordings: Dataset) -> Result:
 
 
 def _slides(classifier: Classifier, params: Any, recording: Recording) -> list[Row]:
-    tables = {name: table for name, table in recorded(recording).items() if name not in BESIDE}
-    known: Mapping[str, Any] = recording.attributes
+    tables = {name: table for name, table in streams_as_recorded(recording).items() if name not in UNREAD}
+    attributes: Mapping[str, Any] = recording.attributes
     table = finger(recording.name, tables)
-    stream = next(name for name, one in tables.items() if one is table)
-    sensor = str(known["sensor"] if known.get("sensor") in classifier.layouts else next(iter(classifier.layouts)))
-    rate_hz = known.get("rate_hz")
-    least = float(known.get(LEAST, Options.least))
-    slide = SlideSoFar(classifier, params, sensor, least, float(rate_hz) if rate_hz else None)
-    pause_ns = round(float(known.get(PAUSE, 0.0)) * 1e9)
-    found = enumerate(parts(slide, stream, pause_ns, tables), start=1)
-    return [(recording.name, number, end_ns, slide.answer(part)) for number, (end_ns, part) in found]
+    stream = next(name for name, candidate in tables.items() if candidate is table)
+    sensor = str(
+        attributes["sensor"] if attributes.get("sensor") in classifier.layouts else next(iter(classifier.layouts))
+    )
+    rate_hz = attributes.get("rate_hz")
+    least_seen = float(attributes.get(LEAST, LEAST_SEEN))
+    slide = SlideSoFar(classifier, params, sensor, least_seen, float(rate_hz) if rate_hz else None)
+    pause_ns = round(float(attributes.get(PAUSE, 0.0)) * 1e9)
+    numbered_parts = enumerate(parts(slide, stream, pause_ns, tables), start=1)
+    return [(recording.name, number, end_ns, slide.answer(part)) for number, (end_ns, part) in numbered_parts]
 
 
 def _table(names: tuple[str, ...], rows: list[Row]) -> pa.Table:
@@ -65,17 +67,20 @@ def _table(names: tuple[str, ...], rows: list[Row]) -> pa.Table:
 
     answers = [answer for *_, answer in rows]
     likely = np.array(
-        [np.full(len(names), np.nan) if one.probabilities is None else one.probabilities for one in answers], np.float32
+        [np.full(len(names), np.nan) if answer.probabilities is None else answer.probabilities for answer in answers],
+        np.float32,
     ).reshape(len(rows), len(names))
     about = {"quantity": "prediction"}
-    named = ["unknown" if one.probabilities is None else names[int(one.probabilities.argmax())] for one in answers]
+    materials = [
+        "unknown" if answer.probabilities is None else names[int(answer.probabilities.argmax())] for answer in answers
+    ]
     columns: list[tuple[pa.Field, Any]] = [
         (pa.field("recording", pa.string()), [row[0] for row in rows]),
         (pa.field("slide", pa.int32()), [row[1] for row in rows]),
         (pa.field("t_ns", pa.int64(), metadata={"quantity": "time", "unit": "ns"}), [row[2] for row in rows]),
-        (pa.field("rows", pa.int32()), [one.rows for one in answers]),
-        (pa.field("material", pa.string(), metadata=about), named),
-        (pa.field("cause", pa.string()), [one.cause for one in answers]),
+        (pa.field("rows", pa.int32()), [answer.rows for answer in answers]),
+        (pa.field("material", pa.string(), metadata=about), materials),
+        (pa.field("cause", pa.string()), [answer.cause for answer in answers]),
         *(
             (pa.field(f"probability_{name}", pa.float32(), metadata={"quantity": "probability"}), likely[:, number])
             for number, name in enumerate(names)

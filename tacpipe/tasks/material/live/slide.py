@@ -7,9 +7,11 @@ its own: models that read slides of any length read what there is of it, once th
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from tacpipe.arrays import Float32s
 from tacpipe.channels.finger import finger
@@ -23,6 +25,8 @@ from tacpipe.tasks.material.slides import STREAM, difference
 if TYPE_CHECKING:
     import pyarrow as pa
 
+    Tables = Mapping[str, pa.Table]
+
 SLIDES = "segment.slides"
 ENDED_NS = 200_000_000  # without a row of the slide, after which it counts as over
 UNLIKE = "the slide is like none of the materials that the model knows"
@@ -35,9 +39,9 @@ def slide_params(steps: Sequence[Mapping[str, Any]]) -> Any:
     """
     names = [step["stage"] for step in steps]
     if names != [SLIDES]:
-        found = ", ".join(f"`tacpipe {name.replace('.', ' ')}`" for name in names) or "no stage"
+        commands = ", ".join(f"`tacpipe {name.replace('.', ' ')}`" for name in names) or "no stage"
         raise TacpipeError(
-            f"The model was trained behind {found}; live, a slide is cut out by `tacpipe segment slides` alone. Train it "
+            f"The model was trained behind {commands}; live, a slide is cut out by `tacpipe segment slides` alone. Train it "
             f"on recordings that went through that stage."
         )
     params_found = stage_params(steps[0])
@@ -83,7 +87,7 @@ class SlideSoFar:
     """Names the material of the slide in what has come of a recording."""
 
     def __init__(
-        self, classifier: Classifier, params: Any, sensor: str, least: float, rate_hz: float | None = None
+        self, classifier: Classifier, params: Any, sensor: str, least_seen: float, rate_hz: float | None = None
     ) -> None:
         """Take the params of `segment slides`, and which fraction of a slide is enough. Raises for an unknown sensor.
 
@@ -94,7 +98,7 @@ class SlideSoFar:
         self._attributes = {"sensor": sensor} | ({"rate_hz": rate_hz} if rate_hz else {})
         self._layout, self._reader = classifier.layout(sensor), classifier.readers[sensor]
         self._stage = registry.load(SLIDES)
-        self._least = least
+        self._least = least_seen
 
     @property
     def frames(self) -> int:
@@ -108,33 +112,33 @@ class SlideSoFar:
 
     def answer(self, streams: Mapping[str, pa.Table]) -> Answer:
         """Return what a recording of these streams would give if it ended now."""
-        held = Held(streams, self._attributes)
+        recording = Held(streams, self._attributes)
         try:
-            whole = self._stage(replace(self._params, crop="none"), held)
+            segmented = self._stage(replace(self._params, crop="none"), recording)
         except TacpipeError:
             return Answer(None, cause="no slide has begun")
-        table = whole.streams[STREAM]
+        table = segmented.streams[STREAM]
         rows = table.num_rows
         newest_ns = finger("so far", streams).column("t_ns")[-1].as_py()
-        ended = rows > 0 and newest_ns - table.column("t_ns")[-1].as_py() > ENDED_NS
+        is_over = rows > 0 and newest_ns - table.column("t_ns")[-1].as_py() > ENDED_NS
         try:
-            cut, lacks = self._cut(held, table)
+            cut, lacks = self._cut(recording, table)
             layout, frames = slides_of.frames(cut, self._sensor, self._classifier.quantities)
         except TacpipeError as error:
-            return Answer(None, rows, 0.0, ended, str(error))
-        there = Answer(None, rows, min(1.0, len(frames) / self.frames), ended)
+            return Answer(None, rows, 0.0, is_over, str(error))
+        answer = Answer(None, rows, min(1.0, len(frames) / self.frames), is_over)
         if layout.channels != self._layout.channels or len(frames) > self.frames:
-            return replace(there, cause=f"the slide {difference(self._layout, layout)} as the model was trained on")
-        if len(frames) < self.frames and not (self.any_length and there.seen >= self._least):
+            return replace(answer, cause=f"the slide {difference(self._layout, layout)} as the model was trained on")
+        if len(frames) < self.frames and not (self.any_length and answer.seen >= self._least):
             enough = f"{self._least:.0%} of {self.frames}" if self.any_length else str(self.frames)
-            return replace(there, cause=f"{len(frames)} rows of the slide have come, and {enough} are needed")
+            return replace(answer, cause=f"{len(frames)} rows of the slide have come, and {enough} are needed")
         if not lacks and not self._layout.alike(layout):
-            return replace(there, cause=f"the slide {difference(self._layout, layout)} as the model was trained on")
+            return replace(answer, cause=f"the slide {difference(self._layout, layout)} as the model was trained on")
         scores = self._reader.read(frames[None]).scores
         if self._classifier.unlike(scores, frames[None], self._sensor)[0]:
-            return replace(there, scores=scores[0], cause=UNLIKE)
+            return replace(answer, scores=scores[0], cause=UNLIKE)
         return replace(
-            there, scores=scores[0], probabilities=self._classifier.probabilities_of(scores, self._sensor)[0]
+            answer, scores=scores[0], probabilities=self._classifier.probabilities_of(scores, self._sensor)[0]
         )
 
     def is_over(self, streams: Mapping[str, pa.Table], finger_stream: str, pause_ns: int) -> bool:
@@ -144,14 +148,14 @@ class SlideSoFar:
         free, as a recording does. With ``pressure`` it is where the arm has stopped.
         """
         free = self._params.trigger == "load"
-        held = {name: table for name, table in streams.items() if not free or name == finger_stream}
-        if finger_stream not in held:
+        tables = {name: table for name, table in streams.items() if not free or name == finger_stream}
+        if finger_stream not in tables:
             return False
         try:
-            whole = self._stage(replace(self._params, crop="none"), Held(held, self._attributes)).streams[STREAM]
+            slide = self._stage(replace(self._params, crop="none"), Held(tables, self._attributes)).streams[STREAM]
         except TacpipeError:  # no slide has begun
             return False
-        newest_ns, last_ns = (one.column("t_ns")[-1].as_py() for one in (held[finger_stream], whole))
+        newest_ns, last_ns = (table.column("t_ns")[-1].as_py() for table in (tables[finger_stream], slide))
         return bool(newest_ns - last_ns >= pause_ns)
 
     @property
@@ -159,12 +163,74 @@ class SlideSoFar:
         """Whether only the arm, when it stops, ends a slide."""
         return bool(self._params.trigger != "load")
 
-    def _cut(self, held: Held, table: pa.Table) -> tuple[Any, bool]:
+    def _cut(self, recording: Held, table: pa.Table) -> tuple[Any, bool]:
         """Return the rows of the slide that count, as the stage cuts them out or as far as they have come, and which."""
         params = self._params
         first = params.offset_frames if params.crop == "offset" else 0
         if params.crop == "none" or table.num_rows - first >= params.frames:
-            cut = self._stage(params, held)
-            return Held(cut.streams, {**held.attributes, **cut.attributes}), False
-        rest = table.slice(min(first, table.num_rows))
-        return Held({STREAM: rest}, held.attributes), rest.num_rows < self.frames
+            cut = self._stage(params, recording)
+            return Held(cut.streams, {**recording.attributes, **cut.attributes}), False
+        remaining = table.slice(min(first, table.num_rows))
+        return Held({STREAM: remaining}, recording.attributes), remaining.num_rows < self.frames
+
+
+MOMENT_NS = 100_000_000  # between two moments of a part, from its finger's first sample on
+
+
+class Parting:
+    """Finds the ends of slides in what has come of a part of a recording."""
+
+    def __init__(self, slide: SlideSoFar, finger: str, pause_ns: int) -> None:
+        """Take what a slide is, the stream of the finger, and how long a pause is."""
+        self._slide, self._finger, self._pause_ns = slide, finger, pause_ns
+        self._looked = 0  # moments of this part so far
+
+    def begin(self) -> None:
+        """Begin another part."""
+        self._looked = 0
+
+    def end_ns(self, tables: Tables, until_ns: int) -> int | None:
+        """Return the moment at which the slide of this part is over, None where it is not by ``until_ns``.
+
+        ``tables`` are the streams of this part, of which all samples up to ``until_ns`` have come.
+        """
+        if self._finger not in tables:
+            return None
+        first_ns = int(tables[self._finger].column("t_ns")[0].as_py())
+        while (at_ns := first_ns + (self._looked + 1) * MOMENT_NS) <= until_ns:
+            self._looked += 1
+            if self._slide.is_over(up_to(tables, at_ns), self._finger, self._pause_ns):
+                return at_ns
+        return None
+
+
+def up_to(tables: Tables, t_ns: int) -> dict[str, pa.Table]:
+    """Return the rows of each stream up to a time; streams without any are left out."""
+    return {name: tables[name].slice(0, count) for name, count in _counts(tables, t_ns).items() if count}
+
+
+def after(tables: Tables, t_ns: int) -> dict[str, pa.Table]:
+    """Return the rows of each stream behind a time; streams without any are left out."""
+    counts = _counts(tables, t_ns)
+    return {name: tables[name].slice(count) for name, count in counts.items() if count < tables[name].num_rows}
+
+
+def _counts(tables: Tables, t_ns: int) -> dict[str, int]:
+    """Return how many rows each stream has up to a time."""
+    return {
+        name: int(np.searchsorted(table.column("t_ns").to_numpy(), t_ns, "right")) for name, table in tables.items()
+    }
+
+
+def parts(slide: SlideSoFar, finger: str, pause_ns: int, tables: Tables) -> Iterator[tuple[int, dict[str, pa.Table]]]:
+    """Yield the end and the streams of each part of a whole recording; all of it is one where a pause is 0."""
+    remaining = {name: table for name, table in tables.items() if table.num_rows}
+    last_ns = max((int(table.column("t_ns")[-1].as_py()) for table in remaining.values()), default=0)
+    parting = Parting(slide, finger, pause_ns)
+    parted = False
+    while pause_ns and (end_ns := parting.end_ns(remaining, last_ns)) is not None:
+        yield end_ns, up_to(remaining, end_ns)
+        remaining, parted = after(remaining, end_ns), True
+        parting.begin()
+    if finger in remaining or not parted:
+        yield last_ns, remaining

@@ -1,4 +1,4 @@
-"""What is published of candidate grasps: the touch that is predicted of each, and their ranking."""
+"""Declare the messages of a session with a model of touch: the ranking of the candidate grasps of a request."""
 
 from __future__ import annotations
 
@@ -9,15 +9,73 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from tacpipe.arrays import Float32s, Floats
+from tacpipe.arrays import Float32s, Floats, Int64s
 from tacpipe.channels import biotac_sp
-from tacpipe.live.messages import VERSION, known, properties
+from tacpipe.live import messages
+from tacpipe.live.messages import VERSION, Sizes, head_values, rounded
+from tacpipe.sensors.live import LSL, Column, Declaration, Value, latency_values
 
 COLUMNS = tuple(name for target in biotac_sp.TARGETS for name in biotac_sp.value_columns(target))  # of a touch
+TOUCH = "touch"  # the recorded stream, one row per grasp
+ORDER = ("request", "grasp", "rank")
+SCORES = ("score", "level_th", "level_mf")
+
+
+def _names(*names: str) -> list[Column]:
+    return [Column(name) for name in names]
+
+
+DECLARATION = Declaration(
+    TOUCH,
+    (
+        *head_values(),
+        Value("request", "number of the request, as it was sent", "integer", streams=(LSL,)),
+        Value("criterion", "criterion of the ranking", "string"),
+        Value("best", "number of the best grasp, from 0", "integer"),
+        Value(
+            "candidates",
+            "grasps of the request: `grasp`, `rank`, `score`, `level_th`, `level_mf`, and `touch` by value",
+            "array",
+            schema=lambda sizes: {"type": "array", "items": {"type": "object"}},
+        ),
+        Value(
+            "best_grasp",
+            "best grasp, its score and levels, and how many grasps there are",
+            streams=(LSL,),
+            columns=lambda sizes: _names("best", *SCORES, "grasps"),
+        ),
+        Value(
+            "order",
+            "request, grasp from 0, and rank from 1",
+            streams=(TOUCH,),
+            type="<i8",
+            quantity="prediction",
+            columns=lambda sizes: _names(*ORDER),
+        ),
+        Value(
+            "grasp_scores",
+            "score of the grasp and how much each finger is touched, 0 to 1",
+            streams=(TOUCH,),
+            quantity="prediction",
+            columns=lambda sizes: _names(*SCORES),
+        ),
+        Value(
+            "touch",
+            "predicted touch of the grasp",
+            streams=(TOUCH,),
+            unit="count",
+            quantity="prediction",
+            columns=lambda sizes: [Column(name, sizes.unit) for name in sizes.channels],
+        ),
+        Value("cause", "reason why nothing is ranked", "string"),
+        *latency_values("latency_ms", "skipped"),
+    ),
+    {TOUCH: 4},
+)
 
 
 @dataclass
-class TouchMessage:
+class TouchMessage(messages.Message):
     """The ranking of the candidates of one request, or why there is none."""
 
     seq: int
@@ -34,6 +92,7 @@ class TouchMessage:
     compute_ms: float = math.nan
     skipped: int = 0
     late: int = 0
+    declaration: ClassVar[Declaration] = DECLARATION
 
     @property
     def answers(self) -> bool:
@@ -46,67 +105,61 @@ class TouchMessage:
         best = f"grasp {self.ranks.index(1)} of {len(self.ranks)}" if self.ranks else "unknown"
         return {f"request {self.request}": best}
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the message as JSON and msgpack hold it; what is not known is null."""
-        return {
-            "version": VERSION,
-            "kind": "touch",
-            "seq": self.seq,
-            "t_ns": self.t_ns,
-            "request": self.request,
-            "criterion": self.criterion,
-            "best": self.ranks.index(1) if self.ranks else None,
-            "candidates": None if self.touch is None else [self._candidate(row) for row in range(len(self.touch))],
-            "cause": self.cause,
-            "latency_ms": known(self.latency_ms),
-            "skipped": self.skipped,
-        }
+    @property
+    def best(self) -> int | None:
+        """The number of the best grasp."""
+        return self.ranks.index(1) if self.ranks else None
+
+    @property
+    def candidates(self) -> list[dict[str, Any]] | None:
+        """Each grasp as JSON has it."""
+        return None if self.touch is None else [self._candidate(row) for row in range(len(self.touch))]
 
     def _candidate(self, row: int) -> dict[str, Any]:
         assert self.touch is not None
-        values = [None if math.isnan(one) else one for one in self.touch[row].astype(np.float32).tolist()]
-        thumb, middle = (known(one) for one in self.levels[row].tolist())
-        about = {"grasp": row, "rank": self.ranks[row], "score": known(float(self.scores[row]))}
+        values = [None if math.isnan(value) else value for value in self.touch[row].astype(np.float32).tolist()]
+        thumb, middle = map(rounded, self.levels[row].tolist())
+        about = {"grasp": row, "rank": self.ranks[row], "score": rounded(float(self.scores[row]))}
         return {**about, "level_th": thumb, "level_mf": middle, "touch": dict(zip(COLUMNS, values, strict=True))}
 
-    def columns(self) -> Float32s:
-        """Return number of the request, its best grasp with score and levels, and how many there are."""
-        if not self.ranks:
-            return np.array([self.request, -1, np.nan, np.nan, np.nan, 0], np.float32)
-        best = self.ranks.index(1)
-        return np.array([self.request, best, self.scores[best], *self.levels[best], len(self.ranks)], np.float32)
+    @property
+    def best_grasp(self) -> Float32s:
+        """The best grasp with its score and levels, and how many grasps there are (5,)."""
+        best = self.best
+        if best is None:
+            return np.array([-1, np.nan, np.nan, np.nan, 0], np.float32)
+        return np.array([best, self.scores[best], *self.levels[best], len(self.ranks)], np.float32)
 
-    def outputs(self, output: str) -> tuple[Any, ...] | None:
-        """Return the numbers of the session's stream ``touch``, a row a grasp, or ``latency``."""
-        if output == "touch":
-            if self.touch is None:
-                return None
-            order = np.array([[self.request, row, rank] for row, rank in enumerate(self.ranks)], np.int64)
-            worth = np.column_stack([self.scores, self.levels]).astype(np.float32)
-            return (order, np.hstack([worth, self.touch.astype(np.float32)]))
-        numbers = (self.latency_ms, math.nan, self.compute_ms, 0, self.skipped, self.late)
-        return (np.array([numbers], dtype=np.float32),)
+    @property
+    def order(self) -> Int64s:
+        """Request, number and rank of each grasp (grasp, 3)."""
+        return np.array([[self.request, row, rank] for row, rank in enumerate(self.ranks)], np.int64)
+
+    @property
+    def grasp_scores(self) -> Float32s:
+        """Score and levels of each grasp (grasp, 3)."""
+        return np.column_stack([self.scores, self.levels]).astype(np.float32)
+
+    def row_count(self, stream: str) -> int:
+        """Return the number of grasps for the stream of rankings."""
+        return len(self.ranks) if stream == TOUCH else 1
 
 
 @dataclass(frozen=True)
-class TouchDescription:
+class TouchDescription(messages.Description):
     """What the messages of a session with a model of touch are."""
 
     targets: tuple[str, ...]
     criterion: str
     model: str
-    kind: ClassVar[str] = "touch"
-    rate_hz: ClassVar[float] = 0.0  # an answer a request
+    rate_hz: float = 0.0  # one answer per request
+    declaration: ClassVar[Declaration] = DECLARATION
+    answers: ClassVar[str] = "rankings"
 
-    def columns(self) -> list[tuple[str, str]]:
-        """Return the columns of `TouchMessage.columns`."""
-        return [(name, "1") for name in ("request", "best", "score", "level_th", "level_mf", "grasps")]
-
-    def schema(self) -> dict[str, Any]:
-        """Return the properties of a message, as JSON schema has them."""
-        texts = dict.fromkeys(("kind", "criterion", "cause"), "string")
-        named = properties("version", "seq", "t_ns", "request", "best", "skipped", **texts, latency_ms="number")
-        return {**named, "candidates": {"type": "array", "items": {"type": "object"}}}
+    @property
+    def sizes(self) -> Sizes:
+        """The names of the predicted values."""
+        return Sizes(COLUMNS)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the description as JSON and msgpack hold it."""

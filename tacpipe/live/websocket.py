@@ -20,7 +20,7 @@ from websockets.typing import Origin
 
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.links import network
-from tacpipe.live.messages import About, Published, to_json
+from tacpipe.live.messages import Description, Message, to_json
 from tacpipe.printable import excerpt
 
 HOST = "127.0.0.1"  # default host of the server
@@ -48,7 +48,7 @@ class WebsocketPublisher:
     page comes from, and other pages are refused. Programs send no origin and are accepted.
     """
 
-    def __init__(self, place: str, about: About) -> None:
+    def __init__(self, place: str, about: Description) -> None:
         place, _, options = place.partition("?")
         origins = parse_qsl(options, keep_blank_values=True)
         if any(name != "origin" or not value for name, value in origins):
@@ -72,7 +72,7 @@ class WebsocketPublisher:
         """How many subscribers there are."""
         return len(self._subscribers)
 
-    def publish(self, message: Published) -> None:
+    def publish(self, message: Message) -> None:
         """Send a message to each subscriber that keeps up."""
         if self._subscribers:
             self._loop.call_soon_threadsafe(self._send, to_json(message.to_dict()).decode())

@@ -1,0 +1,192 @@
+"""Run models of forward live: their settings, the plan of a session, and the engine with its alarms."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+
+from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.live.settings import Settings, TaskSettings, option
+from tacpipe.live.task import LiveTask, SessionPlan
+from tacpipe.plugins.constraints import PositiveInt, Range
+from tacpipe.sensors.plan import MEASURED
+from tacpipe.tasks.forward.live.messages import ALARM, DECLARATION, FORECAST
+
+if TYPE_CHECKING:
+    from tacpipe.datasets.dataset import Dataset, Model
+    from tacpipe.live.engine import Engine
+    from tacpipe.plugins.stage import Result
+    from tacpipe.recording.rig import Rig
+    from tacpipe.sensors.live import Declaration
+    from tacpipe.sensors.sensor import Sensor
+    from tacpipe.tasks.forward.live.alarms import Alarms
+    from tacpipe.tasks.forward.live.engine import CausalChain
+    from tacpipe.tasks.task import PredictionRequest
+
+ALARM_KEYS = ("alarms_per_hour", "alarms_on", "split")
+
+
+@dataclass(frozen=True)
+class ForwardSettings(TaskSettings):
+    """Settings of a session with a model of forward."""
+
+    # Source of plans: measured (motion continues; default), udp::PORT, ws:HOST:PORT, rig:STREAM (its set-points)
+    plan: str = MEASURED
+    plan_from: str = ""  # IP address whose plans are accepted, for --plan udp:HOST:PORT
+    steps: tuple[PositiveInt, ...] = ()  # Steps ahead that are published; all by default
+    quantiles: tuple[PositiveInt, ...] = ()  # Quantiles published next to forecasts, percent, as 10,90; none by default
+    # False alarms an hour that each alarm may give; 0: no alarms (default)
+    alarms_per_hour: Annotated[float, Range(0, below=1e6)] = 0.0
+    alarms_on: str = ""  # Recordings that the levels of alarms are set on
+    split: str = ""  # Split whose validation recordings --alarms-on means
+
+    @classmethod
+    def override(cls, stated: Mapping[str, Any], options: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Return what a rig file states, without its alarms or its split where the options have others."""
+        void: tuple[str, ...] = ()
+        if options.get("alarms_per_hour") == 0:  # the option 0 switches off the alarms of the file
+            void = ALARM_KEYS
+        elif "alarms_on" in options and "split" not in options:  # the file's split is of the file's recordings
+            void = ("split",)
+        return {name: value for name, value in stated.items() if name not in void}
+
+    def check(self, settings: Settings) -> None:
+        """Raise `UsageError` where alarms lack recordings, or recordings or a split lack alarms."""
+        if bool(self.alarms_per_hour) != bool(self.alarms_on):
+            present, absent = ALARM_KEYS[:2] if self.alarms_per_hour else ALARM_KEYS[1::-1]
+            missing = absent if present in settings.places else option(absent)
+            raise UsageError(
+                f"{settings.name_in_errors(present)} needs {missing} with it: the levels of alarms are set on recordings, "
+                f"as in `--alarms-per-hour 6 --alarms-on data/segments --split data/split`."
+            )
+        if self.split and not self.alarms_on:
+            raise UsageError(f"{settings.name_in_errors('split')} has no effect without {option('alarms_on')}.")
+
+    def steps_up_to(self, horizon: int) -> tuple[int, ...]:
+        """Return the steps ahead that are published. Raises `UsageError` for others than the model predicts."""
+        steps = tuple(sorted(set(self.steps))) or tuple(range(1, horizon + 1))
+        if steps[-1] > horizon:
+            listed = ",".join(map(str, self.steps))
+            raise UsageError(f"The steps {listed} are requested, and the model predicts 1 to {horizon} steps ahead.")
+        return steps
+
+
+class ForwardLive(LiveTask):
+    """Forecasts with alarms at each grid point."""
+
+    settings: ClassVar[type[TaskSettings]] = ForwardSettings
+    declaration: ClassVar[Declaration] = DECLARATION
+
+    def plan(self, model: Dataset, rig: Rig, settings: Settings) -> SessionPlan:
+        """Return the streams of forecasts, alarms and latencies, and the rig with a stream of plans where plans come."""
+        from tacpipe.datasets import model_files
+        from tacpipe.tasks import calibrated
+        from tacpipe.tasks.forward.live import plans
+        from tacpipe.tasks.forward.live.alarms import NAMES
+        from tacpipe.tasks.forward.live.stages import refuse_look_ahead
+
+        config = model_files.tree(model.files, model_files.CONFIG, {"horizon": int, "inputs.tactile": list})
+        own_settings = _own(settings)
+        if not settings.allow_look_ahead:
+            with settings.naming("model"):
+                refuse_look_ahead(config, model.source.chain)
+        with settings.naming("steps"):
+            steps = own_settings.steps_up_to(config["horizon"])
+        levels = tuple(sorted(set(own_settings.quantiles)))
+        if levels:
+            with settings.naming("quantiles"):
+                _refuse_absent_quantiles(config, levels, calibrated.quantiles_of)
+        with settings.naming("plan"):
+            planned = plans.with_plan(rig, own_settings.plan, own_settings.plan_from)
+        unit = str(config["inputs"].get("unit", "count"))
+        forecast: dict[str, Any] = {"channels": list(config["inputs"]["tactile"]), "steps": list(steps), "unit": unit}
+        streams: dict[str, dict[str, Any]] = {
+            FORECAST: {**forecast, **({"quantiles": list(levels)} if levels else {})},
+            ALARM: {"alarms": list(NAMES)},
+            "latency": {},
+        }
+        attributes = {"live_plan": own_settings.plan, "live_alarms_per_hour": own_settings.alarms_per_hour}
+        return SessionPlan(planned, replace(own_settings, steps=steps, quantiles=levels), streams, attributes)
+
+    def engine(self, model: Dataset, rig: Rig, sensors: Mapping[str, Sensor], settings: Settings) -> Engine:
+        """Return the engine with the model's causal chain, which has made its first forecast."""
+        from tacpipe.tasks.forward.forecaster import Forecaster
+        from tacpipe.tasks.forward.live import plans
+        from tacpipe.tasks.forward.live.chain import Chain
+        from tacpipe.tasks.forward.live.engine import ForecastEngine
+
+        own_settings = _own(settings)
+        forecaster = Forecaster.load(model.files)
+        open_chain = functools.partial(
+            Chain.of,
+            forecaster,
+            model.source.chain,
+            master=rig.master,
+            plan_from=plans.targets_of(rig, own_settings.plan),
+            quantiles=own_settings.quantiles,
+            allow_look_ahead=settings.allow_look_ahead,
+        )
+
+        engine = ForecastEngine(
+            sensors,
+            lambda layouts, beginning: open_chain(layouts, beginning=beginning),
+            lambda chain: _alarms(own_settings, model, chain),
+            own_settings.steps or None,
+            settle_ns=round(settings.settle_ms * 1e6),
+            quantiles=own_settings.quantiles,
+        )
+        if own_settings.steps and max(own_settings.steps) > engine.chain.horizon:
+            raise UsageError(f"The model predicts 1 to {engine.chain.horizon} steps ahead; give --steps of these.")
+        forecaster.prepare_single()
+        return engine
+
+    def predict(self, model: Model, recordings: Dataset, request: PredictionRequest) -> Result:
+        """Return a table of causal forecasts for each recording."""
+        from tacpipe.tasks.forward.live import replay
+
+        look_ahead = request.allow_look_ahead
+        return replay.predict(model, recordings, request.steps, request.quantiles, allow_look_ahead=look_ahead)
+
+    def evaluate(self, model: Model, recordings: Dataset) -> Result:
+        """Return the evaluation of recordings of sessions: published forecasts next to those of the offline chain."""
+        from tacpipe.tasks.forward.live import evaluation
+
+        return evaluation.evaluate(model, recordings)
+
+
+def _own(settings: Settings) -> ForwardSettings:
+    assert isinstance(settings.task, ForwardSettings)
+    return settings.task
+
+
+def _refuse_absent_quantiles(
+    config: Mapping[str, Any], levels: tuple[int, ...], find_quantiles: Callable[[Any, tuple[int, ...]], Any]
+) -> None:
+    """Raise `UsageError` for quantiles that the model does not have."""
+    calibrated_levels = CalibratedLevels(tuple(map(int, config.get("quantiles", {}).get("levels", []))))
+    try:
+        find_quantiles(calibrated_levels if calibrated_levels.percents else None, levels)
+    except TacpipeError as error:
+        raise UsageError(str(error)) from error
+
+
+@dataclass(frozen=True)
+class CalibratedLevels:
+    """The quantiles that a model was calibrated for."""
+
+    percents: tuple[int, ...]
+
+
+def _alarms(own_settings: ForwardSettings, model: Dataset, chain: CausalChain) -> Alarms:
+    """Return the alarms of a session, with levels where it has any."""
+    from tacpipe.engine.pipeline import open_dataset
+    from tacpipe.tasks.forward.live.alarms import Alarms, on_recordings
+
+    if not own_settings.alarms_per_hour:
+        return Alarms.unset(chain.layout)
+    recordings = open_dataset(own_settings.alarms_on)
+    if own_settings.split:
+        recordings = recordings.select(split=own_settings.split, role="val")
+    return on_recordings(model, recordings, own_settings.alarms_per_hour)
