@@ -73,10 +73,10 @@ def add(program: typer.Typer, summary: str) -> None:
     fixed = [
         parameter.replace(kind=kinds[0]) for parameter in signature.parameters.values() if parameter.kind != kinds[1]
     ]
-    shown = signature.replace(parameters=[*fixed, *_options()])
+    complete = signature.replace(parameters=[*fixed, *_options()])
     function: Any = live
-    function.__signature__ = shown  # read by typer, as the annotations are
-    function.__annotations__ = {name: parameter.annotation for name, parameter in shown.parameters.items()}
+    function.__signature__ = complete  # read by typer, as the annotations are
+    function.__annotations__ = {name: parameter.annotation for name, parameter in complete.parameters.items()}
     program.command("live", help=summary + HELP)(live)
 
 
@@ -85,9 +85,9 @@ def _options() -> list[inspect.Parameter]:
     from tacpipe.live import settings
 
     options = _options_for(settings.Settings, None)
-    for task, own in settings.task_settings().items():
+    for task, kind in settings.task_settings().items():
         options |= {
-            name: option for name, option in _options_for(own, f"Models of {task}").items() if name not in options
+            name: option for name, option in _options_for(kind, f"Models of {task}").items() if name not in options
         }
     return list(options.values())
 
@@ -106,7 +106,12 @@ def _options_for(kind: type[Any], panel: str | None) -> dict[str, inspect.Parame
         parsed: Any = bool | None if is_flag else list[str] | None if name in REPEATED else str | None
         about = helps.get(name, "")
         option = typer.Option(
-            None, *flags, help=f"{about}." if about else "", show_default=False, rich_help_panel=panel
+            None,
+            *flags,
+            help=f"{about}." if about else "",
+            show_default=False,
+            metavar="NUMBER" if fields.bare(annotation) in (int, float) else None,
+            rich_help_panel=panel,
         )
         options[name] = inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=option, annotation=parsed)
     return options
@@ -144,20 +149,20 @@ def _run(
     recorded: list[Any] = []
     lost: list[str] = []
     with (
-        Ended() as ended,
-        session.run_model(recorder, prepared.options, ended) as supervisor,
+        Ended() as is_over,
+        session.run_model(recorder, prepared.options, is_over) as supervisor,
         recorder.open(),
         View(recorder.watches, quiet=quiet, more=lambda: _lines(supervisor)).open() as view,
     ):
-        recorder.await_first(ended)
+        recorder.await_first(is_over)
         if plan is not None and supervisor.alarms.get("levels"):
             levels = json.dumps(supervisor.alarms, separators=(",", ":"))
             plan = replace(plan, attributes={**plan.attributes, "live_alarm_levels": levels})
         if plan is None:
-            _follow(recorder, duration_s, view, ended)
+            _follow(recorder, duration_s, view, is_over)
             lost = recorder.lost()
         else:
-            recorded, lost = trials.run(recorder, store, plan, view, ended)
+            recorded, lost = trials.run(recorder, store, plan, view, is_over)
     figures = supervisor.figures()
     if not quiet:
         for recording in recorded:
@@ -173,7 +178,7 @@ def _lines(supervisor: Supervisor) -> list[str]:
     return session.lines(supervisor.figures())
 
 
-def _follow(recorder: Recorder, duration_s: float | None, view: Any, ended: Ended) -> None:
+def _follow(recorder: Recorder, duration_s: float | None, view: Any, is_over: Ended) -> None:
     """Run the rig without recording it."""
     from tacpipe.recording import clock
 
@@ -181,7 +186,7 @@ def _follow(recorder: Recorder, duration_s: float | None, view: Any, ended: Ende
     recorder.follow()
 
     def over() -> bool:
-        return ended() or (duration_s is not None and clock.now_s() - began_s >= duration_s)
+        return is_over() or (duration_s is not None and clock.now_s() - began_s >= duration_s)
 
     recorder.run(over, lambda: view.show(f"live, not recorded, {clock.now_s() - began_s:.0f} s"))
 

@@ -45,8 +45,8 @@ class PreparedSession:
     attributes: Mapping[str, Any]  # further attributes of the recordings
 
 
-def prepare(rig: Rig, where: str, options: Mapping[str, Any]) -> PreparedSession:
-    """Return a session with a rig (read from the file ``where``) and options of the command; None: not given.
+def prepare(rig: Rig, rig_file: str, options: Mapping[str, Any]) -> PreparedSession:
+    """Return a session with a rig (read from the file ``rig_file``) and options of the command; None: not given.
 
     Raises `UsageError` that names option, or file and key, for what this computer, the model or the rig does not allow.
     """
@@ -54,14 +54,14 @@ def prepare(rig: Rig, where: str, options: Mapping[str, Any]) -> PreparedSession
     if not path:
         raise UsageError(
             f'A live session needs a model: give --model models/forward, or state model = "models/forward" in the '
-            f"table [live] of {where}."
+            f"table [live] of {rig_file}."
         )
-    common = Settings(path, places={} if options.get("model") else {"model": f"{where}, live"})
+    common = Settings(path, places={} if options.get("model") else {"model": f"{rig_file}, live"})
     with common.naming("model"):
         model = open_model(path)
     kinds = {**fields.hints(Settings), **fields.hints(model.live.settings)}
     parsed = {name: parse_option(name, text, kinds[name]) if name in kinds else text for name, text in options.items()}
-    settings = Settings.from_sources(model.live.settings, rig.live, where, parsed)
+    settings = Settings.from_sources(model.live.settings, rig.live, rig_file, parsed)
     if settings.realtime:
         with settings.naming("realtime"):
             scheduling.check()
@@ -106,9 +106,11 @@ def add_streams(rig: Rig, streams: Mapping[str, Mapping[str, Any]]) -> Rig:
 
     Raises `UsageError` where the rig has a stream of such a name, and for messages too large for a packet.
     """
-    taken = [name for name in streams if name in rig.streams]
-    if taken:
-        raise UsageError(f"The rig file has a stream {taken[0]}, as a live session adds itself; give it another name.")
+    conflicting = [name for name in streams if name in rig.streams]
+    if conflicting:
+        raise UsageError(
+            f"The rig file has a stream {conflicting[0]}, as a live session adds itself; give it another name."
+        )
     added = {
         name: Stream(
             name, "live", rigs.make("live", options, "live"), Address("udp", f"127.0.0.1:{port}"), dict(options)

@@ -33,13 +33,13 @@ SWITCH_S = 0.0005  # time that one thread may hold up another: the threads that 
 
 
 @contextlib.contextmanager
-def run_model(recorder: Recorder, options: SessionOptions, ended: Callable[[], bool]) -> Iterator[Supervisor]:
+def run_model(recorder: Recorder, options: SessionOptions, is_over: Callable[[], bool]) -> Iterator[Supervisor]:
     """Have the model's process follow a rig while in the block. Raises what it refuses the session with."""
     supervisor = Supervisor(options, Tap(options.streams))
     before_s = sys.getswitchinterval()
     sys.setswitchinterval(SWITCH_S)
     try:
-        supervisor.start(ended)
+        supervisor.start(is_over)
         recorder.accompany(supervisor, options.streams)
         gc.collect()
         gc.freeze()  # a later collection would hold up the threads that read for 20 ms and more
@@ -99,10 +99,10 @@ class Supervisor:
         self._due_s = 0.0
         self._refusal: tuple[str, int] | None = None
 
-    def start(self, ended: Callable[[], bool]) -> None:
+    def start(self, is_over: Callable[[], bool]) -> None:
         """Start the process and wait until it is ready. Raises what it refuses the session with, as its exit code states."""
         self._spawn()
-        while not ended() and not self._is_ready():
+        while not is_over() and not self._is_ready():
             clock.sleep(LOOK_S)
 
     def _is_ready(self) -> bool:

@@ -29,9 +29,9 @@ class TaskSettings:
     """The settings that only sessions of one task have. A subclass is a frozen dataclass; its comments are the help."""
 
     @classmethod
-    def override(cls, stated: Mapping[str, Any], options: Mapping[str, Any]) -> Mapping[str, Any]:
+    def override(cls, file_settings: Mapping[str, Any], options: Mapping[str, Any]) -> Mapping[str, Any]:
         """Return what a rig file states, without the keys that ``options`` make void."""
-        return stated
+        return file_settings
 
     def check(self, settings: Settings) -> None:
         """Raise `UsageError` for settings that do not go together."""
@@ -43,7 +43,7 @@ class Settings:
 
     model: str = ""  # Trained model, as of `tacpipe train`
     publish: tuple[str, ...] = ()  # Address to publish to: ws:HOST:PORT, udp:HOST:PORT, lsl:NAME, mcap:FILE
-    settle_ms: Annotated[float, Range(0, 1000)] = 2.0  # Time after a row in which its samples are awaited, ms
+    settle_ms: Annotated[float, Range(0, 1000)] = 2.0  # Time after a row in which its samples are awaited, ms [2]
     realtime: bool = False  # Real-time scheduling of the session, where the system allows it
     allow_look_ahead: bool = False  # Accept a model that was trained on rows that look ahead
     task: TaskSettings = field(default_factory=TaskSettings)  # settings of the model's task
@@ -53,9 +53,13 @@ class Settings:
 
     @classmethod
     def from_sources(
-        cls, task_settings: type[TaskSettings], stated: Mapping[str, Any], where: str, options: Mapping[str, Any]
+        cls,
+        task_settings: type[TaskSettings],
+        file_settings: Mapping[str, Any],
+        rig_file: str,
+        options: Mapping[str, Any],
     ) -> Self:
-        """Return the settings that a rig file ``where`` states in its table ``[live]``, overridden by ``options``.
+        """Return the settings that a rig file ``rig_file`` states in its table ``[live]``, overridden by ``options``.
 
         ``task_settings`` is the dataclass of the task's settings; None is an option that was not given.
         Raises `UsageError` that names file and key, or option, for an unknown key, a value that is not allowed, and
@@ -68,16 +72,16 @@ class Settings:
         for name, value in options.items():
             if name not in allowed:
                 raise UsageError(
-                    f"{option(name)} is no setting of this model; there are {', '.join(map(option, allowed))}."
+                    f"This model has no setting {option(name)}; there are {', '.join(map(option, allowed))}."
                 )
             fields.check(value, allowed[name], option(name))
-        for name in stated:
+        for name in file_settings:
             if name not in allowed:
-                raise fields.unknown(name, allowed, f"{where}, live", "key")
-        stated = task_settings.override(stated, options)
-        places = {name: f"{where}, live" for name in stated if name not in options}
-        values = {**{name: value for name, value in stated.items() if name not in options}, **options}
-        filled_from = f"{where}, live"
+                raise fields.unknown(name, allowed, f"{rig_file}, live", "key")
+        file_settings = task_settings.override(file_settings, options)
+        places = {name: f"{rig_file}, live" for name in file_settings if name not in options}
+        values = {**{name: value for name, value in file_settings.items() if name not in options}, **options}
+        filled_from = f"{rig_file}, live"
         task = params.filled(task_settings, {n: v for n, v in values.items() if n in task_fields}, filled_from, "key")
         base = params.filled(cls, {n: v for n, v in values.items() if n in common}, filled_from, "key")
         settings: Self = replace(base, task=task, places=places)
@@ -121,10 +125,10 @@ class SessionOptions:
         live = registry.load_task(content["task"]).live
         if live is None:
             raise UsageError(f"Models of the task {content['task']} do not run live.")
-        stated = content["settings"]
-        task = live.settings(**_tuples(stated["task"]))
+        common = content["settings"]
+        task = live.settings(**_tuples(common["task"]))
         settings = replace(
-            Settings(**_tuples({name: stated[name] for name in stated if name not in NOT_SET})), task=task
+            Settings(**_tuples({name: common[name] for name in common if name not in NOT_SET})), task=task
         )
         return cls(**{**_tuples(content), "settings": settings})
 

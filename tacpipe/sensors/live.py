@@ -33,7 +33,7 @@ HEAD = np.dtype([("magic", "S4"), ("version", "u1"), ("kind", "u1"), ("rest", "<
 UNKNOWN, OFF, ON = -1, 0, 1  # states of an alarm
 LARGEST_PACKET = 60_000  # bytes
 LATENCY = "latency"  # stream that every session records
-LATENCY_NUMBER = 2  # in its packets
+LATENCY_NUMBER = 2  # its number in packets
 LSL = "lsl"  # channels of the published LSL stream; not recorded
 
 
@@ -130,7 +130,7 @@ def latency_values(*in_json: str) -> tuple[Value, ...]:
 class Declaration:
     """The messages of one task: their values in order, and the recorded streams that hold them."""
 
-    kind: str  # of the messages, as JSON names it
+    kind: str  # kind of the messages, as JSON names it
     values: tuple[Value, ...]
     numbers: Mapping[str, int] = field(default_factory=dict)  # number in packets of each stream but `LATENCY`
 
@@ -148,7 +148,7 @@ class Declaration:
         return [(value, column) for value in self.recorded(stream) for column in value.columns_for(sizes)]
 
 
-COMMON = Declaration("", latency_values())  # without a task: the stream that every session records
+COMMON = Declaration("", latency_values())  # declares the stream that every session records
 
 
 def blocks(values: Sequence[tuple[str, AnyArray]]) -> tuple[AnyArray, ...]:

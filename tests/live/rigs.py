@@ -99,7 +99,7 @@ def model(
 
 def chain(made: Made, given: FakeRecording, quantiles: Sequence[int] = ()) -> Chain:
     """The chain of a model, for the streams of a recording."""
-    return Chain.of(*made, {name: table.schema for name, table in given.tables.items()}, quantiles=quantiles)
+    return Chain.for_model(*made, {name: table.schema for name, table in given.tables.items()}, quantiles=quantiles)
 
 
 def whole(made: Made, given: FakeRecording, quantiles: Sequence[int] = ()) -> list[Forecast]:

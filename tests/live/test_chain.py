@@ -249,7 +249,7 @@ def test_a_rig_of_other_streams_than_the_models_is_refused_by_the_name_of_what_d
 ) -> None:
     streams = change({name: table.schema for name, table in GIVEN.tables.items()})
     with pytest.raises(TacpipeError, match=named):
-        Chain.of(*models["planned"], streams)
+        Chain.for_model(*models["planned"], streams)
 
 
 @pytest.mark.parametrize(
@@ -265,7 +265,7 @@ def test_a_model_behind_stages_that_look_ahead_is_refused_by_their_name(
     models: dict[str, Made], steps: Any, named: str
 ) -> None:
     with pytest.raises(TacpipeError, match=named):
-        Chain.of(models["raw"][0], steps, {name: table.schema for name, table in GIVEN.tables.items()})
+        Chain.for_model(models["raw"][0], steps, {name: table.schema for name, table in GIVEN.tables.items()})
 
 
 def test_a_model_of_rows_that_look_ahead_is_refused_unless_that_is_allowed(tmp_path: Path) -> None:
@@ -274,17 +274,17 @@ def test_a_model_of_rows_that_look_ahead_is_refused_unless_that_is_allowed(tmp_p
     stated = json.loads(interpolated[0]["config.json"])["look_ahead"]
     assert 0 < stated["mean_ms"] < stated["max_ms"]
     with pytest.raises(TacpipeError, match=f"at most {stated['max_ms']:g} ms.*--allow-look-ahead"):
-        Chain.of(*interpolated, schemas)
-    assert Chain.of(*interpolated, schemas, allow_look_ahead=True).rate_hz == 50.0
+        Chain.for_model(*interpolated, schemas)
+    assert Chain.for_model(*interpolated, schemas, allow_look_ahead=True).rate_hz == 50.0
     older = json.loads(interpolated[0]["config.json"])
     del older["look_ahead"]
     step = {"stage": "synchronize", "version": 2, "params": {"grid": "logged", "rate_hz": 50.0}, "fitted": None}
     files = {**interpolated[0], "config.json": json.dumps(older).encode()}
     contacts = rigs.step("segment.contacts")
     with pytest.raises(TacpipeError, match="interpolated"):
-        Chain.of(files, [step, contacts], schemas)
+        Chain.for_model(files, [step, contacts], schemas)
     held = {**step, "params": {"grid": "logged", "rate_hz": 50.0, "causal": True}}
-    assert Chain.of(files, [held, contacts], schemas).streams
+    assert Chain.for_model(files, [held, contacts], schemas).streams
 
 
 @pytest.mark.parametrize("kind", ["raw", "latents", "logged"])
@@ -300,7 +300,7 @@ def test_a_chain_that_continues_a_session_predicts_the_same_once_it_has_its_cont
     assert first.beginning is None
     first.advance(half_ns)
     schemas = {name: table.schema for name, table in calm.tables.items()}
-    second = Chain.of(*models[kind], schemas, beginning=first.beginning)
+    second = Chain.for_model(*models[kind], schemas, beginning=first.beginning)
     for name, table in calm.tables.items():
         second.push(name, table.slice(table.filter(rigs.until(table, half_ns)).num_rows))
     found = [one for one in second.advance(T0 + 2900 * MS) if one.count is not None]
@@ -322,7 +322,7 @@ def test_counts_that_had_run_over_their_end_are_continued_at_the_turn_that_is_ne
     beginning = first.beginning
     assert beginning is not None
     assert Beginning.from_json(json.loads(json.dumps(beginning.to_json()))) == beginning
-    second = Chain.of(*models["raw"], schemas, beginning=beginning)
+    second = Chain.for_model(*models["raw"], schemas, beginning=beginning)
     for name, table in given.tables.items():
         second.push(name, table.slice(table.filter(rigs.until(table, half_ns)).num_rows))
     found = [one for one in second.advance(T0 + 2900 * MS) if one.count is not None]

@@ -24,7 +24,7 @@ MATERIAL = model_of("material", classes=[0, 1])
         (PLAIN, "10,90", "tacpipe calibrate MODEL"),
         (CALIBRATED, "10,25", "10,50,90, not 25"),
         (CALIBRATED, "ten", "--quantiles is ('ten',); it must be a list"),
-        (MATERIAL, "10,90", "--quantiles is no setting of this model"),
+        (MATERIAL, "10,90", "This model has no setting --quantiles"),
     ],
 )
 def test_quantiles_that_a_model_does_not_have_are_refused_before_the_session_begins(

@@ -53,7 +53,7 @@ def session(tables: dict[str, pa.Table]) -> list[Any]:
     """The forecasts of a session in which each sample came alone, two milliseconds late."""
     model = tacpipe.open("models/g")
     schemas = {name: table.schema for name, table in tables.items()}
-    chain = Chain.of(model.files, model.source.chain, schemas, quantiles=QUANTILES)
+    chain = Chain.for_model(model.files, model.source.chain, schemas, quantiles=QUANTILES)
     arrivals = sorted(
         (t_ns, name, row)
         for name, table in tables.items()

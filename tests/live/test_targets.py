@@ -91,7 +91,7 @@ def aimed(seed: int) -> FakeRecording:
 
 
 def fed(model: Made, given: FakeRecording, cuts: list[int], plan_from: str = "robot") -> list[Any]:
-    chain = Chain.of(*model, {name: table.schema for name, table in given.tables.items()}, plan_from=plan_from)
+    chain = Chain.for_model(*model, {name: table.schema for name, table in given.tables.items()}, plan_from=plan_from)
     found = []
     for name, table, cut in rigs.pieces(given, cuts, list(given.tables)):
         chain.push(name, table)

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 LOAD, SLIP = "load", "slip"
 NAMES = (LOAD, SLIP)
-LEAST = 1e-9  # that a level counts as, so that a forecast of no change is never beyond it
+LEAST = 1e-9  # smallest level: a forecast of no change never exceeds it
 WORDS = {UNKNOWN: "unknown", OFF: "off", ON: "on"}
 
 
@@ -40,7 +40,7 @@ class State:
     """One alarm at one grid point."""
 
     state: int  # `UNKNOWN`, `OFF` or `ON`
-    score: float  # times its level; above 1 the alarm is on; NaN where it is unknown
+    score: float  # multiples of the level; above 1 the alarm is on; NaN: unknown
 
     @property
     def word(self) -> str:
@@ -56,11 +56,9 @@ class Alarms:
     """The levels of a model's alarms."""
 
     axes: tuple[tuple[str, str], ...]  # stream and axis of each load
-    levels: Mapping[
-        str, tuple[float, ...]
-    ]  # of ``load`` for each of these, of ``slip`` one; infinite where there is none
+    levels: Mapping[str, tuple[float, ...]]  # one level of ``load`` per axis, one of ``slip``; infinite: none
     per_hour: float = math.nan  # false alarms that they were set for
-    floors: tuple[float, ...] = ()  # of the score for slips, of each skin
+    floors: tuple[float, ...] = ()  # floor of the score for slips, per skin
 
     @classmethod
     def unset(cls, layout: Sequence[Mapping[str, str]]) -> Self:
@@ -96,9 +94,11 @@ class Alarms:
 
     def to_json(self) -> dict[str, Any]:
         """Return the levels as JSON can hold them: null where there is none."""
-        levels = {name: [one if math.isfinite(one) else None for one in values] for name, values in self.levels.items()}
+        levels = {
+            name: [value if math.isfinite(value) else None for value in values] for name, values in self.levels.items()
+        }
         return {
-            "axes": [list(one) for one in self.axes],
+            "axes": [list(axis) for axis in self.axes],
             "levels": levels,
             "floors": list(self.floors),
             "per_hour": self.per_hour,

@@ -58,9 +58,9 @@ BLOCKING = Cause.START | Cause.CONTEXT | Cause.GAP | Cause.VALUE | Cause.SKIPPED
 
 @dataclass(frozen=True, slots=True)
 class Forecast:
-    """What was predicted at one grid point; one is returned for each grid point, also where nothing can be predicted."""
+    """The prediction at one grid point; each grid point has one, also where nothing can be predicted."""
 
-    t_ns: int  # of the grid point; step k is the time t_ns + k * period, on a uniform grid
+    t_ns: int  # time of the grid point; step k is the time t_ns + k * period, on a uniform grid
     made_from_t_ns: int  # stamp of the newest sample that was read, never above t_ns; 0 before the streams have begun
     count: Float32s | None  # (horizon, channel), above rest; None where `cause` has a flag of `BLOCKING`
     now: Float32s | None  # (channel,), above rest at t_ns; None before the level at rest is known
@@ -78,7 +78,7 @@ def _gap_ms(synchronize: Any, forecaster: Forecaster, stream: str) -> float:
 
 
 class Beginning(NamedTuple):
-    """What a chain learned when its session began: enough for another chain to continue the session."""
+    """The state since the beginning of a session that another chain needs to continue it."""
 
     origin_ns: int  # first point of the grid
     rest: tuple[float, ...]  # level at rest of each channel
@@ -121,9 +121,11 @@ class Chain:
         targets: Targets | None = None,
         quantiles: Sequence[int] = (),
     ) -> None:
-        """Make a chain of parts that fit; `of` checks that they do."""
+        """Make a chain of parts that fit; `for_model` checks that they do."""
         self._targets = targets
-        self._quantiles = forecaster.quantiles_of(quantiles)[1] if quantiles else []  # where they stand in a band
+        self._quantiles = (
+            forecaster.quantiles_of(quantiles)[1] if quantiles else []
+        )  # places of the quantiles in a band
         stages = causal_stages(steps)
         self._forecaster, self._stages, self._layout = forecaster, stages, layout
         sync = stages.synchronize
@@ -142,12 +144,12 @@ class Chain:
         self._late_plans = 0
         self._until_ns: int | None = None
         period_ns = 1e9 / self.rate_hz
-        self._apart_ns = stages.apart * period_ns
+        self._apart_ns = stages.largest_step * period_ns
         self._codec_ns = CODEC_GAP * period_ns
         self._ahead_ns = np.rint(np.arange(1, forecaster.horizon + 1) * period_ns).astype(np.int64)  # (horizon,)
 
     @classmethod
-    def of(
+    def for_model(
         cls,
         model: Mapping[str, bytes] | Forecaster,
         steps: Sequence[Mapping[str, Any]],
@@ -191,7 +193,7 @@ class Chain:
         if plan_from and plan_from not in layouts:
             raise UsageError(f"There is no stream {plan_from} that plans could come from; there are {listed(layouts)}.")
         targets = Targets(plan_from, layouts[plan_from]) if plan_from else None
-        layout = Layout.of(forecaster, stages.synchronize, layouts, master)
+        layout = Layout.for_forecaster(forecaster, stages.synchronize, layouts, master)
         return cls(forecaster, steps, layout, beginning, targets, quantiles)
 
     @property
@@ -250,7 +252,7 @@ class Chain:
 
     @property
     def reads_plan(self) -> bool:
-        """Whether the model reads planned motion."""
+        """True for a model that reads planned motion."""
         return self._forecaster.actions == "planned" and bool(self._forecaster.pose.position)
 
     @property
@@ -328,7 +330,7 @@ class Chain:
             if row.t_ns <= first.t_ns + round(self._stages.contacts.rest_s * 1e9) or not self._resting:
                 self._resting.append(row)
                 return Forecast(row.t_ns, row.newest_ns, None, None, Cause.START, row.gaps)
-            self._rest = self._layout.rest(
+            self._rest = self._layout.rest_levels(
                 self._stages.contacts, [resting_row.tactile for resting_row in self._resting]
             )
             for resting_row in self._resting:

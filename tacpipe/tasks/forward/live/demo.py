@@ -31,16 +31,23 @@ from tacpipe.simulation import pick_and_move
 from tacpipe.simulation.emulation.emulator import Emulator
 from tacpipe.simulation.emulation.world import World
 
-GAP_PERIODS = 5.0  # without a forecast, where the line is broken
-BEFORE_MS, AFTER_MS = 400.0, 150.0  # of a slip, that are shown from near
-MOST_SLIPS = 6  # that are shown from near
+GAP_PERIODS = 5.0  # periods without a forecast that break the line
+BEFORE_MS, AFTER_MS = 400.0, 150.0  # time around a slip that is drawn enlarged
+MOST_SLIPS = 6  # slips that are drawn enlarged
 MEASURED, PREDICTED, SLIPPED, QUIET = "#444444", "#d95f02", "#1b6ca8", "#cccccc"
 
 
 def draw(
-    path: Path, recording: Any, layout: Any, truth_ns: Times, slips: Bools, found: Times, horizon_ns: int, headline: str
+    path: Path,
+    recording: Any,
+    layout: Any,
+    truth_ns: Times,
+    slips: Bools,
+    slips_ns: Times,
+    horizon_ns: int,
+    headline: str,
 ) -> Path:
-    """Draw a session against the slips of the simulation, ``found`` (event, 2), and return the path."""
+    """Draw a session against the slips of the simulation, ``slips_ns`` (event, 2), and return the path."""
     import matplotlib as mpl
 
     mpl.use("Agg")
@@ -49,7 +56,7 @@ def draw(
     start_ns = int(truth_ns[0])
     alarm = recording.table("alarm").to_pandas()
     alarm_ns = alarm["t_device_ns"].to_numpy()
-    columns = max(1, min(MOST_SLIPS, len(found)))
+    columns = max(1, min(MOST_SLIPS, len(slips_ns)))
     figure = pyplot.figure(figsize=(12, 7.5), layout="constrained")
     grid = figure.add_gridspec(3, columns, height_ratios=(2, 1, 2))
     upper = figure.add_subplot(grid[0, :])
@@ -58,10 +65,10 @@ def draw(
     _loads(upper, recording.table("forecast"), layout, start_ns, horizon_ns)
     _strips(lower, alarm, (alarm_ns - start_ns) / 1e9, (truth_ns[slips] - start_ns) / 1e9)
     for axes in (upper, lower):
-        for begins_ns in found[:, 0].tolist():
+        for begins_ns in slips_ns[:, 0].tolist():
             axes.axvline((begins_ns - start_ns) / 1e9, color=SLIPPED, linewidth=0.6, alpha=0.6)
     nears: list[Any] = []
-    for place, begins_ns in enumerate(found[:MOST_SLIPS, 0].tolist()):
+    for place, begins_ns in enumerate(slips_ns[:MOST_SLIPS, 0].tolist()):
         near = figure.add_subplot(grid[2, place], sharey=nears[0] if nears else None)
         nears.append(near)
         _near(near, alarm, (alarm_ns - begins_ns) / 1e6, horizon_ns / 1e6)
@@ -104,7 +111,7 @@ def _loads(axes: Any, table: Any, layout: Any, start_ns: int, horizon_ns: int) -
     gaps = np.flatnonzero(np.diff(at_s) > GAP_PERIODS * period_s) + 1
 
     def line(values: AnyFloats, colour: str, label: str) -> None:
-        broken_s, broken = (np.insert(np.asarray(one, float), gaps, np.nan) for one in (at_s, values))
+        broken_s, broken = (np.insert(np.asarray(series, float), gaps, np.nan) for series in (at_s, values))
         axes.plot(broken_s, broken, color=colour, linewidth=1, label=label)
 
     line(pulled.max(axis=1), PREDICTED, f"largest predicted of the next {horizon_ns / 1e6:.0f} ms")
@@ -129,9 +136,9 @@ def _strips(axes: Any, alarm: Any, alarm_s: AnyFloats, slips_s: AnyFloats) -> No
 
 def _near(axes: Any, alarm: Any, since_ms: AnyFloats, horizon_ms: float) -> None:
     """Draw the score of the slip alarm around a slip."""
-    shown = (since_ms >= -BEFORE_MS) & (since_ms <= AFTER_MS)
-    score, state = alarm["slip_score"].to_numpy()[shown], alarm["slip_state"].to_numpy()[shown]
-    at_ms = since_ms[shown]
+    near = (since_ms >= -BEFORE_MS) & (since_ms <= AFTER_MS)
+    score, state = alarm["slip_score"].to_numpy()[near], alarm["slip_state"].to_numpy()[near]
+    at_ms = since_ms[near]
     axes.axvspan(-horizon_ms, 0, color=QUIET, alpha=0.3, linewidth=0)
     axes.axhline(1.0, color=MEASURED, linewidth=0.8, linestyle="--")
     axes.axvline(0.0, color=SLIPPED, linewidth=1.2)
@@ -149,7 +156,7 @@ EFFORT = 1.15  # the largest load of the plan over the limit of friction: each t
 LIVE_S = 60.0
 PER_HOUR = 60.0  # false alarms: one a minute, as `tacpipe evaluate` allows
 SEED = 7
-AHEAD_S, EVERY_S, POINT_S = 0.5, 0.1, 0.02  # of the plan: reach, from one to the next, between points
+AHEAD_S, EVERY_S, POINT_S = 0.5, 0.1, 0.02  # the plan: its length, the time between plans, the time between points
 SWITCH_S = 0.0005
 
 
@@ -164,8 +171,8 @@ def run(output: Path, rig_file: Path, seconds: float = LIVE_S) -> Path:
     sys.setswitchinterval(SWITCH_S)
     with Emulator(rigs.read(rig_file), SEED, folder=output / "emulated", world=world) as emulator:
         (output / "emulated" / "rig.toml").write_text(rig_text.of(emulator.rig))
-        ended = threading.Event()
-        planner = threading.Thread(target=send_plans, args=(emulator, port, ended), daemon=True)
+        is_over = threading.Event()
+        planner = threading.Thread(target=send_plans, args=(emulator, port, is_over), daemon=True)
         planner.start()
         try:
             _tacpipe(
@@ -174,7 +181,7 @@ def run(output: Path, rig_file: Path, seconds: float = LIVE_S) -> Path:
                 *("--alarms-per-hour", f"{PER_HOUR:g}", "--alarms-on", str(output / "setting")),
             )
         finally:
-            ended.set()
+            is_over.set()
             planner.join()
         epoch_ns = emulator.epoch_ns + time.time_ns() - time.monotonic_ns()
     return _shown(output, world, epoch_ns)
@@ -193,8 +200,8 @@ def _train(output: Path) -> None:
 def _simulate(output: Path, name: str, trials: int, seed: int) -> None:
     """Simulate trials, up to their contacts."""
     recordings, synced = str(output / f"{name}-recordings"), str(output / f"{name}-synced")
-    asked = ("--trials", str(trials), "--seed", str(seed), "--effort", str(EFFORT))
-    _tacpipe("simulate", "forward", *asked, "-o", recordings, "--quiet")
+    options = ("--trials", str(trials), "--seed", str(seed), "--effort", str(EFFORT))
+    _tacpipe("simulate", "forward", *options, "-o", recordings, "--quiet")
     _tacpipe("synchronize", recordings, "-o", synced, "--rate-hz", "50", "--quiet")
     _tacpipe("segment", "contacts", synced, "-o", str(output / name), "--quiet")
 
@@ -206,13 +213,13 @@ def _tacpipe(*words: str) -> None:
         raise TacpipeError(f"The demo stopped: `tacpipe {' '.join(words)}` ended with {code}.")
 
 
-def send_plans(emulator: Emulator, port: int, ended: threading.Event) -> None:
+def send_plans(emulator: Emulator, port: int, is_over: threading.Event) -> None:
     """Send where the emulated hand will be, as a controller would."""
     import socket
 
     offset_ns = time.time_ns() - time.monotonic_ns()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as planner:
-        while not ended.wait(EVERY_S):
+        while not is_over.wait(EVERY_S):
             since_ns = time.monotonic_ns() - emulator.epoch_ns
             t_ns = since_ns + np.arange(0, round(AHEAD_S * 1e9), round(POINT_S * 1e9), dtype=np.int64)
             poses = emulator.world.arm(t_ns)[:, 1:]
@@ -233,31 +240,31 @@ def _shown(output: Path, world: World, epoch_ns: int) -> Path:
     config = json.loads(tacpipe.open(output / "model").files["config.json"])
     period_ns = round(1e9 / config["rate_hz"])
     horizon_ns = config["horizon"] * period_ns
-    found = {
+    leads_by_alarm = {
         name: leads(t_ns, alarm[f"{name}_state"].to_numpy(), events, horizon_ns, period_ns) for name in ("slip", "load")
     }
     terminal.note(f"\n{len(events)} slips of the simulation; horizon {horizon_ns / 1e6:.0f} ms; {len(t_ns)} rows")
-    worth = [described(name, one) for name, one in found.items()]
+    worth = [described(name, lead) for name, lead in leads_by_alarm.items()]
     for line in worth:
         terminal.note(line)
-    known = latency["latency_ms"].dropna()
-    if len(known):
+    known_ms = latency["latency_ms"].dropna()
+    if len(known_ms):
         terminal.note(
-            f"latency: median {known.median():.1f} ms, 99 % {known.quantile(0.99):.1f} ms, {len(known)} forecasts"
+            f"latency: median {known_ms.median():.1f} ms, 99 % {known_ms.quantile(0.99):.1f} ms, {len(known_ms)} forecasts"
         )
     layout = config["inputs"]["layout"]
     return draw(output / "live.png", recording, layout, truth_ns, slips, events, horizon_ns, worth[0])
 
 
-def described(name: str, found: Leads) -> str:
+def described(name: str, lead: Leads) -> str:
     """Return what an alarm was worth in words.
 
     >>> described("slip", Leads(4, (120.0, 80.0), 1, 0.005))
     'slip alarm: 2 of 4 slips led, by 100 ms in the median; 1 false alarm in 18 s'
     """
-    median = f", by {np.median(found.leads_ms):.0f} ms in the median" if found.leads_ms else ""
-    false = f"{found.false_alarms} false alarm{'' if found.false_alarms == 1 else 's'} in {found.hours * 3600:.0f} s"
-    return f"{name} alarm: {len(found.leads_ms)} of {found.events} slips led{median}; {false}"
+    median = f", by {np.median(lead.leads_ms):.0f} ms in the median" if lead.leads_ms else ""
+    false = f"{lead.false_alarms} false alarm{'' if lead.false_alarms == 1 else 's'} in {lead.hours * 3600:.0f} s"
+    return f"{name} alarm: {len(lead.leads_ms)} of {lead.events} slips led{median}; {false}"
 
 
 if __name__ == "__main__":

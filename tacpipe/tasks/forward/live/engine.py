@@ -28,13 +28,11 @@ from tacpipe.tasks.forward.live.messages import Description, Message
 if TYPE_CHECKING:
     import pyarrow as pa
 
-PERIODS = 2.0  # without a forecast, after which a message states why there is none
-SLACK_NS = 5_000_000  # of the same, for jitter
-EARLY_NS = (
-    1_500_000  # before a row is due, at which what came by then is decoded: the row then waits for the rest alone
-)
+PERIODS = 2.0  # periods without a forecast after which a message states the cause
+SLACK_NS = 5_000_000  # additional time for jitter
+EARLY_NS = 1_500_000  # time before a row is due at which earlier samples are decoded
 LITTLE_NS = 300_000  # a shorter wait until then is not worth waking for
-STARTING_S = 0.005  # between two tries while the grid is not known
+STARTING_S = 0.005  # wait between two tries while the grid is unknown
 
 
 class CausalChain(Protocol):
@@ -74,7 +72,7 @@ class CausalChain(Protocol):
 
     @property
     def beginning(self) -> Beginning | None:
-        """What a chain needs to continue this one's session; None as long as it is not known."""
+        """The state that a chain needs to continue the session; None until it is known."""
 
     def push(self, stream: str, batch: Any) -> None:
         """Take samples."""
@@ -110,9 +108,9 @@ class ForecastEngine(Engine):
         self._begun: set[str] = set()
         self._decoders = self._new_decoders()
         self._last_ns: int | None = None  # monotonic, of the last message
-        self._point_ns: int | None = None  # of the last grid point
+        self._point_ns: int | None = None  # time of the last grid point
         self._why = ""  # there is a chain and yet no grid: why
-        self._continues: Beginning | None = None  # of a process that ended, which the next recording continues
+        self._continues: Beginning | None = None  # state of an earlier process that the next recording continues
 
     @property
     def period_ns(self) -> int:
@@ -126,7 +124,7 @@ class ForecastEngine(Engine):
 
     @property
     def beginning(self) -> Beginning | None:
-        """What another process needs to continue this recording."""
+        """The state that another process needs to continue this recording."""
         return self.chain.beginning
 
     def describe(self, model: str) -> Description:

@@ -39,12 +39,12 @@ if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset, Model, Recording
 
 LEVELS = "live_alarm_levels"  # attribute of a recording: the levels of its alarms, as JSON
-DIGITS = 12  # of a digest in a message, as `tacpipe show` prints it
+DIGITS = 12  # digits of a digest in a message, as `tacpipe show` prints it
 MODEL = "live_model"  # attribute of a recording: the digest of the model that its session ran
 
 
 class _Offline(NamedTuple):
-    """What the offline model predicts of a recording."""
+    """Predictions of a recording by the offline model."""
 
     now: Int64s  # (window,), rows of the track
     ahead: AnyFloats  # (window, horizon, channel), above rest
@@ -110,12 +110,14 @@ def _session(
 ) -> Session:
     tables = streams_as_recorded(recording)
     levels = () if forecaster.uncertainty is None else forecaster.uncertainty.percents
-    session = Published.of(tables["forecast"], forecaster.codec.channels, levels)
+    session = Published.from_stream(tables["forecast"], forecaster.codec.channels, levels)
     chain = replay.chain_of(forecaster, model.source.chain, recording, tables, session.levels, allow_look_ahead=True)
     forecasts = list(replay.replayed(chain, tables))
     with_values = [forecast for forecast in forecasts if forecast.count is not None]
     made_ns = np.array([forecast.t_ns for forecast in with_values], np.int64)
-    same, equal = measures.equality(session.t_ns, session.whole(), made_ns, session.alike(with_values))
+    same, equal = measures.equality(
+        session.t_ns, session.values_and_quantiles(), made_ns, session.matching_rows(with_values)
+    )
     latency = tables["latency"]
     track = tracks.track(offline, forecaster.codec, forecaster.pose)
     predicted = _offline(forecaster, track)
@@ -280,11 +282,11 @@ class Published:
     t_ns: Times  # (row,), of the grid points
     steps: tuple[int, ...]
     values: Float32s  # (row, step, channel)
-    levels: tuple[int, ...]  # of the quantiles, in percent; empty where it published none
+    levels: tuple[int, ...]  # levels of the quantiles, percent; empty: none were published
     quantiles: Float32s  # (row, level x step, channel)
 
     @classmethod
-    def of(cls, forecast: Any, channels: Sequence[str], trained_levels: Sequence[int] = ()) -> Published:
+    def from_stream(cls, forecast: Any, channels: Sequence[str], trained_levels: Sequence[int] = ()) -> Published:
         """Return what a stream of forecasts (an arrow table) of some channels holds, and quantiles of ``known`` levels."""
         ends = {name.rpartition("_t")[2] for name in forecast.column_names if name.rpartition("_t")[0] in channels}
         steps = sorted({int(end.partition("_q")[0]) for end in ends})
@@ -301,11 +303,11 @@ class Published:
         quantiles = stacked([f"t{step}_q{level}" for level, step in itertools.product(levels, steps)])
         return cls(times(forecast), tuple(steps), values, tuple(levels), quantiles)
 
-    def whole(self) -> Float32s:
+    def values_and_quantiles(self) -> Float32s:
         """Return values and quantiles (row, step + level x step, channel)."""
         return np.concatenate([self.values, self.quantiles], axis=1)
 
-    def alike(self, forecasts: Sequence[Forecast]) -> Float32s:
+    def matching_rows(self, forecasts: Sequence[Forecast]) -> Float32s:
         """Return the same of other forecasts, which all have values and as many quantiles as were published."""
         places = [step - 1 for step in self.steps]
         rows: list[Float32s] = []
@@ -315,7 +317,7 @@ class Published:
             if forecast.quantiles is not None:
                 levels = list(forecast.quantiles[places].transpose(2, 0, 1))
             rows.append(np.concatenate([forecast.count[places], *levels]))
-        return np.stack(rows) if rows else self.whole()[:0]
+        return np.stack(rows) if rows else self.values_and_quantiles()[:0]
 
 
 def times(stream: Any) -> Times:

@@ -1,4 +1,4 @@
-"""Which columns of which streams a forecaster reads, and the stream of planned motion."""
+"""Find the columns that a forecaster reads among the streams of a rig, and make streams of planned motion."""
 
 from __future__ import annotations
 
@@ -64,24 +64,28 @@ def plan_table(arrived_ns: int, t_ns: Times, poses: AnyFloats) -> pa.Table:
 
 @dataclass(frozen=True)
 class Layout:
-    """Where a forecaster's inputs are among the samples of a rig's streams."""
+    """The places of a forecaster's inputs in the samples of a rig's streams."""
 
     master: str
-    columns: Mapping[str, Sequence[str]]  # that are read of each stream
+    columns: Mapping[str, Sequence[str]]  # columns that are read, by stream
     readings: Mapping[str, Reading]
-    tactile_of: Mapping[str, tuple[Indices, Indices]]  # by stream: columns, and the channels that they are
-    axes: Mapping[str, int]  # of the taxels of each of these streams
-    kinds: Mapping[str, np.dtype[Any]]  # in which levels at rest are computed, by stream
+    tactile_of: Mapping[str, tuple[Indices, Indices]]  # columns and the channels that they hold, by stream
+    axes: Mapping[str, int]  # axes of the taxels, by stream
+    kinds: Mapping[str, np.dtype[Any]]  # types in which levels at rest are computed, by stream
     position: Place | None
     orientation: Place | None
     joints: tuple[Place, Place] | None  # angles and speeds
     finger: Place | None
     position_m: Floats  # (3,), how many metres the unit of each coordinate is
     finger_scale_m: float
-    _places: dict[str, tuple[Any, tuple[int, ...]]] = field(default_factory=dict)  # of columns in batches of a schema
+    _places: dict[str, tuple[Any, tuple[int, ...]]] = field(
+        default_factory=dict
+    )  # places of columns in batches, by stream
 
     @classmethod
-    def of(cls, forecaster: Forecaster, synchronize: Any, layouts: Mapping[str, pa.Schema], master: str = "") -> Layout:
+    def for_forecaster(
+        cls, forecaster: Forecaster, synchronize: Any, layouts: Mapping[str, pa.Schema], master: str = ""
+    ) -> Layout:
         """Return where inputs are in streams of these schemas, by the params of the model's `synchronize`.
 
         Raises `TacpipeError` where a stream or a channel is absent, or is another than the model's.
@@ -211,7 +215,7 @@ class Layout:
         stream, columns = self.finger
         return float(np.float32(values[stream][columns[0]] * self.finger_scale_m))
 
-    def rest(self, contacts: Any, rows: Sequence[Floats]) -> Floats:
+    def rest_levels(self, contacts: Any, rows: Sequence[Floats]) -> Floats:
         """Return each channel's level at rest (channel,) by the params of `segment contacts` from the rows of the rest."""
         stacked = np.stack(rows)  # (row, channel)
         levels = np.empty(stacked.shape[1])

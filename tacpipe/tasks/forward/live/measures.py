@@ -25,8 +25,8 @@ class Equality:
     published: int  # rows
     recomputed: int  # rows
     compared: int  # rows that are in both
-    equal: int  # of these, all values bit for bit
-    largest_difference: float  # of the others, in the unit of the channels; 0 where there are none
+    equal: int  # compared rows whose values are all equal, bit for bit
+    largest_difference: float  # largest difference of the other rows, in the unit of the channels; 0: no such row
 
 
 def equality(
@@ -113,11 +113,11 @@ Sums = dict[str, tuple[Floats, Floats]]  # squared and absolute errors (step,) b
 
 
 class Session(NamedTuple):
-    """What a recording shows of a live session."""
+    """Measures of one recorded live session."""
 
     equality: Equality
     explained: int  # published rows that differ after a sample that came too late
-    rows: int  # that errors are of
+    rows: int  # rows whose errors count
     sums: Sums
     alarms: dict[str, dict[str, Leads]]  # alarm and event, to live and offline
     latency_ms: Floats

@@ -100,7 +100,7 @@ class Message(messages.Message):
     seq: int
     t_ns: int  # time of the grid point, UTC as the recording has it
     values: Float32s | None  # (step, channel), in the channels' unit above rest; None: no forecast
-    cause: str = ""  # in words: why there is no forecast, or what it was made without
+    cause: str = ""  # reason why there is no forecast, or what it was made without
     flags: int = 0  # the same as `tacpipe.tasks.forward.live.chain.Cause`
     alarms: Mapping[str, State] = field(default_factory=lambda: dict(NOTHING_KNOWN))
     made_from_t_ns: int = 0  # arrival of the newest sample that was read
@@ -120,7 +120,7 @@ class Message(messages.Message):
 
     @property
     def answers(self) -> bool:
-        """Whether there is a forecast."""
+        """True where there is a forecast."""
         return self.values is not None
 
     @property
@@ -160,7 +160,7 @@ class Message(messages.Message):
 
 @dataclass(frozen=True)
 class Description(messages.Description):
-    """What the values of forecasts are."""
+    """Describes the values of forecasts."""
 
     channels: tuple[str, ...]
     steps: tuple[int, ...]

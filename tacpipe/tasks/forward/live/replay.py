@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from tacpipe.datasets.dataset import Dataset, Model, Recording
 
-PIECE_NS = 1_000_000_000  # of a recording that is given at once
+PIECE_NS = 1_000_000_000  # length of the pieces of a recording that a chain gets
 
 
 def predict(
@@ -113,12 +113,12 @@ def chain_of(
     allow_look_ahead: bool = False,
 ) -> Chain:
     """Return the chain of a model for the streams ``tables`` of a recording, with the master and source of plans that it
-    names; all else is as in `Chain.of`."""
+    names; all else is as in `Chain.for_model`."""
     schemas = {name: table.schema for name, table in tables.items()}
     plan = str(recording.attributes.get("live_plan", ""))
     source = plan.removeprefix("rig:") if plan.startswith("rig:") else ""
     master, source = str(recording.attributes.get("master", "")), source if source in schemas else ""
-    return Chain.of(
+    return Chain.for_model(
         forecaster, steps, schemas, master, plan_from=source, quantiles=quantiles, allow_look_ahead=allow_look_ahead
     )
 

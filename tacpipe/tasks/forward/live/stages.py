@@ -19,7 +19,7 @@ class CausalStages(NamedTuple):
     contacts: Any
 
     @property
-    def apart(self) -> float:
+    def largest_step(self) -> float:
         """How many periods two rows may be apart with none missing between."""
         return apart({GRID: self.synchronize.timeline})
 

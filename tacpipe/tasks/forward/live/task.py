@@ -43,14 +43,14 @@ class ForwardSettings(TaskSettings):
     split: str = ""  # Split whose validation recordings --alarms-on means
 
     @classmethod
-    def override(cls, stated: Mapping[str, Any], options: Mapping[str, Any]) -> Mapping[str, Any]:
+    def override(cls, file_settings: Mapping[str, Any], options: Mapping[str, Any]) -> Mapping[str, Any]:
         """Return what a rig file states, without its alarms or its split where the options have others."""
         void: tuple[str, ...] = ()
         if options.get("alarms_per_hour") == 0:  # the option 0 switches off the alarms of the file
             void = ALARM_KEYS
         elif "alarms_on" in options and "split" not in options:  # the file's split is of the file's recordings
             void = ("split",)
-        return {name: value for name, value in stated.items() if name not in void}
+        return {name: value for name, value in file_settings.items() if name not in void}
 
     def check(self, settings: Settings) -> None:
         """Raise `UsageError` where alarms lack recordings, or recordings or a split lack alarms."""
@@ -120,7 +120,7 @@ class ForwardLive(LiveTask):
         own_settings = _own(settings)
         forecaster = Forecaster.load(model.files)
         open_chain = functools.partial(
-            Chain.of,
+            Chain.for_model,
             forecaster,
             model.source.chain,
             master=rig.master,

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 GAP_NS = 50_000_000  # age of the newest sample of the finger, from which on its stream is silent
-LONGEST_NS = 120_000_000_000  # of a recording, whose rows are kept until it ends
+LONGEST_NS = 120_000_000_000  # longest recording: its rows are kept until it ends
 IDLE_NS = 20_000_000
 RESTARTED = "the model's process was started anew, and lacks what came before"
 THROWN = "blocks were thrown away under overload"
@@ -34,7 +34,7 @@ THROWN = "blocks were thrown away under overload"
 
 @dataclass(frozen=True)
 class Begun:
-    """That a recording has begun, for a process that is started anew in it: what came of it is lost to that one."""
+    """States that a recording runs, for a process that replaces another one and lacks the samples so far."""
 
     def to_json(self) -> dict[str, Any]:
         """Return nothing: there is no more to know."""
@@ -58,7 +58,7 @@ class MaterialEngine(Engine):
         """Take what is read. A pause of 0: a recording is one slide."""
         super().__init__(sensors, settle_ns)
         self._parting = Parting(slide, finger, pause_ns) if pause_ns else None
-        self._number = 1  # of the slide in its recording
+        self._number = 1  # number of the slide in its recording
         self.every_ns = every_ns
         self._late = 0
         self._finger, self._slide, self._description = finger, slide, description
@@ -77,7 +77,7 @@ class MaterialEngine(Engine):
 
     @property
     def beginning(self) -> Begun | None:
-        """That a recording has begun."""
+        """States that a recording runs."""
         return Begun() if self.running else None
 
     def describe(self, model: str) -> MaterialDescription:

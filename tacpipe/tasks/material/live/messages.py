@@ -113,12 +113,12 @@ class MaterialMessage(messages.Message):
 
     @property
     def ended(self) -> bool:
-        """Whether the slide is over."""
+        """True where the slide is over."""
         return self.state in (ENDED, FINAL)
 
     @property
     def answers(self) -> bool:
-        """Whether a material is named."""
+        """True where a material is named."""
         return self.probabilities is not None
 
     @property
@@ -131,12 +131,12 @@ class MaterialMessage(messages.Message):
 
 @dataclass(frozen=True)
 class MaterialDescription(messages.Description):
-    """What the messages of a session with a model of materials are."""
+    """Describes the messages of a session with a model of materials."""
 
     channels: tuple[str, ...]  # names of the materials
     sensor: str
     frames: int  # rows of a slide that the model reads
-    any_length: bool  # whether it reads fewer
+    any_length: bool  # True: it reads fewer, too
     confidence: str  # probability: what the model was trained to state; order: scores of no scale, which only order
     rate_hz: float  # messages a second
     model: str

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     Tables = Mapping[str, pa.Table]
 
 SLIDES = "segment.slides"
-ENDED_NS = 200_000_000  # without a row of the slide, after which it counts as over
+ENDED_NS = 200_000_000  # time without a row of the slide after which it is over
 UNLIKE = "the slide is like none of the materials that the model knows"
 
 
@@ -73,10 +73,10 @@ class Held:
 
 @dataclass(frozen=True)
 class Answer:
-    """What a model gives of a slide so far."""
+    """The answer of a model for a slide so far."""
 
     scores: Float32s | None  # (class,); None: no material is named, for a cause
-    rows: int = 0  # of the slide so far
+    rows: int = 0  # rows of the slide so far
     seen: float = 0.0  # fraction of the rows that the model reads
     ended: bool = False  # nothing came of the slide for `ENDED_NS`
     cause: str = ""
@@ -107,7 +107,7 @@ class SlideSoFar:
 
     @property
     def any_length(self) -> bool:
-        """Whether it reads fewer."""
+        """True for a model that reads fewer rows, too."""
         return self._reader.any_length
 
     def answer(self, streams: Mapping[str, pa.Table]) -> Answer:
@@ -160,7 +160,7 @@ class SlideSoFar:
 
     @property
     def ends_by_arm(self) -> bool:
-        """Whether only the arm, when it stops, ends a slide."""
+        """True where a slide ends only when the arm stops."""
         return bool(self._params.trigger != "load")
 
     def _cut(self, recording: Held, table: pa.Table) -> tuple[Any, bool]:
@@ -174,7 +174,7 @@ class SlideSoFar:
         return Held({STREAM: remaining}, recording.attributes), remaining.num_rows < self.frames
 
 
-MOMENT_NS = 100_000_000  # between two moments of a part, from its finger's first sample on
+MOMENT_NS = 100_000_000  # time between two moments of a part, from its finger's first sample on
 
 
 class Parting:

@@ -15,7 +15,7 @@ from tacpipe.live import messages
 from tacpipe.live.messages import VERSION, Sizes, head_values, rounded
 from tacpipe.sensors.live import LSL, Column, Declaration, Value, latency_values
 
-COLUMNS = tuple(name for target in biotac_sp.TARGETS for name in biotac_sp.value_columns(target))  # of a touch
+COLUMNS = tuple(name for target in biotac_sp.TARGETS for name in biotac_sp.value_columns(target))  # values of a touch
 TOUCH = "touch"  # the recorded stream, one row per grasp
 ORDER = ("request", "grasp", "rank")
 SCORES = ("score", "level_th", "level_mf")
@@ -85,7 +85,7 @@ class TouchMessage(messages.Message):
     touch: Floats | None = None  # (grasp, value), `COLUMNS` in device counts; NaN for what the model does not predict
     levels: Floats = field(default_factory=lambda: np.zeros((0, 2)))  # (grasp, finger)
     scores: Floats = field(default_factory=lambda: np.zeros(0))  # (grasp,)
-    ranks: tuple[int, ...] = ()  # of each grasp, 1 for the best
+    ranks: tuple[int, ...] = ()  # rank of each grasp, 1 for the best
     cause: str = ""  # why nothing is ranked
     made_from_t_ns: int = 0
     latency_ms: float = math.nan
@@ -96,12 +96,12 @@ class TouchMessage(messages.Message):
 
     @property
     def answers(self) -> bool:
-        """Whether candidates are ranked."""
+        """True where candidates are ranked."""
         return self.touch is not None
 
     @property
     def states(self) -> Mapping[str, str]:
-        """Which grasp of which request is best."""
+        """The best grasp of the request."""
         best = f"grasp {self.ranks.index(1)} of {len(self.ranks)}" if self.ranks else "unknown"
         return {f"request {self.request}": best}
 
@@ -147,7 +147,7 @@ class TouchMessage(messages.Message):
 
 @dataclass(frozen=True)
 class TouchDescription(messages.Description):
-    """What the messages of a session with a model of touch are."""
+    """Describes the messages of a session with a model of touch."""
 
     targets: tuple[str, ...]
     criterion: str

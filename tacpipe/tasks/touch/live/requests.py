@@ -18,7 +18,7 @@ from tacpipe.printable import excerpt
 from tacpipe.tasks.touch.predictor import Touch
 
 NPZ = ".npz"
-LARGEST_BYTES = 1 << 28  # of an NPZ file
+LARGEST_BYTES = 1 << 28  # limit of an NPZ file
 
 
 def grasps(record: Any) -> list[Grasp]:
@@ -87,11 +87,11 @@ CONTACT, BALANCE, LEVEL = "contact", "balance", "level"
 
 
 class Criterion(NamedTuple):
-    """What a grasp is ranked by: the higher its score, the better."""
+    """A criterion of a ranking: the higher the score, the better the grasp."""
 
-    text: str  # as the user gave it
-    score: Callable[[Floats], Floats]  # of levels (grasp, finger) to scores (grasp,)
-    fingers: int  # whose touch must be predicted
+    text: str  # the criterion as the user gave it
+    score: Callable[[Floats], Floats]  # function of levels (grasp, finger) that returns scores (grasp,)
+    fingers: int  # fingers whose touch must be predicted
 
 
 def criterion(text: str) -> Criterion:
