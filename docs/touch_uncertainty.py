@@ -24,7 +24,7 @@ from tacpipe.tasks.touch import calibration as touch_calibration
 from tacpipe.tasks.touch import evaluation as touch_evaluation
 from tacpipe.tasks.touch import headline as headlines
 from tacpipe.tasks.touch import training as touch_training
-from tacpipe.tasks.touch.report.uncertainty import Measured, measured
+from tacpipe.tasks.touch.report.uncertainty import Band, measure_bands
 from tacpipe.tasks.touch.result_names import CONSTANT, COVERAGE, MODEL, OBJECT_MEAN
 
 if TYPE_CHECKING:
@@ -84,7 +84,7 @@ def table(rows: pd.DataFrame) -> str:
     lines = ["| " + " | ".join(heads) + " |", "| --- " * len(heads) + "|"]
     for known in (True, False):
         some = rows[rows.known == known]
-        found = measured(some, known)
+        found = measure_bands(some, known)
         for target in (name for name in headlines.TARGETS if (name, MODEL) in found):
             model, constant, mean = (found[target, name] for name in (MODEL, CONSTANT, OBJECT_MEAN))
             cells = ["known" if known else "novel", f"`{target}`", str(some.recording.nunique())]
@@ -94,12 +94,12 @@ def table(rows: pd.DataFrame) -> str:
     return "\n".join(lines)
 
 
-def _coverage(one: Measured) -> str:
+def _coverage(one: Band) -> str:
     mean, low, high = one.coverage
     return f"{mean:.2f} ({low:.2f} to {high:.2f})"
 
 
-def _gain(one: Measured) -> str:
+def _gain(one: Band) -> str:
     mean, low, high = (100 * part for part in one.gain)
     return f"{mean:.0f} % ({low:.0f} to {high:.0f})".replace("-", "\N{MINUS SIGN}")
 

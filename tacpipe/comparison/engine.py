@@ -1,23 +1,22 @@
-"""Methods next to each other and to their baselines: errors, gain over the best baseline, and how sure that is.
+"""Compare methods with each other and with their baselines: errors, gain over the best baseline, and intervals.
 
-Runs of a method are pooled: its errors are summed by seed and recording, and intervals are over clusters of recordings, and
-over seeds where there are several (`tacpipe.metrics.pairing`).
-"""
+Runs of a method are pooled: its errors are summed by seed and recording. Intervals are over clusters of recordings, and over
+seeds where there are several (`tacpipe.metrics.pairing`)."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from tacpipe.comparison.runs import MODEL, Method, Question, Run, Settings, grouped, separate
+from tacpipe.comparison.runs import MODEL, Method, Question, Run, Settings, grouped, separate, spread
 from tacpipe.comparison.specification import Kind, TaskReport, by_task, report_on
-from tacpipe.comparison.spread import spread
 from tacpipe.metrics import pairing
 from tacpipe.metrics.headline import Headline
 from tacpipe.metrics.intervals import Estimate
 from tacpipe.metrics.pairing import Gain, Measure, Pair, Sums
+from tacpipe.metrics.proportions import paired_t
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -62,7 +61,7 @@ class Comparison:
 
     def of(self, *kinds: Kind) -> list[Row]:
         """Return the rows of some kinds, the best first."""
-        return [one for one in self.rows if one.kind in kinds]
+        return [row for row in self.rows if row.kind in kinds]
 
     @property
     def models(self) -> list[Row]:
@@ -78,8 +77,8 @@ class Comparison:
     def best_baseline(self) -> Row | None:
         """The baseline that the best method is compared with."""
         name = self.best.baseline if self.best else ""
-        found = self.of("baseline")
-        return next((one for one in found if one.name == name), next(iter(found), None))
+        baselines = self.of("baseline")
+        return next((row for row in baselines if row.name == name), next(iter(baselines), None))
 
     @property
     def headline(self) -> Headline | None:
@@ -122,12 +121,12 @@ def compare(results: Sequence[Dataset], *, pool: bool = True) -> list[Comparison
     With ``pool``, runs that differ in seed or fold alone are one method; without, each run is a row of its own. Results
     that hold nothing to compare are left out.
     """
-    found = []
+    all_comparisons = []
     for name, same in by_task(results).items():
         task = report_on(name)
         runs = task.read(same)
-        found += comparisons(task, grouped(runs, task.usual) if pool else separate(runs))
-    return found
+        all_comparisons += comparisons(task, grouped(runs, task.usual) if pool else separate(runs))
+    return all_comparisons
 
 
 def comparisons(task: TaskReport, methods: Sequence[Method]) -> list[Comparison]:
@@ -150,8 +149,10 @@ def _by_unit(methods: Sequence[Method], question: Question) -> dict[str, list[Me
 
 def questions_of(runs: Sequence[Run]) -> list[Question]:
     """Return the questions that any run was evaluated on by their places, those of one place as most runs order them."""
-    most = sorted(runs, key=lambda run: -len(run.questions))
-    return sorted(dict.fromkeys(question for run in most for question in run.questions), key=lambda one: one.place)
+    ordered = sorted(runs, key=lambda run: -len(run.questions))
+    return sorted(
+        dict.fromkeys(question for run in ordered for question in run.questions), key=lambda candidate: candidate.place
+    )
 
 
 def compare_on(task: TaskReport, methods: Sequence[Method], question: Question) -> Comparison:
@@ -160,24 +161,28 @@ def compare_on(task: TaskReport, methods: Sequence[Method], question: Question) 
     Baselines, oracles and controls are those of one method's runs (`reference`), because a split has the same for all; a
     variant of the model is given for each method.
     """
-    held = [one for one in methods if one.of(question)]
-    measure = held[0].of(question)[0].questions[question].measure
-    source = reference(task, held, question, measure)
+    evaluated = [evaluated_method for evaluated_method in methods if evaluated_method.of(question)]
+    measure = evaluated[0].of(question)[0].questions[question].measure
+    source = reference(task, evaluated, question, measure)
     entries: list[tuple[str, Kind, str, Method]] = []
     sources: dict[str, Method] = {}
-    for one in [source, *held]:
-        for predictor in one.predictors(question):
-            sources.setdefault(predictor, one)
-    for one in held:
-        for predictor in one.predictors(question):
+    for evaluated_method in [source, *evaluated]:
+        for predictor in evaluated_method.predictors(question):
+            sources.setdefault(predictor, evaluated_method)
+    for evaluated_method in evaluated:
+        for predictor in evaluated_method.predictors(question):
             kind = task.kind(predictor)
-            if kind == "model" and one.control:
-                entries.append((one.name, "control", predictor, one))
+            if kind == "model" and evaluated_method.control:
+                entries.append((evaluated_method.name, "control", predictor, evaluated_method))
             elif kind == "model" or kind == "variant":
-                name = one.name if kind == "model" else f"{one.name} · {task.predictor_name(predictor)}"
-                entries.append((name, kind, predictor, one))
-            elif one is sources[predictor]:
-                entries.append((task.predictor_name(predictor), kind, predictor, one))
+                name = (
+                    evaluated_method.name
+                    if kind == "model"
+                    else f"{evaluated_method.name} · {task.predictor_name(predictor)}"
+                )
+                entries.append((name, kind, predictor, evaluated_method))
+            elif evaluated_method is sources[predictor]:
+                entries.append((task.predictor_name(predictor), kind, predictor, evaluated_method))
     ranked = [_ranked(task, method, source, question, predictor) for _, _, predictor, method in entries]
     picked = [next(iter(pairs.values())) for (_, kind, *_), pairs in zip(entries, ranked, strict=True)
               if kind == "model" and pairs]  # fmt: skip
@@ -193,10 +198,10 @@ def compare_on(task: TaskReport, methods: Sequence[Method], question: Question) 
 def reference(task: TaskReport, methods: Sequence[Method], question: Question, measure: Measure) -> Method:
     """Return the method whose runs report on baselines: with most baselines, then most runs, then the least error."""
 
-    def place(one: Method) -> tuple[int, int, float]:
-        counted = sum(task.kind(name) not in ("model", "variant") for name in one.predictors(question))
-        error = float(measure.error(sum(one.sums(question).values())[None])[0])  # type: ignore[index]
-        return counted, len(one.of(question)), -error
+    def place(method: Method) -> tuple[int, int, float]:
+        counted = sum(task.kind(name) not in ("model", "variant") for name in method.predictors(question))
+        error = float(measure.error(sum(method.sums(question).values())[None])[0])  # type: ignore[index]
+        return counted, len(method.of(question)), -error
 
     return max(methods, key=place)
 
@@ -204,7 +209,7 @@ def reference(task: TaskReport, methods: Sequence[Method], question: Question, m
 def headline(row: Row, comparison: Comparison) -> Headline | None:
     """Return a row of a method as a headline, with all baselines that it was compared with."""
     question, method = comparison.question, row.method
-    source = next((one.method for one in comparison.rows if one.kind == "baseline"), method)
+    source = next((row.method for row in comparison.rows if row.kind == "baseline"), method)
     task = report_on(comparison.task)
     rivals = (
         [row_of_model for row_of_model in comparison.models if row_of_model is not row] if row.kind == "model" else []
@@ -227,8 +232,8 @@ def headline(row: Row, comparison: Comparison) -> Headline | None:
 def difference(first: Method, second: Method, question: Question, predictors: tuple[str, str] = (MODEL, MODEL)) -> Gain:
     """Return what one method gains over another on the recordings of both."""
     measure = first.of(question)[0].questions[question].measure
-    one, other = first.sums(question, predictors[0]), second.sums(question, predictors[1])
-    return pairing.difference(measure, one, other, _clusters(first, question))
+    first_sums, second_sums = first.sums(question, predictors[0]), second.sums(question, predictors[1])
+    return pairing.difference(measure, first_sums, second_sums, _clusters(first, question))
 
 
 def _ranked(task: TaskReport, method: Method, source: Method, question: Question, predictor: str) -> dict[str, Pair]:
@@ -251,8 +256,8 @@ def _row(
 ) -> Row:
     """Return the row of a predictor; ``pairs`` are with its baselines, ``picked`` those of all methods with the best."""
     sums, clusters = method.sums(question, predictor), _clusters(method, question)
-    runs = [one for one in method.of(question) if one.questions[question].sums.get(predictor)]
-    each = [measure.score_of(one.questions[question].sums[predictor].values()) for one in runs]
+    runs = [run for run in method.of(question) if run.questions[question].sums.get(predictor)]
+    run_scores = [measure.score_of(run.questions[question].sums[predictor].values()) for run in runs]
     gain = pairing.gain(measure, list(pairs.values()), picked if kind == "model" else ())
     return Row(
         name,
@@ -262,7 +267,7 @@ def _row(
         method,
         measure.values(sum(sums.values())),  # type: ignore[arg-type]
         pairing.score(measure, sums, clusters),
-        spread(each).sd,
+        spread(run_scores).sd,
         next(iter(pairs), ""),
         gain,
         next((compared.p(measure) for compared in pairs.values()), math.nan),
@@ -275,15 +280,74 @@ def _row(
 
 def _baselines(task: TaskReport, method: Method, source: Method, question: Question) -> dict[str, Sums]:
     """Return the baselines of a method's own runs, or else of ``source``, by what tables call them."""
-    found = {}
+    baselines = {}
     for name in dict.fromkeys([*method.predictors(question), *source.predictors(question)]):
         if task.kind(name) == "baseline":
-            found[task.predictor_name(name)] = method.sums(question, name) or source.sums(question, name)
-    return found
+            baselines[task.predictor_name(name)] = method.sums(question, name) or source.sums(question, name)
+    return baselines
 
 
 def _clusters(method: Method, question: Question) -> dict[str, str] | None:
-    held = [run.questions[question].clusters for run in method.of(question)]
-    if any(one is None for one in held):
+    clusters_by_run = [run.questions[question].clusters for run in method.of(question)]
+    if any(clusters is None for clusters in clusters_by_run):
         return None
-    return {name: cluster for one in held if one for name, cluster in one.items()}
+    return {name: cluster for clusters in clusters_by_run if clusters for name, cluster in clusters.items()}
+
+
+ABOUT = ("run", "seed", "fold", "tested", "recording")  # columns of a table of observations
+
+
+@dataclass(frozen=True)
+class PairedRuns:
+    """Two methods compared over what both were repeated for."""
+
+    unit: str  # ``folds``, or ``seeds`` where there is one fold
+    units: int  # that both methods have; 0 where there are fewer than two
+    p: float  # of the paired t test, NaN below two units and where all differ by as much
+
+
+def observations(runs: Sequence[Run], question: Question, predictor: str = MODEL) -> pd.DataFrame:
+    """Return a row a run and recording: run (its place), seed, fold, tested, recording, and ``s0``, ``s1`` … of its sums.
+
+    ``tested`` is the set of a run's recordings as text: what distinguishes folds that have no name.
+    """
+    import pandas as pd
+
+    rows = []
+    for place, run in enumerate(runs):
+        sums = run.questions[question].sums.get(predictor, {}) if question in run.questions else {}
+        tested = "\n".join(sorted(sums))
+        rows += [(place, run.seed, run.fold, tested, name, *parts) for name, parts in sums.items()]
+    width = max(map(len, rows), default=0) - len(ABOUT)
+    return pd.DataFrame(rows, columns=[*ABOUT, *(f"s{place}" for place in range(width))])
+
+
+def paired_runs(
+    first: Sequence[Run], second: Sequence[Run], question: Question, predictors: tuple[str, str] = (MODEL, MODEL)
+) -> PairedRuns:
+    """Return the paired t test of two methods' scores by fold, or by seed where there is one fold.
+
+    Folds are those that runs name, or else the recordings that they were evaluated on.
+    """
+    for unit, column in (("folds", "fold"), ("folds", "tested"), ("seeds", "seed")):
+        first_scores, second_scores = (
+            _scores(runs, question, name, column) for runs, name in zip((first, second), predictors, strict=True)
+        )
+        common = [key for key in first_scores if key in second_scores]
+        if len(common) > 1:
+            pairs = [(first_scores[key], second_scores[key]) for key in common]
+            gains = [mine - yours for mine, yours in pairs]
+            alike = max(gains) - min(gains) < 1e-12 * max(map(abs, (*gains, 1.0)))
+            return PairedRuns(unit, len(pairs), math.nan if alike else paired_t(*zip(*pairs, strict=True)).p)
+    return PairedRuns("folds", 0, math.nan)
+
+
+def _scores(runs: Sequence[Run], question: Question, predictor: str, column: str) -> dict[Hashable, float]:
+    """Return the mean score of the runs of each value of a column."""
+    score = next(run for run in runs if question in run.questions).questions[question].measure.score_of
+    table = observations(runs, question, predictor).dropna(subset=column)
+    parts = [name for name in table.columns if name not in ABOUT]
+    scores: dict[Hashable, list[float]] = {}
+    for (_, key), rows in table.groupby(["run", column]):
+        scores.setdefault(key, []).append(score(rows[parts].to_numpy()))
+    return {key: sum(values) / len(values) for key, values in scores.items()}

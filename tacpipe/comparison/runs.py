@@ -1,4 +1,4 @@
-"""A result of an evaluation as a run, and the runs of a method: what a task reads from its results for a comparison."""
+"""Pool results of evaluations as runs of methods, and name the methods."""
 
 from __future__ import annotations
 
@@ -7,13 +7,76 @@ from collections.abc import Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from tacpipe.comparison.naming import distinct_names
+import numpy as np
+
 from tacpipe.metrics import pairing
 
 if TYPE_CHECKING:
     from tacpipe.arrays import AnyFloats
     from tacpipe.datasets.dataset import Dataset
     from tacpipe.metrics.pairing import Measure, Sums
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Mean and standard deviation over runs; the latter is NaN for a single one."""
+
+    mean: float
+    sd: float
+
+
+def spread(values: Sequence[float]) -> Spread:
+    """Return mean and standard deviation of one value a run.
+
+    >>> spread([1.0, 3.0])
+    Spread(mean=2.0, sd=1.4142135623730951)
+    """
+    return Spread(
+        float(np.mean(values)) if values else float("nan"),
+        float(np.std(values, ddof=1)) if len(values) > 1 else float("nan"),
+    )
+
+
+Tree = Mapping[str, Any]
+
+
+def distinct_names(
+    methods: Sequence[tuple[str, Tree]], usual: Collection[str | tuple[str, Any]] = ()
+) -> list[tuple[str, dict[str, Any]]]:
+    """Return a name for each method, given a first name and all its settings, and the settings that are part of it.
+
+    Settings are given where methods of the same first name differ in them, but for empty ones and those in ``usual``:
+    names, or names with values.
+
+    >>> distinct_names([("net", {"deep": True, "width": 8}), ("net", {"deep": False, "width": 8}), ("tree", {"deep": True})])
+    [('net · deep', {'deep': True}), ('net · no deep', {'deep': False}), ('tree', {})]
+    """
+    alike: dict[str, list[Tree]] = {}
+    for name, settings in methods:
+        alike.setdefault(name, []).append(settings)
+    distinct = []
+    for first, settings in methods:
+        differing = {
+            name: value
+            for name, value in settings.items()
+            if name not in usual and (name, value) not in usual and any(run.get(name) != value for run in alike[first])
+        }
+        distinct.append((" · ".join([first, *marks(differing)]), differing))
+    return distinct
+
+
+def marks(differing: Tree) -> list[str]:
+    """Return settings as a name states them, those that are empty left out.
+
+    >>> marks({"width": 8, "deep": True, "of": ""})
+    ['deep', 'width 8']
+    """
+    return [
+        f"{name} {value}" if not isinstance(value, bool) else name if value else f"no {name}"
+        for name, value in sorted(differing.items())
+        if value != ""
+    ]
+
 
 Settings = Mapping[str, Any]
 MODEL = "model"  # the predictor that a run is about
@@ -100,14 +163,14 @@ class Method:
 
     def of(self, question: Question) -> list[Run]:
         """Return its runs that were evaluated on a question."""
-        return [one for one in self.runs if question in one.questions]
+        return [run for run in self.runs if question in run.questions]
 
     def sums(self, question: Question, predictor: str = MODEL) -> Sums:
         """Return what a predictor of its runs errs, by seed and recording; of several runs with a seed, added up."""
         return pairing.added(
-            ((run.seed, name), one)
+            ((run.seed, name), run_sums)
             for run in self.of(question)
-            for name, one in run.questions[question].sums.get(predictor, {}).items()
+            for name, run_sums in run.questions[question].sums.get(predictor, {}).items()
         )
 
     def predictors(self, question: Question) -> list[str]:
@@ -121,29 +184,29 @@ def grouped(runs: Sequence[Run], usual: Collection[str | tuple[str, Any]] = ()) 
     Runs of one task whose method, settings and units of errors are alike are one method. Names state the settings in which
     methods of the same first name differ, but for empty ones and those in ``usual``: names, or names with values.
     """
-    found: dict[str, list[Run]] = {}
+    by_key: dict[str, list[Run]] = {}
     for run in runs:
-        found.setdefault(_key(run), []).append(run)
-    firsts = [same[0] for same in found.values()]
-    names = distinct_names([(one.method, one.settings) for one in firsts], usual)
-    made = [
+        by_key.setdefault(_key(run), []).append(run)
+    firsts = [same[0] for same in by_key.values()]
+    names = distinct_names([(method.method, method.settings) for method in firsts], usual)
+    methods = [
         Method(name, same[0].family or same[0].method, same[0].settings, differing, tuple(same))
-        for (name, differing), same in zip(names, found.values(), strict=True)
+        for (name, differing), same in zip(names, by_key.values(), strict=True)
     ]
-    return sorted(made, key=lambda one: one.name)
+    return sorted(methods, key=lambda method: method.name)
 
 
 def separate(runs: Sequence[Run]) -> list[Method]:
     """Return a method a run, in the order given: nothing is pooled, and names state seed and fold too."""
-    found = []
+    methods = []
     for method in grouped(runs):
         for run in method.runs:
             about = {name: getattr(run, name) for name in ("seed", "fold") if getattr(run, name) is not None}
             marks = [f"{name} {value}" for name, value in about.items()] if len(method.runs) > 1 else []
             name = " · ".join([method.name, *marks])
-            found.append(Method(name, method.family, run.settings, {**method.differing, **about}, (run,)))
+            methods.append(Method(name, method.family, run.settings, {**method.differing, **about}, (run,)))
     order = {id(run): place for place, run in enumerate(runs)}
-    return sorted(found, key=lambda one: order[id(one.runs[0])])
+    return sorted(methods, key=lambda candidate: order[id(candidate.runs[0])])
 
 
 def _key(run: Run) -> str:

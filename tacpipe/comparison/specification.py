@@ -73,8 +73,8 @@ class TaskReport:
 
 def report_on(task: str) -> TaskReport:
     """Return the report of the task of this name, by headlines where no installed task has the name or it brings none."""
-    own = registry.load_task(task).report if task in registry.tasks() else None
-    return own or TaskReport(task)
+    task_report = registry.load_task(task).report if task in registry.tasks() else None
+    return task_report or TaskReport(task)
 
 
 def task_of(result: Dataset) -> str:

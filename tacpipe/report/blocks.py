@@ -119,10 +119,10 @@ def table(
 
 def fold(title: str, *blocks: Block | None, about: str = "") -> list[Fold]:
     """Return a fold of those blocks that are there; none where none is."""
-    held = [one for one in blocks if one is not None and not (isinstance(one, Note) and not one.text)]
-    if all(isinstance(one, Note) for one in held):
+    shown_blocks = [block for block in blocks if block is not None and not (isinstance(block, Note) and not block.text)]
+    if all(isinstance(block, Note) for block in shown_blocks):
         return []
-    return [Fold(title, held, about)]
+    return [Fold(title, shown_blocks, about)]
 
 
 def notes(*texts: str) -> Note:
@@ -197,13 +197,13 @@ def p_value(p: float) -> Cell:
     return Cell(NONE if math.isnan(p) else "< 0.0001" if p < 1e-4 else f"{p:.2g}", value=None if math.isnan(p) else p)
 
 
-def form(what: str, text: str, published: bool) -> str:
+def form(name: str, text: str, published: bool) -> str:
     """Return a caption or title, as that of a table or figure of the paper where the data are the paper's.
 
     >>> form("Figure 9", "validation accuracy", True), form("Figure 9", "validation accuracy", False)
     ("Figure 9 in the paper's form: validation accuracy", 'Validation accuracy')
     """
-    return f"{what} in the paper's form: {text}" if published else f"{text[:1].upper()}{text[1:]}"
+    return f"{name} in the paper's form: {text}" if published else f"{text[:1].upper()}{text[1:]}"
 
 
 def counted(count: int, plural: str) -> str:

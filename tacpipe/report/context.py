@@ -1,20 +1,192 @@
-"""What the parts of a task's section are made from."""
+"""Read what results hold and where they come from, and collect the results of one task."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+import math
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from tacpipe.comparison.engine import Comparison, Row
 from tacpipe.comparison.runs import MODEL, Method, Run
 from tacpipe.comparison.specification import TaskReport
+from tacpipe.datasets.origin import PUBLISHED
+from tacpipe.plugins import params as params_of
+from tacpipe.plugins import registry
+from tacpipe.report import charts
+from tacpipe.report.blocks import Block, table
+from tacpipe.report.charts import Line
 
 if TYPE_CHECKING:
+    from tacpipe.comparison.runs import Method
     from tacpipe.datasets.dataset import Dataset
+    from tacpipe.report.charts import Spec
+
+
+Tree = Mapping[str, Any]
+CALIBRATION = ("quantiles", "known")  # what `tacpipe calibrate` adds to a model's configuration
+GROWS = "trained_on"  # which names the recordings of the calibration too
+
+
+class Result:
+    """One result: a model trained once and evaluated once."""
+
+    STAGE: ClassVar[str] = ""  # that trained the model
+    SETS: ClassVar[Collection[str]] = ()  # published sets whose paper's tables and figures are next to ours
+
+    def __init__(self, dataset: Dataset) -> None:
+        self.dataset = dataset
+
+    @cached_property
+    def config(self) -> Tree:
+        """What the model was trained and evaluated with."""
+        return read_json(self.dataset, "config.json")
+
+    @cached_property
+    def metrics(self) -> Tree:
+        """All errors of the result by name."""
+        return read_json(self.dataset, "metrics.json")
+
+    @cached_property
+    def history(self) -> Sequence[Tree]:
+        """What ``history.jsonl`` states, one line an epoch; empty where nothing was trained by epochs."""
+        lines = self.dataset.files.get("history.jsonl", b"").splitlines()
+        return [json.loads(line) for line in lines if line.strip()]
+
+    @cached_property
+    def params(self) -> Tree:
+        """What the model was trained with, as far as it counts for its architecture."""
+        return params_of.counting(registry.load(self.STAGE), self.given)
+
+    @property
+    def given(self) -> Tree:
+        """The params that are stored with the model."""
+        params: Tree = self.config.get("params", {})
+        return params
+
+    @property
+    def simulated(self) -> bool:
+        """Whether any of its recordings was simulated."""
+        return is_simulated(self.dataset)
+
+    @property
+    def published(self) -> bool:
+        """Whether its recordings are those of the task's paper."""
+        return is_published(self.dataset, self.SETS)
+
+
+def read_json(result: Dataset, name: str) -> Tree:
+    """Return what a JSON file of a result holds; empty where there is none of the name."""
+    tree: Tree = json.loads(result.files[name]) if name in result.files else {}
+    return tree
+
+
+def drop_duplicates(results: Sequence[Dataset]) -> list[Dataset]:
+    """Return results without those whose model was evaluated on the same recordings once it was calibrated too.
+
+    Both hold the same predictions, so that one training would count as two.
+    """
+    keys = [_result_key(result) for result in results]
+    calibrated = {key for key, result in zip(keys, results, strict=True) if _is_calibrated(result)}
+    return [
+        result for key, result in zip(keys, results, strict=True) if _is_calibrated(result) or key not in calibrated
+    ]
+
+
+def _is_calibrated(result: Dataset) -> bool:
+    return any(name in read_json(result, "config.json") for name in CALIBRATION)
+
+
+def _result_key(result: Dataset) -> str:
+    """Return what is the same of a model and its calibrated copy, and what they were evaluated on."""
+    config = {key: value for key, value in read_json(result, "config.json").items() if key not in (*CALIBRATION, GROWS)}
+    inputs = {name: value for name, value in result.manifest.get("inputs", {}).items() if name != "model"}
+    return json.dumps([config, inputs], sort_keys=True)
+
+
+SIMULATED = "These recordings were simulated: nothing here is evidence about a real sensor."
+
+
+def is_simulated(result: Dataset) -> bool:
+    """Return whether any recording of a result was simulated."""
+    return any(bool(shard.attributes.get("simulated")) for shard in result.recordings.values())
+
+
+def is_published(result: Dataset, sets: Collection[str]) -> bool:
+    """Return whether all recordings of a result are of published ``sets``: what their papers state is about these data
+    alone.
+
+    The attribute ``published``, which `tacpipe ingest` sets, names the set of a recording.
+    """
+    set_names = [str(shard.attributes.get(PUBLISHED) or "") for shard in result.recordings.values()]
+    return bool(set_names) and all(text and set(text.split(",")) <= set(sets) for text in set_names)
+
+
+def _params_of_step(step: Tree) -> dict[str, Any]:
+    """Return the params of a step of a chain by today's names."""
+    return params_of.named(str(step.get("stage")), step.get("params") or {})
+
+
+def provenance_blocks(manifest: Tree) -> list[Block]:
+    """Return the chain of stages behind a dataset, from its manifest, with params and digests."""
+    steps = [*manifest.get("chain", ()), {key: manifest.get(key) for key in ("stage", "version", "params")}]
+    rows = []
+    for step in steps:
+        params = ", ".join(f"{key} = {json.dumps(value)}" for key, value in _params_of_step(step).items())
+        fitted = ", ".join(f"{name} {digest[:12]}" for name, digest in (step.get("fitted") or {}).items())
+        rows.append([str(step.get("stage")), str(step.get("version")), params, fitted])
+    dataset_digests = [("this result", str(manifest.get("digest", "")))]
+    for argument, inputs in manifest.get("inputs", {}).items():
+        datasets = inputs if isinstance(inputs, list) else [inputs]
+        dataset_digests += [
+            (argument, dataset["dataset"] if isinstance(dataset, dict) else str(dataset)) for dataset in datasets
+        ]
+    digests = [[name, digest] for name, digest in dataset_digests if digest]
+    return [
+        table("Stages, the oldest first", ["stage", "version", "params", "fitted"], rows, words=True),
+        table("Digests of datasets", ["", "digest"], digests, words=True),
+    ]
+
+
+def loss_chart(
+    runs: Mapping[str, Sequence[Sequence[float]]], quantity: str, order: Sequence[str] = (), *, log: bool = False
+) -> Spec:
+    """Return a thin line a run, one value an epoch, and the mean over the runs of each name.
+
+    The mean ends where the first of its runs does. NaN breaks a line.
+    """
+    lines = []
+    for name, curves in runs.items():
+        if len(curves) > 1:
+            lines += [Line(name, range(1, len(curve) + 1), curve, thin=True) for curve in curves]
+        length = min(map(len, curves))
+        mean = np.mean([curve[:length] for curve in curves], axis=0)
+        lines.append(Line(name, range(1, length + 1), mean))
+    single = all(len(curve) < 2 for curves in runs.values() for curve in curves)  # of which no line can be seen
+    return charts.lines(lines, "epoch", quantity, order=order, log=log, points=single)
+
+
+def without_gaps(values: Sequence[float | None]) -> list[float]:
+    """Return one value an epoch, NaN where an epoch states none; empty where no epoch states any.
+
+    >>> stated([None, 1]), stated([None, None])
+    ([nan, 1.0], [])
+    """
+    return (
+        []
+        if all(value is None for value in values)
+        else [math.nan if value is None else float(value) for value in values]
+    )
+
+
+def curves_of_methods(methods: Sequence[Method], read: Callable[[Any], list[float]]) -> dict[str, list[list[float]]]:
+    """Return the curves that ``read`` gives of the results of each method, by its name; methods without any left out."""
+    by_method = {method.name: [curve for result in method.details if (curve := read(result))] for method in methods}
+    return {name: curves for name, curves in by_method.items() if curves}
 
 
 @dataclass(frozen=True)
@@ -32,36 +204,36 @@ class Context:
     @cached_property
     def parts(self) -> dict[str, list[Comparison]]:
         """The comparisons by part of the recordings."""
-        found: dict[str, list[Comparison]] = {}
-        for one in self.comparisons:
-            found.setdefault(one.question.part, []).append(one)
-        return found
+        by_part: dict[str, list[Comparison]] = {}
+        for comparison in self.comparisons:
+            by_part.setdefault(comparison.question.part, []).append(comparison)
+        return by_part
 
     @property
     def simulated(self) -> bool:
         """Whether any run was evaluated on simulated recordings."""
-        return any(one.simulated for one in self.runs)
+        return any(run.simulated for run in self.runs)
 
     @property
     def published(self) -> bool:
         """Whether all runs were evaluated on the recordings of the task's paper."""
-        return bool(self.runs) and all(one.published for one in self.runs)
+        return bool(self.runs) and all(run.published for run in self.runs)
 
     def winner(self, part: str) -> Method | None:
         """Return the method of the best mean rank over the targets of a part; of several the first by name."""
         ranks: dict[str, list[int]] = {}
-        for one in self.parts[part]:
-            for place, row in enumerate(one.models):
+        for method in self.parts[part]:
+            for place, row in enumerate(method.models):
                 ranks.setdefault(row.name, []).append(place)
-        most = max(map(len, ranks.values()), default=0)
-        held = {name: float(np.mean(places)) for name, places in ranks.items() if len(places) == most}
-        best = min(held, key=lambda name: (held[name], name), default=None)
-        return next((one for one in self.methods if one.name == best), None)
+        target_count = max(map(len, ranks.values()), default=0)
+        mean_ranks = {name: float(np.mean(places)) for name, places in ranks.items() if len(places) == target_count}
+        best = min(mean_ranks, key=lambda name: (mean_ranks[name], name), default=None)
+        return next((method for method in self.methods if method.name == best), None)
 
     def row(self, comparison: Comparison, method: Method | None) -> Row | None:
         """Return the row of a method itself in a comparison."""
         return next(
-            (one for one in comparison.rows if method and one.method is method and one.name == method.name), None
+            (row for row in comparison.rows if method and row.method is method and row.name == method.name), None
         )
 
 

@@ -1,22 +1,127 @@
-"""One page of results, each task's part by the module that its plug-in brings for it."""
+"""Render one page of results of all tasks, as one HTML file that loads nothing."""
 
 from __future__ import annotations
 
+import functools
+import json
+import re
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from importlib import resources
+from typing import TYPE_CHECKING, Any
 
 from tacpipe.comparison.specification import TaskReport, by_task, report_on
 from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError
-from tacpipe.report import html
-from tacpipe.report.blocks import listed
+from tacpipe.plugins import extras
+from tacpipe.report.blocks import Block, Chart, Charts, Fold, Section, listed
 from tacpipe.report.sections import section
 
 if TYPE_CHECKING:
+    from markupsafe import Markup
+
     from tacpipe.datasets.dataset import Dataset
 
 
-def render(given: Sequence[Dataset], *, title: str = "", traces: int = 2) -> bytes:
+LIBRARY = "vl_convert"  # brings Vega and Vega-Lite as JavaScript
+COMMAND = re.compile(r"`([^`]+)`")
+
+
+def page(sections: Sequence[Section], title: str, heading: str = "") -> bytes:
+    """Return the page as UTF-8; the same sections give the same bytes."""
+    with extras.named("A report"):
+        import jinja2
+        from markupsafe import Markup
+
+        charts = any(_has_charts(section) for section in sections)
+        library = bundle() if charts else ""
+    environment = jinja2.Environment(
+        loader=jinja2.FunctionLoader(_template), autoescape=True, trim_blocks=True, lstrip_blocks=True,
+        undefined=jinja2.StrictUndefined,
+    )  # fmt: skip
+    environment.filters |= {"spec": _spec_markup, "commands": _mark_commands}
+    parts: dict[str, Any] = {
+        "style": Markup(_template("page.css")),
+        "script": Markup(_template("page.js")),
+        "library": Markup(library),
+    }
+    text = environment.get_template("page.html").render(
+        sections=sections, title=title, heading=heading, charts=charts, **parts
+    )
+    return f"{text}\n".encode()
+
+
+@functools.cache
+def bundle() -> str:
+    """Return Vega, Vega-Lite and Vega-Embed as one script, which puts ``vegaEmbed`` into the window."""
+    import vl_convert
+
+    script: str = vl_convert.javascript_bundle(snippet="window.vegaEmbed = vegaEmbed;")
+    safe = script.replace("</script", "<\\/script")
+    return f"(() => {{{safe}}})();"  # its own names stay in it
+
+
+def _template(name: str) -> str:
+    return (resources.files("tacpipe.report") / "templates" / name).read_text(encoding="utf-8")
+
+
+def _spec_markup(spec: Any) -> Markup:
+    """Return a chart's specification as JSON that no text in it can end, its data by column."""
+    from markupsafe import Markup
+
+    text = json.dumps(_pack_spec(spec), sort_keys=True, separators=(",", ":"), allow_nan=False, ensure_ascii=False)
+    return Markup(text.replace("<", "\\u003c"))
+
+
+def _pack_spec(spec: Any) -> Any:
+    """Return a specification whose data are by column: what is the same in all rows once, other texts by their place.
+
+    >>> _packed({"data": {"values": [{"a": 1, "b": "x"}, {"a": 2, "b": "x"}]}})
+    {'data': {'rows': 2, 'columns': {'a': [1, 2], 'b': {'of': ['x'], 'at': 0}}}}
+    """
+    if isinstance(spec, dict):
+        if set(spec) == {"values"} and isinstance(spec["values"], list):
+            rows = spec["values"]
+            names = dict.fromkeys(name for row in rows for name in row)
+            return {
+                "rows": len(rows),
+                "columns": {name: _pack_column([row.get(name) for row in rows]) for name in names},
+            }
+        return {name: _pack_spec(value) for name, value in spec.items()}
+    return [_pack_spec(item) for item in spec] if isinstance(spec, list | tuple) else spec
+
+
+def _pack_column(values: list[Any]) -> Any:
+    distinct = list(dict.fromkeys((type(value_key), value_key) for value_key in values))
+    if len(distinct) == 1 and len(values) > 1:
+        return {"of": [values[0]], "at": 0}
+    if all(isinstance(value_key, int | float) or value_key is None for value_key in values) and not any(
+        isinstance(value_key, bool) for value_key in values
+    ):
+        return values
+    places = {value_key: place for place, value_key in enumerate(distinct)}
+    return {
+        "of": [value_key for _, value_key in distinct],
+        "at": [places[type(value_key), value_key] for value_key in values],
+    }
+
+
+def _mark_commands(text: str) -> Markup:
+    """Return text in which what stands in backquotes is code that a click copies."""
+    from markupsafe import Markup, escape
+
+    return Markup(COMMAND.sub(r'<code data-copy="" title="click to copy">\1</code>', str(escape(text))))
+
+
+def _has_charts(section: Section) -> bool:
+    """Return whether a section holds any chart."""
+
+    def inside(block: Block) -> bool:
+        return isinstance(block, Chart | Charts) or (isinstance(block, Fold) and any(map(inside, block.blocks)))
+
+    return section.chart is not None or any(map(inside, section.folds))
+
+
+def render(datasets: Sequence[Dataset], *, title: str = "", traces: int = 2) -> bytes:
     """Return the page for results of ``tacpipe evaluate``, as UTF-8; the same results give the same bytes.
 
     Without a ``title``, it is made of what the tasks on the page predict.
@@ -24,22 +129,22 @@ def render(given: Sequence[Dataset], *, title: str = "", traces: int = 2) -> byt
     whose task can use them. Raises `TacpipeError` where none can, and without any result.
     """
     with model_files.validated("the results"):
-        return _rendered(given, title, traces)
+        return _rendered(datasets, title, traces)
 
 
-def _rendered(given: Sequence[Dataset], title: str, traces: int) -> bytes:
-    results = [one for one in given if "metrics.json" in one.files]
-    others = [one for one in given if "metrics.json" not in one.files]
+def _rendered(datasets: Sequence[Dataset], title: str, traces: int) -> bytes:
+    results = [dataset for dataset in datasets if "metrics.json" in dataset.files]
+    extra_datasets = [dataset for dataset in datasets if "metrics.json" not in dataset.files]
     tasks = {name: report_on(name) for name in by_task(results)}
-    if not results or not all(_users(one, tasks) for one in others):
+    if not results or not all(_users(dataset, tasks) for dataset in extra_datasets):
         raise TacpipeError("There is no metrics.json in this dataset. Give the output of `tacpipe evaluate`.")
     sections = []
-    for name, found in by_task(results).items():
-        beside = [one for one in others if name in _users(one, tasks)]
-        sections.append(section(tasks[name], found, beside, traces))
-    titles = [one.title for one in sections]
-    return html.page(
-        sections, title or listed([*titles[:1], *(one[:1].lower() + one[1:] for one in titles[1:])]), title
+    for name, task_results in by_task(results).items():
+        used_datasets = [dataset for dataset in extra_datasets if name in _users(dataset, tasks)]
+        sections.append(section(tasks[name], task_results, used_datasets, traces))
+    titles = [section.title for section in sections]
+    return page(
+        sections, title or listed([*titles[:1], *(title[:1].lower() + title[1:] for title in titles[1:])]), title
     )
 
 

@@ -26,10 +26,10 @@ def sentence(context: Context) -> tuple[str, str]:
     """Return which method is best, by how much over the best baseline and on how much, and the verdict on that."""
     clauses: list[str] = []
     verdicts: list[str] = []
-    last, held = "", ("", "")
+    last, answer = "", ("", "")
     for part, compared in context.parts.items():
         method = context.winner(part)
-        rows = [(one, row) for one in compared if (row := context.row(one, method)) is not None]
+        rows = [(comparison, row) for comparison in compared if (row := context.row(comparison, method)) is not None]
         if not rows or method is None:
             continue
         # parts of other splits or timelines come behind a fold
@@ -37,11 +37,11 @@ def sentence(context: Context) -> tuple[str, str]:
         last = method.name
         verdicts += [row.gain.verdict for _, row in rows]
         alike = (verdicts[-1], rows[0][1].baseline)
-        if name == "it" and len(rows) == 1 and alike == held and verdicts[-1]:
+        if name == "it" and len(rows) == 1 and alike == answer and verdicts[-1]:
             clauses.append(f"on {part} too: {_amount(*rows[0])}")
         else:
             clauses.append(_clause(part, name, rows))
-        held = alike
+        answer = alike
     if not clauses:
         return "", ""
     text = "; ".join(clauses[:2])
@@ -53,43 +53,43 @@ def first_chart(context: Context) -> Chart | None:
     dots: list[Dot] = []
     levels: dict[str, float] = {}
     chosen = _questions(context)
-    many = len(chosen) > 2
-    for one in chosen:
-        panel = (one.question.target if many else one.question.where) if len(chosen) > 1 else ""
-        methods = one.models[: 1 if many else SHOWN]
-        if many and (winner := context.row(one, context.winner(one.question.part))):
+    has_panels = len(chosen) > 2
+    for comparison in chosen:
+        panel = (comparison.question.target if has_panels else comparison.question.where) if len(chosen) > 1 else ""
+        methods = comparison.models[: 1 if has_panels else SHOWN]
+        if has_panels and (winner := context.row(comparison, context.winner(comparison.question.part))):
             methods = [winner]
-        best = one.best_baseline
-        baselines = [row for row in one.of("baseline") if row is not best][: 0 if many else 2]
-        shown = [*methods, *([best] if best else []), *baselines]
-        sign = -1 if one.measure.rises else 1
-        for row in sorted(shown, key=lambda row: (math.isnan(row.score.mean), sign * row.score.mean)):
+        best = comparison.best_baseline
+        baselines = [row for row in comparison.of("baseline") if row is not best][: 0 if has_panels else 2]
+        shown_rows = [*methods, *([best] if best else []), *baselines]
+        sign = -1 if comparison.measure.rises else 1
+        for row in sorted(shown_rows, key=lambda row: (math.isnan(row.score.mean), sign * row.score.mean)):
             score = row.score
             dots += [Dot(row.name, score.mean, score.low, score.high, row.kind, panel)]
         if best:
             levels[panel] = best.score.mean
-    if not any(one.kind == "model" for one in dots):
+    if not any(comparison.kind == "model" for comparison in dots):
         return None
     measure = chosen[0].measure
     better = "right" if measure.rises else "left"
     caption = (
         f"Blue: methods; grey: baselines; dashed: the best baseline. Better is to the {better}. Bars: 95 % intervals."
     )
-    where = f", {chosen[0].question.part}" if many and chosen[0].question.part else ""
-    spec = charts.ranking(dots, measure.scored, level=levels, row=20 if many else 24)
-    return Chart(_capital(f"{measure.scored}{where}"), spec, caption)
+    part = f", {chosen[0].question.part}" if has_panels and chosen[0].question.part else ""
+    spec = charts.ranking(dots, measure.scored, level=levels, row=20 if has_panels else 24)
+    return Chart(_capital(f"{measure.scored}{part}"), spec, caption)
 
 
 def first_table(context: Context) -> Table | None:
     """Return the best methods and the best baseline, a row each; of several targets, the best method's row a target."""
     parts = dict(list(context.parts.items())[:2])
-    if not any(one.models for compared in parts.values() for one in compared):
+    if not any(comparison.models for compared in parts.values() for comparison in compared):
         return None
-    targets = list(dict.fromkeys(one.question.target for compared in parts.values() for one in compared))
+    targets = list(dict.fromkeys(comparison.question.target for compared in parts.values() for comparison in compared))
     if len(targets) > 1:
         return _by_target(context, parts, targets)
     firsts = [compared[0] for compared in parts.values()]
-    names = list(dict.fromkeys(row.name for one in firsts for row in _leaders(one)))[: MOST - 2]
+    names = list(dict.fromkeys(row.name for comparison in firsts for row in _leaders(comparison)))[: MOST - 2]
     baselines = [row.name for first in firsts for row in [first.best_baseline] if row]
     baselines += [row.name for first in firsts for row in first.of("baseline") if row.name == first.measure.reference]
     baselines = list(dict.fromkeys(baselines))
@@ -97,20 +97,22 @@ def first_table(context: Context) -> Table | None:
     single = len(firsts) == 1
     heads, kinds = [""], dict[int, str]()
     rows: list[Sequence[str | Cell]] = []
-    for one in firsts:
-        heads += _heads(one, single)
+    for comparison in firsts:
+        heads += _heads(comparison, single)
     for name in [*names, *baselines]:
         cells: list[str | Cell] = [name]
-        for one in firsts:
-            row = next((row for row in one.rows if row.name == name), None)
-            cells += _cells(one, row, single)
+        for comparison in firsts:
+            row = next((row for row in comparison.rows if row.name == name), None)
+            cells += _cells(comparison, row, single)
         if name in baselines:
             kinds[len(rows)] = "quiet"
         rows.append(cells)
     if names:
         kinds[0] = "best"
-    left = len({row.name for one in firsts for row in one.models}) - len(names)
-    title = "Best methods and the best baseline" + (f"; {counted(left, 'more methods')} below" if left > 0 else "")
+    remaining = len({row.name for comparison in firsts for row in comparison.models}) - len(names)
+    title = "Best methods and the best baseline" + (
+        f"; {counted(remaining, 'more methods')} below" if remaining > 0 else ""
+    )
     return table_of(title, heads, rows, kinds)
 
 
@@ -124,16 +126,16 @@ def _by_target(context: Context, parts: dict[str, list[Comparison]], targets: Se
     for target in targets[:MOST]:
         cells: list[str | Cell] = [target]
         for part, compared in parts.items():
-            one = next((one for one in compared if one.question.target == target), None)
-            row = context.row(one, context.winner(part)) if one else None
-            if one is None or row is None:
+            comparison = next((comparison for comparison in compared if comparison.question.target == target), None)
+            row = context.row(comparison, context.winner(part)) if comparison else None
+            if comparison is None or row is None:
                 cells += [NONE] * 3
                 continue
-            best = next((base for base in one.of("baseline") if base.name == row.baseline), None)
+            best = next((base for base in comparison.of("baseline") if base.name == row.baseline), None)
             cells += [
                 number(row.values[0]),
                 Cell(number(best.values[0]).text, best.name) if best else NONE,
-                gain(one, row),
+                gain(comparison, row),
             ]
         rows.append(cells)
     measure = next(iter(parts.values()))[0].measure
@@ -149,8 +151,8 @@ def gain(comparison: Comparison, row: Row) -> Cell:
 def _questions(context: Context) -> list[Comparison]:
     """Return the comparisons of the chart: of the first two parts, or where there are several targets those of one."""
     parts = list(context.parts.values())
-    several = any(len(one) > 1 for one in parts)
-    return parts[0] if parts and several else [compared[0] for compared in parts[:2]]
+    has_several_targets = any(len(part) > 1 for part in parts)
+    return parts[0] if parts and has_several_targets else [compared[0] for compared in parts[:2]]
 
 
 def _leaders(comparison: Comparison) -> list[Row]:
@@ -159,73 +161,75 @@ def _leaders(comparison: Comparison) -> list[Row]:
     for row in comparison.models:
         firsts.setdefault(row.family, row)
     heads = list(firsts.values())[: MOST - 2]
-    held = {row.name for row in heads} | {row.name for row in comparison.models[: MOST - 2 - len(heads)]}
-    more = [row for row in comparison.models if row.name not in held][: max(MOST - 2 - len(held), 0)]
-    return [row for row in comparison.models if row.name in held or row in more]
+    leading_names = {row.name for row in heads} | {row.name for row in comparison.models[: MOST - 2 - len(heads)]}
+    next_rows = [row for row in comparison.models if row.name not in leading_names][
+        : max(MOST - 2 - len(leading_names), 0)
+    ]
+    return [row for row in comparison.models if row.name in leading_names or row in next_rows]
 
 
-def _heads(one: Comparison, single: bool) -> list[str]:
-    measure = one.measure
+def _heads(comparison: Comparison, single: bool) -> list[str]:
+    measure = comparison.measure
     columns = list(measure.columns[-2:]) if single else [measure.columns[-1]]
-    where = "" if single or not one.question.part else f"{one.question.part}: "
+    place = "" if single or not comparison.question.part else f"{comparison.question.part}: "
     return [
-        *(f"{where}{name}" for name in columns),
-        f"{where}{measure.name} over baseline",
+        *(f"{place}{name}" for name in columns),
+        f"{place}{measure.name} over baseline",
         *(["n"] if single else []),
     ]
 
 
-def _cells(one: Comparison, row: Row | None, single: bool) -> list[str | Cell]:
+def _cells(comparison: Comparison, row: Row | None, single: bool) -> list[str | Cell]:
     if row is None:
-        return [NONE] * len(_heads(one, single))
+        return [NONE] * len(_heads(comparison, single))
     values = row.values[-2:] if single else row.values[-1:]
     count = [Cell(f"{row.n:,}", value=row.n)] if single else []
-    compared = gain(one, row) if row.baseline else Cell("")
+    compared = gain(comparison, row) if row.baseline else Cell("")
     return [*(number(value) for value in values), compared, *count]
 
 
 def _clause(part: str, name: str, rows: Sequence[tuple[Comparison, Row]]) -> str:
-    where = f"on {part}, " if part else ""
+    place = f"on {part}, " if part else ""
     if len(rows) == 1:
-        one, row = rows[0]
-        return f"{where}{name} {_verb(one, row)}"
-    found: dict[str, list[str]] = {}
-    for one, row in rows:
-        found.setdefault(row.gain.verdict, []).append(one.question.target)
+        comparison, row = rows[0]
+        return f"{place}{name} {_verb(comparison, row)}"
+    targets_by_verdict: dict[str, list[str]] = {}
+    for comparison, row in rows:
+        targets_by_verdict.setdefault(row.gain.verdict, []).append(comparison.question.target)
     counts = []
-    for each in (headline.BETTER, headline.UNCLEAR, headline.WORSE):
-        if each in found:
-            all_of = len(found[each]) == len(rows)
-            which = f"all {len(rows)} targets" if all_of else f"{listed(found[each])}"
-            counts.append(f"{CLAUSES[each]} the best baseline on {which}")
+    for verdict in (headline.BETTER, headline.UNCLEAR, headline.WORSE):
+        if verdict in targets_by_verdict:
+            all_of = len(targets_by_verdict[verdict]) == len(rows)
+            targets = f"all {len(rows)} targets" if all_of else f"{listed(targets_by_verdict[verdict])}"
+            counts.append(f"{CLAUSES[verdict]} the best baseline on {targets}")
     if not counts:
         return (
-            f"{where}{name} was evaluated on {counted(rows[0][1].n, rows[0][0].measure.cluster)}, too few for a verdict"
+            f"{place}{name} was evaluated on {counted(rows[0][1].n, rows[0][0].measure.cluster)}, too few for a verdict"
         )
-    return f"{where}{name} is {listed(counts)} ({counted(rows[0][1].n, rows[0][0].measure.cluster)})"
+    return f"{place}{name} is {listed(counts)} ({counted(rows[0][1].n, rows[0][0].measure.cluster)})"
 
 
-def _verb(one: Comparison, row: Row) -> str:
-    size = counted(row.n, one.measure.cluster)
+def _verb(comparison: Comparison, row: Row) -> str:
+    size = counted(row.n, comparison.measure.cluster)
     if not row.baseline:
         return f"was evaluated without a baseline, on {size}"
     verdict = row.gain.verdict
     if verdict == headline.NO_VERDICT:
-        warning = headline.too_few(row.n, one.measure.cluster, row.gain.effective)
-        return f"has {_gained(one, row)} over the best baseline, {row.baseline}; {warning}"
-    return f"is {CLAUSES[verdict]} the best baseline, {row.baseline}: {_amount(one, row, '95 % interval ')}"
+        warning = headline.too_few(row.n, comparison.measure.cluster, row.gain.effective)
+        return f"has {_gained(comparison, row)} over the best baseline, {row.baseline}; {warning}"
+    return f"is {CLAUSES[verdict]} the best baseline, {row.baseline}: {_amount(comparison, row, '95 % interval ')}"
 
 
-def _amount(one: Comparison, row: Row, called: str = "") -> str:
+def _amount(comparison: Comparison, row: Row, called: str = "") -> str:
     """Return a gain with its interval and what it rests on."""
-    ends = [headline.signed(end, one.measure.name) for end in (row.gain.low, row.gain.high)]
+    ends = [headline.signed(end, comparison.measure.name) for end in (row.gain.low, row.gain.high)]
     interval = f"{called}{' to '.join(ends)}, " if ends[0] != ends[1] else ""
-    return f"{_gained(one, row)} ({interval}{counted(row.n, one.measure.cluster)})"
+    return f"{_gained(comparison, row)} ({interval}{counted(row.n, comparison.measure.cluster)})"
 
 
-def _gained(one: Comparison, row: Row) -> str:
-    gained = headline.signed(row.gain.mean, one.measure.name)
-    return f"{gained} points" if one.measure.name == "points" else f"{one.measure.name} {gained}"
+def _gained(comparison: Comparison, row: Row) -> str:
+    gained = headline.signed(row.gain.mean, comparison.measure.name)
+    return f"{gained} points" if comparison.measure.name == "points" else f"{comparison.measure.name} {gained}"
 
 
 def _capital(text: str) -> str:

@@ -1,10 +1,10 @@
-"""The section of a task: its first screen, all methods, what the task's own specification adds, recordings and runs."""
+"""Write the section of a task: its first screen, all methods, its own folds, recordings, runs and provenance."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,15 +12,70 @@ from tacpipe.comparison import engine
 from tacpipe.comparison.engine import Comparison, Row
 from tacpipe.comparison.runs import MODEL, grouped
 from tacpipe.comparison.specification import TaskReport
-from tacpipe.metrics import pairing
+from tacpipe.metrics import headline, pairing
 from tacpipe.metrics.pairing import Measure
-from tacpipe.report import blocks, charts, plain, provenance, screen
-from tacpipe.report.blocks import NONE, Cell, Chart, Fold, Group, Note, Section, Table, counted, fold, number, p_value
+from tacpipe.report import blocks, charts, context, screen
+from tacpipe.report.blocks import (
+    NONE,
+    Cell,
+    Chart,
+    Fold,
+    Group,
+    Note,
+    Section,
+    Table,
+    counted,
+    fold,
+    number,
+    p_value,
+    table,
+)
 from tacpipe.report.blocks import Row as Line
-from tacpipe.report.context import Context, median_run
+from tacpipe.report.context import SIMULATED, Context, is_simulated, median_run, provenance_blocks
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
+
+
+def metrics_sentence(results: Sequence[Dataset]) -> str:
+    """Return the first headline of results as a sentence; what they lack where there is none."""
+    for result in results:
+        headlines = headline.read(result.files[headline.FILE]) if headline.FILE in result.files else []
+        if headlines:
+            return headline.sentence(headlines[0])
+    counts = [context.read_json(result, "metrics.json").get("counts") for result in results]
+    if all(count is not None and not count.get("recordings", count.get("n", True)) for count in counts):
+        return "No recording was left to evaluate the model on: it has seen all of them, or none holds a window."
+    return "These results hold no errors by recording, so methods cannot be compared: their numbers are below."
+
+
+def metric_folds(result: Dataset, place: int, count: int) -> list[Fold]:
+    """Return the part of the page that one result has: the ``place``-th ``of`` so many."""
+    config = context.read_json(result, "config.json")
+    name = ": ".join(str(config[key]) for key in ("task", "architecture") if key in config) or "result"
+    rows = [[name, value] for name, value in leaves(context.read_json(result, "metrics.json")).items()]
+    headlines = headline.read(result.files[headline.FILE]) if headline.FILE in result.files else []
+    first = [table("Next to its best baseline", *headline.table(headlines))] if headlines else []
+    title = f"{f'{place}. ' if count > 1 else ''}{name.replace('_', ' ')}"
+    return [Fold(title, [*first, table("Metrics", ["", "value"], rows), *context.provenance_blocks(result.manifest)])]
+
+
+def leaves(tree: Mapping[str, Any]) -> dict[str, str]:
+    """Return the values of nested names as text, by the names that lead to each.
+
+    >>> leaves({"model": {"accuracy": {"biotac": 0.5}}, "classes": [1, 2], "p": None})
+    {'model, accuracy, biotac': '0.5', 'classes': '[1, 2]', 'p': '–'}
+    """
+    texts: dict[str, str] = {}
+    for name, value in tree.items():
+        if isinstance(value, Mapping):
+            texts.update({f"{name}, {path}": text for path, text in leaves(value).items()})
+        elif isinstance(value, int | float) and not isinstance(value, bool):
+            texts[name] = number(value).text
+        else:
+            texts[name] = NONE if value is None else json.dumps(value)
+    return texts
+
 
 RECORDINGS = 60  # rows of a table of recordings
 DOTS = 400  # recordings of a chart
@@ -36,15 +91,17 @@ PICKED = (
 )
 
 
-def section(task: TaskReport, results: Sequence[Dataset], others: Sequence[Dataset], traces: int) -> Section:
+def section(task: TaskReport, results: Sequence[Dataset], extra_datasets: Sequence[Dataset], traces: int) -> Section:
     """Return what results of one task state, with datasets that are not results next to them."""
     runs = task.read(results)
     methods = grouped(runs, task.usual)
-    compared = {id(one.dataset) for one in runs}
-    bare = [one for one in results if id(one) not in compared]
-    context = Context(task, methods, engine.comparisons(task, methods), others, bare, traces, runs)
+    compared = {id(result.dataset) for result in runs}
+    bare = [result for result in results if id(result) not in compared]
+    context = Context(task, methods, engine.comparisons(task, methods), extra_datasets, bare, traces, runs)
     sentence, verdict = task.sentence(context) or screen.sentence(context)
-    unread = [each for number, one in enumerate(bare, 1) for each in plain.folds(one, number, len(bare))]
+    unread = [
+        result_fold for number, result in enumerate(bare, 1) for result_fold in metric_folds(result, number, len(bare))
+    ]
     folds = [
         *everything(context),
         *task.folds(context),
@@ -54,9 +111,9 @@ def section(task: TaskReport, results: Sequence[Dataset], others: Sequence[Datas
         *basis(context),
         *source(context),
     ]
-    simulated = context.simulated or any(provenance.simulated(one) for one in bare)
+    simulated = context.simulated or any(is_simulated(result) for result in bare)
     if not runs and bare:
-        sentence = plain.sentence(bare)
+        sentence = metrics_sentence(bare)
     return Section(
         task.name or "results",
         f"{task.title[:1].upper()}{task.title[1:]}" or "Results",
@@ -72,7 +129,7 @@ def section(task: TaskReport, results: Sequence[Dataset], others: Sequence[Datas
 
 def everything(context: Context) -> list[Fold]:
     """Return all methods by family, then baselines, oracles and controls, a table a question."""
-    tables = [_table(context, one) for one in context.comparisons]
+    tables = [_table(context, comparison) for comparison in context.comparisons]
     if not tables:
         return []
     measure = context.comparisons[0].measure
@@ -99,70 +156,80 @@ def headline_caption(measure: Measure) -> str:
     )
 
 
-def _table(context: Context, one: Comparison) -> Table:
-    extra = context.task.columns(context, one)
+def _table(context: Context, comparison: Comparison) -> Table:
+    extra = context.task.columns(context, comparison)
     families: dict[str, list[Row]] = {}
-    for row in one.models:
+    for row in comparison.models:
         families.setdefault(row.family, []).append(row)
     groups = [
-        Group([_line(one, row, extra, "best" if row is one.best else "") for row in rows], folded=len(rows) > 1)
+        Group(
+            [_line(comparison, row, extra, "best" if row is comparison.best else "") for row in rows],
+            folded=len(rows) > 1,
+        )
         for rows in families.values()
     ]
     for kind, title in KINDS.items():
-        rows = one.of(kind)  # type: ignore[arg-type]
+        rows = comparison.of(kind)  # type: ignore[arg-type]
         if rows:
-            groups.append(Group([_line(one, row, extra, "quiet") for row in rows], title))
-    score = [] if _same(one) else [one.measure.scored]
-    heads = ["", *one.measure.columns, *score, "interval", "sd over runs", f"{one.measure.name} over the best baseline"]
-    counts = dict.fromkeys([one.measure.cluster, "recordings", "runs"])
+            groups.append(Group([_line(comparison, row, extra, "quiet") for row in rows], title))
+    score = [] if _same(comparison) else [comparison.measure.scored]
+    heads = [
+        "",
+        *comparison.measure.columns,
+        *score,
+        "interval",
+        "sd over runs",
+        f"{comparison.measure.name} over the best baseline",
+    ]
+    counts = dict.fromkeys([comparison.measure.cluster, "recordings", "runs"])
     heads += ["best baseline", "p", *(head for head, _ in extra), *counts]
-    return Table(one.question.where if len(context.comparisons) > 1 else "", heads, groups)
+    return Table(comparison.question.where if len(context.comparisons) > 1 else "", heads, groups)
 
 
-def _same(one: Comparison) -> bool:
+def _same(comparison: Comparison) -> bool:
     """Return whether the score is among the columns already."""
-    return all(row.score.mean == row.values[-1] or np.isnan(row.score.mean) for row in one.rows) or all(
-        row.score.mean == row.values[0] for row in one.rows
+    return all(row.score.mean == row.values[-1] or np.isnan(row.score.mean) for row in comparison.rows) or all(
+        row.score.mean == row.values[0] for row in comparison.rows
     )
 
 
-def _line(one: Comparison, row: Row, extra: Sequence[tuple[str, Callable[[Row], Cell]]], kind: str) -> Line:
+def _line(comparison: Comparison, row: Row, extra: Sequence[tuple[str, Callable[[Row], Cell]]], kind: str) -> Line:
     score = row.score
     ends = NONE if np.isnan(score.low) else f"{number(score.low).text} to {number(score.high).text}"
     cells: list[str | Cell] = [row.name, *(number(value) for value in row.values)]
-    cells += [] if _same(one) else [number(score.mean)]
-    cells += [ends, number(row.spread, 3), screen.gain(one, row), row.baseline or NONE, p_value(row.p)]
+    cells += [] if _same(comparison) else [number(score.mean)]
+    cells += [ends, number(row.spread, 3), screen.gain(comparison, row), row.baseline or NONE, p_value(row.p)]
     cells += [make(row) for _, make in extra]
-    counts = {one.measure.cluster: row.n, "recordings": row.recordings, "runs": row.runs}
+    counts = {comparison.measure.cluster: row.n, "recordings": row.recordings, "runs": row.runs}
     cells += [Cell(f"{count:,}", value=count) for count in counts.values()]
     return Line(cells, kind)
 
 
 def recordings(context: Context) -> list[Fold]:
     """Return how the best method does on each recording of each part, the worst first, and the command to see one."""
-    found: list[blocks.Block] = []
-    for one in context.comparisons:
-        row = context.row(one, context.winner(one.question.part))
-        found += _by_recording(one, row) if row else []
-    if not found:
+    parts: list[blocks.Block] = []
+    for comparison in context.comparisons:
+        row = context.row(comparison, context.winner(comparison.question.part))
+        parts += _by_recording(comparison, row) if row else []
+    if not parts:
         return []
     command = Note(
         "To see a recording with what was predicted: `tacpipe view DATASET RECORDING --predictions RESULT`, where DATASET "
         "was given to `tacpipe evaluate` and RESULT is its output. A click on a name copies its command."
     )
-    return [Fold("Recordings", [command, *found], "where the best method fails, and the command to look at it")]
+    return [Fold("Recordings", [command, *parts], "where the best method fails, and the command to look at it")]
 
 
-def _by_recording(one: Comparison, row: Row) -> list[blocks.Block]:
-    measure, question = one.measure, one.question
-    best = next((base for base in one.of("baseline") if base.name == row.baseline), None)
-    mine = pairing.added((name, one) for (_, name), one in row.method.sums(question).items())
+def _by_recording(comparison: Comparison, row: Row) -> list[blocks.Block]:
+    measure, question = comparison.measure, comparison.question
+    best = next((base for base in comparison.of("baseline") if base.name == row.baseline), None)
+    mine = pairing.added((name, comparison) for (_, name), comparison in row.method.sums(question).items())
     based_on = best.method.sums(question, best.predictor) if best else {}
-    others = pairing.added((name, one) for (_, name), one in based_on.items())
+    baseline_sums = pairing.added((name, comparison) for (_, name), comparison in based_on.items())
     names = sorted(mine)
     errors, based = (
-        np.array([float(measure.error(held[name][None])[0]) if name in held else np.nan for name in names])
-        for held in (mine, others)
+        np.array([float(measure.error(sums[name][None])[0]) if name in sums else np.nan for name in names])
+        for sums in (mine, baseline_sums)
     )
     gains = np.asarray(measure.gain(errors, based), np.float64)
     order = sorted(range(len(names)), key=lambda at: (np.isnan(errors[at]), -errors[at], names[at]))  # the worst first
@@ -172,29 +239,31 @@ def _by_recording(one: Comparison, row: Row) -> list[blocks.Block]:
     for at in wrong[:RECORDINGS]:
         name = names[at]
         values = [number(value) for value in measure.values(mine[name])]
-        base = number(measure.values(others[name])[0]) if name in others else Cell(NONE)
+        base = number(measure.values(baseline_sums[name])[0]) if name in baseline_sums else Cell(NONE)
         gain = Cell(blocks.signed(float(gains[at]), digits), value=None if np.isnan(gains[at]) else float(gains[at]))
         rows.append([Cell(name, copy=f"tacpipe view DATASET {name} --predictions RESULT"), *values, base, gain])
-    found: list[blocks.Block] = []
-    known = gains[~np.isnan(gains)]
+    parts: list[blocks.Block] = []
+    defined = gains[~np.isnan(gains)]
     title = f"{question.where}: {row.name}"
-    if len(known) > 3 and measure.cluster == "recordings":
+    if len(defined) > 3 and measure.cluster == "recordings":
         ranked = [at for at in np.argsort(-gains, kind="stable") if not np.isnan(gains[at])]
-        kept = [ranked[at] for at in np.unique(np.linspace(0, len(ranked) - 1, min(len(ranked), DOTS)).astype(int))]
+        drawn = [ranked[at] for at in np.unique(np.linspace(0, len(ranked) - 1, min(len(ranked), DOTS)).astype(int))]
         dots = [
             {"x": float(at), "y": float(gains[name]), "name": row.name, "tip": names[name]}
-            for at, name in enumerate(kept, 1)
+            for at, name in enumerate(drawn, 1)
         ]
         quantity = f"{measure.name} over {row.baseline}"
         spec = charts.scatter(dots, "recordings, the best first", quantity, level=("", 0.0), legend=False, height=170)
-        found.append(Chart(f"{title}, better than {row.baseline} on {int((known > 0).sum())} of {len(known)}", spec))
+        parts.append(
+            Chart(f"{title}, better than {row.baseline} on {int((defined > 0).sum())} of {len(defined)}", spec)
+        )
     about = f"the {RECORDINGS} worst of {len(names):,}" if len(wrong) > RECORDINGS else "the worst first"
     right = f"; {len(names) - len(wrong):,} of {len(names):,} are without error" if len(wrong) < len(names) else ""
-    other = f"{row.baseline}: {measure.columns[0]}" if row.baseline else ""
-    heads = ["recording", *measure.columns, other, measure.name]
+    baseline_head = f"{row.baseline}: {measure.columns[0]}" if row.baseline else ""
+    heads = ["recording", *measure.columns, baseline_head, measure.name]
     if not rows:
-        return [*found, Note(f"{title}: all {len(names):,} are without error.")]
-    return [*found, blocks.table(f"{title}, {about}{right}", heads, rows)]
+        return [*parts, Note(f"{title}: all {len(names):,} are without error.")]
+    return [*parts, blocks.table(f"{title}, {about}{right}", heads, rows)]
 
 
 def every_run(context: Context) -> list[Fold]:
@@ -204,20 +273,24 @@ def every_run(context: Context) -> list[Fold]:
         for run in sorted(method.runs, key=lambda run: (str(run.fold), str(run.seed))):
             cells: list[str | Cell] = [
                 method.name,
-                *(NONE if one is None else str(one) for one in (run.fold, run.seed)),
+                *(NONE if number_or_name is None else str(number_or_name) for number_or_name in (run.fold, run.seed)),
             ]
-            for one in context.comparisons:
-                sums = run.questions[one.question].sums.get(MODEL, {}) if one.question in run.questions else {}
+            for number_or_name in context.comparisons:
+                sums = (
+                    run.questions[number_or_name.question].sums.get(MODEL, {})
+                    if number_or_name.question in run.questions
+                    else {}
+                )
                 cells += [
-                    number(one.measure.score_of(sums.values())) if sums else NONE,
+                    number(number_or_name.measure.score_of(sums.values())) if sums else NONE,
                     f"{len(sums):,}" if sums else NONE,
                 ]
             rows.append([*cells, *context.task.run_columns(run).values()])
     if not rows:
         return []
     heads: list[str] = ["", "fold", "seed"]
-    for one in context.comparisons:
-        heads += [f"{one.question.where}: {one.measure.scored}", "recordings"]
+    for number_or_name in context.comparisons:
+        heads += [f"{number_or_name.question.where}: {number_or_name.measure.scored}", "recordings"]
     heads += list(context.task.run_columns(context.runs[0]))
     return fold("Every run", blocks.table("", heads, rows), about=counted(len(rows), "runs"))
 
@@ -226,32 +299,34 @@ def basis(context: Context) -> list[Fold]:
     """Return what the numbers rest on and cannot show."""
     texts = list(context.task.caveats(context))
     texts += [PICKED] if len(context.methods) > 1 else []
-    texts += [provenance.SIMULATED] if context.simulated else []
+    texts += [SIMULATED] if context.simulated else []
     texts += ["No recording above is one that its model was trained on."] if context.runs else []
-    return [Fold("What these numbers rest on", [Note(one) for one in dict.fromkeys(texts) if one])] if texts else []
+    return [Fold("What these numbers rest on", [Note(text) for text in dict.fromkeys(texts) if text])] if texts else []
 
 
 def source(context: Context) -> list[Fold]:
     """Return where the best method's median run comes from."""
     if not context.comparisons:
-        return [Fold("Where it comes from", provenance.parts(one.manifest)) for one in context.bare[:1]]
+        return [Fold("Where it comes from", provenance_blocks(result.manifest)) for result in context.bare[:1]]
     first = context.comparisons[0]
     method = context.winner(first.question.part) or context.methods[0]
     run = median_run(method, first)
     params = ", ".join(f"{name} = {json.dumps(value, default=str)}" for name, value in sorted(run.settings.items()))
     note = Note(f"A run of {method.name}{f', seed {run.seed}' if run.seed is not None else ''}, with {params}.")
-    return [Fold("Where it comes from", [note, *provenance.parts(run.dataset.manifest)])]
+    return [Fold("Where it comes from", [note, *provenance_blocks(run.dataset.manifest)])]
 
 
 def _counts(context: Context, results: Sequence[Dataset]) -> list[str]:
-    found = []
+    counts = []
     if context.methods:
-        found.append(counted(len(context.methods), "methods"))
+        counts.append(counted(len(context.methods), "methods"))
     if len(results) > 1:
-        found.append(counted(len(results), "results"))
-    held = {name for run in context.runs for errors in run.questions.values() for name in errors.sums.get(MODEL, {})}
-    if held:
-        names = {one.measure.cluster for one in context.comparisons}
+        counts.append(counted(len(results), "results"))
+    recording_names = {
+        name for run in context.runs for errors in run.questions.values() for name in errors.sums.get(MODEL, {})
+    }
+    if recording_names:
+        names = {comparison.measure.cluster for comparison in context.comparisons}
         word = next(iter(names)) if len(names) == 1 else context.comparisons[0].measure.cluster
-        found.append(counted(len(held), word))
-    return found
+        counts.append(counted(len(recording_names), word))
+    return counts

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from tacpipe.comparison.observations import observations, paired_runs
+from tacpipe.comparison.engine import observations, paired_runs
 from tacpipe.comparison.runs import Run
 from tests.comparison.comparison_fakes import QUESTION, run
 

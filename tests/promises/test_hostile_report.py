@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from tacpipe.report import charts, html, page
+from tacpipe.report import charts, page
 from tacpipe.report.blocks import Chart, Section
 from tacpipe.report.charts import Line
 from tests.fake_recordings import FakeDataset, FakeRecording, FakeShard
@@ -97,7 +97,7 @@ def poisoned(result: Any, words: Words) -> Any:
 
 @pytest.fixture(autouse=True)
 def unbundled(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(html, "bundle", lambda: "/* library */")
+    monkeypatch.setattr(page, "bundle", lambda: "/* library */")
 
 
 NOTE = "note"
@@ -148,7 +148,7 @@ def test_nothing_that_a_label_holds_becomes_an_element_of_the_page(case: str) ->
 def test_the_words_of_a_chart_are_text_too() -> None:
     spec = charts.lines([Line(HOSTILE, [1.0, 2.0], [0.1, 0.2])], HOSTILE, HOSTILE)
     found = Tags()
-    found.feed(html.page([Section("t", "t", "", chart=Chart(HOSTILE, spec, HOSTILE))], "t").decode())
+    found.feed(page.page([Section("t", "t", "", chart=Chart(HOSTILE, spec, HOSTILE))], "t").decode())
     assert "img" not in found.tags and found.runs == []
     assert found.scripts == ["application/json", "", ""]  # a chart, the library, the page's own
     assert "alert('x')" in found.text

@@ -2,10 +2,10 @@
 
 import pytest
 
-from tacpipe.report import html
+from tacpipe.report import page
 
 
 @pytest.fixture
 def unbundled(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pages hold a mark in place of the library of charts."""
-    monkeypatch.setattr(html, "bundle", lambda: "/* library */")
+    monkeypatch.setattr(page, "bundle", lambda: "/* library */")

@@ -13,7 +13,7 @@ import pytest
 
 from tacpipe.comparison import engine
 from tacpipe.errors import TacpipeError
-from tacpipe.report import html, page
+from tacpipe.report import page
 from tacpipe.report.blocks import Chart, Fold, Note, Section, table
 from tests.conftest import forget
 from tests.fake_recordings import FakeDataset, FakeShard, dataset
@@ -194,7 +194,7 @@ def test_text_that_looks_like_markup_stays_text() -> None:
     section = Section(
         "t", name, name, chart=Chart(name, spec, name), folds=[Fold(name, [Note(name), table(name, [name], [[name]])])]
     )
-    content = html.page([section], name)
+    content = page.page([section], name)
     assert name.replace("`", "") in check(content).replace("`", "")
     (data,) = re.findall(r'application/json">(.*?)</script>', content.decode())
     assert json.loads(data)["data"]["columns"]["name"]["of"] == [name]
@@ -202,4 +202,4 @@ def test_text_that_looks_like_markup_stays_text() -> None:
 
 def test_a_number_that_is_not_defined_cannot_enter_a_chart() -> None:
     with pytest.raises(ValueError, match="not JSON compliant"):
-        html.page([Section("t", "t", "", chart=Chart("t", {"data": {"values": [{"x": float("nan")}]}}))], "t")
+        page.page([Section("t", "t", "", chart=Chart("t", {"data": {"values": [{"x": float("nan")}]}}))], "t")

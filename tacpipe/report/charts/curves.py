@@ -1,14 +1,15 @@
-"""Lines over x, with their bands."""
+"""Draw curves over time or epochs, and bars."""
 
 from __future__ import annotations
 
-from collections.abc import Container, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from tacpipe.arrays import AnyFloats, Floats
 from tacpipe.report.charts.grammar import (
+    BETTER,
     COLOURS,
     INK,
     MARGIN,
@@ -22,6 +23,37 @@ from tacpipe.report.charts.grammar import (
     y_of,
     zoom,
 )
+
+
+def bars(values: Mapping[str, float], x: str, y: str, *, marked: int = 0, height: int = 220) -> Spec:
+    """Return bars in the order given, the first ``marked`` in another colour."""
+    rows = [
+        {"x": name, "y": short(value), "kept": place < marked} for place, (name, value) in enumerate(values.items())
+    ]
+    colour = {
+        "field": "kept",
+        "type": "nominal",
+        "legend": None,
+        "scale": {"domain": [True, False], "range": [BETTER, QUIET]},
+    }
+    return {
+        "data": {"values": rows},
+        "height": height,
+        "mark": {"type": "bar"},
+        "encoding": {
+            "x": {
+                "field": "x",
+                "type": "ordinal",
+                "sort": None,
+                "title": x,
+                "axis": {"labelOverlap": True, "labelAngle": 0},
+            },
+            "y": {"field": "y", "type": "quantitative", "title": y},
+            "color": colour,
+            "tooltip": [tip_of("x", x), tip_of("y", y)],
+        },
+    }
+
 
 POINTS = 300  # of a line that are drawn
 ROOM = 0.02  # beyond the ends of a diagonal, as a fraction of it
@@ -41,7 +73,7 @@ class Line:
 
 
 def lines(
-    several: Sequence[Line],
+    curves: Sequence[Line],
     x: str,
     y: str,
     *,
@@ -59,8 +91,8 @@ def lines(
     With ``diagonal``, two numbers, a thin line lies where x and y are the same, between them.
     Charts with the same ``order`` of names give a name the same colour.
     """
-    names = list(order) or list(dict.fromkeys(one.name for one in several if not one.thin))
-    values = [row for number, one in enumerate(several) for row in _rows(one, number)]
+    names = list(order) or list(dict.fromkeys(curve.name for curve in curves if not curve.thin))
+    values = [row for number, curve in enumerate(curves) for row in _rows(curve, number)]
     across, up = _scales(values, log=log, floor=floor, diagonal=diagonal)
     if points:
         across["padding"] = up["padding"] = MARGIN
@@ -73,7 +105,7 @@ def lines(
             **whole_steps(row["x"] for row in values),
         },
         "y": {"field": "y", "type": "quantitative", "title": y, "scale": up},
-        "color": _colour(names, {one.name for one in several}),
+        "color": _colour(names, {curve.name for curve in curves}),
         "detail": {"field": "run", "type": "nominal"},
         "opacity": _opacity(1, 0.07),
     }
@@ -81,8 +113,8 @@ def lines(
         *([_span(shade)] if shade else []),
         *([diagonal_of(diagonal)] if diagonal else []),
         *([_rule(*level)] if level else []),
-        *([_bands(base)] if any(one.low is not None for one in several) else []),
-        *(_strokes(base, thin=thin) for thin in (True, False) if any(one.thin is thin for one in several)),
+        *([_bands(base)] if any(curve.low is not None for curve in curves) else []),
+        *(_strokes(base, thin=thin) for thin in (True, False) if any(curve.thin is thin for curve in curves)),
     ]
     if points:
         layers.append(_dots(base))
@@ -110,19 +142,19 @@ def _scales(values: Sequence[Spec], *, log: bool, floor: float | None, diagonal:
 
 def _colour(names: Sequence[str], drawn: Container[str]) -> Spec:
     """Return the colours of the names that are drawn, each by its place among all."""
-    held = [name for name in names if name in drawn]
-    colours = [COLOURS[names.index(name) % len(COLOURS)] for name in held]
+    drawn_names = [name for name in names if name in drawn]
+    colours = [COLOURS[names.index(name) % len(COLOURS)] for name in drawn_names]
     return {
         "field": "name",
         "type": "nominal",
-        "scale": {"domain": held, "range": colours},
-        "legend": legend_of(len(held)),
+        "scale": {"domain": drawn_names, "range": colours},
+        "legend": legend_of(len(drawn_names)),
     }
 
 
-def _opacity(shown: float, hidden: float) -> Spec:
+def _opacity(opacity: float, hidden: float) -> Spec:
     """Return the opacity of what is chosen in the legend, all where nothing is, and of the rest."""
-    return {"condition": {"param": "shown", "value": shown, "empty": True}, "value": hidden}
+    return {"condition": {"param": "shown", "value": opacity, "empty": True}, "value": hidden}
 
 
 def _span(shade: tuple[float, float]) -> Spec:
@@ -182,31 +214,31 @@ def decimated(x: Floats, y: Floats, count: int = POINTS) -> tuple[Floats, Floats
     """
     if len(x) <= count:
         return x, y
-    kept: list[int] = []
+    indices: list[int] = []
     for part in np.array_split(np.arange(len(x)), max(count // 2, 1)):
-        held = part[~np.isnan(y[part])]
-        if len(held) < len(part):
-            kept.append(int(part[np.isnan(y[part])][0]))
-        if len(held):
-            kept += sorted({int(held[np.argmin(y[held])]), int(held[np.argmax(y[held])])})
-    at = np.array(sorted(set(kept)))
+        defined = part[~np.isnan(y[part])]
+        if len(defined) < len(part):
+            indices.append(int(part[np.isnan(y[part])][0]))
+        if len(defined):
+            indices += sorted({int(defined[np.argmin(y[defined])]), int(defined[np.argmax(y[defined])])})
+    at = np.array(sorted(set(indices)))
     return x[at], y[at]
 
 
-def _rows(one: Line, number: int) -> list[Spec]:
-    x, y = (np.asarray(part, np.float64) for part in (one.x, one.y))
-    bounds = [None if part is None else np.asarray(part, np.float64) for part in (one.low, one.high)]
+def _rows(curve: Line, number: int) -> list[Spec]:
+    x, y = (np.asarray(part, np.float64) for part in (curve.x, curve.y))
+    bounds = [None if part is None else np.asarray(part, np.float64) for part in (curve.low, curve.high)]
     if bounds[0] is None:
         x, y = decimated(x, y)
     rows = []
     for place, (at, value) in enumerate(zip(x, y, strict=True)):
         row: Spec = {
-            "name": one.name,
+            "name": curve.name,
             "run": number,
             "x": short(at),
             "y": short(value),
-            "dashed": one.dashed,
-            "thin": one.thin,
+            "dashed": curve.dashed,
+            "thin": curve.thin,
         }
         if bounds[0] is not None and bounds[1] is not None and not np.isnan([bounds[0][place], bounds[1][place]]).any():
             row |= {"low": short(bounds[0][place]), "high": short(bounds[1][place])}

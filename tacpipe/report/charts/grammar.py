@@ -14,11 +14,11 @@ FEW_STEPS = 12  # whole numbers on an axis, up to which each has a tick
 MARGIN = 8  # pixels between points and the ends of an axis, so that none is cut
 
 
-def colour_of(number: int, of: int) -> str:
+def colour_of(number: int, count: int) -> str:
     """Return a colour that is derived from its neighbours' on a light page and on a dark one."""
-    if of <= len(COLOURS):
+    if count <= len(COLOURS):
         return COLOURS[number]
-    return f"hsl({360 * number // of} 70% {(42, 62)[number % 2]}%)"
+    return f"hsl({360 * number // count} 70% {(42, 62)[number % 2]}%)"
 
 
 def legend_of(count: int) -> Spec | None:
@@ -54,7 +54,7 @@ def y_of(name: str) -> Spec:
 
 def diagonal_of(ends: Sequence[float]) -> Spec:
     """Return a thin line on which x and y are the same, between its ends."""
-    values = [{"x": short(one), "y": short(one)} for one in ends]
+    values = [{"x": short(end), "y": short(end)} for end in ends]
     mark = {"type": "line", "stroke": INK, "strokeWidth": 0.8}
     return {
         "data": {"values": values},

@@ -1,21 +1,28 @@
-"""Points of rows with x, y and a name, and lines that join pairs of them."""
+"""Draw points: scatters, planes of taxels, rankings with intervals, and grids of squares."""
 
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
-from tacpipe.arrays import AnyFloats
+import numpy as np
+
+from tacpipe.arrays import AnyFloats, Ints
 from tacpipe.report.charts.grammar import (
+    BETTER,
     INK,
     MARGIN,
     QUIET,
+    WORSE,
     Spec,
     colour_of,
     diagonal_of,
     legend_of,
     short,
+    text_of,
     tip_of,
     whole_steps,
     y_of,
@@ -67,8 +74,8 @@ def scatter(
     }
     layers = []
     if diagonal and values:
-        both = [float(row[key] or 0.0) for row in values for key in ("x", "y")]
-        layers.append(diagonal_of([min(both), max(both)]))
+        coordinates = [float(row[key] or 0.0) for row in values for key in ("x", "y")]
+        layers.append(diagonal_of([min(coordinates), max(coordinates)]))
     if level and not math.isnan(level[1]):
         rule = {"type": "rule", "stroke": QUIET, "strokeDash": [4, 3], "tooltip": level[0]}
         layers.append({"data": {"values": [{"y": short(level[1])}]}, "mark": rule, "encoding": {"y": y_of("y")}})
@@ -77,7 +84,7 @@ def scatter(
 
 def marked(points: Sequence[tuple[str, float, float]], x: str, y: str) -> Spec:
     """Return a layer of diamonds at points (name, x, y), which state their numbers under the cursor."""
-    values = [{"name": name, "x": short(one), "y": short(other)} for name, one, other in points]
+    values = [{"name": name, "x": short(x), "y": short(y)} for name, x, y in points]
     places: Spec = {"x": {"field": "x", "type": "quantitative"}, "y": {"field": "y", "type": "quantitative"}}
     mark = {"type": "point", "shape": "diamond", "filled": True, "size": 110, "fill": INK, "opacity": 1}
     return {
@@ -90,8 +97,8 @@ def marked(points: Sequence[tuple[str, float, float]], x: str, y: str) -> Spec:
 def joined(pairs: Sequence[tuple[str, AnyFloats, AnyFloats]]) -> Spec:
     """Return a layer of lines between two points (x, y), each with its name at the first."""
     values = [
-        {"text": name, **dict(zip(("x", "y", "x2", "y2"), map(short, (*one, *other)), strict=True))}
-        for name, one, other in pairs
+        {"text": name, **dict(zip(("x", "y", "x2", "y2"), map(short, (*start, *end)), strict=True))}
+        for name, start, end in pairs
     ]
     places: Spec = {"x": {"field": "x", "type": "quantitative"}, "y": {"field": "y", "type": "quantitative"}}
     rule = {
@@ -103,3 +110,219 @@ def joined(pairs: Sequence[tuple[str, AnyFloats, AnyFloats]]) -> Spec:
         "data": {"values": values},
         "layer": [rule, {"mark": text, "encoding": {**places, "text": {"field": "text"}}}],
     }
+
+
+def plane(rows: Sequence[Mapping[str, Any]], panels: Sequence[str], *, size: int, columns: int = 2) -> Spec:
+    """Return points in the plane, as many units across as down, a panel a name: rows have x, y, panel, strength and text.
+
+    A strength from -1 to 1 is a colour; what has no ``text`` has none.
+    """
+    values = [{key: short(value) if isinstance(value, float) else value for key, value in row.items()} for row in rows]
+    xs, ys = ([float(row[key]) for row in rows] for key in ("x", "y"))
+    room = 0.06 * (max(max(xs) - min(xs), max(ys) - min(ys)) or 1.0)
+    ends = {
+        key: [round(min(coordinates) - room, 3), round(max(coordinates) + room, 3)]
+        for key, coordinates in (("x", xs), ("y", ys))
+    }
+    tall = (ends["y"][1] - ends["y"][0]) / ((ends["x"][1] - ends["x"][0]) or 1.0)
+    places: Spec = {
+        key: {"field": key, "type": "quantitative", "axis": None, "scale": {"domain": ends[key], "nice": False}}
+        for key in ("x", "y")
+    }
+    has_texts = any("text" in row for row in values)
+    opacity = {"field": "opacity", "type": "quantitative", "scale": None, "legend": None}
+    colour = {"field": "side", "type": "nominal", "legend": None,
+              "scale": {"domain": ["a", "b", "c"], "range": [BETTER, WORSE, QUIET]}}  # fmt: skip
+    tips = [tip_of(name, name) for name in dict.fromkeys(key for row in values for key in row) if name[0].isupper()]
+    for row in values:
+        strength = float(row.pop("strength") or 0.0)
+        row["side"] = "c" if strength == 0 else "a" if strength > 0 else "b"
+        row["opacity"] = short(min(1.0, 0.12 + 0.78 * abs(strength))) if strength else 0.35
+    layer: list[Spec] = [
+        {"mark": {"type": "circle", "size": size, "stroke": QUIET if has_texts else None, "strokeWidth": 0.5},
+         "encoding": {**places, "color": colour, "opacity": opacity, "tooltip": tips}}
+    ]  # fmt: skip
+    if has_texts:
+        layer.append({"mark": {"type": "text", "fontSize": 8.5, "fill": INK, "tooltip": None},
+                      "encoding": {**places, "text": {"field": "text"}}})  # fmt: skip
+    return {
+        "data": {"values": values},
+        "columns": columns,
+        "facet": {"field": "panel", "type": "nominal", "sort": list(panels), "title": None,
+                  "header": {"labelFontWeight": 600, "labelLimit": 0, "labelPadding": 2}},
+        "spec": {"layer": layer, "view": {"stroke": None}},
+        "spacing": 12,
+        "usermeta": {"tall": short(tall), "columns": columns},
+    }  # fmt: skip
+
+
+LABEL_CHARACTERS = 24  # a line of a predictor's name; longer names take several lines
+LINE_HEIGHT = 13  # pixels
+KINDS = {"model": "var(--c0)", "baseline": "var(--faint)", "oracle": "var(--c2)", "control": "var(--c3)"}
+
+
+@dataclass(frozen=True)
+class Dot:
+    """A score with its interval, of one predictor on one question."""
+
+    name: str
+    mean: float
+    low: float
+    high: float
+    kind: str = "model"
+    panel: str = ""
+
+
+def ranking(dots: Sequence[Dot], x: str, *, level: Mapping[str, float] | None = None, row: int = 24) -> Spec:
+    """Return a dot and its interval a predictor, in the order given, a panel a question; ``level`` draws a rule in each.
+
+    What lies far beyond the others is drawn at the end of the axis as a triangle.
+    """
+    low, high = _ends(dots)
+    panels = list(dict.fromkeys(estimate.panel for estimate in dots))
+    lines_by_name = {dot.name: textwrap.wrap(dot.name, LABEL_CHARACTERS) or [""] for dot in dots}
+    row = max(row, LINE_HEIGHT * max(map(len, lines_by_name.values()), default=1) + 5)
+    values = []
+    for place, estimate in enumerate(dots):
+        off = estimate.mean < low or estimate.mean > high
+        values.append(
+            {
+                "name": "\n".join(lines_by_name[estimate.name]), "panel": estimate.panel,
+                "place": place, "kind": estimate.kind,
+                "x": short(min(max(estimate.mean, low), high)), "mean": short(estimate.mean),
+                "low": short(min(max(estimate.low, low), high)), "high": short(min(max(estimate.high, low), high)),
+                "off": ("left" if estimate.mean < low else "right") if off else "",
+                "interval": "" if math.isnan(estimate.low) else f"{text_of(estimate.low)} to {text_of(estimate.high)}",
+                "level": short((level or {}).get(estimate.panel, math.nan)),
+            }
+        )  # fmt: skip
+    y: Spec = {
+        "field": "name",
+        "type": "nominal",
+        "sort": {"field": "place"},
+        "title": None,
+        "axis": {
+            "labelExpr": "split(datum.label, '\\n')",
+            "labelLimit": 0,
+            "ticks": False,
+            "domain": False,
+            "labelPadding": 6,
+        },
+    }
+    colour = {
+        "field": "kind",
+        "type": "nominal",
+        "legend": None,
+        "scale": {"domain": list(KINDS), "range": list(KINDS.values())},
+    }
+    scale = {"zero": False, "domain": [short(low), short(high)], "nice": False}
+    across = {"field": "x", "type": "quantitative", "title": x, "scale": scale}
+    tip = [tip_of("name", ""), tip_of("mean", x), tip_of("interval", "95 % interval"), tip_of("kind", "kind")]
+    layer: list[Spec] = [
+        {"mark": {"type": "rule", "stroke": QUIET, "strokeDash": [3, 3]},
+         "encoding": {"x": {"field": "level", "type": "quantitative"}}},
+        {"mark": {"type": "rule", "strokeWidth": 2.5, "clip": True},
+         "encoding": {"y": y, "x": {"field": "low", "type": "quantitative"}, "x2": {"field": "high"}, "color": colour}},
+        {"transform": [{"filter": "datum.off === ''"}],
+         "mark": {"type": "circle", "size": 90, "opacity": 1},
+         "encoding": {"y": y, "x": across, "color": colour, "tooltip": tip}},
+        {"transform": [{"filter": "datum.off !== ''"}],
+         "mark": {"type": "point", "filled": True, "size": 90, "shape": {"expr": "'triangle-' + datum.off"}, "opacity": 1},
+         "encoding": {"y": y, "x": across, "color": colour, "tooltip": tip}},
+    ]  # fmt: skip
+    if len(panels) == 1:
+        return {"data": {"values": values}, "height": {"step": row}, "layer": layer}
+    return {
+        "data": {"values": values},
+        "facet": {"row": {"field": "panel", "type": "nominal", "sort": panels, "title": None,
+                          "header": {"labelAngle": 0, "labelOrient": "top", "labelAnchor": "start", "labelFontWeight": 600,
+                                     "labelLimit": 0, "labelPadding": 2}}},
+        "spec": {"height": {"step": row}, "layer": layer},
+        "resolve": {"scale": {"y": "independent"}},
+        "spacing": 6,
+    }  # fmt: skip
+
+
+def _ends(dots: Sequence[Dot]) -> tuple[float, float]:
+    """Return where the axis of a ranking ends: what is far beyond most does not press the others together."""
+    means = np.array([dot.mean for dot in dots if not math.isnan(dot.mean)])
+    if not len(means):
+        return 0.0, 1.0
+    middle = float(np.median(means))
+    halves = [(dot.high - dot.low) / 2 for dot in dots if not math.isnan(dot.high - dot.low)]
+    scales = (np.median(np.abs(means - middle)), np.median(halves) if halves else 0.0, 0.02 * abs(middle), 1e-6)
+    far = 6 * float(max(scales))
+    bounds = [end for dot in dots for end in (dot.mean, dot.low, dot.high) if abs(end - middle) <= far]
+    low, high = min(bounds), max(bounds)
+    room = 0.04 * ((high - low) or abs(high) or 1.0)
+    return low - room, high + room
+
+
+def matrix(counts: Ints, names: Sequence[str], down: str, across: str) -> Spec:
+    """Return how often each name (row) was taken for each (column), each with its number; mistakes in another colour."""
+    totals = np.maximum(counts.sum(axis=1), 1)
+    values = [
+        {
+            "row": names[row], "column": names[column], "count": int(count), "right": bool(row == column),
+            # the square root shows a single mistake next to many right ones
+            "strength": short(0.15 + 0.75 * float(np.sqrt(count / totals[row]))),
+            "fraction": f"{100 * count / totals[row]:.1f} % of {totals[row]}",
+        }
+        for (row, column), count in np.ndenumerate(counts)
+        if count
+    ]  # fmt: skip
+    axis = {"domain": False, "ticks": False, "labelLimit": 110, "labelFontSize": 10}
+    places: Spec = {
+        "y": {"field": "row", "type": "nominal", "sort": None, "scale": {"domain": list(names)}, "title": down,
+              "axis": axis},
+        "x": {"field": "column", "type": "nominal", "sort": None, "scale": {"domain": list(names)}, "title": across,
+              "axis": {**axis, "labelAngle": 0 if max(map(len, names), default=0) < 4 else -90}},
+        "tooltip": [tip_of("row", down), tip_of("column", across), tip_of("count", "slides"),
+                    tip_of("fraction", "fraction")],
+    }  # fmt: skip
+    colour = {
+        "field": "right",
+        "type": "nominal",
+        "legend": None,
+        "scale": {"domain": [True, False], "range": [BETTER, WORSE]},
+    }
+    square = {"color": colour, "opacity": {"field": "strength", "type": "quantitative", "scale": None, "legend": None}}
+    return {
+        "data": {"values": values},
+        "height": {"step": 20},
+        "layer": [
+            {"mark": {"type": "rect"}, "encoding": {**places, **square}},
+            {"mark": {"type": "text", "fontSize": 9, "fill": INK}, "encoding": {**places, "text": {"field": "count"}}},
+        ],
+    }
+
+
+def grid(matrix: AnyFloats, title: str) -> Spec:
+    """Return a square matrix in squares: the stronger the colour, the farther from 0; blue above it, orange below."""
+    largest = float(np.abs(matrix).max()) or 1.0
+    values = [
+        {
+            "row": row + 1,
+            "column": column + 1,
+            "value": short(float(value)),
+            "above": bool(value > 0),
+            "strength": strength,
+        }
+        for (row, column), value in np.ndenumerate(matrix)
+        # the square root shows what is small next to the largest
+        if (strength := round(math.sqrt(abs(float(value)) / largest), 2)) >= 0.01
+    ]
+    axis = {"labelOverlap": True, "labelAngle": 0, "domain": False, "ticks": False}
+    return {
+        "data": {"values": values},
+        "height": {"step": 13},
+        "mark": {"type": "rect"},
+        "encoding": {
+            "y": {"field": "row", "type": "ordinal", "title": title, "axis": axis},
+            "x": {"field": "column", "type": "ordinal", "title": title, "axis": axis},
+            "opacity": {"field": "strength", "type": "quantitative", "scale": None, "legend": None},
+            "color": {"field": "above", "type": "nominal", "legend": None,
+                      "scale": {"domain": [True, False], "range": [BETTER, WORSE]}},
+            "tooltip": [tip_of("row", title), tip_of("column", title), tip_of("value", "value")],
+        },
+    }  # fmt: skip

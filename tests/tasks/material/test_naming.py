@@ -12,7 +12,7 @@ from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.tasks.material import prediction as material_prediction
 from tacpipe.tasks.material.model import MaterialModel
 from tacpipe.tasks.material.naming import UNKNOWN, Naming
-from tacpipe.tasks.material.report import confusion, predictions
+from tacpipe.tasks.material.report import figures, predictions
 from tests.fake_recordings import FakeDataset, FakeShard
 from tests.report import parts
 from tests.tasks.material.textures import MATERIALS, dataset, evaluated, slide, slides, trained
@@ -92,7 +92,7 @@ def test_networks_and_held_out_classes_go_by_their_words(tmp_path: Path) -> None
     tree, result = evaluated(files, both[2])
     assert tree["zero_shot"]["n"]["roboskin"] == 4
     table = result.recordings["predictions"].streams[""]
-    read = predictions.read(table, MaterialModel.load(files).config)
+    read = predictions.read_predictions(table, MaterialModel.load(files).config)
     assert {WORDS[one + 1] for one in read.of("roboskin").materials.tolist()} == {"felt", "foam, soft"}
     with pytest.raises(UsageError, match=r"hold_out names roboskin=tin.*cork"):
         trained(tmp_path / "other", both[0], both[1], architecture="raec", hold_out="roboskin=tin")
@@ -104,7 +104,7 @@ def test_a_report_has_the_words(tmp_path: Path) -> None:
     shards = {"predictions": FakeShard("predictions", result.recordings["predictions"].streams[""])}
     given: Any = FakeDataset(shards, result.files, {})
     (method,) = parts.methods("material", given)
-    counts, named = confusion.counted(method, "biotac")
+    counts, named = figures.count_confusions(method, "biotac")
     assert named == sorted(WORDS.values()) and counts.sum() == 3 * len(MATERIALS)
 
 

@@ -1,18 +1,30 @@
-"""How results of forecasts are read, compared and reported."""
+"""Report results of forecasts."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from tacpipe.comparison.engine import Comparison, Row
-from tacpipe.comparison.runs import Run
+from tacpipe.comparison.runs import MODEL, Method, Question, Run
 from tacpipe.comparison.specification import Kind, TaskReport
-from tacpipe.report.blocks import Cell, Fold
+from tacpipe.metrics import pairing
+from tacpipe.metrics.intervals import Interval
+from tacpipe.report import blocks, charts
+from tacpipe.report.blocks import NONE, Cell, Chart, Charts, Fold, Note, Table, fold, number, table
+from tacpipe.report.charts import Line
 from tacpipe.report.context import Context
-from tacpipe.tasks.forward.report import parts, reading, sweep
+from tacpipe.tasks.forward import headline, units
+from tacpipe.tasks.forward.headline import BASELINE
+from tacpipe.tasks.forward.report import bands, events, figures, methods, representations, skill
+from tacpipe.tasks.forward.report.methods import ACTIONS, shown_steps
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from tacpipe.datasets.dataset import Dataset
 
 
@@ -23,32 +35,316 @@ class ForwardReport(TaskReport):
 
     def read(self, results: Sequence[Dataset]) -> list[Run]:
         """Return the runs of results that hold error sums of recordings which the model has not seen."""
-        return reading.read(results)
+        return methods.read_runs(results)
 
     def kind(self, predictor: str) -> Kind:
         """Return what a predictor is."""
-        return reading.kind(predictor)
+        return methods.kind_of_predictor(predictor)
 
     def predictor_name(self, predictor: str) -> str:
         """Return the name of a predictor in tables."""
-        return reading.called(predictor)
+        return methods.predictor_name(predictor)
 
     def uses(self, dataset: Dataset) -> bool:
         """Return whether a dataset is of ``tacpipe compress``, whose losses are drawn next to the errors of forecasts."""
-        return sweep.FILE in dataset.files
+        return representations.CODEC_FILE in dataset.files
 
     def columns(self, context: Context, comparison: Comparison) -> Sequence[tuple[str, Callable[[Row], Cell]]]:
         """Return the skill by step and errors with channels in other units."""
-        return parts.columns(context, comparison)
+        return columns(context, comparison)
 
     def folds(self, context: Context) -> list[Fold]:
         """Return what forecasts have of their own."""
-        return parts.folds(context)
+        return folds(context)
 
     def caveats(self, context: Context) -> list[str]:
         """Return what must be known about the numbers."""
-        return parts.caveats(context)
+        return caveats(context)
 
     def run_columns(self, run: Run) -> dict[str, str | Cell]:
         """Return more columns of the table of runs."""
-        return parts.about_run(run)
+        return run_columns(run)
+
+
+Tree = Mapping[str, Any]
+LINES = 4  # methods in a figure of skill, the paper's not counted
+FLOOR = -1.0  # skill at which figures end
+SETTINGS = ("preset", "epochs", "stride", "hidden", "batch", "seed")
+
+
+def folds(context: Context) -> list[Fold]:
+    """Return what forecasts have of their own."""
+    if not context.comparisons:
+        return representations.representation_folds(context)
+    return [
+        *_ahead(context),
+        *_channels(context),
+        *_ablations(context),
+        *bands.band_folds(context),
+        *events.anticipation_folds(context),
+        *events.slip_folds(context),
+        *skill.situation_folds(context),
+        *events.live_folds(context),
+        *representations.representation_folds(context),
+        *figures.prediction_folds(context),
+        *figures.training_folds(context),
+        *figures.single_run_folds(context),
+    ]
+
+
+def columns(context: Context, comparison: Comparison) -> list[tuple[str, Callable[[Row], Cell]]]:
+    """Return more columns of the table of all methods: skill by step, and errors with channels in other units."""
+    steps, known_objects = _steps(context), _known(comparison.question)
+    unit = comparison.measure.unit
+
+    @functools.cache
+    def skills(row: Row, group: str) -> Interval | None:
+        sums = skill.sums_of_row(row, steps, known_objects, group)
+        return skill.skill_intervals(sums) if sums else None
+
+    def squared(group: str) -> Callable[[Row], Cell]:
+        return lambda row: number(skill.mean_squared(skill.sums_of_row(row, _all_steps(context), known_objects, group)))
+
+    def at(place: int) -> Callable[[Row], Cell]:
+        return lambda row: skill.skill_cell(skills(row, "both"), place)
+
+    def windows(row: Row) -> Cell:
+        counts: dict[str, int] = {}
+        for run in row.method.of(comparison.question):
+            errors = run.details.errors
+            for name, count, is_known in zip(errors.recordings, errors.windows, errors.known, strict=True):
+                if known_objects is None or bool(is_known) == known_objects:
+                    counts[name] = max(int(count), counts.get(name, 0))
+        return Cell(f"{sum(counts.values()):,}", value=sum(counts.values()))
+
+    return [
+        *((f"skill over persistence t+{step}", at(place)) for place, step in enumerate(steps)),
+        ("skill over persistence, channels standardised", lambda row: skill.skill_cell(skills(row, "standard"), -1)),
+        (f"MSE ({unit}²)", squared("both")),
+        ("MSE (standardised)", squared("standard")),
+        ("windows", windows),
+    ]
+
+
+def caveats(context: Context) -> list[str]:
+    """Return what must be known about these numbers."""
+    runs = [run.details for run in context.runs]
+    known_by_recording: dict[str, set[bool]] = {}
+    values: dict[str, set[Any]] = {}
+    for run in runs:
+        for name, setting_values in zip(run.errors.recordings, run.errors.known, strict=True):
+            known_by_recording.setdefault(name, set()).add(bool(setting_values))
+        for name in SETTINGS:
+            if run.config["params"].get(name) is not None:
+                values.setdefault(name, set()).add(run.config["params"][name])
+    settings = "; ".join(
+        f"{name} {', '.join(map(str, sorted(setting_values, key=str)))}" for name, setting_values in values.items()
+    )
+    counts = [run.metrics.get("counts", {}) for run in runs[:1]]
+    mixed = "Objects of some recordings are known to one run and unseen to another."
+    effective = [
+        f"{setting_values['windows']:,} windows overlap and are worth about {setting_values['effective_windows']:,}"
+        for setting_values in counts
+        if "windows" in setting_values
+    ]
+    return [
+        f"Settings: {settings}." if settings else "",
+        *_look_ahead(context),
+        "Skill over persistence is 1 − mean absolute error / mean absolute error of persistence over all channels, the "
+        "geometric mean of the ratios over recordings. Every representation is decoded to the channels' own unit before it "
+        "is evaluated, so all rows can be compared. Errors without a step are means over all steps.",
+        f"In the first run, {effective[0]}." if effective else "",
+        mixed if any(len(setting_values) > 1 for setting_values in known_by_recording.values()) else "",
+        "The recorded motion represents the plan: errors of methods that read it hold for an arm that follows it perfectly."
+        if any(run.actions == "planned" for run in runs)
+        else "",
+        "; ".join(f"{figures.predictor_title(name)}: {figures.EXPLAINED[name]}" for name in _predictors(context)) + ".",
+    ]  # fmt: skip
+
+
+def _look_ahead(context: Context) -> list[str]:
+    """Return how far the rows that models were trained on look ahead, with their methods where others do not."""
+    methods: dict[str, list[str]] = {}
+    for method in context.methods:
+        for note in dict.fromkeys(
+            note for run in method.runs for note in headline.look_ahead_notes(run.details.config)
+        ):
+            methods.setdefault(note, []).append(method.name)
+    return [
+        note if len(names) == len(context.methods) else f"{blocks.listed(names)}: {note}"
+        for note, names in methods.items()
+    ]
+
+
+def run_columns(run: Run) -> dict[str, Cell | str]:
+    """Return more columns of the table of runs."""
+    epochs = len(run.details.history)
+    return {"epochs": str(epochs) if epochs else NONE}
+
+
+def _ahead(context: Context) -> list[Fold]:
+    """Return skill over the time ahead of the best methods, the paper's and the best baseline, a chart a part."""
+    drawn, order = [], list[str]()
+    chosen = {comparison: _shown(context, comparison) for comparison in context.comparisons}
+    for rows in chosen.values():
+        order += [row.name for row in rows if row.name not in order]
+    for comparison, rows in chosen.items():
+        config = rows[0].method.runs[0].details.config
+        rate_hz = float(config.get("rate_hz") or 0)
+        steps = _all_steps(context)
+        x = [1000 * step / rate_hz if rate_hz else float(step) for step in steps]
+        lines, cut = [], []
+        for row in rows:
+            interval = skill.skill_intervals(skill.sums_of_row(row, steps, _known(comparison.question)))
+            mean, low, high = (getattr(interval, name)[:-1] for name in ("mean", "low", "high"))
+            lines.append(Line(row.name, x, mean, low, high, dashed=row.kind != "model"))
+            cut += [row.name] if float(np.nanmin(mean)) < FLOOR else []
+        caption = "Bands: 95 % intervals over recordings. Dashed: a baseline. Click a name to show it alone."
+        caption += f" Ends at {blocks.signed(FLOOR, 1)}, above some of {blocks.listed(cut)}." if cut else ""
+        spec = charts.lines(
+            lines, f"time ahead ({'ms' if rate_hz else 'steps'})", "skill over persistence", order=order,
+            level=("persistence", 0.0), floor=FLOOR,
+        )  # fmt: skip
+        drawn.append(Chart(f"Skill by time ahead: {comparison.question.where}", spec, caption))
+    return fold("By time ahead", Charts(drawn)) if drawn else []
+
+
+def _shown(context: Context, comparison: Comparison) -> list[Row]:
+    rows = comparison.models[:LINES]
+    paper_row = context.row(comparison, figures.paper_representative(context))
+    rows += [paper_row] if paper_row and paper_row not in rows else []
+    return rows + [row for row in comparison.of("baseline") if row.predictor != BASELINE][:1]
+
+
+def _channels(context: Context) -> list[Fold]:
+    """Return errors and skill by sensor and axis of the best method, of the paper's, and of persistence."""
+    tables: list[Table] = []
+    steps = _steps(context)
+    for comparison in context.comparisons:
+        chosen = [
+            row
+            for row in dict.fromkeys([comparison.best, context.row(comparison, figures.paper_representative(context))])
+            if row
+        ]
+        if not chosen:
+            continue
+        known_objects = _known(comparison.question)
+        rows: list[Sequence[str | Cell]] = []
+        groups = chosen[0].method.runs[0].details.errors.groups
+        for group in (name for name in groups if name not in ("both", "standard", "feature", "latent")):
+            for row in chosen:
+                sums = skill.sums_of_row(row, steps, known_objects, group)
+                if sums:
+                    interval = skill.skill_intervals(sums)
+                    cells = [
+                        skill.skill_cell(interval, -1),
+                        *map(number, skill.mean_absolute(sums)),
+                        *(skill.skill_cell(interval, at) for at in range(len(steps))),
+                    ]
+                    rows.append([f"{group}, {row.name}", *cells])
+            persistence = skill.sums_of_method(chosen[0].method, BASELINE, steps, known_objects, group)
+            if persistence:
+                rows.append(
+                    [f"{group}, {BASELINE}", NONE, *map(number, skill.mean_absolute(persistence)), *[NONE] * len(steps)]
+                )
+        ahead = [f"t+{step}" for step in steps]
+        heads = [
+            "",
+            "mean skill",
+            *(f"MAE {step} ({comparison.measure.unit})" for step in ahead),
+            *(f"skill {step}" for step in ahead),
+        ]
+        tables += [table(comparison.question.where, heads, rows)] if rows else []
+    note = Note("Skill is over persistence here.")
+    return fold("By sensor and axis", *tables, note)
+
+
+def _ablations(context: Context) -> list[Fold]:
+    """Return what the plan and the timeline change: methods alike but for one of them."""
+    steps = _steps(context)
+    parts = list(dict.fromkeys(_known(comparison.question) for comparison in context.comparisons))
+    tables = [*_actions(context, steps, parts), *_timelines(context, steps, parts)]
+    note = Note(
+        "Differences are paired: both are on the same recordings. An interval above 0 shows that the plan helps."
+    )
+    return fold("What the plan and the timeline change", *tables, note)
+
+
+def _actions(context: Context, steps: Sequence[int], parts: Sequence[bool | None]) -> list[Table]:
+    rows: list[Sequence[str | Cell]] = []
+    for family in _families(context.methods, "actions"):
+        planned = next((candidate for candidate in family if candidate.settings["actions"] == "planned"), None)
+        for method in sorted(family, key=lambda candidate: ACTIONS.index(candidate.settings["actions"])):
+            label = method.name if method is planned or planned is None else f"… {method.settings['actions']}"
+            row: list[str | Cell] = [label]
+            for part in parts:
+                method_sums = skill.sums_of_method(method, MODEL, steps, part)
+                row.append(skill.skill_cell(skill.skill_intervals(method_sums), -1) if method_sums else NONE)
+                planned_sums = (
+                    skill.sums_of_method(planned, MODEL, steps, part) if planned and planned is not method else {}
+                )
+                lost = (
+                    pairing.paired_intervals(planned_sums, method_sums, skill.at_steps)
+                    if planned_sums and method_sums
+                    else None
+                )
+                row += [skill.skill_cell(lost, -1), skill.skill_cell(lost, -2)] if lost else [NONE, NONE]
+            rows.append([*row, str(len(method.runs))])
+    heads = [""]
+    for part in parts:
+        place = headline.PARTS[part] or "all recordings"
+        heads += [f"{place}: mean skill", f"{place}: the plan's gain", f"{place}: the plan's gain at t+{steps[-1]}"]
+    return [table("What the planned motion is worth", [*heads, "runs"], rows)] if rows else []
+
+
+def _timelines(context: Context, steps: Sequence[int], parts: Sequence[bool | None]) -> list[Table]:
+    rows: list[Sequence[str | Cell]] = []
+    for family in _families(context.methods, "timeline"):
+        for method in sorted(family, key=lambda candidate: str(candidate.settings["timeline"])):
+            rate_hz = float(method.runs[0].details.config.get("rate_hz") or 0)
+            row: list[str | Cell] = [
+                f"{method.name} ({method.settings['timeline']})",
+                f"{1000 / rate_hz:.0f}" if rate_hz else NONE,
+            ]
+            for part in parts:
+                sums = skill.sums_of_method(method, MODEL, steps, part)
+                row += (
+                    [skill.skill_cell(skill.skill_intervals(sums), -1), number(skill.mean_absolute(sums)[-1])]
+                    if sums
+                    else [NONE, NONE]
+                )
+            rows.append([*row, str(len(method.runs))])
+    heads, unit = ["", "a step (ms)"], units.common(run.details.config for run in context.runs)
+    for part in parts:
+        place = headline.PARTS[part] or "all recordings"
+        heads += [f"{place}: mean skill", f"{place}: MAE t+{steps[-1]} ({unit})"]
+    title = "Timelines: a step lasts differently, so rows cannot be compared"
+    return [table(title, [*heads, "runs"], rows)] if rows else []
+
+
+def _predictors(context: Context) -> list[str]:
+    predictors = {name for run in context.runs for name in run.details.errors.predictors}
+    return [name for name in figures.EXPLAINED if name in predictors]
+
+
+def _steps(context: Context) -> tuple[int, ...]:
+    return shown_steps([run.details for run in context.runs])
+
+
+def _all_steps(context: Context) -> list[int]:
+    return sorted(set.intersection(*(set(run.details.errors.steps) for run in context.runs)))
+
+
+def _known(question: Question) -> bool | None:
+    return next(
+        (known_objects for known_objects, name in headline.PARTS.items() if name and question.part.startswith(name)),
+        None,
+    )
+
+
+def _families(methods: Sequence[Method], setting: str) -> list[list[Method]]:
+    """Return the methods that differ in one setting alone, where there are several such."""
+    by_key: dict[str, list[Method]] = {}
+    for method in methods:
+        by_key.setdefault(method.key_without(setting), []).append(method)
+    return [family for family in by_key.values() if len(family) > 1]

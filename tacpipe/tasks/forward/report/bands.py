@@ -34,97 +34,104 @@ EXPLAINED = (
 )
 
 
-def folds(context: Context) -> list[Fold]:
+def band_folds(context: Context) -> list[Fold]:
     """Return how good quantiles are, of the results of calibrated models; nothing without any."""
     runs = [run for run in context.runs if COVERAGE in run.details.dataset.files]
     if not runs:
         return []
-    asked = sorted({tuple(run.details.metrics["quantiles"]["levels"]) for run in runs})[0]
-    level = (asked[-1] - asked[0]) / 100
+    levels = sorted({tuple(run.details.metrics["quantiles"]["levels"]) for run in runs})[0]
+    level = (levels[-1] - levels[0]) / 100
     methods = sorted({run.method for run in runs})
     drawn: list[Chart] = []
     rows: list[Sequence[Any]] = []
     for method in methods:
-        sums = _sums([run for run in runs if run.method == method])
-        for known in (True, False):
-            own = {name: one[known] for name, one in sums.items() if one.get(known)}
-            if own:
-                title = " · ".join(filter(None, (method if len(methods) > 1 else "", PARTS[known])))
-                drawn.append(_coverage(title, own, level))
-                rows += _rows(title, own)
+        sums = _band_sums([run for run in runs if run.method == method])
+        for known_objects in (True, False):
+            part_sums = {name: by_part[known_objects] for name, by_part in sums.items() if by_part.get(known_objects)}
+            if part_sums:
+                title = " · ".join(filter(None, (method if len(methods) > 1 else "", PARTS[known_objects])))
+                drawn.append(_coverage_chart(title, part_sums, level))
+                rows += _coverage_rows(title, part_sums)
     heads = ("", "step", "recordings", "coverage", "width", "pinball loss", "pinball loss below persistence's (%)")
-    title = f"Bands from the {asked[0]} to the {asked[-1]} % quantile"
+    title = f"Bands from the {levels[0]} to the {levels[-1]} % quantile"
     return fold(
         "Uncertainty",
         Charts(drawn),
         blocks.notes(EXPLAINED),
         table(title, heads, rows),
-        *([Charts(_examples(runs[0]))] if EXAMPLES in runs[0].details.dataset.files else []),
+        *([Charts(_example_charts(runs[0]))] if EXAMPLES in runs[0].details.dataset.files else []),
     )
 
 
 Sums = Mapping[str, dict[str, "AnyFloats"]]  # recording -> covered, width, pinball and values, each (step,)
 
 
-def _sums(runs: Sequence[Run]) -> dict[str, dict[bool, dict[str, dict[str, AnyFloats]]]]:
+def _band_sums(runs: Sequence[Run]) -> dict[str, dict[bool, dict[str, dict[str, AnyFloats]]]]:
     """Return the sums of recordings that were not seen, by predictor, whether the object is known, and recording."""
-    found: dict[str, dict[bool, dict[str, dict[str, AnyFloats]]]] = {}
+    sums: dict[str, dict[bool, dict[str, dict[str, AnyFloats]]]] = {}
     for run in runs:
         read = from_parquet(run.details.dataset.files[COVERAGE]).to_pandas()
         read["unit"] = read["recording"].where(read["known"] | read["object"].isna(), read["object"])
         for (name, is_known, recording), group in read[~read.seen].groupby(["predictor", "known", "unit"]):
             by_step = group.groupby("step", as_index=False)[["covered", "width", "pinball", "values"]].sum()
             added = {key: by_step[key].to_numpy(float) for key in ("covered", "width", "pinball", "values")}
-            there = found.setdefault(str(name), {}).setdefault(bool(is_known), {})
-            before = there.get(str(recording))
-            there[str(recording)] = added if before is None else {key: before[key] + added[key] for key in added}
-    return found
+            predictor_sums = sums.setdefault(str(name), {}).setdefault(bool(is_known), {})
+            before = predictor_sums.get(str(recording))
+            predictor_sums[str(recording)] = (
+                added if before is None else {key: before[key] + added[key] for key in added}
+            )
+    return sums
 
 
-def _of(sums: Mapping[str, Mapping[str, AnyFloats]], key: str) -> AnyFloats:
+def _sums_for(sums: Mapping[str, Mapping[str, AnyFloats]], key: str) -> AnyFloats:
     """Return one kind of sums (recording, step)."""
-    return np.stack([one[key] for one in sums.values()])
+    return np.stack([recording_sums[key] for recording_sums in sums.values()])
 
 
-def _coverage(title: str, sums: Mapping[str, Mapping[str, Mapping[str, AnyFloats]]], level: float) -> Chart:
+def _coverage_chart(title: str, sums: Mapping[str, Mapping[str, Mapping[str, AnyFloats]]], level: float) -> Chart:
     """Return coverage by step of each predictor, with its interval over recordings."""
-    several = []
-    for name in (one for one in NAMES if one in sums):
-        interval = intervals.share_interval(_of(sums[name], "covered"), _of(sums[name], "values"))
+    lines = []
+    for name in (predictor for predictor in NAMES if predictor in sums):
+        interval = intervals.share_interval(_sums_for(sums[name], "covered"), _sums_for(sums[name], "values"))
         low, high = (np.where(np.isnan(ends), interval.mean, ends) for ends in (interval.low, interval.high))
         steps = np.arange(1.0, len(low) + 1)
-        several.append(Line(NAMES[name], steps, interval.mean, low, high, dashed=name != "model"))
-    spec = charts.lines(several, "rows ahead", "coverage", level=("asked for", level))
+        lines.append(Line(NAMES[name], steps, interval.mean, low, high, dashed=name != "model"))
+    spec = charts.lines(lines, "rows ahead", "coverage", level=("asked for", level))
     return Chart(f"Coverage: {title}", spec)
 
 
-def _rows(title: str, sums: Mapping[str, Mapping[str, Mapping[str, AnyFloats]]]) -> list[Sequence[Any]]:
+def _coverage_rows(title: str, sums: Mapping[str, Mapping[str, Mapping[str, AnyFloats]]]) -> list[Sequence[Any]]:
     """Return the rows of the table: a predictor and step each."""
-    still = _of(sums["persistence"], "pinball").sum(axis=0)
+    persistence = _sums_for(sums["persistence"], "pinball").sum(axis=0)
     rows: list[Sequence[Any]] = []
-    for name in (one for one in NAMES if one in sums):
-        one = {key: _of(sums[name], key).sum(axis=0) for key in ("covered", "width", "pinball", "values")}
-        for step in (each for each in SHOWN if each <= len(still)):
-            at, values = step - 1, one["values"][step - 1]
-            gain = 100 * (1 - one["pinball"][at] / still[at]) if still[at] else float("nan")
-            measured = (one["covered"][at] / values, one["width"][at] / values, one["pinball"][at] / values, gain)
+    for name in (totals for totals in NAMES if totals in sums):
+        totals = {key: _sums_for(sums[name], key).sum(axis=0) for key in ("covered", "width", "pinball", "values")}
+        for step in (shown_step for shown_step in SHOWN if shown_step <= len(persistence)):
+            at, values = step - 1, totals["values"][step - 1]
+            gain = 100 * (1 - totals["pinball"][at] / persistence[at]) if persistence[at] else float("nan")
+            measured = (
+                totals["covered"][at] / values,
+                totals["width"][at] / values,
+                totals["pinball"][at] / values,
+                gain,
+            )
             rows.append([f"{title}: {NAMES[name]}", f"t+{step}", str(len(sums[name])), *map(number, measured)])
     return rows
 
 
-def _examples(run: Run) -> list[Chart]:
+def _example_charts(run: Run) -> list[Chart]:
     """Return a forecast with its band of each recording that the evaluation kept, next to what was measured."""
     drawn = []
-    for one in json.loads(run.details.dataset.files[EXAMPLES]):
-        levels = sorted((int(name[1:]), name) for name in one if name.startswith("q"))
-        low, middle, high = (one[levels[at][1]] for at in (0, len(levels) // 2, -1))
-        time_s = np.array(one["t_s"]) - one["t_s"][0]
-        several = [
-            Line("measured", time_s, one["measured"]),
-            Line(f"predicted {one['step']} rows before", time_s, middle, low, high, dashed=True),
+    for example in json.loads(run.details.dataset.files[EXAMPLES]):
+        levels = sorted((int(name[1:]), name) for name in example if name.startswith("q"))
+        low, middle, high = (example[levels[at][1]] for at in (0, len(levels) // 2, -1))
+        time_s = np.array(example["t_s"]) - example["t_s"][0]
+        lines = [
+            Line("measured", time_s, example["measured"]),
+            Line(f"predicted {example['step']} rows before", time_s, middle, low, high, dashed=True),
         ]
         spec = charts.lines(
-            several, "time (s)", f"{units.of_model(run.details.config)} above rest", points=False, height=190
+            lines, "time (s)", f"{units.of_model(run.details.config)} above rest", points=False, height=190
         )
-        drawn.append(Chart(f"{one['recording']}: {one['channel']}", spec, wide=True))
+        drawn.append(Chart(f"{example['recording']}: {example['channel']}", spec, wide=True))
     return drawn

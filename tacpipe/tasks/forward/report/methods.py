@@ -1,21 +1,134 @@
-"""What makes a method of forecasting, and which method is the paper's."""
+"""Read results of forecasts as runs of methods, from the sums of their errors."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-from tacpipe.report import contents
-from tacpipe.report.contents import Tree
+import numpy as np
+
+from tacpipe.arrays import AnyFloats, Bools, Int64s
+from tacpipe.comparison.runs import Errors, Question, Run
+from tacpipe.comparison.specification import Kind
+from tacpipe.errors import TacpipeError
+from tacpipe.report import context
+from tacpipe.report.context import Tree, drop_duplicates
+from tacpipe.tasks.forward import headline, units
+from tacpipe.tasks.forward.headline import BASELINE
 from tacpipe.tasks.forward.params import Recurrent
-from tacpipe.tasks.forward.report import error_sums
-from tacpipe.tasks.forward.report.error_sums import ErrorSums
 
 if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from tacpipe.arrays import AnyFloats
     from tacpipe.comparison.runs import Method
     from tacpipe.datasets.dataset import Dataset
+
+
+ERRORS_FILE = "errors.parquet"
+ERROR_COLUMNS = (
+    "recording",
+    "known",
+    "seen",
+    "predictor",
+    "group",
+    "step",
+    "windows",
+    "channels",
+    "squared",
+    "absolute",
+)
+
+
+@dataclass(frozen=True)
+class ErrorSums:
+    """Sums over windows and channels; NaN where a predictor has no errors in a group of channels."""
+
+    predictors: tuple[str, ...]
+    groups: tuple[str, ...]
+    recordings: tuple[str, ...]  # that the model was not trained on
+    steps: tuple[int, ...]
+    known: Bools  # (recording,): other recordings of its object were trained on
+    windows: Int64s  # (recording,)
+    channels: Mapping[str, int]  # by group
+    squared: AnyFloats  # (predictor, group, recording, step)
+    absolute: AnyFloats  # (predictor, group, recording, step)
+    named: bool = True  # whether any recording names its object: else none is known or unseen
+    objects: Mapping[str, str] = field(default_factory=dict)  # recording to its object, if it names one
+
+    def of(self, predictor: str, group: str) -> tuple[AnyFloats, AnyFloats] | None:
+        """Return squared and absolute sums, both (recording, step); None where there are none."""
+        if predictor not in self.predictors or group not in self.groups:
+            return None
+        at = self.predictors.index(predictor), self.groups.index(group)
+        squared, absolute = self.squared[at], self.absolute[at]
+        return None if np.isnan(squared).any() else (squared, absolute)
+
+
+def read_error_sums(content: bytes) -> ErrorSums:
+    """Return the sums that a file holds, without those of recordings that the model was trained on.
+
+    Raises `TacpipeError` where a column is missing, or where predictors were not evaluated on the same windows.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    from tacpipe.io.parquet import owned
+
+    schema = pq.read_schema(pa.BufferReader(owned(content)))
+    missing = [name for name in ERROR_COLUMNS if name not in schema.names]
+    if missing:
+        raise TacpipeError(f"{ERRORS_FILE} has no column {' and no '.join(missing)}. Evaluate the model again.")
+    objects = ["object"] if "object" in schema.names else []
+    table = pq.read_table(pa.BufferReader(owned(content)), columns=[*ERROR_COLUMNS, *objects])
+    table = table.filter(np.logical_not(table["seen"].to_numpy()))
+    has_objects = not objects or table["object"].null_count < table.num_rows or not table.num_rows
+    (predictors, predictor), (groups, group), (recordings, recording) = (
+        _coded(table[name]) for name in ("predictor", "group", "recording")
+    )
+    steps, step = np.unique(table["step"].to_numpy(), return_inverse=True)
+    windows = np.zeros(len(recordings), dtype=np.int64)
+    windows[recording] = table["windows"].to_numpy()
+    uneven = np.flatnonzero(windows[recording] != table["windows"].to_numpy())
+    if len(uneven):
+        raise TacpipeError(
+            f"In {ERRORS_FILE}, predictors were evaluated on different windows of {recordings[recording[uneven[0]]]}, so "
+            f"they cannot be compared. Evaluate the model again."
+        )
+    is_known = np.zeros(len(recordings), dtype=np.bool_)
+    is_known[recording] = table["known"].to_numpy()
+    sums = np.full((2, len(predictors), len(groups), len(recordings), len(steps)), np.nan)
+    for index, name in enumerate(("squared", "absolute")):
+        sums[index, predictor, group, recording, step] = table[name].to_numpy()
+    return ErrorSums(
+        predictors,
+        groups,
+        recordings,
+        tuple(int(step) for step in steps),
+        is_known,
+        windows,
+        {groups[code]: int(width) for code, width in zip(group, table["channels"].to_numpy(), strict=True)},
+        sums[0],
+        sums[1],
+        has_objects,
+        _object_names(table) if objects else {},
+    )
+
+
+def _object_names(table: pa.Table) -> dict[str, str]:
+    """Return the object that each recording names."""
+    pairs = zip(table["recording"].to_pylist(), table["object"].to_pylist(), strict=True)
+    return {recording: name for recording, name in pairs if name is not None}
+
+
+def _coded(column: pa.ChunkedArray) -> tuple[tuple[str, ...], Int64s]:
+    """Return the distinct values of a text column in the order in which they come, and the place of each row's."""
+    encoded = column.combine_chunks().dictionary_encode()
+    return tuple(encoded.dictionary.to_pylist()), encoded.indices.to_numpy().astype(np.int64)
+
 
 ACTIONS = ("planned", "none", "shuffled")
 _PAPER_WIDTH = {"pca": 20, "autoencoder": 8}  # latents the paper keeps
@@ -23,7 +136,7 @@ _NO_METHOD = ("seed", "actions", "architecture", "baselines")  # baselines are f
 _PREFERRED = ("pca", "autoencoder", "raw")  # the paper's own order of what forecasts best
 
 
-class Result(contents.Result):
+class Result(context.Result):
     """One result of forecasts."""
 
     STAGE = "train.forward"
@@ -32,7 +145,7 @@ class Result(contents.Result):
     @cached_property
     def errors(self) -> ErrorSums:
         """The error sums of recordings that the model has not seen."""
-        return error_sums.read(self.dataset.files[error_sums.FILE])
+        return read_error_sums(self.dataset.files[ERRORS_FILE])
 
     @property
     def actions(self) -> str:
@@ -75,9 +188,9 @@ class Result(contents.Result):
         return " · ".join(parts)
 
 
-def comparable(dataset: Dataset) -> bool:
+def has_error_sums(dataset: Dataset) -> bool:
     """Return whether a result holds what a comparison reads: only those of the task ``forward`` do."""
-    return all(name in dataset.files for name in ("metrics.json", "config.json", error_sums.FILE))
+    return all(name in dataset.files for name in ("metrics.json", "config.json", ERRORS_FILE))
 
 
 def main_timeline(runs: Sequence[Result]) -> str:
@@ -86,21 +199,21 @@ def main_timeline(runs: Sequence[Result]) -> str:
     return max(count, key=lambda name: (count[name], name))
 
 
-def recurrent(method: Method) -> bool:
+def is_recurrent(method: Method) -> bool:
     """Return whether a method is the paper's encoder and decoder, with the plan."""
     return method.settings["actions"] == "planned" and method.family.startswith("recurrent")
 
 
-def papers(methods: Sequence[Method]) -> Method | None:
+def paper_method(methods: Sequence[Method]) -> Method | None:
     """Return the method nearest to what the paper found best: the recurrent model of 20 principal components."""
-    found = [one for one in methods if recurrent(one) and codec(one)["of"] == "levels"]
-    return min(found, key=_distance, default=None)
+    candidates = [method for method in methods if is_recurrent(method) and codec_of(method)["of"] == "levels"]
+    return min(candidates, key=_distance, default=None)
 
 
-def codec(method: Method) -> Tree:
+def codec_of(method: Method) -> Tree:
     """Return kind, width and name of a method's representation."""
-    found: Tree = method.details[0].config["codec"]
-    return found
+    codec: Tree = method.details[0].config["codec"]
+    return codec
 
 
 def paper_row(codec: Tree) -> str | None:
@@ -121,7 +234,119 @@ def paper_row(codec: Tree) -> str | None:
 
 def _distance(method: Method) -> tuple[int, int, int, str]:
     """Return how far a recurrent method is from the paper's, for sorting."""
-    found = codec(method)
-    kind = found["kind"]
-    off = abs(int(found["latents"]) - _PAPER_WIDTH.get(kind, int(found["latents"])))
+    codec = codec_of(method)
+    kind = codec["kind"]
+    off = abs(int(codec["latents"]) - _PAPER_WIDTH.get(kind, int(codec["latents"])))
     return _PREFERRED.index(kind), off, -len(method.runs), method.name
+
+
+ORACLES = ("codec", "codec_anchored")  # of what knows the true future
+
+
+def read_runs(results: Sequence[Dataset]) -> list[Run]:
+    """Return the runs of results that hold error sums of recordings which the model has not seen."""
+    all_results = [Result(result) for result in drop_duplicates(results) if has_error_sums(result)]
+    runs = [result for result in all_results if result.errors.recordings]
+    if not runs:
+        return []
+    steps = shown_steps(runs)
+    usual = main_timeline(runs)
+    return [_run(result, steps, usual) for result in runs]
+
+
+def kind_of_predictor(predictor: str) -> Kind:
+    """Return what a predictor is.
+
+    >>> [kind(one) for one in ("model", "model_anchored", "ridge", "codec", "codec_persistence PCA-20")]
+    ['model', 'variant', 'baseline', 'oracle', 'control']
+    """
+    if predictor.startswith("model"):
+        return "model" if predictor == "model" else "variant"
+    return (
+        "oracle" if predictor.split(" ")[0] in ORACLES else "control" if predictor.startswith("codec") else "baseline"
+    )
+
+
+def predictor_name(predictor: str) -> str:
+    """Return what tables call a predictor: its name in ``metrics.json`` with spaces.
+
+    >>> called("model_anchored"), called("codec_persistence PCA-20")
+    ('anchored', 'codec persistence PCA-20')
+    """
+    return predictor.removeprefix("model_").replace("_", " ")
+
+
+def name_with_codec(predictor: str, codec: str) -> str:
+    """Return the name of a predictor among several representations: those that go through a codec state which.
+
+    >>> through("ridge", "PCA-20"), through("codec_persistence", "PCA-20")
+    ('ridge', 'codec_persistence PCA-20')
+    """
+    return f"{predictor} {codec}" if predictor.startswith("codec") else predictor
+
+
+def shown_steps(runs: Sequence[Result]) -> tuple[int, ...]:
+    """Return the steps to report on, those that all runs predict."""
+    return headline.shown(sorted(set.intersection(*(set(run.errors.steps) for run in runs))))
+
+
+def sums_by_recording(
+    run: Result, predictor: str, steps: Sequence[int], known_objects: bool | None = None, group: str = "both"
+) -> dict[str, AnyFloats]:
+    """Return what `headline.sums` adds up, by recording; empty where a predictor has no errors in a group of channels."""
+    errors = run.errors
+    predictor_sums, persistence_sums = errors.of(predictor, group), errors.of(BASELINE, group)
+    if predictor_sums is None or persistence_sums is None:
+        return {}
+    at, width = [errors.steps.index(step) for step in steps], errors.channels[group]
+    return {
+        name: headline.sums(
+            (predictor_sums[0][place, at], predictor_sums[1][place, at]),
+            (persistence_sums[0][place, at], persistence_sums[1][place, at]),
+            float(errors.windows[place]) * width,
+        )
+        for place, name in enumerate(errors.recordings)
+        if errors.windows[place] and (known_objects is None or bool(errors.known[place]) == known_objects)
+    }  # fmt: skip
+
+
+def object_clusters(run: Result, known_objects: bool | None) -> dict[str, str] | None:
+    """Return the object of each recording of unseen objects, which is what chance draws there; None of other recordings."""
+    errors = run.errors
+    if known_objects is not False or not errors.objects:
+        return None
+    return {name: errors.objects.get(name, name) for name in errors.recordings}
+
+
+def _run(run: Result, steps: Sequence[int], usual: str) -> Run:
+    config = run.config
+    elsewhere = run.timeline != usual
+    timeline = f"{run.timeline} timeline" if elsewhere else ""
+    questions = {}
+    for known_objects in (True, False) if run.errors.named else (None,):
+        by_predictor = {
+            name_with_codec(name, str(config["codec"]["name"])): predictor_sums
+            for name in run.errors.predictors
+            if (predictor_sums := sums_by_recording(run, name, steps, known_objects))
+        }
+        if by_predictor:
+            part = ", ".join(filter(None, (headline.PARTS[known_objects], timeline)))
+            objects = object_clusters(run, known_objects)
+            cluster = headline.OBJECTS if objects else headline.RECORDINGS
+            measure = headline.measure(steps, units.of_model(config), cluster)
+            questions[Question(part, place=2 * elsewhere + (known_objects is False))] = Errors(
+                measure, by_predictor, objects
+            )
+    return Run(
+        run.dataset,
+        headline.TASK,
+        run.name(usual),
+        run.settings,
+        questions,
+        family=str(config["architecture"]).replace("_", " "),
+        seed=run.given.get("seed"),
+        simulated=run.simulated,
+        published=run.published,
+        control=run.actions == "shuffled",
+        details=run,
+    )

@@ -1,20 +1,87 @@
-"""Errors of representations in their own spaces, Table 1 of the paper, and what codecs hold and lose."""
+"""Compare representations of the tactile signals, and the losses of codecs."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tacpipe.comparison.runs import MODEL, Method, Run
-from tacpipe.comparison.spread import Spread, spread
-from tacpipe.report import blocks, charts, provenance
+from tacpipe.comparison.runs import MODEL, Method, Run, Spread, spread
+from tacpipe.report import blocks, charts
 from tacpipe.report.blocks import NONE, Cell, Chart, Charts, Fold, Note, Table, fold, number, table
 from tacpipe.report.charts import Line
-from tacpipe.report.context import Context
-from tacpipe.tasks.forward.report import methods as by_method
-from tacpipe.tasks.forward.report import reading, sweep
+from tacpipe.report.context import Context, is_published
+from tacpipe.tasks.forward.report import methods
+
+if TYPE_CHECKING:
+    from tacpipe.datasets.dataset import Dataset
+
+
+Tree = Mapping[str, Any]
+
+CODEC_FILE = "codec.json"
+
+
+@dataclass(frozen=True)
+class Loss:
+    """What codecs of one kind and width lose on the way to latents and back, the mean over the codecs."""
+
+    series: str  # kind and class: PCA, AE-C1, …
+    latents: int
+    codecs: int
+    part: str  # of the training recordings: ``val``, held out of the fit, or ``train``
+    mse_standardised: float
+    mae_counts: float
+
+
+def read_codecs(datasets: Sequence[Dataset]) -> list[Tree]:
+    """Return the descriptions of the codecs among the files of ``datasets``, each one once."""
+    texts = dict.fromkeys(bytes(dataset.files[CODEC_FILE]) for dataset in datasets if CODEC_FILE in dataset.files)
+    return [json.loads(content) for content in texts]
+
+
+def codec_series(codec: Tree) -> str:
+    """Return what codecs that differ in width alone are called together.
+
+    >>> series({"kind": "autoencoder", "frames": 2, "of": "increments"})
+    'AE-C2 increments'
+    """
+    name = f"AE-C{codec.get('frames', 1)}" if codec["kind"] == "autoencoder" else str(codec["kind"]).upper()
+    return name if codec.get("of", "levels") == "levels" else f"{name} {codec['of']}"
+
+
+def codec_losses(codecs: Sequence[Tree]) -> list[Loss]:
+    """Return what codecs lose by series and width, on held-out recordings if all report on these, or else on the fit's."""
+    part = (
+        "val"
+        if all("val" in loss_tree["reconstruction"] for loss_tree in codecs if loss_tree.get("reconstruction"))
+        else "train"
+    )
+    by_series: dict[tuple[str, int], list[Tree]] = {}
+    for codec in codecs:
+        if codec.get("reconstruction"):
+            by_series.setdefault((codec_series(codec), int(codec["latents"])), []).append(codec["reconstruction"])
+    mean_losses = []
+    for (name, latents), described in sorted(by_series.items()):
+        errors = {
+            measure: float(np.mean([loss_tree[part][measure] for loss_tree in described]))
+            for measure in ("mse_standardised", "mae_counts")
+        }
+        mean_losses.append(Loss(name, latents, len(described), part, **errors))
+    return mean_losses
+
+
+def paper_codec(codecs: Sequence[Tree], series: str, latents: int) -> Tree | None:
+    """Return the first codec of a series that has a covariance, the one whose width is nearest to ``latents``."""
+    candidates = [
+        candidate for candidate in codecs if codec_series(candidate) == series and candidate.get("latent_covariance")
+    ]
+    return min(candidates, key=lambda candidate: abs(int(candidate["latents"]) - latents), default=None)
+
 
 COMPONENTS = 40  # bars of the explained variance
 PRINTED = {  # validation and test error in Table 1 of the paper
@@ -32,7 +99,7 @@ OWN_SPACE = (
 
 
 @dataclasses.dataclass(frozen=True)
-class Represented:
+class Representation:
     """A row of Table 1: errors in a representation's own scaled space."""
 
     validation: Spread
@@ -41,72 +108,84 @@ class Represented:
     persistence: Spread
 
 
-def folds(context: Context) -> list[Fold]:
+def representation_folds(context: Context) -> list[Fold]:
     """Return the recurrent model on each representation, and codecs' variance, covariance and loss."""
-    codecs = sweep.read([*(run.dataset for run in context.runs), *context.others])
+    codecs = read_codecs([*(run.dataset for run in context.runs), *context.others])
     published = context.published or (
-        not context.runs and all(provenance.published(one, by_method.Result.SETS) for one in context.bare)
+        not context.runs and all(is_published(result, methods.Result.SETS) for result in context.bare)
     )
-    own = _table(context) if context.runs else None
+    method_table = _representation_table(context) if context.runs else None
     note = OWN_SPACE + (
         " The paper's own recordings are not public; its numbers are as printed." if context.published else ""
     )
-    return fold("Representations", own, Note(note) if own else None, *_codecs(codecs, published))
+    return fold(
+        "Representations", method_table, Note(note) if method_table else None, *_codec_charts(codecs, published)
+    )
 
 
-def represented(method: Method) -> Represented | None:
+def represent_method(method: Method) -> Representation | None:
     """Return a method's errors in its own scaled space; None where the results do not state them."""
 
-    def error(run: Run, predictor: str, known: bool | None = None) -> float | None:
+    def error(run: Run, predictor: str, known_objects: bool | None = None) -> float | None:
         steps = run.details.errors.steps
-        found = list(reading.sums(run.details, predictor, steps, known, "feature").values())
-        total = np.sum(found, axis=0) if found else None
+        error_sums = list(methods.sums_by_recording(run.details, predictor, steps, known_objects, "feature").values())
+        total = np.sum(error_sums, axis=0) if error_sums else None
         return None if total is None else float((total[: len(steps)] / total[-1]).mean())
 
-    def over(predictor: str, known: bool | None = None) -> list[float]:
-        return [value for run in method.runs if (value := error(run, predictor, known)) is not None]
+    def over(predictor: str, known_objects: bool | None = None) -> list[float]:
+        return [value for run in method.runs if (value := error(run, predictor, known_objects)) is not None]
 
-    tested, known = over(MODEL), over(MODEL, True)
+    tested, known_objects = over(MODEL), over(MODEL, True)
     if not tested:
         return None
     # the recurrent model is trained by this very error, so its loss states it too
     validation = [run.details.config.get("validation", {}) for run in method.runs]
-    described = [one.get("mse_feature", one.get("loss") if by_method.recurrent(method) else None) for one in validation]
-    return Represented(
-        spread([float(one) for one in described if one is not None]),
+    described = [
+        tree.get("mse_feature", tree.get("loss") if methods.is_recurrent(method) else None) for tree in validation
+    ]
+    return Representation(
+        spread([float(tree) for tree in described if tree is not None]),
         spread(tested),
-        spread(known) if known else None,
+        spread(known_objects) if known_objects else None,
         spread(over("persistence")),
     )
 
 
-def _table(context: Context) -> Table | None:
+def _representation_table(context: Context) -> Table | None:
     """Return the recurrent model on each representation: Table 1 in the paper's form where the data are the paper's."""
     published, order = context.published, list(PRINTED)
-    found = [one for one in context.methods if by_method.recurrent(one)]
+    recurrent_methods = [represented for represented in context.methods if methods.is_recurrent(represented)]
 
     def place(method: Method) -> tuple[int, str, int, str]:
-        codec = by_method.codec(method)
-        row = by_method.paper_row(codec)
+        codec = methods.codec_of(method)
+        row = methods.paper_row(codec)
         return order.index(row) if row else len(order), str(codec["kind"]), int(codec["latents"]), method.name
 
-    named = any(run.details.errors.named for method in found for run in method.runs)
+    has_objects = any(run.details.errors.named for method in recurrent_methods for run in method.runs)
     rows: list[list[str | Cell]] = []
-    for method in sorted(found, key=place):
-        one = represented(method)
-        if one is None:
+    for method in sorted(recurrent_methods, key=place):
+        represented = represent_method(method)
+        if represented is None:
             continue
-        paper = by_method.paper_row(by_method.codec(method)) or ""
-        cells: list[str | Cell] = [blocks.with_sd(part.mean, part.sd) for part in (one.validation, one.test)]
-        cells += [blocks.with_sd(one.known.mean, one.known.sd) if one.known else NONE] if named else []
-        cells.append(blocks.with_sd(one.persistence.mean, one.persistence.sd))
-        cells.append(number(one.test.mean / one.persistence.mean, 3) if one.persistence.mean else NONE)
+        paper = methods.paper_row(methods.codec_of(method)) or ""
+        cells: list[str | Cell] = [
+            blocks.with_sd(part.mean, part.sd) for part in (represented.validation, represented.test)
+        ]
+        cells += (
+            [blocks.with_sd(represented.known.mean, represented.known.sd) if represented.known else NONE]
+            if has_objects
+            else []
+        )
+        cells.append(blocks.with_sd(represented.persistence.mean, represented.persistence.sd))
+        cells.append(
+            number(represented.test.mean / represented.persistence.mean, 3) if represented.persistence.mean else NONE
+        )
         if published:
             cells += [f"{value:.4f}" for value in PRINTED[paper]] if paper in PRINTED else [NONE, NONE]
         rows.append([method.name.split(" · ", 1)[-1], *cells, str(len(method.runs))])
     if not rows:
         return None
-    heads = ["representation", "validation", "test", *(["test, known objects"] if named else [])]
+    heads = ["representation", "validation", "test", *(["test, known objects"] if has_objects else [])]
     heads += [
         "persistence, test",
         "test ÷ persistence",
@@ -114,7 +193,7 @@ def _table(context: Context) -> Table | None:
         "runs",
     ]
     if published:
-        present = {by_method.paper_row(by_method.codec(one)) for one in found}
+        present = {methods.paper_row(methods.codec_of(represented)) for represented in recurrent_methods}
         blank = [NONE] * (len(heads) - 4)
         rows += [
             [name, *blank, *(f"{value:.4f}" for value in PRINTED[name]), "0"] for name in order if name not in present
@@ -127,45 +206,47 @@ def _table(context: Context) -> Table | None:
     return table(f"{title}, mean ± sd over runs", heads, rows)
 
 
-def _codecs(codecs: Sequence[sweep.Tree], published: bool) -> list[Charts | Table]:
+def _codec_charts(codecs: Sequence[Tree], published: bool) -> list[Charts | Table]:
     if not codecs:
         return []
     drawn = []
-    pca, autoencoder = sweep.papers(codecs, "PCA", 20), sweep.papers(codecs, "AE-C1", 8)
+    pca, autoencoder = paper_codec(codecs, "PCA", 20), paper_codec(codecs, "AE-C1", 8)
     if pca and pca.get("explained_ratio"):
-        kept, ratio = int(pca["latents"]), pca["explained_ratio"]
+        kept_latents, ratio = int(pca["latents"]), pca["explained_ratio"]
         printed = "; in the paper 20 hold 82 %" if published else ""
-        caption = f"The {kept} that are kept hold {100 * sum(ratio[:kept]):.1f} %{printed}."
-        values = {str(place): 100 * float(one) for place, one in enumerate(ratio[:COMPONENTS], 1)}
+        caption = f"The {kept_latents} that are kept hold {100 * sum(ratio[:kept_latents]):.1f} %{printed}."
+        values = {str(place): 100 * float(share) for place, share in enumerate(ratio[:COMPONENTS], 1)}
         title = f"Variance by principal component{', Figure 4 of the paper' if published else ''}"
-        drawn.append(Chart(title, charts.bars(values, "principal component", "variance (%)", marked=kept), caption))
+        drawn.append(
+            Chart(title, charts.bars(values, "principal component", "variance (%)", marked=kept_latents), caption)
+        )
     for name, codec in (("PCA", pca), ("AE-C1", autoencoder)):
         if codec:
             spec = {**charts.grid(np.array(codec["latent_covariance"]), "latent"), "usermeta": {"most": 360}}
             caption = "Training rows; blue above 0, orange below; strength is the square root of the size."
             drawn.append(Chart(f"Covariance between the {codec['latents']} latents of {name}", spec, caption))
-    losses = sweep.losses(codecs)
+    losses = codec_losses(codecs)
     series: dict[str, dict[int, float]] = {}
-    for one in losses:
-        series.setdefault(one.series, {})[one.latents] = one.mse_standardised
+    for share in losses:
+        series.setdefault(share.series, {})[share.latents] = share.mse_standardised
     if any(len(widths) > 1 for widths in series.values()):
-        several = [
-            Line(name, sorted(found), [found[width] for width in sorted(found)])
-            for name, found in sorted(series.items())
+        lines = [
+            Line(name, sorted(by_width), [by_width[width] for width in sorted(by_width)])
+            for name, by_width in sorted(series.items())
         ]
         caption = "Error of encoding and decoding, where 1 is what no latent at all would give. Lower is better."
-        spec = charts.lines(several, "latents", "mean squared error (standardised)")
+        spec = charts.lines(lines, "latents", "mean squared error (standardised)")
         drawn.append(Chart("Reconstruction error by number of latents", spec, caption))
     rows = [
         [
-            one.series,
-            str(one.latents),
-            f"{one.mse_standardised:.4f}",
-            number(one.mae_counts),
-            "held out" if one.part == "val" else "of the fit",
-            str(one.codecs),
+            share.series,
+            str(share.latents),
+            f"{share.mse_standardised:.4f}",
+            number(share.mae_counts),
+            "held out" if share.part == "val" else "of the fit",
+            str(share.codecs),
         ]
-        for one in losses
+        for share in losses
     ]
     heads = ["", "latents", "MSE (standardised)", "MAE (channels' unit)", "training recordings", "codecs"]
     lost = [table("What representations lose on the way to latents and back", heads, rows)] if rows else []

@@ -1,40 +1,44 @@
-"""Errors and skill of a method, pooled over its runs and their recordings, with intervals."""
+"""Compute the skill of forecasts over persistence, by step and by situation."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from tacpipe.arrays import AnyFloats
 from tacpipe.comparison.engine import Row
-from tacpipe.comparison.runs import Method
+from tacpipe.comparison.runs import MODEL, Method
 from tacpipe.metrics import intervals, pairing
 from tacpipe.metrics.intervals import Interval
 from tacpipe.report import blocks
-from tacpipe.report.blocks import NONE, Cell
-from tacpipe.tasks.forward.headline import Parts
-from tacpipe.tasks.forward.report import reading
+from tacpipe.report.blocks import NONE, Cell, Fold, Note, fold, interval, number, table
+from tacpipe.report.context import Context
+from tacpipe.tasks.forward.headline import BASELINE, Parts
+from tacpipe.tasks.forward.report import methods
+from tacpipe.tasks.forward.situations import LOST, PACE_M_S, SITUATIONS, TURNING_RAD_S, WIDTH_M
 
 if TYPE_CHECKING:
     from tacpipe.metrics.pairing import Sums
 
 
-def sums_of(row: Row, steps: Sequence[int], known: bool | None, group: str = "both") -> Sums:
+def sums_of_row(row: Row, steps: Sequence[int], known_objects: bool | None, group: str = "both") -> Sums:
     """Return the sums of a row's predictor at some steps in a group of channels, by seed and recording."""
-    return sums(row.method, row.predictor.split(" ")[0], steps, known, group)
+    return sums_of_method(row.method, row.predictor.split(" ")[0], steps, known_objects, group)
 
 
-def sums(method: Method, predictor: str, steps: Sequence[int], known: bool | None, group: str = "both") -> Sums:
+def sums_of_method(
+    method: Method, predictor: str, steps: Sequence[int], known_objects: bool | None, group: str = "both"
+) -> Sums:
     """Return the sums of a method's predictor at some steps in a group of channels, by seed and recording.
 
     Those of unseen objects are by seed and object.
     """
     parts = []
     for run in method.runs:
-        clusters = reading.clusters(run.details, known) or {}
-        sums = reading.sums(run.details, predictor, steps, known, group)
+        clusters = methods.object_clusters(run.details, known_objects) or {}
+        sums = methods.sums_by_recording(run.details, predictor, steps, known_objects, group)
         parts += [((run.seed, clusters.get(name, name)), errors) for name, errors in sums.items()]
     return pairing.added(parts)
 
@@ -45,7 +49,7 @@ def at_steps(draws: AnyFloats) -> AnyFloats:
     return np.hstack([parts.skill, parts.mean_skill[:, None]])
 
 
-def skills(sums: Sums) -> Interval:
+def skill_intervals(sums: Sums) -> Interval:
     """Return the skill over persistence at each step and over all, with intervals."""
     return intervals.skill_of_log_ratio(pairing.value_intervals(sums, lambda draws: np.log1p(-at_steps(draws))))
 
@@ -54,13 +58,13 @@ def _total(sums: Sums) -> Parts:
     return Parts.of_sums(np.sum(list(sums.values()), axis=0))
 
 
-def mae(sums: Sums) -> list[float]:
+def mean_absolute(sums: Sums) -> list[float]:
     """Return the mean absolute error at each step."""
     total = _total(sums)
     return [float(value) for value in total.absolute / total.values]
 
 
-def mse(sums: Sums) -> float:
+def mean_squared(sums: Sums) -> float:
     """Return the mean squared error over all steps; NaN without sums."""
     if not sums:
         return float("nan")
@@ -68,8 +72,66 @@ def mse(sums: Sums) -> float:
     return float((total.squared / total.values).mean())
 
 
-def cell(found: Interval | None, at: int) -> Cell:
+def skill_cell(intervals: Interval | None, at: int) -> Cell:
     """Return a value with its interval; a dash where there is none."""
-    if found is None:
+    if intervals is None:
         return Cell(NONE)
-    return blocks.interval(float(found.mean[at]), float(found.low[at]), float(found.high[at]))
+    return blocks.interval(float(intervals.mean[at]), float(intervals.low[at]), float(intervals.high[at]))
+
+
+Tree = Mapping[str, Any]
+SITUATION_NOTE = (
+    "A window is named by its last row and the rows to come, the first name that fits: no contact; closing: the gripper "
+    f"closes by more than {1000 * WIDTH_M:g} mm or contact begins; releasing: it opens by more than that or contact ends; "
+    f"slipping: the load falls by more than {100 * LOST:g} % with the gripper still; holding in motion: the hand is faster "
+    f"than {PACE_M_S:g} m/s or {TURNING_RAD_S:g} rad/s; holding still. Errors are means over all steps and channels, "
+    "skill is 1 − mean absolute error / that of persistence, the geometric mean over recordings. The interval is over "
+    "recordings, given for methods of one run."
+)
+
+
+def situation_folds(context: Context) -> list[Fold]:
+    """Return errors and skill by situation of each method; nothing where no result states them."""
+    rows: list[list[str | Cell]] = []
+    for name in SITUATIONS:
+        for method in context.methods:
+            scores = skill_in_situation(method, name)
+            if scores:
+                share = f"{100 * scores['part']:.1f} %"
+                skill = interval(scores["skill"], scores["low"], scores["high"])
+                errors = (number(scores[BASELINE]), number(scores[MODEL]))
+                rows.append([name, method.name, f"{scores['windows']:,.0f}", share, *errors, skill])
+    heads = ["situation", "method", "windows", "of persistence's error", "MAE of persistence", "MAE", "skill"]
+    if not rows:
+        return []
+    return fold("By situation", table("Errors by what the hand does", heads, rows), Note(SITUATION_NOTE))
+
+
+def skill_in_situation(method: Method, situation: str) -> dict[str, float] | None:
+    """Return windows, errors, skill and what part of persistence's error lies in a situation, pooled over runs.
+
+    Skill is weighted by windows; of one run it has its interval.
+    """
+    trees = [run.details.metrics.get("situations", {}) for run in method.runs]
+    selected = [part[situation] for part in trees if situation in part and "mean" in part[situation]["skill"]]
+    if not selected:
+        return None
+    weights = [float(part["windows"]) for part in selected]
+
+    def mean(values: list[float]) -> float:
+        return float(np.average(values, weights=weights))
+
+    total_error = sum(
+        part["windows"] * part["mae_counts"][BASELINE]["mean"] for tree in trees for part in tree.values()
+    )
+    persistence_error = mean([part["mae_counts"][BASELINE]["mean"] for part in selected])
+    ends = selected[0]["skill"]["mean"] if len(method.runs) == 1 else {}
+    return {
+        "windows": sum(weights),
+        "part": sum(weights) * persistence_error / total_error if total_error else float("nan"),
+        BASELINE: persistence_error,
+        MODEL: mean([part["mae_counts"][MODEL]["mean"] for part in selected]),
+        "skill": mean([part["skill"]["mean"]["mean"] for part in selected]),
+        "low": float(ends.get("low", np.nan)),
+        "high": float(ends.get("high", np.nan)),
+    }

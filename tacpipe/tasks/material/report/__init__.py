@@ -1,4 +1,4 @@
-"""How results on materials are read, compared and reported."""
+"""Report results on materials."""
 
 from __future__ import annotations
 
@@ -6,11 +6,15 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 from tacpipe.comparison.engine import Comparison, Row
-from tacpipe.comparison.runs import Run
+from tacpipe.comparison.runs import Method, Run
 from tacpipe.comparison.specification import Kind, TaskReport
-from tacpipe.report.blocks import Cell, Fold
+from tacpipe.report import blocks
+from tacpipe.report.blocks import NONE, Cell, Fold, Note
 from tacpipe.report.context import Context
-from tacpipe.tasks.material.report import methods, parts, profiles, reading, tables
+from tacpipe.tasks.material import headline
+from tacpipe.tasks.material.report import figures, joint, methods, scores, uncertainty
+from tacpipe.tasks.material.report.methods import question_on, runs_on, sensor_title, sensors_of
+from tacpipe.tasks.material.report.predictions import LAST, LEVEL, MODEL
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
@@ -24,32 +28,157 @@ class MaterialReport(TaskReport):
 
     def read(self, results: Sequence[Dataset]) -> list[Run]:
         """Return the runs of results that hold predictions of slides which the model has not seen."""
-        return reading.read(results)
+        return methods.read_runs(results)
 
     def kind(self, predictor: str) -> Kind:
         """Return what a predictor is."""
-        return reading.kind(predictor)
+        return methods.kind_of_predictor(predictor)
 
     def predictor_name(self, predictor: str) -> str:
         """Return the name of a predictor in tables."""
-        return reading.called(predictor)
+        return methods.predictor_name(predictor)
 
     def uses(self, dataset: Dataset) -> bool:
         """Return whether a dataset holds slides, which are drawn."""
-        return profiles.reads(dataset)
+        return figures.holds_slides(dataset)
 
     def columns(self, context: Context, comparison: Comparison) -> Sequence[tuple[str, Callable[[Row], Cell]]]:
         """Return counts, the last epoch, the skill over the mean level and the numbers of the paper."""
-        return parts.columns(context, comparison)
+        return columns(context, comparison)
 
     def folds(self, context: Context) -> list[Fold]:
         """Return what materials have of their own."""
-        return parts.folds(context)
+        return folds(context)
 
     def caveats(self, context: Context) -> list[str]:
         """Return what must be known about the numbers."""
-        return parts.caveats(context)
+        return caveats(context)
 
     def run_columns(self, run: Run) -> dict[str, str | Cell]:
         """Return more columns of the table of runs."""
-        return tables.about_run(run)
+        return joint.run_columns(run)
+
+
+PAIRED = (
+    "A slide that several runs evaluated counts as the fraction of runs that named it right; the interval is from drawing "
+    "slides anew. McNemar's test takes a slide for right where at least half of the runs are; the t test pairs accuracies "
+    "of the same fold."
+)
+
+
+def folds(context: Context) -> list[Fold]:
+    """Return what materials have of their own."""
+    methods = context.methods
+    return [
+        *blocks.fold(
+            "Joint learning",
+            *map(Note, joint.joint_effects(methods)),
+            joint.difference_table(methods),
+            joint.swap_table(methods),
+            Note(PAIRED),
+        ),
+        *blocks.fold("Fewer slides of one sensor", *joint.reduction_tables(methods)),
+        *figures.few_slides_folds(methods),
+        *joint.zero_shot_folds(methods),
+        *figures.confusion_folds(context),
+        *uncertainty.uncertainty_folds(methods),
+        *figures.latent_folds(methods),
+        *figures.training_folds(methods),
+        *figures.profile_folds(context.others),
+    ]
+
+
+def columns(context: Context, comparison: Comparison) -> list[tuple[str, Callable[[Row], Cell]]]:
+    """Return more columns of the table of all methods: counts, the last epoch, skill over the mean level, the paper's."""
+    runs = [run for run in context.runs if comparison.question in run.questions]
+    sensors = (
+        sensor for run in runs for sensor in run.details.sensors if question_on(run, sensor) == comparison.question
+    )
+    sensor = next(sensors)
+
+    def runs_of(row: Row) -> list[Run]:
+        return row.method.of(comparison.question)
+
+    def named_right(row: Row) -> Cell:
+        counted = row.predictor != headline.CHANCE  # which names none
+        return scores.accuracy_cell(scores.accuracy(runs_of(row), sensor, row.predictor) if counted else None)
+
+    def last(row: Row) -> Cell:
+        counted = scores.accuracy(runs_of(row), sensor, LAST) if row.predictor == MODEL else None
+        return Cell(scores.format_percent(counted.fraction), value=counted.fraction) if counted else Cell(NONE)
+
+    def paper(row: Row) -> Cell:
+        value = joint.ACCURACIES.get(row.family, {}).get(sensor) if row.kind == "model" else None
+        return Cell(NONE) if value is None else Cell(f"{value:.2f}", value=value)
+
+    more_columns: list[tuple[str, Callable[[Row], Cell]]] = [
+        ("slides named right", named_right),
+        (
+            "skill over the mean level",
+            lambda row: blocks.number(scores.level_skill(runs_of(row), sensor, row.predictor), 3),
+        ),
+    ]
+    if any(LAST in run.details.predictions.predicted for run in runs):
+        more_columns.append(("last epoch (%)", last))
+    return [*more_columns, ("paper, Table I (%)", paper)] if context.published else more_columns
+
+
+def caveats(context: Context) -> list[str]:
+    """Return what must be known about these numbers."""
+    methods = context.methods
+    return [_basis(methods), _pooled(methods), scores.caution(methods), _not_run(methods)] if methods else []
+
+
+def _pooled(methods: Sequence[Method]) -> str:
+    """Return what the table of accuracies of these methods holds."""
+    runs = [run for method in methods for run in method.details]
+    published = all(method.published for method in methods)
+    predicted = {name for run in runs for name in run.predictions.predicted}
+    described = [
+        "Slides named right: accuracy ± standard deviation over runs; in small print, those of all that runs of the method "
+        "were evaluated on, then the 95 % interval (Wilson) over slides, each counted once however many runs named it.",
+        "Networks have the weights that did best in validation, unless the name states otherwise."
+        if any(run.history for run in runs)
+        else "",
+        f"Last epoch: the weights of the last one{', which the paper’s code reports' if published else ''}."
+        if LAST in predicted
+        else "",
+        "Skill is 1 − errors / errors of the mean level alone, a linear readout of the time-averaged channels."
+        if LEVEL in predicted
+        else "",
+        "Mapping to a known space is reported for the sensor that was mapped to the other's."
+        if any(method.settings["frozen_sensor"] for method in methods)
+        else "",
+        joint.PRINTED_BASIS if published else "",
+    ]
+    return " ".join(filter(None, described))
+
+
+def _basis(methods: Sequence[Method]) -> str:
+    """Return what all rests on: slides, training slides, and settings."""
+    described = []
+    for sensor in sensors_of(methods):
+        slides = [run.details.predictions.of(sensor) for method in methods for run in runs_on(method, sensor)]
+        names = {str(name) for slide in slides for name in slide.recordings}
+        trained = sorted({run.learned[sensor] for method in methods for run in method.details if sensor in run.learned})
+        counts = f" after training on {blocks.listed([f'{count:,}' for count in trained])}" if trained else ""
+        described.append(f"{len(names):,} slides of {sensor}{counts}")
+    settings, runs = {}, [run for method in methods for run in method.details]
+    for name in ("seed", "epochs"):
+        values = {run.params[name] for run in runs if name in run.params and (name == "seed" or run.history)}
+        if values:
+            settings[name] = ", ".join(str(value) for value in sorted(values))
+    settings_text = "; ".join(f"{name} {values}" for name, values in settings.items())
+    return f"Evaluated on {blocks.listed(described)}.{f' Settings: {settings_text}.' if settings_text else ''}"
+
+
+def _not_run(methods: Sequence[Method]) -> str:
+    """Return what the paper printed of methods that were not run, where the slides are the paper's."""
+    if not all(method.published for method in methods):
+        return ""
+    missing = [name for name in joint.ACCURACIES if all(method.family != name for method in methods)]
+    missed = [
+        f"{name}: {', '.join(f'{sensor_title(sensor)} {value:.2f} %' for sensor, value in joint.ACCURACIES[name].items())}"
+        for name in missing
+    ]
+    return f"In the paper's Table I and not run here: {'; '.join(missed)}." if missed else ""

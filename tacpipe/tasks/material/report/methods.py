@@ -1,17 +1,35 @@
-"""A result on materials, what makes a method of such results, and what it is called."""
+"""Read results on materials as runs of methods: a question is the slides of a sensor."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from tacpipe.comparison.naming import marks
-from tacpipe.comparison.runs import Method, Run
-from tacpipe.report import contents
-from tacpipe.report.contents import Tree
+import numpy as np
+
+from tacpipe.comparison.runs import Errors, Method, Question, Run, marks
+from tacpipe.comparison.specification import Kind
+from tacpipe.report import context
+from tacpipe.report.context import Tree, drop_duplicates
+from tacpipe.tasks.material import headline
 from tacpipe.tasks.material.report import predictions
-from tacpipe.tasks.material.report.predictions import Predictions
+from tacpipe.tasks.material.report.predictions import (
+    LAST,
+    LEVEL,
+    LEVEL_ONLY,
+    LEVEL_REMOVED,
+    MODEL,
+    NOTHING,
+    SHUFFLED,
+    SWAPPED,
+    Predictions,
+)
+
+if TYPE_CHECKING:
+    from tacpipe.arrays import AnyFloats
+    from tacpipe.datasets.dataset import Dataset
+
 
 SENSORS = {"biotac": "BioTac", "roboskin": "RoboSkin"}
 USUAL = (("elsewhere", False), ("elsewhere", True), ("layout", "time"))  # settings that no name states
@@ -42,7 +60,7 @@ _PAIRS = ("alignment_weight", "align_from", "alignment_loss")  # of no effect wh
 _SAME = 0.75  # training slides in this ratio are as many: folds differ in size, some learn from validation slides too
 
 
-class Result(contents.Result):
+class Result(context.Result):
     """One result on materials."""
 
     STAGE = "train.material"
@@ -51,24 +69,24 @@ class Result(contents.Result):
     @cached_property
     def predictions(self) -> Predictions:
         """What was predicted of each slide that the model has not seen."""
-        return predictions.read(self.dataset.recordings["predictions"].table(), self.config)
+        return predictions.read_predictions(self.dataset.recordings["predictions"].table(), self.config)
 
     @property
     def given(self) -> Tree:
         """The params that are stored with the model; dropout had no effect in an older version."""
-        found = super().given
-        return {**found, "dropout": 0.0} if found.get("dropout_mode") == "noop" else found
+        params = super().given
+        return {**params, "dropout": 0.0} if params.get("dropout_mode") == "noop" else params
 
     @cached_property
     def sensors(self) -> tuple[str, ...]:
         """The sensors whose slides the model was evaluated on."""
-        return ordered(self.predictions.sensors.tolist())
+        return ordered_sensors(self.predictions.sensors.tolist())
 
     @property
     def trained(self) -> Mapping[str, int]:
         """The number of slides with the role train, by sensor."""
-        found: Mapping[str, int] = self.config.get("counts", {}).get("train", {})
-        return found
+        counts: Mapping[str, int] = self.config.get("counts", {}).get("train", {})
+        return counts
 
     @property
     def learned(self) -> Mapping[str, int]:
@@ -83,7 +101,7 @@ class Result(contents.Result):
             return {sensor: count + watched.get(sensor, 0) for sensor, count in self.trained.items()}
         batch, percent = int(params.get("batch", 32)), int(params.get("subsample_percent", 100))
         return {
-            sensor: kept(count, batch, percent) if sensor == params.get("subsample_sensor") else count
+            sensor: slides_kept(count, batch, percent) if sensor == params.get("subsample_sensor") else count
             for sensor, count in self.trained.items()
         }
 
@@ -96,7 +114,7 @@ class Result(contents.Result):
     def place(self) -> tuple[str, str]:
         """The split and the layout of its slides: what is given together of results is of one of each."""
         split = self.config.get("split", "")
-        layouts = {one.get("layout", "time") for one in self.config.get("sensors", {}).values()}
+        layouts = {sensor_config.get("layout", "time") for sensor_config in self.config.get("sensors", {}).values()}
         described = str(split.get("scheme", "")) if isinstance(split, Mapping) else str(split)
         return described, "authors" if "authors" in layouts else "time"
 
@@ -107,21 +125,21 @@ def settings(results: Sequence[Result]) -> list[dict[str, Any]]:
     That is architecture, joint or not, number of training slides, layout and split of the slides, and all params but the
     seed; what is of no effect is left out.
     """
-    places = [one.place for one in results]
+    places = [result.place for result in results]
     main = max(dict.fromkeys(places), key=places.count, default=("", "time"))
-    whole: dict[tuple[str, str], dict[str, int]] = {}  # the largest number of training slides, by place and sensor
-    for one, place in zip(results, places, strict=True):
-        for sensor, count in one.trained.items():
-            most = whole.setdefault(place, {})
-            most[sensor] = max(count, most.get(sensor, 0))
-    few: list[float] = []
+    all_slides: dict[tuple[str, str], dict[str, int]] = {}  # the largest number of training slides, by place and sensor
+    for result, place in zip(results, places, strict=True):
+        for sensor, count in result.trained.items():
+            most_slides = all_slides.setdefault(place, {})
+            most_slides[sensor] = max(count, most_slides.get(sensor, 0))
+    fractions: list[float] = []
     return [
-        {**_settings(one), "elsewhere": place != main, **_few(one, whole.get(place, {}), few)}
-        for one, place in zip(results, places, strict=True)
+        {**_settings(result), "elsewhere": place != main, **_few(result, all_slides.get(place, {}), fractions)}
+        for result, place in zip(results, places, strict=True)
     ]
 
 
-def plain(settings: Tree, *but: str) -> bool:
+def has_usual_settings(settings: Tree, *but: str) -> bool:
     """Return whether a method of these settings was trained on all materials and slides, with true labels and pairs.
 
     This is what tables compare; the settings in ``but`` may be others.
@@ -129,7 +147,7 @@ def plain(settings: Tree, *but: str) -> bool:
     return all(name in but or settings[name] in usual for name, usual in _PLAIN.items())
 
 
-def line(method: Method) -> str:
+def method_title(method: Method) -> str:
     """Return a method's name but for the number of slides: what a curve over that is called."""
     settings = method.settings
     parts = [base_name({**settings, "few": "", "subsample_sensor": ""})]
@@ -143,21 +161,26 @@ def line(method: Method) -> str:
 
 def sensors_of(methods: Sequence[Method]) -> tuple[str, ...]:
     """Return the sensors that any of some methods was evaluated on."""
-    return ordered([sensor for method in methods for one in method.details for sensor in one.sensors])
+    return ordered_sensors([sensor for method in methods for result in method.details for sensor in result.sensors])
 
 
-def of(method: Method, sensor: str) -> list[Run]:
+def runs_on(method: Method, sensor: str) -> list[Run]:
     """Return the runs of a method that were evaluated on slides of ``sensor``."""
     return [run for run in method.runs if sensor in run.details.sensors]
 
 
-def ordered(sensors: Collection[str]) -> tuple[str, ...]:
+def ordered_sensors(sensors: Collection[str]) -> tuple[str, ...]:
     """Return sensors, each once, in the order of tables: those of the paper first."""
-    known = list(SENSORS)
-    return tuple(sorted(set(sensors), key=lambda one: (known.index(one) if one in known else len(known), one)))
+    named_sensors = list(SENSORS)
+    return tuple(
+        sorted(
+            set(sensors),
+            key=lambda sensor: (named_sensors.index(sensor) if sensor in named_sensors else len(named_sensors), sensor),
+        )
+    )
 
 
-def shown(sensor: str) -> str:
+def sensor_title(sensor: str) -> str:
     """Return a sensor's name as texts have it.
 
     >>> shown("biotac"), shown("xela1")
@@ -166,7 +189,7 @@ def shown(sensor: str) -> str:
     return SENSORS.get(sensor, sensor)
 
 
-def kept(slides: int, batch: int, ratio: int) -> int:
+def slides_kept(slides: int, batch: int, ratio: int) -> int:
     """Return how many slides a sensor learns from that keeps ``ratio`` % of the full batches.
 
     90 % leaves out each tenth batch, the others keep each second, fourth, sixth and ninth.
@@ -174,11 +197,11 @@ def kept(slides: int, batch: int, ratio: int) -> int:
     >>> [kept(600, 32, ratio) for ratio in (100, 90, 50, 25, 17, 11)]
     [600, 512, 288, 160, 96, 64]
     """
-    every = {50: 2, 25: 4, 17: 6, 11: 9}
+    steps = {50: 2, 25: 4, 17: 6, 11: 9}
     batches = range(slides // batch)
     if ratio == 100:
         return slides
-    return batch * sum(number % 10 != 0 if ratio == 90 else number % every[ratio] == 0 for number in batches)
+    return batch * sum(number % 10 != 0 if ratio == 90 else number % steps[ratio] == 0 for number in batches)
 
 
 def base_name(settings: Tree, variants: bool = True) -> str:
@@ -193,16 +216,16 @@ def base_name(settings: Tree, variants: bool = True) -> str:
         name += " independent"
     if not variants:
         return name
-    held_out = (one.strip().partition("=") for one in str(settings["hold_out"]).split(";") if settings["hold_out"])
+    held_out = (text.strip().partition("=") for text in str(settings["hold_out"]).split(";") if settings["hold_out"])
     parts = [
         name,
         "with vibration" if settings["vibration"] else "",
         "permuted pairs" if settings["pairing"] == "permuted" else "",
         "permuted labels" if settings["labels"] == "permuted" else "",
-        f"{shown(settings['subsample_sensor'])} {settings['subsample_percent']} %"
+        f"{sensor_title(settings['subsample_sensor'])} {settings['subsample_percent']} %"
         if settings["subsample_sensor"]
         else "",
-        *(f"{shown(sensor)} without {materials.replace(',', ', ')}" for sensor, _, materials in held_out),
+        *(f"{sensor_title(sensor)} without {materials.replace(',', ', ')}" for sensor, _, materials in held_out),
         f"{settings['few']} slides" if settings["few"] else "",
     ]
     return " · ".join(filter(None, parts))
@@ -241,22 +264,97 @@ def _settings(run: Result) -> dict[str, Any]:
     }
 
 
-def _few(run: Result, whole: Mapping[str, int], described: list[float]) -> dict[str, str]:
+def _few(run: Result, all_slides: Mapping[str, int], described: list[float]) -> dict[str, str]:
     """Return the number of training slides of a run where it has not all, and the sensor that this is so for if not all.
 
     Numbers are rounded to those of other runs that have about as many; ``described`` has the fractions of before. A
     sensor that learns from some batches alone has all slides: that is a setting.
     """
     fewer = {}
-    for sensor in ordered(run.trained):
-        fraction = run.trained[sensor] / max(whole[sensor], 1)
+    for sensor in ordered_sensors(run.trained):
+        fraction = run.trained[sensor] / max(all_slides[sensor], 1)
         if fraction > _SAME:
             continue
-        same = [one for one in described if _SAME < one / fraction < 1 / _SAME]
+        same = [earlier for earlier in described if _SAME < earlier / fraction < 1 / _SAME]
         if not same:
             described.append(fraction)
-        fewer[sensor] = str(round((same or [fraction])[0] * whole[sensor]))
+        fewer[sensor] = str(round((same or [fraction])[0] * all_slides[sensor]))
     if set(fewer) == set(run.trained) and len(set(fewer.values())) == 1:
         return {"few": next(iter(fewer.values())), "few_of": ""}
-    few = ", ".join(f"{shown(sensor)} {count}" for sensor, count in fewer.items())
-    return {"few": few, "few_of": ",".join(fewer)}
+    reductions = ", ".join(f"{sensor_title(sensor)} {count}" for sensor, count in fewer.items())
+    return {"few": reductions, "few_of": ",".join(fewer)}
+
+
+PREDICTOR_NAMES = {
+    LEVEL: headline.BASELINES[LEVEL],
+    LEVEL_ONLY: headline.BASELINES[LEVEL_ONLY],
+    LEVEL_REMOVED: "same readout, level removed",
+    SHUFFLED: "trained on shuffled labels",
+    SWAPPED: "classifiers exchanged",
+    LAST: "last epoch",
+}
+KINDS: dict[str, Kind] = {
+    MODEL: "model",
+    LEVEL: "baseline",
+    LEVEL_ONLY: "baseline",
+    headline.CHANCE: "baseline",
+    SHUFFLED: "control",
+    LEVEL_REMOVED: "control",
+}
+
+
+def read_runs(results: Sequence[Dataset]) -> list[Run]:
+    """Return the runs of results that hold predictions of slides which the model has not seen."""
+    all_results = [Result(result) for result in drop_duplicates(results) if "predictions" in result.recordings]
+    with_sensors = [result for result in all_results if result.sensors]
+    return [_run(*pair) for pair in zip(with_sensors, settings(with_sensors), strict=True)]
+
+
+def kind_of_predictor(predictor: str) -> Kind:
+    """Return what a predictor is."""
+    return KINDS.get(predictor, "variant")
+
+
+def predictor_name(predictor: str) -> str:
+    """Return what tables call a predictor."""
+    return PREDICTOR_NAMES.get(predictor, predictor.replace("_", " "))
+
+
+def question_on(run: Run, sensor: str) -> Question | None:
+    """Return the question that a run answers on slides of a sensor."""
+    return next((question for question in run.questions if question.part.split(", ")[0] == sensor_title(sensor)), None)
+
+
+def named_right(result: Result, sensor: str, predictor: str) -> dict[str, AnyFloats]:
+    """Return whether each slide of a sensor was named right, 1 or 0, and 1, by recording."""
+    rows = result.predictions.of(sensor)
+    triples = zip(rows.recordings, rows.predicted[predictor], rows.materials, strict=True)
+    return {str(name): np.array([answer == truth, 1.0]) for name, answer, truth in triples if answer != NOTHING}
+
+
+def _run(result: Result, settings: dict[str, Any]) -> Run:
+    place = " · ".join(str(settings[name]) for name in ("split", "layout")) if settings["elsewhere"] else ""
+    classes = len(result.config.get("classes", ()))
+    questions = {}
+    for sensor in result.sensors:
+        sums = {predictor: named_right(result, sensor, predictor) for predictor in result.predictions.predicted}
+        if classes:
+            sums[headline.CHANCE] = dict.fromkeys(sums[MODEL], np.array([1 / classes, 1.0]))
+        part = ", ".join(filter(None, (sensor_title(sensor), place)))
+        questions[Question(part, place=int(settings["elsewhere"]))] = Errors(
+            headline.MEASURE, {name: predictor_sums for name, predictor_sums in sums.items() if predictor_sums}
+        )
+    return Run(
+        result.dataset,
+        headline.TASK,
+        base_name(settings),
+        settings,
+        questions,
+        family=base_name(settings, variants=False),
+        seed=result.params.get("seed"),
+        fold=result.config.get("fold"),
+        simulated=result.simulated,
+        published=result.published,
+        control=not has_usual_settings(settings, "elsewhere"),
+        details=result,
+    )

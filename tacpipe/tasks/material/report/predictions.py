@@ -60,17 +60,17 @@ class Predictions:
         sessions: dict[tuple[str, int], set[str]] = {}
         for sensor, material, session in zip(self.sensors, self.materials, self.sessions, strict=True):
             sessions.setdefault((str(sensor), int(material)), set()).add(str(session))
-        return all(len(one) == 1 for one in sessions.values())
+        return all(len(names) == 1 for names in sessions.values())
 
 
-def read(table: pa.Table, config: Mapping[str, Any]) -> Predictions:
+def read_predictions(table: pa.Table, config: Mapping[str, Any]) -> Predictions:
     """Return what the table ``predictions`` of a result states of slides that its model has not seen.
 
     As in the result's own metrics, slides of materials that were held out of a sensor's labels do not count, nor those
     of the last batch where the model's ``config`` leaves it out, nor those of a sensor whose network was only taken over.
     """
     naming = Naming.from_json(config)
-    table = table.filter(_counted(table, config, naming))
+    table = table.filter(_counted_slides(table, config, naming))
     names = [name for name in table.column_names if name.startswith("z") and name[1:].isdigit()]
     latents = np.column_stack([table[name].to_numpy() for name in names]).astype(np.float64) if names else None
     return Predictions(
@@ -80,7 +80,7 @@ def read(table: pa.Table, config: Mapping[str, Any]) -> Predictions:
         {name: _numbers(table, name, naming) for name in PREDICTORS if name in table.column_names},
         latents if latents is not None and np.isfinite(latents).all() else None,
         naming,
-        np.array([one or "" for one in table["session"].to_pylist()], dtype=np.str_)
+        np.array([session or "" for session in table["session"].to_pylist()], dtype=np.str_)
         if "session" in table.column_names
         else None,
     )
@@ -91,18 +91,18 @@ def _numbers(table: pa.Table, name: str, naming: Naming) -> Int64s:
     if not naming.names:
         return table[name].fill_null(NOTHING).to_numpy().astype(np.int64)  # type: ignore[no-any-return]
     numbers = {material: number for number, material in enumerate(naming.names)}
-    return np.array([numbers.get(one, NOTHING) for one in table[name].to_pylist()], np.int64)
+    return np.array([numbers.get(label, NOTHING) for label in table[name].to_pylist()], np.int64)
 
 
-def _counted(table: pa.Table, config: Mapping[str, Any], naming: Naming) -> Bools:
+def _counted_slides(table: pa.Table, config: Mapping[str, Any], naming: Naming) -> Bools:
     """Return which rows count (slide,)."""
     sensors = np.array(table["sensor"].to_pylist(), dtype=np.str_)
     materials = _numbers(table, "material", naming)
     params = params_of.counting(registry.load("train.material"), config.get("params", {}))
     counted: Bools = ~table["seen"].to_numpy(zero_copy_only=False).astype(bool)
     counted &= sensors != str(params.get("frozen_sensor", ""))
-    for sensor, held in config.get("held_out", {}).items():
-        counted &= ~((sensors == sensor) & np.isin(materials, held))
+    for sensor, held_out in config.get("held_out", {}).items():
+        counted &= ~((sensors == sensor) & np.isin(materials, held_out))
     if params.get("drop_last"):
         batch = int(params["batch"])
         for sensor in np.unique(sensors):

@@ -16,7 +16,7 @@ from tacpipe.metrics.proportions import wilson
 from tacpipe.report import blocks, charts
 from tacpipe.report.blocks import NONE, Block, Cell, Chart, Charts, Fold, fold, number, table
 from tacpipe.report.charts import Line
-from tacpipe.tasks.material.report.methods import of, sensors_of, shown
+from tacpipe.tasks.material.report.methods import runs_on, sensor_title, sensors_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -51,15 +51,18 @@ class Rate(NamedTuple):
     slides: int
 
 
-def folds(methods: Sequence[Method]) -> list[Fold]:
+def uncertainty_folds(methods: Sequence[Method]) -> list[Fold]:
     """Return reliability and curves of unknown, of calibrated models; nothing without any."""
     reliable, refused, rows = [], [], []
     for sensor in sensors_of(methods):
-        held = [(one, read) for one in methods if (read := answers(one, sensor)) is not None]
-        reliable += [_reliability(f"{shown(sensor)}: {one.name}", one, sensor, read) for one, read in held]
-        curves = [(one.name, read) for one, read in held if {True, False} <= set(read.known)]
-        refused += [_unknown(shown(sensor), curves)] if curves else []
-        rows += [_row(one, sensor, read) for one, read in held]
+        calibrated = [(method, read) for method in methods if (read := read_answers(method, sensor)) is not None]
+        reliable += [
+            _reliability_chart(f"{sensor_title(sensor)}: {method.name}", method, sensor, read)
+            for method, read in calibrated
+        ]
+        curves = [(method.name, read) for method, read in calibrated if {True, False} <= set(read.known)]
+        refused += [_unknown_chart(sensor_title(sensor), curves)] if curves else []
+        rows += [_table_row(method, sensor, read) for method, read in calibrated]
     heads = (
         "",
         "slides",
@@ -77,7 +80,7 @@ def folds(methods: Sequence[Method]) -> list[Fold]:
     return fold("Uncertainty", *parts, table("Probabilities and the answer unknown", heads, rows), blocks.notes(TABLE))
 
 
-def answers(method: Method, sensor: str) -> pd.DataFrame | None:
+def read_answers(method: Method, sensor: str) -> pd.DataFrame | None:
     """Return what calibrated runs of a method answered of a sensor's slides: a row a slide that was not seen and a run.
 
     Columns: ``run``, ``recording``, ``known`` (whether its material was learned), ``right``, ``probability``, ``score`` and
@@ -86,7 +89,7 @@ def answers(method: Method, sensor: str) -> pd.DataFrame | None:
     import pandas as pd
 
     parts = []
-    for number_of, run in enumerate(of(method, sensor)):
+    for number_of, run in enumerate(runs_on(method, sensor)):
         files = run.details.dataset.files
         if ANSWERS not in files:
             continue
@@ -101,7 +104,7 @@ def answers(method: Method, sensor: str) -> pd.DataFrame | None:
     return pd.concat(parts) if parts else None
 
 
-def rate(rows: pd.DataFrame, column: str) -> Rate:
+def rate_of(rows: pd.DataFrame, column: str) -> Rate:
     """Return in which fraction of slides a column is true, with Wilson's interval; NaN without slides."""
     if not len(rows):
         return Rate(float("nan"), float("nan"), float("nan"), 0)
@@ -116,97 +119,103 @@ def rate_over_materials(rows: pd.DataFrame, column: str) -> Rate:
     Ends are NaN with fewer than `headline.FEWEST` materials, and in results that do not name them.
     """
     if "label" not in rows or rows.label.nunique() < headline.FEWEST:
-        return rate(rows, column)._replace(low=float("nan"), high=float("nan"))
+        return rate_of(rows, column)._replace(low=float("nan"), high=float("nan"))
     interval = share_interval(rows[[column]].to_numpy(float), np.ones((len(rows), 1)), rows.label.to_numpy(str)).first
     return Rate(*interval, rows.recording.nunique())
 
 
-def curve(known: AnyFloats, unknown: AnyFloats) -> Floats:
+def unknown_curve(known_scores: AnyFloats, unknown: AnyFloats) -> Floats:
     """Return which fraction of unknown slides scores below the threshold below which `RATES` of known ones do (rate,).
 
     ``known`` and ``unknown`` (slide,) are scores. Between thresholds it is linear, as the area under it is.
     """
-    ends = np.r_[-np.inf, np.unique(np.concatenate([known, unknown])), np.inf]
-    one, other = (np.searchsorted(np.sort(scores), ends, side="left") / len(scores) for scores in (known, unknown))
-    found: Floats = np.interp(RATES, one, np.maximum.accumulate(other))
-    return found
+    ends = np.r_[-np.inf, np.unique(np.concatenate([known_scores, unknown])), np.inf]
+    refused_known, refused_unknown = (
+        np.searchsorted(np.sort(scores), ends, side="left") / len(scores) for scores in (known_scores, unknown)
+    )
+    curve: Floats = np.interp(RATES, refused_known, np.maximum.accumulate(refused_unknown))
+    return curve
 
 
-def _reliability(title: str, method: Method, sensor: str, read: pd.DataFrame) -> Chart:
+def _reliability_chart(title: str, method: Method, sensor: str, read: pd.DataFrame) -> Chart:
     """Return accuracy by stated probability, before and after the temperature."""
-    own = read[read.known].sort_values("probability", kind="stable")
-    bins = np.array_split(np.arange(len(own)), int(np.clip(len(own) // FEWEST, 1, calibration.BINS)))
-    each = [(float(own.iloc[some].probability.mean()), rate(own.iloc[some], "right")) for some in bins if len(some)]
-    right, low, high = ([getattr(one, name) for _, one in each] for name in ("fraction", "low", "high"))
-    several = [Line("calibrated", [stated for stated, _ in each], right, low, high)]
-    if before := _before(method, sensor):
-        several.append(Line("as trained", [one for one, _ in before], [one for _, one in before], dashed=True))
-    spec = charts.lines(several, "stated probability", "fraction right", diagonal=(0, 1), height=220)
+    known_rows = read[read.known].sort_values("probability", kind="stable")
+    bins = np.array_split(np.arange(len(known_rows)), int(np.clip(len(known_rows) // FEWEST, 1, calibration.BINS)))
+    binned = [
+        (float(known_rows.iloc[indices].probability.mean()), rate_of(known_rows.iloc[indices], "right"))
+        for indices in bins
+        if len(indices)
+    ]
+    right, low, high = ([getattr(value, name) for _, value in binned] for name in ("fraction", "low", "high"))
+    lines = [Line("calibrated", [probability for probability, _ in binned], right, low, high)]
+    if before := _uncalibrated_points(method, sensor):
+        lines.append(Line("as trained", [value for value, _ in before], [value for _, value in before], dashed=True))
+    spec = charts.lines(lines, "stated probability", "fraction right", diagonal=(0, 1), height=220)
     return Chart(title, spec)
 
 
-def _before(method: Method, sensor: str) -> list[tuple[float, float]]:
+def _uncalibrated_points(method: Method, sensor: str) -> list[tuple[float, float]]:
     """Return mean confidence and accuracy of each bin of what the runs stated before calibration."""
     sums: dict[int, list[float]] = {}
-    for run in of(method, sensor):
+    for run in runs_on(method, sensor):
         tree = run.details.metrics.get("calibration", {}).get(sensor, {}).get("before", {})
-        for one in tree.get("reliability", []):
-            place = min(int(one["confidence"] * calibration.BINS), calibration.BINS - 1)
+        for bin_tree in tree.get("reliability", []):
+            place = min(int(bin_tree["confidence"] * calibration.BINS), calibration.BINS - 1)
             total = sums.setdefault(place, [0.0, 0.0, 0.0])
-            for at, value in enumerate((1.0, one["confidence"], one["accuracy"])):
-                total[at] += one["n"] * value
-    return [(stated / n, right / n) for _, (n, stated, right) in sorted(sums.items())]
+            for at, value in enumerate((1.0, bin_tree["confidence"], bin_tree["accuracy"])):
+                total[at] += bin_tree["n"] * value
+    return [(probability / n, right / n) for _, (n, probability, right) in sorted(sums.items())]
 
 
-def _unknown(sensor: str, several: Sequence[tuple[str, pd.DataFrame]]) -> Chart:
+def _unknown_chart(sensor: str, chart_lines: Sequence[tuple[str, pd.DataFrame]]) -> Chart:
     """Return how many slides of unknown materials are found against known ones that are lost, and where thresholds lie."""
     drawn, points = [], []
-    for name, read in several:
-        each = []
-        for _, one in read.groupby("run"):
-            known, unknown = (one.score[one.known == flag].to_numpy(float) for flag in (True, False))
-            if len(known) and len(unknown):
-                each.append(100 * curve(known, unknown))
-        runs = np.stack(each)
+    for name, read in chart_lines:
+        loss_curves = []
+        for _, run_rows in read.groupby("run"):
+            known_scores, unknown = (run_rows.score[run_rows.known == flag].to_numpy(float) for flag in (True, False))
+            if len(known_scores) and len(unknown):
+                loss_curves.append(100 * unknown_curve(known_scores, unknown))
+        runs = np.stack(loss_curves)
         low, high = (runs.min(axis=0), runs.max(axis=0)) if len(runs) > 1 else (None, None)
         drawn.append(Line(name, 100 * RATES, runs.mean(axis=0), low, high))
-        lost, found = (100 * rate(read[read.known == flag], "refused").fraction for flag in (True, False))
-        points.append((name, lost, found))
+        lost, unknown_rate = (100 * rate_of(read[read.known == flag], "refused").fraction for flag in (True, False))
+        points.append((name, lost, unknown_rate))
     x, y = "slides of known materials answered unknown (%)", "slides of unknown materials answered unknown (%)"
     spec = charts.lines(drawn, x, y, diagonal=(0, 100), points=False, height=260)
     spec["layer"].append(charts.marked(points, x, y))
     return Chart(f"Unknown: {sensor}", spec)
 
 
-def _row(method: Method, sensor: str, read: pd.DataFrame) -> Sequence[str | Cell]:
+def _table_row(method: Method, sensor: str, read: pd.DataFrame) -> Sequence[str | Cell]:
     """Return a row of the table."""
-    trees = [run.details.metrics for run in of(method, sensor)]
+    trees = [run.details.metrics for run in runs_on(method, sensor)]
     measured = [tree["calibration"][sensor] for tree in trees if sensor in tree.get("calibration", {})]
     refused = [tree.get("unknown", {}).get(sensor, {}) for tree in trees]
-    areas = [one["auroc"][one["rule"]] for one in refused if "auroc" in one]
+    areas = [tree["auroc"][tree["rule"]] for tree in refused if "auroc" in tree]
 
     def mean(measure: str) -> Cell:
         if not measured:
             return Cell(NONE)
-        before, after = (float(np.mean([one[when][measure] for one in measured])) for when in ("before", "after"))
+        before, after = (float(np.mean([tree[when][measure] for tree in measured])) for when in ("before", "after"))
         return Cell(number(after, 3).text, f"{number(before, 3).text} as trained", after)
 
-    known, other = read[read.known], read[~read.known]
+    known_rows, unknown_rows = read[read.known], read[~read.known]
     return [
-        f"{shown(sensor)}: {method.name}",
-        f"{known.recording.nunique():,}",
+        f"{sensor_title(sensor)}: {method.name}",
+        f"{known_rows.recording.nunique():,}",
         *map(mean, ("calibration_error", "log_loss")),
-        _percent(rate(known, "refused")),
-        _percent(rate_over_materials(other.assign(named_known=~other.refused), "named_known")),
+        _rate_cell(rate_of(known_rows, "refused")),
+        _rate_cell(rate_over_materials(unknown_rows.assign(named_known=~unknown_rows.refused), "named_known")),
         number(float(np.mean(areas)), 3) if areas else Cell(NONE),
-        _percent(rate(known[~known.refused], "right")),
+        _rate_cell(rate_of(known_rows[~known_rows.refused], "right")),
     ]
 
 
-def _percent(found: Rate) -> Cell:
+def _rate_cell(counted: Rate) -> Cell:
     """Return a fraction in percent above its interval."""
-    if not found.slides:
+    if not counted.slides:
         return Cell(NONE)
-    ends = "" if np.isnan(found.low) else f"{100 * found.low:.1f} to {100 * found.high:.1f} "
-    below = f"{ends}of {found.slides:,}"
-    return Cell(f"{100 * found.fraction:.1f}", below, found.fraction)
+    ends = "" if np.isnan(counted.low) else f"{100 * counted.low:.1f} to {100 * counted.high:.1f} "
+    below = f"{ends}of {counted.slides:,}"
+    return Cell(f"{100 * counted.fraction:.1f}", below, counted.fraction)

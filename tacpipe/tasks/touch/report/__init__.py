@@ -1,16 +1,30 @@
-"""How results on touch are read, compared and reported."""
+"""Report results on touch."""
 
 from __future__ import annotations
 
+import functools
+import math
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 from tacpipe.comparison.engine import Comparison, Row
 from tacpipe.comparison.runs import Run
 from tacpipe.comparison.specification import TaskReport
-from tacpipe.report.blocks import Cell, Fold
+from tacpipe.metrics import headline
+from tacpipe.report import blocks, screen
+from tacpipe.report.blocks import NONE, Cell, Charts, Fold
 from tacpipe.report.context import Context
-from tacpipe.tasks.touch.report import clouds, methods, parts, reading
+from tacpipe.tasks.touch import headline as headlines
+from tacpipe.tasks.touch.report import figures, methods, predictions, uncertainty
+from tacpipe.tasks.touch.report.methods import (
+    caution,
+    default_method,
+    describe_split,
+    describe_training,
+    grouped_by_split,
+)
+from tacpipe.tasks.touch.report.paper import generalisation_tables, setting_tables, tables_by_object
+from tacpipe.tasks.touch.report.predictions import Score
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
@@ -24,32 +38,142 @@ class TouchReport(TaskReport):
 
     def read(self, results: Sequence[Dataset]) -> list[Run]:
         """Return the runs of results that hold predictions of grasps which the model has not seen."""
-        return reading.read(results)
+        return methods.read_runs(results)
 
     def predictor_name(self, predictor: str) -> str:
         """Return the name of a predictor in tables."""
-        return reading.called(predictor)
+        return methods.predictor_name(predictor)
 
     def uses(self, dataset: Dataset) -> bool:
         """Return whether a dataset holds grasps, which are drawn."""
-        return clouds.reads(dataset)
+        return figures.holds_grasps(dataset)
 
     def columns(self, context: Context, comparison: Comparison) -> Sequence[tuple[str, Callable[[Row], Cell]]]:
         """Return R², skill over the constant, mean absolute error and batch means."""
-        return parts.columns(context, comparison)
+        return columns(context, comparison)
 
     def sentence(self, context: Context) -> tuple[str, str]:
         """Return how the best method compares, and whether any is better than the baselines on novel objects."""
-        return parts.sentence(context)
+        return sentence(context)
 
     def folds(self, context: Context) -> list[Fold]:
         """Return what touch has of its own."""
-        return parts.folds(context)
+        return folds(context)
 
     def caveats(self, context: Context) -> list[str]:
         """Return what must be known about the numbers."""
-        return parts.caveats(context)
+        return caveats(context)
 
     def run_columns(self, run: Run) -> dict[str, str | Cell]:
         """Return more columns of the table of runs."""
-        return parts.about_run(run)
+        return run_columns(run)
+
+
+POOLED = (
+    "PDC is the pressure of the fluid in a fingertip. RMSE is global, over all grasps and electrodes of all runs of a "
+    "method, as a fraction of the target's fixed range and in device counts; batch mean is the mean RMSE of batches of 10. "
+    "R² is about the mean of the evaluated grasps, so a constant lies at 0 or below. A novel object has no mean of its own: "
+    "the constant represents it."
+)
+NO_EVIDENCE = "there is no evidence of generalisation"
+MIXED = "What is marked simulated is not evidence about a real sensor."
+
+
+def sentence(context: Context) -> tuple[str, str]:
+    """Return the general sentence, and where no method is better than the baselines on novel objects, that this is so."""
+    text, verdict = screen.sentence(context)
+    novel = [comparison for comparison in context.comparisons if comparison.question.part.startswith("novel")]
+    better = [
+        comparison for comparison in novel if any(row.gain.verdict == headline.BETTER for row in comparison.models)
+    ]
+    if novel and not better:
+        text = f"{text.removesuffix('.')}: {NO_EVIDENCE}."
+    return text, verdict
+
+
+def folds(context: Context) -> list[Fold]:
+    """Return what touch has of its own."""
+    methods = context.methods
+    if not methods:
+        return figures.cloud_folds(context.others, {})
+    parted = grouped_by_split(methods)
+    first = (context.winner(next(iter(context.parts))) if context.parts else None) or default_method(parted[0])
+    chosen = {
+        grasp.recording: f"{grasp.place} by error" for grasp in figures.choose_grasps(first.details[0].predictions)
+    }
+    folds: list[Fold] = []
+    for group in parted:
+        result = group[0].details[0]
+        place = f": {describe_split(result.split, result.simulated)}" if len(parted) > 1 else ""
+        folds += blocks.fold(f"By object{place}", *tables_by_object(group))
+        drawn = figures.loss_charts(group)
+        folds += blocks.fold(f"Training{place}", Charts(drawn)) if drawn else []
+    published = all(grasp.published for grasp in methods)
+    paper = [*setting_tables(methods), *generalisation_tables(methods), *figures.figure_8(methods)]
+    return [
+        *figures.pressure_folds(first),
+        *figures.electrode_folds(first),
+        *uncertainty.uncertainty_folds(methods),
+        *figures.cloud_folds(context.others, chosen),
+        *blocks.fold("The paper's tables and figures" if published else "What settings change", *paper),
+        *folds,
+    ]
+
+
+def columns(context: Context, comparison: Comparison) -> list[tuple[str, Callable[[Row], Cell]]]:
+    """Return more columns of the table of all methods: R², skill over the constant, mean absolute error and batch means."""
+    target = next(name for name, title in headlines.TARGETS.items() if title == comparison.question.target)
+    known_objects = comparison.question.part.startswith(headlines.PARTS[True])
+
+    @functools.cache
+    def score(row: Row) -> Score | None:
+        runs = [run.details.predictions for run in row.method.of(comparison.question)]
+        return predictions.score(runs, target, known_objects, row.predictor)
+
+    def cell(value: Callable[[Score], Cell]) -> Callable[[Row], Cell]:
+        return lambda row: value(found) if (found := score(row)) else Cell(NONE)
+
+    return [
+        (
+            "R²",
+            cell(lambda scored: Cell(blocks.fixed(scored.r2, 2), value=None if math.isnan(scored.r2) else scored.r2)),
+        ),
+        ("skill over the constant", cell(lambda scored: blocks.interval(*scored.skill))),
+        ("RMSE over runs", cell(lambda scored: blocks.with_sd(scored.each.mean, scored.each.sd))),
+        ("batch mean", cell(lambda scored: Cell(blocks.fixed(scored.batch_mean, 4), value=scored.batch_mean))),
+        ("MAE (counts)", cell(lambda scored: blocks.number(predictions.to_counts(scored.target, scored.mae), 3))),
+    ]
+
+
+def caveats(context: Context) -> list[str]:
+    """Return what must be known about these numbers."""
+    methods = context.methods
+    if not methods:
+        return []
+    mixed = MIXED if len({method.simulated for method in methods}) > 1 else ""
+    return [
+        POOLED,
+        *map(describe_training, grouped_by_split(methods)),
+        caution(methods),
+        mixed,
+    ]
+
+
+def run_columns(run: Run) -> dict[str, str | Cell]:
+    """Return more columns of the table of runs."""
+    trained = run.details.trained
+    rsquared = []
+    for known_objects in (True, False):
+        for target in run.details.predictions.targets:
+            scored = predictions.score([run.details.predictions], target, known_objects)
+            rsquared += (
+                [f"{headlines.TARGETS[target]}, {headlines.PARTS[known_objects]}: {blocks.fixed(scored.r2, 2)}"]
+                if scored
+                else []
+            )
+    return {
+        "split": methods.split_name(run.details.split),
+        "trained on": NONE if trained is None else f"{trained:,}",
+        "epochs": str(len(run.details.history) or NONE),
+        "R²": Cell("; ".join(rsquared) or NONE),
+    }

@@ -1,22 +1,31 @@
-"""A result on touch, what makes a method of such results, and what it is called."""
+"""Read results on touch as runs of methods, and write their names and what must be stated next to an error."""
 
 from __future__ import annotations
 
 import json
+import math
 from collections import Counter
 from collections.abc import Sequence
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from tacpipe.channels import biotac_sp
-from tacpipe.comparison.naming import distinct_names, marks
-from tacpipe.comparison.runs import Method
+from tacpipe.comparison.runs import Errors, Method, Question, Run, distinct_names, marks
+from tacpipe.metrics import regression
 from tacpipe.plugins import params as params_of
-from tacpipe.report import contents
-from tacpipe.report.contents import Tree
+from tacpipe.report import blocks, context
+from tacpipe.report.context import Tree, drop_duplicates
+from tacpipe.tasks.touch import headline
 from tacpipe.tasks.touch.report import predictions
 from tacpipe.tasks.touch.report.predictions import Predictions
-from tacpipe.tasks.touch.result_names import PREDICTIONS
+from tacpipe.tasks.touch.result_names import CONSTANT, NEAREST_IN_TIME, OBJECT_MEAN, PREDICTIONS
+
+if TYPE_CHECKING:
+    from tacpipe.arrays import Floats
+    from tacpipe.datasets.dataset import Dataset
+
 
 PAPERS = "pointnet"  # the architecture of the paper
 DEFAULT = "tree-ensemble"  # the one that is trained where none is named
@@ -25,7 +34,7 @@ USUAL = ("split", "simulated")  # settings that no name states: parts of questio
 _NO_METHOD = ("seed", "run_label", "baselines")  # runs of one method may differ in these; the label is shown as split
 
 
-class Result(contents.Result):
+class Result(context.Result):
     """One result on touch."""
 
     STAGE = "train.touch"
@@ -34,7 +43,7 @@ class Result(contents.Result):
     @cached_property
     def predictions(self) -> Predictions:
         """What was predicted of each grasp that the model has not seen."""
-        return predictions.read(self.dataset.recordings[PREDICTIONS])
+        return predictions.read_predictions(self.dataset.recordings[PREDICTIONS])
 
     @property
     def architecture(self) -> str:
@@ -50,8 +59,8 @@ class Result(contents.Result):
     @property
     def trained(self) -> int | None:
         """How many grasps the weights were fitted to."""
-        found: int | None = self.config.get("counts", {}).get("train")
-        return found
+        count: int | None = self.config.get("counts", {}).get("train")
+        return count
 
     @cached_property
     def settings(self) -> dict[str, Any]:
@@ -66,73 +75,87 @@ class Result(contents.Result):
         return {**params, "architecture": self.architecture, "split": self.split, "simulated": self.simulated}
 
 
-def names(results: Sequence[Result]) -> list[str]:
+def method_names(results: Sequence[Result]) -> list[str]:
     """Return what the method of each result is called.
 
     A name states what a method does without, colour, and the settings in which it differs from most methods of its
     architecture.
     """
-    keys = [json.dumps(one.settings, sort_keys=True) for one in results]
-    runs, held = Counter(keys), {key: one.settings for key, one in zip(keys, results, strict=True)}
-    found: dict[str, str] = {}
-    for architecture in {one.architecture for one in results}:
-        same = {key: one for key, one in held.items() if one["architecture"] == architecture}
-        usual = _usual([(one, runs[key]) for key, one in same.items()])
-        named = distinct_names([(architecture, one) for one in same.values()], usual)
-        found |= {
-            key: " · ".join([*_called(one), *marks(differing)])
-            for (key, one), (_, differing) in zip(same.items(), named, strict=True)
+    keys = [json.dumps(settings.settings, sort_keys=True) for settings in results]
+    runs, settings_by_key = Counter(keys), {key: settings.settings for key, settings in zip(keys, results, strict=True)}
+    names_by_key: dict[str, str] = {}
+    for architecture in {settings.architecture for settings in results}:
+        same = {key: settings for key, settings in settings_by_key.items() if settings["architecture"] == architecture}
+        usual = _usual_settings([(settings, runs[key]) for key, settings in same.items()])
+        distinct = distinct_names([(architecture, settings) for settings in same.values()], usual)
+        names_by_key |= {
+            key: " · ".join([*_first_names(settings), *marks(differing)])
+            for (key, settings), (_, differing) in zip(same.items(), distinct, strict=True)
         }
-    return [found[key] for key in keys]
+    return [names_by_key[key] for key in keys]
 
 
-def splits(results: Sequence[Result]) -> list[tuple[str, bool]]:
+def ordered_splits(results: Sequence[Result]) -> list[tuple[str, bool]]:
     """Return how the grasps of results were parted, and whether they were simulated: what is a question of its own.
 
     Recorded grasps come before simulated ones, then what the default method was run on, then the most targets and runs.
     """
-    found: dict[tuple[str, bool], list[Result]] = {}
-    for one in results:
-        found.setdefault((one.split, one.simulated), []).append(one)
+    by_split: dict[tuple[str, bool], list[Result]] = {}
+    for result in results:
+        by_split.setdefault((result.split, result.simulated), []).append(result)
 
     def place(key: tuple[str, bool]) -> tuple[bool, bool, int, int, str]:
-        same = found[key]
-        targets = {target for one in same for target in one.predictions.targets}
-        return key[1], all(one.architecture != DEFAULT for one in same), -len(targets), -len(same), key[0]
+        same = by_split[key]
+        targets = {target for result_of_split in same for target in result_of_split.predictions.targets}
+        return (
+            key[1],
+            all(result_of_split.architecture != DEFAULT for result_of_split in same),
+            -len(targets),
+            -len(same),
+            key[0],
+        )
 
-    return sorted(found, key=place)
+    return sorted(by_split, key=place)
 
 
-def groups(methods: Sequence[Method]) -> list[list[Method]]:
+def grouped_by_split(methods: Sequence[Method]) -> list[list[Method]]:
     """Return methods that were trained and evaluated on grasps parted in the same way, in the order of `splits`."""
-    order = splits([one for method in methods for one in method.details])
-    return [[one for one in methods if (one.settings["split"], one.settings["simulated"]) == key] for key in order]
+    order = ordered_splits([result for method in methods for result in method.details])
+    return [
+        [method for method in methods if (method.settings["split"], method.settings["simulated"]) == key]
+        for key in order
+    ]
 
 
-def default(methods: Sequence[Method]) -> Method:
+def default_method(methods: Sequence[Method]) -> Method:
     """Return the method that represents the project's own: the default with most runs, or else that with most runs."""
-    return max(methods, key=lambda one: (one.settings["architecture"] == DEFAULT, len(one.runs)))
+    return max(methods, key=lambda candidate: (candidate.settings["architecture"] == DEFAULT, len(candidate.runs)))
 
 
-def main(methods: Sequence[Method]) -> list[Method]:
+def one_per_architecture(methods: Sequence[Method]) -> list[Method]:
     """Return one method an architecture: that with most runs, of several one that reads colour, then the shortest name."""
 
-    def place(one: Method) -> tuple[int, bool, int, str]:
-        return -len(one.runs), not one.settings.get("colour", True), len(one.name), one.name
+    def place(result_of_split: Method) -> tuple[int, bool, int, str]:
+        return (
+            -len(result_of_split.runs),
+            not result_of_split.settings.get("colour", True),
+            len(result_of_split.name),
+            result_of_split.name,
+        )
 
     chosen: dict[str, Method] = {}
-    for one in sorted(methods, key=place):
-        chosen.setdefault(one.settings["architecture"], one)
-    return sorted(chosen.values(), key=lambda one: one.name)
+    for candidate in sorted(methods, key=place):
+        chosen.setdefault(candidate.settings["architecture"], candidate)
+    return sorted(chosen.values(), key=lambda candidate: candidate.name)
 
 
-def targets(*methods: Method) -> tuple[str, ...]:
+def predicted_targets(*methods: Method) -> tuple[str, ...]:
     """Return what any run of some methods predicts, in the order of tables."""
-    held = {target for method in methods for one in method.details for target in one.predictions.targets}
-    return tuple(target for target in biotac_sp.TARGETS if target in held)
+    available = {target for method in methods for result in method.details for target in result.predictions.targets}
+    return tuple(target for target in biotac_sp.TARGETS if target in available)
 
 
-def _called(settings: Tree) -> list[str]:
+def _first_names(settings: Tree) -> list[str]:
     """Return what a kind of model is called by what it reads; marks that distinguish methods of a kind come behind."""
     architecture, coloured = str(settings["architecture"]), settings.get("colour", True)
     if architecture == "trees":
@@ -140,17 +163,175 @@ def _called(settings: Tree) -> list[str]:
     return [NAMES.get(architecture, architecture), *([] if coloured else ["without colour"])]
 
 
-def _usual(alike: Sequence[tuple[Tree, int]]) -> list[tuple[str, Any]]:
+def _usual_settings(alike: Sequence[tuple[Tree, int]]) -> list[tuple[str, Any]]:
     """Return the setting that most methods have, or of several such that of most runs, by name, given methods and runs.
 
     All splits are usual, and so are simulated grasps: these have headings of their own. What is called by its colour has no
     mark of it.
     """
-    found = []
+    usual = []
     for name in sorted({name for settings, _ in alike for name in settings}):
-        held = [(settings[name], runs) for settings, runs in alike if name in settings]
-        values = [value for value, _ in held]
-        weights = [(values.count(one), sum(runs for value, runs in held if value == one)) for one in values]
-        kept = values if name in (*USUAL, "colour") else [values[weights.index(max(weights))]]
-        found += [(name, value) for value in kept]
-    return found
+        values_and_runs = [(settings[name], runs) for settings, runs in alike if name in settings]
+        values = [value for value, _ in values_and_runs]
+        weights = [
+            (values.count(candidate), sum(runs for value, runs in values_and_runs if value == candidate))
+            for candidate in values
+        ]
+        usual_values = values if name in (*USUAL, "colour") else [values[weights.index(max(weights))]]
+        usual += [(name, value) for value in usual_values]
+    return usual
+
+
+EPOCHS, BATCH, LEARNING_RATE = 250, 10, 0.01  # in all tables of the paper; Figure 8 has 1,000 epochs
+FINGER_NAMES = {"e_th": "thumb", "e_mf": "middle finger"}
+BASELINES = {  # rows that every table has
+    CONSTANT: "constant: the mean of training",
+    OBJECT_MEAN: "mean of the object",
+    NEAREST_IN_TIME: "mean of the nearest in time",
+}
+RECORDED = (
+    "{same} of {all} evaluated grasps follow one of the same object in time, so errors on known objects rest on when they "
+    "were recorded as well: the mean of the grasps nearest in time, whatever their object, states how much."
+)
+IN_A_ROW = 0.75  # of successive grasps: from here on, objects were not taken by turns
+
+
+def caution(methods: Sequence[Method]) -> str:
+    """Return what these grasps cannot show, next to every table of errors; empty where nothing is known against them."""
+    if methods and all(method.simulated for method in methods):
+        return context.SIMULATED
+    counts = [run.predictions.in_a_row for method in methods if not method.simulated for run in method.details]
+    same, follow_any = (sum(column) for column in zip(*counts, strict=True)) if counts else (0, 0)
+    return (
+        RECORDED.format(same=f"{same:,}", all=f"{follow_any:,}") if follow_any and same / follow_any >= IN_A_ROW else ""
+    )
+
+
+def baseline_name(predictor: str) -> str:
+    """Return what a table calls a predictor that is not a model's own.
+
+    >>> baseline("object_mean"), baseline("nearest_neighbours")
+    ('mean of the object', 'nearest neighbours')
+    """
+    return BASELINES.get(predictor, predictor.replace("_", " "))
+
+
+def short_r2(value: float) -> str:
+    """Return R² where there is little room.
+
+    >>> [signed_short(value) for value in (0.456, -0.02, -3.04, -1234.5)]
+    ['0.46', '−0.02', '−3.0', '< −9']
+    """
+    if value >= -1 or math.isnan(value):
+        return blocks.fixed(value, 2)
+    return f"−{-value:.1f}" if value > -9 else "< −9"
+
+
+def split_name(described: str) -> str:
+    """Return how grasps were parted, where somebody stated so."""
+    return described.replace("-", " ").replace("_", " ") or "one split"
+
+
+def describe_split(described: str, simulated: bool) -> str:
+    """Return how grasps were parted and whether they were simulated.
+
+    >>> place("by-day", True), place("simulated", True), place("", False)
+    ('by day, simulated', 'simulated', 'one split')
+    """
+    name = split_name(described)
+    return f"{name}, simulated" if simulated and "simulated" not in name else name
+
+
+def describe_schedule(run: Result) -> str:
+    """Return how a run was trained, and whether that is the paper's way."""
+    if not run.history:
+        return "fitted without epochs"
+    params = run.params
+    epochs, batch, rate = (params.get(name) for name in ("epochs", "batch", "learning_rate"))
+    described = f"{epochs} epochs in batches of {batch}, learning rate {rate}"
+    if run.architecture != PAPERS or not run.published:
+        return described
+    if (batch, rate) == (BATCH, LEARNING_RATE) and int(epochs or 0) >= EPOCHS:
+        return f"paper schedule ({described})"
+    return f"quick ({described}; the paper: {EPOCHS}, {BATCH}, {LEARNING_RATE})"
+
+
+def describe_training(methods: Sequence[Method]) -> str:
+    """Return with which preset the runs of a table were trained, how many there are, and on how many grasps."""
+    runs = [run for schedule in methods for run in schedule.details]
+    described = [
+        f"{count} run{'s' if count > 1 else ''}: {schedule}"
+        for schedule, count in Counter(describe_schedule(run) for run in runs).most_common()
+    ]
+    trained = sorted({run.trained for run in runs if run.trained is not None})
+    counts = f" Trained on {format_span(trained)} grasps." if trained else ""
+    return f"{'; '.join(described)}.{counts}"
+
+
+def format_span(counts: Sequence[int]) -> str:
+    """Return the least and the largest of sorted counts.
+
+    >>> span([412, 9000]), span([7])
+    ('412 to 9,000', '7')
+    """
+    return " to ".join(f"{count:,}" for count in dict.fromkeys((counts[0], counts[-1])))
+
+
+def read_runs(results: Sequence[Dataset]) -> list[Run]:
+    """Return the runs of results that hold predictions of grasps which the model has not seen."""
+    all_results = [Result(result) for result in drop_duplicates(results) if PREDICTIONS in result.recordings]
+    with_unseen_grasps = [result for result in all_results if len(result.predictions.recordings)]
+    splits = ordered_splits(with_unseen_grasps)
+    return [_run(*pair, splits) for pair in zip(with_unseen_grasps, method_names(with_unseen_grasps), strict=True)]
+
+
+def predictor_name(predictor: str) -> str:
+    """Return what tables call a predictor.
+
+    >>> called("object_mean"), called("nearest_neighbours")
+    ('mean of the object', 'nearest neighbours')
+    """
+    return headline.BASELINES.get(predictor, predictor.replace("_", " "))
+
+
+def _run(run: Result, name: str, splits: Sequence[tuple[str, bool]]) -> Run:
+    questions = {}
+    for known_objects in (True, False):
+        rows = run.predictions.of(known_objects)
+        place = 2 * splits.index((run.split, run.simulated)) + (not known_objects)
+        if not len(rows.recordings):
+            continue
+        objects = dict(zip(rows.recordings.tolist(), rows.objects.tolist(), strict=True))
+        for target in rows.targets:
+            low, high = biotac_sp.RANGES[target]
+            sums = {
+                name: _squared(target, rows.true[target], touch[target], rows.recordings.tolist())
+                for name, touch in rows.predicted.items()
+                if target in touch
+            }
+            measure = headline.measure(high - low, "grasps" if known_objects else "objects")
+            part = headline.PARTS[known_objects]
+            if len(splits) > 1:
+                part += f", {describe_split(run.split, run.simulated)}"
+            questions[Question(part, headline.TARGETS[target], place)] = Errors(
+                measure, sums, None if known_objects else objects
+            )
+    return Run(
+        run.dataset,
+        headline.TASK,
+        name,
+        run.settings,
+        questions,
+        family=NAMES.get(run.architecture, run.architecture),
+        seed=run.params.get("seed"),
+        simulated=run.simulated,
+        published=run.published,
+        details=run,
+    )
+
+
+def _squared(target: str, true: Floats, predicted: Floats, names: Sequence[str]) -> dict[str, Floats]:
+    """Return the sum of squares in fractions of the target's range and the number of values, by grasp."""
+    true_fractions, predicted_fractions = (biotac_sp.normalised(target, values) for values in (true, predicted))
+    squared = regression.squared_sums(true_fractions, predicted_fractions)
+    return {name: np.array([value, float(true_fractions.shape[1])]) for name, value in zip(names, squared, strict=True)}

@@ -1,22 +1,26 @@
-"""What a result's model and baselines predicted of each grasp that the model has not seen."""
+"""Read what a model and its baselines predicted for unseen grasps, and score it."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tacpipe.arrays import AnyArray, Bools, Floats, Times
+from tacpipe.arrays import AnyArray, AnyFloats, Bools, Floats, Times
 from tacpipe.channels import biotac_sp
-from tacpipe.tasks.touch.result_names import GRASPS, MODEL, TRUE
+from tacpipe.comparison.runs import Spread, spread
+from tacpipe.metrics import regression
+from tacpipe.metrics.intervals import Estimate
+from tacpipe.tasks.touch.result_names import CONSTANT, GRASPS, MODEL, TRUE
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
     from tacpipe.datasets.dataset import Recording
+
 
 Touch = Mapping[str, Floats]  # by target, (grasp, value), device counts
 
@@ -47,36 +51,36 @@ class Predictions:
         """What the model predicts, in the order of tables."""
         return tuple(name for name in biotac_sp.TARGETS if name in self.true and name in self.predicted[MODEL])
 
-    def of(self, known: bool | None) -> Predictions:
+    def of(self, known_objects: bool | None) -> Predictions:
         """Return the rows of known or of novel objects, or all."""
-        return self if known is None else self.rows(self.known == known)
+        return self if known_objects is None else self.rows(self.known == known_objects)
 
     def rows(self, chosen: AnyArray) -> Predictions:
         """Return some rows, stated by a mask (grasp,) or by their numbers."""
         predicted = {
-            name: {target: one[chosen] for target, one in touch.items()} for name, touch in self.predicted.items()
+            name: {target: values[chosen] for target, values in touch.items()} for name, touch in self.predicted.items()
         }
-        true = {target: one[chosen] for target, one in self.true.items()}
+        true = {target: values[chosen] for target, values in self.true.items()}
         t_ns = None if self.t_ns is None else self.t_ns[chosen]
         return Predictions(self.recordings[chosen], self.objects[chosen], self.known[chosen], true, predicted, t_ns)
 
 
-def read(shard: Recording) -> Predictions:
+def read_predictions(shard: Recording) -> Predictions:
     """Return what the recording ``predictions`` of a result states of grasps that its model has not seen."""
     grasps = shard.table(GRASPS)
-    others = {name: _touch(shard.table(name)) for name in shard.streams if name != GRASPS}
-    found = Predictions(
+    targets_by_stream = {name: _read_targets(shard.table(name)) for name in shard.streams if name != GRASPS}
+    predictions = Predictions(
         np.array(grasps["recording"].to_pylist(), dtype=np.str_),
         np.array([name or UNNAMED for name in grasps["object"].to_pylist()], dtype=np.str_),
         np.array(grasps["known"].to_pylist(), dtype=bool),
-        others.pop(TRUE),
-        others,
+        targets_by_stream.pop(TRUE),
+        targets_by_stream,
         grasps["t_ns"].to_numpy() if "t_ns" in grasps.column_names else None,
     )
-    return found.rows(~np.array(grasps["seen"].to_pylist(), dtype=bool))
+    return predictions.rows(~np.array(grasps["seen"].to_pylist(), dtype=bool))
 
 
-def _touch(table: pa.Table) -> Touch:
+def _read_targets(table: pa.Table) -> Touch:
     """Return the targets that a stream holds in full."""
     columns = {target: biotac_sp.value_columns(target) for target in biotac_sp.TARGETS}
     return {
@@ -84,3 +88,102 @@ def _touch(table: pa.Table) -> Touch:
         for target, names in columns.items()
         if set(names) <= set(table.column_names)
     }
+
+
+@dataclass(frozen=True)
+class Score:
+    """What one predictor does on one target; errors are fractions of the target's range (`biotac_sp.RANGES`)."""
+
+    target: str
+    rmse: float  # global, over the grasps of all runs
+    each: Spread  # of the RMSE of single runs
+    batch_mean: float  # mean over runs of the mean RMSE of batches
+    mae: float
+    r2: float
+    skill: Estimate  # over the constant
+    grasps: int  # each counted once
+    objects: int
+    runs: int
+
+    @property
+    def counts(self) -> float:
+        """The RMSE in device counts."""
+        return to_counts(self.target, self.rmse)
+
+
+def to_counts(target: str, fraction: float) -> float:
+    """Return a fraction of a target's range in device counts.
+
+    >>> in_counts("pdc_th", 0.1)
+    90.0
+    """
+    low, high = biotac_sp.RANGES[target]
+    return fraction * (high - low)
+
+
+class _Rows(NamedTuple):
+    """What a run reports on a target."""
+
+    true: AnyFloats  # (grasp, value), normalised
+    predicted: AnyFloats  # (grasp, value)
+    constant: AnyFloats  # (grasp, value), NaN where the result holds none
+    recordings: NDArray[np.str_]  # (grasp,)
+    objects: NDArray[np.str_]  # (grasp,)
+
+
+def score(runs: Sequence[Predictions], target: str, known_objects: bool | None, predictor: str = MODEL) -> Score | None:
+    """Return how a predictor does, from the predictions of runs on known or on novel objects, or on all; None without any.
+
+    Grasps of all runs are pooled. The skill's interval comes from drawing grasps anew, with what all runs stated of each,
+    where objects are known, and else from drawing objects: what is asked then is how the next object would fare.
+    """
+    parts = _rows(runs, target, known_objects, predictor)
+    if not parts:
+        return None
+    rows = _pooled(parts)
+    return Score(
+        target,
+        regression.rmse(rows.true, rows.predicted),
+        spread([regression.rmse(part.true, part.predicted) for part in parts]),
+        float(np.mean([regression.batch_mean_rmse(part.true, part.predicted) for part in parts])),
+        regression.mae(rows.true, rows.predicted),
+        regression.r2(rows.true, rows.predicted),
+        _skill(rows, rows.recordings if known_objects else rows.objects),
+        len(np.unique(rows.recordings)),
+        len(np.unique(rows.objects)),
+        len(parts),
+    )
+
+
+def r2_by_electrode(runs: Sequence[Predictions], target: str, known_objects: bool | None) -> AnyFloats | None:
+    """Return the R² of each electrode, (value,), pooled over runs; None where nothing is stated of the target."""
+    parts = _rows(runs, target, known_objects, MODEL)
+    return regression.r2_by_value(*_pooled(parts)[:2]) if parts else None
+
+
+def _rows(runs: Sequence[Predictions], target: str, known_objects: bool | None, predictor: str) -> list[_Rows]:
+    """Return what each run states that holds the target, the predictor and such objects."""
+    parts = []
+    for rows in (run.of(known_objects) for run in runs):
+        predicted = rows.predicted.get(predictor, {})
+        if target not in predicted or target not in rows.true or not len(rows.recordings):
+            continue
+        constant = rows.predicted.get(CONSTANT, {}).get(target, np.full_like(rows.true[target], np.nan))
+        true, described, mean = (
+            biotac_sp.normalised(target, values) for values in (rows.true[target], predicted[target], constant)
+        )
+        parts.append(_Rows(true, described, mean, rows.recordings, rows.objects))
+    return parts
+
+
+def _pooled(parts: Sequence[_Rows]) -> _Rows:
+    return _Rows(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def _skill(rows: _Rows, clusters: NDArray[np.str_]) -> Estimate:
+    """Return the skill over the constant on rows where there is one."""
+    defined = ~np.isnan(rows.constant).any(axis=1)
+    model, baseline = (
+        regression.squared_sums(rows.true[defined], values[defined]) for values in (rows.predicted, rows.constant)
+    )
+    return regression.skill_interval(model, baseline, clusters[defined])

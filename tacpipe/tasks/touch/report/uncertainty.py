@@ -17,8 +17,8 @@ from tacpipe.report import blocks, charts
 from tacpipe.report.blocks import NONE, Cell, Chart, Charts, Fold, fold, number, table
 from tacpipe.report.charts import Dot
 from tacpipe.tasks.touch import headline as headlines
-from tacpipe.tasks.touch.report import electrodes, wording
-from tacpipe.tasks.touch.report import methods as by_method
+from tacpipe.tasks.touch.report import figures
+from tacpipe.tasks.touch.report.methods import FINGER_NAMES, describe_split, ordered_splits
 from tacpipe.tasks.touch.result_names import CONSTANT, COVERAGE, MODEL, OBJECT_MEAN
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ STRONGEST = 0.2  # difference of coverage that has the strongest colour
 
 
 @dataclass(frozen=True)
-class Measured:
+class Band:
     """A predictor's band on one target."""
 
     values: int
@@ -45,18 +45,20 @@ class Measured:
     gain: tuple[float, float, float]  # 1 - pinball / pinball of the constant, with its 95 % interval
 
 
-def folds(methods: Sequence[Method]) -> list[Fold]:
+def uncertainty_folds(methods: Sequence[Method]) -> list[Fold]:
     """Return how good quantiles are, of calibrated models; nothing without any."""
-    found: list[Fold] = []
-    several = len(by_method.splits([one for method in methods for one in method.details])) > 1
+    folds: list[Fold] = []
+    has_several_splits = (
+        len(ordered_splits([electrode_chart for method in methods for electrode_chart in method.details])) > 1
+    )
     for method in methods:
-        read = _read(method)
+        read = _read_coverage(method)
         if read is None:
             continue
         levels = method.details[0].metrics["quantiles"]["levels"]
-        asked = (levels[-1] - levels[0]) / 100
-        parts = [(known, read[read.known == known]) for known in (True, False)]
-        held = [(known, rows) for known, rows in parts if len(rows)]
+        level = (levels[-1] - levels[0]) / 100
+        parts = [(known_objects, read[read.known == known_objects]) for known_objects in (True, False)]
+        evaluated = [(known_objects, rows) for known_objects, rows in parts if len(rows)]
         title = f"Bands from the {levels[0]} to the {levels[-1]} % quantile"
         heads = (
             "",
@@ -66,93 +68,105 @@ def folds(methods: Sequence[Method]) -> list[Fold]:
             "pinball loss (counts)",
             "below the constant's (%)",
         )
-        found += fold(
+        folds += fold(
             "Uncertainty",
-            Charts([_coverage(rows, known, asked) for known, rows in held]),
+            Charts([_coverage_chart(rows, known_objects, level) for known_objects, rows in evaluated]),
             blocks.notes(EXPLAINED),
-            table(title, heads, [row for known, rows in held for row in _rows(rows, known)]),
-            Charts([one for known, rows in held if (one := _by_electrode(rows, known, asked))]),
+            table(
+                title, heads, [row for known_objects, rows in evaluated for row in _coverage_rows(rows, known_objects)]
+            ),
+            Charts(
+                [
+                    electrode_chart
+                    for known_objects, rows in evaluated
+                    if (electrode_chart := _electrode_chart(rows, known_objects, level))
+                ]
+            ),
             blocks.notes(ELECTRODES),
-            about=method.name + (f", {wording.place(*_parted(method))}" if several else ""),
+            about=method.name + (f", {describe_split(*_split_of(method))}" if has_several_splits else ""),
         )
-    return found
+    return folds
 
 
-def measured(rows: pd.DataFrame, known: bool) -> dict[tuple[str, str], Measured]:
+def measure_bands(rows: pd.DataFrame, known_objects: bool) -> dict[tuple[str, str], Band]:
     """Return what each predictor's band is worth on each target, of grasps of known objects or of novel ones."""
-    found = {}
+    bands = {}
     for target, same in rows.groupby("target"):
-        clustered = same.groupby(["predictor", "recording" if known else "object"])
+        clustered = same.groupby(["predictor", "recording" if known_objects else "object"])
         sums = clustered[["covered", "pinball"]].sum().join(clustered.size().rename("values"))
         constant = sums.loc[CONSTANT]
-        for predictor, one in same.groupby("predictor"):
-            own = sums.loc[predictor]
-            lost, still = (each["pinball"].to_numpy(float)[:, None] for each in (own, constant))
-            gain = intervals.skill_interval(lost, still).first
-            share = intervals.share_interval(*(own[[part]].to_numpy(float) for part in ("covered", "values"))).first
-            found[str(target), str(predictor)] = Measured(
-                len(one),
+        for predictor, predictor_rows in same.groupby("predictor"):
+            predictor_sums = sums.loc[predictor]
+            lost, constant_loss = (
+                loss_sums["pinball"].to_numpy(float)[:, None] for loss_sums in (predictor_sums, constant)
+            )
+            gain = intervals.skill_interval(lost, constant_loss).first
+            share = intervals.share_interval(
+                *(predictor_sums[[part]].to_numpy(float) for part in ("covered", "values"))
+            ).first
+            bands[str(target), str(predictor)] = Band(
+                len(predictor_rows),
                 share,
-                float(one.width.mean()),
-                float(one.pinball.mean()),
+                float(predictor_rows.width.mean()),
+                float(predictor_rows.pinball.mean()),
                 gain,
             )
-    return found
+    return bands
 
 
-def by_electrode(rows: pd.DataFrame, target: str) -> AnyFloats:
+def coverage_by_electrode(rows: pd.DataFrame, target: str) -> AnyFloats:
     """Return the fraction of grasps whose value lies in the model's band, of each electrode of a finger (electrode,)."""
-    own = rows[(rows.target == target) & (rows.predictor == MODEL)]
-    found: AnyFloats = own.groupby("value")["covered"].mean().sort_index().to_numpy(float)
-    return found
+    model_rows = rows[(rows.target == target) & (rows.predictor == MODEL)]
+    coverage: AnyFloats = model_rows.groupby("value")["covered"].mean().sort_index().to_numpy(float)
+    return coverage
 
 
-def _parted(method: Method) -> tuple[str, bool]:
+def _split_of(method: Method) -> tuple[str, bool]:
     """Return how the grasps of a method were parted, and whether they were simulated."""
     return str(method.settings["split"]), bool(method.settings["simulated"])
 
 
-def _read(method: Method) -> pd.DataFrame | None:
+def _read_coverage(method: Method) -> pd.DataFrame | None:
     """Return a row a value, predictor, grasp and run of a method; None where none of its runs is of a calibrated model."""
     import pandas as pd
 
-    files = [one.dataset.files[COVERAGE] for one in method.details if COVERAGE in one.dataset.files]
-    return pd.concat([from_parquet(one).to_pandas() for one in files]) if files else None
+    files = [result.dataset.files[COVERAGE] for result in method.details if COVERAGE in result.dataset.files]
+    return pd.concat([from_parquet(file).to_pandas() for file in files]) if files else None
 
 
-def _coverage(rows: pd.DataFrame, known: bool, asked: float) -> Chart:
+def _coverage_chart(rows: pd.DataFrame, known_objects: bool, nominal: float) -> Chart:
     """Return the coverage of each predictor on each target."""
-    found = measured(rows, known)
-    targets = [name for name in headlines.TARGETS if (name, MODEL) in found]
+    bands = measure_bands(rows, known_objects)
+    targets = [name for name in headlines.TARGETS if (name, MODEL) in bands]
     dots = []
     for target in targets:
-        for predictor in (one for one in NAMES if (target, one) in found):
+        for predictor in (name for name in NAMES if (target, name) in bands):
             kind = "model" if predictor == MODEL else "baseline"
             panel = headlines.TARGETS[target]
-            dots.append(Dot(NAMES[predictor], *found[target, predictor].coverage, kind=kind, panel=panel))
-    level = {headlines.TARGETS[target]: asked for target in targets}
-    return Chart(f"Coverage: {headlines.PARTS[known]}", charts.ranking(dots, "coverage", level=level, row=18))
+            dots.append(Dot(NAMES[predictor], *bands[target, predictor].coverage, kind=kind, panel=panel))
+    level = {headlines.TARGETS[target]: nominal for target in targets}
+    return Chart(f"Coverage: {headlines.PARTS[known_objects]}", charts.ranking(dots, "coverage", level=level, row=18))
 
 
-def _rows(rows: pd.DataFrame, known: bool) -> list[Sequence[str | Cell]]:
+def _coverage_rows(rows: pd.DataFrame, known_objects: bool) -> list[Sequence[str | Cell]]:
     """Return the rows of the table: a target and predictor each."""
-    found = measured(rows, known)
-    shown: list[Sequence[str | Cell]] = []
-    for target in (name for name in headlines.TARGETS if (name, MODEL) in found):
+    bands = measure_bands(rows, known_objects)
+    rows_shown: list[Sequence[str | Cell]] = []
+    for target in (name for name in headlines.TARGETS if (name, MODEL) in bands):
         low_count, high_count = biotac_sp.RANGES[target]
-        for predictor in (one for one in NAMES if (target, one) in found):
-            one = found[target, predictor]
-            shown.append(
+        for predictor in (item for item in NAMES if (target, item) in bands):
+            item = bands[target, predictor]
+            rows_shown.append(
                 [
-                    f"{headlines.PARTS[known]}, {headlines.TARGETS[target]}: {NAMES[predictor]}",
-                    f"{one.values:,}",
-                    _with_interval(one.coverage, 2),
-                    number(100 * one.width / (high_count - low_count), 3),
-                    number(one.pinball, 3),
-                    Cell(NONE) if predictor == CONSTANT else _with_interval([100 * part for part in one.gain], 0),
+                    f"{headlines.PARTS[known_objects]}, {headlines.TARGETS[target]}: {NAMES[predictor]}",
+                    f"{item.values:,}",
+                    _with_interval(item.coverage, 2),
+                    number(100 * item.width / (high_count - low_count), 3),
+                    number(item.pinball, 3),
+                    Cell(NONE) if predictor == CONSTANT else _with_interval([100 * part for part in item.gain], 0),
                 ]
             )
-    return shown
+    return rows_shown
 
 
 def _with_interval(values: Sequence[float], digits: int) -> Cell:
@@ -162,16 +176,18 @@ def _with_interval(values: Sequence[float], digits: int) -> Cell:
     return Cell(blocks.fixed(mean, digits), below, mean)
 
 
-def _by_electrode(rows: pd.DataFrame, known: bool, asked: float) -> Chart | None:
+def _electrode_chart(rows: pd.DataFrame, known_objects: bool, nominal: float) -> Chart | None:
     """Return the coverage of each electrode on the fingertips; None without electrodes."""
     tips: list[dict[str, object]] = []
-    for target in (one for one in electrodes.FINGERS if (rows.target == one).any()):
-        found = by_electrode(rows, target)
-        strength = np.clip((found - asked) / STRONGEST, -1, 1)
-        texts = [f"{100 * value:.0f}" for value in found]
-        tips += electrodes.tip(wording.FINGERS[target], strength, texts, "Coverage (%)")
+    for target in (finger for finger in figures.FINGERS if (rows.target == finger).any()):
+        coverage = coverage_by_electrode(rows, target)
+        strength = np.clip((coverage - nominal) / STRONGEST, -1, 1)
+        texts = [f"{100 * value:.0f}" for value in coverage]
+        tips += figures.fingertip(FINGER_NAMES[target], strength, texts, "Coverage (%)")
     if not tips:
         return None
     grasps = rows["recording"].nunique()
-    caption = f"{blocks.counted(grasps, 'grasps')}; {100 * asked:.0f} % is asked for."
-    return Chart(f"Coverage of each electrode, {headlines.PARTS[known]}", electrodes.plane(tips), caption)
+    caption = f"{blocks.counted(grasps, 'grasps')}; {100 * nominal:.0f} % is asked for."
+    return Chart(
+        f"Coverage of each electrode, {headlines.PARTS[known_objects]}", figures.draw_fingertips(tips), caption
+    )

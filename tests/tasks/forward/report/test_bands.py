@@ -9,7 +9,7 @@ import pyarrow as pa
 
 from tacpipe.io.parquet import to_parquet
 from tacpipe.report.blocks import Charts, Fold, Table
-from tacpipe.tasks.forward.report import reading
+from tacpipe.tasks.forward.report import methods
 from tests.fake_recordings import FakeDataset
 from tests.report import parts
 from tests.tasks.forward.report.result_fakes import STEPS, WINDOWS, result
@@ -68,5 +68,5 @@ def test_a_model_that_was_evaluated_before_and_after_its_calibration_counts_once
     copy = FakeDataset(one.recordings, {**one.files, "config.json": json.dumps(config).encode()}, one.manifest)
     other = result("raw", seed=1)
     for several in ([plain, copy, other], [copy, other, plain], [copy, other]):
-        assert [run.dataset for run in reading.read(several)] == [one for one in several if one is not plain]
-    assert [run.dataset for run in reading.read([plain, other])] == [plain, other]
+        assert [run.dataset for run in methods.read_runs(several)] == [one for one in several if one is not plain]
+    assert [run.dataset for run in methods.read_runs([plain, other])] == [plain, other]

@@ -8,7 +8,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from tacpipe.errors import TacpipeError
-from tacpipe.tasks.forward.report import error_sums
+from tacpipe.tasks.forward.report import methods
 from tests.tasks.forward.report.result_fakes import GROUPS, errors
 
 RATIOS = {"model": {"r1": 0.5, "r2": 0.25}}
@@ -16,7 +16,7 @@ WINDOWS = {"r1": 10, "r2": 30}
 
 
 def test_every_row_lands_at_its_predictor_group_recording_and_step() -> None:
-    found = error_sums.read(errors(RATIOS, WINDOWS, known=["r2"]))
+    found = methods.read_error_sums(errors(RATIOS, WINDOWS, known=["r2"]))
     assert found.recordings == ("r1", "r2")
     assert found.steps == (1, 2, 3)
     assert found.known.tolist() == [False, True]
@@ -34,8 +34,8 @@ def test_every_row_lands_at_its_predictor_group_recording_and_step() -> None:
 
 
 def test_recordings_that_were_trained_on_are_left_out() -> None:
-    assert error_sums.read(errors(RATIOS, WINDOWS, seen=["r1"])).recordings == ("r2",)
-    nothing = error_sums.read(errors(RATIOS, WINDOWS, seen=["r1", "r2"]))
+    assert methods.read_error_sums(errors(RATIOS, WINDOWS, seen=["r1"])).recordings == ("r2",)
+    nothing = methods.read_error_sums(errors(RATIOS, WINDOWS, seen=["r1", "r2"]))
     assert (nothing.recordings, nothing.steps, nothing.predictors) == ((), (), ())
 
 
@@ -44,7 +44,7 @@ def test_a_predictor_that_lacks_a_group_has_no_errors_there() -> None:
     lacking = [not (row["predictor"] == "model" and row["group"] == "feature") for row in table.to_pylist()]
     content = io.BytesIO()
     pq.write_table(table.filter(lacking), content)
-    found = error_sums.read(content.getvalue())
+    found = methods.read_error_sums(content.getvalue())
     assert found.of("model", "feature") is None
     assert found.of("persistence", "feature") is not None
 
@@ -54,10 +54,10 @@ def test_a_missing_column_and_uneven_windows_are_refused() -> None:
     content = io.BytesIO()
     pq.write_table(table.drop_columns(["known"]), content)
     with pytest.raises(TacpipeError, match="has no column known"):
-        error_sums.read(content.getvalue())
+        methods.read_error_sums(content.getvalue())
     rows = table.to_pylist()
     rows[0]["windows"] = 11
     content = io.BytesIO()
     pq.write_table(table.from_pylist(rows), content)
     with pytest.raises(TacpipeError, match="different windows of r1"):
-        error_sums.read(content.getvalue())
+        methods.read_error_sums(content.getvalue())

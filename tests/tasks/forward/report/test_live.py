@@ -5,7 +5,7 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
-from tacpipe.tasks.forward.report import live
+from tacpipe.tasks.forward.report import events
 
 LIVE = {
     "mae": {"live": {"t1": 2.5, "t10": 40.0}, "persistence": {"t1": 2.75, "t10": 41.0}},
@@ -31,7 +31,7 @@ def context(metrics: dict[str, Any]) -> Any:
 
 
 def test_a_result_of_live_sessions_has_errors_rows_and_alarms() -> None:
-    (found,) = live.folds(context({"live": LIVE}))
+    (found,) = events.live_folds(context({"live": LIVE}))
     text = str(found)
     for shown in ("published live", "t+10", "1,419 of 1,489", "slip alarm, slips", "8.5", "41.5"):
         assert shown in text
@@ -39,15 +39,15 @@ def test_a_result_of_live_sessions_has_errors_rows_and_alarms() -> None:
 
 def test_steps_stand_in_their_order() -> None:
     errors = {"live": {"t1": 1.0, "t10": 3.0, "t5": 2.0}}  # as JSON sorts them
-    (found,) = live.folds(context({"live": {**LIVE, "mae": errors}}))
+    (found,) = events.live_folds(context({"live": {**LIVE, "mae": errors}}))
     text = str(found)
     assert text.index("t+1'") < text.index("t+5'") < text.index("t+10'")
 
 
 def test_a_session_without_forecasts_or_alarms_has_its_rows() -> None:
-    (found,) = live.folds(context({"live": {**LIVE, "mae": {}, "alarms": {}, "latency": {"count": 0}}}))
+    (found,) = events.live_folds(context({"live": {**LIVE, "mae": {}, "alarms": {}, "latency": {"count": 0}}}))
     assert "1,500" in str(found) and "published live" not in str(found)
 
 
 def test_another_result_has_no_such_part() -> None:
-    assert live.folds(context({"counts": {}})) == []
+    assert events.live_folds(context({"counts": {}})) == []

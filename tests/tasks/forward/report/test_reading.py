@@ -18,7 +18,7 @@ import pytest
 from tacpipe.comparison import engine
 from tacpipe.comparison.engine import Comparison
 from tacpipe.comparison.runs import Method, grouped
-from tacpipe.tasks.forward.report import methods, reading
+from tacpipe.tasks.forward.report import methods
 from tests.fake_recordings import FakeDataset
 from tests.tasks.forward.report.result_fakes import WINDOWS, errors, result
 
@@ -35,7 +35,7 @@ def compared(*results: Any) -> dict[str, Comparison]:
 
 
 def named(*results: Any) -> dict[str, Method]:
-    return {one.name: one for one in grouped(reading.read(results))}
+    return {one.name: one for one in grouped(methods.read_runs(results))}
 
 
 def test_errors_are_means_over_windows_and_channels_of_the_objects_asked_for() -> None:
@@ -134,8 +134,8 @@ def test_only_steps_that_all_runs_predict_are_shown() -> None:
     files = {**other.files, "errors.parquet": errors({"model": dict.fromkeys(WINDOWS, 0.5)}, steps=range(1, 11))}
     given: list[Any] = [one, FakeDataset(other.recordings, files, other.manifest)]
     runs = [methods.Result(each) for each in given]
-    assert reading.shown_steps(runs[1:]) == (1, 3, 5, 10)
-    assert reading.shown_steps(runs) == (1, 3)
+    assert methods.shown_steps(runs[1:]) == (1, 3, 5, 10)
+    assert methods.shown_steps(runs) == (1, 3)
 
 
 def test_results_without_errors_by_recording_or_all_trained_on_are_left_out() -> None:
@@ -143,7 +143,7 @@ def test_results_without_errors_by_recording_or_all_trained_on_are_left_out() ->
     seen = errors({"model": dict.fromkeys(WINDOWS, 0.5)}, seen=tuple(WINDOWS))
     files = {name: content for name, content in one.files.items() if name != "errors.parquet"}
     given = [FakeDataset(one.recordings, each) for each in (files, {**files, "errors.parquet": seen})]
-    assert reading.read(given) == []  # type: ignore[arg-type]
+    assert methods.read_runs(given) == []  # type: ignore[arg-type]
 
 
 def test_runs_that_differ_in_their_seed_alone_are_one_method() -> None:
@@ -184,10 +184,10 @@ def test_a_name_states_only_in_what_methods_differ() -> None:
 def test_the_papers_method_is_the_recurrent_one_of_twenty_components() -> None:
     given = [result("raw"), result("AE-C1-8"), result("PCA-8"), result("PCA-20"), result(architecture="tcn")]
     found = named(*given)
-    assert methods.papers(list(found.values())) is found["recurrent · PCA-20"]
-    nearest = methods.papers(list(named(*given[:2]).values()))
+    assert methods.paper_method(list(found.values())) is found["recurrent · PCA-20"]
+    nearest = methods.paper_method(list(named(*given[:2]).values()))
     assert nearest is not None and nearest.name == "recurrent · AE-C1-8"
-    assert methods.papers(list(named(result(architecture="tcn")).values())) is None
+    assert methods.paper_method(list(named(result(architecture="tcn")).values())) is None
 
 
 def test_most_runs_decide_which_timeline_is_the_main_one() -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from tacpipe.comparison.runs import grouped
 from tacpipe.report.blocks import Note, Section
-from tacpipe.tasks.forward.report import anticipation, reading, representations
+from tacpipe.tasks.forward.report import events, methods, representations
 from tests.fake_recordings import FakeDataset
 from tests.report import parts
 from tests.tasks.forward.report.result_fakes import codec, errors, result
@@ -140,15 +140,15 @@ def test_table_1_holds_the_papers_numbers_next_to_ours_and_those_not_run() -> No
 
 
 def test_a_row_of_table_1_has_mean_and_sd_over_runs_in_the_models_own_space() -> None:
-    (method,) = grouped(reading.read([result(seed=0, ratio=0.5), result(seed=1, ratio=0.75)]))
-    found = representations.represented(method)
+    (method,) = grouped(methods.read_runs([result(seed=0, ratio=0.5), result(seed=1, ratio=0.75)]))
+    found = representations.represent_method(method)
     assert found is not None and found.known is not None
     assert (found.validation.mean, found.validation.sd) == pytest.approx((0.015, 0.01 / np.sqrt(2)))
     assert (found.test.mean, found.test.sd) == pytest.approx((1.25, 0.5 / np.sqrt(2)))  # ratio times the mean step, 2
     assert found.known.mean == pytest.approx(1.25)
     assert (found.persistence.mean, found.persistence.sd) == pytest.approx((2, 0))
-    (method,) = grouped(reading.read([result(validation={"loss": 0.25, "epoch": 3})]))
-    found = representations.represented(method)
+    (method,) = grouped(methods.read_runs([result(validation={"loss": 0.25, "epoch": 3})]))
+    found = representations.represent_method(method)
     assert found is not None and found.validation.mean == 0.25  # the recurrent model's loss is that error
 
 
@@ -159,9 +159,11 @@ def test_anticipation_is_weighted_by_events_and_leaves_out_what_was_never_seen_c
     for one, row in zip(given, stated, strict=True):
         content = {"anticipation": {"model": dict(zip(names, row, strict=True))}}
         one.files["metrics.json"] = json.dumps(content).encode()
-    (method,) = grouped(reading.read(given))
-    assert anticipation.of(method, "model") == pytest.approx(dict(zip(names, (16, 0.875, 3.0, 1.0, 2.5), strict=True)))
-    assert anticipation.of(method, "ridge") is None
+    (method,) = grouped(methods.read_runs(given))
+    assert events.anticipation_scores(method, "model") == pytest.approx(
+        dict(zip(names, (16, 0.875, 3.0, 1.0, 2.5), strict=True))
+    )
+    assert events.anticipation_scores(method, "ridge") is None
 
 
 def test_in_full_are_the_median_run_of_the_best_method_and_of_the_papers() -> None:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tacpipe.tasks.forward.report import situations
+from tacpipe.tasks.forward.report.skill import situation_folds, skill_in_situation
 
 
 def run(**found: tuple[int, float, float, float]) -> Any:
@@ -30,23 +30,23 @@ def test_several_runs_are_weighted_by_their_windows_and_one_has_its_interval() -
         run(closing=(300, 20.0, 20.0, 0.0)),
     )
     method: Any = SimpleNamespace(name="mixed", runs=[first, second])
-    found = situations.of_method(method, "closing")
+    found = skill_in_situation(method, "closing")
     assert found is not None
     assert found["windows"] == 400
     assert (found["persistence"], found["model"]) == pytest.approx((25.0, 22.5))
     assert found["skill"] == pytest.approx(0.05)
     assert found["part"] == pytest.approx((4000 + 6000) / (4000 + 6000 + 4000))
     assert np.isnan(found["low"])
-    alone = situations.of_method(SimpleNamespace(name="mixed", runs=[first]), "slipping")  # type: ignore[arg-type]
+    alone = skill_in_situation(SimpleNamespace(name="mixed", runs=[first]), "slipping")  # type: ignore[arg-type]
     assert alone is not None and (alone["low"], alone["high"]) == pytest.approx((0.2, 0.4))
-    assert situations.of_method(method, "releasing") is None
+    assert skill_in_situation(method, "releasing") is None
 
 
 def test_results_without_situations_have_no_table() -> None:
     empty: Any = SimpleNamespace(methods=[SimpleNamespace(name="gru", runs=[run()])])
-    assert situations.folds(empty) == []
+    assert situation_folds(empty) == []
     full: Any = SimpleNamespace(methods=[SimpleNamespace(name="mixed", runs=[run(closing=(100, 40.0, 30.0, 0.2))])])
-    (one,) = situations.folds(full)
+    (one,) = situation_folds(full)
     assert one.title == "By situation"
     table: Any = one.blocks[0]
     assert [getattr(cell, "text", cell) for cell in table.rows[0].cells][:4] == ["closing", "mixed", "100", "100.0 %"]

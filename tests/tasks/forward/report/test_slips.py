@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from scipy import stats
 
-from tacpipe.tasks.forward.report import slips
+from tacpipe.tasks.forward.report import events
 from tests.report.parts import cells
 
 NAMES = ("events", "led", "median_lead_ms", "false_alarms", "minutes")
@@ -30,7 +30,9 @@ def context(*methods: Any) -> Any:
 
 
 def test_runs_add_up_and_the_median_lead_is_weighted_by_slips_that_were_led() -> None:
-    found = slips.of(method("gru", run(model=(10, 6, 120.0, 3, 4.0)), run(model=(30, 2, 40.0, 5, 12.0))), "model")
+    found = events.slip_scores(
+        method("gru", run(model=(10, 6, 120.0, 3, 4.0)), run(model=(30, 2, 40.0, 5, 12.0))), "model"
+    )
     assert found is not None
     assert (found["events"], found["led"], found["false_alarms"], found["minutes"]) == (40, 8, 8, 16.0)
     assert found["led_percent"] == pytest.approx(20)
@@ -41,25 +43,25 @@ def test_runs_add_up_and_the_median_lead_is_weighted_by_slips_that_were_led() ->
 
 
 def test_without_a_slip_that_was_led_there_is_no_lead_and_without_minutes_no_rate() -> None:
-    found = slips.of(method("gru", run(model=(4, 0, None, 0, 0.0))), "model")
+    found = events.slip_scores(method("gru", run(model=(4, 0, None, 0, 0.0))), "model")
     assert found is not None and found["led_percent"] == 0
     assert math.isnan(found["median_lead_ms"]) and math.isnan(found["false_alarms_per_hour"])
 
 
 def test_a_run_whose_recordings_do_not_state_slips_counts_for_nothing() -> None:
     alone = method("gru", run(model=(10, 6, 120.0, 3, 4.0)))
-    assert slips.of(method("gru", *alone.runs, run()), "model") == slips.of(alone, "model")
-    assert slips.of(alone, "ridge") is None
-    assert slips.of(method("gru", run()), "model") is None
+    assert events.slip_scores(method("gru", *alone.runs, run()), "model") == events.slip_scores(alone, "model")
+    assert events.slip_scores(alone, "ridge") is None
+    assert events.slip_scores(method("gru", run()), "model") is None
 
 
 def test_the_table_has_methods_and_baselines_and_the_best_first() -> None:
     best = method("taxelwise", run(model=(10, 6, 120.0, 1200, 4.0), persistence=(10, 1, 20.0, 3, 4.0)))
-    (one,) = slips.folds(context(method("gru", run(model=(10, 4, 60.0, 3, 4.0))), best))
+    (one,) = events.slip_folds(context(method("gru", run(model=(10, 4, 60.0, 3, 4.0))), best))
     (found,) = one.blocks
     assert [str(row.cells[0]) for row in found.rows] == ["taxelwise", "gru", "persistence"]  # type: ignore[union-attr]
     assert cells(found, "taxelwise") == ["10", "6", "60 | 31 to 83", "120", "1,200", "4", "18,000"]  # type: ignore[arg-type]
 
 
 def test_results_of_recordings_without_slips_have_no_such_part() -> None:
-    assert slips.folds(context(method("gru", run()))) == []
+    assert events.slip_folds(context(method("gru", run()))) == []

@@ -9,16 +9,16 @@ import pytest
 
 from tacpipe.comparison.runs import Run
 from tacpipe.metrics.proportions import wilson
-from tacpipe.tasks.material.report import accuracy, reading
+from tacpipe.tasks.material.report import methods, scores
 from tests.tasks.material.report.material_fakes import result
 
 
 def runs(*results: Any) -> list[Run]:
-    return reading.read(results)
+    return methods.read_runs(results)
 
 
 def test_runs_on_the_same_slides_are_pooled_but_claim_no_more_slides() -> None:
-    found = accuracy.accuracy(runs(*(result(wrong={"biotac": wrong}, fold=wrong) for wrong in (2, 6))), "biotac")
+    found = scores.accuracy(runs(*(result(wrong={"biotac": wrong}, fold=wrong) for wrong in (2, 6))), "biotac")
     assert found is not None
     assert (found.correct, found.evaluated, found.slides, found.runs) == (32, 40, 20, 2)
     assert found.fraction == 0.8
@@ -28,21 +28,21 @@ def test_runs_on_the_same_slides_are_pooled_but_claim_no_more_slides() -> None:
 
 def test_runs_on_other_slides_add_theirs() -> None:
     given = runs(*(result(wrong={"biotac": 2}, first=first) for first in (1, 100)))
-    found = accuracy.accuracy(given, "biotac")
+    found = scores.accuracy(given, "biotac")
     assert found is not None
     assert found.slides == 40
     assert (found.low, found.high) == wilson(36, 40)
 
 
 def test_a_single_run_has_no_spread_and_another_sensor_no_accuracy() -> None:
-    found = accuracy.accuracy(runs(result(wrong={"biotac": 2})), "biotac")
+    found = scores.accuracy(runs(result(wrong={"biotac": 2})), "biotac")
     assert found is not None and math.isnan(found.sd)
-    assert accuracy.accuracy(runs(result(wrong={"biotac": 2})), "roboskin") is None
-    assert accuracy.accuracy(runs(result(wrong={"biotac": 2})), "biotac", "swapped") is None
+    assert scores.accuracy(runs(result(wrong={"biotac": 2})), "roboskin") is None
+    assert scores.accuracy(runs(result(wrong={"biotac": 2})), "biotac", "swapped") is None
 
 
 def test_each_slide_has_the_share_of_runs_that_named_it_right() -> None:
-    found = accuracy.right(runs(*(result(wrong={"biotac": wrong}) for wrong in (0, 1))), "biotac")
+    found = scores.slides_named_right(runs(*(result(wrong={"biotac": wrong}) for wrong in (0, 1))), "biotac")
     by_slide = found.groupby("recording").mean()
     assert by_slide["biotac-m01-t001"] == 0.5
     assert by_slide.sum() == 19.5
@@ -50,7 +50,7 @@ def test_each_slide_has_the_share_of_runs_that_named_it_right() -> None:
 
 def test_skill_is_the_share_of_the_mean_levels_mistakes_that_is_avoided() -> None:
     given = runs(result(wrong={"biotac": 2}, also={"mean_level": {"biotac": 8}}), result(wrong={"biotac": 20}))
-    assert accuracy.skill(given, "biotac") == pytest.approx(0.75)  # the second run has no mean level
-    assert accuracy.skill(given, "biotac", "mean_level") == 0
+    assert scores.level_skill(given, "biotac") == pytest.approx(0.75)  # the second run has no mean level
+    assert scores.level_skill(given, "biotac", "mean_level") == 0
     perfect = runs(result(wrong={"biotac": 2}, also={"mean_level": {"biotac": 0}}))
-    assert math.isnan(accuracy.skill(perfect, "biotac"))
+    assert math.isnan(scores.level_skill(perfect, "biotac"))

@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 from tacpipe.comparison.runs import Method
-from tacpipe.tasks.material.report import comparison
+from tacpipe.tasks.material.report import scores
 from tests.report import parts
 from tests.tasks.material.report.material_fakes import result
 
@@ -32,18 +32,18 @@ def of(*results: Any) -> Method:
 
 
 def test_a_difference_is_over_slides_that_both_were_judged_on() -> None:
-    found = comparison.difference(method(2), method(6), "biotac")
+    found = scores.compare_runs(method(2), method(6), "biotac")
     assert found is not None
     assert (found.slides, found.first_only, found.second_only) == (20, 4, 0)
     assert found.gain.mean == pytest.approx(20.0)
     assert found.mcnemar == pytest.approx(2 * 0.5**4)  # four disagreements, all for the first
     assert found.gain.low > 0 and found.word == "better"
-    other = comparison.difference(method(2), of(result(wrong={"biotac": 2}, first=50)), "biotac")
+    other = scores.compare_runs(method(2), of(result(wrong={"biotac": 2}, first=50)), "biotac")
     assert other is None
 
 
 def test_the_interval_covers_what_drawing_slides_anew_gives() -> None:
-    found = comparison.difference(method(2), method(6), "biotac")
+    found = scores.compare_runs(method(2), method(6), "biotac")
     assert found is not None
     sd = math.sqrt(0.2 * 0.8 / 20)  # four gains of 1 among 20 slides
     assert found.gain.low == pytest.approx(20 - 196 * sd, abs=5)
@@ -51,20 +51,20 @@ def test_the_interval_covers_what_drawing_slides_anew_gives() -> None:
 
 
 def test_methods_that_are_as_good_cannot_be_representative_method() -> None:
-    found = comparison.difference(method(3), method(3), "biotac")
+    found = scores.compare_runs(method(3), method(3), "biotac")
     assert found is not None
     assert (found.gain.mean, found.mcnemar, found.word) == (0, 1, "unclear")
 
 
 def test_folds_are_paired_where_there_are_several() -> None:
-    found = comparison.difference(method(2, 3, 4), method(4, 6, 5), "biotac")
+    found = scores.compare_runs(method(2, 3, 4), method(4, 6, 5), "biotac")
     assert found is not None
     assert (found.runs.unit, found.runs.units) == ("folds", 3)
     assert found.runs.p == pytest.approx(stats.ttest_rel([0.9, 0.85, 0.8], [0.8, 0.7, 0.75]).pvalue)
 
 
 def test_folds_that_only_one_method_has_are_not_paired() -> None:
-    found = comparison.difference(method(2, 3, 4), method(4, 6), "biotac")
+    found = scores.compare_runs(method(2, 3, 4), method(4, 6), "biotac")
     assert found is not None and found.runs.units == 2
     assert found.runs.p == pytest.approx(stats.ttest_rel([0.9, 0.85], [0.8, 0.7]).pvalue)
 
@@ -74,7 +74,7 @@ def test_folds_that_are_not_told_are_known_by_their_test_slides() -> None:
         of(*(result(wrong={"biotac": n}, fold=None, first=at) for n, at in zip(wrong, (1, 100), strict=True)))
         for wrong in ((1, 2), (3, 7))
     )
-    found = comparison.difference(first, second, "biotac")
+    found = scores.compare_runs(first, second, "biotac")
     assert found is not None and (found.runs.unit, found.runs.units) == ("folds", 2)
 
 
@@ -83,13 +83,13 @@ def test_seeds_are_paired_where_there_is_one_fold() -> None:
         of(*(result(wrong={"biotac": n}, fold=None, seed=seed) for seed, n in enumerate(wrong)))
         for wrong in ((1, 2), (3, 7))
     )
-    found = comparison.difference(first, second, "biotac")
+    found = scores.compare_runs(first, second, "biotac")
     assert found is not None and (found.runs.unit, found.runs.units) == ("seeds", 2)
 
 
 def test_one_run_each_and_gains_without_spread_have_no_t_test() -> None:
     for first, second in (((1,), (2,)), ((1, 2), (3, 4))):
-        found = comparison.difference(method(*first), method(*second), "biotac")
+        found = scores.compare_runs(method(*first), method(*second), "biotac")
         assert found is not None and math.isnan(found.runs.p)
 
 
@@ -103,7 +103,7 @@ def test_joint_learning_is_compared_with_the_same_network_alone_the_control_and_
         result("minirocket", wrong=BOTH),
         result("minirocket", wrong=BOTH, train=dict.fromkeys(BOTH, 64)),
     ]
-    found = comparison.pairs(parts.methods("material", *given))
+    found = scores.method_pairs(parts.methods("material", *given))
     assert [pair.name for pair in found] == [
         "RAEC joint · decoder D1 − RAEC independent · decoder D1",
         "RAEC joint · decoder D1 − RAEC joint · permuted pairs",

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from tacpipe.comparison.runs import Method
-from tacpipe.tasks.material.report import joint, zero_shot
+from tacpipe.tasks.material.report import joint
 from tests.report import parts
 from tests.tasks.material.report.material_fakes import result
 
@@ -27,18 +27,18 @@ def trained(swapped: dict[str, int], alignment: float, **params: Any) -> Any:
     ("alone", "told"), [(12, ("helps", "BioTac", "+55.0")), (2, ("makes no difference", "BioTac", "+5.0"))]
 )
 def test_what_joint_learning_does_is_stated_no_more_surely_than_the_slides_allow(alone: int, told: Any) -> None:
-    found = joint.effects(grouped(trained(BOTH, 0.01), result(wrong={"biotac": alone, "roboskin": 2})))
+    found = joint.joint_effects(grouped(trained(BOTH, 0.01), result(wrong={"biotac": alone, "roboskin": 2})))
     assert all(one in found[0] for one in told)
 
 
 def test_joint_learning_that_hurts_is_stated() -> None:
-    found = joint.effects(grouped(result(wrong={"biotac": 9}, joint=True), result(wrong={"biotac": 0})))
+    found = joint.joint_effects(grouped(result(wrong={"biotac": 9}, joint=True), result(wrong={"biotac": 0})))
     assert "hurts" in found[0] and "−45.0" in found[0]
 
 
 def test_a_control_that_aligns_and_swaps_as_well_makes_the_alignment_label_driven() -> None:
     permuted = trained({"biotac": 2, "roboskin": 2}, 0.015, pairing="permuted", partners=PARTNERS)
-    control = joint.effects(grouped(trained(BOTH, 0.01), permuted))[-1]
+    control = joint.joint_effects(grouped(trained(BOTH, 0.01), permuted))[-1]
     assert "label-driven" in control
     assert "0.015" in control and "0.01" in control and "BioTac 90.0" in control and "95.0" in control
 
@@ -53,21 +53,21 @@ def test_a_control_that_aligns_and_swaps_as_well_makes_the_alignment_label_drive
 )
 def test_a_control_that_does_worse_does_not(swapped: dict[str, int], alignment: float, told: str) -> None:
     given = grouped(trained(BOTH, 0.01), trained(swapped, alignment, pairing="permuted", partners=PARTNERS))
-    control = joint.effects(given)[-1]
+    control = joint.joint_effects(given)[-1]
     assert told in control and "label-driven" not in control
 
 
 def test_a_control_is_no_evidence_where_real_pairs_have_not_aligned() -> None:
     swapped = {"biotac": 1, "roboskin": 12}
     given = grouped(trained(swapped, 0.01), trained(swapped, 0.01, pairing="permuted", partners=PARTNERS))
-    control = joint.effects(given)[-1]
+    control = joint.joint_effects(given)[-1]
     assert "50.0 points" in control and "label-driven" not in control
 
 
 def test_a_missing_control_and_a_missing_counterpart_are_stated() -> None:
-    alone, control = joint.effects(grouped(trained(BOTH, 0.01)))
+    alone, control = joint.joint_effects(grouped(trained(BOTH, 0.01)))
     assert "not tested" in alone and control == joint.NO_CONTROL
-    assert joint.effects(grouped(result("minirocket", wrong={"biotac": 0}))) == []
+    assert joint.joint_effects(grouped(result("minirocket", wrong={"biotac": 0}))) == []
 
 
 @pytest.mark.parametrize(("correct", "word"), [(20, "above chance"), (5, "distinguished"), (0, "distinguished")])
@@ -77,5 +77,5 @@ def test_materials_that_a_sensor_never_saw_are_named_from_the_other_sensors_clas
     given = grouped(
         trained(BOTH, 0.01), result(wrong=BOTH, joint=True, hold_out="roboskin=3,4", metrics={"zero_shot": zero})
     )
-    (told,) = zero_shot.sentences(given)
+    (told,) = joint.zero_shot_sentences(given)
     assert word in told and f"{correct} of 20" in told

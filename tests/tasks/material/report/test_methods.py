@@ -31,7 +31,7 @@ def test_seeds_folds_and_sensors_that_were_trained_alone_make_one_method() -> No
     )
     assert {name: len(one.runs) for name, one in found.items()} == {"RAEC independent": 8}
     assert methods.sensors_of([found["RAEC independent"]]) == ("biotac", "roboskin")
-    assert len(methods.of(found["RAEC independent"], "biotac")) == 4
+    assert len(methods.runs_on(found["RAEC independent"], "biotac")) == 4
 
 
 def test_names_say_what_keeps_a_method_from_being_plain() -> None:
@@ -47,7 +47,7 @@ def test_names_say_what_keeps_a_method_from_being_plain() -> None:
         result("minirocket", wrong=BOTH, train={"biotac": 64, "roboskin": 64}),
         result(wrong=BOTH, known="biotac"),
     )
-    assert {name: methods.plain(one.settings) for name, one in found.items()} == {
+    assert {name: methods.has_usual_settings(one.settings) for name, one in found.items()} == {
         "MiniRocket": True,
         "X-LSTM": True,
         "RAEC independent": True,
@@ -89,11 +89,11 @@ def test_results_of_another_split_stand_apart_from_what_most_have() -> None:
         return made
 
     found = grouped(placed("", 0), placed("", 1), placed("last to first", 2))
-    assert {name: methods.plain(one.settings) for name, one in found.items()} == {
+    assert {name: methods.has_usual_settings(one.settings) for name, one in found.items()} == {
         "MiniRocket": True,
         "MiniRocket · split last to first": False,
     }
-    assert methods.plain(found["MiniRocket · split last to first"].settings, "elsewhere")
+    assert methods.has_usual_settings(found["MiniRocket · split last to first"].settings, "elsewhere")
 
 
 def test_folds_of_nearly_one_size_pool_and_fewer_slides_do_not() -> None:
@@ -121,8 +121,8 @@ def test_one_sensor_with_fewer_slides_than_the_other_is_a_method_of_its_own() ->
         result(wrong=BOTH, joint=True, train={"biotac": 64, "roboskin": 64}),
     )
     assert list(found) == ["RAEC joint", "RAEC joint · 64 slides", "RAEC joint · RoboSkin 64 slides"]
-    assert methods.line(found["RAEC joint · RoboSkin 64 slides"]) == "RAEC joint · other sensor whole"
-    assert methods.line(found["RAEC joint · 64 slides"]) == "RAEC joint"
+    assert methods.method_title(found["RAEC joint · RoboSkin 64 slides"]) == "RAEC joint · other sensor whole"
+    assert methods.method_title(found["RAEC joint · 64 slides"]) == "RAEC joint"
 
 
 def test_simulated_slides_and_scrambled_ones_are_kept_apart() -> None:
@@ -133,8 +133,8 @@ def test_simulated_slides_and_scrambled_ones_are_kept_apart() -> None:
 def test_a_mapped_method_tells_of_the_sensor_that_was_mapped() -> None:
     found = grouped(result(wrong=BOTH, known="biotac"), result(wrong=BOTH, known="roboskin"))
     (method,) = found.values()
-    assert [run.details.sensors for run in methods.of(method, "roboskin")] == [("roboskin",)]
-    assert [run.details.sensors for run in methods.of(method, "biotac")] == [("biotac",)]
+    assert [run.details.sensors for run in methods.runs_on(method, "roboskin")] == [("roboskin",)]
+    assert [run.details.sensors for run in methods.runs_on(method, "biotac")] == [("biotac",)]
 
 
 @pytest.mark.parametrize(("params", "slides"), [({"reduce": "biotac", "ratio": 25, "batch": 32}, 160), ({}, 576)])

@@ -14,7 +14,7 @@ BOTH = {"biotac": 1, "roboskin": 2}
 
 def read(given: Any, **config: Any) -> Predictions:
     told = {**json.loads(given.files["config.json"]), **config}
-    return predictions.read(given.recordings["predictions"].table(), told)
+    return predictions.read_predictions(given.recordings["predictions"].table(), told)
 
 
 def test_slides_of_training_are_left_out() -> None:

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from tacpipe.comparison.runs import Method
-from tacpipe.report import provenance
+from tacpipe.report import context
 from tacpipe.report.blocks import Section
-from tacpipe.tasks.material.report import confusion, curves, latents, profiles, wording
+from tacpipe.tasks.material.report import figures, scores
 from tacpipe.tasks.material.report.methods import Result
 from tests.fake_recordings import FakeDataset
 from tests.report import parts
@@ -92,13 +92,13 @@ def test_a_labs_own_slides_get_nothing_that_the_paper_states_of_its_own(simulate
     text = parts.words(found)
     for told in ("paper", "192 slides", "one session", "mapping to known space", "X-LSTM", "Figure"):
         assert told not in text, told
-    assert (found.simulated, text.count(provenance.SIMULATED)) == (simulated, int(simulated))
+    assert (found.simulated, text.count(context.SIMULATED)) == (simulated, int(simulated))
 
 
 @pytest.mark.parametrize(("sessions", "told"), [(1, True), (2, False)])
 def test_that_each_material_has_one_session_is_stated_where_it_is_so(sessions: int, told: bool) -> None:
     given = result("minirocket", wrong=BOTH, published=False, sessions=sessions)
-    assert (wording.SESSIONS in parts.words(parts.section("material", given))) == told
+    assert (scores.SESSIONS in parts.words(parts.section("material", given))) == told
 
 
 def test_one_result_alone_has_no_comparison_of_methods() -> None:
@@ -121,17 +121,17 @@ def test_a_result_without_unseen_slides_is_reported_as_its_metrics_name_it() -> 
 
 def test_confusions_are_counted_over_runs_and_stated_in_words() -> None:
     (method,) = grouped(result(wrong={"biotac": 2}, fold=0), result(wrong={"biotac": 1}, fold=1))
-    counts, materials = confusion.counted(method, "biotac")
+    counts, materials = figures.count_confusions(method, "biotac")
     assert materials == [1, 2, 3, 4]
     # the fakes take the first slide of material 1 for 2 in both runs, and that of 2 for 3 in one
     assert counts.tolist() == [[8, 2, 0, 0], [0, 9, 1, 0], [0, 0, 10, 0], [0, 0, 0, 10]]
-    assert confusion.worst(counts, materials) == "Most often it takes 1 for 2 (2 of 10) and 2 for 3 (1 of 10)."
-    assert confusion.worst(np.diag([3, 3]), [1, 2]) == "It takes none for another."
+    assert figures.describe_worst(counts, materials) == "Most often it takes 1 for 2 (2 of 10) and 2 for 3 (1 of 10)."
+    assert figures.describe_worst(np.diag([3, 3]), [1, 2]) == "It takes none for another."
 
 
 def test_confusion_matrices_hold_every_count_of_the_best_method_and_of_the_joint_one() -> None:
     drawn = parts.charts(
-        confusion.folds(
+        figures.confusion_folds(
             parts.context("material", result("minirocket", wrong={"biotac": 1}), result(wrong=BOTH, joint=True))
         )
     )
@@ -144,7 +144,7 @@ def test_projections_keep_what_lies_in_a_plane() -> None:
     rng = np.random.default_rng(0)
     plane = rng.normal(size=(2, 5))
     points = [rng.normal(size=(count, 2)) @ plane for count in (4, 7)]
-    flat = latents.projected(points)
+    flat = figures.project_on_plane(points)
     assert [one.shape for one in flat] == [(4, 2), (7, 2)]
     together = np.vstack(points), np.vstack(flat)
     apart = [np.linalg.norm(one[:, None] - one[None], axis=2) for one in together]
@@ -153,7 +153,7 @@ def test_projections_keep_what_lies_in_a_plane() -> None:
 
 def test_a_projection_does_not_depend_on_the_sign_that_a_decomposition_takes() -> None:
     points = np.random.default_rng(1).normal(size=(9, 4)) * [5, 2, 1, 1]
-    first, second = latents.projected([points])[0], latents.projected([points[::-1]])[0][::-1]
+    first, second = figures.project_on_plane([points])[0], figures.project_on_plane([points[::-1]])[0][::-1]
     assert np.allclose(first, second)
 
 
@@ -162,14 +162,14 @@ def test_materials_lie_together_with_those_that_they_were_paired_with() -> None:
         Result(result(wrong=BOTH, joint=True, epochs=2, partners=partners, pairing="permuted")).predictions
         for partners in (None, PARTNERS)
     )
-    assert latents.together(same.of("biotac"), same.of("roboskin"), {}) == (4, 4)
-    assert latents.together(other.of("biotac"), other.of("roboskin"), {}) == (0, 4)
-    assert latents.together(other.of("biotac"), other.of("roboskin"), PARTNERS) == (4, 4)
+    assert figures.count_nearest_partners(same.of("biotac"), same.of("roboskin"), {}) == (4, 4)
+    assert figures.count_nearest_partners(other.of("biotac"), other.of("roboskin"), {}) == (0, 4)
+    assert figures.count_nearest_partners(other.of("biotac"), other.of("roboskin"), PARTNERS) == (4, 4)
 
 
 def test_latents_of_a_joint_run_are_next_to_the_control_and_two_that_learned_alone() -> None:
     drawn = parts.charts(
-        latents.folds(
+        figures.latent_folds(
             grouped(
                 result(wrong=BOTH, joint=True, epochs=2),
                 result(wrong=BOTH, joint=True, epochs=2, partners=PARTNERS, pairing="permuted"),
@@ -184,7 +184,7 @@ def test_latents_of_a_joint_run_are_next_to_the_control_and_two_that_learned_alo
     assert {row["shape"] for row in parts.values(drawn[0])} == {"BioTac", "RoboSkin"}
     lines = drawn[1].spec["layer"][-1]["data"]["values"]
     assert [one["text"] for one in lines] == ["1", "2", "3", "4"]
-    assert latents.folds(grouped(result("minirocket", wrong=BOTH))) == []
+    assert figures.latent_folds(grouped(result("minirocket", wrong=BOTH))) == []
 
 
 def test_convergence_is_drawn_for_each_sensor_and_the_alignment_with_its_control() -> None:
@@ -194,7 +194,7 @@ def test_convergence_is_drawn_for_each_sensor_and_the_alignment_with_its_control
         result(wrong=BOTH, joint=True, epochs=4, pairing="permuted"),
         result(wrong={"roboskin": 1}, epochs=4),
     )
-    biotac, roboskin = curves.convergence(given)
+    biotac, roboskin = figures.validation_charts(given)
     assert "BioTac" in biotac.title and "RoboSkin" in roboskin.title
     rows = parts.values(biotac)
     assert {row["name"] for row in rows} == {"RAEC joint"}
@@ -203,15 +203,15 @@ def test_convergence_is_drawn_for_each_sensor_and_the_alignment_with_its_control
         4,
         5,
     ]  # the mean last
-    (pairs,) = curves.alignment(given)
+    (pairs,) = figures.alignment_charts(given)
     assert {row["name"] for row in parts.values(pairs)} == {"RAEC joint", "RAEC joint · permuted pairs"}
-    assert curves.convergence(grouped(result("minirocket", wrong=BOTH))) == []
-    assert curves.alignment(grouped(result(wrong=BOTH, epochs=3))) == []
+    assert figures.validation_charts(grouped(result("minirocket", wrong=BOTH))) == []
+    assert figures.alignment_charts(grouped(result(wrong=BOTH, epochs=3))) == []
 
 
 def test_curves_over_slides_are_those_of_methods_with_several_numbers() -> None:
     drawn = parts.charts(
-        curves.few_slides(
+        figures.few_slides_folds(
             grouped(
                 *(result("minirocket", wrong=BOTH, train=dict.fromkeys(BOTH, count)) for count in (64, 576)),
                 *(result(wrong=BOTH, joint=True, reduce="biotac", ratio=ratio, shuffle=False) for ratio in (11, 50)),
@@ -224,11 +224,11 @@ def test_curves_over_slides_are_those_of_methods_with_several_numbers() -> None:
     names = [{row["name"] for row in parts.values(one)} for one in drawn]
     assert names == [{"MiniRocket", f"{joint} · fixed batches"}, {"MiniRocket", joint}]
     assert {row["x"] for row in parts.values(drawn[0]) if row["name"] == "MiniRocket"} == {64, 576}
-    assert curves.few_slides(grouped(result("minirocket", wrong=BOTH))) == []
+    assert figures.few_slides_folds(grouped(result("minirocket", wrong=BOTH))) == []
 
 
 def test_slides_are_counted_and_the_one_of_median_force_is_drawn() -> None:
-    found = profiles.folds([material_fakes.recorded(5, outside=2)])
+    found = figures.profile_folds([material_fakes.recorded(5, outside=2)])
     text = parts.words(found)
     assert "5 slides of BioTac, 2 of them outside the protocol (2 moved at 12 mm/s)." in text
     assert "1 slide of RoboSkin, 0 of them outside the protocol." in text
@@ -243,4 +243,4 @@ def test_what_was_not_measured_is_not_drawn(lacking: str) -> None:
     shard = given.recordings["biotac-m01-t000"]
     short = shard.tables["profile"].drop_columns([lacking] if lacking == "force_n" else [lacking, "speed_raw_m_s"])
     shard.tables = {**shard.tables, "profile": short}
-    assert len(parts.charts(profiles.folds([given]))) == 1
+    assert len(parts.charts(figures.profile_folds([given]))) == 1

@@ -7,7 +7,7 @@ from typing import Any
 from tacpipe.comparison import engine
 from tacpipe.comparison.runs import Method
 from tacpipe.metrics.proportions import wilson
-from tacpipe.tasks.material.report import reduction, tables, zero_shot
+from tacpipe.tasks.material.report.joint import difference_table, reduction_tables, swap_table, zero_shot_folds
 from tests.report import parts
 from tests.tasks.material.report.material_fakes import result
 
@@ -61,7 +61,7 @@ def test_controls_and_fewer_slides_do_not_compete() -> None:
 
 
 def test_table_2_tells_what_exchanging_classifiers_costs() -> None:
-    found = tables.swaps(
+    found = swap_table(
         grouped(
             result(wrong=BOTH, joint=True, also={"swapped": {"biotac": 3, "roboskin": 2}}),
             result(wrong=BOTH, joint=True, pairing="permuted", also={"swapped": {"biotac": 2, "roboskin": 1}}),
@@ -74,11 +74,11 @@ def test_table_2_tells_what_exchanging_classifiers_costs() -> None:
     assert parts.cells(found, "RAEC joint · permuted pairs")[5] == "+5.0"
     assert parts.cells(found, "paper: RAEC joint") == ["96.01", "95.31", "−0.7", "93.23", "93.23", "+0.0", "–"]
     assert "MiniRocket" not in parts.words([found])
-    assert tables.swaps(grouped(result("minirocket", wrong=BOTH))) is None
+    assert swap_table(grouped(result("minirocket", wrong=BOTH))) is None
 
 
 def test_tables_3_and_4_stand_beside_the_papers_and_a_readout_of_as_many_slides() -> None:
-    found = reduction.tables(
+    found = reduction_tables(
         grouped(
             result(wrong=BOTH, joint=True, reduce="roboskin", ratio=11, shuffle=False),
             result(wrong={"roboskin": 10}, reduce="roboskin", ratio=11, shuffle=False),
@@ -91,12 +91,12 @@ def test_tables_3_and_4_stand_beside_the_papers_and_a_readout_of_as_many_slides(
     assert row[0] == "64"
     assert [cell[:5].strip() for cell in row[1:]] == ["95.0", "96.88", "90.0", "45.31", "50.0", "46.35", "70.0"]
     assert parts.cells(found, "50 %") == ["288", "–", "96.88", "–", "86.98", "–", "82.29", "–"]
-    assert reduction.tables(grouped(result(wrong=BOTH, joint=True))) == []
+    assert reduction_tables(grouped(result(wrong=BOTH, joint=True))) == []
 
 
 def test_a_sensor_that_a_split_gave_fewer_slides_stands_in_for_one_that_learns_from_fewer_batches() -> None:
     fewer = {"biotac": 96, "roboskin": 576}
-    found = reduction.tables(
+    found = reduction_tables(
         grouped(
             result(wrong=BOTH, joint=True),
             result(wrong={"biotac": 4, "roboskin": 2}, joint=True, train=fewer),
@@ -119,7 +119,7 @@ def test_a_sensor_that_a_split_gave_fewer_slides_stands_in_for_one_that_learns_f
 
 
 def test_paired_comparisons_tell_points_disagreements_and_tests() -> None:
-    found = tables.differences(
+    found = difference_table(
         grouped(
             *(result(wrong={"biotac": wrong}, joint=True, fold=wrong) for wrong in (1, 2)),
             *(result(wrong={"biotac": 6}, fold=fold) for fold in (1, 2)),
@@ -131,7 +131,7 @@ def test_paired_comparisons_tell_points_disagreements_and_tests() -> None:
     # slides that one of two joint runs names right count as right, and the five others only the joint one does
     assert row[1:4] == ["20", "5 : 0", "0.062"]
     assert row[5] == "2 folds"
-    assert tables.differences(grouped(result("minirocket", wrong=BOTH))) is None
+    assert difference_table(grouped(result("minirocket", wrong=BOTH))) is None
 
 
 def test_every_run_is_listed() -> None:
@@ -165,11 +165,11 @@ def test_held_out_materials_are_told_out_of_all_and_out_of_themselves() -> None:
         )
         for seed in (0, 1)
     ]
-    found = parts.tables(zero_shot.folds(grouped(*given)))
+    found = parts.tables(zero_shot_folds(grouped(*given)))
     name = "RAEC joint · RoboSkin without 3, 4"
     assert parts.cells(found, f"{name}, out of all")[1].startswith("20.0 ± 0.0 | 16/80")
     assert parts.cells(found, f"{name}, out of all")[2:] == ["5.0", "2"]
     low, high = wilson(1, 4)  # two materials in two runs, a fifth of which is right
     assert parts.cells(found, f"{name}, out of all")[1].endswith(f"· {100 * low:.1f} to {100 * high:.1f}")
     assert parts.cells(found, f"{name}, out of those held out")[1].startswith("50.0 ± 0.0 | 40/80")
-    assert zero_shot.folds(grouped(result(wrong=BOTH))) == []
+    assert zero_shot_folds(grouped(result(wrong=BOTH))) == []

@@ -70,7 +70,7 @@ def test_reliability_is_drawn_of_as_many_slides_a_bin_and_unknown_with_its_thres
 def test_a_curve_states_which_fraction_of_unknown_slides_lies_below_each_threshold() -> None:
     rng = np.random.default_rng(0)
     known, unknown = rng.normal(1, 1, 300), rng.normal(0, 1, 200)
-    found = uncertainty.curve(known, unknown)
+    found = uncertainty.unknown_curve(known, unknown)
     for at in (10, 50, 90):  # thresholds below which so many percent of known slides lie
         threshold = np.sort(known)[3 * at]
         assert found[at] == pytest.approx(np.mean(unknown < threshold), abs=1e-12)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from tacpipe.comparison.runs import Method
-from tacpipe.tasks.touch.report.methods import default, groups, main
+from tacpipe.tasks.touch.report.methods import default_method, grouped_by_split, one_per_architecture
 from tests.report import parts
 from tests.tasks.touch.report.touch_fakes import result
 
@@ -84,7 +84,7 @@ def test_the_wrist_makes_a_method_only_where_it_is_read() -> None:
 
 
 def test_methods_are_compared_on_one_split_alone_recorded_grasps_first() -> None:
-    found = groups(
+    found = grouped_by_split(
         methods(
             *(result("pointnet", split="folds", seed=seed, targets=("pdc_th",)) for seed in range(5)),
             result(split="random"),
@@ -106,14 +106,14 @@ def test_methods_are_compared_on_one_split_alone_recorded_grasps_first() -> None
 
 
 def test_the_default_stands_for_a_group_and_else_the_method_of_most_runs() -> None:
-    (both,) = groups(methods(result(), result("trees", seed=0), result("trees", seed=1)))
-    assert default(both).name == "tree-ensemble"
-    (others,) = groups(methods(result("pointnet"), result("trees", seed=0), result("trees", seed=1)))
-    assert default(others).name == "trees on geometry and colour"
+    (both,) = grouped_by_split(methods(result(), result("trees", seed=0), result("trees", seed=1)))
+    assert default_method(both).name == "tree-ensemble"
+    (others,) = grouped_by_split(methods(result("pointnet"), result("trees", seed=0), result("trees", seed=1)))
+    assert default_method(others).name == "trees on geometry and colour"
 
 
 def test_one_method_an_architecture_is_told_in_detail() -> None:
-    (group,) = groups(methods(*(result("pointnet", head=head) for head in ("fc1", "fc3", "fc3")), result()))
-    assert [one.name for one in main(group)] == ["PointNet", "tree-ensemble"]
-    (both,) = groups(methods(result("trees", inputs="xyzcont"), result("trees")))
-    assert [one.name for one in main(both)] == ["trees on geometry and colour"]
+    (group,) = grouped_by_split(methods(*(result("pointnet", head=head) for head in ("fc1", "fc3", "fc3")), result()))
+    assert [one.name for one in one_per_architecture(group)] == ["PointNet", "tree-ensemble"]
+    (both,) = grouped_by_split(methods(result("trees", inputs="xyzcont"), result("trees")))
+    assert [one.name for one in one_per_architecture(both)] == ["trees on geometry and colour"]

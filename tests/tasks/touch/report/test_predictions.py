@@ -11,14 +11,14 @@ from tests.tasks.touch.report.touch_fakes import KNOWN, NOVEL, PER_OBJECT, resul
 
 
 def test_grasps_that_the_model_has_seen_are_left_out() -> None:
-    found = predictions.read(result().recordings["predictions"])
+    found = predictions.read_predictions(result().recordings["predictions"])
     assert len(found.recordings) == len(KNOWN) * PER_OBJECT
     assert "bleach-seen" not in found.recordings
     assert max(one.max() for one in found.true.values()) < 1e5
 
 
 def test_values_are_device_counts_by_target_with_electrodes_side_by_side() -> None:
-    found = predictions.read(result(off=0.1).recordings["predictions"])
+    found = predictions.read_predictions(result(off=0.1).recordings["predictions"])
     assert found.targets == biotac_sp.TARGETS
     assert found.true["e_mf"].shape == (24, 24)
     np.testing.assert_allclose(found.true["pdc_th"][:2, 0], [3040, 2860])  # 0.6 and 0.4 of 2500 to 3400
@@ -26,7 +26,7 @@ def test_values_are_device_counts_by_target_with_electrodes_side_by_side() -> No
 
 
 def test_known_and_novel_objects_are_told_apart() -> None:
-    found = predictions.read(result(novel=NOVEL).recordings["predictions"])
+    found = predictions.read_predictions(result(novel=NOVEL).recordings["predictions"])
     assert set(found.of(True).objects) == set(KNOWN)
     assert set(found.of(False).objects) == set(NOVEL)
     assert len(found.of(None).recordings) == len(found.recordings)
@@ -36,11 +36,11 @@ def test_what_a_model_does_not_foretell_is_no_target_though_its_truth_is_there()
     given = result(targets=("pdc_th", "e_th"))
     shard = given.recordings["predictions"]
     shard.tables = {**shard.tables, "true": result().recordings["predictions"].tables["true"]}
-    assert predictions.read(shard).targets == ("pdc_th", "e_th")
+    assert predictions.read_predictions(shard).targets == ("pdc_th", "e_th")
 
 
 def test_an_object_without_a_name_is_called_unnamed() -> None:
     shard = result(known=("",)).recordings["predictions"]
     grasps = shard.tables["grasps"]
     assert pa.compute.any(pa.compute.equal(grasps["object"], "")).as_py()
-    assert set(predictions.read(shard).objects) == {"unnamed"}
+    assert set(predictions.read_predictions(shard).objects) == {"unnamed"}

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from tacpipe.channels import biotac_sp
-from tacpipe.tasks.touch.report import scores, tables, wording
-from tacpipe.tasks.touch.report.methods import Result
+from tacpipe.tasks.touch.report import paper, predictions
+from tacpipe.tasks.touch.report.methods import Result, baseline_name
 from tacpipe.tasks.touch.report.predictions import Predictions
 from tests.report import parts
 from tests.tasks.touch.report.touch_fakes import KNOWN, NOVEL, result
@@ -21,7 +21,7 @@ def runs(*results: Any) -> list[Predictions]:
 
 @pytest.mark.parametrize("target", biotac_sp.TARGETS)
 def test_errors_are_shares_of_the_range_and_counts_and_skill_is_over_the_constant(target: str) -> None:
-    found = scores.score(runs(result(off=0.05)), target, True)
+    found = predictions.score(runs(result(off=0.05)), target, True)
     assert found is not None
     low, high = biotac_sp.RANGES[target]
     assert found.rmse == pytest.approx(0.05, abs=1e-6)
@@ -33,7 +33,7 @@ def test_errors_are_shares_of_the_range_and_counts_and_skill_is_over_the_constan
 
 
 def test_runs_on_the_same_grasps_are_pooled_but_claim_no_more_grasps() -> None:
-    found = scores.score(runs(result(off=0.03, seed=0), result(off=0.05, seed=1)), "pdc_th", True)
+    found = predictions.score(runs(result(off=0.03, seed=0), result(off=0.05, seed=1)), "pdc_th", True)
     assert found is not None
     assert found.rmse == pytest.approx(math.sqrt((0.03**2 + 0.05**2) / 2), abs=1e-6)
     assert found.each.mean == pytest.approx(0.04, abs=1e-6)
@@ -42,20 +42,20 @@ def test_runs_on_the_same_grasps_are_pooled_but_claim_no_more_grasps() -> None:
 
 
 def test_runs_of_other_folds_add_their_grasps() -> None:
-    found = scores.score(runs(result(), result(first=50)), "pdc_th", True)
+    found = predictions.score(runs(result(), result(first=50)), "pdc_th", True)
     assert found is not None and found.grasps == 48
 
 
 def test_a_batch_mean_is_no_larger_than_the_error_over_all() -> None:
-    found = scores.score(runs(result(off={"bleach": 0.01, "coffee": 0.05, "spam": 0.2})), "pdc_th", True)
+    found = predictions.score(runs(result(off={"bleach": 0.01, "coffee": 0.05, "spam": 0.2})), "pdc_th", True)
     assert found is not None
     assert found.batch_mean < found.rmse == pytest.approx(math.sqrt((0.01**2 + 0.05**2 + 0.2**2) / 3), abs=1e-6)
 
 
 def test_objects_are_drawn_where_they_are_novel_and_grasps_where_they_are_known() -> None:
     apart = {"bleach": 0.02, "coffee": 0.02, "spam": 0.02, "drill": 0.01, "shoe": 0.09}
-    novel = scores.score(runs(result(off=apart, novel=NOVEL)), "pdc_th", False)
-    known = scores.score(runs(result(off=apart, known=(*KNOWN, *NOVEL))), "pdc_th", True)
+    novel = predictions.score(runs(result(off=apart, novel=NOVEL)), "pdc_th", False)
+    known = predictions.score(runs(result(off=apart, known=(*KNOWN, *NOVEL))), "pdc_th", True)
     assert novel is not None and known is not None
     assert math.isnan(novel.skill.low)  # two objects show nothing of how much objects vary
     assert known.skill.high - known.skill.low < 0.5
@@ -63,21 +63,21 @@ def test_objects_are_drawn_where_they_are_novel_and_grasps_where_they_are_known(
 
 
 def test_one_novel_object_gives_no_interval() -> None:
-    found = scores.score(runs(result(novel=("drill",))), "pdc_th", False)
+    found = predictions.score(runs(result(novel=("drill",))), "pdc_th", False)
     assert found is not None and math.isnan(found.skill.low)
 
 
 def test_where_nothing_is_said_there_is_no_score() -> None:
     given = runs(result(targets=("pdc_th",)))
-    assert scores.score(given, "e_th", True) is None
-    assert scores.score(given, "pdc_th", False) is None
-    assert scores.score(given, "pdc_th", True, "nearest_in_time") is None
+    assert predictions.score(given, "e_th", True) is None
+    assert predictions.score(given, "pdc_th", False) is None
+    assert predictions.score(given, "pdc_th", True, "nearest_in_time") is None
 
 
 def test_without_a_constant_there_is_no_skill() -> None:
     given = result()
     del given.recordings["predictions"].tables["constant"]
-    found = scores.score(runs(given), "pdc_th", True)
+    found = predictions.score(runs(given), "pdc_th", True)
     assert found is not None and math.isnan(found.skill.mean)
     assert found.rmse == pytest.approx(0.05, abs=1e-6)
 
@@ -89,8 +89,8 @@ def test_baselines_come_from_the_method_of_most_runs() -> None:
         result("trees", off=0.04, baselines={"object_mean": 0.08}, seed=0),
         result("trees", off=0.04, baselines={"object_mean": 0.08}, seed=1),
     )
-    found = dict(tables.baseline_rows(methods, "pdc_th", True))
-    assert list(found) == [wording.baseline(one) for one in ("constant", "object_mean", "nearest_in_time")]
-    mean = found[wording.baseline("object_mean")]
+    found = dict(paper.baseline_rows(methods, "pdc_th", True))
+    assert list(found) == [baseline_name(one) for one in ("constant", "object_mean", "nearest_in_time")]
+    mean = found[baseline_name("object_mean")]
     assert mean is not None and mean.runs == 2 and mean.rmse == pytest.approx(0.08, abs=1e-6)
-    assert found[wording.baseline("nearest_in_time")] is None
+    assert found[baseline_name("nearest_in_time")] is None

@@ -9,12 +9,11 @@ import pytest
 
 from tacpipe.channels import biotac_sp
 from tacpipe.comparison.runs import Method
-from tacpipe.report import provenance
+from tacpipe.report import context
 from tacpipe.report.blocks import Section
 from tacpipe.tasks.touch import headline as headlines
-from tacpipe.tasks.touch.report import clouds, curves, electrodes, pressure
+from tacpipe.tasks.touch.report import NO_EVIDENCE, figures
 from tacpipe.tasks.touch.report.methods import Result
-from tacpipe.tasks.touch.report.parts import NO_EVIDENCE
 from tests.fake_recordings import FakeDataset
 from tests.report import parts
 from tests.tasks.touch.report.touch_fakes import NOVEL, recorded, result
@@ -106,7 +105,7 @@ def test_a_labs_own_grasps_get_nothing_that_the_paper_states_of_its_own(simulate
     for told in ("paper", "RGBPose, trained on", "9,000 grasps", "FC6"):
         assert told not in text, told
     assert "Number of hidden layers of the head" in text
-    assert (found.simulated, text.count(provenance.SIMULATED) > 0) == (simulated, simulated)
+    assert (found.simulated, text.count(context.SIMULATED) > 0) == (simulated, simulated)
 
 
 def test_that_an_objects_grasps_follow_one_another_is_stated_where_they_do() -> None:
@@ -154,7 +153,7 @@ def test_grasps_are_chosen_by_their_error_whatever_the_order_of_rows() -> None:
     names = [f"object{number:02d}" for number in range(11)]
     off = {name: 0.01 * (11 - number) for number, name in enumerate(names)}
     given = result(off=off, known=names, per_object=1)
-    chosen = electrodes.chosen(Result(given).predictions)
+    chosen = figures.choose_grasps(Result(given).predictions)
     assert [(one.place, one.recording) for one in chosen] == [
         ("median", "object05-000"),
         ("best decile", "object09-000"),
@@ -164,12 +163,14 @@ def test_grasps_are_chosen_by_their_error_whatever_the_order_of_rows() -> None:
     shard = given.recordings["predictions"]
     back = list(range(len(names)))[::-1]
     shard.tables = {name: table.take(back) for name, table in shard.tables.items()}
-    assert [one.recording for one in electrodes.chosen(Result(given).predictions)] == [one.recording for one in chosen]
+    assert [one.recording for one in figures.choose_grasps(Result(given).predictions)] == [
+        one.recording for one in chosen
+    ]
 
 
 def test_electrodes_are_drawn_where_they_are_with_their_values_and_errors_in_counts() -> None:
     (method,) = methods(result(off=0.05, novel=NOVEL))
-    drawn = parts.charts(electrodes.folds(method))
+    drawn = parts.charts(figures.electrode_folds(method))
     assert len(drawn) == 5  # R² on known and novel objects, three grasps
     assert (
         "RMSE 0.0500 of the range" in drawn[2].caption
@@ -181,31 +182,31 @@ def test_electrodes_are_drawn_where_they_are_with_their_values_and_errors_in_cou
     assert at[1][1] > at[10][1] and at[21][1] > at[24][1]
     panels = {row["panel"] for row in parts.values(drawn[2])}
     assert panels == {"thumb, true", "thumb, predicted", "middle finger, true", "middle finger, predicted"}
-    assert electrodes.folds(methods(result(targets=("pdc_th",)))[0]) == []
+    assert figures.electrode_folds(methods(result(targets=("pdc_th",)))[0]) == []
 
 
 def test_pressures_are_drawn_for_the_fingers_that_are_predicted() -> None:
     (method,) = methods(result(novel=NOVEL, targets=("pdc_mf", "e_mf")))
-    (chart,) = parts.charts(pressure.folds(method))
+    (chart,) = parts.charts(figures.pressure_folds(method))
     assert chart.title == "PDC middle finger" and "40 unseen grasps" in chart.caption
     assert len(parts.values(chart)) == 40 and "drill (novel)" in {row["name"] for row in parts.values(chart)}
 
 
 def test_a_cloud_is_drawn_with_its_grasp_and_the_chosen_ones_first() -> None:
-    (chart,) = parts.charts(clouds.folds([recorded()], {"drill-002": "median by error", "elsewhere": "best"}))
+    (chart,) = parts.charts(figures.cloud_folds([recorded()], {"drill-002": "median by error", "elsewhere": "best"}))
     assert chart.title == "drill-002 (median by error): drill"
     assert chart.caption == "2,000 points, the fingers 70 mm apart."
-    assert len(parts.values(chart)) == 2 * (clouds.POINTS + 2)  # two views, and both contacts in each
-    assert len(parts.charts(clouds.folds([recorded()], {}))) == 2
-    assert clouds.folds([], {"drill-002": "median"}) == []
+    assert len(parts.values(chart)) == 2 * (figures.POINTS + 2)  # two views, and both contacts in each
+    assert len(parts.charts(figures.cloud_folds([recorded()], {}))) == 2
+    assert figures.cloud_folds([], {"drill-002": "median"}) == []
 
 
 def test_a_dataset_without_clouds_or_grasps_is_not_read() -> None:
     given = recorded(["a"])
-    assert clouds.reads(given)
+    assert figures.holds_grasps(given)
     shard = given.recordings["a"]
     shard.tables = {name: table for name, table in shard.tables.items() if name != "grasp"}
-    assert not clouds.reads(given)
+    assert not figures.holds_grasps(given)
 
 
 def test_losses_are_of_one_target_and_the_mean_of_its_networks() -> None:
@@ -217,23 +218,23 @@ def test_losses_are_of_one_target_and_the_mean_of_its_networks() -> None:
     ]
     several = Result(run.dataset)
     several.__dict__["history"] = [*run.history, *lines]
-    assert curves.losses(several, "all", "train_loss") == [3.0, 1.5]
-    assert curves.losses(several, "all", "val_loss") == []
-    assert len(curves.losses(several, "e_th", "train_loss")) == 4
-    assert curves.losses(several, "pdc_mf", "train_loss") == []
+    assert figures.losses_by_epoch(several, "all", "train_loss") == [3.0, 1.5]
+    assert figures.losses_by_epoch(several, "all", "val_loss") == []
+    assert len(figures.losses_by_epoch(several, "e_th", "train_loss")) == 4
+    assert figures.losses_by_epoch(several, "pdc_mf", "train_loss") == []
 
 
 def test_figure_8_is_of_the_papers_network_trained_longest() -> None:
     heads = (("fc3", 3), ("fc1", 8))
     given = [result("pointnet", head=head, epochs=epochs, targets=("pdc_th",)) for head, epochs in heads]
-    (chart,) = curves.figure_8(methods(*given, result(epochs=20)))
+    (chart,) = figures.figure_8(methods(*given, result(epochs=20)))
     assert "PointNet · head fc1" in chart.title and "paper schedule" in chart.caption
-    assert curves.figure_8(methods(result(epochs=20))) == []
+    assert figures.figure_8(methods(result(epochs=20))) == []
 
 
 def test_losses_without_validation_grasps_are_reported_as_such() -> None:
     watched, unwatched = result(epochs=3), result(epochs=3)
     unwatched.files["config.json"] = unwatched.files["config.json"].replace(b'"val": 10', b'"val": 0')
-    drawn = [curves.charts_of(methods(one))[0] for one in (watched, unwatched)]
-    assert [curves.UNWATCHED in one.caption for one in drawn] == [False, True]
-    assert curves.charts_of(methods(result())) == []
+    drawn = [figures.loss_charts(methods(one))[0] for one in (watched, unwatched)]
+    assert [figures.UNWATCHED in one.caption for one in drawn] == [False, True]
+    assert figures.loss_charts(methods(result())) == []

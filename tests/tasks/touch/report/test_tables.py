@@ -6,7 +6,7 @@ from typing import Any
 
 from tacpipe.comparison.runs import Method
 from tacpipe.report.blocks import Section, Table
-from tacpipe.tasks.touch.report import forms, generalisation, tables
+from tacpipe.tasks.touch.report import paper
 from tests.report import parts
 from tests.tasks.touch.report.touch_fakes import NOVEL, result
 
@@ -60,7 +60,7 @@ def test_baselines_have_their_group_and_other_ones_rows_of_their_own() -> None:
 
 def test_each_object_is_told_beside_its_mean_and_novel_ones_have_none() -> None:
     off = {"bleach": 0.02, "coffee": 0.05, "spam": 0.2, "drill": 0.11, "shoe": 0.05}
-    (found,) = tables.by_object(methods(result(off=off, novel=NOVEL, **PDC)))
+    (found,) = paper.tables_by_object(methods(result(off=off, novel=NOVEL, **PDC)))
     assert parts.cells(found, "bleach") == ["8", "0.0200 | 0.0800", "+0.800"]
     assert parts.cells(found, "spam") == ["8", "0.2000 | 0.0800", "−1.000"]
     assert parts.cells(found, "drill (novel)") == ["8", "0.1100", "−0.100"]
@@ -80,7 +80,7 @@ def test_table_1_holds_heads_beside_the_papers_and_baselines() -> None:
         for head, offs in {"fc1": (0.06, 0.08), "fc3": (0.04,)}.items()
         for seed, off in enumerate(offs)
     ]
-    given_parts = forms.parts(methods(*given))
+    given_parts = paper.setting_tables(methods(*given))
     (found,) = parts.tables(given_parts)
     row = parts.cells(found, "FC1: 1024")
     assert row[:2] == ["0.0700 ± 0.0141", "63"]
@@ -95,14 +95,14 @@ def test_table_1_holds_heads_beside_the_papers_and_baselines() -> None:
 
 
 def test_a_table_of_one_row_and_one_of_other_networks_is_not_told() -> None:
-    assert forms.parts(methods(result("pointnet", **PDC), result(head="fc1", **PDC))) == []
+    assert paper.setting_tables(methods(result("pointnet", **PDC), result(head="fc1", **PDC))) == []
     both = [result("pointnet", head="fc1", epochs=9, **PDC), result("pointnet", head="fc2", points=250, **PDC)]
-    assert forms.parts(methods(*both)) == []  # they differ in more than the head
+    assert paper.setting_tables(methods(*both)) == []  # they differ in more than the head
 
 
 def test_only_runs_on_the_same_split_are_rows_of_one_table() -> None:
     given = [result("pointnet", head=f"fc{n}", split=f"split {n}", **PDC) for n in (1, 2)]
-    assert forms.parts(methods(*given)) == []
+    assert paper.setting_tables(methods(*given)) == []
 
 
 def test_a_quick_schedule_is_told_beside_the_papers() -> None:
@@ -110,12 +110,14 @@ def test_a_quick_schedule_is_told_beside_the_papers() -> None:
     for one in given:
         one.files["config.json"] = one.files["config.json"].replace(b'"epochs": 250', b'"epochs": 30')
     assert "2 runs: quick (30 epochs in batches of 10, learning rate 0.01; the paper: 250, 10, 0.01)" in parts.words(
-        forms.parts(methods(*given))
+        paper.setting_tables(methods(*given))
     )
 
 
 def test_table_2_holds_numbers_of_points_beside_the_papers() -> None:
-    found = parts.tables(forms.parts(methods(*(result("pointnet", points=points, **PDC) for points in (250, 750)))))
+    found = parts.tables(
+        paper.setting_tables(methods(*(result("pointnet", points=points, **PDC) for points in (250, 750))))
+    )
     assert parts.cells(found, "250 points")[-3:] == ["1", "0.03010 ± 0.00105", "8"]
     assert parts.cells(found, "500 points")[-3:] == ["–", "0.02790 ± 0.00115", "14"]
 
@@ -127,7 +129,7 @@ def test_tables_3_and_4_and_figure_9_vary_one_setting_each() -> None:
         *(result("pointnet", rotation_deg=angle, **PDC) for angle in (45.0, 180.0)),
         *(result("pointnet", inputs=name, wrist="estimated", **PDC) for name in ("xyz", "rgbpose")),
     ]
-    blocks = forms.parts(methods(*given))
+    blocks = paper.setting_tables(methods(*given))
     found, text = parts.tables(blocks), parts.words(blocks)
     assert [name in text for name in ("Table I ", "Table II ", "Table III ", "Table IV ", "Figure 9 ")] == [
         False,
@@ -145,14 +147,14 @@ def test_tables_3_and_4_and_figure_9_vary_one_setting_each() -> None:
 
 def test_simulated_tables_say_so() -> None:
     text = parts.words(
-        forms.parts(methods(*(result("pointnet", head=f"fc{n}", simulated=True, **PDC) for n in (1, 2))))
+        paper.setting_tables(methods(*(result("pointnet", head=f"fc{n}", simulated=True, **PDC) for n in (1, 2))))
     )
     assert "(simulated)" in text and "nothing here is evidence about a real sensor" in text
 
 
 def test_figures_10_and_11_tell_known_beside_novel_objects_and_the_change() -> None:
     off = {"bleach": 0.04, "coffee": 0.04, "spam": 0.04, "drill": 0.06, "shoe": 0.06}
-    blocks = generalisation.parts(methods(result("pointnet", off=off, novel=NOVEL, baselines=BASELINES)))
+    blocks = paper.generalisation_tables(methods(result("pointnet", off=off, novel=NOVEL, baselines=BASELINES)))
     found, text = parts.tables(blocks), parts.words(blocks)
     row = parts.cells(found, "PDC thumb")
     assert row[0] == "0.0400 | 36 counts"
@@ -171,10 +173,10 @@ def test_known_and_novel_objects_may_come_from_other_splits_of_the_same_network(
     two = ("pdc_th", "pdc_mf")
     known = result("pointnet", split="folds", targets=two)
     novel = result("pointnet", split="all known", known=(), novel=NOVEL, off=0.06, targets=two)
-    assert parts.cells(parts.tables(generalisation.parts(methods(known, novel))), "PDC thumb")[6] == "+20"
+    assert parts.cells(parts.tables(paper.generalisation_tables(methods(known, novel))), "PDC thumb")[6] == "+20"
     other = result("pointnet", split="all known", known=(), novel=NOVEL, head="fc1", targets=two)
-    assert generalisation.parts(methods(known, other)) == []
+    assert paper.generalisation_tables(methods(known, other)) == []
 
 
 def test_one_target_alone_is_no_table_of_targets() -> None:
-    assert generalisation.parts(methods(result("pointnet", novel=NOVEL, **PDC))) == []
+    assert paper.generalisation_tables(methods(result("pointnet", novel=NOVEL, **PDC))) == []

@@ -57,7 +57,7 @@ def test_coverage_is_pooled_over_runs_and_certain_by_grasp_or_by_novel_object() 
     several = pd.concat([rows(0), rows(1)])
     for known, cluster in ((True, "recording"), (False, "object")):
         some = several[several.known == known]
-        one = uncertainty.measured(some, known)["e_mf", "model"]
+        one = uncertainty.measure_bands(some, known)["e_mf", "model"]
         own = some[(some.target == "e_mf") & (some.predictor == "model")]
         assert one.values == len(own) == 2 * 2 * 10 * 24
         assert one.coverage[0] == own.covered.mean()

@@ -1,0 +1,344 @@
+"""Draw single runs: errors by step, traces of recordings, losses by epoch."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tacpipe.arrays import AnyFloats
+from tacpipe.comparison.runs import MODEL, Method, Run
+from tacpipe.report import blocks, charts
+from tacpipe.report.blocks import Cell, Chart, Charts, Fold, Note, Table, counted, fold, number, table
+from tacpipe.report.charts import Line
+from tacpipe.report.context import Context, loss_chart, median_run
+from tacpipe.tasks.forward import headline, units
+from tacpipe.tasks.forward.report import methods
+
+if TYPE_CHECKING:
+    from tacpipe.datasets.dataset import Recording
+
+
+Tree = Mapping[str, Any]
+OFF_SCALE = ("context_mean", "train_mean")  # so far off that the others would lie on one line
+EXPLAINED = {
+    "model": "the trained model",
+    "persistence": "nothing changes: the last frame is held",
+    "codec_persistence": "the last frame is held after going through the codec",
+    "codec": "the true future through the codec, which is what compression alone costs",
+    "model_anchored": "the model's forecast, moved so that it continues from the last frame",
+    "codec_anchored": "the true future through the codec, moved so that it continues from the last frame",
+    "context_mean": "the mean of the frames the model reads",
+    "train_mean": "the mean of the training recordings",
+    "damped_trend": "the last frames' trend continues and fades",
+    "last_value_linear": "a linear map of the frames the model reads, the last frame taken off them",
+    "ridge": "ridge regression of the changes to come on those of the frames the model reads",
+    "ridge_actions": "the same with the planned motion",
+}
+
+
+def run_folds(method: str, run: Run) -> list[Fold]:
+    """Return the errors of a run of a method; nothing where the result holds no errors by step."""
+    metrics, unit = run.details.metrics, units.of_model(run.details.config)
+    names = _ordered_predictors(metrics)
+    if not names:
+        return []
+    notes = [Note(text) for text in (_describe_floor(metrics, unit), _describe_seen(metrics)) if text]
+    return fold(
+        f"In full: {method}",
+        *notes,
+        *_rmse_charts(run, names, unit),
+        *_error_tables(metrics, names, unit),
+        about="one run, each predictor and step",
+    )
+
+
+def predictor_title(predictor: str) -> str:
+    """Return a name of ``metrics.json`` as texts have it."""
+    return predictor.replace("_", " ")
+
+
+def _rmse_charts(run: Run, names: Sequence[str], unit: str) -> list[Chart]:
+    metrics, rate_hz = run.details.metrics, float(run.details.config.get("rate_hz") or 0)
+    steps = sorted(int(name[1:]) for name in _both_groups(metrics[names[0]]["mse_counts"]) if name != "mean")
+    x = [1000 * step / rate_hz if rate_hz else float(step) for step in steps]
+    lines = [
+        Line(
+            predictor_title(name),
+            x,
+            [float(np.sqrt(_both_groups(metrics[name]["mse_counts"])[f"t{step}"])) for step in steps],
+            dashed=name != MODEL,
+        )
+        for name in names
+        if name not in OFF_SCALE
+    ]
+    ahead = f"time ahead ({'ms' if rate_hz else 'steps'})"
+    return [
+        Chart(
+            "Error of each predictor by time ahead",
+            charts.lines(lines, ahead, f"root mean squared error ({unit})"),
+            "All channels, unseen recordings.",
+        )
+    ]
+
+
+def _error_tables(metrics: Tree, names: Sequence[str], unit: str) -> list[Table]:
+    groups = metrics[names[0]]["mae_counts"]
+    steps = [f"t{step}" for step in headline.STEPS if f"t{step}" in _both_groups(groups)] + ["mean"]
+    heads = ["", *(name.replace("t", "t+") if name != "mean" else name for name in steps)]
+
+    def cells(errors: Tree) -> list[Cell]:
+        return [number(errors[step]) for step in steps]
+
+    errors = {"mae_counts": f"Mean absolute error ({unit})", "mse_counts": f"Mean squared error ({unit}²)"}
+    tables = [
+        table(title, heads, [[predictor_title(name), *cells(_both_groups(metrics[name][measure]))] for name in names])
+        for measure, title in errors.items()
+    ]
+    rows: list[Sequence[str | Cell]] = [
+        [predictor_title(name), *cells(metrics[name]["mse_feature"])]
+        for name in names
+        if "mse_feature" in metrics[name]
+    ]
+    tables += [table("Mean squared error (latents scaled to ±1)", heads, rows)] if rows else []
+    rows = [
+        [measure, *(_error_cell(skill.get(step, {})) for step in steps)] for measure, skill in metrics["skill"].items()
+    ]
+    tables.append(table("Skill over persistence, with 95 % interval", heads, rows))
+    rows = [
+        [f"{predictor_title(name)}, {group}", *cells(metrics[name]["mae_counts"][group])]
+        for group in groups
+        if group not in ("both", "all")
+        for name in names[:2]
+    ]
+    tables.append(table(f"Mean absolute error by sensor and axis ({unit})", heads, rows))
+    rows = []
+    for name in ("known", "unseen"):
+        part = metrics.get(name, {})
+        if "skill" in part:
+            objects = f"{name} objects ({counted(part['counts']['recordings'], 'recordings')})"
+            rows += [
+                [
+                    f"{objects}, {predictor_title(predictor)} ({unit})",
+                    *cells(_both_groups(part[predictor]["mae_counts"])),
+                ]
+                for predictor in _ordered_predictors(part)[:2]
+            ]
+            rows.append([f"{objects}, skill", *(_error_cell(_without_summary(part).get(step, {})) for step in steps)])
+    return (
+        [*tables, table("Known objects and unseen ones: mean absolute error, and skill", heads, rows)]
+        if rows
+        else tables
+    )
+
+
+def _describe_floor(metrics: Tree, unit: str) -> str:
+    """Return a warning where the codec alone loses more than persistence errs, empty otherwise."""
+    if "codec" not in metrics:
+        return ""
+    floor, baseline = (_both_groups(metrics[name]["mse_counts"]) for name in ("codec", "persistence"))
+    steps = sorted(int(name[1:]) for name in floor if name != "mean")
+    lost = [step for step in steps if floor[f"t{step}"] >= baseline[f"t{step}"]]
+    if not lost:
+        return ""
+    steps_text = "at every step" if lost == steps else f"up to t+{max(lost)}"
+    return (
+        f"The codec alone loses more than persistence errs {steps_text} (squared error of the true future through the "
+        f"codec: {number(floor['mean']).text} {unit}² on average), so a model of its latents can hardly win there in {unit}."
+    )
+
+
+def _describe_seen(metrics: Tree) -> str:
+    """Return the errors on recordings that the model was trained on, which prove nothing."""
+    described = _without_summary(metrics.get("seen", {})).get("mean", {})
+    if "mean" not in described:
+        return ""
+    count = counted(metrics["seen"]["counts"]["recordings"], "recordings")
+    mean = blocks.signed(described["mean"])
+    return f"Left out: {count} that the model was trained or stopped on; its mean skill on these is {mean}."
+
+
+def _without_summary(part: Tree) -> Tree:
+    """Return the skill that ratios of single recordings give; the pooled one of results of before this was measured."""
+    skills: Tree = part.get("skill", {})
+    scores: Tree = skills.get(headline.GEOMETRIC, skills.get("mse_counts", {}))
+    return scores
+
+
+def _error_cell(interval_tree: Tree) -> Cell:
+    return (
+        blocks.interval(interval_tree["mean"], interval_tree.get("low", np.nan), interval_tree.get("high", np.nan))
+        if "mean" in interval_tree
+        else Cell("not defined")
+    )
+
+
+def _both_groups(scores: Tree) -> Tree:
+    """Return the errors over all channels; results of before this was called ``both`` call it ``all``."""
+    group: Tree = scores["both"] if "both" in scores else scores["all"]
+    return group
+
+
+def _ordered_predictors(metrics: Tree) -> list[str]:
+    """Return the names of model and baselines, model first, then persistence."""
+    predictors = [
+        name
+        for name, scores in metrics.items()
+        if name != "skill" and isinstance(scores, Mapping) and "mse_counts" in scores
+    ]
+    order = list(EXPLAINED)
+    return sorted(predictors, key=lambda name: (order.index(name) if name in order else len(order), name))
+
+
+SHOWN_S = 12.0  # seconds of a recording that are drawn
+TRUTH = "truth now"
+UNSHIFTED = (
+    "Each prediction stands at the time at which it was known: one that sees ahead runs left of the truth, "
+    "persistence lies on it. Long recordings are drawn from their first seconds, thinned to what can be seen."
+)
+
+
+def draw_traces(
+    shard: Recording, latents: Sequence[int], steps: Sequence[int], title: str, caption: str = "", *, unit: str = ""
+) -> list[Chart]:
+    """Return the first seconds of some latents of a recording, by their place from 0, and what was predicted of them.
+
+    ``unit`` is that of latents which are the channels themselves. Latents and steps that the recording does not hold are
+    left out.
+    """
+    table = shard.table()
+    if not table.num_rows:
+        return []
+    time_s = (table.column("t_ns").to_numpy() - table.column("t_ns")[0].as_py()) / 1e9
+    time_s = time_s[time_s <= SHOWN_S]
+    broken = np.concatenate([[False], np.diff(table.column("contact").to_numpy()) != 0])
+    latent_names = [name for name in table.column_names if f"{name}_t1" in table.column_names]
+
+    def values(name: str) -> AnyFloats:
+        column: AnyFloats = table.column(name).to_numpy().astype(np.float64)
+        column[broken] = np.nan
+        return column[: len(time_s)]
+
+    drawn = []
+    for latent in (latent_names[index] for index in latents if index < len(latent_names)):
+        ahead = [step for step in steps if f"{latent}_t{step}" in table.column_names]
+        lines = [Line(TRUTH, time_s, values(latent))]
+        lines += [Line(f"t+{step}", time_s, values(f"{latent}_t{step}"), dashed=True) for step in ahead]
+        quantity = f"{latent} ({unit})" if unit else latent
+        spec = charts.lines(lines, "time at which the prediction is known (s)", quantity, points=False, height=170)
+        drawn.append(Chart(f"{title}: {latent}", spec, caption, wide=True))
+    return drawn
+
+
+TRACE_STEPS = (1, 5, 10)
+LOSS_NAMES = {"training": "train_loss", "validation": "val_loss"}
+
+
+def paper_representative(context: Context) -> Method | None:
+    """Return the paper's method where the recordings are the paper's."""
+    return methods.paper_method(context.methods) if context.published else None
+
+
+def _representatives(context: Context) -> list[tuple[Method, Run]]:
+    """Return a median run of the best method of the last part, and of the paper's: those that are shown singly."""
+    compared = [candidate for candidate in context.comparisons if candidate.best]
+    last = next(
+        (candidate for candidate in reversed(compared) if candidate.question.place < 2), next(iter(compared), None)
+    )  # the main timeline
+    if last is None or last.best is None:
+        return []
+    chosen = [candidate for candidate in (last.best.method, paper_representative(context)) if candidate]
+    if len(context.runs) <= 2:
+        chosen += list(context.methods)
+    by_name = {
+        candidate.name: (
+            candidate,
+            median_run(
+                candidate, next(comparison for comparison in context.comparisons if candidate.of(comparison.question))
+            ),
+        )
+        for candidate in chosen
+    }
+    return list(by_name.values())
+
+
+def prediction_folds(context: Context) -> list[Fold]:
+    """Return what was predicted next to what came, of recordings of median, lowest and highest skill, and the paper's."""
+    drawn = []
+    for method, run in _representatives(context):
+        ranked = ranked_trials(run)
+        places = {"median": len(ranked) // 2, "lowest": 0, "highest": len(ranked) - 1}
+        rank_by_name = {ranked[at][1]: (rank, ranked[at][0]) for rank, at in reversed(places.items()) if ranked}
+        for name, (rank, skill) in list(reversed(rank_by_name.items()))[: context.traces]:
+            caption = f"The recording of {rank} skill ({blocks.signed(skill)}) of {method.name}."
+            drawn += draw_traces(
+                run.dataset.recordings[name], (0, 1), TRACE_STEPS, name, caption, unit=_unit_of_run(run)
+            )
+    return fold("Predictions next to the truth", *drawn, *_paper_traces(context), Note(UNSHIFTED) if drawn else None)
+
+
+def _unit_of_run(run: Run) -> str:
+    """Return the unit of the latents of a run: that of the channels where they are not compressed, else none."""
+    config = run.details.config
+    return units.of_model(config) if config["codec"]["kind"] == "raw" else "latent units"
+
+
+def _paper_traces(context: Context) -> list[Chart]:
+    """Return Figures 5 and 6 of the paper: the first two components, and the second and fourth latent of AE-C1."""
+    choices = (
+        ("PCA", (0, 1), "Figure 5 in the paper's form: the first two principal components"),
+        ("AE-C1", (1, 3), "Figure 6 in the paper's form: the second and the fourth latent of AE-C1"),
+    )
+    drawn: list[Chart] = []
+    for row, latents, title in choices if context.published else ():
+        trace_charts = [
+            method
+            for method in context.methods
+            if methods.is_recurrent(method) and methods.paper_row(method.runs[0].details.config["codec"]) == row
+        ]
+        for method in trace_charts[:1]:
+            evaluated = next((comparison for comparison in context.comparisons if method.of(comparison.question)), None)
+            run = median_run(method, evaluated) if evaluated else method.runs[0]
+            ranked = ranked_trials(run)
+            if ranked:
+                name = ranked[len(ranked) // 2][1]
+                caption = f"{name}, the recording of median skill of {method.name}."
+                drawn += draw_traces(
+                    run.dataset.recordings[name], latents, (3, 5, 10), title, caption, unit=_unit_of_run(run)
+                )
+    return drawn
+
+
+def ranked_trials(run: Run) -> list[tuple[float, str]]:
+    """Return skill and name of the recordings that the model has not seen, of the predictions that a result holds."""
+    text = run.dataset.files.get("trials.csv", b"").decode()
+    return sorted(
+        (float(trial["skill"]), trial["recording"])
+        for trial in csv.DictReader(io.StringIO(text))
+        if trial["seen"] == "false" and trial["skill"] and trial["recording"] in run.dataset.recordings
+    )
+
+
+def training_folds(context: Context) -> list[Fold]:
+    """Return training and validation loss by epoch of the representative runs."""
+    drawn = []
+    for method, run in _representatives(context):
+        history = run.details.history
+        if not history:
+            continue
+        best = min(history, key=lambda line: line["val_loss"])
+        curves = {name: [[epoch[key] for epoch in history]] for name, key in LOSS_NAMES.items()}
+        spec = {**loss_chart(curves, "loss (scaled latents)", log=True), "height": 190}
+        selected = (
+            f"{len(history)} epochs; the weights of epoch {best['epoch']} were kept, whose validation loss is lowest."
+        )
+        drawn.append(Chart(f"Loss by epoch: {method.name}", spec, selected))
+    return fold("Training", Charts(drawn)) if drawn else []
+
+
+def single_run_folds(context: Context) -> list[Fold]:
+    """Return the errors of representative runs in full, by predictor and step."""
+    return [run_fold for method, run in _representatives(context) for run_fold in run_folds(method.name, run)]

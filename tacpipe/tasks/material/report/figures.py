@@ -1,0 +1,389 @@
+"""Draw confusions, training, latents and typical slides."""
+
+from __future__ import annotations
+
+import functools
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tacpipe.arrays import AnyFloats, Ints
+from tacpipe.comparison.runs import Method
+from tacpipe.report import blocks, charts
+from tacpipe.report.blocks import Chart, Charts, Fold, Note, counted, fold, form, listed
+from tacpipe.report.charts import Line
+from tacpipe.report.context import Context, curves_of_methods, is_published, loss_chart, without_gaps
+from tacpipe.tasks.material.report import scores
+from tacpipe.tasks.material.report.methods import (
+    Result,
+    has_usual_settings,
+    method_title,
+    ordered_sensors,
+    runs_on,
+    sensor_title,
+    sensors_of,
+)
+from tacpipe.tasks.material.report.predictions import MODEL, NOTHING, Predictions
+from tacpipe.tasks.material.report.scores import accuracy
+
+if TYPE_CHECKING:
+    from tacpipe.datasets.dataset import Dataset, Recording
+
+
+MOST_PAIRS = 3  # pairs of materials in words
+CONFUSION_NOTE = (
+    "Unseen slides. Blue: named right; orange: wrong. The stronger, the larger the fraction of a material's slides."
+)
+
+
+def confusion_folds(context: Context) -> list[Fold]:
+    """Return the confusions of the best method and of the joint one, a chart a sensor."""
+    drawn = []
+    joint = scores.main_method(context.methods)
+    for sensor in sensors_of([method for method in context.methods if has_usual_settings(method.settings)]):
+        compared = next(
+            (method for method in context.comparisons if method.question.part == sensor_title(sensor)), None
+        )
+        best = compared.best.method if compared and compared.best else None
+        chosen = dict.fromkeys(method for method in (best, joint) if method and runs_on(method, sensor))
+        drawn += [_confusion_chart(method, sensor) for method in chosen]
+    return fold("Which materials are confused", Charts(drawn), Note(CONFUSION_NOTE)) if drawn else []
+
+
+def count_confusions(method: Method, sensor: str) -> tuple[Ints, list[int] | list[str]]:
+    """Return how often each material was taken for each, pooled over runs, (material, named), and the materials."""
+    import pandas as pd
+
+    tables = []
+    for run in runs_on(method, sensor):
+        rows = run.details.predictions.of(sensor)
+        described = rows.predicted[MODEL] != NOTHING
+        truth, answers = (rows.named(numbers[described]) for numbers in (rows.materials, rows.predicted[MODEL]))
+        tables.append(pd.DataFrame({"truth": truth, "named": answers}))
+    rows_of_runs = pd.concat(tables)
+    materials = sorted({*rows_of_runs["truth"], *rows_of_runs["named"]})
+    counts = pd.crosstab(rows_of_runs["truth"], rows_of_runs["named"]).reindex(
+        index=materials, columns=materials, fill_value=0
+    )
+    return counts.to_numpy(dtype=np.int64), materials
+
+
+def describe_worst(counts: Ints, materials: Sequence[int | str]) -> str:
+    """Return the materials most often taken for another, in words."""
+    wrong = counts - np.diag(np.diag(counts))
+    order = np.argsort(-wrong, axis=None, kind="stable")[:MOST_PAIRS]
+    described = []
+    for place in order:
+        row, column = np.unravel_index(place, wrong.shape)
+        if wrong[row, column]:
+            described.append(f"{materials[row]} for {materials[column]} ({wrong[row, column]} of {counts[row].sum()})")
+    return f"Most often it takes {listed(described)}." if described else "It takes none for another."
+
+
+def _confusion_chart(method: Method, sensor: str) -> Chart:
+    counts, materials = count_confusions(method, sensor)
+    runs = len(runs_on(method, sensor))
+    label = runs_on(method, sensor)[0].details.predictions.naming.key
+    names = [str(material) for material in materials]
+    spec = {**charts.matrix(counts, names, label, "named"), "usermeta": {"most": 150 + 30 * len(names)}}
+    pooled = f", {runs} runs pooled" if runs > 1 else ""
+    caption = f"{counts.trace()} of {counts.sum()} right{pooled}. {describe_worst(counts, materials)}"
+    return Chart(f"{sensor_title(sensor)}: {method.name}", spec, caption)
+
+
+Points = dict[int, tuple[float, float, float]]  # accuracy and its bounds, by number of training slides
+
+
+def training_folds(methods: Sequence[Method]) -> list[Fold]:
+    """Return validation accuracy and latent difference by epoch."""
+    drawn = [*validation_charts(methods), *alignment_charts(methods)]
+    return blocks.fold("Training", Charts(drawn)) if drawn else []
+
+
+def validation_charts(methods: Sequence[Method]) -> list[Chart]:
+    """Return validation accuracy by epoch, Figure 9 of the paper, one chart a sensor; none without epochs."""
+    networks = [method for method in methods if has_usual_settings(method.settings)]
+    chosen = [method for family in ("RAEC joint", "RAEC independent") for method in networks if method.family == family]
+    order = [method.name for method in chosen]
+    drawn = []
+    for sensor in sensors_of(chosen):
+        loss_curves = curves_of_methods(chosen, functools.partial(_validation_by_epoch, sensor=sensor))
+        if loss_curves:
+            spec = loss_chart(loss_curves, "validation accuracy (%)", order)
+            title = blocks.form(
+                "Figure 9", f"validation accuracy on {sensor_title(sensor)}", all(method.published for method in chosen)
+            )
+            drawn.append(Chart(title, spec, "Thick: mean over runs; thin: single runs."))
+    return drawn
+
+
+def alignment_charts(methods: Sequence[Method]) -> list[Chart]:
+    """Return Figure 10 in the paper's form: how far the sensors' latents of a pair are apart; none where none is given."""
+    chosen = [
+        method
+        for method in methods
+        if (has_usual_settings(method.settings) or scores.is_control(method)) and method.settings["joint"]
+    ]
+    loss_curves = curves_of_methods(chosen, alignment_by_epoch)
+    if not loss_curves:
+        return []
+    spec = loss_chart(loss_curves, "mean squared latent difference", log=True)
+    title = blocks.form("Figure 10", "latent difference of training pairs", all(method.published for method in chosen))
+    caption = ""
+    if any(scores.is_control(method) for method in chosen):
+        caption = "Pairs of permuted materials fall as real ones do where labels alone drive the alignment."
+    return [Chart(title, spec, caption)]
+
+
+def alignment_by_epoch(run: Result) -> list[float]:
+    """Return the mean squared latent difference of training pairs by epoch; NaN where an epoch does not state it."""
+    return without_gaps([epoch.get("alignment") for epoch in run.history])
+
+
+def few_slides_folds(methods: Sequence[Method]) -> list[Fold]:
+    """Return accuracy over the number of training slides, a chart a sensor; none where all have as many."""
+    chosen = [candidate for candidate in methods if has_usual_settings(candidate.settings, "few", "subsample_sensor")]
+    drawn = []
+    for sensor in sensors_of(chosen):
+        points: dict[str, Points] = {}
+        for method in chosen:
+            fewer = {method.settings["subsample_sensor"], method.settings["few_of"]} - {""}
+            if fewer <= {sensor}:
+                _add_points(points, method_title(method), method, sensor)
+            if fewer == {sensor}:  # such a line ends where all sensors have all slides
+                loose = ("few", "few_of", "subsample_sensor", "subsample_percent")
+                for candidate in chosen:
+                    if has_usual_settings(candidate.settings) and candidate.key_without(*loose) == method.key_without(
+                        *loose
+                    ):
+                        _add_points(points, method_title(method), candidate, sensor)
+        drawn_points = {name: candidate for name, candidate in sorted(points.items()) if len(candidate) > 1}
+        if drawn_points:
+            lines = []
+            for name, counts_and_accuracies in drawn_points.items():
+                slides = sorted(counts_and_accuracies)
+                mean, low, high = (
+                    [100 * value for value in part]
+                    for part in zip(*(counts_and_accuracies[at] for at in slides), strict=True)
+                )
+                lines.append(Line(name, slides, mean, low, high))
+            chance = 100 / max(len(chosen[0].details[0].config.get("classes", ())), 1)
+            spec = charts.lines(lines, "training slides", "accuracy (%)", level=("chance", chance))
+            caption = "Unseen slides, with 95 % intervals; dashed across: chance."
+            if any("other sensor whole" in name for name in drawn_points):
+                caption += " Other sensor whole: this one alone has fewer."
+            if any("fixed batches" in name for name in drawn_points):
+                caption += " Fixed batches: the same in every epoch, of which a sensor learns from a share."
+            drawn.append(Chart(f"Accuracy on {sensor_title(sensor)} by number of training slides", spec, caption))
+    return blocks.fold("Few slides", Charts(drawn)) if drawn else []
+
+
+def _add_points(points: dict[str, Points], name: str, method: Method, sensor: str) -> None:
+    """Add what a method states to a line."""
+    counted = accuracy(runs_on(method, sensor), sensor)
+    if counted is None:
+        return
+    described = [run.details.learned[sensor] for run in runs_on(method, sensor) if sensor in run.details.learned]
+    if described:
+        points.setdefault(name, {})[max(described)] = (counted.fraction, counted.low, counted.high)
+
+
+def _validation_by_epoch(run: Result, sensor: str) -> list[float]:
+    """Return the validation accuracy on a sensor's slides by epoch, in percent; empty where none is given."""
+    accuracies = [epoch.get("val", {}).get(sensor, {}).get("accuracy") for epoch in run.history]
+    return [100 * value for value in without_gaps(accuracies)]
+
+
+LATENT_NOTE = (
+    "Latents of unseen slides on their first two principal components, both sensors together: a colour is a material, whose "
+    "name is at the mean of the first sensor's slides. A line leads from there to the mean of the other sensor's "
+    "slides of the material that it was paired with, so short lines are what alignment makes. Where permuted pairs have "
+    "lines as short, that sensors lie together is not evidence that they measure the same."
+)
+
+
+def latent_folds(methods: Sequence[Method]) -> list[Fold]:
+    """Return a chart each of a joint run, of the control and of two independent ones; nothing without joint latents."""
+    main = scores.main_method(methods)
+    if main is None:
+        return []
+    chosen = main, scores.permuted_method(methods, main), scores.independent_method(methods, main)
+    drawn = [chart for method in chosen if method and (chart := _latent_chart(method))]
+    return fold("Latents", Charts(drawn), Note(LATENT_NOTE)) if drawn else []
+
+
+def project_on_plane(parts: Sequence[AnyFloats]) -> list[AnyFloats]:
+    """Return points of several sets, each (slide, latent), on the first two principal components of all, (slide, 2).
+
+    Of the two directions of a component the one is taken in which its largest weight is positive.
+    """
+    stacked = np.vstack(parts)
+    centre = stacked.mean(axis=0)
+    axes = np.linalg.svd(stacked - centre, full_matrices=False)[2][:2]  # (component, latent)
+    axes *= np.sign(axes[np.arange(len(axes)), np.abs(axes).argmax(axis=1)])[:, None]
+    return [(part - centre) @ axes.T for part in parts]
+
+
+def count_nearest_partners(first: Predictions, second: Predictions, partners: Mapping[int, int]) -> tuple[int, int]:
+    """Return of how many materials the nearest mean among the other's is that of its partner, and of how many.
+
+    All latents count. ``partners`` has the other sensor's material of each; one that is not in it is its own.
+    """
+    first_materials, second_materials = np.unique(first.materials), np.unique(second.materials)
+    means = [
+        np.array([_latents_of(part)[part.materials == name].mean(axis=0) for name in names])
+        for part, names in ((first, first_materials), (second, second_materials))
+    ]
+    distances = np.linalg.norm(means[0][:, None] - means[1][None], axis=2)  # (material, material of the other)
+    partner_names = [partners.get(int(name), int(name)) for name in first_materials]
+    is_nearest = [
+        near == name
+        for near, name in zip(second_materials[distances.argmin(axis=1)], partner_names, strict=True)
+        if name in second_materials
+    ]
+    return int(sum(is_nearest)), len(is_nearest)
+
+
+def _latent_chart(method: Method) -> Chart | None:
+    """Return the latents of one run of a method, or of one a sensor where each has its own model."""
+    rows = _paired_predictions(method.details)
+    if rows is None:
+        return None
+    sensors, parts = rows
+    points = project_on_plane([_latents_of(part) for part in parts])
+    partners = {
+        int(material): int(partner) for material, partner in method.details[0].config.get("partners", {}).items()
+    }
+    same, count = count_nearest_partners(parts[0], parts[1], partners)
+    dots = [
+        {"name": str(name), "x": float(x), "y": float(y), "shape": sensor_title(sensor), "tip": str(recording)}
+        for sensor, part, at in zip(sensors, parts, points, strict=True)
+        for name, recording, (x, y) in zip(part.named(part.materials), part.recordings, at, strict=True)
+    ]
+    spec = charts.scatter(
+        dots,
+        "first principal component",
+        "second principal component",
+        shapes=[sensor_title(sensor) for sensor in sensors],
+        legend=False,
+    )
+    spec["layer"].append(charts.joined(_latent_rows(points, parts, partners)))
+    partner_text = "the material that it was paired with" if partners else "the same material"
+    caption = f"For {same} of {count} materials, the other sensor's nearest mean is {partner_text}."
+    return Chart(f"{method.name}: latents of both sensors", spec, caption)
+
+
+def _latent_rows(
+    points: Sequence[AnyFloats], parts: Sequence[Predictions], partners: Mapping[int, int]
+) -> list[tuple[str, AnyFloats, AnyFloats]]:
+    """Return the name of each material, the mean of the first sensor's slides and of its partner's by the other."""
+    means = [
+        {int(material): at[part.materials == material].mean(axis=0) for material in np.unique(part.materials)}
+        for at, part in zip(points, parts, strict=True)
+    ]
+    names = dict(zip(parts[0].materials.tolist(), parts[0].named(parts[0].materials).tolist(), strict=True))
+    return [
+        (str(names[material]), middle, means[1][partners.get(material, material)])
+        for material, middle in means[0].items()
+        if partners.get(material, material) in means[1]
+    ]
+
+
+def _paired_predictions(runs: Sequence[Result]) -> tuple[tuple[str, str], list[Predictions]] | None:
+    """Return two sensors and the rows of each, of the first run that holds both, or else of the first of each."""
+    with_latents = [run for run in runs if run.predictions.latents is not None]
+    sensors = ordered_sensors([sensor for run in with_latents for sensor in run.sensors])[:2]
+    if len(sensors) < 2:
+        return None
+    joint_run = next((run for run in with_latents if set(sensors) <= set(run.sensors)), None)
+    chosen = [joint_run or next(run for run in with_latents if sensor in run.sensors) for sensor in sensors]
+    parts = [run.predictions.of(sensor) for run, sensor in zip(chosen, sensors, strict=True)]
+    if len({_latents_of(part).shape[1] for part in parts}) > 1:
+        return None
+    return (sensors[0], sensors[1]), parts
+
+
+def _latents_of(part: Predictions) -> AnyFloats:
+    assert part.latents is not None
+    return part.latents
+
+
+SLIDE, PROFILE = "slide", "profile"
+
+
+def holds_slides(dataset: Dataset) -> bool:
+    """Return whether a dataset holds slides."""
+    return any(SLIDE in shard.streams or PROFILE in shard.streams for shard in dataset.recordings.values())
+
+
+def profile_folds(datasets: Sequence[Dataset]) -> list[Fold]:
+    """Return what slides were like; nothing without any."""
+    shards = [shard for dataset in datasets for shard in dataset.recordings.values() if holds_slides(dataset)]
+    if not shards:
+        return []
+    published = all(is_published(dataset, Result.SETS) for dataset in datasets)
+    sensors = ordered_sensors([str(shard.attributes.get("sensor", "")) for shard in shards])
+    parts = [
+        _describe_counts([shard for shard in shards if shard.attributes.get("sensor", "") == sensor], sensor)
+        for sensor in sensors
+    ]
+    drawn: list[Chart] = []
+    for sensor in sensors:
+        sensor_shards = [
+            shard for shard in shards if shard.attributes.get("sensor", "") == sensor and PROFILE in shard.streams
+        ]
+        if sensor_shards:
+            drawn += _profile_charts(typical_slide(sensor_shards), sensor, published)
+    return [Fold("The slides", [Note(" ".join(parts)), *([Charts(drawn)] if drawn else [])])]
+
+
+def typical_slide(shards: Sequence[Recording]) -> Recording:
+    """Return the slide of median force among those that kept to the protocol, or among all where none did."""
+    inside_protocol = [shard for shard in shards if not shard.attributes.get("outside_protocol")] or list(shards)
+
+    def force(shard: Recording) -> tuple[float, str]:
+        return float(shard.attributes.get("force_n") or 0.0), shard.name
+
+    return sorted(inside_protocol, key=force)[len(inside_protocol) // 2]
+
+
+def _describe_counts(shards: Sequence[Recording], sensor: str) -> str:
+    """Return how many slides there are of a sensor, and how many kept to the protocol."""
+    outside = [shard for shard in shards if shard.attributes.get("outside_protocol")]
+    slides_text = counted(len(shards), "slides")
+    if not any("outside_protocol" in shard.attributes for shard in shards):
+        return f"{slides_text} of {sensor_title(sensor)}."
+    text = f"{slides_text} of {sensor_title(sensor)}, {len(outside):,} of them outside the protocol"
+    reasons = Counter(str(shard.attributes.get("outside_protocol_why", "")) for shard in outside)
+    described = [f"{count} {reason}" for reason, count in reasons.most_common() if reason]
+    return text + (f" ({listed(described)})." if described else ".")
+
+
+def _profile_charts(shard: Recording, sensor: str, published: bool) -> list[Chart]:
+    """Return force and speed of one slide."""
+    table = shard.table(PROFILE)
+    time_ns = table["t_ns"].to_numpy()
+    time_s = (time_ns - time_ns[0]) / 1e9
+    during = time_s[table["phase"].to_numpy() == 0]
+    shade = (float(during[0]), float(during[-1])) if len(during) else None
+    profiles = (
+        ("Figure 5", f"force on {sensor_title(sensor)}", "force (N)", {"force_n": "force"}, 1.0),
+        (
+            "Figure 6",
+            f"speed on {sensor_title(sensor)}",
+            "speed (mm/s)",
+            {"speed_raw_m_s": "as measured", "speed_m_s": "median of 3"},
+            1000.0,
+        ),
+    )
+    drawn = []
+    for number, title, quantity, columns, scale in profiles:
+        lines = {label: scale * table[name].to_numpy() for name, label in columns.items() if name in table.column_names}
+        drawn_lines = [Line(label, time_s, values) for label, values in lines.items() if np.isfinite(values).any()]
+        if drawn_lines:
+            spec = charts.lines(drawn_lines, "time (s)", quantity, shade=shade, points=False, height=190)
+            caption = f"{shard.name}, the slide of median force. Shaded: the slide."
+            drawn.append(Chart(form(number, title, published), spec, caption))
+    return drawn

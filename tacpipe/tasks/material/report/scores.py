@@ -1,0 +1,218 @@
+"""Compute accuracies over slides, and what one method gains over another."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from tacpipe.comparison import engine
+from tacpipe.comparison.engine import PairedRuns, observations, paired_runs
+from tacpipe.comparison.runs import Method, Question, Run
+from tacpipe.metrics.pairing import Gain
+from tacpipe.metrics.proportions import mcnemar, wilson
+from tacpipe.report import context
+from tacpipe.report.blocks import NONE, Cell, fixed
+from tacpipe.tasks.material.report import methods
+from tacpipe.tasks.material.report.methods import has_usual_settings, question_on, runs_on
+from tacpipe.tasks.material.report.predictions import LEVEL, MODEL
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """The fraction of slides named right, pooled over runs."""
+
+    correct: int  # verdicts of all runs added
+    evaluated: int
+    slides: int  # each counted once
+    low: float  # 95 % interval over slides (Wilson)
+    high: float
+    sd: float  # over runs, NaN for a single one
+    runs: int
+
+    @property
+    def fraction(self) -> float:
+        """The fraction of slides named right."""
+        return self.correct / self.evaluated
+
+
+def accuracy(runs: Sequence[Run], sensor: str, predictor: str = MODEL) -> Accuracy | None:
+    """Return how many slides of a sensor a predictor of these runs names right; None where none states anything."""
+    named_right = slides_named_right(runs, sensor, predictor)
+    if not len(named_right):
+        return None
+    correct, evaluated, slides = int(named_right.sum()), len(named_right), named_right.index.unique("recording").size
+    by_run = named_right.groupby("run").mean()
+    low, high = wilson(round(correct / evaluated * slides), slides)
+    return Accuracy(correct, evaluated, slides, low, high, float(by_run.std()), len(by_run))
+
+
+def level_skill(runs: Sequence[Run], sensor: str, predictor: str = MODEL) -> float:
+    """Return 1 - errors / errors of the mean level, of runs that hold both; NaN where the mean level never errs.
+
+    1 is perfect, 0 no better than what the time-averaged channels state.
+    """
+    comparable = [run for run in runs if {LEVEL, predictor} <= set(run.details.predictions.predicted)]
+    counted, level = (accuracy(comparable, sensor, name) for name in (predictor, LEVEL))
+    if counted is None or level is None or level.fraction == 1:
+        return float("nan")
+    return 1 - (1 - counted.fraction) / (1 - level.fraction)
+
+
+def slides_named_right(runs: Sequence[Run], sensor: str, predictor: str = MODEL) -> pd.Series:
+    """Return whether slides were named right, 1 or 0, by run and recording."""
+    import pandas as pd
+
+    questions = {question: None for run in runs if (question := methods.question_on(run, sensor))}
+    parts = [observations(runs, question, predictor) for question in questions]
+    table = pd.concat(parts) if parts else observations((), Question(), predictor)
+    return table.set_index(["run", "recording"])["s0"] if len(table) else pd.Series(dtype=float)
+
+
+@dataclass(frozen=True)
+class Difference:
+    """What the first method has over the second on the slides that both were evaluated on."""
+
+    slides: int
+    gain: Gain  # percentage points
+    first_only: int  # slides that the first alone names right
+    second_only: int
+    mcnemar: float  # p
+    runs: PairedRuns
+
+    @property
+    def word(self) -> str:
+        """Whether the first is ``better`` or ``worse``, or that is ``unclear``."""
+        return "better" if self.gain.low > 0 else "worse" if self.gain.high < 0 else "unclear"
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two methods that a table compares."""
+
+    name: str
+    first: Method
+    second: Method
+
+
+def compare_runs(
+    first: Method, second: Method, sensor: str, predictors: tuple[str, str] = (MODEL, MODEL)
+) -> Difference | None:
+    """Return what ``first`` has over ``second`` on slides of a sensor; None where they share none.
+
+    McNemar's test takes a slide for right where at least half of a method's runs name it right.
+    """
+    runs_by_method = [runs_on(first_right, sensor) for first_right in (first, second)]
+    if not all(runs_by_method) or (question := question_on(runs_by_method[0][0], sensor)) is None:
+        return None
+    gain = engine.difference(first, second, question, predictors)
+    if not gain.clusters:
+        return None
+    first_right, second_right = (
+        slides_named_right(runs, sensor, name).groupby("recording").mean() >= 0.5
+        for runs, name in zip(runs_by_method, predictors, strict=True)
+    )
+    first_right, second_right = first_right.align(second_right, join="inner")
+    p = mcnemar(first_right.to_numpy(), second_right.to_numpy())
+    only = int((first_right & ~second_right).sum()), int((second_right & ~first_right).sum())
+    return Difference(
+        gain.clusters, gain, *only, p, paired_runs(runs_by_method[0], runs_by_method[1], question, predictors)
+    )
+
+
+def method_pairs(methods: Sequence[Method]) -> list[Pair]:
+    """Return which methods a table compares: what is asked to help, against the same without it."""
+    candidates = [candidate for candidate in methods if has_usual_settings(candidate.settings)]
+    all_pairs = []
+    for joint in (candidate for candidate in candidates if candidate.family == "RAEC joint"):
+        twins = independent_method(methods, joint), permuted_method(methods, joint)
+        all_pairs += [Pair(f"{joint.name} − {candidate.name}", joint, candidate) for candidate in twins if candidate]
+        all_pairs += [
+            Pair(f"{candidate.name} − {joint.name}", candidate, joint)
+            for candidate in candidates
+            if candidate.family == "MiniRocket"
+        ]
+    return all_pairs
+
+
+def is_control(method: Method) -> bool:
+    """Return whether a method is the negative control: trained jointly like others, its pairs of permuted materials."""
+    settings = method.settings
+    return (
+        method.family == "RAEC joint" and settings["pairing"] == "permuted" and has_usual_settings(settings, "pairing")
+    )
+
+
+def main_method(methods: Sequence[Method], family: str = "RAEC joint") -> Method | None:
+    """Return the plain method of a family that represents it where one is given: that with most runs."""
+    candidates = [
+        candidate for candidate in methods if has_usual_settings(candidate.settings) and candidate.family == family
+    ]
+    return max(candidates, key=lambda candidate: len(candidate.runs), default=None)
+
+
+def independent_method(methods: Sequence[Method], joint: Method) -> Method | None:
+    """Return the network most like a joint one that learned from one sensor alone."""
+    return nearest_method(
+        joint,
+        [method for method in methods if has_usual_settings(method.settings) and method.family == "RAEC independent"],
+    )
+
+
+def permuted_method(methods: Sequence[Method], joint: Method) -> Method | None:
+    """Return the control that is most like a joint method."""
+    return nearest_method(joint, [method for method in methods if is_control(method)])
+
+
+def nearest_method(method: Method, candidates: Sequence[Method]) -> Method | None:
+    """Return that of ``others`` that shares most settings with a method; of several the one with most runs."""
+
+    def shared(candidate: Method) -> int:
+        return sum(candidate.settings.get(name) == value for name, value in method.settings.items())
+
+    return max(candidates, key=lambda candidate: (shared(candidate), len(candidate.runs), candidate.name), default=None)
+
+
+SESSIONS = (
+    "Each material was recorded in one session, so texture cannot be distinguished from session in these data: a model that "
+    "recognises a session by its drift or its mean level is right as well."
+)
+
+
+def caution(methods: Sequence[Method]) -> str:
+    """Return what these slides cannot show, next to every table of accuracies; empty where nothing is known against them."""
+    if any(rows.simulated for rows in methods):
+        return context.SIMULATED
+    predictions = [result.predictions for rows in methods for result in rows.details]
+    return SESSIONS if predictions and all(rows.one_session_each for rows in predictions) else ""
+
+
+def format_percent(fraction: float) -> str:
+    """Return a share in percent.
+
+    >>> percent(0.995), percent(float("nan"))
+    ('99.5', '–')
+    """
+    return fixed(100 * fraction, 1)
+
+
+def accuracy_cell(counted: Accuracy | None) -> Cell:
+    """Return an accuracy and its standard deviation over runs, above what it rests on and its interval."""
+    return (
+        count_cell(counted.correct, counted.evaluated, counted.low, counted.high, counted.sd) if counted else Cell(NONE)
+    )
+
+
+def count_cell(correct: int, evaluated: int, low: float, high: float, sd: float) -> Cell:
+    """Return a share in percent, with its standard deviation where there is one, above what it rests on.
+
+    >>> counted(190, 200, 0.91, 0.97, float("nan"))
+    Cell(text='95.0', below='190/200 · 91.0 to 97.0', value=0.95, copy='')
+    """
+    spread = "" if math.isnan(sd) else f" ± {format_percent(sd)}"
+    below = f"{correct}/{evaluated} · {format_percent(low)} to {format_percent(high)}"
+    return Cell(f"{format_percent(correct / evaluated)}{spread}", below, correct / evaluated)

@@ -1,0 +1,320 @@
+"""Draw pressures, electrodes, clouds with their grasps, and losses by epoch."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tacpipe.arrays import AnyFloats
+from tacpipe.channels import biotac_sp
+from tacpipe.clouds.cloud import Cloud
+from tacpipe.clouds.grasp import Grasp
+from tacpipe.comparison.runs import Method
+from tacpipe.metrics import regression
+from tacpipe.report import blocks, charts, context
+from tacpipe.report.blocks import Chart, Charts, Fold, Note, fold
+from tacpipe.tasks.touch import headline as headlines
+from tacpipe.tasks.touch.report import methods, paper, predictions
+from tacpipe.tasks.touch.report.methods import (
+    PAPERS,
+    Result,
+    describe_training,
+    one_per_architecture,
+    predicted_targets,
+)
+from tacpipe.tasks.touch.report.predictions import Predictions
+from tacpipe.tasks.touch.result_names import CONSTANT, MODEL
+
+if TYPE_CHECKING:
+    from tacpipe.datasets.dataset import Dataset, Recording
+
+
+PRESSURES = ("pdc_th", "pdc_mf")
+MOST_GRASPS = 800  # grasps of a figure
+
+
+def pressure_folds(method: Method) -> list[Fold]:
+    """Return a chart a finger, of the first run; nothing where the method predicts no pressure."""
+    rows = method.details[0].predictions
+    drawn = [_pressure_chart(method, target) for target in PRESSURES if target in rows.targets and len(rows.recordings)]
+    return fold("The pressure, predicted and true", Charts(drawn), about=method.name) if drawn else []
+
+
+def _pressure_chart(method: Method, target: str) -> Chart:
+    rows = method.details[0].predictions
+    total = len(rows.recordings)
+    rows = rows.rows(np.unique(np.linspace(0, total - 1, MOST_GRASPS).astype(int)))
+    values = rows.true[target][:, 0], rows.predicted[MODEL][target][:, 0]
+    dots = [
+        {
+            "name": f"{name}{'' if is_known else ' (novel)'}",
+            "tip": str(recording),
+            "x": float(true),
+            "y": float(predicted),
+        }
+        for recording, name, is_known, true, predicted in zip(
+            rows.recordings, rows.objects, rows.known, *values, strict=True
+        )
+    ]
+    constant = rows.predicted.get(CONSTANT, {}).get(target)
+    level = None if constant is None else ("constant", float(constant[0, 0]))
+    name = headlines.TARGETS[target]
+    spec = charts.scatter(dots, "true (counts)", "predicted (counts)", diagonal=True, level=level)
+    counts_text = f"{len(rows.recordings):,} of {total:,}" if len(rows.recordings) < total else f"{total:,}"
+    return Chart(
+        name, spec, f"{counts_text} unseen grasps of the first run. Line: predicted as true; dashed: the constant."
+    )
+
+
+FINGERS = ("e_th", "e_mf")
+PLACES = {"median": 0.5, "best decile": 0.1, "worst decile": 0.9}  # by error, of the grasps that are drawn
+FINGERTIPS = (
+    "Fingertips are seen on the pad, the skin rolled out flat, the tip up. R² is about the mean of these grasps: 1 is "
+    "perfect (blue), 0 as good as that mean, below 0 worse (orange). A contact lies on a few electrodes: a mean over 24 "
+    "hides them."
+)
+COLOURS = (
+    "Counts. Blue: lower than the constant, which is the mean of training grasps, so pressed more; orange: higher."
+)
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """A grasp that is drawn, and why."""
+
+    place: str
+    row: int  # among the grasps that were chosen from
+    recording: str
+    error: float  # RMSE over the electrodes of both fingers, fraction of the range
+
+
+def electrode_folds(method: Method) -> list[Fold]:
+    """Return the electrodes' R² and some grasps; nothing where the method predicts no electrodes."""
+    fingers = [target for target in FINGERS if target in predicted_targets(method)]
+    if not fingers:
+        return []
+    drawn = [part for known_objects in (True, False) if (part := _r2_chart(method, fingers, known_objects))]
+    rows = method.details[0].predictions
+    pairs = [_true_and_predicted(rows, grasp, fingers) for grasp in choose_grasps(rows)]
+    return fold(
+        "Electrodes", Charts(drawn), Note(FINGERTIPS), *pairs, Note(COLOURS) if pairs else None, about=method.name
+    )
+
+
+def choose_grasps(rows: Predictions) -> list[Chosen]:
+    """Return the grasps of a run at the median, the best and the worst decile by the electrodes' error.
+
+    Of grasps that err alike the first by name comes first, so the same results choose the same grasps.
+    """
+    fingers = [target for target in FINGERS if target in rows.targets]
+    if not fingers or not len(rows.recordings):
+        return []
+    squared = [
+        np.square(
+            biotac_sp.normalised(finger, rows.predicted[MODEL][finger])
+            - biotac_sp.normalised(finger, rows.true[finger])
+        )
+        for finger in fingers
+    ]
+    error = np.sqrt(np.hstack(squared).mean(axis=1))
+    order = np.lexsort((rows.recordings, error))
+    places = [(place, int(order[round(place_fraction * (len(order) - 1))])) for place, place_fraction in PLACES.items()]
+    return [Chosen(place, row, str(rows.recordings[row]), float(error[row])) for place, row in places]
+
+
+def _r2_chart(method: Method, fingers: Sequence[str], known_objects: bool) -> Chart | None:
+    """Return the R² of each electrode on known or on novel objects; None where there are none."""
+    rows: list[dict[str, object]] = []
+    for target in fingers:
+        scores_by_electrode = predictions.r2_by_electrode(paper.predictions_of_runs(method), target, known_objects)
+        if scores_by_electrode is not None:
+            strength = np.nan_to_num(np.clip(scores_by_electrode, -1, 1))
+            rows += fingertip(
+                methods.FINGER_NAMES[target], strength, [methods.short_r2(value) for value in scores_by_electrode], "R²"
+            )
+    if not rows:
+        return None
+    return Chart(f"R² of each electrode, {headlines.PARTS[known_objects]}", draw_fingertips(rows))
+
+
+def _true_and_predicted(rows: Predictions, grasp: Chosen, fingers: Sequence[str]) -> Chart:
+    """Return true next to predicted electrodes of one grasp."""
+    tips: list[dict[str, object]] = []
+    errors = []
+    for target in fingers:
+        finger = methods.FINGER_NAMES[target]
+        true, predicted = (touch[target][grasp.row] for touch in (rows.true, rows.predicted[MODEL]))
+        constant = rows.predicted.get(CONSTANT, {}).get(target)
+        usual = rows.true[target].mean(axis=0) if constant is None else constant[grasp.row]
+        widest = float(np.abs(true - usual).max()) or 1.0
+        for title, values in (("true", true), ("predicted", predicted)):
+            tips += fingertip(
+                f"{finger}, {title}", (usual - values) / widest, [f"{value:.0f}" for value in values], "Counts"
+            )
+        errors.append(f"{finger} {regression.rmse(true[None], predicted[None]):.0f} counts")
+    part = headlines.PARTS[bool(rows.known[grasp.row])].removesuffix("s")
+    caption = f"{rows.objects[grasp.row]} ({part}). RMSE {grasp.error:.4f} of the range; {', '.join(errors)}."
+    return Chart(
+        f"True next to predicted: {grasp.place} by error, {grasp.recording}", draw_fingertips(tips), caption, wide=True
+    )
+
+
+def fingertip(panel: str, strength: AnyFloats, texts: Sequence[str], quantity: str) -> list[dict[str, object]]:
+    """Return the electrodes of one fingertip, its skin rolled out flat, the tip up, coloured from -1 to 1."""
+    places = 1000 * biotac_sp.unrolled_m()[:, ::-1]  # (electrode, across and along), mm
+    return [
+        {"panel": panel, "x": float(x), "y": float(y), "strength": round(float(np.clip(part, -1, 1)), 2), "text": text,
+         "Electrode": number, quantity: text}
+        for number, ((x, y), part, text) in enumerate(zip(places, strength, texts, strict=True), 1)
+    ]  # fmt: skip
+
+
+def draw_fingertips(rows: Sequence[dict[str, object]]) -> charts.Spec:
+    """Return fingertips next to each other, of rows that `tip` gave."""
+    spec = charts.plane(rows, list(dict.fromkeys(str(row["panel"]) for row in rows)), size=520, columns=4)
+    spec["usermeta"] |= {"panel": 200, "least": 170}
+    return spec
+
+
+CLOUD, GRASP = "cloud", "grasp"
+MOST_CLOUDS = 3
+NEAR_MM = 10.0  # of a grasp point: about where a fingertip of 6.7 mm radius lies
+POINTS = 700  # of a cloud that are drawn
+VIEWS = {"from the camera": 0, "from the side": 2}  # which coordinate runs across; down is y in both
+CLOUD_COLOURS = (
+    "Blue points lie near the first contact, orange ones near the second. What the camera did not see is not in the cloud, "
+    "though a finger may touch it."
+)
+
+
+def holds_grasps(dataset: Dataset) -> bool:
+    """Return whether a dataset holds clouds with grasps."""
+    return any(_has_grasp(shard) for shard in dataset.recordings.values())
+
+
+def cloud_folds(datasets: Sequence[Dataset], chosen: Mapping[str, str]) -> list[Fold]:
+    """Return the clouds of ``chosen`` grasps, stated with the words next to their names; nothing without any dataset.
+
+    Where none of them is there, the first grasps are drawn.
+    """
+    shards = {name: shard for dataset in datasets for name, shard in dataset.recordings.items() if _has_grasp(shard)}
+    if not shards:
+        return []
+    first = dict.fromkeys(sorted(shards)[:MOST_CLOUDS], "")
+    described = {name: words for name, words in chosen.items() if name in shards} or first
+    drawn = [_cloud_chart(shards[name], words) for name, words in described.items()]
+    return fold("Clouds and their grasps", Charts(drawn), Note(CLOUD_COLOURS))
+
+
+def _has_grasp(shard: Recording) -> bool:
+    return {CLOUD, GRASP} <= set(getattr(shard, "streams", ()))
+
+
+def _cloud_chart(shard: Recording, words: str) -> Chart:
+    cloud, grasp = Cloud.of(shard.table(CLOUD)), Grasp.of(shard.table(GRASP))
+    contacts_m = np.array([grasp.g1_m, grasp.g2_m])
+    middle = contacts_m.mean(axis=0)
+    indices = np.unique(np.linspace(0, len(cloud) - 1, POINTS).astype(int))
+    points = 1000 * (cloud.points_m[indices].astype(np.float64) - middle)  # (point, xyz), mm
+    contacts = 1000 * (contacts_m - middle)
+    distance = np.linalg.norm(points[:, None] - contacts[None], axis=2)  # (point, finger)
+    near = np.where(distance.min(axis=1) <= NEAR_MM, np.array([1, -1])[distance.argmin(axis=1)], 0)
+    rows = [
+        {
+            "panel": view,
+            "x": float(round(point[across], 1)),
+            "y": float(round(-point[1], 1)),
+            "strength": 0.6 * int(side),
+        }
+        for view, across in VIEWS.items()
+        for point, side in zip(points, near, strict=True)
+    ]
+    rows += [
+        {"panel": view, "x": float(point[across]), "y": float(-point[1]), "strength": side}
+        for view, across in VIEWS.items()
+        for point, side in zip(contacts, (1.0, -1.0), strict=True)
+    ]
+    about = f"{shard.name}{f' ({words})' if words else ''}: {shard.attributes.get('object', 'an object')}"
+    caption = f"{len(cloud):,} points, the fingers {1000 * grasp.opening_m:.0f} mm apart."
+    return Chart(about, charts.plane(rows, list(VIEWS), size=9), caption)
+
+
+ALL = "all"  # stands where one network predicts all targets
+UNWATCHED = (
+    " Where no grasps were kept for validation, it is the loss on those of training, evaluated after each epoch."
+)
+
+
+def loss_charts(methods: Sequence[Method]) -> list[Chart]:
+    """Return validation losses of one method an architecture, a chart a target; none without epochs."""
+    drawn, shown_methods = [], one_per_architecture(methods)
+    for target in (*biotac_sp.TARGETS, ALL):
+        curves = context.curves_of_methods(
+            shown_methods, functools.partial(losses_by_epoch, target=target, name="val_loss")
+        )
+        if curves:
+            name = headlines.TARGETS.get(target, "one network for all targets")
+            spec = context.loss_chart(curves, "validation loss", log=True)
+            caption = "Each method's own loss. Thick: mean over runs; thin: single runs."
+            drawn.append(Chart(f"Validation loss by epoch, {name}", spec, f"{caption}{_unwatched_note(shown_methods)}"))
+    return drawn
+
+
+def figure_8(methods: Sequence[Method]) -> list[Chart]:
+    """Return Figure 8 in the paper's form: both losses of its network, of most epochs; none where it was not run."""
+    candidates = [
+        (method, target)
+        for method in methods
+        for target in (paper.TARGET, ALL)
+        if method.settings["architecture"] == PAPERS and _loss_curves(method, target, "train_loss")
+    ]
+    if not candidates:
+        return []
+    method, target = max(
+        candidates,
+        key=lambda candidate: (len(_loss_curves(candidate[0], candidate[1], "train_loss")[0]), len(candidate[0].runs)),
+    )
+    loss_names = {"training": "train_loss", "validation": "val_loss"}
+    curves = {name: described for name, loss in loss_names.items() if (described := _loss_curves(method, target, loss))}
+    quantity = "loss (RMSE, fraction of the range)" if method.settings.get("loss", "rmse") == "rmse" else "loss"
+    text = f"training and validation loss by epoch, {method.name}, {headlines.TARGETS.get(target, 'all targets')}"
+    printed = " The paper's figure has 1,000 epochs." if method.published else ""
+    caption = (
+        f"{describe_training([method])}{printed}{_unwatched_note([method])}{' Simulated.' if method.simulated else ''}"
+    )
+    return [
+        Chart(blocks.form("Figure 8", text, method.published), context.loss_chart(curves, quantity, log=True), caption)
+    ]
+
+
+def losses_by_epoch(result: Result, target: str, name: str) -> list[float]:
+    """Return a loss of the network of one target by epoch, or the mean of several networks; empty where none states it.
+
+    The mean ends where the first network does. NaN stands where an epoch does not state the loss.
+    """
+    networks: dict[object, list[float]] = {}
+    for line in result.history:
+        if line.get("target", ALL) == target:
+            described = line.get(name)
+            networks.setdefault(line.get("network"), []).append(float("nan") if described is None else float(described))
+    length = min(map(len, networks.values()), default=0)
+    mean = [
+        sum(values) / len(values)
+        for values in zip(*(network_losses[:length] for network_losses in networks.values()), strict=True)
+    ]
+    return mean if any(not math.isnan(value) for value in mean) else []
+
+
+def _loss_curves(method: Method, target: str, name: str) -> list[list[float]]:
+    return [curve for result in method.details if (curve := losses_by_epoch(result, target, name))]
+
+
+def _unwatched_note(methods: Sequence[Method]) -> str:
+    """Return what must be stated where some runs had no validation grasps."""
+    runs = [run for method in methods for run in method.details if run.history]
+    return UNWATCHED if any(run.config.get("counts", {}).get("val") == 0 for run in runs) else ""
