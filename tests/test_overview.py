@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from tacpipe.cli import headline_table
-from tacpipe.io import tables
+from tacpipe.io import terminal
 from tacpipe.metrics import headline
 from tests import chain
 from tests.conftest import tacpipe
@@ -65,7 +65,7 @@ def test_a_result_is_shown_by_its_headline_its_baselines_and_what_it_rests_on(la
     text, value = shown(lab, "results/forward")
     told = headline.read((lab / "results/forward/headline.json").read_bytes())
     assert value["kind"] == "result"
-    assert text.startswith(headline_table.text(told, tables.width_of(sys.stdout)))
+    assert text.startswith(headline_table.text(told, terminal.width_of(sys.stdout)))
     assert value["headline"] == [one.to_json() for one in told]
     assert value["baselines"] == [one.name for one in told[0].baselines]
     assert "ridge" in row(text, "baselines") and "codec" not in row(text, "baselines")
@@ -121,7 +121,7 @@ def test_a_picture_hatches_the_padding_of_contacts(lab: Path, tmp_path: Path) ->
 
 def test_evaluate_prints_its_headline_on_a_hit_too_and_stdout_is_the_output_alone(lab: Path) -> None:
     found = headline.read((lab / "results/forward/headline.json").read_bytes())
-    told = headline_table.text(found, tables.width_of(sys.stderr))
+    told = headline_table.text(found, terminal.width_of(sys.stderr))
     done = tacpipe(lab, EVALUATE)
     assert done.stdout == "results/forward\n"
     assert "0 ran" in done.stderr and told in done.stderr

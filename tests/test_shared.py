@@ -6,7 +6,7 @@ import pytest
 
 from tacpipe.engine.shared import SharedFiles
 from tacpipe.errors import StorageError, TacpipeError
-from tacpipe.io.drafts import Draft
+from tacpipe.io.files import Draft
 from tacpipe.store.store import Store
 
 

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tacpipe.errors import LockedError, TacpipeError, UsageError
-from tacpipe.io.drafts import Draft
+from tacpipe.io.files import Draft
 from tacpipe.io.hashing import bytes_digest, digest
 from tacpipe.store.location import locate, project
 from tacpipe.store.store import MissingError, Store

@@ -125,7 +125,7 @@ def test_rows_that_are_put_aside_on_disk_give_the_bytes_of_their_table(
 ) -> None:
     monkeypatch.setattr(parquet, "ROW_GROUP_ROWS", 400)
     monkeypatch.setattr(row_groups, "IN_MEMORY", 0)
-    monkeypatch.setattr(row_groups, "AT_ONCE", 5000)
+    monkeypatch.setattr(row_groups, "WRITE_BYTES", 5000)
     rows, rng = 1001, np.random.default_rng(0)
     gone = rng.random(rows) < 0.2
     gone[400:800] = False  # a whole group without a null

@@ -118,7 +118,7 @@ def add(program: typer.Typer, summary: str) -> None:
 
 def _record(rig: Rig, store: Store, plan: Any, *, quiet: bool) -> tuple[list[Recorded], list[str]]:
     from tacpipe.datasets import directory
-    from tacpipe.io.termination import Ended
+    from tacpipe.io.termination import EndRequest
     from tacpipe.recording import appending, completing, trials, triggers
     from tacpipe.recording.recorder import Recorder
     from tacpipe.recording.view import View
@@ -135,7 +135,7 @@ def _record(rig: Rig, store: Store, plan: Any, *, quiet: bool) -> tuple[list[Rec
     directory.check_output(store, plan.output)
     appending.refuse_taken(plan.output, plan.names)
     recorder = Recorder(completing.completed(rig))
-    with Ended() as ended, recorder.open(), View(recorder.watches, quiet=quiet).open() as view:
+    with EndRequest() as ended, recorder.open(), View(recorder.watches, quiet=quiet).open() as view:
         recorder.await_first(ended)
         recorded, lost = trials.run(recorder, store, plan, view, ended)
     for one in recorded if not quiet else ():
@@ -171,14 +171,14 @@ def _dry_run(rig: Rig, *, as_json: bool) -> str:
     """Open every stream and return what each does. Raises `DeviceError` for those that do not open or give nothing."""
     from dataclasses import asdict
 
-    from tacpipe.io.termination import Ended
+    from tacpipe.io.termination import EndRequest
     from tacpipe.recording import clock, completing
     from tacpipe.recording.recorder import Recorder
     from tacpipe.recording.view import line
 
     rig = completing.completed(rig)
     recorder = Recorder(rig)
-    with Ended() as ended, recorder.open():
+    with EndRequest() as ended, recorder.open():
         recorder.await_first(ended)
         until_s = clock.now_s() + DRY_RUN_S
         recorder.run(lambda: ended() or clock.now_s() > until_s)

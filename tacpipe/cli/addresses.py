@@ -9,7 +9,7 @@ from typing import Any
 
 import typer
 
-from tacpipe.io.places import local
+from tacpipe.io.files import local
 
 
 def refuse(program: typer.Typer) -> None:

@@ -131,7 +131,7 @@ def _compare(program: typer.Typer) -> None:
         as_json: AsJson = False,
     ) -> None:
         from tacpipe.cli import compare as comparing
-        from tacpipe.io import tables
+        from tacpipe.io import terminal
 
         if as_csv and as_json:
             raise UsageError("--csv and --json exclude each other. Give one of them.")
@@ -144,7 +144,7 @@ def _compare(program: typer.Typer) -> None:
             else:
                 for number, table in enumerate(found.tables()):
                     terminal.result("") if number else None
-                    tables.show(table, result=True)
+                    terminal.show(table, on_stdout=True)
 
 
 def _track(program: typer.Typer) -> None:

@@ -15,7 +15,7 @@ from tacpipe.comparison import engine
 from tacpipe.engine import pipeline
 from tacpipe.errors import UsageError
 from tacpipe.io import terminal
-from tacpipe.io.tables import Group, Row, Table
+from tacpipe.io.terminal import Group, Row, Table
 from tacpipe.metrics import headline
 from tacpipe.store.location import locate
 

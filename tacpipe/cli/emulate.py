@@ -37,7 +37,7 @@ def emulate(
     """Serve a rig."""
     from tacpipe.datasets import replacing
     from tacpipe.io.files import readable_errors, write_whole
-    from tacpipe.io.termination import Ended
+    from tacpipe.io.termination import EndRequest
     from tacpipe.recording import rig_text
     from tacpipe.recording.rig import read
     from tacpipe.simulation.emulation import byte_faults
@@ -46,7 +46,7 @@ def emulate(
     asked, wrong, path = read(rig), byte_faults.parse(faults), output / "rig.toml"
     replacing.refuse_foreign(path, MARK)
     sys.setswitchinterval(SWITCH_S)
-    with Ended() as ended, readable_errors(output):
+    with EndRequest() as ended, readable_errors(output):
         with Emulator(asked, seed, wrong, output) as emulator:
             write_whole(str(path), rig_text.of(emulator.rig).encode(), f"{path}.draft")
             terminal.result(path)

@@ -7,8 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from tacpipe.datasets import manifest
-from tacpipe.io import tables, terminal
-from tacpipe.io.tables import Group, Row, Table
+from tacpipe.io import terminal
+from tacpipe.io.terminal import Group, Row, Table
 from tacpipe.metrics import headline
 from tacpipe.metrics.headline import Headline
 from tacpipe.plugins import params as params_of
@@ -68,7 +68,7 @@ _VERDICTS = {
 }
 
 
-def text(headlines: Sequence[Headline], width: int = tables.WIDTH) -> str:
+def text(headlines: Sequence[Headline], width: int = terminal.WIDTH) -> str:
     """Return headlines as lines of text: their table, or a sentence where there is none."""
     return table(headlines).text(width) if headlines else EMPTY
 
@@ -76,6 +76,6 @@ def text(headlines: Sequence[Headline], width: int = tables.WIDTH) -> str:
 def show(headlines: Sequence[Headline]) -> None:
     """Print headlines on stderr."""
     if headlines:
-        tables.show(table(headlines), result=False)
+        terminal.show(table(headlines), on_stdout=False)
     else:
         terminal.note(EMPTY)

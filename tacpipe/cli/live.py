@@ -15,7 +15,7 @@ from tacpipe.errors import DeviceError, UsageError
 from tacpipe.io import terminal
 
 if TYPE_CHECKING:
-    from tacpipe.io.termination import Ended
+    from tacpipe.io.termination import EndRequest
     from tacpipe.live.preparation import PreparedSession
     from tacpipe.live.session import Supervisor
     from tacpipe.recording import trials as trials_of
@@ -130,7 +130,7 @@ def _run(
     """Run a session and print what it did."""
     from tacpipe.cli import acquire
     from tacpipe.datasets import directory
-    from tacpipe.io.termination import Ended
+    from tacpipe.io.termination import EndRequest
     from tacpipe.live import session
     from tacpipe.recording import appending, trials
     from tacpipe.recording.recorder import Recorder
@@ -149,7 +149,7 @@ def _run(
     recorded: list[Any] = []
     lost: list[str] = []
     with (
-        Ended() as is_over,
+        EndRequest() as is_over,
         session.run_model(recorder, prepared.options, is_over) as supervisor,
         recorder.open(),
         View(recorder.watches, quiet=quiet, more=lambda: _lines(supervisor)).open() as view,
@@ -178,7 +178,7 @@ def _lines(supervisor: Supervisor) -> list[str]:
     return session.lines(supervisor.figures())
 
 
-def _follow(recorder: Recorder, duration_s: float | None, view: Any, is_over: Ended) -> None:
+def _follow(recorder: Recorder, duration_s: float | None, view: Any, is_over: EndRequest) -> None:
     """Run the rig without recording it."""
     from tacpipe.recording import clock
 

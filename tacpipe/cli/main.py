@@ -90,7 +90,7 @@ def main() -> None:
             raise
         _complain(str(short))
         code = FAILED
-    sys.exit(termination.done(code))
+    sys.exit(termination.finish(code))
 
 
 def _printed(code: int) -> int:

@@ -13,7 +13,7 @@ from tacpipe.cli import headline_table, identities
 from tacpipe.datasets.dataset import Dataset
 from tacpipe.datasets.manifest import Found
 from tacpipe.errors import TacpipeError
-from tacpipe.io import tables
+from tacpipe.io import terminal
 from tacpipe.metrics import headline
 from tacpipe.plugins import params as params_of
 from tacpipe.store.store import Store
@@ -102,7 +102,7 @@ def result_text(value: Mapping[str, Any]) -> list[str]:
         lines = ["This result was evaluated before headlines were kept: run `tacpipe evaluate` again to have them."]
     else:
         found = [headline.Headline.from_json(one) for one in value["headline"]]
-        lines = headline_table.text(found, tables.width_of(sys.stdout)).splitlines()
+        lines = headline_table.text(found, terminal.width_of(sys.stdout)).splitlines()
     parts = {name: flat(one) for name, one in value["by_part"].items()}
     fold = f", fold {value['fold']}" if value["role"] and value["fold"] is not None else ""
     described = [
@@ -241,7 +241,7 @@ def _aligned(described: list[tuple[str, Any]]) -> list[str]:
     """Return names and values in two columns, long values on several lines; what is None is left out."""
     shown = [(name, str(value)) for name, value in described if value is not None and value != ""]
     width = max((len(name) for name, _ in shown), default=0) + 2
-    room = max(tables.width_of(sys.stdout) - width, 20)
+    room = max(terminal.width_of(sys.stdout) - width, 20)
     return [
         f"{'' if at else name:<{width}}{line}" for name, value in shown for at, line in enumerate(_wrapped(value, room))
     ]

@@ -157,7 +157,7 @@ def _stanza(report: Report) -> list[str]:
         f'name = "{candidate.kind.replace("-", "_")}"',
         f'sensor = "{candidate.kind}"',
         f'transport = "{report.address}"',
-        *(_described(options, notes) if notes else [f"options = {toml.value(options)}"] if options else []),
+        *(_described(options, notes) if notes else [f"options = {toml.toml_value(options)}"] if options else []),
     ]
 
 
@@ -167,9 +167,9 @@ def _described(options: Mapping[str, Any], notes: Mapping[str, str]) -> list[str
     for name, value in options.items():
         note = f"  # {notes[name]}" if name in notes else ""
         if isinstance(value, list) and any(isinstance(one, Mapping) for one in value):
-            lines += [f"{name} = [{note}", *(f"    {toml.value(one)}," for one in value), "]"]
+            lines += [f"{name} = [{note}", *(f"    {toml.toml_value(one)}," for one in value), "]"]
         else:
-            lines.append(f"{name} = {toml.value(value)}{note}")
+            lines.append(f"{name} = {toml.toml_value(value)}{note}")
     return lines
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, TypedDict
 from tacpipe.channels import streams
 from tacpipe.channels.masks import GAP, gap_shares
 from tacpipe.errors import UsageError
-from tacpipe.io.tables import Group, Row, Table
+from tacpipe.io.terminal import Group, Row, Table
 from tacpipe.metrics.headline import counted
 from tacpipe.printable import WALL_CLOCK_NS, listed, plain, shown
 

@@ -12,7 +12,7 @@ from tacpipe.datasets import manifest as manifest_of
 from tacpipe.datasets import pages
 from tacpipe.datasets.manifest import Entry, Manifest
 from tacpipe.errors import StorageError, TacpipeError, UsageError
-from tacpipe.io.tables import WIDTH, Group, Row, Table
+from tacpipe.io.terminal import WIDTH, Group, Row, Table
 from tacpipe.metrics.headline import counted
 from tacpipe.plugins import params as params_of
 from tacpipe.printable import listed

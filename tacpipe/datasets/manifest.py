@@ -17,7 +17,7 @@ from tacpipe.datasets.checks import Listed, check, check_beside
 from tacpipe.datasets.dataset_digest import DatasetDigest
 from tacpipe.datasets.paths import MANIFEST, shard_path
 from tacpipe.errors import DamagedError, StorageError, UsageError
-from tacpipe.io import places, regular
+from tacpipe.io import files, regular
 from tacpipe.io.files import unread
 from tacpipe.io.hashing import bytes_digest, remembered_file_digest
 from tacpipe.plugins.stage import Attribute
@@ -286,7 +286,7 @@ def find(path: Path | str) -> Found:
 
     Raises `UsageError` where there is none, and `StorageError` where the system fails to read it.
     """
-    given = places.local(path)
+    given = files.local(path)
     file = given if given.name == NAME else given / NAME
     try:
         large = os.stat(file).st_size >= pages.LARGE  # noqa: PTH116  (of a pipe or a device it is 0)

@@ -21,7 +21,7 @@ from tacpipe.datasets import manifest as manifest_of
 from tacpipe.datasets import recording_names
 from tacpipe.datasets.manifest import ACQUIRE, VALUES, Manifest
 from tacpipe.errors import DamagedError, StorageError, TacpipeError, UsageError
-from tacpipe.io import places, regular
+from tacpipe.io import files, regular
 from tacpipe.io.hashing import digest
 from tacpipe.printable import listed, plain
 from tacpipe.store import layout
@@ -55,7 +55,7 @@ class Plan:
 
 def refuse_inputs(output: Path, inputs: Iterable[Path]) -> None:
     """Raise `UsageError` if ``output`` is one of the ``inputs`` of a command, an address, or within a store."""
-    places.local(output)
+    files.local(output)
     layout.refuse_within(output)
     for path in inputs:
         if _same(output, path.parent if path.name == manifest_of.NAME else path):

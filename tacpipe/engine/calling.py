@@ -80,7 +80,7 @@ def call(
         track=tuple(how.track),
         **paths,
     )
-    with progress.shown(how.progress):
+    with progress.showing_progress(how.progress):
         outcome = pipeline.run(request)
     for note in outcome.notes:
         warnings.warn(note, ResultWarning, stacklevel=_STACK)

@@ -43,7 +43,7 @@ def of(requests: Sequence[Request], jobs: int) -> Estimate | None:
 
     That is where nothing is missing, where no network is trained, and where the first one fails.
     """
-    with progress.shown(False):
+    with progress.showing_progress(False):
         try:
             missing = [one for one in requests if _is_missing(one)]
             each_s = _timed(missing[0]) if missing else None

@@ -21,8 +21,7 @@ from tacpipe.engine.shared import SharedFiles
 from tacpipe.engine.task import Task
 from tacpipe.errors import FAILED, DamagedError, StorageError, TacpipeError
 from tacpipe.io import memory, regular
-from tacpipe.io.drafts import Hashed
-from tacpipe.io.files import write_whole
+from tacpipe.io.files import Hashed, write_whole
 from tacpipe.io.hashing import bytes_digest, digest, remembered_file_digest
 from tacpipe.plugins import extras, failures, registry
 from tacpipe.plugins import params as params_of

@@ -73,7 +73,7 @@ def run(given: Sequence[Request], jobs: int) -> Iterator[tuple[Request, Outcome 
 
 def _run(task: tuple[int, Request]) -> tuple[int, Outcome | TacpipeError]:
     position, request = task
-    with progress.shown(False):
+    with progress.showing_progress(False):
         try:
             return position, pipeline.run(request)
         except TacpipeError as error:

@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from tacpipe.errors import TacpipeError, is_input_error
-from tacpipe.io import drafts, regular
-from tacpipe.io.drafts import Draft
-from tacpipe.io.files import move, present
+from tacpipe.io import files, regular
+from tacpipe.io.files import Draft, move, present
 from tacpipe.io.hashing import digest
 from tacpipe.store.store import Store
 
@@ -35,7 +34,7 @@ class SharedFiles:
                 raise TacpipeError(regular.content(failed, _MOST_BYTES, follow=False).decode())
             if not present(path):
                 name = self.store.draft()
-                with drafts.begun(name, self.store.root) as draft:
+                with files.new_draft(name, self.store.root) as draft:
                     try:
                         make(draft)
                     except TacpipeError as error:

@@ -1,1 +1,1 @@
-"""What programs read and write safely: atomic files, digests, Parquet, YAML, the terminal, memory limits, signals."""
+"""Read and write safely: atomic files, digests, Parquet, YAML, the terminal, memory limits, signals."""

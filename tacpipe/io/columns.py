@@ -1,4 +1,4 @@
-"""The columns of a Parquet file in memory, decoded some at a time: a long recording is never unpacked as a whole."""
+"""Decode the columns of a Parquet file in memory a few at a time, so that a long recording is never unpacked as a whole."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class Columns:
         place = self._places.get(name)
         if place is None:
             block = self._blocks[name]
-            self.forget()  # before the next block is decoded
+            self.forget()  # frees memory for the next block
             self._decoded = self._file.read(block)
             self._places = {column: place for place, column in enumerate(block)}
             place = self._places[name]
@@ -109,7 +109,7 @@ def change(columns: Columns, change_rows: Callable[[pa.Table, int], pa.Table]) -
 def release() -> None:
     """Give back memory that Arrow and the C library keep of what is gone: as much as a long recording took, once read."""
     pa.default_memory_pool().release_unused()
-    with contextlib.suppress(OSError, AttributeError):  # of a C library without it
+    with contextlib.suppress(OSError, AttributeError):  # not every C library has malloc_trim
         ctypes.CDLL(None).malloc_trim(0)
 
 

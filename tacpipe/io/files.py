@@ -1,16 +1,18 @@
-"""Files that are there whole or not at all: draft, fsync, rename; and what the file system states, as sentences."""
+"""Write files atomically by draft, fsync and rename, and turn errors of the file system into sentences."""
 
 from __future__ import annotations
 
 import contextlib
 import errno
+import hashlib
 import os
+import re
 from collections.abc import Iterable, Iterator
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
-from tacpipe.errors import StorageError
+from tacpipe.errors import StorageError, UsageError
 from tacpipe.io import regular
 
 _READ_ONLY = (errno.EROFS, errno.EACCES, errno.EPERM)
@@ -98,14 +100,14 @@ def walk(source: Path | str, *, links: bool = True) -> Iterator[tuple[str, list[
     out of the list are passed over, and so are those that are removed meanwhile. Raises `StorageError` for a folder that
     cannot be listed: `os.walk` passes over it, and what it holds would seem to be gone.
     """
-    seen: set[str] = set()
+    visited: set[str] = set()
     pending = [os.fspath(source)]
     while pending:
         place = pending.pop()
         real = os.path.realpath(place)
-        if real in seen:
+        if real in visited:
             continue
-        seen.add(real)
+        visited.add(real)
         try:
             folders, files = _contents(place, links)
         except FileNotFoundError:
@@ -139,10 +141,10 @@ def _is_folder(entry: os.DirEntry[str], links: bool) -> bool:
         return False
 
 
-def read_json(path: Path, most: int = regular.JSON_BYTES) -> dict[str, Any] | None:
-    """Return the mapping that a file of a store holds; None if it is not there, holds none, or more than ``most`` bytes."""
+def read_json(path: Path, max_bytes: int = regular.JSON_BYTES) -> dict[str, Any] | None:
+    """Return the mapping in a file of a store; None if it is missing, holds none, or has more than ``max_bytes`` bytes."""
     try:
-        value = regular.json_value(path, most)
+        value = regular.json_value(path, max_bytes)
     except (FileNotFoundError, ValueError, RecursionError, regular.IrregularError):
         return None
     return value if isinstance(value, dict) else None
@@ -239,3 +241,100 @@ def _move(draft: str, path: str, exclusive: bool) -> bool:
             return False
         os.replace(draft, path)  # noqa: PTH105  (of two that come here at once the later one stays: both are complete)
     return True
+
+
+class Hashed:
+    """A file object that counts and hashes content without storing it."""
+
+    closed = False
+
+    def __init__(self) -> None:
+        self.bytes, self._hash = 0, hashlib.sha256()
+
+    @property
+    def digest(self) -> str:
+        """The digest of what was written so far."""
+        return self._hash.hexdigest()
+
+    def write(self, content: bytes | memoryview) -> int:
+        """Take all of ``content``."""
+        self._hash.update(content)
+        self.bytes += len(content)
+        return len(content)
+
+    def tell(self) -> int:
+        """Return how many bytes were written."""
+        return self.bytes
+
+    def flush(self) -> None:
+        """Do nothing: nothing is held back."""
+
+
+class Draft(Hashed):
+    """A new file in a store, which keeps what is written to it."""
+
+    def __init__(self, path: str, root: Path | str, mode: int) -> None:
+        super().__init__()
+        self._root = root
+        self._handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
+
+    def write(self, content: bytes | memoryview) -> int:
+        """Write all of ``content``. Raises `StorageError` where the disk does not take it."""
+        try:
+            write_all(self._handle, content)
+        except OSError as error:
+            raise sentence(self._root, error) from error
+        return super().write(content)
+
+    def sync(self) -> None:
+        """Have the content outlast a loss of power. Raises `StorageError` as `write` does."""
+        try:
+            os.fsync(self._handle)
+        except OSError as error:
+            raise sentence(self._root, error) from error
+
+    def release(self) -> None:
+        """Let go of the file. Raises `StorageError` as `write` does."""
+        try:
+            os.close(self._handle)
+        except OSError as error:
+            raise sentence(self._root, error) from error
+
+
+@contextlib.contextmanager
+def new_draft(path: str, root: Path | str, *, mode: int = 0o666) -> Iterator[Draft]:
+    """Yield a new file at ``path``, in the store ``root``; after the block it is removed unless it was moved away.
+
+    ``mode`` is less what the umask takes. Raises `StorageError` where the file system does not allow it.
+    """
+    try:
+        os.makedirs(os.path.dirname(path), exist_ok=True)  # noqa: PTH103, PTH120
+        draft = Draft(path, root, mode)
+    except OSError as error:
+        raise sentence(root, error) from error
+    try:
+        yield draft
+    finally:
+        try:
+            draft.release()
+        finally:
+            with contextlib.suppress(OSError):  # one that stays is swept up later
+                os.unlink(path)  # noqa: PTH108
+
+
+_ADDRESS = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*:/")  # one slash: Path("s3://bucket/x") keeps no second one
+
+
+def local(path: Path | str) -> Path:
+    """Return ``path``. Raises `UsageError` for an address: a folder of that name would be made here instead.
+
+    >>> local("data/recordings")
+    PosixPath('data/recordings')
+    """
+    if _ADDRESS.match(str(path)):
+        scheme, _, location = str(path).partition(":")
+        raise UsageError(
+            f"{scheme}://{location.lstrip('/')} is an address, and {scheme}:// is not supported. Give a path of the file "
+            "system."
+        )
+    return Path(path)

@@ -1,4 +1,4 @@
-"""Arrays in temporary files that are mapped into memory: what was read of them is let go of, and read again when needed."""
+"""Keep arrays in temporary files that are mapped into memory, whose pages are released and read again when needed."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from tacpipe.io.files import sentence
 if TYPE_CHECKING:
     import pyarrow as pa
 
-SEGMENT_BYTES = 1 << 28  # of a file, of which there are few: each takes a descriptor
-MOST_READ = 1 << 26  # bytes, after which what was read is let go of
+SEGMENT_BYTES = 1 << 28  # size of a file; few are opened, since each takes a descriptor
+MOST_READ = 1 << 26  # bytes read before their pages are released
 
 
 class MappedArrays:
@@ -36,10 +36,10 @@ class MappedArrays:
         if values.nbytes <= self._in_memory:
             self._in_memory -= values.nbytes
             return values
-        made = self.empty(values.shape, values.dtype)
-        made[...] = values
+        mapped_copy = self.empty(values.shape, values.dtype)
+        mapped_copy[...] = values
         self.release()
-        return made
+        return mapped_copy
 
     def put_aside(self, column: AnyArray | pa.Array) -> AnyArray | pa.Array:
         """Return a column of the same values; one of texts, or with nulls, stays in memory. Raises as `empty`."""
@@ -64,7 +64,7 @@ class MappedArrays:
             return np.empty(shape, kind)
         place = -(-self._used // mmap.ALLOCATIONGRANULARITY) * mmap.ALLOCATIONGRANULARITY
         if not self._segments or place + size > len(self._segments[-1]):
-            self._segments.append(_file(max(size, SEGMENT_BYTES)))
+            self._segments.append(_map_temporary_file(max(size, SEGMENT_BYTES)))
             place = 0
         self._used = place + size
         return np.frombuffer(self._segments[-1], kind, int(np.prod(shape)), place).reshape(shape)
@@ -82,7 +82,7 @@ class MappedArrays:
             segment.madvise(mmap.MADV_DONTNEED)
 
 
-def _file(size: int) -> mmap.mmap:
+def _map_temporary_file(size: int) -> mmap.mmap:
     """Return a temporary file of this size, mapped; all of it has its place on the disk."""
     try:
         with tempfile.TemporaryFile() as file:

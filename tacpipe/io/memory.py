@@ -1,4 +1,4 @@
-"""How much memory is left for this process, so that what a file declares is refused before it is taken."""
+"""Measure the memory that is left for this process, to refuse files that declare more before it is allocated."""
 
 from __future__ import annotations
 
@@ -88,13 +88,13 @@ def scarce() -> bool:
 
 def shortage(error: BaseException) -> ShortageError | None:
     """Return in words that memory or threads ran out, where ``error`` or what it came from states it; else None."""
-    seen: BaseException | None = error
-    while seen is not None:
-        if isinstance(seen, ShortageError):
-            return seen
-        if _is_shortage(seen):
-            return _short(f"memory ran out ({' '.join(str(seen).split())[:160] or type(seen).__name__})")
-        seen = seen.__cause__ or seen.__context__
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, ShortageError):
+            return cause
+        if _is_shortage(cause):
+            return _shortage_error(f"memory ran out ({' '.join(str(cause).split())[:160] or type(cause).__name__})")
+        cause = cause.__cause__ or cause.__context__
     return None
 
 
@@ -103,7 +103,7 @@ def _is_shortage(error: BaseException) -> bool:
         return True
     if isinstance(error, OSError) and error.errno in (errno.ENOMEM, errno.EAGAIN):
         return True
-    if isinstance(error, OSError) and error.errno is None and scarce():  # of libraries that name no cause, as Arrow's
+    if isinstance(error, OSError) and error.errno is None and scarce():  # Arrow and others name no cause
         return True
     text = str(error)
     if isinstance(error, ImportError) and any(words in text for words in _NO_ROOM):
@@ -111,12 +111,12 @@ def _is_shortage(error: BaseException) -> bool:
     return isinstance(error, RuntimeError) and any(words in text for words in (*_NO_ROOM, *_NO_THREAD))
 
 
-def _short(what: str) -> ShortageError:
+def _shortage_error(need: str) -> ShortageError:
     limit = (
         f", of the {_megabytes(resource.getrlimit(resource.RLIMIT_AS)[0])} that `ulimit -v` allows" if limited() else ""
     )
     return ShortageError(
-        f"This command needs more memory than there is: {what}; {_megabytes(available())} are left{limit}. What was "
+        f"This command needs more memory than there is: {need}; {_megabytes(available())} are left{limit}. What was "
         f"finished is kept: run the same command again with more, or with a smaller --jobs."
     )
 
@@ -148,7 +148,7 @@ def require_library(name: str) -> None:
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     needed = LIBRARIES[name] + A_CORE * max(0, cores - 2)
     if limited() and available() < needed:
-        raise _short(f"{name} takes {_megabytes(needed)} to load")
+        raise _shortage_error(f"{name} takes {_megabytes(needed)} to load")
 
 
 @contextlib.contextmanager
@@ -162,14 +162,14 @@ def raising_shortage() -> Iterator[None]:
         raise
 
 
-def require(needed: int, what: str, *, error: type[TacpipeError] = TacpipeError) -> None:
-    """Raise ``error``, a `TacpipeError`, where ``what`` needs more memory than is left."""
+def require(needed: int, source: str, *, error: type[TacpipeError] = TacpipeError) -> None:
+    """Raise ``error``, a `TacpipeError`, where ``source`` needs more memory than is left."""
     if needed <= AT_HAND:
         return
-    left = int(available() * KEPT)
-    if needed > left:
+    limit = int(available() * KEPT)
+    if needed > limit:
         raise error(
-            f"{what} declares {readable_size(needed)} of data, and {readable_size(left)} of memory are left. If that "
+            f"{source} declares {readable_size(needed)} of data, and {readable_size(limit)} of memory are left. If that "
             "is what you expect, read it on a computer with more memory or in parts; if its source is untrusted, do "
             "not use it."
         )

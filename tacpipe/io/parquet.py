@@ -22,19 +22,19 @@ from tacpipe.io.parquet_claims import Claims
 from tacpipe.printable import plain
 
 ROW_GROUP_ROWS = 1 << 20
-HELD_SHARE = 0.25  # above this fraction of repeated rows zstd beats delta packing; measured, docs/format.md
-LARGE_BYTES = 1 << 25  # in memory
+REPEATED_SHARE = 0.25  # above this fraction of repeated rows zstd beats delta packing; measured, docs/format.md
+LARGE_BYTES = 1 << 25  # size in memory
 BATCH_ROWS = 1024  # Arrow's own
-PAGE_BYTES = 1 << 20  # of encoded frames; a batch of 1024 of them could be beyond the 2 GiB that a page may have
-GROUP_BYTES = 1 << 28  # of encoded frames in a group of rows
-TRIED_BYTES = 1 << 20  # of encoded frames that are compressed to see whether it is worth it
-WORTH = 0.95  # of their size
-SOME_ROWS = 1 << 14  # that are decoded at once where rows are read some at a time
+PAGE_BYTES = 1 << 20  # encoded frames per page; a batch of 1024 could exceed the 2 GiB of a page
+GROUP_BYTES = 1 << 28  # encoded frames per group of rows
+TRIED_BYTES = 1 << 20  # encoded frames that are compressed on trial
+WORTH = 0.95  # largest ratio of compressed to original size that is worth it
+SOME_ROWS = 1 << 14  # rows decoded at once where a file is read in batches
 ZSTD_LEVEL = 3
-ZSTD_LEVEL_HELD = 9  # long runs of equal values are worth the search
+ZSTD_LEVEL_REPEATED = 9  # long runs of equal values are worth the search
 _CLOCKS = ("t_ns", "t_device_ns", "seq")
 _KEY = b"tacpipe"
-BROKEN = (  # what pyarrow raises for broken files, and Python for what these say of themselves
+BROKEN = (  # errors of pyarrow for broken files, and of Python for their metadata
     *(pa.ArrowException, OSError, ValueError, RuntimeError, MemoryError, OverflowError),
     *(LookupError, TypeError, AttributeError),
 )
@@ -61,9 +61,9 @@ def write(source: pa.Table | pa.RecordBatchReader, sink: Any) -> int:
     first group of rows. Of batches one group of rows is put aside (`tacpipe.io.row_groups`), or is in memory where there
     are encoded frames among the columns.
     """
-    rows = row_groups.of(source, ROW_GROUP_ROWS, GROUP_BYTES)
+    rows = row_groups.rows_in_groups(source, ROW_GROUP_ROWS, GROUP_BYTES)
     head = rows.head()
-    held = _held_share(head, rows.release) > HELD_SHARE
+    many_repeats = _repeated_share(head, rows.release) > REPEATED_SHARE
     encoding, compression_level = {}, {}
     compression = dict.fromkeys(source.schema.names, "zstd")
     value_bytes = max(
@@ -72,8 +72,8 @@ def write(source: pa.Table | pa.RecordBatchReader, sink: Any) -> int:
     for field in source.schema:
         if row_groups.holds_bytes(field) and _compressed_already(head.column(field.name)):
             compression[field.name] = "none"
-        delta = pa.types.is_integer(field.type) and (field.name in _CLOCKS or not held)
-        compression_level[field.name] = ZSTD_LEVEL if delta or not held else ZSTD_LEVEL_HELD
+        delta = pa.types.is_integer(field.type) and (field.name in _CLOCKS or not many_repeats)
+        compression_level[field.name] = ZSTD_LEVEL if delta or not many_repeats else ZSTD_LEVEL_REPEATED
         if pa.types.is_floating(field.type):
             encoding[field.name] = "BYTE_STREAM_SPLIT"
         elif delta:
@@ -96,7 +96,7 @@ def write(source: pa.Table | pa.RecordBatchReader, sink: Any) -> int:
     ) as writer:
         count = 0
         for group in rows.groups(max(1, min(ROW_GROUP_ROWS, GROUP_BYTES // max(value_bytes, 1)))):
-            writer.write_table(_uncut(group).cast(bare), row_group_size=max(1, group.num_rows))
+            writer.write_table(_combine_chunks(group).cast(bare), row_group_size=max(1, group.num_rows))
             count += group.num_rows
         writer.add_key_value_metadata({_KEY: _fields_to_json(source.schema)})
     return count
@@ -197,7 +197,7 @@ class ParquetTable:
             self._fields = None if stored is None else json.loads(stored)
             self.schema = self._with_fields(self._file.schema_arrow)
         except BROKEN as error:
-            raise _unread(self._size, error) from error
+            raise _read_error(self._size, error) from error
 
     def _opened(self) -> pq.ParquetFile:
         """Return a reader of the file, which checks the pages of one that memory does not hold."""
@@ -213,7 +213,7 @@ class ParquetTable:
                 self._claims = Claims(self._file.schema, content)
             return self._claims.count(content, columns)
         except BROKEN as error:
-            raise _unread(self._size, error) from error
+            raise _read_error(self._size, error) from error
 
     @property
     def num_rows(self) -> int:
@@ -227,7 +227,7 @@ class ParquetTable:
         try:
             return self._described(self._file.read(columns=list(columns) if columns is not None else None))
         except BROKEN as error:
-            raise _unread(self._size, error) from error
+            raise _read_error(self._size, error) from error
 
     def batches(self, columns: Sequence[str] | None = None, rows: int = SOME_ROWS) -> Iterator[pa.Table]:
         """Yield tables of up to ``rows`` rows, decoded as they are asked for, with field metadata."""
@@ -239,7 +239,7 @@ class ParquetTable:
             for batch in self._opened().iter_batches(rows, columns=names, use_threads=False):
                 yield self._described(pa.Table.from_batches([batch]))
         except BROKEN as error:
-            raise _unread(self._size, error) from error
+            raise _read_error(self._size, error) from error
 
     def _described(self, table: pa.Table) -> pa.Table:
         """Return a table of some columns with their field metadata."""
@@ -264,17 +264,17 @@ def stored_batches(path: str, rows: int = SOME_ROWS) -> pa.RecordBatchReader:
     """
     size = os.stat(path).st_size  # noqa: PTH116
 
-    def taken() -> Iterator[pa.RecordBatch]:
+    def read_batches() -> Iterator[pa.RecordBatch]:
         try:
             yield from file.iter_batches(rows, use_threads=False)
         except BROKEN as error:
-            raise _unread(size, error) from error
+            raise _read_error(size, error) from error
 
     try:
         file = pq.ParquetFile(path, buffer_size=1 << 16, pre_buffer=False)
-        return pa.RecordBatchReader.from_batches(file.schema_arrow, taken())
+        return pa.RecordBatchReader.from_batches(file.schema_arrow, read_batches())
     except BROKEN as error:
-        raise _unread(size, error) from error
+        raise _read_error(size, error) from error
 
 
 def owned(*pieces: bytes | memoryview) -> pa.Buffer:
@@ -290,14 +290,14 @@ def owned(*pieces: bytes | memoryview) -> pa.Buffer:
     return buffer
 
 
-def _unread(size: int, error: Exception) -> TacpipeError:
+def _read_error(size: int, error: Exception) -> TacpipeError:
     """Return in words why bytes could not be read: they are damaged, or there is too little memory left to know."""
     if memory.scarce() and (short := memory.shortage(error)) is not None:
         return short
     return DamagedError(f"These {size} bytes are no Parquet file: {plain(' '.join(str(error).split()), 200)}.")
 
 
-def _uncut(group: pa.Table) -> pa.Table:
+def _combine_chunks(group: pa.Table) -> pa.Table:
     """Return rows whose texts and bytes lie in one piece: pages of these would end where pieces do."""
     for position, column in enumerate(group.columns):
         if column.num_chunks > 1 and not pa.types.is_primitive(column.type):
@@ -323,7 +323,7 @@ def _compressed_already(column: pa.ChunkedArray) -> bool:
     return len(content) > 0 and len(pa.Codec("zstd", 1).compress(bytes(content), asbytes=True)) > WORTH * len(content)
 
 
-def _held_share(table: pa.Table, release: Callable[[], None]) -> float:
+def _repeated_share(table: pa.Table, release: Callable[[], None]) -> float:
     """Return the fraction of rows whose integer channels all equal those of the row before.
 
     What was read of a channel is let go of before the next one.
@@ -369,8 +369,8 @@ def with_metadata(table: pa.Table, metadata: dict[str, dict[str, str]]) -> pa.Ta
     """Return ``table`` with ``metadata`` (column to key to text) added to that of its fields."""
     fields = []
     for field in table.schema:
-        kept = {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
-        merged = {**kept, **metadata.get(field.name, {})}
+        existing = {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
+        merged = {**existing, **metadata.get(field.name, {})}
         fields.append(pa.field(field.name, field.type, metadata=merged or None))
     return table.cast(pa.schema(fields))
 
@@ -380,10 +380,10 @@ def one_after_another(tables: Mapping[str, pa.Table]) -> pa.Table:
 
     A table that has such a column keeps its own, as that of a split or of predictions. There must be a table.
     """
-    named = []
+    tables_with_names = []
     for name, table in tables.items():
         if "recording" not in table.column_names:
             names = pa.DictionaryArray.from_arrays(pa.array([0] * table.num_rows, pa.int32()), pa.array([name]))
             table = table.add_column(0, "recording", names)
-        named.append(pa.Table.from_arrays(table.columns, names=table.column_names))
-    return pa.concat_tables(named, promote_options="default").unify_dictionaries()
+        tables_with_names.append(pa.Table.from_arrays(table.columns, names=table.column_names))
+    return pa.concat_tables(tables_with_names, promote_options="default").unify_dictionaries()

@@ -19,10 +19,10 @@ def set_quiet(quiet: bool) -> None:
 
 
 @contextmanager
-def shown(wanted: bool) -> Iterator[None]:
+def showing_progress(visible: bool) -> Iterator[None]:
     """Show bars and sentences within the block, or neither, whatever was set before."""
     before = _quiet
-    set_quiet(not wanted)
+    set_quiet(not visible)
     try:
         yield
     finally:
@@ -34,7 +34,7 @@ def is_quiet() -> bool:
     return _quiet
 
 
-def wanted() -> bool:
+def is_visible() -> bool:
     """Return whether somebody is looking: stderr is a terminal and nobody asked for quiet."""
     return sys.stderr.isatty() and not _quiet
 
@@ -48,7 +48,7 @@ def report(sentence: str) -> None:
 @contextmanager
 def bar(description: str, total: int) -> Iterator[Callable[..., None]]:
     """Yield ``advance(steps=1, note="")``, which moves a bar of ``total`` steps and shows ``note`` behind it."""
-    if not wanted():
+    if not is_visible():
         yield lambda steps=1, note="": None
         return
     from rich.console import Console

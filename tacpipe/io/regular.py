@@ -1,7 +1,7 @@
-"""Regular files, opened as such: a pipe, a device or a folder in the place of one is refused, and never waited for.
+"""Open regular files only: a pipe, a device or a folder in the place of one is refused, and never waited for.
 
 Every file of a store, of a remote store and of an untrusted dataset is opened here. A file of a store is never a symbolic
-link (``follow=False``), and none is read that is larger than what describes it declares (``most``), or than memory.
+link (``follow=False``), and none is read that is larger than what describes it declares (``max_bytes``), or than memory.
 
 What a file of a recording's source names is opened by `inside`: it cannot lead out of its folder, by ``..`` or by a link.
 
@@ -37,14 +37,14 @@ BLOCK_BYTES = 1 << 20
 JSON_BYTES = 1 << 30  # the largest JSON file that is read: a manifest of a million recordings has half of it
 JSON_IN_MEMORY = 24  # bytes that a byte of JSON becomes at most when it is parsed: "[]," is an empty list
 _FLAGS = os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC  # a pipe without writers would block for ever
-_LINK = (errno.ELOOP, errno.EMLINK)  # what systems answer to O_NOFOLLOW
+_LINK = (errno.ELOOP, errno.EMLINK)  # errors of O_NOFOLLOW by system
 
 
 FOLLOW_LINKS = "TACPIPE_FOLLOW_LINKS"  # the environment variable that allows links which lead out of a source
 
 
 class IrregularError(TacpipeError):
-    """What lies at a path is not a regular file, or is larger than it may be."""
+    """A path that is not a regular file, or a file that is larger than allowed."""
 
 
 def opened(path: Path | str, *, follow: bool = True) -> io.BufferedReader:
@@ -56,42 +56,42 @@ def opened(path: Path | str, *, follow: bool = True) -> io.BufferedReader:
     return io.BufferedReader(io.FileIO(handle))
 
 
-def content(path: Path | str, most: int | None = None, *, follow: bool = True) -> bytes:
-    """Return what a regular file of at most ``most`` bytes holds, by default of as many as memory takes.
+def content(path: Path | str, max_bytes: int | None = None, *, follow: bool = True) -> bytes:
+    """Return what a regular file of at most ``max_bytes`` bytes holds, by default of as many as memory takes.
 
     Raises as `opened` does, `IrregularError` for a file that is larger, and `StorageError` where memory is short, which
     states nothing of the file.
     """
     handle, size = _open(path, follow=follow)
     try:
-        _expect_size(path, size, most)
+        _expect_size(path, size, max_bytes)
         with naming(path):
-            found = os.read(handle, size + 1)  # one byte more: it ends there, as it should
-            return found if len(found) == size else _rest(path, handle, found, most)
+            data = os.read(handle, size + 1)  # one byte more: it ends there, as it should
+            return data if len(data) == size else _read_remaining(path, handle, data, max_bytes)
     finally:
         os.close(handle)
 
 
-def blocks(path: Path | str, most: int, *, follow: bool = True) -> Iterator[bytes]:
-    """Yield what a regular file of at most ``most`` bytes holds, `BLOCK_BYTES` at a time; raises as `content` does."""
+def blocks(path: Path | str, max_bytes: int, *, follow: bool = True) -> Iterator[bytes]:
+    """Yield what a regular file of at most ``max_bytes`` bytes holds, `BLOCK_BYTES` at a time; raises as `content` does."""
     handle, size = _open(path, follow=follow)
     try:
         read = 0
-        _expect_size(path, size, most, whole=False)
+        _expect_size(path, size, max_bytes, in_memory=False)
         while block := os.read(handle, BLOCK_BYTES):
             read += len(block)
-            _expect_size(path, read, most, whole=False)
+            _expect_size(path, read, max_bytes, in_memory=False)
             yield block
     finally:
         os.close(handle)
 
 
-def json_value(path: Path | str, most: int = JSON_BYTES) -> Any:
+def json_value(path: Path | str, max_bytes: int = JSON_BYTES) -> Any:
     """Return the JSON value that a file of a store holds.
 
     Raises as `content` does, and `ValueError` or `RecursionError` where it is not JSON.
     """
-    text = content(path, most, follow=False)
+    text = content(path, max_bytes, follow=False)
     expect_parsed(path, len(text))
     return json.loads(text)
 
@@ -177,28 +177,28 @@ def _open(path: Path | str, *, follow: bool) -> tuple[int, int]:
             require(path, os.lstat(path).st_mode)
         raise
     try:
-        found = os.fstat(handle)
-        require(path, found.st_mode)
+        status = os.fstat(handle)
+        require(path, status.st_mode)
     except BaseException:
         os.close(handle)
         raise
-    return handle, found.st_size
+    return handle, status.st_size
 
 
-def _expect_size(path: Path | str, size: int, most: int | None, *, whole: bool = True) -> None:
-    if most is not None and size > most:
+def _expect_size(path: Path | str, size: int, max_bytes: int | None, *, in_memory: bool = True) -> None:
+    if max_bytes is not None and size > max_bytes:
         raise IrregularError(
-            f"{path} has {size:,} bytes, and should have {most:,} at most. It is damaged or was made up; remove it."
+            f"{path} has {size:,} bytes, and should have {max_bytes:,} at most. It is damaged or was made up; remove it."
         )
-    if whole:
+    if in_memory:
         memory.require(size, str(path), error=StorageError)
 
 
-def _rest(path: Path | str, handle: int, begun: bytes, most: int | None) -> bytes:
+def _read_remaining(path: Path | str, handle: int, data: bytes, max_bytes: int | None) -> bytes:
     """Return all of a file that is longer than one read, or that grows or shrinks while it is read."""
-    found = io.BytesIO()
-    while begun:
-        found.write(begun)
-        _expect_size(path, found.tell(), most)
-        begun = os.read(handle, 16 * BLOCK_BYTES)
-    return found.getvalue()
+    buffer = io.BytesIO()
+    while data:
+        buffer.write(data)
+        _expect_size(path, buffer.tell(), max_bytes)
+        data = os.read(handle, 16 * BLOCK_BYTES)
+    return buffer.getvalue()

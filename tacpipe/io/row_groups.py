@@ -18,20 +18,22 @@ from tacpipe.arrays import AnyArray, Bools
 from tacpipe.io.files import sentence, write_all
 
 IN_MEMORY = 1 << 25  # bytes of rows, before a file is made of them
-AT_ONCE = 1 << 22  # bytes of rows that are then written at once
+WRITE_BYTES = 1 << 22  # bytes of rows that are then written at once
 BYTES_TYPES = (pa.lib.Type_BINARY, pa.lib.Type_LARGE_BINARY)
-BESIDE_BYTES = 32  # that an encoded frame may take in memory beside its own: offsets, whether it is there
+FRAME_OVERHEAD = 32  # bytes of an encoded frame in memory besides its content: offsets, validity
 
 
-def of(source: pa.Table | pa.RecordBatchReader, most: int, group_bytes: int) -> Rows | RowsAside:
-    """Return the rows of a table or of batches, to be taken in groups of at most ``most`` rows.
+def rows_in_groups(
+    source: pa.Table | pa.RecordBatchReader, max_rows: int, group_bytes: int
+) -> RowsInMemory | SpilledRows:
+    """Return the rows of a table or of batches, to be taken in groups of at most ``max_rows`` rows.
 
     A group has about ``group_bytes`` of encoded frames at most, where there are any.
     """
     framed = any(holds_bytes(field) for field in source.schema)
     if framed or isinstance(source, pa.Table):
-        return Rows(source, most, group_bytes)
-    return RowsAside(source, most)
+        return RowsInMemory(source, max_rows, group_bytes)
+    return SpilledRows(source, max_rows)
 
 
 def holds_bytes(field: pa.Field) -> bool:
@@ -39,14 +41,14 @@ def holds_bytes(field: pa.Field) -> bool:
     return field.type.id in BYTES_TYPES
 
 
-class Rows:
+class RowsInMemory:
     """The rows of a table or of batches, taken group by group."""
 
-    def __init__(self, source: pa.Table | pa.RecordBatchReader, most: int, group_bytes: int) -> None:
-        self._most, self._group_bytes = most, group_bytes
+    def __init__(self, source: pa.Table | pa.RecordBatchReader, max_rows: int, group_bytes: int) -> None:
+        self._max_rows, self._group_bytes = max_rows, group_bytes
         self._next = source if isinstance(source, pa.Table) else source.schema.empty_table()
         batches = () if isinstance(source, pa.Table) else source
-        self._more = (pa.Table.from_batches([batch]) for batch in batches if batch.num_rows)
+        self._following = (pa.Table.from_batches([batch]) for batch in batches if batch.num_rows)
 
     def release(self) -> None:
         """Do nothing: the rows are in memory."""
@@ -59,12 +61,12 @@ class Rows:
         """Return the rows by which it is decided how columns are stored; they stay to be taken."""
         frames = [field.name for field in self._next.schema if holds_bytes(field)]
         if not frames:
-            self._fill(self._most)
-        while frames and self._next.num_rows < self._most and self._fill(self._next.num_rows + 1):
-            most = self._group_bytes + BESIDE_BYTES * self._next.num_rows
-            if any(self._next.column(name).nbytes > most for name in frames):
+            self._fill(self._max_rows)
+        while frames and self._next.num_rows < self._max_rows and self._fill(self._next.num_rows + 1):
+            max_frame_bytes = self._group_bytes + FRAME_OVERHEAD * self._next.num_rows
+            if any(self._next.column(name).nbytes > max_frame_bytes for name in frames):
                 break
-        head = self._first(self._most)
+        head = self._first(self._max_rows)
         for name in frames:
             ends = np.cumsum(pc.binary_length(head.column(name)).fill_null(0).to_numpy(), dtype=np.int64)
             head = head.slice(0, max(1, int(np.searchsorted(ends, self._group_bytes, side="right"))))
@@ -83,14 +85,14 @@ class Rows:
     def _first(self, rows: int) -> pa.Table:
         return self._next.slice(
             0, min(rows, self._next.num_rows)
-        )  # without columns a slice has as many as are asked for
+        )  # slice() of a table without columns has the requested number of rows
 
     def _fill(self, rows: int) -> bool:
         """Have ``rows`` rows waiting, or all that are left; return whether there are so many."""
         waiting, count = [self._next], int(self._next.num_rows)
-        for more in self._more if count < rows else ():
-            waiting.append(more)
-            count += more.num_rows
+        for table in self._following if count < rows else ():
+            waiting.append(table)
+            count += table.num_rows
             if count >= rows:
                 break
         if len(waiting) > 1:
@@ -98,12 +100,12 @@ class Rows:
         return count >= rows
 
 
-class RowsAside:
+class SpilledRows:
     """The rows of batches without encoded frames, taken group by group, each put aside while it is written."""
 
-    def __init__(self, source: pa.RecordBatchReader, most: int) -> None:
-        self._most = most
-        self._groups = Groups(source, most)
+    def __init__(self, source: pa.RecordBatchReader, max_rows: int) -> None:
+        self._max_rows = max_rows
+        self._groups = SpilledGroups(source, max_rows)
         self._head: pa.Table | None = self._groups.next()
         self.release = self._groups.release
 
@@ -112,8 +114,8 @@ class RowsAside:
         return self._head
 
     def groups(self, rows: int) -> Iterator[pa.Table]:
-        """Yield tables of ``most`` rows, a last one with the rest; an empty one where there is none at all."""
-        assert rows == self._most
+        """Yield tables of ``max_rows`` rows, the last with the remainder; an empty one where there is none at all."""
+        assert rows == self._max_rows
         group, self._head = self._head, None
         while group is not None:
             yield group
@@ -123,10 +125,10 @@ class RowsAside:
 
     def releasing(self, sink: Any) -> Any:
         """Return a file that writes to ``sink``, and lets go of what was read for that."""
-        return _Releasing(sink, self._groups)
+        return _ReleasingSink(sink, self._groups)
 
 
-class Groups:
+class SpilledGroups:
     """The rows of batches in tables of so many rows. There is one table at a time; the next one takes its place.
 
     Rows of numbers lie in a temporary file that is mapped: their pages are let go of with `release`, and come back from
@@ -135,29 +137,29 @@ class Groups:
 
     def __init__(self, source: pa.RecordBatchReader, rows: int) -> None:
         self._source, self._rows = iter(source), rows
-        self._left: pa.RecordBatch | None = None  # of a batch, that belongs to the next group
-        self._group = _Group(source.schema, rows)
+        self._remainder: pa.RecordBatch | None = None  # rows of a batch for the next group
+        self._group = _RowGroup(source.schema, rows)
 
     def next(self) -> pa.Table:
         """Return the next group; one without rows where there is none. Raises `StorageError` where the disk is full."""
         self._group.clear()
-        while self._group.count < self._rows and (batch := self._more()) is not None:
+        while self._group.count < self._rows and (batch := self._next_batch()) is not None:
             room = self._rows - self._group.count
             self._group.add(batch.slice(0, room))
-            self._left = batch.slice(room) if batch.num_rows > room else None
+            self._remainder = batch.slice(room) if batch.num_rows > room else None
         return self._group.table()
 
     def release(self) -> None:
         """Let go of what was read of the group so far, which stays where it is."""
         self._group.release()
 
-    def _more(self) -> pa.RecordBatch | None:
-        left, self._left = self._left, None
-        return next(self._source, None) if left is None else left
+    def _next_batch(self) -> pa.RecordBatch | None:
+        remainder, self._remainder = self._remainder, None
+        return next(self._source, None) if remainder is None else remainder
 
 
 @dataclass
-class _Column:
+class _SpilledColumn:
     """One column of a group: where its numbers lie in the file, or its values, and where it has nulls."""
 
     field: pa.Field
@@ -167,15 +169,15 @@ class _Column:
     valid: list[tuple[int, Bools]] = field(default_factory=list)  # first row, and which rows hold a value
 
 
-class _Group:
+class _RowGroup:
     """Up to so many rows."""
 
     def __init__(self, schema: pa.Schema, rows: int) -> None:
-        self.count = self._aside = 0  # rows, and of them those in the file
+        self.count = self._spilled = 0  # rows, and of them those in the file
         self._schema = schema
         self._waiting: list[pa.RecordBatch] = []  # until they are too large
-        self._bytes = 0  # of those that wait
-        self._columns = [_Column(one, _width(one.type)) for one in schema]
+        self._bytes = 0  # size of the waiting batches
+        self._columns = [_SpilledColumn(column_field, _width(column_field.type)) for column_field in schema]
         place = 0
         for column in self._columns:
             column.start, place = place, place + _whole_pages(column.width * rows)
@@ -185,7 +187,7 @@ class _Group:
 
     def clear(self) -> None:
         """Begin anew."""
-        self.count = self._aside = self._bytes = 0
+        self.count = self._spilled = self._bytes = 0
         self._waiting, self._mapped = [], None  # it is unmapped with the last table that reads it
         for column in self._columns:
             column.values, column.valid = [], []
@@ -195,10 +197,10 @@ class _Group:
         self._waiting.append(batch)
         self._bytes += batch.nbytes
         self.count += batch.num_rows
-        if self._size and self._bytes > (AT_ONCE if self._aside else IN_MEMORY):
-            self._put_aside()
+        if self._size and self._bytes > (WRITE_BYTES if self._spilled else IN_MEMORY):
+            self._spill()
 
-    def _put_aside(self) -> None:
+    def _spill(self) -> None:
         try:
             if self._file is None:
                 self._file = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115  (closed by the line below)
@@ -206,15 +208,17 @@ class _Group:
                 os.ftruncate(self._file.fileno(), self._size)
             for batch in self._waiting:
                 for column, values in zip(self._columns, batch.columns, strict=True):
-                    self._write(column, values, self._aside)
-                self._aside += batch.num_rows
+                    self._write(column, values, self._spilled)
+                self._spilled += batch.num_rows
         except OSError as error:
             raise sentence(tempfile.gettempdir(), error) from error
         self._waiting, self._bytes = [], 0
 
-    def _write(self, column: _Column, values: pa.Array, row: int) -> None:
+    def _write(self, column: _SpilledColumn, values: pa.Array, row: int) -> None:
         if not column.width:
-            column.values.append(values.take(pa.array(np.arange(len(values)))))  # what it was a part of can go
+            column.values.append(
+                values.take(pa.array(np.arange(len(values))))
+            )  # a copy, so that the batch can be freed
             return
         if values.null_count:
             column.valid.append((row, values.is_valid().to_numpy(zero_copy_only=False)))
@@ -223,24 +227,24 @@ class _Group:
 
     def table(self) -> pa.Table:
         """Return the rows."""
-        if not self._aside:
+        if not self._spilled:
             return pa.Table.from_batches(self._waiting, self._schema)
-        self._put_aside()
+        self._spill()
         self._mapped = mmap.mmap(self._file.fileno(), self._size, access=mmap.ACCESS_READ)
         content = pa.py_buffer(self._mapped)
         return pa.Table.from_arrays([self._array(column, content) for column in self._columns], schema=self._schema)
 
-    def _array(self, column: _Column, content: pa.Buffer) -> pa.Array | pa.ChunkedArray:
+    def _array(self, column: _SpilledColumn, content: pa.Buffer) -> pa.Array | pa.ChunkedArray:
         kind = column.field.type
         if not column.width:
             return pa.chunked_array(column.values, kind)
         numbers = content.slice(column.start, column.width * self.count)
         valid = None
         if column.valid:
-            there = np.ones(self.count, dtype=bool)
-            for row, some in column.valid:
-                there[row : row + len(some)] = some
-            valid = pa.py_buffer(np.packbits(there, bitorder="little").tobytes())
+            is_valid = np.ones(self.count, dtype=bool)
+            for row, block_valid in column.valid:
+                is_valid[row : row + len(block_valid)] = block_valid
+            valid = pa.py_buffer(np.packbits(is_valid, bitorder="little").tobytes())
         return pa.Array.from_buffers(kind, self.count, [valid, numbers])
 
     def release(self) -> None:
@@ -264,19 +268,19 @@ def _raw(values: pa.Array, width: int) -> AnyArray:
     return np.frombuffer(content, np.uint8)[values.offset * width : (values.offset + len(values)) * width]
 
 
-class _Releasing:
+class _ReleasingSink:
     """A file to write to, after each piece of which what was read for it is let go of."""
 
     closed = False
 
-    def __init__(self, sink: Any, groups: Groups) -> None:
+    def __init__(self, sink: Any, groups: SpilledGroups) -> None:
         self._sink, self._groups = sink, groups
 
     def write(self, content: bytes | memoryview) -> int:
         """Write all of ``content``."""
-        written: int = self._sink.write(content)
+        count: int = self._sink.write(content)
         self._groups.release()
-        return written
+        return count
 
     def tell(self) -> int:
         """Return how many bytes were written."""

@@ -1,4 +1,4 @@
-"""Tables put aside on disk, so that what is read need not fit in memory; given back piece by piece, or in order."""
+"""Spill tables to disk, so that data need not fit in memory, and read them back piece by piece or in order."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tacpipe.io.files import sentence
 from tacpipe.io.parquet import owned
 
 IN_MEMORY = 1 << 26  # bytes, before a file is made of them
-PIECE_ROWS = 1 << 15  # of a run of rows that is in order
+PIECE_ROWS = 1 << 15  # rows per piece of a sorted run
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Piece:
     start: int
     size: int
     rows: int
-    least: Mapping[str, float] = field(default_factory=dict)
+    minima: Mapping[str, float] = field(default_factory=dict)
 
 
 KEPT = 0.9  # fraction of the free disk that one file may unpack to
@@ -40,16 +40,16 @@ class Spill:
 
     def __init__(self, in_memory: int | None = None) -> None:
         """Take how many bytes stay in memory, before a file is made of them; `IN_MEMORY` by default."""
-        self._most = IN_MEMORY if in_memory is None else in_memory
-        self._file = tempfile.SpooledTemporaryFile(self._most)  # noqa: SIM115  (closed by the line below)
+        self._max_memory = IN_MEMORY if in_memory is None else in_memory
+        self._file = tempfile.SpooledTemporaryFile(self._max_memory)  # noqa: SIM115  (closed by the line below)
         weakref.finalize(self, self._file.close)
         self._lock = threading.Lock()  # streams of one file may be read by threads
         self._end = 0
 
     @property
     def in_memory(self) -> bool:
-        """Whether all that was put aside is in memory still."""
-        return self._end <= self._most
+        """True while all tables are still in memory."""
+        return self._end <= self._max_memory
 
     def add(self, table: pa.Table, orders: Sequence[str] = ()) -> Piece:
         """Put a table aside; ``orders`` are columns of numbers without nulls.
@@ -67,8 +67,8 @@ class Spill:
             except OSError as error:
                 raise sentence(tempfile.gettempdir(), error) from error
             start, self._end = self._end, self._end + content.size
-        least = {name: table.column(name).to_numpy().min().item() for name in orders if table.num_rows}
-        return Piece(start, content.size, table.num_rows, least)
+        minima = {name: table.column(name).to_numpy().min().item() for name in orders if table.num_rows}
+        return Piece(start, content.size, table.num_rows, minima)
 
     def add_run(self, table: pa.Table, order: str) -> list[Piece]:
         """Put a table aside in the order of a column, in pieces that follow one another."""
@@ -144,23 +144,23 @@ def in_order(pieces: Sequence[Piece], read: Callable[[Piece], pa.Table], order: 
     [[1], [3, 4, 9], [12]]
     """
     waiting: list[tuple[int, pa.Table]] = []  # place of the piece, its rows that were not yielded
-    for place, piece in sorted(enumerate(pieces), key=lambda one: (one[1].least[order], one[0])):
-        yield from _before(waiting, order, piece.least[order])
+    for place, piece in sorted(enumerate(pieces), key=lambda numbers: (numbers[1].minima[order], numbers[0])):
+        yield from _rows_below(waiting, order, piece.minima[order])
         waiting.append((place, sorted_by(read(piece), order)))
-    yield from _before(waiting, order, None)
+    yield from _rows_below(waiting, order, None)
 
 
-def _before(waiting: list[tuple[int, pa.Table]], order: str, least: float | None) -> Iterator[pa.Table]:
-    """Yield the rows below ``least`` as one table, and leave the others waiting."""
+def _rows_below(waiting: list[tuple[int, pa.Table]], order: str, limit: float | None) -> Iterator[pa.Table]:
+    """Yield the rows below ``limit`` as one table, and leave the others waiting."""
     ready: list[pa.Table] = []
-    left: list[tuple[int, pa.Table]] = []
-    for place, table in sorted(waiting, key=lambda one: one[0]):
+    later: list[tuple[int, pa.Table]] = []
+    for place, table in sorted(waiting, key=lambda entry: entry[0]):
         values = table.column(order).to_numpy()
-        end = table.num_rows if least is None else int(np.searchsorted(values, least, side="left"))
+        end = table.num_rows if limit is None else int(np.searchsorted(values, limit, side="left"))
         if end:
             ready.append(table.slice(0, end))
         if end < table.num_rows:
-            left.append((place, table.slice(end)))
-    waiting[:] = left
+            later.append((place, table.slice(end)))
+    waiting[:] = later
     if ready:
         yield sorted_by(pa.concat_tables(ready), order)

@@ -1,4 +1,4 @@
-"""What is printed: results on stdout, all else on stderr, and no control character of what files hold.
+"""Print results on stdout and all else on stderr, without control characters that files hold.
 
 A label, a name or a header may come from anybody, and a terminal obeys escape sequences. So all that is printed passes
 through here, where a character that is not printable is shown as Python's repr shows it.
@@ -14,7 +14,11 @@ import json
 import os
 import select
 import sys
-from typing import Any
+import textwrap
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import Any, TextIO
 
 from tacpipe import printable
 
@@ -90,3 +94,108 @@ def unprinted() -> OSError | None:
     raw = getattr(getattr(sys.stdout, "buffer", None), "raw", None)
     failure = raw.failure if isinstance(raw, _Standard) else None
     return None if isinstance(failure, BrokenPipeError) else failure
+
+
+WIDTH = 120  # width without a terminal
+GAP = "  "
+
+
+@dataclass(frozen=True)
+class Row:
+    """The cells of a row and how they are shown on a terminal, as rich names styles."""
+
+    cells: Sequence[str]
+    style: str = ""
+
+
+@dataclass(frozen=True)
+class Group:
+    """Rows below a heading; an empty heading is not printed."""
+
+    heading: str
+    rows: Sequence[Row]
+
+
+@dataclass(frozen=True)
+class Table:
+    """Groups of rows with the same columns, and a caption."""
+
+    heads: Sequence[str]
+    groups: Sequence[Group]
+    caption: str = ""
+    spare: Sequence[int] = ()  # columns that may be left out, in this order
+    left: Sequence[int] = field(default=(0,))  # columns of text, aligned to the left
+
+    def lines(self, width: int) -> list[tuple[str, str]]:
+        """Return the lines of the table within ``width`` cells as far as `spare` allows, each with its style."""
+        columns = self._fitting_columns(width)
+        widths = {at: max(_cells(row[at]) for row in self._all_rows()) for at in columns}
+        indent = GAP if any(group.heading for group in self.groups) else ""
+
+        def line(cells: Sequence[str]) -> str:
+            padded = [
+                printable.padded(cells[at], widths[at])
+                if at in self.left
+                else " " * (widths[at] - _cells(cells[at])) + cells[at]
+                for at in columns
+            ]
+            return (indent + GAP.join(padded)).rstrip()
+
+        lines = [(line(self.heads), "bold")]
+        for group in self.groups:
+            lines += [(group.heading, "bold")] if group.heading else []
+            lines += [(line(row.cells), row.style) for row in group.rows]
+        caption = textwrap.wrap(printable.shown(self.caption), max(20, min(width, WIDTH)))
+        return [*lines, *((text, "dim") for text in caption)]
+
+    def text(self, width: int = WIDTH) -> str:
+        """Return the table as lines of text."""
+        return "\n".join(text for text, _ in self.lines(width))
+
+    def _all_rows(self) -> Iterator[Sequence[str]]:
+        yield self.heads
+        for group in self.groups:
+            yield from (row.cells for row in group.rows)
+
+    def _fitting_columns(self, width: int) -> list[int]:
+        columns = list(range(len(self.heads)))
+        for at in self.spare:
+            needed = sum(max(_cells(row[at]) for row in self._all_rows()) + len(GAP) for at in columns)
+            if needed <= width:
+                break
+            columns.remove(at)
+        return columns
+
+
+def width_of(stream: TextIO) -> int:
+    """Return how many cells a line of a stream has: those of its terminal, else ``COLUMNS``, else 120."""
+    with suppress(OSError, ValueError, AttributeError):
+        return os.get_terminal_size(stream.fileno()).columns
+    with suppress(KeyError, ValueError):
+        return max(int(os.environ["COLUMNS"]), 40)
+    return WIDTH
+
+
+def show(table: Table, *, on_stdout: bool) -> None:
+    """Print a table on stdout or stderr, in colours on a terminal; a command's result goes to stdout."""
+    stream = sys.stdout if on_stdout else sys.stderr
+    lines = table.lines(width_of(stream))
+    if not stream.isatty():
+        (result if on_stdout else note)("\n".join(text for text, _ in lines))
+        return
+    from rich.console import Console
+    from rich.text import Text
+
+    console = Console(file=stream, highlight=False, markup=False, soft_wrap=True)
+    for text, style in lines:
+        console.print(Text(printable.shown(text), style=style))
+
+
+def _cells(text: str) -> int:
+    """Return how many cells text takes: some letters take two, and some none.
+
+    >>> _cells("木"), _cells("−0.1")
+    (2, 4)
+    """
+    padded = printable.padded(text, 4 * len(text))
+    return 4 * len(text) - (len(padded) - len(text))

@@ -11,6 +11,7 @@ never counts as a second request. What was connected to standard output and erro
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
 import select
 import signal
@@ -25,7 +26,7 @@ from tacpipe import printable
 from tacpipe.errors import INTERRUPTED
 from tacpipe.io import terminal
 
-GRACE_S = 0.7  # to end in good order
+GRACE_S = 0.7  # time to end in good order
 TWICE_S = 0.25  # `timeout` signals a process and then its group: what comes so soon after a request is the same one
 SENTENCE = "tacpipe: interrupted; what was finished is kept."
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -37,7 +38,7 @@ class _Requests:
     def __init__(self) -> None:
         self._last_s = -TWICE_S
 
-    def another(self) -> bool:
+    def is_new_request(self) -> bool:
         """Return whether the signal that has just come is a request of its own."""
         now_s = time.monotonic()
         if now_s - self._last_s <= TWICE_S:
@@ -47,26 +48,26 @@ class _Requests:
 
 
 class _Program:
-    """What this process knows of termination requests; there is one."""
+    """The state of termination requests of this process; one instance exists."""
 
     def __init__(self) -> None:
-        self.by_main_thread = _Requests()  # by the main thread
-        self.by_listener = _Requests()  # by the thread that listens
+        self.by_main_thread = _Requests()
+        self.by_listener = _Requests()
         self.ending = False
         self.installed = False  # it is a command's own process
         self.deferred = False  # `KeyboardInterrupt` waits
         self.own_way = False  # the next request is the command's own business
         self.sentence = SENTENCE
         self.reported = False
-        self.code: int | None = None  # of a command that is done
-        self.restore: Callable[[], None] = lambda: None  # what was done to the terminal
+        self.code: int | None = None  # exit code of a command that is done
+        self.restore: Callable[[], None] = lambda: None  # resets the terminal
 
     def ask(self, number: int, frame: FrameType | None) -> None:
         """Raise `KeyboardInterrupt` for the first request, end at once for the second: the handler of all signals."""
         hung_up = number == signal.SIGHUP
         if hung_up:
             drop_closed_streams()
-        if not self.by_main_thread.another() or (hung_up and self.ending):
+        if not self.by_main_thread.is_new_request() or (hung_up and self.ending):
             return
         if self.ending or self.code is not None:
             self.end()
@@ -76,12 +77,16 @@ class _Program:
 
     def listen(self, wakeups: int) -> None:
         """See to it that the process ends soon after a request: run by a thread that hears of signals from C."""
-        expected = asked = False
+        expected = requested_before = False
         while True:
             (number,) = os.read(wakeups, 1)
-            if number not in _SIGNALS or not self.by_listener.another() or (number == signal.SIGHUP and asked):
+            if (
+                number not in _SIGNALS
+                or not self.by_listener.is_new_request()
+                or (number == signal.SIGHUP and requested_before)
+            ):
                 continue
-            asked = True
+            requested_before = True
             if self.own_way:
                 self.own_way = False
             elif expected:
@@ -120,8 +125,8 @@ def install_handlers() -> None:
     signal.set_wakeup_fd(wakes, warn_on_full_buffer=False)
     threading.Thread(target=_program.listen, args=(wakeups,), daemon=True).start()
     _program.installed = True
-    _program.restore = _terminal()
-    unraisable = sys.unraisablehook  # where an interrupt meets code that cannot raise, the thread ends the process
+    _program.restore = _terminal_restorer()
+    unraisable = sys.unraisablehook  # the listener ends the process if an interrupt meets code that cannot raise
     sys.unraisablehook = lambda reported: None if reported.exc_type is KeyboardInterrupt else unraisable(reported)
 
 
@@ -137,7 +142,7 @@ def report() -> None:
         terminal.note(sentence)
 
 
-def done(code: int) -> int:
+def finish(code: int) -> int:
     """Return the exit code of a command that is done: whoever requests it to end from now on gets this code.
 
     An interrupted process ends here: taking down torch and the like would need another second.
@@ -176,18 +181,18 @@ def deferred() -> Iterator[None]:
             raise KeyboardInterrupt
 
 
-class Ended:
-    """Whether somebody asked to end: the first request ends what runs in its own way and keeps it, the second interrupts.
+class EndRequest:
+    """A request to end: the first lets the running work finish in its own way and keeps it, the second interrupts.
 
     ``number`` is the signal that asked, None before.
     """
 
     def __init__(self) -> None:
         self.number: int | None = None
-        self._asked = threading.Event()
+        self._requested = threading.Event()
         self._heard = _Requests()
 
-    def __enter__(self) -> Ended:
+    def __enter__(self) -> EndRequest:
         self._before: dict[signal.Signals, Any] = {}
         for number in _SIGNALS:
             if signal.getsignal(number) is not signal.SIG_IGN:
@@ -204,22 +209,22 @@ class Ended:
 
     def __call__(self) -> bool:
         """Return whether somebody did."""
-        return self._asked.is_set()
+        return self._requested.is_set()
 
     def wait(self, timeout_s: float | None) -> None:
         """Wait until somebody does, or for so long."""
-        self._asked.wait(timeout_s)
+        self._requested.wait(timeout_s)
 
     def _ask(self, number: int, frame: FrameType | None) -> None:
         if number == signal.SIGHUP:
             drop_closed_streams()
-        if not self._heard.another() or (number == signal.SIGHUP and self._asked.is_set()):
+        if not self._heard.is_new_request() or (number == signal.SIGHUP and self._requested.is_set()):
             return
-        if self._asked.is_set():
+        if self._requested.is_set():
             _program.ending = True
             raise KeyboardInterrupt
         self.number = number
-        self._asked.set()
+        self._requested.set()
 
 
 def drop_closed_streams() -> None:
@@ -232,25 +237,35 @@ def drop_closed_streams() -> None:
             watched = select.poll()
             watched.register(handle, select.POLLOUT)
             if any(state & (select.POLLHUP | select.POLLERR) for _, state in watched.poll(0)):
-                nothing = os.open(os.devnull, os.O_WRONLY)
-                os.dup2(nothing, handle)
-                os.close(nothing)
+                null_device = os.open(os.devnull, os.O_WRONLY)
+                os.dup2(null_device, handle)
+                os.close(null_device)
 
 
-def _terminal() -> Callable[[], None]:
+def _terminal_restorer() -> Callable[[], None]:
     """Return what makes the terminal as it is now: a process that ends at once cannot show the cursor or echo again."""
     settings: list[tuple[int, Any]] = []
     with contextlib.suppress(ImportError, OSError):
         import termios
 
         settings = [(0, termios.tcgetattr(0))] if os.isatty(0) else []
-    shown = b"\r\x1b[2K\x1b[?25h" if os.isatty(2) and os.environ.get("TERM", "dumb") != "dumb" else b""
+    show_cursor = b"\r\x1b[2K\x1b[?25h" if os.isatty(2) and os.environ.get("TERM", "dumb") != "dumb" else b""
 
     def restore() -> None:
         with contextlib.suppress(Exception):
             for handle, state in settings:
                 if os.tcgetpgrp(handle) == os.getpgrp():  # another one would be stopped for it
                     termios.tcsetattr(handle, termios.TCSANOW, state)
-            os.write(2, shown)
+            os.write(2, show_cursor)
 
     return restore
+
+
+def end_with(pipe: int) -> None:
+    """Have this process end as soon as the other end of a pipe is closed, which is when the process there ends.
+
+    The kernel reports it by a signal, which ends this process in the middle of a long call in C as well.
+    """
+    signal.signal(signal.SIGIO, signal.SIG_DFL)
+    fcntl.fcntl(pipe, fcntl.F_SETOWN, os.getpid())
+    fcntl.fcntl(pipe, fcntl.F_SETFL, os.O_ASYNC)

@@ -11,12 +11,12 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
-def each(work: Callable[[Item], Result], items: Iterable[Item], at_once: int) -> Iterator[Result]:
+def map_in_threads(work: Callable[[Item], Result], items: Iterable[Item], at_once: int) -> Iterator[Result]:
     """Yield what ``work`` gives for each of ``items``, in their order, made ``at_once`` at a time by as many threads.
 
     With one at a time no thread is started. What ``work`` raises is raised here, and what has not begun is left out.
 
-    >>> list(each(len, ["a", "bb", "ccc"], 2))
+    >>> list(map_in_threads(len, ["a", "bb", "ccc"], 2))
     [1, 2, 3]
     """
     if at_once == 1:

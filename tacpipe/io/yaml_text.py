@@ -10,9 +10,9 @@ from typing import Any
 
 from tacpipe.printable import plain
 
-DEEPEST = 50  # levels of lists and mappings within one another
-MOST = 100_000  # values, with those that aliases represent
-LONGEST = 10_000_000  # characters
+MAX_DEPTH = 50  # levels of lists and mappings within one another
+MAX_VALUES = 100_000  # values, with those that aliases represent
+MAX_CHARACTERS = 10_000_000  # characters
 
 
 def load(content: str | bytes) -> Any:
@@ -20,8 +20,8 @@ def load(content: str | bytes) -> Any:
     much."""
     import yaml
 
-    if len(content) > LONGEST:
-        raise ValueError(f"it has {len(content)} characters, {LONGEST} are allowed")
+    if len(content) > MAX_CHARACTERS:
+        raise ValueError(f"it has {len(content)} characters, {MAX_CHARACTERS} are allowed")
     fast: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
     class Loader(fast):  # type: ignore[misc]
@@ -40,41 +40,41 @@ def load(content: str | bytes) -> Any:
             return super().construct_mapping(node, deep)
 
     try:
-        _count(yaml.parse(content, Loader=fast))
+        _refuse_large(yaml.parse(content, Loader=fast))
         return yaml.load(content, Loader=Loader)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
-        where = f" in line {mark.line + 1}, column {mark.column + 1}" if mark is not None else ""
-        raise ValueError(f"{plain(str(error.problem or error.context), 200)}{where}") from None
-    except (yaml.YAMLError, AttributeError, TypeError, RecursionError) as error:  # of tags that promise another value
+        place = f" in line {mark.line + 1}, column {mark.column + 1}" if mark is not None else ""
+        raise ValueError(f"{plain(str(error.problem or error.context), 200)}{place}") from None
+    except (yaml.YAMLError, AttributeError, TypeError, RecursionError) as error:  # wrong tags raise the latter
         raise ValueError(plain(" ".join(str(error).split()), 200)) from None
 
 
-def _count(events: Any) -> None:
+def _refuse_large(events: Any) -> None:
     """Raise `ValueError` where the events of a text represent too much."""
     import yaml
 
-    sizes: dict[str, int] = {}  # of what each anchor names, itself included
-    within: list[tuple[str | None, int]] = [(None, 0)]  # anchor and size of each list or mapping that is open
+    sizes: dict[str, int] = {}  # number of values of each anchor
+    open_nodes: list[tuple[str | None, int]] = [(None, 0)]  # anchor and size of each list or mapping that is open
     total = 0
     for event in events:
         size, anchor = 0, None
         if isinstance(event, yaml.CollectionStartEvent):
-            within.append((event.anchor, 1))
-            if len(within) > DEEPEST:
-                raise ValueError(f"it has more than {DEEPEST} lists and mappings within one another")
+            open_nodes.append((event.anchor, 1))
+            if len(open_nodes) > MAX_DEPTH:
+                raise ValueError(f"it has more than {MAX_DEPTH} lists and mappings within one another")
         elif isinstance(event, yaml.CollectionEndEvent):
-            anchor, size = within.pop()
+            anchor, size = open_nodes.pop()
         elif isinstance(event, yaml.ScalarEvent):
             anchor, size = event.anchor, 1
         elif isinstance(event, yaml.AliasEvent):
-            if event.anchor in (name for name, _ in within):
+            if event.anchor in (name for name, _ in open_nodes):
                 raise ValueError(f"the alias {plain(str(event.anchor))} stands within what it names")
             size = sizes.get(str(event.anchor), 1)
         if size:
-            within[-1] = within[-1][0], within[-1][1] + size
-            total = max(total, sum(held for _, held in within))
+            open_nodes[-1] = open_nodes[-1][0], open_nodes[-1][1] + size
+            total = max(total, sum(node_size for _, node_size in open_nodes))
         if anchor is not None:
             sizes[anchor] = size
-        if total > MOST:
-            raise ValueError(f"it represents more than {MOST} values, by aliases or as written")
+        if total > MAX_VALUES:
+            raise ValueError(f"it represents more than {MAX_VALUES} values, by aliases or as written")

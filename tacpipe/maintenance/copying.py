@@ -113,7 +113,11 @@ def _damaged(target: AnyStore, names: Iterable[str], sizes: Mapping[str, int], *
         return True
 
     names = list(names) if verify else []
-    return [name for name, sound in zip(names, threads.each(is_sound, names, target.at_once), strict=True) if not sound]
+    return [
+        name
+        for name, sound in zip(names, threads.map_in_threads(is_sound, names, target.at_once), strict=True)
+        if not sound
+    ]
 
 
 def _send(source: AnyStore, target: AnyStore, plan: _Plan, names: Sequence[str], beside: tuple[str, ...]) -> None:
@@ -132,7 +136,7 @@ def _send(source: AnyStore, target: AnyStore, plan: _Plan, names: Sequence[str],
     total = sum(sizes[name] for name in names)
     went = 0
     with progress.bar("copying", len(names)) as advance:
-        for name, error in threads.each(send, names, max(source.at_once, target.at_once)):
+        for name, error in threads.map_in_threads(send, names, max(source.at_once, target.at_once)):
             failed += [] if error is None else [(name, error)]
             went += sizes[name]
             advance(note=f"{went / 1e6:,.1f} of {total / 1e6:,.1f} MB")
@@ -159,7 +163,7 @@ def _copy_records(
     several = (
         (key, one) for key, one in source.records_of(found.digest) if _named(one) & names and _named(one) <= names
     )
-    keys = list(threads.each(commit, several, max(source.at_once, target.at_once)))
+    keys = list(threads.map_in_threads(commit, several, max(source.at_once, target.at_once)))
     target.settle(layout.record_name(key) for key in keys)
     target.note_records(found.digest, keys)
 

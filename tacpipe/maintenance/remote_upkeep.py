@@ -56,7 +56,7 @@ def verify(store: RemoteStore) -> Soundness:
     names = [Path(entry.name).name for entry in entries if _is_object(entry.name)]
     found.foreign = sorted(entry.name for entry in entries if not _is_object(entry.name))
     with progress.bar("verifying", len(names)) as advance:
-        for name, why in threads.each(lambda name: (name, _why(store, name)), names, AT_ONCE):
+        for name, why in threads.map_in_threads(lambda name: (name, _why(store, name)), names, AT_ONCE):
             found.objects += why is not AbsentError
             if why is MissingError:
                 found.damaged.append(name)
@@ -151,7 +151,7 @@ def _remove(store: RemoteStore, surplus: list[Entry], records: dict[str, set[str
     """Move objects aside, read again what is needed, and remove what still nobody needs, records first."""
     mine = uuid.uuid4().hex
     asides = {entry.name: f"tmp/{layout.ASIDE}{Path(entry.name).name}-{mine}" for entry in surplus}
-    moves = threads.each(lambda one: store.files.move(one.name, asides[one.name]), surplus, AT_ONCE)
+    moves = threads.map_in_threads(lambda one: store.files.move(one.name, asides[one.name]), surplus, AT_ONCE)
     moved = [entry for entry, there in zip(surplus, moves, strict=True) if there]
     needed = _needed(store).objects
     back = [entry for entry in moved if Path(entry.name).name in needed]
@@ -167,7 +167,7 @@ def _remove(store: RemoteStore, surplus: list[Entry], records: dict[str, set[str
 
 
 def _each(work: Callable[[Item], object], items: Iterable[Item]) -> None:
-    for _ in threads.each(work, items, AT_ONCE):
+    for _ in threads.map_in_threads(work, items, AT_ONCE):
         pass
 
 
@@ -233,7 +233,7 @@ def _needed(store: RemoteStore) -> _Needed:
         todo = sorted(set(wanted) - needed.manifests)
         needed.manifests |= set(todo)
         wanted = []
-        for manifest in threads.each(lambda name: _manifest(store, name), todo, AT_ONCE):
+        for manifest in threads.map_in_threads(lambda name: _manifest(store, name), todo, AT_ONCE):
             if manifest is not None:
                 needed.objects |= {one for _, one in manifest.objects()}
                 wanted += ancestors(manifest)
@@ -262,7 +262,7 @@ def _unnamed(store: RemoteStore, names: Collection[str], recorded: Iterable[Mani
     those of all that they name."""
     covered = {one for manifest in recorded for one, _ in replacing.possessions(manifest)}
     kept: set[str] = set()
-    for name, manifest in threads.each(lambda name: (name, _perhaps(store, name)), names, AT_ONCE):
+    for name, manifest in threads.map_in_threads(lambda name: (name, _perhaps(store, name)), names, AT_ONCE):
         if manifest is not None and any(one not in covered for one, _ in replacing.possessions(manifest)):
             kept |= {name, *(one for _, one in manifest.objects())}
     return kept

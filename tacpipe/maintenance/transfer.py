@@ -10,7 +10,7 @@ from tacpipe.datasets import directory as directory_of
 from tacpipe.datasets import manifest as manifest_of
 from tacpipe.datasets import paths, replacing
 from tacpipe.errors import DamagedError, StorageError, TacpipeError, UsageError
-from tacpipe.io import places, regular
+from tacpipe.io import files, regular
 from tacpipe.io.files import may_not_write
 from tacpipe.io.hashing import digest
 from tacpipe.maintenance import copying, pushed
@@ -32,7 +32,7 @@ def named_store(remote: Path | str) -> AnyStore:
     """Return the store at a path or an address, whether or not there is one. Raises `UsageError` for another address."""
     found = addresses.parsed(str(remote))
     if isinstance(found, Path):
-        return Store(places.local(found).absolute())
+        return Store(files.local(found).absolute())
     return RemoteStore(Bucket(found))
 
 

@@ -39,7 +39,7 @@ from tacpipe.errors import TacpipeError
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from tacpipe.io.drafts import Draft
+    from tacpipe.io.files import Draft
     from tacpipe.plugins.requirements import Requirements
 
 ROLES = ("train", "val", "calibration", "test")

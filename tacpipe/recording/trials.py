@@ -11,7 +11,7 @@ from pathlib import Path
 from tacpipe.datasets.paths import NAME_BYTES
 from tacpipe.errors import TacpipeError
 from tacpipe.io import termination
-from tacpipe.io.termination import Ended
+from tacpipe.io.termination import EndRequest
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import excerpt, plain
 from tacpipe.recording import appending, clock, header, sealing, triggers
@@ -73,7 +73,9 @@ class Recorded:
         return f"{plain(self.name, NAME_BYTES)}: {self.seconds:.1f} s, {described}{kept}"
 
 
-def run(recorder: Recorder, store: Store, plan: Plan, view: View, ended: Ended) -> tuple[list[Recorded], list[str]]:
+def run(
+    recorder: Recorder, store: Store, plan: Plan, view: View, ended: EndRequest
+) -> tuple[list[Recorded], list[str]]:
     """Record what ``plan`` asks for; ``ended`` cuts it short, and so does a stream that was lost and is not back.
 
     Return what was recorded, and a sentence for each stream that was lost.
@@ -100,7 +102,7 @@ def _keys(plan: Plan) -> contextlib.AbstractContextManager[triggers.Keys]:
     return triggers.keys() if "key" in (plan.start, plan.stop) else contextlib.nullcontext(lambda *, must=False: False)
 
 
-def _await(recorder: Recorder, starts: triggers.Trigger, ended: Ended, view: View, waiting: str) -> None:
+def _await(recorder: Recorder, starts: triggers.Trigger, ended: EndRequest, view: View, waiting: str) -> None:
     recorder.run(lambda: ended() or starts(), lambda: view.show(waiting))
 
 
@@ -122,7 +124,7 @@ def recover(store: Store, folder: Path, opened: Path | None) -> Recorded:
 
 
 def _record(
-    recorder: Recorder, store: Store, plan: Plan, trial: int, stops: triggers.Trigger, view: View, ended: Ended
+    recorder: Recorder, store: Store, plan: Plan, trial: int, stops: triggers.Trigger, view: View, ended: EndRequest
 ) -> tuple[Recorded, list[str]]:
     name = plan.names[trial]
     attributes = {**plan.attributes, **({"trial": trial + 1} if plan.trials > 1 else {})}

@@ -38,7 +38,7 @@ class View:
     @contextlib.contextmanager
     def open(self) -> Iterator[View]:
         """Have the view on the terminal while in the block, where there is one."""
-        if self._quiet or not progress.wanted():
+        if self._quiet or not progress.is_visible():
             yield self
             return
         from rich.console import Console

@@ -16,8 +16,7 @@ from typing import Any
 
 from tacpipe.errors import StorageError, TacpipeError
 from tacpipe.io import progress, threads
-from tacpipe.io.drafts import Draft
-from tacpipe.io.files import present
+from tacpipe.io.files import Draft, present
 from tacpipe.io.hashing import digest
 from tacpipe.store import addresses, layout, records
 from tacpipe.store.addresses import Address
@@ -183,7 +182,7 @@ class CachedStore(Store):
         self.prepare()
         self.bucket  # noqa: B018  (before there are threads)
         with self._bar("downloading", len(absent)) as advance:
-            for _ in threads.each(bring, absent, AT_ONCE if len(absent) > 1 else 1):
+            for _ in threads.map_in_threads(bring, absent, AT_ONCE if len(absent) > 1 else 1):
                 advance()
 
     def _bring(self, name: str, size: int | None = None) -> None:
@@ -251,7 +250,9 @@ class CachedStore(Store):
             self.bucket.files.create(layout.object_name(name), _Blocks(self, name))
 
         with self._bar("uploading", len(names)) as advance:
-            for name, _ in zip(names, threads.each(send, names, AT_ONCE if len(names) > 1 else 1), strict=True):
+            for name, _ in zip(
+                names, threads.map_in_threads(send, names, AT_ONCE if len(names) > 1 else 1), strict=True
+            ):
                 self._there[name] = os.lstat(self.object_path(name)).st_size
                 advance()
         self._made.difference_update(names)

@@ -168,7 +168,7 @@ class RemoteStore:
                     return found
             if budget > 0:  # that was all
                 return found
-        entries = threads.each(self.files.stat, left, AT_ONCE)
+        entries = threads.map_in_threads(self.files.stat, left, AT_ONCE)
         return found | {left[path]: entry for path, entry in zip(left, entries, strict=True) if entry is not None}
 
     def has(self, name: str, size: int | None = None) -> bool:
@@ -313,7 +313,7 @@ class RemoteStore:
         """Yield keys and their records, by default all; damaged ones count as none."""
         if keys is None:
             keys = [Path(entry.name).stem for entry in self.files.list("records")]
-        for key, record in threads.each(self._record, keys, AT_ONCE):
+        for key, record in threads.map_in_threads(self._record, keys, AT_ONCE):
             if record is not None:
                 yield key, record
 

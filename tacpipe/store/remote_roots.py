@@ -112,7 +112,7 @@ class RemoteRoots:
     def _read(self, wanted: str = "") -> Iterator[tuple[str, Root | None]]:
         """Yield the name of each root, or of the one that is ``wanted``, and its newest version; None for a damaged one."""
         newest = {name: found[-1] for name, found in self._versions(wanted).items()}
-        return zip(newest, threads.each(self._at, newest.values(), AT_ONCE), strict=True)
+        return zip(newest, threads.map_in_threads(self._at, newest.values(), AT_ONCE), strict=True)
 
     def _at(self, version: tuple[int, str]) -> Root | None:
         number, file = version

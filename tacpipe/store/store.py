@@ -15,9 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from tacpipe.errors import DamagedError, StorageError, TacpipeError
-from tacpipe.io import drafts, memory, progress, regular
-from tacpipe.io.drafts import Draft
-from tacpipe.io.files import listed, move, present, readable_errors, sync_folder, sync_folders
+from tacpipe.io import files, memory, progress, regular
+from tacpipe.io.files import Draft, listed, move, present, readable_errors, sync_folder, sync_folders
 from tacpipe.io.hashing import bytes_digest, canonical, digest
 from tacpipe.store import layout
 from tacpipe.store.directory import Directory
@@ -197,7 +196,7 @@ class Store:
         For content that memory need not hold; else as `put`. Where ``write`` raises, nothing of it is kept.
         """
         path = self.draft()
-        with drafts.begun(path, self.root, mode=0o444) as draft:
+        with files.new_draft(path, self.root, mode=0o444) as draft:
             write(draft)
             draft.sync()
             name = draft.digest

@@ -25,7 +25,7 @@ def on_stderr(stage: str, workspace: Path | None) -> Iterator[list[Follower]]:
     """
     if progress.is_quiet():
         yield []
-    elif not progress.wanted():
+    elif not progress.is_visible():
         yield [Lines(workspace)]
     else:
         shown = Bar(stage, workspace)

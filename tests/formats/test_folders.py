@@ -48,8 +48,8 @@ def change(trial: Path, described: str) -> None:
         ("😀", "😀"),
         ("Prüfling-Ø5", "Prüfling-Ø5"),
         ("Кубок 1", "Кубок-1"),
-        ("cafe\u0301", "café"),  # as macOS writes it
-        ("a\u202etxt", "a-txt"),  # what would turn the text around
+        ("cafe\u0301", "café"),  # macOS writes it so
+        ("a\u202etxt", "a-txt"),  # a mark that would reverse the text
         ("new\nline\x9b31m", "new-line-31m"),
         (".hidden", "hidden"),
         ("a\\b", "a-b"),
@@ -182,14 +182,14 @@ def test_a_walk_finds_what_os_walk_finds_and_circles_end(tmp_path: Path) -> None
     (tmp_path / "a/b/round").symlink_to(tmp_path / "a")
     (tmp_path / "gone").symlink_to(tmp_path / "absent")
     (tmp_path / "self").symlink_to(tmp_path / "self")
-    found = {place: (sorted(folders), sorted(names)) for place, folders, names in files.walk(tmp_path, links=False)}
-    for place, (folders, names) in found.items():
+    items = {place: (sorted(folders), sorted(names)) for place, folders, names in files.walk(tmp_path, links=False)}
+    for place, (folders, names) in items.items():
         there = sorted(path.name for path in Path(place).iterdir())
         links = [name for name in there if Path(place, name).is_symlink()]
         assert sorted([*folders, *names]) == there
         assert not set(links) & set(folders)
-    assert set(found) == {place for place, _, _ in os.walk(tmp_path)}
-    assert {place for place, _, _ in files.walk(tmp_path)} == set(found)
+    assert set(items) == {place for place, _, _ in os.walk(tmp_path)}
+    assert {place for place, _, _ in files.walk(tmp_path)} == set(items)
     assert list(files.walk(tmp_path / "absent")) == []
 
 
@@ -199,7 +199,7 @@ LISTING = {
     "rglob",
     "iterdir",
     "fwalk",
-}  # of os, glob and pathlib: errors are passed over, or raised bare
+}  # functions of os, glob and pathlib that pass over errors, or raise them bare
 ALLOWED = {"holders.py"}  # looks at other users' processes, which may not be looked at
 
 
@@ -249,10 +249,10 @@ class Failing(io.RawIOBase):
         return True
 
     def readinto(self, _: Any) -> int:
-        raise OSError(self.error.errno, self.error.strerror)  # as of a read: without a name
+        raise OSError(self.error.errno, self.error.strerror)  # errors of a read have no file name
 
 
-@pytest.mark.parametrize(("name", "file"), [(name, file) for name, several in FORMATS.items() for file in several])
+@pytest.mark.parametrize(("name", "file"), [(name, file) for name, value in FORMATS.items() for file in value])
 @pytest.mark.parametrize("number", [errno.EIO, errno.EMFILE, errno.ESTALE, errno.ENOMEM])
 def test_a_disk_that_fails_is_no_bad_recording_whichever_file_it_is(
     lab: Lab, monkeypatch: pytest.MonkeyPatch, name: str, file: str, number: int
@@ -273,12 +273,12 @@ def test_a_disk_that_fails_is_no_bad_recording_whichever_file_it_is(
             raise error
         return io.BufferedReader(Failing(error))
 
-    whole = regular.content
+    full = regular.content
 
     def content(path: Path | str, *given: Any, **named: Any) -> bytes:
         if str(path).endswith(file) and hashed:
             raise OSError(number, os.strerror(number), str(path))
-        return whole(path, *given, **named)
+        return full(path, *given, **named)
 
     monkeypatch.setattr(computing, "compute", counted)
     monkeypatch.setattr(regular, "opened", opened)

@@ -194,7 +194,7 @@ def test_without_a_terminal_a_line_an_epoch_holds_losses_best_and_seconds(
 
 
 def test_quiet_prints_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with progress.shown(False), display.on_stderr("train", tmp_path) as shown:
+    with progress.showing_progress(False), display.on_stderr("train", tmp_path) as shown:
         followed(tmp_path, *shown)
     assert capsys.readouterr().err == ""
 
@@ -202,7 +202,7 @@ def test_quiet_prints_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]
 def test_on_a_terminal_the_bar_counts_batches_and_shows_loss_best_rate_and_remaining_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(progress, "wanted", lambda: True)
+    monkeypatch.setattr(progress, "is_visible", lambda: True)
     monkeypatch.setattr(display, "REDRAW_S", 0.0)
     drawn: list[tuple[str, float, str]] = []
     with display.on_stderr("train", tmp_path) as shown:

@@ -212,7 +212,7 @@ def _merged(before: template.Values, over: template.Values) -> dict[str, Any]:
 def _mapping(file: Path, *, missing: bool = False) -> Mapping[str, Any]:
     """Return what a YAML file holds; nothing of one that may be ``missing`` and is."""
     try:
-        value = yaml_text.load(regular.content(file, yaml_text.LONGEST))
+        value = yaml_text.load(regular.content(file, yaml_text.MAX_CHARACTERS))
     except FileNotFoundError:
         if missing:
             return {}

@@ -307,7 +307,7 @@ def _work(
     worker = get_worker()
     name = str(worker.name)
     senders = [relay.Sender(functools.partial(worker.log_event, topic))] if topic else []
-    with _alone, progress.shown(False), provenance.worker(name), following.tracked(senders):
+    with _alone, progress.showing_progress(False), provenance.worker(name), following.tracked(senders):
         try:
             _check(name, wanted, tasks[0])
             lease = _lease(tasks[0])

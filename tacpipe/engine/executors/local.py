@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from tacpipe.engine import processor
 from tacpipe.engine.executors import chunks, forking
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.io import processes, termination
+from tacpipe.io import termination
 from tacpipe.training import devices
 
 if TYPE_CHECKING:
@@ -87,7 +87,7 @@ def _start(jobs: int, preload: Sequence[str], workers: dict[Connection, Connecti
 def _work(tasks: Connection, alive: Connection, variables: dict[str, str]) -> None:
     """Compute what comes over ``tasks`` for as long as the process at the other end of ``alive`` lives."""
     os.environ.update(variables)
-    processes.end_with(alive.fileno())
+    termination.end_with(alive.fileno())
     while True:
         try:
             compute, chunk = tasks.recv()

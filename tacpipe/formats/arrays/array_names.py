@@ -75,7 +75,7 @@ _UNREAL = ("sin", "cos")  # sine and cosine of an angle are no angles
 
 
 def meanings(name: str, width: int, integers: bool = False) -> list[ColumnMeaning]:
-    """Return what each of ``width`` columns of an array called ``name`` holds; ``whole``: its values are whole numbers.
+    """Return what each of ``width`` columns of an array called ``name`` holds; ``integers``: its values are whole numbers.
 
     >>> meanings("robot0_eef_pos", 3)[0], meanings("obs/joint_pos", 7)[6].unit
     (ColumnMeaning(quantity='position', unit='m', component='x'), 'rad')

@@ -174,7 +174,7 @@ def open_hdf5(path: Path) -> Iterator[Hdf5Tree]:
 
 @contextlib.contextmanager
 def _open_truncated(path: Path, available: int, size: int) -> Iterator[Hdf5Tree]:
-    """Open a file of which ``left`` of ``size`` bytes are there. Raises `TacpipeError` where that is not enough."""
+    """Open a file that has ``available`` of ``size`` bytes. Raises `TacpipeError` where that is not enough."""
     with regular.failing(path), regular.opened(path) as file:
         try:
             file_h5 = h5py.File(_PaddedFile(file, available, size), "r")

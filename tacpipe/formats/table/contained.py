@@ -195,7 +195,7 @@ def why_unread(layout: layouts.Layout, source: Path, kind: layouts.Format | None
 def read_recording(
     layout: layouts.Layout, kind: layouts.Format | None, files: Files, values: Values, shared: Shared | None = None
 ) -> RecordingOutput:
-    """Return one recording of ``files``, as `sources` found it; without streams in the layout all of a container.
+    """Return one recording of ``files``, as `discover_sources` returned it; all of a container without a layout.
 
     With ``shared`` a table of many recordings is cut into these once.
     """
@@ -224,7 +224,7 @@ def member_files(paths: Mapping[str, Path]) -> dict[str, Path]:
 
 
 def container_paths(files: Files) -> dict[str, Path]:
-    """Return the paths whose `members` these files are.
+    """Return the paths whose `member_files` these files are.
 
     >>> container_paths({"skin": Path("a.csv"), "container/meta/info.json": Path("lab/run/meta/info.json")})
     {'skin': PosixPath('a.csv'), 'container': PosixPath('lab/run')}

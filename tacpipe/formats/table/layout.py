@@ -214,7 +214,7 @@ def read_layout(path: Path) -> Layout:
 
 
 def parse_layout(text: str, place: str = "The layout") -> Layout:
-    """Return the layout in a TOML text; ``where`` names it in errors."""
+    """Return the layout in a TOML text; ``place`` names it in errors."""
     try:
         tables = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:

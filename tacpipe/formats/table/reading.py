@@ -45,7 +45,7 @@ class LongTable:
     def blocks(self, channels: Sequence[ChosenColumn]) -> Iterator[tuple[Times, list[pa.Array]]]:
         """Yield stamps in ns and one column per chosen channel, NaN where there is no value, moment by moment.
 
-        Raises `TacpipeError` for two values of a channel at one moment, and as `columns.converted` does.
+        Raises `TacpipeError` for two values of a channel at one moment, and as `columns.convert_column` does.
         """
         moments = 0
         for table in in_order(self.pieces, self.spill.read, MOMENT):
@@ -84,7 +84,7 @@ class LongTable:
 
 
 def read_long_table(file: RowFile, stream: StreamLayout, recording: str | None, shared: Shared | None) -> LongTable:
-    """Return the rows of a table in long form. Raises as `rows.blocks` does, and for too many channels."""
+    """Return the rows of a table in long form. Raises as `rows.row_blocks` does, and for too many channels."""
     assert stream.long is not None
     if not stream.time.column:
         raise UsageError(
@@ -154,14 +154,14 @@ def stream_batches(
 
 
 def read_stream_table(path: Path, stream: StreamLayout, recording: str | None = None) -> pa.Table:
-    """Return `batches` of a file as one table."""
+    """Return `stream_batches` of a file as one table."""
     return stream_batches(rows.open_rows(path, stream), stream, recording).read_all()
 
 
 def read_contained_stream(path: Path, source: SourceStream, stream: StreamLayout) -> pa.Table | pa.RecordBatchReader:
     """Return the rows of a stream of the container at ``path`` with ``t_ns``: a table of one that is in memory already.
 
-    Raises as `batches` does. Where the layout's ``stream`` states neither time nor columns, they are as the container
+    Raises as `stream_batches` does. Where the layout's ``stream`` states neither time nor columns, they are as the container
     declares them. What the container states of the column with the stamps is stated of ``t_ns``.
     """
     stream = stream if stream.time.is_declared else replace(stream, time=source.time)

@@ -249,8 +249,8 @@ def read_streams(
 ) -> RecordedStreams:
     """Return the recording whose files are ``paths`` by stream; ``episode`` is its name where a file holds many.
 
-    Streams of one container are read in one pass. Raises as `table` does, and for a stream that its container lacks,
-    unless it is optional.
+    Streams of one container are read in one pass. Raises as `reading.stream_batches` does, and for a stream
+    that its container lacks, unless it is optional.
     """
     tables: dict[str, pa.Table | pa.RecordBatchReader] = {}
     attributes: dict[str, Attribute] = {}

@@ -27,7 +27,7 @@ from tacpipe.formats.table.layout import EXTENSIONS, StreamLayout, extension
 from tacpipe.formats.table.text import TextTable
 from tacpipe.formats.table.workbook import Workbook
 from tacpipe.io import regular
-from tacpipe.io.drafts import Draft, Hashed
+from tacpipe.io.files import Draft, Hashed
 from tacpipe.io.parquet import owned
 from tacpipe.io.spill import Spill, in_order
 from tacpipe.plugins.stage import Shared
@@ -166,7 +166,7 @@ def stamps_of_file(path: Path, stream: StreamLayout) -> Times:
     """Return the stamps in a file that holds those of all rows of ``stream``, in ns (row,).
 
     They are in the column that the stream's time names, or in the only one of the file. Raises `TacpipeError` for a file
-    with several columns where none is named, and as `stamped` does.
+    with several columns where none is named, and as `stamps_of_column` does.
     """
     kind = EXTENSIONS.get(extension(path), "csv")
     clock = StreamLayout(stream.name, format=kind, time=replace(stream.time, file=""), encoding=stream.encoding)

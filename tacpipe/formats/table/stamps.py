@@ -174,7 +174,7 @@ def _from_floats(column: pa.Array, factor: int) -> Int64s:
 
 
 def _cast(column: pa.Array, kind: pa.DataType, expected: str) -> pa.Array:
-    """Return a column as ``kind``; raises `StampError`, with what is ``wanted``, for the first that cannot be."""
+    """Return a column as ``kind``; raises `StampError`, with ``expected``, for the first that cannot be converted."""
     try:
         return column.cast(kind)
     except pa.ArrowInvalid:
