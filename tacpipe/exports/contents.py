@@ -1,7 +1,7 @@
 """Describe what the recordings of an export hold: streams, columns, rates, and what the format does not carry.
 
-Each part of an export returns the description of its recording as small tables, which are stored. `of_parts` puts them
-together, so an export is described without opening the recordings again.
+Each part of an export returns the description of its recording as small tables, which are stored. `contents_from_parts`
+merges them, so an export is described without opening the recordings again.
 
 A writer states which columns it wrote, and `part` adds a `Loss` for every other column of the recording: a format that
 leaves something out cannot do so silently.
@@ -175,56 +175,61 @@ def _sentence(stream: str | None, columns: Collection[str], reason: str) -> str:
     return f"column{'s' * (len(names) > 1)} {', '.join(names)} of {place}: {reason}" if names else f"{place}: {reason}"
 
 
+@dataclass
+class _StreamTotals:
+    """What the parts read so far hold of one stream."""
+
+    columns: tuple[Column, ...]  # columns in the first recording that has it
+    shared: Sequence[Column]
+    all_columns: dict[str, None]  # ordered set of names
+    recordings: list[str] = field(default_factory=list)
+    rows: int = 0
+    rates_hz: list[float] = field(default_factory=list)
+    differing: list[str] = field(default_factory=list)
+    nan: bool = False
+
+    def add(self, recording: str, row: Mapping[str, Any], columns: tuple[Column, ...]) -> None:
+        """Add the stream of a recording: its row of the table `STREAMS` and its columns."""
+        self.recordings.append(recording)
+        self.rows += row["rows"]
+        self.nan |= row["nan"]
+        self.rates_hz += [row["rate_hz"]] if row["rate_hz"] else []
+        if columns != self.columns:
+            self.differing.append(recording)
+            alike = {(column.name, column.type) for column in columns}
+            self.shared = [column for column in self.shared if (column.name, column.type) in alike]
+            self.all_columns |= dict.fromkeys(column.name for column in columns)
+
+    def stream(self, name: str) -> Stream:
+        """Return the stream over all recordings."""
+        rates_hz = [min(self.rates_hz), max(self.rates_hz)] if self.rates_hz else []
+        shared = [column.name for column in self.shared]
+        names = list(self.all_columns)
+        return Stream(name, self.columns, self.recordings, self.rows, rates_hz, self.differing, shared, self.nan, names)
+
+
 def contents_from_parts(parts: Dataset) -> Contents:
-    """Return what all recordings hold together."""
-    columns: dict[str, tuple[Column, ...]] = {}
-    totals: dict[str, dict[str, Any]] = {}
+    """Return the contents of all recordings together."""
+    totals: dict[str, _StreamTotals] = {}
     losses: list[tuple[str, Loss]] = []
     seconds, starts = 0.0, []
-    tables: dict[str, Any] = {}  # tables of columns by digest: nearly all recordings have the same
+    tables: dict[str, dict[str, tuple[Column, ...]]] = {}  # columns by digest: most recordings have the same
     for part in parts:
         key = part.digests[COLUMNS]
         if key not in tables:
             tables[key] = _columns_by_stream(part.table(COLUMNS).to_pylist())
-        for row in part.table(STREAMS).to_pylist():
-            name = row["stream"]
-            first = columns.setdefault(name, tables[key][name])
-            total = totals.setdefault(
-                name, {**_empty_totals(), "shared": first, "all_columns": dict.fromkeys(c.name for c in first)}
-            )
-            total["recordings"].append(part.name)
-            total["rows"] += row["rows"]
-            total["nan"] |= row["nan"]
-            total["rates"] += [row["rate_hz"]] if row["rate_hz"] else []
-            if tables[key][name] != first:
-                total["others"].append(part.name)
-                alike = {(column.name, column.type) for column in tables[key][name]}
-                total["shared"] = [column for column in total["shared"] if (column.name, column.type) in alike]
-                total["all_columns"] |= dict.fromkeys(column.name for column in tables[key][name])
-        stamps = [row for row in part.table(STREAMS).to_pylist() if row["first_ns"] is not None]
-        if stamps:
-            starts.append(min(row["first_ns"] for row in stamps))
-            seconds += (max(row["last_ns"] for row in stamps) - starts[-1]) / 1e9
+        rows = part.table(STREAMS).to_pylist()
+        for row in rows:
+            columns = tables[key][row["stream"]]
+            empty = _StreamTotals(columns, columns, dict.fromkeys(column.name for column in columns))
+            totals.setdefault(row["stream"], empty).add(part.name, row, columns)
+        stamped = [row for row in rows if row["first_ns"] is not None]
+        if stamped:
+            starts.append(min(row["first_ns"] for row in stamped))
+            seconds += (max(row["last_ns"] for row in stamped) - starts[-1]) / 1e9
         losses += [(part.name, Loss(**row)) for row in part.table(LOSSES).to_pylist()]
-    merged = {
-        name: Stream(
-            name,
-            columns[name],
-            total["recordings"],
-            total["rows"],
-            [min(total["rates"]), max(total["rates"])] if total["rates"] else [],
-            total["others"],
-            [column.name for column in total["shared"]],
-            total["nan"],
-            list(total["all_columns"]),
-        )
-        for name, total in sorted(totals.items())
-    }
+    merged = {name: total.stream(name) for name, total in sorted(totals.items())}
     return Contents(merged, seconds, min(starts, default=None), loss_sentences(losses))
-
-
-def _empty_totals() -> dict[str, Any]:
-    return {"recordings": [], "rows": 0, "rates": [], "others": [], "nan": False}
 
 
 def field_metadata(field: pa.Field) -> dict[str, str]:

@@ -39,13 +39,13 @@ def make(folder: Path) -> Path:
     """Make the environment in ``folder`` and return its interpreter."""
     venv.create(folder, with_pip=True, clear=True)
     python = folder / "bin" / "python"
-    found = subprocess.run(
+    result = subprocess.run(
         [str(python), "-c", "import sysconfig; print(sysconfig.get_path('purelib'))"],
         capture_output=True,
         text=True,
         check=True,
     )
-    packages = Path(found.stdout.strip())
+    packages = Path(result.stdout.strip())
     (packages / "tests.pth").write_text(f"{sysconfig.get_path('purelib')}\n")
     install = [str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
     subprocess.run([*install, "--no-deps", *ALONE], check=True)

@@ -19,26 +19,26 @@ def lerobot(folder: str) -> dict[str, Any]:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
     from lerobot.datasets.utils import dataset_to_policy_features
 
-    whole = LeRobotDataset("tacpipe/export", root=folder)
-    frames = [whole[index] for index in range(len(whole))]
-    past = [-2 / whole.fps, 0.0, 1 / whole.fps]
+    dataset = LeRobotDataset("tacpipe/export", root=folder)
+    frames = [dataset[index] for index in range(len(dataset))]
+    past = [-2 / dataset.fps, 0.0, 1 / dataset.fps]
     windows = LeRobotDataset("tacpipe/export", root=folder, episodes=[1], delta_timestamps={"observation.state": past})
     window = windows[0]
     return {
-        "frames": len(whole),
-        "episodes": whole.num_episodes,
-        "fps": whole.fps,
+        "frames": len(dataset),
+        "episodes": dataset.num_episodes,
+        "fps": dataset.fps,
         "values": {
             name: np.array([frame[name].tolist() for frame in frames]).tolist()
             for name in ("observation.state", "observation.tactile.skin", "action", "tacpipe.t_ns", "episode_index")
         },
         "tasks": sorted({frame["task"] for frame in frames}),
-        "names": whole.features["observation.state"]["names"],
-        "policy": {name: one.type.name for name, one in dataset_to_policy_features(whole.meta.features).items()},
+        "names": dataset.features["observation.state"]["names"],
+        "policy": {name: value.type.name for name, value in dataset_to_policy_features(dataset.meta.features).items()},
         "window": window["observation.state"].tolist(),
         "padded": window["observation.state_is_pad"].tolist(),
-        "mean": whole.meta.stats["observation.tactile.skin"]["mean"].tolist(),
-        "recordings": list(whole.meta.episodes["tacpipe/recording"]),
+        "mean": dataset.meta.stats["observation.tactile.skin"]["mean"].tolist(),
+        "recordings": list(dataset.meta.episodes["tacpipe/recording"]),
     }
 
 
@@ -46,23 +46,25 @@ def add_frame(folder: str) -> dict[str, Any]:
     """Write the frames of an export again with LeRobot's own writer; return its seconds and bytes."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    given = LeRobotDataset("tacpipe/export", root=folder)
+    dataset = LeRobotDataset("tacpipe/export", root=folder)
     index = {"timestamp", "frame_index", "episode_index", "index", "task_index"}
-    features = {name: one for name, one in given.features.items() if name not in index and one["dtype"] != "string"}
-    frames = [given[number] for number in range(len(given))]
+    features = {
+        name: value for name, value in dataset.features.items() if name not in index and value["dtype"] != "string"
+    }
+    frames = [dataset[number] for number in range(len(dataset))]
     started = time.perf_counter()
-    made = LeRobotDataset.create("a/b", fps=given.fps, features=features, root=f"{folder}-theirs", use_videos=False)
+    output = LeRobotDataset.create("a/b", fps=dataset.fps, features=features, root=f"{folder}-theirs", use_videos=False)
     episode = 0
     for frame in frames:
         if frame["episode_index"].item() != episode:
-            made.save_episode()
+            output.save_episode()
             episode = frame["episode_index"].item()
         values = {
-            name: frame[name].numpy().astype(one["dtype"]).reshape(one["shape"]) for name, one in features.items()
+            name: frame[name].numpy().astype(value["dtype"]).reshape(value["shape"]) for name, value in features.items()
         }
-        made.add_frame({**values, "task": frame["task"]})
-    made.save_episode()
-    made.finalize()
+        output.add_frame({**values, "task": frame["task"]})
+    output.save_episode()
+    output.finalize()
     seconds = time.perf_counter() - started
     size = sum(path.stat().st_size for path in Path(f"{folder}-theirs").rglob("*") if path.is_file())
     return {"seconds": seconds, "bytes": size, "frames": len(frames)}
@@ -72,15 +74,15 @@ def hub(folder: str) -> dict[str, Any]:
     """Open a card with `datasets`: each configuration's rows and types."""
     import datasets
 
-    found = {}
+    result = {}
     for name in datasets.get_dataset_config_names(folder):
         rows = datasets.load_dataset(folder, name)["train"]
-        found[name] = {
+        result[name] = {
             "rows": len(rows),
-            "types": {key: one.dtype for key, one in rows.features.items()},
+            "types": {key: value.dtype for key, value in rows.features.items()},
             "last": rows[-1],
         }
-    return found
+    return result
 
 
 def parquet(pattern: str) -> dict[str, Any]:
@@ -88,7 +90,7 @@ def parquet(pattern: str) -> dict[str, Any]:
     import datasets
 
     rows = datasets.load_dataset("parquet", data_files=pattern)["train"]
-    return {"rows": len(rows), "types": {key: one.dtype for key, one in rows.features.items()}}
+    return {"rows": len(rows), "types": {key: value.dtype for key, value in rows.features.items()}}
 
 
 def croissant(folder: str) -> dict[str, Any]:
@@ -97,7 +99,7 @@ def croissant(folder: str) -> dict[str, Any]:
 
     dataset = mlcroissant.Dataset(f"{folder}/croissant.json")
     issues = dataset.metadata.ctx.issues
-    records = {one.id: list(dataset.records(one.id)) for one in dataset.metadata.record_sets}
+    records = {entry.id: list(dataset.records(entry.id)) for entry in dataset.metadata.record_sets}
     return {
         "errors": sorted(issues.errors),
         "warnings": sorted(issues.warnings),
@@ -105,7 +107,7 @@ def croissant(folder: str) -> dict[str, Any]:
         "records": {
             name: {
                 "rows": len(rows),
-                "last": {key: one.decode() if isinstance(one, bytes) else one for key, one in rows[-1].items()},
+                "last": {key: value.decode() if isinstance(value, bytes) else value for key, value in rows[-1].items()},
             }
             for name, rows in records.items()
         },

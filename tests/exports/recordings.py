@@ -109,8 +109,8 @@ def write(folder: Path, given: Mapping[str, tuple[Tables, Mapping[str, Any]]]) -
             for stream, table in sorted(tables.items())
         }
         recordings[name] = {"attributes": dict(sorted(attributes.items())), "shards": shards}
-    made = Manifest(ACQUIRE, 1, {}, recordings=recordings)
-    directory.change(store, folder, lambda: directory.Change(made))
+    output = Manifest(ACQUIRE, 1, {}, recordings=recordings)
+    directory.change(store, folder, lambda: directory.Change(output))
     return folder
 
 

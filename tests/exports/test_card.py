@@ -22,11 +22,11 @@ def rows(query: str) -> list[Any]:
 
 def test_duckdb_and_polars_read_the_rows_with_their_recording_and_types(rig: Lab) -> None:
     rig.run("export card rec -o card --license cc-by-4.0")
-    found = rows(
+    result = rows(
         "select recording, object, max(seq) from 'card/data/skin/*.parquet' join 'card/labels.parquet' using (recording) "
         "group by all order by 1"
     )
-    assert found == [("trial-00", "box", 39), ("trial-01", "cup", 39)]
+    assert result == [("trial-00", "box", 39), ("trial-01", "cup", 39)]
     frame = pl.read_parquet("card/data/odd/*.parquet").filter(pl.col("recording") == "trial-01").drop("recording")
     assert frame.to_arrow().cast(recordings.odd(1).schema).equals(recordings.odd(1))
     assert frame.schema["uint32"] == pl.UInt32
@@ -43,7 +43,7 @@ def test_the_card_has_a_configuration_a_stream_and_the_licence(rig: Lab) -> None
     front = yaml.safe_load(text.split("---")[1])
     assert front["license"] == "cc-by-4.0"
     assert front["pretty_name"] == "Our: touch"
-    assert {one["config_name"]: one["data_files"] for one in front["configs"]} == {
+    assert {entry["config_name"]: entry["data_files"] for entry in front["configs"]} == {
         "arm": "data/arm/*.parquet",
         "odd": "data/odd/*.parquet",
         "skin": "data/skin/*.parquet",
@@ -62,7 +62,7 @@ def test_croissant_states_the_type_and_unit_of_each_column(rig: Lab) -> None:
     assert fields["odd/said"]["dataType"] == "sc:Text"
     assert all(" " not in name for name in fields)
     assert fields["odd/on"]["dataType"] == "sc:Boolean"
-    assert [one["name"] for one in value["creator"]] == ["A", "B"]
+    assert [entry["name"] for entry in value["creator"]] == ["A", "B"]
 
 
 def test_a_licence_that_is_not_stated_is_a_note(rig: Lab) -> None:

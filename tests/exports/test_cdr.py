@@ -17,11 +17,11 @@ T_NS = np.array([0, 1, 1_700_000_000_987_654_321], np.int64)
 
 
 def store(topic: ros.Topic) -> Any:
-    found = get_typestore(Stores.EMPTY)
-    for number, one in enumerate(topic.definition.split("\n" + "=" * 80 + "\n")):
-        name, _, text = (f"MSG: {topic.type}\n{one}" if not number else one).removeprefix("MSG: ").partition("\n")
-        found.register(get_types_from_msg(text, name if name.count("/") == 2 else name.replace("/", "/msg/")))
-    return found
+    result = get_typestore(Stores.EMPTY)
+    for number, entry in enumerate(topic.definition.split("\n" + "=" * 80 + "\n")):
+        name, _, text = (f"MSG: {topic.type}\n{entry}" if not number else entry).removeprefix("MSG: ").partition("\n")
+        result.register(get_types_from_msg(text, name if name.count("/") == 2 else name.replace("/", "/msg/")))
+    return result
 
 
 @pytest.mark.parametrize(
@@ -76,6 +76,6 @@ def test_a_pose_needs_each_component_once() -> None:
 
 def test_names_of_fields_are_those_that_ros_allows() -> None:
     names = ["Force X [N]", "force_x_n", "9", "header", "__a__b__", "µ"]
-    made = ros.field_names(names)
-    assert len(set(made.values())) == len(names)
-    assert all(re.fullmatch(r"[a-z]([a-z0-9]|_(?!_))*(?<!_)", name) for name in made.values())
+    output = ros.field_names(names)
+    assert len(set(output.values())) == len(names)
+    assert all(re.fullmatch(r"[a-z]([a-z0-9]|_(?!_))*(?<!_)", name) for name in output.values())

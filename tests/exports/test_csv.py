@@ -16,18 +16,18 @@ from tests.exports import recordings
 def test_what_ingest_reads_back_has_the_same_shards_and_labels(rig: Lab) -> None:
     rig.run("export csv rec -o csv")
     rig.run("ingest table csv --layout csv/layout.toml -o back")
-    given, back = tacpipe.open("rec"), tacpipe.open("back")
-    assert list(given.recordings) == list(back.recordings)
-    for one in given:
-        assert dict(back[one.name].attributes) == dict(one.attributes)
-        for stream in one.streams:
-            table, read = one.table(stream), back[one.name].table(stream)
+    provided, back = tacpipe.open("rec"), tacpipe.open("back")
+    assert list(provided.recordings) == list(back.recordings)
+    for entry in provided:
+        assert dict(back[entry.name].attributes) == dict(entry.attributes)
+        for stream in entry.streams:
+            table, read = entry.table(stream), back[entry.name].table(stream)
             assert table.schema.equals(read.schema, check_metadata=True)
             for name in table.column_names:
                 assert table.column(name).to_numpy().tobytes() == read.column(name).to_numpy().tobytes() or (
                     table.column(name).equals(read.column(name)) and table.schema.field(name).type == pa.string()
                 )
-        assert back[one.name].digests == one.digests
+        assert back[entry.name].digests == entry.digests
 
 
 def test_pandas_reads_a_file_with_the_values_that_were_recorded(rig: Lab) -> None:

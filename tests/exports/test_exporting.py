@@ -28,8 +28,8 @@ LATER = [EVERY[0], *(pytest.param(export, marks=pytest.mark.long) for export in 
 
 def counts(ran: str) -> tuple[int, int]:
     """Return how many ran and were reused."""
-    found = json.loads(ran)
-    return found["ran"], found["reused"]
+    content = json.loads(ran)
+    return content["ran"], content["reused"]
 
 
 @pytest.mark.parametrize("export", LATER)
@@ -43,7 +43,7 @@ def test_an_export_is_answered_by_the_store_the_second_time(rig: Lab, export: st
 
 
 @pytest.mark.parametrize(
-    "export", ["csv", *(pytest.param(one, marks=pytest.mark.long) for one in ("mcap", "hdf5", "card"))]
+    "export", ["csv", *(pytest.param(entry, marks=pytest.mark.long) for entry in ("mcap", "hdf5", "card"))]
 )
 def test_a_new_recording_costs_one_recording_and_leaves_the_files_of_the_others(rig: Lab, export: str) -> None:
     rig.run(f"export {export} rec -o out")
@@ -144,8 +144,8 @@ def test_an_edited_file_is_replaced_only_with_replace_and_comes_back_from_the_st
 ) -> None:
     rig.run(f"export {export} -o out")
     path = rig.folder / "out" / name
-    written = path.read_bytes()
-    edited = written + b"by hand\n"
+    content = path.read_bytes()
+    edited = content + b"by hand\n"
     path.write_bytes(edited)
     assert rig.run("store verify").code == 0  # the store has a copy of its own
     before = {file: file.read_bytes() for file in (rig.folder / "out").rglob("*") if file.is_file()}
@@ -156,10 +156,10 @@ def test_an_edited_file_is_replaced_only_with_replace_and_comes_back_from_the_st
         assert "--replace" in ran.err
         assert {file: file.read_bytes() for file in (rig.folder / "out").rglob("*") if file.is_file()} == before
     rig.run(f"export {export} -o out --replace")
-    assert path.read_bytes() == written
+    assert path.read_bytes() == content
     assert rig.call(f"export {export} -o out --check").code == 0
     rig.run("store gc --grace-days 0")
-    old = [one for one in json.loads(rig.run("store list --json").out)["manifests"] if one["state"] == "replaced"]
+    old = [entry for entry in json.loads(rig.run("store list --json").out)["manifests"] if entry["state"] == "replaced"]
     rig.run(f"store checkout {old[0]['manifest']} -o old")
     assert (rig.folder / "old" / name).read_bytes() == edited
 
@@ -225,16 +225,16 @@ def test_synchronized_recordings_are_exported_with_their_shards(rig: Lab) -> Non
 
 
 def test_files_are_made_one_at_a_time() -> None:
-    made: list[str] = []
+    output: list[str] = []
 
     def make(name: str) -> bytes:
-        made.append(name)
+        output.append(name)
         return name.encode()
 
     files = Files({"a": b"x", "b": lambda: make("b"), "c": lambda: make("c")})
-    assert (len(files), sorted(files), made) == (3, ["a", "b", "c"], [])
+    assert (len(files), sorted(files), output) == (3, ["a", "b", "c"], [])
     assert files["b"] == b"b"
-    assert made == ["b"]
+    assert output == ["b"]
 
 
 def test_a_dataset_without_recordings_is_refused(rig: Lab) -> None:

@@ -27,11 +27,11 @@ def test_h5py_reads_each_column_to_the_bit_with_unit_and_quantity(rig: Lab) -> N
             assert list(file[stream]) == table.column_names
             for name in table.column_names:
                 values = file[stream][name]
-                wanted = table[name].to_numpy(zero_copy_only=False)
-                if wanted.dtype == object:
-                    assert values.asstr()[:].tolist() == wanted.tolist()
+                expected = table[name].to_numpy(zero_copy_only=False)
+                if expected.dtype == object:
+                    assert values.asstr()[:].tolist() == expected.tolist()
                 else:
-                    assert (values.dtype, values[:].tobytes()) == (wanted.dtype, wanted.tobytes())
+                    assert (values.dtype, values[:].tobytes()) == (expected.dtype, expected.tobytes())
         assert dict(file["skin/taxel01_y"].attrs) == {"unit": "count", "quantity": "tactile", "taxel": "1", "axis": "y"}
 
 

@@ -25,12 +25,12 @@ def info() -> Any:
 def test_frames_hold_what_synchronize_gives_under_lerobot_s_names(rig: Lab) -> None:
     rig.run(EXPORT)
     rig.run("synchronize rec -o sync --rate-hz 100")
-    given = tacpipe.open("sync")
+    provided = tacpipe.open("sync")
     frames = pq.read_table("lr/data/chunk-000/file-000.parquet")
     features = info()["features"]
     start = 0
-    for episode, one in enumerate(given):
-        table = one.table()
+    for episode, entry in enumerate(provided):
+        table = entry.table()
         mine = frames.slice(start, table.num_rows)
         assert set(mine["episode_index"].to_pylist()) == {episode}
         assert mine["index"].to_pylist() == list(range(start, start + table.num_rows))
@@ -39,9 +39,9 @@ def test_frames_hold_what_synchronize_gives_under_lerobot_s_names(rig: Lab) -> N
         for feature, stream in (("observation.state", "arm"), ("observation.tactile.skin", "skin")):
             values = np.array(mine[feature].to_pylist(), np.float32)
             for position, name in enumerate(features[feature]["names"]):
-                wanted = table[f"{stream}_{name}"].to_numpy()
+                expected = table[f"{stream}_{name}"].to_numpy()
                 with np.errstate(over="ignore"):
-                    np.testing.assert_array_equal(values[:, position], wanted.astype(np.float32))
+                    np.testing.assert_array_equal(values[:, position], expected.astype(np.float32))
         state, action = (np.array(mine[name].to_pylist()) for name in ("observation.state", "action"))
         np.testing.assert_array_equal(action[:-1], state[1:])
         np.testing.assert_array_equal(mine["tacpipe.gap.skin"].to_numpy(), table["skin_gap"].to_numpy())
@@ -54,9 +54,9 @@ def test_the_task_is_the_recording_s_label_and_every_label_is_with_its_episode(r
     tasks = pd.read_parquet("lr/meta/tasks.parquet")
     assert tasks["task_index"].to_dict() == {"press the box": 0, "press the cup": 1}
     episodes = pq.read_table("lr/meta/episodes/chunk-000/file-000.parquet").to_pylist()
-    assert [one["tasks"] for one in episodes] == [["press the box"], ["press the cup"]]
-    assert [one["tacpipe/recording"] for one in episodes] == ["trial-00", "trial-01"]
-    assert [json.loads(one["tacpipe/attributes"]) for one in episodes] == [
+    assert [episode["tasks"] for episode in episodes] == [["press the box"], ["press the cup"]]
+    assert [episode["tacpipe/recording"] for episode in episodes] == ["trial-00", "trial-01"]
+    assert [json.loads(episode["tacpipe/attributes"]) for episode in episodes] == [
         recordings.trial(0)[1],
         recordings.trial(1)[1],
     ]
@@ -71,12 +71,12 @@ def test_statistics_are_those_of_the_frames(rig: Lab) -> None:
     with open("lr/meta/stats.json") as file:
         stats = json.load(file)
     values = np.array(frames["observation.tactile.skin"].to_pylist(), float)
-    found = stats["observation.tactile.skin"]
+    result = stats["observation.tactile.skin"]
     for name in ("min", "max", "mean", "std"):
-        np.testing.assert_allclose(found[name], getattr(values, name)(axis=0), rtol=1e-9)
-    assert found["count"] == [len(values)]
-    assert found["q01"] < found["q10"] < found["q50"] < found["q90"] < found["q99"]
-    numbers = {name for name, one in info()["features"].items() if one["dtype"] != "string"}
+        np.testing.assert_allclose(result[name], getattr(values, name)(axis=0), rtol=1e-9)
+    assert result["count"] == [len(values)]
+    assert result["q01"] < result["q10"] < result["q50"] < result["q90"] < result["q99"]
+    numbers = {name for name, value in info()["features"].items() if value["dtype"] != "string"}
     assert set(stats) == numbers
 
 

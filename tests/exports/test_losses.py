@@ -81,8 +81,8 @@ def of_lerobot(folder: Path) -> Names:
 
 def of_zarr(folder: Path) -> Names:
     """Return the columns of the arrays."""
-    every = [json.loads(path.read_bytes())["columns"] for path in folder.glob("replay.zarr/data/*/.zattrs")]
-    return of_frames(*(column for columns in every for column in columns))
+    content = [json.loads(path.read_bytes())["columns"] for path in folder.glob("replay.zarr/data/*/.zattrs")]
+    return of_frames(*(column for columns in content for column in columns))
 
 
 def of_robomimic(folder: Path) -> Names:

@@ -18,49 +18,49 @@ from tests.exports import recordings
 
 def read(path: Path) -> dict[str, list[tuple[int, Any]]]:
     """Return log time and message of each topic, as rosbags reads them."""
-    found: dict[str, list[tuple[int, Any]]] = {}
+    result: dict[str, list[tuple[int, Any]]] = {}
     with AnyReader([path]) as reader:
         last = 0
         for connection, t_ns, raw in reader.messages():
             assert t_ns >= last
             last = t_ns
-            found.setdefault(connection.topic, []).append((t_ns, reader.deserialize(raw, connection.msgtype)))
-    return found
+            result.setdefault(connection.topic, []).append((t_ns, reader.deserialize(raw, connection.msgtype)))
+    return result
 
 
 def test_rosbags_reads_each_column_to_the_bit_with_its_stamps(rig: Lab) -> None:
     rig.run("export mcap rec -o mcap")
-    found = read(rig.folder / "mcap/trial-01.mcap")
+    result = read(rig.folder / "mcap/trial-01.mcap")
     for stream, table in recordings.trial(1)[0].items():
-        messages = found[f"/{stream}"]
+        messages = result[f"/{stream}"]
         np.testing.assert_array_equal([t_ns for t_ns, _ in messages], table["t_ns"].to_numpy())
-        stamps = [one.header.stamp.sec * 10**9 + one.header.stamp.nanosec for _, one in messages]
+        stamps = [value.header.stamp.sec * 10**9 + value.header.stamp.nanosec for _, value in messages]
         np.testing.assert_array_equal(stamps, table["t_ns"].to_numpy())
         for name in table.column_names[1:]:
             field = "force_x_n_2" if name == "Force X [N]" and "force_x_n" in table.column_names else name.lower()
             field = {"Force X [N]": "force_x_n"}.get(name, field)
-            values = [getattr(one, field) for _, one in messages]
-            wanted = table[name].to_numpy(zero_copy_only=False)
+            values = [getattr(value, field) for _, value in messages]
+            expected = table[name].to_numpy(zero_copy_only=False)
             if pa.types.is_string(table.schema.field(name).type):
-                assert values == wanted.tolist()
+                assert values == expected.tolist()
             else:
-                assert np.array(values, wanted.dtype).tobytes() == wanted.tobytes()
+                assert np.array(values, expected.dtype).tobytes() == expected.tobytes()
 
 
 def test_a_pose_and_tactile_states_are_there_as_usual_messages_unless_they_are_not_wanted(rig: Lab) -> None:
     rig.run("export mcap rec -o mcap")
-    found = read(rig.folder / "mcap/trial-00.mcap")
+    result = read(rig.folder / "mcap/trial-00.mcap")
     arm = recordings.arm(0)
     np.testing.assert_array_equal(
-        [one.pose.position.y for _, one in found["/arm/pose"]], arm["position_y_m"].to_numpy()
+        [value.pose.position.y for _, value in result["/arm/pose"]], arm["position_y_m"].to_numpy()
     )
     np.testing.assert_array_equal(
-        [one.pose.orientation.w for _, one in found["/arm/pose"]], arm["orientation_w"].to_numpy()
+        [value.pose.orientation.w for _, value in result["/arm/pose"]], arm["orientation_w"].to_numpy()
     )
     np.testing.assert_array_equal(
-        [one.wrench.torque.z for _, one in found["/arm/wrench"]], arm["torque_z_nm"].to_numpy()
+        [value.wrench.torque.z for _, value in result["/arm/wrench"]], arm["torque_z_nm"].to_numpy()
     )
-    touch = [one.sensors[0].values for _, one in found["/skin/tactile"]]
+    touch = [value.sensors[0].values for _, value in result["/skin/tactile"]]
     np.testing.assert_array_equal(np.array(touch)[:, 5], recordings.skin(0)["taxel02_z"].to_numpy())
     rig.run("export mcap rec -o bare --no-usual-messages")
     assert set(read(rig.folder / "bare/trial-00.mcap")) == {"/skin", "/arm", "/odd"}
@@ -76,7 +76,7 @@ def test_labels_and_columns_with_their_units_are_metadata(rig: Lab) -> None:
     assert record.metadata["recording"] == "trial-01"
     assert json.loads(record.metadata["attributes"]) == recordings.trial(1)[1]
     assert summary is not None
-    channels = {one.topic: json.loads(one.metadata["tacpipe"]) for one in summary.channels.values()}
+    channels = {entry.topic: json.loads(entry.metadata["tacpipe"]) for entry in summary.channels.values()}
     assert channels["/skin"]["stream"] == "skin"
     assert channels["/skin"]["columns"][1] == {
         "field": "taxel01_x",
@@ -85,7 +85,7 @@ def test_labels_and_columns_with_their_units_are_metadata(rig: Lab) -> None:
         "about": {"unit": "count", "quantity": "tactile", "taxel": "1", "axis": "x"},
     }
     assert channels["/arm/pose"] == {"derived_from": "/arm"}
-    assert {one.encoding for one in summary.schemas.values()} == {"ros2msg"}
+    assert {entry.encoding for entry in summary.schemas.values()} == {"ros2msg"}
 
 
 def test_events_are_a_topic_in_the_order_of_time_and_missing_values_are_listed(lab: Lab) -> None:
@@ -93,8 +93,8 @@ def test_events_are_a_topic_in_the_order_of_time_and_missing_values_are_listed(l
     events = pa.table({"t_ns": t_ns, "stream": ["skin", "arm"], "frames": pa.array([3, None], pa.int64())})
     recordings.write(lab.folder / "rec", {"a": ({"events": events, "skin": recordings.skin(1)}, {})})
     ran = lab.run("export mcap rec -o mcap")
-    found = read(lab.folder / "mcap/a.mcap")["/events"]
-    assert [(at, one.stream, one.frames) for at, one in found] == [(t_ns[1], "arm", 0), (t_ns[0], "skin", 3)]
+    result = read(lab.folder / "mcap/a.mcap")["/events"]
+    assert [(at, value.stream, value.frames) for at, value in result] == [(t_ns[1], "arm", 0), (t_ns[0], "skin", 3)]
     assert any("frames" in line and "events" in line for line in ran.err.splitlines())
 
 
@@ -121,9 +121,9 @@ def test_a_cloud_of_points_is_one_message_with_its_colours(lab: Lab) -> None:
         ("z", 8, 7),
         ("rgb", 12, 7),
     ]
-    made = message.data.view([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<u4")])
-    assert made["z"].tolist() == [0.5, -1.5]
-    assert made["rgb"].tolist() == [0x010101, 0xFFFFFF]
+    output = message.data.view([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<u4")])
+    assert output["z"].tolist() == [0.5, -1.5]
+    assert output["rgb"].tolist() == [0x010101, 0xFFFFFF]
 
 
 def test_encoded_images_are_messages_that_viewers_know_and_come_back_to_the_bit(lab: Lab) -> None:

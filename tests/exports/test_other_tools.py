@@ -41,47 +41,47 @@ def read(tool: str, given: str) -> Any:
 def test_lerobot_s_loader_gives_values_names_tasks_and_windows_back(rig: Lab) -> None:
     rig.run("export lerobot rec -o lr --rate-hz 100 --actions arm --task 'press the {object}'")
     rig.run("synchronize rec -o sync --rate-hz 100")
-    tables = [one.table() for one in tacpipe.open("sync")]
-    found = read("lerobot", "lr")
-    assert (found["frames"], found["episodes"], found["fps"]) == (sum(map(len, tables)), 2, 100)
-    assert found["tasks"] == ["press the box", "press the cup"]
-    assert found["recordings"] == ["trial-00", "trial-01"]
+    tables = [entry.table() for entry in tacpipe.open("sync")]
+    result = read("lerobot", "lr")
+    assert (result["frames"], result["episodes"], result["fps"]) == (sum(map(len, tables)), 2, 100)
+    assert result["tasks"] == ["press the box", "press the cup"]
+    assert result["recordings"] == ["trial-00", "trial-01"]
     for feature, stream, name, place in (
         ("observation.state", "arm", "position_y_m", 1),
         ("observation.tactile.skin", "skin", "taxel02_x", 3),
     ):
-        wanted = np.concatenate([table[f"{stream}_{name}"].to_numpy() for table in tables]).astype(np.float32)
-        np.testing.assert_array_equal(np.array(found["values"][feature], np.float32)[:, place], wanted)
-    assert found["names"][1] == "position_y_m"
-    assert found["values"]["tacpipe.t_ns"] == [one for table in tables for one in table["t_ns"].to_pylist()]
-    assert found["policy"] == {
+        values = np.concatenate([table[f"{stream}_{name}"].to_numpy() for table in tables]).astype(np.float32)
+        np.testing.assert_array_equal(np.array(result["values"][feature], np.float32)[:, place], values)
+    assert result["names"][1] == "position_y_m"
+    assert result["values"]["tacpipe.t_ns"] == [value for table in tables for value in table["t_ns"].to_pylist()]
+    assert result["policy"] == {
         "observation.state": "STATE",
         "observation.tactile.skin": "STATE",
         "observation.odd": "STATE",
         "action": "ACTION",
     }
     first = len(tables[0])
-    state = np.array(found["values"]["observation.state"])
-    np.testing.assert_array_equal(np.array(found["window"]), state[[first, first, first + 1]])
-    assert found["padded"] == [True, False, False]
-    np.testing.assert_allclose(found["mean"], np.mean(found["values"]["observation.tactile.skin"], axis=0))
+    state = np.array(result["values"]["observation.state"])
+    np.testing.assert_array_equal(np.array(result["window"]), state[[first, first, first + 1]])
+    assert result["padded"] == [True, False, False]
+    np.testing.assert_allclose(result["mean"], np.mean(result["values"]["observation.tactile.skin"], axis=0))
 
 
 def test_the_hub_s_library_opens_each_configuration_of_a_card_in_its_own_types(rig: Lab) -> None:
     rig.run("export card rec -o card --license cc-by-4.0")
-    found = read("hub", "card")
-    assert {name: one["rows"] for name, one in found.items()} == {"arm": 400, "odd": 60, "skin": 80, "labels": 2}
-    assert found["skin"]["types"]["taxel01_x"] == "uint16"
-    assert found["odd"]["types"]["uint32"] == "uint32"
-    assert found["skin"]["last"]["recording"] == "trial-01"
-    assert found["skin"]["last"]["t_ns"] == recordings.skin(1)["t_ns"][-1].as_py()
-    assert found["labels"]["last"]["object"] == "cup"
+    result = read("hub", "card")
+    assert {name: value["rows"] for name, value in result.items()} == {"arm": 400, "odd": 60, "skin": 80, "labels": 2}
+    assert result["skin"]["types"]["taxel01_x"] == "uint16"
+    assert result["odd"]["types"]["uint32"] == "uint32"
+    assert result["skin"]["last"]["recording"] == "trial-01"
+    assert result["skin"]["last"]["t_ns"] == recordings.skin(1)["t_ns"][-1].as_py()
+    assert result["labels"]["last"]["object"] == "cup"
 
 
 def test_the_hub_s_library_opens_a_dataset_directory_as_it_is(rig: Lab) -> None:
-    found = read("parquet", str(rig.folder / "rec/*/skin.parquet"))
-    assert found["rows"] == 80
-    assert found["types"]["taxel01_x"] == "uint16"
+    result = read("parquet", str(rig.folder / "rec/*/skin.parquet"))
+    assert result["rows"] == 80
+    assert result["types"]["taxel01_x"] == "uint16"
 
 
 def test_croissant_metadata_are_valid_and_lead_to_the_rows(rig: Lab) -> None:
@@ -89,10 +89,10 @@ def test_croissant_metadata_are_valid_and_lead_to_the_rows(rig: Lab) -> None:
         "export card rec -o card --license https://creativecommons.org/licenses/by/4.0/ --creators us --title Touch "
         "--url https://example.org/touch --published 2026-01-31 --cite-as 'us, 2026'"
     )
-    found = read("croissant", "card")
-    assert (found["errors"], found["warnings"], found["name"]) == ([], [], "Touch")
-    assert {name: one["rows"] for name, one in found["records"].items()} == {"arm": 400, "odd": 60, "skin": 80}
-    lines = {one["skin/recording"] for one in [found["records"]["skin"]["last"]]}
+    result = read("croissant", "card")
+    assert (result["errors"], result["warnings"], result["name"]) == ([], [], "Touch")
+    assert {name: value["rows"] for name, value in result["records"].items()} == {"arm": 400, "odd": 60, "skin": 80}
+    lines = {entry["skin/recording"] for entry in [result["records"]["skin"]["last"]]}
     assert lines <= {"trial-00", "trial-01"}
 
 

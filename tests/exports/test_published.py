@@ -31,10 +31,10 @@ def ingested(lab: Lab, name: str) -> list[str]:
     if not (sample_data() / SETS[name]).exists():
         pytest.skip("published data lie elsewhere; see data/README.md")
     lab.run(f"ingest {name} {sample_data() / SETS[name]} -o rec --skip-bad")
-    every = list(tacpipe.open("rec").recordings)
-    if every[KEPT:]:
-        lab.run(f"label rec {' '.join(map(repr, every[KEPT:]))} --exclude 'not exported here'")
-    return every[:KEPT]
+    items = list(tacpipe.open("rec").recordings)
+    if items[KEPT:]:
+        lab.run(f"label rec {' '.join(map(repr, items[KEPT:]))} --exclude 'not exported here'")
+    return items[:KEPT]
 
 
 @pytest.mark.parametrize("name", ["xela-psc", pytest.param("xela-flat", marks=pytest.mark.long)])
@@ -42,30 +42,30 @@ def test_a_set_comes_back_from_mcap_to_the_bit(lab: Lab, name: str) -> None:
     names = ingested(lab, name)
     lab.run("export mcap rec -o mcap")
     lab.run("ingest mcap mcap -o back")
-    given, back = tacpipe.open("rec"), tacpipe.open("back")
-    assert {one.name: one.digests for one in back} == {one: given[one].digests for one in names}
+    provided, back = tacpipe.open("rec"), tacpipe.open("back")
+    assert {entry.name: entry.digests for entry in back} == {entry: provided[entry].digests for entry in names}
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", SETS)
 def test_every_set_is_exported_at_native_rates(lab: Lab, name: str) -> None:
     names = ingested(lab, name)
-    given = tacpipe.open("rec")
+    provided = tacpipe.open("rec")
     for export in ("csv", "mcap", "hdf5", "card"):
         lab.run(f"export {export} rec -o {export}")
-    for one in (given[name] for name in names):
-        timed = [stream for stream in one.streams if "t_ns" in one.table(stream).column_names]
+    for entry in (provided[name] for name in names):
+        timed = [stream for stream in entry.streams if "t_ns" in entry.table(stream).column_names]
         assert timed
-        with h5py.File(f"hdf5/{one.name}.h5") as file, AnyReader([Path(f"mcap/{one.name}.mcap")]) as reader:
-            assert set(file) == set(one.streams)
+        with h5py.File(f"hdf5/{entry.name}.h5") as file, AnyReader([Path(f"mcap/{entry.name}.mcap")]) as reader:
+            assert set(file) == set(entry.streams)
             counts = {connection.topic: connection.msgcount for connection in reader.connections}
-            for stream in one.streams:
-                table = one.table(stream)
+            for stream in entry.streams:
+                table = entry.table(stream)
                 for column in table.column_names:
                     assert len(file[stream][column]) == table.num_rows
                 if stream in timed:
                     assert counts[f"/{stream}"] == table.num_rows
-                path = f"card/data/{stream}/{one.name}.parquet"
+                path = f"card/data/{stream}/{entry.name}.parquet"
                 answer = duckdb.sql(f"select count(*) from '{path}'")
                 assert answer is not None
                 assert answer.fetchall() == [(table.num_rows,)]
@@ -82,6 +82,6 @@ def test_every_set_with_a_course_in_time_is_exported_as_frames(lab: Lab, name: s
     ends = zarr.open_array("buffer/replay.zarr", path="meta/episode_ends", mode="r")[:]
     assert len(frames) == ends[-1]  # type: ignore[index]
     assert set(frames["episode_index"].to_pylist()) == set(range(len(names)))
-    assert any(one.startswith("observation.tactile.") for one in frames.column_names)
+    assert any(entry.startswith("observation.tactile.") for entry in frames.column_names)
     with h5py.File("demos/demos.hdf5") as file:
-        assert sum(file["data"][one].attrs["num_samples"] for one in file["data"]) == len(frames)
+        assert sum(file["data"][entry].attrs["num_samples"] for entry in file["data"]) == len(frames)

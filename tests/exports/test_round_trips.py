@@ -43,9 +43,11 @@ def test_the_shards_are_the_same_when_few_rows_are_read_at_a_time(
 def assert_same(rig: Lab, export: str, ingest: str) -> None:
     rig.run(f"export {export} -o out")
     rig.run(f"ingest {ingest} -o back")
-    given, back = tacpipe.open("rec"), tacpipe.open("back")
-    assert {one.name: one.digests for one in back} == {one.name: one.digests for one in given}
-    assert {one.name: dict(one.attributes) for one in back} == {one.name: dict(one.attributes) for one in given}
+    provided, back = tacpipe.open("rec"), tacpipe.open("back")
+    assert {entry.name: entry.digests for entry in back} == {entry.name: entry.digests for entry in provided}
+    assert {entry.name: dict(entry.attributes) for entry in back} == {
+        entry.name: dict(entry.attributes) for entry in provided
+    }
 
 
 @pytest.mark.long
@@ -54,12 +56,12 @@ def test_frames_come_back_with_their_values_and_times(rig: Lab, export: str) -> 
     rig.run(f"export {export} -o out")
     rig.run("synchronize rec -o sync --rate-hz 100")
     rig.run(f"ingest {'zarr' if 'zarr' in export else 'hdf5'} out -o back")
-    for given, back in zip(tacpipe.open("sync"), tacpipe.open("back"), strict=True):
+    for provided, back in zip(tacpipe.open("sync"), tacpipe.open("back"), strict=True):
         tables = [back.table(stream) for stream in back.streams]
         for name in ("skin_taxel01_x", "arm_position_z_m", "skin_gap"):
             (table,) = (table for table in tables if name in table.column_names)
-            assert table["t_ns"].equals(given.table()["t_ns"])
-            assert table[name].equals(given.table()[name])
+            assert table["t_ns"].equals(provided.table()["t_ns"])
+            assert table[name].equals(provided.table()[name])
 
 
 @pytest.mark.long

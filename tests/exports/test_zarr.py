@@ -21,7 +21,7 @@ def opened() -> Any:
 def test_zarr_reads_the_frames_of_all_recordings_and_where_each_ends(rig: Lab) -> None:
     rig.run("export zarr rec -o buffer --rate-hz 100 --actions arm")
     rig.run("synchronize rec -o sync --rate-hz 100")
-    tables = [one.table() for one in tacpipe.open("sync")]
+    tables = [entry.table() for entry in tacpipe.open("sync")]
     store = opened()
     assert store["meta/episode_ends"][:].tolist() == np.cumsum([table.num_rows for table in tables]).tolist()
     touch = np.concatenate([table["skin_taxel01_z"].to_numpy() for table in tables])
@@ -41,8 +41,8 @@ def test_the_store_holds_nothing_that_zarr_does_not_know(rig: Lab) -> None:
 
 def test_recordings_of_other_channels_are_refused_by_name(lab: Lab) -> None:
     both = {"skin": recordings.skin(1), "arm": recordings.arm(1)}
-    given: dict[str, Any] = {"a": ({"skin": recordings.skin(1)}, {}), "b": (both, {})}
-    recordings.write(lab.folder / "rec", given)
+    provided: dict[str, Any] = {"a": ({"skin": recordings.skin(1)}, {}), "b": (both, {})}
+    recordings.write(lab.folder / "rec", provided)
     ran = lab.call("export zarr rec -o buffer --rate-hz 100")
     assert ran.code == 2
     assert "b" in ran.err.split()

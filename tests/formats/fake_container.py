@@ -28,7 +28,7 @@ class Fake:
         content = self._content()
         streams = content["streams"] if episode is None else content["episodes"][episode]
         return Contents(
-            [_stream(name, one) for name, one in streams.items() if sources is None or name in sources],
+            [_stream(name, value) for name, value in streams.items() if sources is None or name in sources],
             {"robot": content.get("robot", "panda")},
             content.get("skipped", {}),
             content.get("notes", ()),
@@ -48,7 +48,7 @@ def _stream(source: str, values: dict[str, list[float]]) -> SourceStream:
         for name in values
         if name != "stamp"
     ]
-    table = pa.table([pa.array(values[one.name], one.type) for one in fields], pa.schema(fields))
+    table = pa.table([pa.array(values[field.name], field.type) for field in fields], pa.schema(fields))
     return SourceStream(source, source.strip("/"), Time("stamp", "ns"), table, table.num_rows)
 
 

@@ -17,7 +17,7 @@ ARM = {
     "jv": ",".join(f"va{joint}" for joint in range(1, 8)),
 }
 FINGER = ["tdc", "tac", "pdc", *(f"pac{n}" for n in range(1, 23)), *(f"ele{n}" for n in range(1, 20))]
-SECOND = 1_581_072_654  # of UTC, when slides begin
+SECOND = 1_581_072_654  # UTC time at which slides begin
 
 
 def stamp(nanoseconds: int) -> str:

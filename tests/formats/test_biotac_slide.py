@@ -69,9 +69,9 @@ def test_the_comma_at_the_end_of_rows_shifts_no_column(tmp_path: Path) -> None:
 
 def test_stamps_keep_their_last_nanosecond(tmp_path: Path) -> None:
     write_biotac(tmp_path)
-    found = read(tmp_path).streams["biotac"].column("t_ns").to_pylist()
-    assert found == [SECOND * 10**9 + 10_000_001 * row for row in range(6)]
-    assert [round(float(nanoseconds)) for nanoseconds in found] != found  # float64 could not hold them
+    streams = read(tmp_path).streams["biotac"].column("t_ns").to_pylist()
+    assert streams == [SECOND * 10**9 + 10_000_001 * row for row in range(6)]
+    assert [round(float(nanoseconds)) for nanoseconds in streams] != streams  # float64 could not hold them
 
 
 def test_what_has_no_angular_velocity_has_nan_and_no_other_value_is_touched(tmp_path: Path) -> None:
@@ -121,9 +121,9 @@ def test_slides_are_found_at_any_depth_with_the_streams_of_the_arm_that_are_ther
     (tmp_path / "mat10" / "mat10_3_jt.csv").unlink()
     (tmp_path / "mat10" / "mat10_4_cp.csv").write_text("of a slide whose finger is missing")
     (tmp_path / "mat10" / "mat10_3.pt").write_bytes(b"")
-    found = discover(Params(), tmp_path)
-    assert {name: len(files) for name, files in found.items()} == {"biotac-m02-t001": 1, "biotac-m10-t003": 6}
-    assert list(found["biotac-m02-t001"].values()) == [tmp_path / "a" / "mat2" / "mat2_1_bio.csv"]
+    sources = discover(Params(), tmp_path)
+    assert {name: len(files) for name, files in sources.items()} == {"biotac-m02-t001": 1, "biotac-m10-t003": 6}
+    assert list(sources["biotac-m02-t001"].values()) == [tmp_path / "a" / "mat2" / "mat2_1_bio.csv"]
 
 
 def test_a_folder_without_slides_and_a_slide_that_is_there_twice_are_refused(tmp_path: Path) -> None:
@@ -167,15 +167,15 @@ def test_a_fault_is_told_with_its_file_and_row(tmp_path: Path, name: str, old: s
 @pytest.mark.data
 @pytest.mark.skipif(not (SAMPLE / "biotac_slide_20_50").is_dir(), reason="the published recordings are not here")
 def test_the_published_slides_are_read_as_they_are_written() -> None:
-    found = discover(Params(), SAMPLE / "biotac_slide_20_50")
-    assert len(found) == 800
-    with_arm = {name: files for name, files in found.items() if len(files) > 1}
+    sources = discover(Params(), SAMPLE / "biotac_slide_20_50")
+    assert len(sources) == 800
+    with_arm = {name: files for name, files in sources.items() if len(files) > 1}
     assert {len(files) for files in with_arm.values()} == {7}
     for files in [*with_arm.values()][:3]:
         streams = biotac_slide(Params(), files).streams
         for path in files.values():
             lines = [line.rstrip(",").split(",") for line in path.read_text().split("\n")[1:] if line]
-            (table,) = (one for one in streams.values() if _holds(one, lines[0]))
+            (table,) = (stream for stream in streams.values() if _holds(stream, lines[0]))
             assert table.column("t_ns").to_pylist() == [int(Decimal(cells[0]) * 10**9) for cells in lines]
             np.testing.assert_array_equal(values(table), np.array([cells[1:] for cells in lines], dtype=np.float64))
         assert streams["biotac"].num_rows >= 599

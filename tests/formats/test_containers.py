@@ -1,4 +1,4 @@
-"""What all formats of containers share, with a container of the tests' own."""
+"""Parts that all formats of containers share, tried with a fake container."""
 
 from __future__ import annotations
 
@@ -28,7 +28,10 @@ def _fake(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def read(folder: Path, params: Params = NONE) -> dict[str, RecordingOutput]:
-    return {name: COMMAND.read(params, one.files, one.values) for name, one in COMMAND.discover(params, folder).items()}
+    return {
+        name: COMMAND.read(params, value.files, value.values)
+        for name, value in COMMAND.discover(params, folder).items()
+    }
 
 
 def given(text: str) -> Params:
@@ -37,21 +40,21 @@ def given(text: str) -> Params:
 
 def test_without_a_layout_streams_are_as_their_file_declares_them(tmp_path: Path) -> None:
     fake_container.write(tmp_path / "day" / "run 1.fake")
-    found = read(tmp_path)["run-1"]
-    table = found.streams["skin"]
+    result = read(tmp_path)["run-1"]
+    table = result.streams["skin"]
     assert table.column("t_ns").to_pylist() == [10**9, 2 * 10**9]
     assert table.schema.field("t_ns").metadata == {b"unit": b"ns", b"quantity": b"time", b"clock": b"header stamp"}
     assert table.schema.field("t2").type == pa.float32()
     assert table.schema.field("t2").metadata == {b"quantity": b"tactile", b"taxel": b"7"}
     assert str(table.column("t1").to_pylist()) == "[0.5, nan]"
-    assert found.attributes == {"robot": "panda"}
+    assert result.attributes == {"robot": "panda"}
 
 
 def test_a_rule_replaces_what_it_states_and_nothing_else(tmp_path: Path) -> None:
     fake_container.write(tmp_path / "a.fake")
     params = given('[streams.pad]\nsource = "/skin"\ncolumns = [{ match = "t{taxel}", unit = "N" }]')
-    (found,) = read(tmp_path, params).values()
-    field = found.streams["pad"].schema.field("t2")
+    (result,) = read(tmp_path, params).values()
+    field = result.streams["pad"].schema.field("t2")
     assert field.type == pa.float32()
     assert field.metadata == {b"quantity": b"tactile", b"taxel": b"2", b"unit": b"N"}
 
@@ -69,9 +72,9 @@ def test_a_layout_of_a_table_reads_a_container_beside_a_csv(tmp_path: Path) -> N
     time = { column = "time" }
     columns = [{ match = "x" }]
     """
-    made = layout.parse_layout(text)
-    found = contained.discover_sources(made, tmp_path, recordings.find_recordings(made, tmp_path))
-    output = contained.read_recording(made, None, found["t1"].files, found["t1"].values)
+    result = layout.parse_layout(text)
+    sources = contained.discover_sources(result, tmp_path, recordings.find_recordings(result, tmp_path))
+    output = contained.read_recording(result, None, sources["t1"].files, sources["t1"].values)
     assert {name: len(table.read_all() if name == "arm" else table) for name, table in output.streams.items()} == {
         "skin": 2,
         "arm": 1,
@@ -83,26 +86,26 @@ def test_episodes_inside_a_file_are_recordings(tmp_path: Path) -> None:
     stamps = {"stamp": [1, 2], "t1": [1, 2]}
     episodes = {"demo_0": {"/skin": stamps}, "demo_1": {"/skin": {"stamp": [7], "t1": [7]}}}
     fake_container.write(tmp_path / "all.fake", episodes=episodes)
-    assert {name: one.streams["skin"].num_rows for name, one in read(tmp_path).items()} == {
+    assert {name: value.streams["skin"].num_rows for name, value in read(tmp_path).items()} == {
         "all-demo_0": 2,
         "all-demo_1": 1,
     }
-    named = given('[recordings]\nname = "{recording}-of-{file}"')
-    assert sorted(read(tmp_path, named)) == ["demo_0-of-all", "demo_1-of-all"]
+    by_name = given('[recordings]\nname = "{recording}-of-{file}"')
+    assert sorted(read(tmp_path, by_name)) == ["demo_0-of-all", "demo_1-of-all"]
 
 
 def test_what_cannot_be_read_is_named_in_notes_and_in_the_attributes(tmp_path: Path) -> None:
     fake_container.write(tmp_path / "a.fake", skipped={"/odd": "its encoding is foo"}, notes=["cut off"])
-    (found,) = read(tmp_path).values()
-    assert found.attributes["skipped"] == "/odd: its encoding is foo"
-    assert found.notes[0] == "cut off" and "/odd" in found.notes[1] and "foo" in found.notes[1]
+    (result,) = read(tmp_path).values()
+    assert result.attributes["skipped"] == "/odd: its encoding is foo"
+    assert result.notes[0] == "cut off" and "/odd" in result.notes[1] and "foo" in result.notes[1]
 
 
 def test_a_stream_that_is_not_there_is_an_error_with_the_reason_unless_it_is_optional(tmp_path: Path) -> None:
     fake_container.write(tmp_path / "a.fake", skipped={"/odd": "its encoding is foo"})
-    for source, named in (("/odd", "encoding is foo"), ("/no", "it has /skin")):
+    for source, by_name in (("/odd", "encoding is foo"), ("/no", "it has /skin")):
         text = f'[streams.s]\nsource = "{source}"\n[streams.skin]\nsource = "/skin"\n'
-        with pytest.raises(TacpipeError, match=named):
+        with pytest.raises(TacpipeError, match=by_name):
             read(tmp_path, given(text))
     optional = given('[streams.s]\nsource = "/no"\noptional = true\n[streams.skin]\nsource = "/skin"')
     assert list(read(tmp_path, optional)["a"].streams) == ["skin"]

@@ -1,4 +1,4 @@
-"""What a rerun of an ingest imports: hashing the files needs nothing heavy."""
+"""A rerun of an ingest imports little: hashing the files needs nothing heavy."""
 
 from collections.abc import Callable
 from pathlib import Path

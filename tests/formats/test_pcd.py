@@ -33,13 +33,13 @@ def test_a_cloud_that_open3d_wrote_is_read_with_its_colours(
     tmp_path_factory: pytest.TempPathFactory, cloud: tuple[np.ndarray, np.ndarray], text: bool
 ) -> None:
     points, rgb = cloud
-    made = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points.astype(np.float64)))
-    made.colors = open3d.utility.Vector3dVector(rgb / 255)
+    values = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points.astype(np.float64)))
+    values.colors = open3d.utility.Vector3dVector(rgb / 255)
     path = tmp_path_factory.mktemp("cloud") / "cloud.pcd"
-    assert open3d.io.write_point_cloud(path, made, write_ascii=text)
-    found = pcd.read(path)
-    np.testing.assert_allclose(found.points_m, points, rtol=0, atol=1e-9 if text else 0)
-    np.testing.assert_array_equal(np.asarray(found.colours), rgb)
+    assert open3d.io.write_point_cloud(path, values, write_ascii=text)
+    result = pcd.read(path)
+    np.testing.assert_allclose(result.points_m, points, rtol=0, atol=1e-9 if text else 0)
+    np.testing.assert_array_equal(np.asarray(result.colours), rgb)
 
 
 @settings(max_examples=50, deadline=None)
@@ -50,11 +50,11 @@ def test_the_published_layout_is_read_as_open3d_reads_it(
     points, rgb = cloud
     path = tmp_path_factory.mktemp("cloud") / "cloud.pcd"
     written(path, header(len(points)).encode() + packed(points, rgb) + bytes(3916))
-    found, theirs = pcd.read(path), open3d.io.read_point_cloud(path)
-    np.testing.assert_array_equal(found.points_m, np.asarray(theirs.points).astype(np.float32))
-    np.testing.assert_array_equal(np.asarray(found.colours), np.rint(np.asarray(theirs.colors) * 255))
-    np.testing.assert_array_equal(found.points_m, points)
-    np.testing.assert_array_equal(np.asarray(found.colours), rgb)
+    result, theirs = pcd.read(path), open3d.io.read_point_cloud(path)
+    np.testing.assert_array_equal(result.points_m, np.asarray(theirs.points).astype(np.float32))
+    np.testing.assert_array_equal(np.asarray(result.colours), np.rint(np.asarray(theirs.colors) * 255))
+    np.testing.assert_array_equal(result.points_m, points)
+    np.testing.assert_array_equal(np.asarray(result.colours), rgb)
 
 
 def test_fields_stand_in_any_order_and_further_ones_are_skipped(tmp_path: Path) -> None:
@@ -64,25 +64,25 @@ def test_fields_stand_in_any_order_and_further_ones_are_skipped(tmp_path: Path) 
         points[axis] = points_m()[:, place]
     points["rgb"], points["n"], points["_"] = 0xAB_12_34_56, np.nan, 7  # the highest byte is no colour
     head = header(50, FIELDS="n rgb z _ y x", SIZE="4 4 8 1 8 8", TYPE="F U F U F F", COUNT="3 1 1 2 1 1", VERSION=".7")
-    found = pcd.read(written(tmp_path / "cloud.pcd", head.encode() + points.tobytes()))
-    np.testing.assert_array_equal(found.points_m, points_m())
-    assert np.asarray(found.colours).tolist() == [[0x12, 0x34, 0x56]] * 50
+    result = pcd.read(written(tmp_path / "cloud.pcd", head.encode() + points.tobytes()))
+    np.testing.assert_array_equal(result.points_m, points_m())
+    assert np.asarray(result.colours).tolist() == [[0x12, 0x34, 0x56]] * 50
 
 
 def test_lines_of_text_are_points_and_colours_are_the_bits_of_their_float(tmp_path: Path) -> None:
     bits = np.array([0x00FF8001, 0x0000007F], np.uint32).view(np.float32)
     rows = [f"{2 * row}.5 -1e-2 3 {float(value):.9g} 4 5" for row, value in enumerate(bits)]
     head = header(2, "ascii", FIELDS="x y z rgb w", SIZE="4 4 4 4 4", TYPE="F F F F F", COUNT="1 1 1 1 2")
-    found = pcd.read(written(tmp_path / "cloud.pcd", head + "\n".join(rows) + "\n"))
-    np.testing.assert_allclose(found.points_m, [(0.5, -0.01, 3), (2.5, -0.01, 3)])
-    assert np.asarray(found.colours).tolist() == [[255, 128, 1], [0, 0, 127]]
+    result = pcd.read(written(tmp_path / "cloud.pcd", head + "\n".join(rows) + "\n"))
+    np.testing.assert_allclose(result.points_m, [(0.5, -0.01, 3), (2.5, -0.01, 3)])
+    assert np.asarray(result.colours).tolist() == [[255, 128, 1], [0, 0, 127]]
 
 
 def test_a_cloud_without_rgb_has_no_colours_and_count_may_be_left_out(tmp_path: Path) -> None:
     head = header(50, FIELDS="x y z", SIZE="4 4 4", TYPE="F F F", COUNT="")
-    found = pcd.read(written(tmp_path / "cloud.pcd", head.encode() + points_m().tobytes()))
-    assert found.colours is None
-    np.testing.assert_array_equal(found.points_m, points_m())
+    result = pcd.read(written(tmp_path / "cloud.pcd", head.encode() + points_m().tobytes()))
+    assert result.colours is None
+    np.testing.assert_array_equal(result.points_m, points_m())
 
 
 WHOLE = packed(points_m(), colours())

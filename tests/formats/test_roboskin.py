@@ -32,11 +32,11 @@ def values(recording: RecordingOutput) -> np.ndarray:
 def test_slides_come_out_as_they_were_felt_though_they_are_published_scrambled(tmp_path: Path) -> None:
     slides = touched()
     write_roboskin(tmp_path, slides)
-    found = read(tmp_path)
-    assert list(found) == ["roboskin-fold0-000", "roboskin-fold0-001", "roboskin-fold0-002"]
-    for recording, slide in zip(found.values(), slides, strict=True):
+    result = read(tmp_path)
+    assert list(result) == ["roboskin-fold0-000", "roboskin-fold0-001", "roboskin-fold0-002"]
+    for recording, slide in zip(result.values(), slides, strict=True):
         np.testing.assert_array_equal(values(recording), slide)
-    table = found["roboskin-fold0-001"].streams["roboskin"]
+    table = result["roboskin-fold0-001"].streams["roboskin"]
     assert table.column_names[:2] == ["t_ns", "triangle1_taxel01"]
     field = table.schema.field("triangle6_taxel10")
     assert field.type == pa.float32()
@@ -53,8 +53,8 @@ def test_a_block_that_is_right_already_is_taken_as_it_is(tmp_path: Path) -> None
 def test_the_authors_layout_is_the_published_one_whichever_way_the_block_lies(tmp_path: Path) -> None:
     slides = touched()
     path = write_roboskin(tmp_path, slides)
-    for given in (scramble(slides), slides):
-        np.save(path, given)
+    for provided in (scramble(slides), slides):
+        np.save(path, provided)
         for recording, slide in zip(read(tmp_path, Params(layout="authors")).values(), slides, strict=True):
             np.testing.assert_array_equal(values(recording), scramble(slide))
             assert recording.attributes["layout"] == "authors"
@@ -157,9 +157,9 @@ def test_files_that_are_missing_doubled_or_damaged_are_told(tmp_path: Path) -> N
     (tmp_path / "labels_fold_0.npy").unlink()
     with pytest.raises(TacpipeError, match=r"labels_fold_0\.npy"):
         discover(Params(), tmp_path)
-    whole = path.read_bytes()
+    full = path.read_bytes()
     write_roboskin(tmp_path, touched(1))
-    path.write_bytes(whole[:2000])
+    path.write_bytes(full[:2000])
     with pytest.raises(TacpipeError, match="cannot be read as an array of numbers"):
         read(tmp_path)
     path.write_bytes(b"PK\x03\x04 an archive")
@@ -171,8 +171,8 @@ def test_blocks_are_found_at_any_depth_and_copies_below_them_are_passed_over(tmp
     path = write_roboskin(tmp_path / "set" / "arrays", touched(1))
     write_roboskin(tmp_path / "set" / "arrays" / "copies", touched(2))
     np.save(path.with_name("icub_test_4.npy"), touched(1))
-    found = discover(Params(), tmp_path)
-    assert {name: dict(files) for name, files in found.items()} == {
+    sources = discover(Params(), tmp_path)
+    assert {name: dict(files) for name, files in sources.items()} == {
         "roboskin-fold0-000": {"icub_fold_0.npy[0]": path, "labels_fold_0.npy[0]": path.with_name("labels_fold_0.npy")}
     }
 
@@ -180,16 +180,16 @@ def test_blocks_are_found_at_any_depth_and_copies_below_them_are_passed_over(tmp
 @pytest.mark.data
 @pytest.mark.skipif(not (SAMPLE / "roboskin_slide_20_50").is_dir(), reason="the published recordings are not here")
 def test_each_published_slide_is_unscrambled_as_the_formula_says() -> None:
-    found = read(SAMPLE / "roboskin_slide_20_50")
-    assert len(found) == 800
+    result = read(SAMPLE / "roboskin_slide_20_50")
+    assert len(result) == 800
     row, taxel, place = np.indices((6, 10, 75))
     for fold in range(4):
         block = np.load(SAMPLE / "roboskin_slide_20_50" / f"icub_fold_{fold}.npy", allow_pickle=False)
         for slide, published in enumerate(block):
-            whole = values(found[f"roboskin-fold{fold}-{slide:03d}"])
-            mixed = whole[(75 * row + place) % 6, taxel, (75 * row + place) // 6]
+            full = values(result[f"roboskin-fold{fold}-{slide:03d}"])
+            mixed = full[(75 * row + place) % 6, taxel, (75 * row + place) // 6]
             np.testing.assert_array_equal(mixed, published)
-    materials = [recording.attributes["material"] for recording in found.values()]
+    materials = [recording.attributes["material"] for recording in result.values()]
     assert np.bincount(np.array(materials, dtype=int)).tolist() == [0, *[40] * 20]
 
 

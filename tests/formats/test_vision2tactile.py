@@ -35,26 +35,26 @@ def reading(recording: RecordingOutput) -> list[int]:
 
 def test_a_grasp_has_its_cloud_its_points_and_one_reading_at_its_folders_time(tmp_path: Path) -> None:
     write_grasp(tmp_path)
-    ((name, found),) = read(tmp_path).items()
+    ((name, result),) = read(tmp_path).items()
     assert name == "bleach-1561629162"
     marked = {"session": "bleach-2019-06-27", "published": "vision2tactile"}
-    assert found.attributes == {"sensor": "biotac-sp", "object": "bleach", **marked}
-    assert set(found.streams) == {"cloud", "grasp", "reading"}
-    cloud = Cloud.of(found.streams["cloud"])
+    assert result.attributes == {"sensor": "biotac-sp", "object": "bleach", **marked}
+    assert set(result.streams) == {"cloud", "grasp", "reading"}
+    cloud = Cloud.of(result.streams["cloud"])
     np.testing.assert_array_equal(cloud.points_m, points_m())
     np.testing.assert_array_equal(np.asarray(cloud.colours), colours())
-    grasp = Grasp.of(found.streams["grasp"])
+    grasp = Grasp.of(result.streams["grasp"])
     np.testing.assert_allclose([grasp.g1_m, grasp.g2_m], points_m()[:2], rtol=1e-6)
     assert grasp.wrist is None
     for stream in ("grasp", "reading"):
-        assert found.streams[stream].column("t_ns").to_pylist() == [1_561_629_162_000_000_000]
+        assert result.streams[stream].column("t_ns").to_pylist() == [1_561_629_162_000_000_000]
 
 
 def test_the_reading_is_the_middle_finger_then_the_thumb_in_the_files_columns(tmp_path: Path) -> None:
     write_grasp(tmp_path)
-    (found,) = read(tmp_path).values()
-    table, cells = found.streams["reading"], ["", *counts()]
-    assert reading(found) == counts()
+    (result,) = read(tmp_path).values()
+    table, cells = result.streams["reading"], ["", *counts()]
+    assert reading(result) == counts()
     at = {
         "mf_electrode01": 1,
         "mf_electrode24": 24,
@@ -74,8 +74,8 @@ def test_a_wrist_is_read_row_by_row_where_the_file_has_fifteen_numbers(tmp_path:
     path = write_grasp(tmp_path) / "best-grasp.txt"
     wrist = Rotation.from_euler("xyz", [0.3, -0.8, 1.1]).as_matrix()
     path.write_text(path.read_text() + "," + ",".join(f"{value:.6g}" for value in wrist.ravel()) + "\n")
-    (found,) = read(tmp_path).values()
-    np.testing.assert_allclose(np.asarray(Grasp.of(found.streams["grasp"]).wrist), wrist, atol=1e-5)
+    (result,) = read(tmp_path).values()
+    np.testing.assert_allclose(np.asarray(Grasp.of(result.streams["grasp"]).wrist), wrist, atol=1e-5)
     path.write_text(",".join(path.read_text().split(",")[:6]) + ",1,0,0,0,1,0,0,0,-1")
     with pytest.raises(TacpipeError, match=r"best-grasp\.txt"):
         read(tmp_path)
@@ -86,8 +86,8 @@ def test_a_session_is_an_object_on_a_day_whichever_other_grasps_there_are(tmp_pa
     write_grasp(tmp_path, after_s=3600, seed=1)
     write_grasp(tmp_path, after_s=86_400, seed=2)
     write_grasp(tmp_path, "wood", after_s=60, seed=3)
-    found = {name: recording.attributes["session"] for name, recording in read(tmp_path).items()}
-    assert list(found.values()) == ["bleach-2019-06-27", "bleach-2019-06-27", "bleach-2019-06-28", "wood-2019-06-27"]
+    result = {name: recording.attributes["session"] for name, recording in read(tmp_path).items()}
+    assert list(result.values()) == ["bleach-2019-06-27", "bleach-2019-06-27", "bleach-2019-06-28", "wood-2019-06-27"]
     assert read(tmp_path / "wood" / str(BEGAN_S + 60))["wood-1561629222"].attributes["session"] == "wood-2019-06-27"
 
 
@@ -96,27 +96,27 @@ def test_a_reading_that_an_earlier_grasp_has_too_is_marked_and_kept(tmp_path: Pa
     write_grasp(tmp_path, "bleach", after_s=10, seed=1, reading=8)
     write_grasp(tmp_path, "bleach", after_s=90, seed=2, reading=7)
     write_grasp(tmp_path, "coffee", after_s=20, seed=3, reading=7)
-    found = read(tmp_path)
-    assert {name: recording.attributes.get("duplicate_of") for name, recording in found.items()} == {
+    result = read(tmp_path)
+    assert {name: recording.attributes.get("duplicate_of") for name, recording in result.items()} == {
         "bleach-1561629172": None,
         "bleach-1561629252": "coffee-1561629182",
         "coffee-1561629182": None,
         "wood-1561629212": "coffee-1561629182",
     }
-    assert reading(found["wood-1561629212"]) == reading(found["coffee-1561629182"])
+    assert reading(result["wood-1561629212"]) == reading(result["coffee-1561629182"])
 
 
 def test_what_a_grasp_is_named_by_is_in_its_files_and_other_grasps_are_not(tmp_path: Path) -> None:
-    own = write_grasp(tmp_path)
+    local = write_grasp(tmp_path)
     alone = discover(Params(), tmp_path)["bleach-1561629162"]
     assert alone == {
-        f"bleach/1561629162/{name}": own / name for name in ("cloud-object.pcd", "best-grasp.txt", "tactile.tac")
+        f"bleach/1561629162/{name}": local / name for name in ("cloud-object.pcd", "best-grasp.txt", "tactile.tac")
     }
     write_grasp(tmp_path, after_s=9, seed=1)
     twin = write_grasp(tmp_path, "wood", after_s=-9, seed=2, reading=1)
-    found = discover(Params(), tmp_path)
-    assert found["bleach-1561629162"] == alone
-    assert found["bleach-1561629171"]["duplicate_of=wood-1561629153"] == twin / "tactile.tac"
+    sources = discover(Params(), tmp_path)
+    assert sources["bleach-1561629162"] == alone
+    assert sources["bleach-1561629171"]["duplicate_of=wood-1561629153"] == twin / "tactile.tac"
 
 
 def test_a_hit_of_an_ingest_of_grasps_imports_nothing_heavy(tmp_path: Path) -> None:
@@ -201,8 +201,8 @@ def test_a_cloud_without_colours_gives_no_colour_columns(tmp_path: Path) -> None
     path = write_grasp(tmp_path) / "cloud-object.pcd"
     head = header(50, FIELDS="x y z", SIZE="4 4 4", TYPE="F F F", COUNT="1 1 1")
     path.write_bytes(head.encode() + points_m().tobytes())
-    (found,) = read(tmp_path).values()
-    assert found.streams["cloud"].column_names == ["x_m", "y_m", "z_m"]
+    (result,) = read(tmp_path).values()
+    assert result.streams["cloud"].column_names == ["x_m", "y_m", "z_m"]
 
 
 def test_folders_and_files_that_are_missing_doubled_or_misnamed_are_told(tmp_path: Path) -> None:
@@ -228,13 +228,13 @@ def test_folders_and_files_that_are_missing_doubled_or_misnamed_are_told(tmp_pat
 @pytest.mark.data
 @pytest.mark.skipif(not PUBLISHED.is_dir(), reason="the published recordings are not here")
 def test_the_published_grasps_lie_on_their_clouds_and_within_the_published_ranges() -> None:
-    found = read(PUBLISHED)
-    assert len(found) == 280
-    assert {recording.attributes["object"] for recording in found.values()} == {
+    result = read(PUBLISHED)
+    assert len(result) == 280
+    assert {recording.attributes["object"] for recording in result.values()} == {
         "bleach", "campbells", "cheezit", "coffee", "pringles", "spam", "wood"
     }  # fmt: skip
     sizes = []
-    for recording in found.values():
+    for recording in result.values():
         cloud, grasp = Cloud.of(recording.streams["cloud"]), Grasp.of(recording.streams["grasp"])
         sizes.append(len(cloud))
         assert cloud.colours is not None
@@ -256,8 +256,8 @@ def test_the_published_sessions_are_apart_by_a_night_and_go_on_within_two_hours(
     for name in discover(Params(), PUBLISHED):
         label, _, time_s = name.rpartition("-")
         times.setdefault(label, []).append(int(time_s))
-    for label, several in times.items():
-        several.sort()
-        for before, after in pairwise(several):
+    for label, items in times.items():
+        items.sort()
+        for before, after in pairwise(items):
             same = session(label, before) == session(label, after)
             assert after - before < 2 * 3600 if same else after - before > 18 * 3600

@@ -43,7 +43,7 @@ def theirs(path: Path, **options: Any) -> dict[str, Mapping[str, Any]]:
     """Return what pyxdf reads, by the name of the stream."""
     options = {"synchronize_clocks": False, "dejitter_timestamps": False, **options}
     streams, _ = pyxdf.load_xdf(str(path), **options)
-    return {one["info"]["name"][0]: one for one in streams}
+    return {stream["info"]["name"][0]: stream for stream in streams}
 
 
 def stamps(table: pa.Table, name: str = "t_ns") -> Any:
@@ -73,13 +73,13 @@ def force(
 
 def test_channels_have_the_names_units_and_values_that_the_file_states(tmp_path: Path) -> None:
     force(tmp_path / "run.xdf", rows=1000)
-    found = read(tmp_path / "run.xdf")
-    table = found.streams["force"]
+    result = read(tmp_path / "run.xdf")
+    table = result.streams["force"]
     assert table.column_names == ["t_ns", "t_device_ns", "fx", "fy", "fz"]
     assert table.schema.field("fy").metadata == {b"quantity": b"force", b"unit": b"N", b"component": b"y"}
     assert table.schema.field("fz").type == pa.float32()
     assert table.column("fz").to_pylist() == [3.0 * row for row in range(1000)]
-    assert found.attributes["recorded_at"] == "2026-05-04T10:00:00+0200"
+    assert result.attributes["recorded_at"] == "2026-05-04T10:00:00+0200"
 
 
 @pytest.mark.parametrize("kind", ["float32", "double64", "int8", "int16", "int32", "int64"])
@@ -92,24 +92,24 @@ def test_stamps_and_values_are_those_that_pyxdf_reads_to_the_bit(tmp_path: Path,
     writer.numbers(7, kind, [12.0, 12.5], [[4, 4], [5, 5]])
     writer.numbers(7, kind, [None, None], [[6, 6], [7, 7]])
     path = writer.write(tmp_path / "a.xdf")
-    table, other = read(path).streams["a"], theirs(path)["a"]
-    assert np.array_equal(stamps(table, "t_device_ns"), np.rint(other["time_stamps"] * 1e9))
+    table, second = read(path).streams["a"], theirs(path)["a"]
+    assert np.array_equal(stamps(table, "t_device_ns"), np.rint(second["time_stamps"] * 1e9))
     assert np.array_equal(
-        np.column_stack([table.column(name) for name in ("value01", "value02")]), other["time_series"]
+        np.column_stack([table.column(name) for name in ("value01", "value02")]), second["time_series"]
     )
-    assert table.schema.field("value01").type == pa.from_numpy_dtype(other["time_series"].dtype)
+    assert table.schema.field("value01").type == pa.from_numpy_dtype(second["time_series"].dtype)
 
 
 @pytest.mark.parametrize("drift", [0.0, 80e-6, -300e-6])
 def test_stamps_on_the_recorders_clock_are_true_and_near_those_of_pyxdf(tmp_path: Path, drift: float) -> None:
     true_s = force(tmp_path / "run.xdf", drift, rows=30_000, noise_s=100e-6)
-    found = read(tmp_path / "run.xdf")
-    other = theirs(tmp_path / "run.xdf", synchronize_clocks=True)["force"]["time_stamps"]
-    t_s = stamps(found.streams["force"]) / 1e9
+    result = read(tmp_path / "run.xdf")
+    second = theirs(tmp_path / "run.xdf", synchronize_clocks=True)["force"]["time_stamps"]
+    t_s = stamps(result.streams["force"]) / 1e9
     assert np.abs(t_s - true_s).max() < 150e-6
-    assert np.abs(t_s - other).max() < 150e-6
-    assert found.attributes["force_lsl_drift_ppm"] == pytest.approx(drift * 1e6, abs=2)
-    assert found.attributes["force_lsl_clock_resets"] == 0
+    assert np.abs(t_s - second).max() < 150e-6
+    assert result.attributes["force_lsl_drift_ppm"] == pytest.approx(drift * 1e6, abs=2)
+    assert result.attributes["force_lsl_clock_resets"] == 0
 
 
 @pytest.mark.parametrize("later", [0, 1, 237, 499])
@@ -118,15 +118,15 @@ def test_after_a_reset_of_the_senders_clock_stamps_are_true_as_those_of_pyxdf_ar
     tmp_path: Path, set_by_s: float, later: int
 ) -> None:
     true_s = force(tmp_path / "run.xdf", 50e-6, set_by_s, rows=20_000, noise_s=50e-6, later=later)
-    found = read(tmp_path / "run.xdf")
-    other = theirs(tmp_path / "run.xdf", synchronize_clocks=True)["force"]["time_stamps"]
-    t_s = stamps(found.streams["force"]) / 1e9
+    result = read(tmp_path / "run.xdf")
+    second = theirs(tmp_path / "run.xdf", synchronize_clocks=True)["force"]["time_stamps"]
+    t_s = stamps(result.streams["force"]) / 1e9
     assert np.abs(t_s - true_s).max() < 300e-6
-    if abs(set_by_s) > 100:  # where both clocks show the same times, pyxdf takes one for the other
-        assert np.abs(t_s - other).max() < 300e-6
-    assert found.attributes["force_lsl_clock_resets"] == 1
+    if abs(set_by_s) > 100:  # pyxdf confuses two clocks that show the same times
+        assert np.abs(t_s - second).max() < 300e-6
+    assert result.attributes["force_lsl_clock_resets"] == 1
     raw = theirs(tmp_path / "run.xdf")["force"]["time_stamps"]
-    assert np.abs(stamps(found.streams["force"], "t_device_ns") - raw * 1e9).max() <= 1
+    assert np.abs(stamps(result.streams["force"], "t_device_ns") - raw * 1e9).max() <= 1
 
 
 def test_labels_of_tactile_channels_state_taxel_and_axis(tmp_path: Path) -> None:
@@ -141,9 +141,9 @@ def test_labels_of_tactile_channels_state_taxel_and_axis(tmp_path: Path) -> None
 def test_clock_offsets_are_a_stream_as_they_were_measured(tmp_path: Path) -> None:
     force(tmp_path / "run.xdf", 50e-6, noise_s=1e-3)
     table = read(tmp_path / "run.xdf").streams["force_clock_offsets"]
-    other = theirs(tmp_path / "run.xdf")["force"]
-    assert table.column("offset_s").to_pylist() == other["clock_values"]
-    assert np.allclose(stamps(table, "t_device_ns") / 1e9, other["clock_times"], atol=1e-9)
+    second = theirs(tmp_path / "run.xdf")["force"]
+    assert table.column("offset_s").to_pylist() == second["clock_values"]
+    assert np.allclose(stamps(table, "t_device_ns") / 1e9, second["clock_times"], atol=1e-9)
 
 
 def test_markers_are_events_as_text(tmp_path: Path) -> None:
@@ -162,10 +162,10 @@ def test_streams_of_one_name_and_channels_without_labels_are_told_apart_by_numbe
     for number in (4, 9):
         writer.stream(number, "skin", "int16", 3, type_="Tactile")
         writer.numbers(number, "int16", [1.0, 2.0], np.full((2, 3), number))
-    found = read(writer.write(tmp_path / "a.xdf")).streams
-    assert sorted(found) == ["skin_4", "skin_9"]
-    assert found["skin_9"].column("value03").to_pylist() == [9, 9]
-    assert found["skin_9"].schema.field("value01").metadata[b"quantity"] == b"tactile"
+    streams = read(writer.write(tmp_path / "a.xdf")).streams
+    assert sorted(streams) == ["skin_4", "skin_9"]
+    assert streams["skin_9"].column("value03").to_pylist() == [9, 9]
+    assert streams["skin_9"].schema.field("value01").metadata[b"quantity"] == b"tactile"
 
 
 def test_a_stream_without_samples_is_named_and_a_file_of_such_alone_refused(tmp_path: Path) -> None:
@@ -177,9 +177,9 @@ def test_a_stream_without_samples_is_named_and_a_file_of_such_alone_refused(tmp_
         read(path)
     writer.stream(2, "loud")
     writer.numbers(2, "float32", [1.0], np.ones((1, 1)))
-    found = read(writer.write(path))
-    assert list(found.streams) == ["loud"]
-    assert "silent" in str(found.attributes["skipped"])
+    result = read(writer.write(path))
+    assert list(result.streams) == ["loud"]
+    assert "silent" in str(result.attributes["skipped"])
 
 
 def test_a_file_that_was_cut_off_gives_what_stands_before_wherever_it_is_cut(tmp_path: Path) -> None:
@@ -192,18 +192,18 @@ def test_a_file_that_was_cut_off_gives_what_stands_before_wherever_it_is_cut(tmp
         writer.texts(2, [100 + start / 100], [f"m{start}"])
         writer.offset(1, 100 + start / 100, 0.0)
         writer.boundary()
-    whole = writer.bytes
-    first = whole.index(writer.parts[3]) + 24
+    full = writer.bytes
+    first = full.index(writer.parts[3]) + 24
     path = tmp_path / "a.xdf"
-    seen = set()
-    for stop in range(first, len(whole), 5):
-        path.write_bytes(whole[:stop])
-        found = read(path)
-        values = found.streams["a"].column("value01").to_pylist()
+    observed = set()
+    for stop in range(first, len(full), 5):
+        path.write_bytes(full[:stop])
+        result = read(path)
+        values = result.streams["a"].column("value01").to_pylist()
         assert values == list(range(len(values)))
-        assert stop == len(whole) or found.notes or whole[:stop].endswith(tuple(writer.parts))
-        seen.add(len(values))
-    assert seen == set(range(1, 41))
+        assert stop == len(full) or result.notes or full[:stop].endswith(tuple(writer.parts))
+        observed.add(len(values))
+    assert observed == set(range(1, 41))
 
 
 def test_bytes_that_are_wrong_cost_what_stands_up_to_the_next_boundary(tmp_path: Path) -> None:
@@ -217,9 +217,9 @@ def test_bytes_that_are_wrong_cost_what_stands_up_to_the_next_boundary(tmp_path:
     broken[place] = 77  # the length of the second chunk of samples
     path = tmp_path / "a.xdf"
     path.write_bytes(broken)
-    found = read(path)
-    assert found.streams["a"].column("value").to_pylist() == [*range(10), *range(20, 30)]
-    assert any(f"{place:,}" in note for note in found.notes)
+    result = read(path)
+    assert result.streams["a"].column("value").to_pylist() == [*range(10), *range(20, 30)]
+    assert any(f"{place:,}" in note for note in result.notes)
 
 
 def test_samples_that_the_footer_counts_and_the_file_lacks_are_named(tmp_path: Path) -> None:
@@ -236,11 +236,11 @@ def test_a_clock_that_goes_back_without_a_measurement_is_not_read_as_if_it_had_n
     writer.stream(2, "b", "int32", 1)
     writer.numbers(1, "int32", [500.0, 500.01, 3.0, 3.01, 3.02], np.ones((5, 1)))
     writer.numbers(2, "int32", [1.0, 1.02, 1.01, 1.03], np.ones((4, 1)))
-    found = read(writer.write(tmp_path / "a.xdf"))
-    assert list(found.streams) == ["b"]
-    assert "sample 3" in str(found.attributes["skipped"])
-    assert stamps(found.streams["b"]).tolist() == [10**9, 1_020_000_000, 1_020_000_000, 1_030_000_000]
-    assert stamps(found.streams["b"], "t_device_ns").tolist() == [10**9, 1_020_000_000, 1_010_000_000, 1_030_000_000]
+    result = read(writer.write(tmp_path / "a.xdf"))
+    assert list(result.streams) == ["b"]
+    assert "sample 3" in str(result.attributes["skipped"])
+    assert stamps(result.streams["b"]).tolist() == [10**9, 1_020_000_000, 1_020_000_000, 1_030_000_000]
+    assert stamps(result.streams["b"], "t_device_ns").tolist() == [10**9, 1_020_000_000, 1_010_000_000, 1_030_000_000]
 
 
 @pytest.mark.parametrize("name", ["a.xdfz", "a.xdf.gz"])
@@ -268,9 +268,9 @@ def test_a_description_that_cannot_be_read_costs_its_stream_alone(tmp_path: Path
     writer.numbers(1, "int32", [1.0], np.ones((1, 1)))
     writer.stream(2, "a", "int32")
     writer.numbers(2, "int32", [1.0], np.ones((1, 1)))
-    found = read(writer.write(tmp_path / "a.xdf"))
-    assert list(found.streams) == ["a"]
-    assert "uint128" in str(found.attributes["skipped"])
+    result = read(writer.write(tmp_path / "a.xdf"))
+    assert list(result.streams) == ["a"]
+    assert "uint128" in str(result.attributes["skipped"])
 
 
 def test_a_layout_replaces_what_the_file_states_wrongly(tmp_path: Path) -> None:
@@ -284,14 +284,14 @@ def test_a_layout_replaces_what_the_file_states_wrongly(tmp_path: Path) -> None:
 @pytest.mark.skipif(SAMPLE_DATA is None, reason="TACPIPE_SAMPLE_DATA is not set")
 def test_a_published_file_reads_as_pyxdf_does() -> None:
     path = Path(str(SAMPLE_DATA)) / "foreign" / "xdf" / "minimal.xdf"
-    found, other = read(path), theirs(path)
+    result, second = read(path), theirs(path)
     synced = theirs(path, synchronize_clocks=True)
-    for name, one in other.items():
-        table = found.streams[name]
-        assert np.array_equal(stamps(table, "t_device_ns"), np.rint(one["time_stamps"] * 1e9))
+    for name, entry in second.items():
+        table = result.streams[name]
+        assert np.array_equal(stamps(table, "t_device_ns"), np.rint(entry["time_stamps"] * 1e9))
         assert np.allclose(stamps(table) / 1e9, synced[name]["time_stamps"], atol=1e-8)
         channels = [table.column(column).to_pylist() for column in table.column_names[2:]]
-        assert np.column_stack(channels).tolist() == np.asarray(one["time_series"]).tolist()
+        assert np.column_stack(channels).tolist() == np.asarray(entry["time_series"]).tolist()
 
 
 def test_samples_that_were_put_aside_are_those_that_were_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -299,6 +299,6 @@ def test_samples_that_were_put_aside_are_those_that_were_not(tmp_path: Path, mon
     expected = read(tmp_path / "run.xdf").streams["force"]
     monkeypatch.setattr(xdf_streams, "SPILL_ROWS", 64)
     monkeypatch.setattr(xdf_streams, "PASSED_BYTES", mmap.PAGESIZE)
-    made = read(tmp_path / "run.xdf").streams["force"]
-    assert isinstance(made, pa.RecordBatchReader)
-    assert made.read_all().equals(expected, check_metadata=True)
+    streams = read(tmp_path / "run.xdf").streams["force"]
+    assert isinstance(streams, pa.RecordBatchReader)
+    assert streams.read_all().equals(expected, check_metadata=True)

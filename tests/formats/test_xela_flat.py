@@ -47,9 +47,9 @@ def test_every_stream_keeps_its_rows_and_its_layout(flat_trial: Trial) -> None:
         "marker2": (6, 8),
     }
     raw = np.random.default_rng(2).integers(0, 65_536, (6, 48))
-    found = recording.streams["xela2"]
-    np.testing.assert_array_equal(np.column_stack([column.to_numpy() for column in found.columns[1:]]), raw)
-    assert found.schema.field("taxel16_z").metadata == {
+    streams = recording.streams["xela2"]
+    np.testing.assert_array_equal(np.column_stack([column.to_numpy() for column in streams.columns[1:]]), raw)
+    assert streams.schema.field("taxel16_z").metadata == {
         b"unit": b"count",
         b"quantity": b"tactile",
         b"taxel": b"16",
@@ -84,9 +84,9 @@ def test_what_is_known_of_a_trial_becomes_attributes(flat_trial: Trial) -> None:
 
 def test_a_marker_that_was_not_seen_is_nan_and_not_ten(flat_trial: Trial) -> None:
     marker = read(flat_trial()).streams["marker2"]
-    seen = ~np.isnan(np.column_stack([column.to_numpy() for column in marker.columns[1:]]))
-    assert seen.all(axis=1).tolist() == [True, True, False, True, True, True]
-    assert not seen[2].any()
+    values = ~np.isnan(np.column_stack([column.to_numpy() for column in marker.columns[1:]]))
+    assert values.all(axis=1).tolist() == [True, True, False, True, True, True]
+    assert not values[2].any()
 
 
 def test_trials_are_found_at_any_depth_with_unique_names(flat_trial: Trial, tmp_path: Path) -> None:
@@ -111,11 +111,11 @@ def test_a_trial_that_lacks_a_file_is_found_and_named_when_read(flat_trial: Tria
     folder = flat_trial()
     (folder / "marker.csv").unlink()
     (tmp_path / "data_sample_empty").mkdir()
-    found = discover(Params(), tmp_path)
+    sources = discover(Params(), tmp_path)
     with pytest.raises(TacpipeError, match=r"2021-11-24-15-19-34 lacks marker\.csv"):
-        xela_flat(Params(), found["2021-11-24-15-19-34"])
+        xela_flat(Params(), sources["2021-11-24-15-19-34"])
     with pytest.raises(TacpipeError, match=r"xela_sensor1\.csv"):
-        xela_flat(Params(), found["empty"])
+        xela_flat(Params(), sources["empty"])
 
 
 @pytest.mark.parametrize(
@@ -171,8 +171,8 @@ def test_more_robot_rows_than_tactile_ones_are_refused(flat_trial: Trial) -> Non
 @pytest.mark.data
 @pytest.mark.skipif(not (SAMPLE / "xela_flat_pick_move").is_dir(), reason="the published recordings are not here")
 def test_the_published_trials_are_read_as_they_were_counted() -> None:
-    found = discover(Params(), SAMPLE / "xela_flat_pick_move")
-    recordings = [xela_flat(Params(), files) for files in found.values()]
+    sources = discover(Params(), SAMPLE / "xela_flat_pick_move")
+    recordings = [xela_flat(Params(), files) for files in sources.values()]
     assert len(recordings) == 52
     assert {recording.attributes["object"] for recording in recordings} == {
         "4",
@@ -195,6 +195,6 @@ def test_the_published_trials_are_read_as_they_were_counted() -> None:
 
 def test_selected_streams_are_those_of_the_whole_recording(flat_trial: Trial) -> None:
     folder = flat_trial()
-    whole, tactile = read(folder), read(folder, Params(streams="xela*"))
-    assert sorted(tactile.streams) == ["xela1", "xela2"] and tactile.attributes == whole.attributes
-    assert all(tactile.streams[name].equals(whole.streams[name]) for name in tactile.streams)
+    full, tactile = read(folder), read(folder, Params(streams="xela*"))
+    assert sorted(tactile.streams) == ["xela1", "xela2"] and tactile.attributes == full.attributes
+    assert all(tactile.streams[name].equals(full.streams[name]) for name in tactile.streams)

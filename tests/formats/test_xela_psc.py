@@ -36,19 +36,19 @@ def set_cell(path: Path, row: int, column: str, cell: str) -> None:
 def test_the_column_major_transform_becomes_position_and_quaternion(psc_trial: Trial) -> None:
     robot = read(psc_trial()).streams["robot"]
     np.testing.assert_allclose(robot.column("position_y_m").to_numpy(), np.arange(6) * 0.3 + 0.1)
-    found = np.column_stack([robot.column(f"orientation_{part}").to_numpy() for part in "xyzw"])
-    wanted = Rotation.random(6, rng=np.random.default_rng(0))
-    assert (Rotation.from_quat(found) * wanted.inv()).magnitude().max() < 1e-7
-    assert ((found[1:] * found[:-1]).sum(axis=1) >= 0).all()
+    values = np.column_stack([robot.column(f"orientation_{part}").to_numpy() for part in "xyzw"])
+    expected = Rotation.random(6, rng=np.random.default_rng(0))
+    assert (Rotation.from_quat(values) * expected.inv()).magnitude().max() < 1e-7
+    assert ((values[1:] * values[:-1]).sum(axis=1) >= 0).all()
 
 
 def test_all_streams_have_the_seconds_of_the_robot_as_stamps(psc_trial: Trial) -> None:
     streams = read(psc_trial()).streams
     start_ns = int(np.datetime64("2022-02-21T09:58:40.837657", "ns").astype(np.int64))
-    wanted = [start_ns + ms * 1_000_000 for ms in (0, 10, 10, 30, 45, 60)]
+    expected = [start_ns + ms * 1_000_000 for ms in (0, 10, 10, 30, 45, 60)]
     assert set(streams) == {"xela1", "xela2", "robot", "marker", "slip"}
     for table in streams.values():
-        assert table.column("t_ns").to_pylist() == wanted
+        assert table.column("t_ns").to_pylist() == expected
         assert b"made" not in table.schema.field("t_ns").metadata
 
 
@@ -97,7 +97,7 @@ def test_a_missing_label_file_is_named(psc_trial: Trial) -> None:
 @pytest.mark.data
 @pytest.mark.skipif(not (SAMPLE / "xela_slip_psc").is_dir(), reason="the published recordings are not here")
 def test_the_published_trials_are_read_as_they_were_counted() -> None:
-    found = discover(Params(), SAMPLE / "xela_slip_psc")
-    recordings = [xela_psc(Params(), files) for files in found.values()]
+    sources = discover(Params(), SAMPLE / "xela_slip_psc")
+    recordings = [xela_psc(Params(), files) for files in sources.values()]
     assert sum(recording.streams["xela1"].num_rows for recording in recordings) == 674
     assert [recording.attributes["slipped"] for recording in recordings] == [False, True]

@@ -50,8 +50,8 @@ class Writer:
     ) -> None:
         """Describe a stream; ``labels`` are label, unit and type of each channel."""
         described = "".join(
-            f"<channel><label>{label}</label><unit>{unit}</unit><type>{own}</type></channel>"
-            for label, unit, own in labels
+            f"<channel><label>{label}</label><unit>{unit}</unit><type>{value}</type></channel>"
+            for label, unit, value in labels
         )
         text = (
             f"<?xml version='1.0'?><info><name>{name}</name><type>{type_}</type><channel_count>{channels}</channel_count>"

@@ -62,8 +62,8 @@ def write_psc(folder: Path) -> Path:
     transforms[:, :3, 3] = poses(0)[:, :3]
     by_column = transforms.transpose(0, 2, 1).reshape(ROWS, 16)
     time_s = np.array([0.0, 0.01, 0.01, 0.03, 0.045, 0.06])
-    rest = np.column_stack([np.arange(14 * ROWS).reshape(ROWS, 14), by_column, -time_s, 2 * time_s, time_s])
-    write(folder / "robot_state.csv", names, rest)
+    values = np.column_stack([np.arange(14 * ROWS).reshape(ROWS, 14), by_column, -time_s, 2 * time_s, time_s])
+    write(folder / "robot_state.csv", names, values)
     write(folder / "marker.csv", [f"marker_{name}" for name in MARKER], poses(1))
     write(folder / "slip_label.csv", ["slip", "fail"], np.array([[0, 0], [0, 0], [1, 0], [1, 0], [0, 1], [0, 1]]))
     (folder / "meta_data.csv").write_text(

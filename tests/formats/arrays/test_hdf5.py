@@ -28,8 +28,8 @@ def given(text: str) -> Params:
 
 
 def read(folder: Path, params: Params = NONE) -> dict[str, RecordingOutput]:
-    found = HDF5.discover(params, folder)
-    return {name: hdf5(params, one.files, one.values) for name, one in found.items()}
+    sources = HDF5.discover(params, folder)
+    return {name: hdf5(params, value.files, value.values) for name, value in sources.items()}
 
 
 def about(table: pa.Table, column: str) -> dict[str, str]:
@@ -38,9 +38,9 @@ def about(table: pa.Table, column: str) -> dict[str, str]:
 
 def test_each_demonstration_of_robomimic_is_a_recording_at_the_rate_of_its_controller(tmp_path: Path) -> None:
     files.robomimic(tmp_path / "lift.hdf5", demos=11)
-    found = read(tmp_path)
-    assert set(found) == {f"lift-demo_{number}" for number in range(11)}
-    obs = found["lift-demo_10"].streams["obs"]
+    result = read(tmp_path)
+    assert set(result) == {f"lift-demo_{number}" for number in range(11)}
+    obs = result["lift-demo_10"].streams["obs"]
     assert obs.column("t_ns").to_pylist() == [row * 50_000_000 for row in range(20)]
     expected = files.values(20, 3, seed=10)
     assert obs.column("robot0_eef_pos_y").to_pylist() == expected[:, 1].tolist()
@@ -48,17 +48,17 @@ def test_each_demonstration_of_robomimic_is_a_recording_at_the_rate_of_its_contr
     assert about(obs, "tactile_3_2") == {"quantity": "tactile", "unit": "count", "taxel": "4", "axis": "z"}
     assert obs.schema.field("tactile_3_2").type == pa.uint16()
     assert "unit" not in about(obs, "robot0_gripper_qpos_0")
-    assert found["lift-demo_10"].attributes["env_args.env_name"] == "Lift"
-    assert found["lift-demo_10"].attributes["num_samples"] == 20
-    assert [found[f"lift-demo_{number}"].attributes["mask.train"] for number in (9, 10)] == [False, True]
+    assert result["lift-demo_10"].attributes["env_args.env_name"] == "Lift"
+    assert result["lift-demo_10"].attributes["num_samples"] == 20
+    assert [result[f"lift-demo_{number}"].attributes["mask.train"] for number in (9, 10)] == [False, True]
 
 
 def test_what_is_left_out_is_named_with_its_reason(tmp_path: Path) -> None:
     files.robomimic(tmp_path / "lift.hdf5", demos=1)
-    (found,) = read(tmp_path).values()
-    said = " ".join(found.notes)
+    (result,) = read(tmp_path).values()
+    said = " ".join(result.notes)
     assert all(part in said for part in ("obs/agentview_image", "84 x 84 x 3", "next_obs", "model_file", "800"))
-    assert "agentview_image" in str(found.attributes["skipped"])
+    assert "agentview_image" in str(result.attributes["skipped"])
 
 
 def test_frames_of_aloha_are_kept_as_they_were_encoded(tmp_path: Path) -> None:
@@ -71,12 +71,12 @@ def test_frames_of_aloha_are_kept_as_they_were_encoded(tmp_path: Path) -> None:
     source = "observations/images/cam_high"
     time = { rate_hz = 50 }
     """
-    (found,) = read(tmp_path, given(layout)).values()
-    assert found.streams["camera"].column("data").to_pylist() == files.pictures(8)
-    assert about(found.streams["camera"], "data") == {"quantity": "image", "encoding": "jpeg"}
-    assert about(found.streams["arms"], "qpos_5") == {"quantity": "joint_position", "unit": "rad"}
-    assert about(found.streams["arms"], "qpos_6") == {"quantity": "state", "unit": "1"}
-    assert found.streams["arms"].column("t_ns").to_pylist()[1] == 20_000_000
+    (result,) = read(tmp_path, given(layout)).values()
+    assert result.streams["camera"].column("data").to_pylist() == files.pictures(8)
+    assert about(result.streams["camera"], "data") == {"quantity": "image", "encoding": "jpeg"}
+    assert about(result.streams["arms"], "qpos_5") == {"quantity": "joint_position", "unit": "rad"}
+    assert about(result.streams["arms"], "qpos_6") == {"quantity": "state", "unit": "1"}
+    assert result.streams["arms"].column("t_ns").to_pylist()[1] == 20_000_000
 
 
 def test_decoded_frames_are_named_and_not_read(tmp_path: Path) -> None:
@@ -89,12 +89,12 @@ def test_decoded_frames_are_named_and_not_read(tmp_path: Path) -> None:
 def test_frames_of_their_own_length_are_kept(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["time_ns"] = files.START_NS + np.arange(3)
-        made = file.create_dataset("cam", (3,), dtype=h5py.vlen_dtype(np.uint8))
+        values = file.create_dataset("cam", (3,), dtype=h5py.vlen_dtype(np.uint8))
         for row, frame in enumerate(files.pictures(3)):
-            made[row] = np.frombuffer(frame, np.uint8)
-    (found,) = read(tmp_path).values()
-    assert found.streams["cam"].column("data").to_pylist() == files.pictures(3)
-    assert found.streams["cam"].column("t_ns").to_pylist() == [files.START_NS + row for row in range(3)]
+            values[row] = np.frombuffer(frame, np.uint8)
+    (result,) = read(tmp_path).values()
+    assert result.streams["cam"].column("data").to_pylist() == files.pictures(3)
+    assert result.streams["cam"].column("t_ns").to_pylist() == [files.START_NS + row for row in range(3)]
 
 
 def test_without_a_rate_nothing_is_read_and_the_entry_to_write_is_named(tmp_path: Path) -> None:
@@ -105,9 +105,9 @@ def test_without_a_rate_nothing_is_read_and_the_entry_to_write_is_named(tmp_path
 
 def test_groups_of_a_lab_have_their_own_stamps_units_and_labels(tmp_path: Path) -> None:
     files.lab(tmp_path / "run.h5")
-    (found,) = read(tmp_path).values()
-    assert set(found.streams) == {"skin", "arm", "gripper"}
-    skin, arm, gripper = (found.streams[name] for name in ("skin", "arm", "gripper"))
+    (result,) = read(tmp_path).values()
+    assert set(result.streams) == {"skin", "arm", "gripper"}
+    skin, arm, gripper = (result.streams[name] for name in ("skin", "arm", "gripper"))
     assert skin.column("t_ns").to_pylist() == [files.START_NS + row * 10_000_000 for row in range(50)]
     assert skin.column("taxels_3").to_pylist() == list(range(3, 200, 4))
     assert about(arm, "load_2") == {"unit": "N"}
@@ -116,9 +116,11 @@ def test_groups_of_a_lab_have_their_own_stamps_units_and_labels(tmp_path: Path) 
     assert gripper.column("t_ns").to_pylist() == [row * 100_000_000 for row in range(6)]
     assert gripper.column("status").to_pylist() == ["ok"] * 6
     assert (
-        found.attributes["material"] == "cork" and found.attributes["trial"] == 3 and found.attributes["mass"] == 0.25
+        result.attributes["material"] == "cork"
+        and result.attributes["trial"] == 3
+        and result.attributes["mass"] == 0.25
     )
-    assert "calibration" in " ".join(found.notes)
+    assert "calibration" in " ".join(result.notes)
 
 
 @pytest.mark.parametrize(
@@ -137,8 +139,8 @@ def test_the_unit_of_stamps_is_that_of_attribute_name_or_size(
         file[name], file["x"] = stamps, [1.0, 2.0]
         if unit:
             file[name].attrs["unit"] = unit
-    (found,) = read(tmp_path).values()
-    assert found.streams["x"].column("t_ns").to_pylist()[1] == second
+    (result,) = read(tmp_path).values()
+    assert result.streams["x"].column("t_ns").to_pylist()[1] == second
 
 
 def test_stamps_of_no_known_unit_are_not_taken_for_seconds(tmp_path: Path) -> None:
@@ -146,20 +148,20 @@ def test_stamps_of_no_known_unit_are_not_taken_for_seconds(tmp_path: Path) -> No
         file["time"], file["x"] = [0.0, 1.0], [1.0, 2.0]
     with pytest.raises(TacpipeError, match=r"a\.h5 .*rate_hz"):
         read(tmp_path)
-    (found,) = read(tmp_path, given('[streams.x]\nsource = "x"\ntime = { column = "time", unit = "ms" }')).values()
-    assert found.streams["x"].column("t_ns").to_pylist() == [0, 10**6]
+    (result,) = read(tmp_path, given('[streams.x]\nsource = "x"\ntime = { column = "time", unit = "ms" }')).values()
+    assert result.streams["x"].column("t_ns").to_pylist() == [0, 10**6]
 
 
 @pytest.mark.parametrize(
     "kind", ["int8", "uint8", "int16", ">i4", "uint32", "int64", "uint64", "float32", ">f8", "bool"]
 )
 def test_values_keep_their_type_and_every_bit(tmp_path: Path, kind: str) -> None:
-    wanted = np.arange(-3, 4).astype(kind)
+    values = np.arange(-3, 4).astype(kind)
     with h5py.File(tmp_path / "a.h5", "w") as file:
-        file.attrs["rate_hz"], file["x"] = 10, wanted
-    (found,) = read(tmp_path).values()
-    column = found.streams["x"].column("x")
-    assert column.to_pylist() == wanted.tolist()
+        file.attrs["rate_hz"], file["x"] = 10, values
+    (result,) = read(tmp_path).values()
+    column = result.streams["x"].column("x")
+    assert column.to_pylist() == values.tolist()
     assert column.type == pa.from_numpy_dtype(np.dtype(kind).newbyteorder("="))
 
 
@@ -171,9 +173,9 @@ def test_arrays_of_another_length_are_a_stream_of_their_own(tmp_path: Path) -> N
             files.values(9, 7),
             files.values(4, 2),
         )
-    (found,) = read(tmp_path).values()
-    assert {name: one.num_rows for name, one in found.streams.items()} == {"dq": 9, "slow": 4}
-    assert len(found.streams["dq"].column_names) == 15
+    (result,) = read(tmp_path).values()
+    assert {name: value.num_rows for name, value in result.streams.items()} == {"dq": 9, "slow": 4}
+    assert len(result.streams["dq"].column_names) == 15
 
 
 def test_nothing_of_another_file_is_read(tmp_path: Path) -> None:
@@ -183,12 +185,12 @@ def test_nothing_of_another_file_is_read(tmp_path: Path) -> None:
         file.attrs["rate_hz"] = 10
         file["y"] = np.arange(4.0)
         file["linked"] = h5py.ExternalLink(str(tmp_path / "secret.bin"), "/x")
-        made = h5py.VirtualLayout(shape=(4,), dtype="f8")
-        made[:] = h5py.VirtualSource(str(tmp_path / "secret.bin"), "x", shape=(4,))
-        file.create_virtual_dataset("virtual", made)
-    (found,) = read(tmp_path).values()
-    assert found.streams["y"].column_names == ["t_ns", "y"]
-    assert "linked" in " ".join(found.notes) and "virtual" in " ".join(found.notes)
+        output = h5py.VirtualLayout(shape=(4,), dtype="f8")
+        output[:] = h5py.VirtualSource(str(tmp_path / "secret.bin"), "x", shape=(4,))
+        file.create_virtual_dataset("virtual", output)
+    (result,) = read(tmp_path).values()
+    assert result.streams["y"].column_names == ["t_ns", "y"]
+    assert "linked" in " ".join(result.notes) and "virtual" in " ".join(result.notes)
 
 
 def test_a_group_within_itself_ends(tmp_path: Path) -> None:
@@ -196,8 +198,8 @@ def test_a_group_within_itself_ends(tmp_path: Path) -> None:
         file.attrs["rate_hz"] = 10
         file["g/x"] = np.arange(4.0)
         file["g/again"] = file["g"]
-    (found,) = read(tmp_path).values()
-    assert set(found.streams) == {"g"}
+    (result,) = read(tmp_path).values()
+    assert set(result.streams) == {"g"}
 
 
 @pytest.mark.parametrize(
@@ -214,11 +216,11 @@ def test_a_damaged_file_is_one_sentence_and_keeps_no_other_from_being_read(
     assert callable(damage)
     files.lab(tmp_path / "good.h5")
     (tmp_path / "bad.h5").write_bytes(damage((tmp_path / "good.h5").read_bytes()))
-    found = HDF5.discover(NONE, tmp_path)
-    assert set(found) == {"bad", "good"}
-    assert hdf5(NONE, found["good"].files, found["good"].values).streams
+    sources = HDF5.discover(NONE, tmp_path)
+    assert set(sources) == {"bad", "good"}
+    assert hdf5(NONE, sources["good"].files, sources["good"].values).streams
     with pytest.raises(TacpipeError, match=r"bad\.h5") as raised:
-        hdf5(NONE, found["bad"].files, found["bad"].values)
+        hdf5(NONE, sources["bad"].files, sources["bad"].values)
     assert all(part in str(raised.value) for part in parts)
 
 
@@ -227,20 +229,20 @@ def test_of_a_file_that_is_cut_short_all_is_read_whose_bytes_are_there_and_nothi
     files.robomimic(path, demos=40)
     content = path.read_bytes()
     path.write_bytes(content[: len(content) * 6 // 10])
-    found = HDF5.discover(NONE, tmp_path)
-    whole = 0
-    for name, one in found.items():
+    sources = HDF5.discover(NONE, tmp_path)
+    full = 0
+    for name, entry in sources.items():
         number = int(name.rpartition("_")[2])
         try:
-            made = hdf5(NONE, one.files, one.values)
+            output = hdf5(NONE, entry.files, entry.values)
         except TacpipeError as error:
             assert "lift.hdf5" in str(error)
             continue
         expected = files.values(10 + number, 3, seed=number)
-        assert made.streams["obs"].column("robot0_eef_pos_x").to_pylist() == expected[:, 0].tolist()
-        assert f"{len(content) * 6 // 10:,} bytes" in " ".join(made.notes)
-        whole += 1
-    assert 10 < whole < 30
+        assert output.streams["obs"].column("robot0_eef_pos_x").to_pylist() == expected[:, 0].tolist()
+        assert f"{len(content) * 6 // 10:,} bytes" in " ".join(output.notes)
+        full += 1
+    assert 10 < full < 30
 
 
 def test_a_damaged_array_is_named_and_costs_its_own_recording(tmp_path: Path) -> None:
@@ -254,10 +256,10 @@ def test_a_damaged_array_is_named_and_costs_its_own_recording(tmp_path: Path) ->
     content = bytearray(path.read_bytes())
     content[place.byte_offset + 500 : place.byte_offset + 700] = bytes(200)
     path.write_bytes(content)
-    found = HDF5.discover(NONE, tmp_path)
-    assert hdf5(NONE, found["lift-demo_0"].files, found["lift-demo_0"].values).streams["x"].num_rows == 4000
+    sources = HDF5.discover(NONE, tmp_path)
+    assert hdf5(NONE, sources["lift-demo_0"].files, sources["lift-demo_0"].values).streams["x"].num_rows == 4000
     with pytest.raises(TacpipeError, match=r"lift\.hdf5: demo_1/x"):
-        hdf5(NONE, found["lift-demo_1"].files, found["lift-demo_1"].values)
+        hdf5(NONE, sources["lift-demo_1"].files, sources["lift-demo_1"].values)
 
 
 def test_the_layout_that_a_guess_prints_reads_the_same(tmp_path: Path) -> None:
@@ -282,7 +284,7 @@ def test_the_same_data_give_the_same_table_from_csv_and_hdf5(tmp_path: Path) -> 
     )
     rows = [",".join(["t_ns", *(f"taxel_{at}" for at in range(4)), "fx"])]
     rows += [
-        f"{t},{','.join(map(str, some))},{one!r}" for t, some, one in zip(t_ns, taxels, force.tolist(), strict=True)
+        f"{t},{','.join(map(str, some))},{value!r}" for t, some, value in zip(t_ns, taxels, force.tolist(), strict=True)
     ]
     (tmp_path / "run.csv").write_text("\n".join(rows) + "\n")
     with h5py.File(tmp_path / "run.h5", "w") as file:
@@ -297,8 +299,8 @@ def test_the_same_data_give_the_same_table_from_csv_and_hdf5(tmp_path: Path) -> 
     text = reading.read_stream_table(
         tmp_path / "run.csv", layout.parse_layout(f'[streams.skin]\nfiles = "run.csv"\n{columns}').streams[0]
     )
-    (found,) = read(tmp_path, given(f'[streams.skin]\nsource = "skin"\n{columns}')).values()
-    assert to_parquet(found.streams["skin"].select(text.column_names)) == to_parquet(text)
+    (result,) = read(tmp_path, given(f'[streams.skin]\nsource = "skin"\n{columns}')).values()
+    assert to_parquet(result.streams["skin"].select(text.column_names)) == to_parquet(text)
 
 
 @pytest.mark.parametrize("chunks", [None, 5, 16])
@@ -315,13 +317,13 @@ def test_a_stream_of_many_blocks_is_the_one_that_was_written(
         for row, picture in enumerate(pictures):
             frames[row] = np.frombuffer(picture, np.uint8)
         file["camera/t_ns"] = files.START_NS + np.arange(100) * 10**6
-    (found,) = read(tmp_path).values()
-    made = {name: rows.read_all() for name, rows in found.streams.items() if isinstance(rows, pa.RecordBatchReader)}
-    assert sorted(made) == ["frames", "skin"]
-    assert [made["skin"].column(f"force_{at}").to_pylist() for at in range(4)] == values.T.tolist()
-    assert made["skin"].column("label").to_pylist()[99] == "row 99"
-    assert made["frames"].column("data").to_pylist() == pictures
-    assert about(made["frames"], "data") == {"quantity": "image", "encoding": "jpeg"}
+    (result,) = read(tmp_path).values()
+    table = {name: rows.read_all() for name, rows in result.streams.items() if isinstance(rows, pa.RecordBatchReader)}
+    assert sorted(table) == ["frames", "skin"]
+    assert [table["skin"].column(f"force_{at}").to_pylist() for at in range(4)] == values.T.tolist()
+    assert table["skin"].column("label").to_pylist()[99] == "row 99"
+    assert table["frames"].column("data").to_pylist() == pictures
+    assert about(table["frames"], "data") == {"quantity": "image", "encoding": "jpeg"}
 
 
 def test_labels_and_clocks_of_a_sensor_are_no_channels_and_time_is_the_longest_dimension(tmp_path: Path) -> None:

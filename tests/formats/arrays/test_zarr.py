@@ -33,19 +33,19 @@ def given(text: str = LAYOUT, *, fill: bool = False) -> ZarrParams:
 
 def read(folder: Path, params: ZarrParams | None = None) -> dict[str, RecordingOutput]:
     params = params or given()
-    found = ZARR.discover(params, folder)
-    return {name: container_commands.zarr(params, one.files, one.values) for name, one in found.items()}
+    sources = ZARR.discover(params, folder)
+    return {name: container_commands.zarr(params, value.files, value.values) for name, value in sources.items()}
 
 
 @pytest.mark.parametrize("zarr_format", [2, 3])
 @pytest.mark.parametrize("name", ["replay.zarr", "replay.zarr.zip"])
-@pytest.mark.filterwarnings("ignore:Duplicate name:UserWarning")  # of zarr's own writer of zip files
+@pytest.mark.filterwarnings("ignore:Duplicate name:UserWarning")  # zarr's own writer of zip files warns
 def test_each_episode_of_a_replay_buffer_is_a_recording(tmp_path: Path, name: str, zarr_format: int) -> None:
     arrays = files.replay(tmp_path / name, zarr_format=zarr_format)
-    found = read(tmp_path)
-    assert list(found) == [f"replay-episode_00000{number}" for number in range(3)]
-    for (start, stop), one in zip([(0, 30), (30, 45), (45, 80)], found.values(), strict=True):
-        table = one.streams["hand"]
+    result = read(tmp_path)
+    assert list(result) == [f"replay-episode_00000{number}" for number in range(3)]
+    for (start, stop), entry in zip([(0, 30), (30, 45), (45, 80)], result.values(), strict=True):
+        table = entry.streams["hand"]
         assert table.column("robot0_eef_pos_z").to_pylist() == arrays["data/robot0_eef_pos"][start:stop, 2].tolist()
         assert (
             table.column("robot0_gripper_width").to_pylist()
@@ -62,27 +62,27 @@ def test_a_rate_names_and_labels_that_the_store_states_count(tmp_path: Path) -> 
     group.create_array("meta/episode_ends", data=np.array([2, 6]))
     group.create_array("meta/score", data=np.array([0.5, 0.25]))
     group["meta"].attrs.update(rate_hz=10, recordings=["cup", "box"], labels={"box": {"material": "cork"}})
-    found = read(tmp_path, given(""))
-    assert found["box"].streams["data"].column("t_ns").to_pylist() == [row * 10**8 for row in range(4)]
-    assert found["box"].streams["data"].column("tactile_3").to_pylist() == [11, 15, 19, 23]
-    assert found["box"].attributes["material"] == "cork" and found["box"].attributes["score"] == 0.25
-    assert "material" not in found["cup"].attributes
-    assert "data/short" in str(found["box"].attributes["skipped"])
+    result = read(tmp_path, given(""))
+    assert result["box"].streams["data"].column("t_ns").to_pylist() == [row * 10**8 for row in range(4)]
+    assert result["box"].streams["data"].column("tactile_3").to_pylist() == [11, 15, 19, 23]
+    assert result["box"].attributes["material"] == "cork" and result["box"].attributes["score"] == 0.25
+    assert "material" not in result["cup"].attributes
+    assert "data/short" in str(result["box"].attributes["skipped"])
 
 
 def test_a_store_without_episodes_is_one_recording(tmp_path: Path) -> None:
     group = files.store(tmp_path / "run.zarr", 3)
     group.create_array("skin/t_ns", data=files.START_NS + np.arange(5) * 10**7)
     group.create_array("skin/force", data=files.values(5, 3))
-    (found,) = read(tmp_path, given("")).values()
-    assert found.streams["skin"].column_names == ["t_ns", "force_x", "force_y", "force_z"]
+    (result,) = read(tmp_path, given("")).values()
+    assert result.streams["skin"].column_names == ["t_ns", "force_x", "force_y", "force_z"]
 
 
 def test_a_lost_chunk_is_not_read_as_zeros(tmp_path: Path) -> None:
     files.replay(tmp_path / "replay.zarr")
     (tmp_path / "replay.zarr" / "data" / "robot0_eef_pos" / "3.0").unlink()
-    found = ZARR.discover(given(), tmp_path)
-    first, last = found["replay-episode_000000"], found["replay-episode_000002"]
+    sources = ZARR.discover(given(), tmp_path)
+    first, last = sources["replay-episode_000000"], sources["replay-episode_000002"]
     assert container_commands.zarr(given(), first.files, first.values).streams["hand"].num_rows == 30
     with pytest.raises(TacpipeError, match=r"replay\.zarr lacks data/robot0_eef_pos/3\.0.*--fill-missing-chunks"):
         container_commands.zarr(given(), last.files, last.values)
@@ -152,8 +152,8 @@ def stores(lab: Lab) -> Lab:
 
 def counts(lab: Lab, more: str = "") -> tuple[int, int]:
     """Return how many recordings were read, and how many were in the store."""
-    found = json.loads(lab.run(f"{INGEST} --json {more}").out)
-    return found["ran"], found["reused"]
+    content = json.loads(lab.run(f"{INGEST} --json {more}").out)
+    return content["ran"], content["reused"]
 
 
 def test_a_changed_chunk_costs_the_recordings_that_lie_in_it(stores: Lab) -> None:
@@ -163,7 +163,7 @@ def test_a_changed_chunk_costs_the_recordings_that_lie_in_it(stores: Lab) -> Non
     arrays = files.replay(stores.folder / "stores" / "replay.zarr")
     place = stores.folder / "stores" / "replay.zarr"
     changed = arrays["data/robot0_eef_pos"].copy()
-    changed[79] = 1.0  # in the chunk of rows 60 to 79, which the last recording has alone
+    changed[79] = 1.0  # the chunk of rows 60 to 79 belongs only to the last recording
     files.store(place.parent / "other.zarr").create_array("x", data=changed, chunks=(20, 3))
     shutil.move(place.parent / "other.zarr" / "x" / "3.0", place / "data" / "robot0_eef_pos" / "3.0")
     shutil.rmtree(place.parent / "other.zarr")
@@ -204,9 +204,9 @@ def test_a_missing_chunk_ends_with_one_and_the_others_are_read_with_skip_bad(sto
 
 def test_an_episode_of_many_blocks_has_the_rows_of_one_block(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     files.replay(tmp_path / "replay.zarr")
-    expected = {name: one.streams["hand"] for name, one in read(tmp_path).items()}
+    expected = {name: value.streams["hand"] for name, value in read(tmp_path).items()}
     monkeypatch.setattr(container, "BLOCK_BYTES", 200)
-    for name, one in read(tmp_path).items():
-        made = one.streams["hand"]
-        assert isinstance(made, pa.RecordBatchReader)
-        assert made.read_all().equals(expected[name], check_metadata=True)
+    for name, entry in read(tmp_path).items():
+        streams = entry.streams["hand"]
+        assert isinstance(streams, pa.RecordBatchReader)
+        assert streams.read_all().equals(expected[name], check_metadata=True)

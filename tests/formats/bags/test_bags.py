@@ -32,12 +32,12 @@ def read(path: Path) -> Contents:
 def streams(path: Path) -> dict[str, SourceStream]:
     contents = read(path)
     assert (dict(contents.skipped), list(contents.notes)) == ({}, [])
-    return {one.name: one for one in contents.streams}
+    return {stream.name: stream for stream in contents.streams}
 
 
 def only(path: Path) -> pa.Table:
-    (found,) = streams(path).values()
-    return found.table
+    (result,) = streams(path).values()
+    return result.table
 
 
 def values(table: pa.Table, names: list[str]) -> np.ndarray[Any, Any]:
@@ -86,21 +86,21 @@ WAYS: dict[str, Callable[[Path], Path]] = {
 
 @pytest.mark.parametrize("way", WAYS)
 def test_a_bag_gives_what_was_sent_however_it_is_stored(tmp_path: Path, way: str) -> None:
-    found = streams(WAYS[way](tmp_path))
-    assert {name: one.source for name, one in found.items()} == {
+    result = streams(WAYS[way](tmp_path))
+    assert {name: value.source for name, value in result.items()} == {
         "joint_states": "/joint_states",
         "left_skin": "/left/skin",
     }
-    joints, skin = found["joint_states"].table, found["left_skin"].table
+    joints, skin = result["joint_states"].table, result["left_skin"].table
     frames = np.arange(FRAMES)
     assert joints.column("t_header_ns").to_pylist() == (START_NS + frames * STEP_NS).tolist()
     assert joints.column("t_log_ns").to_pylist() == (START_NS + frames * STEP_NS + 1_000_000).tolist()
     assert (values(joints, ["joint1_rad", "joint2_rad"]) == np.stack([frames, -frames], axis=1)).all()
     assert values(joints, ["joint1_velocity_rad_s", "joint2_velocity_rad_s"]).tolist() == [[0.5, 0.25]] * FRAMES
     assert skin.schema.field("data_0").type == pa.float32()
-    wanted = np.stack([frames, np.full(FRAMES, 0.1), frames / 3], axis=1).astype(np.float32)
-    assert (values(skin, ["data_0", "data_1", "data_2"]) == wanted).all()
-    assert (found["joint_states"].time.column, found["left_skin"].time.column) == ("t_header_ns", "t_log_ns")
+    expected = np.stack([frames, np.full(FRAMES, 0.1), frames / 3], axis=1).astype(np.float32)
+    assert (values(skin, ["data_0", "data_1", "data_2"]) == expected).all()
+    assert (result["joint_states"].time.column, result["left_skin"].time.column) == ("t_header_ns", "t_log_ns")
 
 
 def test_a_joints_column_has_its_quantity_unit_and_name(tmp_path: Path) -> None:
@@ -116,12 +116,12 @@ def test_joints_are_told_apart_by_name_whatever_their_order(tmp_path: Path) -> N
         position = [frame * 10 + numbers[name] for name in names]
         message = writers.build(TYPES, "sensor_msgs/msg/JointState", name=names, position=position)
         sent.append(("/joints", "sensor_msgs/msg/JointState", START_NS + frame, message))
-    found = streams(writers.ros2(tmp_path / "a", sent))
-    arm_of = found["joints"].table
+    result = streams(writers.ros2(tmp_path / "a", sent))
+    arm_of = result["joints"].table
     assert arm_of.column("joint1_rad").to_pylist() == [1, 11, 31, 41]
     assert arm_of.column("joint2_rad").to_pylist() == [2, 12, 32, 42]
-    assert found["joints_finger"].table.column("joint1_position").to_pylist() == [23, 53]
-    assert b"unit" not in found["joints_finger"].table.schema.field("joint1_position").metadata
+    assert result["joints_finger"].table.column("joint1_position").to_pylist() == [23, 53]
+    assert b"unit" not in result["joints_finger"].table.schema.field("joint1_position").metadata
 
 
 def _stamped(stamps_ns: list[int], log_ns: list[int], path: Path) -> SourceStream:
@@ -130,27 +130,27 @@ def _stamped(stamps_ns: list[int], log_ns: list[int], path: Path) -> SourceStrea
     for index, (stamp, log) in enumerate(zip(stamps_ns, log_ns, strict=True)):
         wrench = writers.build(TYPES, name, header=writers.header(TYPES, stamp), wrench={"force": {"z": float(index)}})
         sent.append(("/wrench", name, log, wrench))
-    (found,) = read(writers.ros2(path, sent)).streams
-    return found
+    (result,) = read(writers.ros2(path, sent)).streams
+    return result
 
 
 def test_rows_are_in_the_order_in_which_they_were_measured(tmp_path: Path) -> None:
-    found = _stamped(
+    result = _stamped(
         [START_NS, START_NS + 20, START_NS + 10], [START_NS + 100, START_NS + 110, START_NS + 120], tmp_path / "a"
     )
-    assert found.time.column == "t_header_ns"
-    assert found.table.column("force_z_n").to_pylist() == [0, 2, 1]
+    assert result.time.column == "t_header_ns"
+    assert result.table.column("force_z_n").to_pylist() == [0, 2, 1]
 
 
 @pytest.mark.parametrize("stamps", [[0, 0], [5 * 10**9, 6 * 10**9], [START_NS, 0], [START_NS - 3600 * 10**9, START_NS]])
 def test_header_stamps_that_are_not_set_or_of_another_clock_leave_the_log_time(
     tmp_path: Path, stamps: list[int]
 ) -> None:
-    found = _stamped(stamps, [START_NS, START_NS + 1], tmp_path / "a")
-    assert found.time.column == "t_log_ns"
-    assert found.table.schema.field("t_log_ns").metadata[b"clock"] == b"log time"
+    result = _stamped(stamps, [START_NS, START_NS + 1], tmp_path / "a")
+    assert result.time.column == "t_log_ns"
+    assert result.table.schema.field("t_log_ns").metadata[b"clock"] == b"log time"
     if any(stamps):
-        assert found.table.column("t_header_ns").to_pylist() == stamps
+        assert result.table.column("t_header_ns").to_pylist() == stamps
 
 
 def test_a_bag_whose_messages_are_not_in_order_is_sorted_by_log_time(tmp_path: Path) -> None:
@@ -164,7 +164,7 @@ def test_a_bag_whose_messages_are_not_in_order_is_sorted_by_log_time(tmp_path: P
 
 
 def test_usual_messages_have_quantities_and_units(tmp_path: Path) -> None:
-    wanted = {
+    expected = {
         "geometry_msgs/msg/WrenchStamped": ("force_x_n", "force", "N"),
         "geometry_msgs/msg/PoseStamped": ("position_y_m", "position", "m"),
         "geometry_msgs/msg/PoseWithCovarianceStamped": ("orientation_w", "orientation", "1"),
@@ -177,11 +177,11 @@ def test_usual_messages_have_quantities_and_units(tmp_path: Path) -> None:
         "lab_msgs/msg/Grip": ("left_torque_x_nm", "torque", "N m"),
     }
     sent: list[Sent] = [
-        (f"/t{number}", name, START_NS, writers.build(TYPES, name)) for number, name in enumerate(wanted)
+        (f"/t{number}", name, START_NS, writers.build(TYPES, name)) for number, name in enumerate(expected)
     ]
-    found = streams(writers.ros2(tmp_path / "a", sent))
-    for number, (column, quantity, unit) in enumerate(wanted.values()):
-        metadata = found[f"t{number}"].table.schema.field(column).metadata
+    result = streams(writers.ros2(tmp_path / "a", sent))
+    for number, (column, quantity, unit) in enumerate(expected.values()):
+        metadata = result[f"t{number}"].table.schema.field(column).metadata
         assert (metadata[b"quantity"].decode(), metadata[b"unit"].decode()) == (quantity, unit)
 
 
@@ -231,9 +231,9 @@ def test_a_xela_server_is_a_stream_a_sensor(tmp_path: Path) -> None:
         taxels = [{"x": 100 * taxel + frame, "y": 1, "z": 60000} for taxel in range(16)]
         sensors = [{"message": frame, "time": 5.0, "taxels": taxels, "sensor_pos": n, "forces": []} for n in (1, 2)]
         sent.append(("/xServTopic", name, START_NS + frame, writers.build(TYPES, name, sensors=sensors)))
-    found = streams(writers.ros2(tmp_path / "a", sent))
-    assert sorted(found) == ["xServTopic_sensor1", "xServTopic_sensor2"]
-    table = found["xServTopic_sensor2"].table
+    result = streams(writers.ros2(tmp_path / "a", sent))
+    assert sorted(result) == ["xServTopic_sensor1", "xServTopic_sensor2"]
+    table = result["xServTopic_sensor2"].table
     assert table.column("taxel16_x").to_pylist() == [1500, 1501, 1502]
     assert table.column("taxel01_z").type == pa.uint16()
     assert table.schema.field("taxel16_x").metadata == {
@@ -267,10 +267,10 @@ def test_transforms_are_a_stream_a_frame(tmp_path: Path) -> None:
             for child in (("tcp", "cup") if frame else ("cup",))
         ]
         sent.append(("/tf", name, START_NS + frame, writers.build(TYPES, name, transforms=transforms)))
-    found = streams(writers.ros2(tmp_path / "a", sent))
-    assert found["tf_cup"].table.column("position_x_m").to_pylist() == [0, 1, 2]
-    assert found["tf_tcp"].table.column("position_x_m").to_pylist() == [1, 2]
-    assert found["tf_tcp"].table.schema.field("t_header_ns").metadata[b"frame"] == b"world"
+    result = streams(writers.ros2(tmp_path / "a", sent))
+    assert result["tf_cup"].table.column("position_x_m").to_pylist() == [0, 1, 2]
+    assert result["tf_tcp"].table.column("position_x_m").to_pylist() == [1, 2]
+    assert result["tf_tcp"].table.schema.field("t_header_ns").metadata[b"frame"] == b"world"
 
 
 def test_arrays_that_change_their_length_leave_nan(tmp_path: Path) -> None:
@@ -317,8 +317,8 @@ def test_images_are_kept_as_encoded_frames(tmp_path: Path) -> None:
 
 def _query(path: Path, *statements: str) -> None:
     with sqlite3.connect(path) as connection:
-        for one in statements:
-            connection.execute(one)
+        for statement in statements:
+            connection.execute(statement)
     connection.close()
 
 
@@ -334,7 +334,7 @@ def test_topics_that_cannot_be_read_are_named_each_with_its_reason(tmp_path: Pat
         "DELETE FROM message_definitions",
     )
     contents = read(bag)
-    assert [one.source for one in contents.streams] == ["/left/skin"]  # a type of ROS's own needs no definition
+    assert [stream.source for stream in contents.streams] == ["/left/skin"]  # a type of ROS's own needs no definition
     assert set(contents.skipped) == {"/joint_states", "/grip"}
     assert "wrong_format" in contents.skipped["/joint_states"]
     assert "lab_msgs/msg/Grip" in contents.skipped["/grip"]
@@ -355,7 +355,7 @@ def test_an_event_of_a_service_is_named_as_one(tmp_path: Path) -> None:
         "'bool data' || char(10) || '---' || char(10) || 'bool success' || char(10) WHERE topic_type LIKE '%JointState'",
     )
     contents = read(bag)
-    assert [one.source for one in contents.streams] == ["/left/skin"]
+    assert [stream.source for stream in contents.streams] == ["/left/skin"]
     assert "service" in contents.skipped["/joint_states"]
 
 
@@ -390,7 +390,7 @@ def test_metadata_that_names_a_missing_file_is_noted_and_the_others_are_read(tmp
     (bag / "metadata.yaml").write_text(yaml.safe_dump(about))
     contents = read(bag)
     assert len(contents.streams) == 2
-    assert any("a_1.db3" in one for one in contents.notes)
+    assert any("a_1.db3" in note for note in contents.notes)
 
 
 def test_a_folder_whose_file_was_renamed_is_read_and_says_so(tmp_path: Path) -> None:
@@ -398,7 +398,7 @@ def test_a_folder_whose_file_was_renamed_is_read_and_says_so(tmp_path: Path) -> 
     (bag / "a.db3").rename(bag / "b.db3")
     contents = read(bag)
     assert len(contents.streams) == 2
-    assert any("a.db3" in one for one in contents.notes)
+    assert any("a.db3" in note for note in contents.notes)
     (bag / "b.db3").unlink()
     with pytest.raises(TacpipeError, match=r"a\.db3"):
         read(bag)
@@ -417,16 +417,16 @@ def test_metadata_that_are_none_are_refused_or_passed_over(tmp_path: Path, text:
 
 
 def test_a_split_bag_is_one_recording(tmp_path: Path) -> None:
-    whole, half = arm(TYPES), FRAMES // 2 * 2
-    bag = writers.ros2(tmp_path / "a", whole[:half], "sqlite3")
-    other = writers.ros2(tmp_path / "other", whole[half:], "sqlite3")
-    (other / "other.db3").rename(bag / "a_1.db3")
+    full, half = arm(TYPES), FRAMES // 2 * 2
+    bag = writers.ros2(tmp_path / "a", full[:half], "sqlite3")
+    second = writers.ros2(tmp_path / "other", full[half:], "sqlite3")
+    (second / "other.db3").rename(bag / "a_1.db3")
     about = yaml.safe_load((bag / "metadata.yaml").read_text())
     about["rosbag2_bagfile_information"]["relative_file_paths"].append("a_1.db3")
     (bag / "metadata.yaml").write_text(yaml.safe_dump(about))
-    together = writers.ros2(tmp_path / "together", whole, "sqlite3")
-    assert {name: one.table for name, one in streams(bag).items()} == {
-        name: one.table for name, one in streams(together).items()
+    together = writers.ros2(tmp_path / "together", full, "sqlite3")
+    assert {name: value.table for name, value in streams(bag).items()} == {
+        name: value.table for name, value in streams(together).items()
     }
 
 
@@ -434,16 +434,16 @@ def test_a_split_bag_is_one_recording(tmp_path: Path) -> None:
 def test_a_file_that_was_cut_off_gives_what_came_before_and_says_so(tmp_path: Path, way: str) -> None:
     path = WAYS[way](tmp_path)
     content = path.read_bytes()
-    whole = streams(path)
+    complete = streams(path)
     rows = []
     for share in np.linspace(0.05, 0.97, 12):
         path.write_bytes(content[: int(len(content) * share)])
         contents = read(path)
-        assert contents.notes or len(contents.streams) == len(whole), "the index alone may be missing without a loss"
-        rows.append(sum(one.table.num_rows for one in contents.streams))
-        for one in contents.streams:
-            full = whole[one.name].table
-            assert one.table.select(full.column_names).equals(full.slice(0, one.table.num_rows))
+        assert contents.notes or len(contents.streams) == len(complete), "the index alone may be missing without a loss"
+        rows.append(sum(stream.table.num_rows for stream in contents.streams))
+        for stream in contents.streams:
+            full = complete[stream.name].table
+            assert stream.table.select(full.column_names).equals(full.slice(0, stream.table.num_rows))
     assert rows == sorted(rows)
     assert rows[-1] == 2 * FRAMES
 
@@ -453,12 +453,12 @@ def test_a_damaged_chunk_costs_its_own_messages(tmp_path: Path) -> None:
         tmp_path / "a.mcap", {"/a": [(START_NS + n, {"v": n}) for n in range(2000)]}, chunk_size=4000
     )
     content = bytearray(path.read_bytes())
-    whole = only(path).num_rows
+    full = only(path).num_rows
     content[len(content) // 3] ^= 0xFF
     path.write_bytes(content)
     contents = read(path)
     assert contents.notes
-    assert whole // 2 < contents.streams[0].table.num_rows < whole
+    assert full // 2 < contents.streams[0].table.num_rows < full
 
 
 def test_a_damaged_database_gives_what_comes_before_the_damage(tmp_path: Path) -> None:
@@ -467,7 +467,7 @@ def test_a_damaged_database_gives_what_comes_before_the_damage(tmp_path: Path) -
     content[len(content) // 2 : len(content) // 2 + 20000] = b"\xa5" * 20000
     (bag / "a.db3").write_bytes(content)
     contents = read(bag)
-    assert any("a.db3" in one for one in contents.notes)
+    assert any("a.db3" in note for note in contents.notes)
     assert 0 < contents.streams[0].table.num_rows < 2000
 
 
@@ -477,23 +477,23 @@ def test_what_a_database_has_not_moved_from_its_log_is_read_too_and_stays_there(
     connection.execute("PRAGMA journal_mode = WAL")
     connection.execute("UPDATE topics SET name = '/renamed' WHERE name = '/left/skin'")
     connection.commit()
-    before = {one.name: one.read_bytes() for one in bag.iterdir() if not one.name.endswith("-shm")}
+    before = {path.name: path.read_bytes() for path in bag.iterdir() if not path.name.endswith("-shm")}
     assert "a.db3-wal" in before
-    assert {one.source for one in read(bag / "a.db3").streams} == {"/joint_states", "/renamed"}
-    assert {one.name: one.read_bytes() for one in bag.iterdir() if not one.name.endswith("-shm")} == before
+    assert {stream.source for stream in read(bag / "a.db3").streams} == {"/joint_states", "/renamed"}
+    assert {path.name: path.read_bytes() for path in bag.iterdir() if not path.name.endswith("-shm")} == before
     connection.close()
 
 
 def test_a_look_has_the_columns_of_the_whole(tmp_path: Path) -> None:
     bag = WAYS["ros2-mcap"](tmp_path)
-    looked = {one.name: one.table.schema for one in open_bag(bag).look(None).streams}
-    assert looked == {name: one.table.schema for name, one in streams(bag).items()}
+    looked = {stream.name: stream.table.schema for stream in open_bag(bag).look(None).streams}
+    assert looked == {name: value.table.schema for name, value in streams(bag).items()}
 
 
 def test_a_look_that_ended_early_states_no_number_of_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tacpipe.formats.bags.container.LOOK_MESSAGES", 10)
     contents = open_bag(WAYS["ros2-mcap"](tmp_path)).look(None)
-    assert [(one.table.num_rows, one.rows) for one in contents.streams] == [(5, None), (5, None)]
+    assert [(stream.table.num_rows, stream.rows) for stream in contents.streams] == [(5, None), (5, None)]
     assert contents.notes
 
 
@@ -507,7 +507,7 @@ def test_a_bag_whose_recorder_was_killed_is_found(lab: Lab) -> None:
 def test_only_the_topics_that_were_asked_for_are_read(tmp_path: Path) -> None:
     bag = WAYS["ros2-mcap"](tmp_path)
     contents = open_bag(bag).read(["/left/skin"], None)
-    assert [one.source for one in contents.streams] == ["/left/skin"]
+    assert [stream.source for stream in contents.streams] == ["/left/skin"]
 
 
 def test_a_command_names_what_it_left_out_and_keeps_it_in_the_attributes(lab: Lab) -> None:
@@ -535,8 +535,8 @@ def test_a_bag_of_others_is_read(path: str, rows: dict[str, int], skipped: int) 
     if not (sample_data() / "foreign" / path).exists():
         pytest.skip("the published bags are not here")
     contents = read(sample_data() / "foreign" / path)
-    found = {one.name: one.table.num_rows for one in contents.streams}
-    assert {name: found.get(name) for name in rows} == rows
+    table = {stream.name: stream.table.num_rows for stream in contents.streams}
+    assert {name: table.get(name) for name in rows} == rows
     assert len(contents.skipped) == skipped
     assert not contents.notes
 
@@ -573,11 +573,11 @@ def test_rows_that_were_put_aside_in_many_pieces_are_those_of_one(
         )
         sent.append(("/joints", "sensor_msgs/msg/JointState", t_ns + int(rng.integers(10**6)), message))
     path = writers.ros2(tmp_path / "bag", sent)
-    expected = {name: one.table for name, one in streams(path).items()}
+    expected = {name: value.table for name, value in streams(path).items()}
     monkeypatch.setattr(topics, "BATCH_MESSAGES", 4)
-    found = {name: one.table for name, one in streams(path).items()}
-    assert found == expected
-    for name, table in found.items():
+    result = {name: value.table for name, value in streams(path).items()}
+    assert result == expected
+    for name, table in result.items():
         assert table.schema.equals(expected[name].schema, check_metadata=True)
         assert (np.diff(table.column("t_header_ns").to_numpy()) > 0).all()
 

@@ -57,15 +57,17 @@ def test_a_value_that_is_missing_in_some_messages_is_nan(tmp_path: Path) -> None
 def test_a_time_in_json_is_the_time_of_the_row(tmp_path: Path) -> None:
     seconds = START_NS // 10**9
     sent = [(START_NS + 500 + n, {"timestamp": {"sec": seconds, "nsec": n}, "v": n}) for n in range(2)]
-    (found,) = read(mcap_json(tmp_path / "a.mcap", {"/s": sent})).streams
-    assert found.time.column == "t_header_ns"
-    assert found.table.column("t_header_ns").to_pylist() == [START_NS, START_NS + 1]
+    (result,) = read(mcap_json(tmp_path / "a.mcap", {"/s": sent})).streams
+    assert result.time.column == "t_header_ns"
+    assert result.table.column("t_header_ns").to_pylist() == [START_NS, START_NS + 1]
 
 
 def test_bytes_in_base64_are_kept_as_bytes(tmp_path: Path) -> None:
     schema = {"type": "object", "properties": {"data": {"type": "string", "contentEncoding": "base64"}}}
     frames = [b"\xff\xd8\x00", b"\x01" * 10]
-    sent = [(START_NS + n, {"data": base64.b64encode(one).decode(), "format": "jpeg"}) for n, one in enumerate(frames)]
+    sent = [
+        (START_NS + n, {"data": base64.b64encode(value).decode(), "format": "jpeg"}) for n, value in enumerate(frames)
+    ]
     table = only(mcap_json(tmp_path / "a.mcap", {"/camera": sent}, schema))
     assert table.column("data").type == pa.binary()
     assert table.column("data").to_pylist() == frames
@@ -104,7 +106,7 @@ def test_messages_of_an_encoding_that_is_not_read_are_named(tmp_path: Path) -> N
                 writer.add_message(channel, START_NS + n, b"x", START_NS + n)
         writer.finish()  # type: ignore[no-untyped-call]
     contents = read(path)
-    assert [one.source for one in contents.streams] == ["/good"]
+    assert [stream.source for stream in contents.streams] == ["/good"]
     assert set(contents.skipped) == {"/flat", "/bare"}
     assert "flatbuffer" in contents.skipped["/flat"]
 
@@ -120,7 +122,7 @@ def test_a_message_that_is_not_an_object_of_json_costs_its_topic(tmp_path: Path,
             writer.add_message(channel, START_NS, content, START_NS)
         writer.finish()  # type: ignore[no-untyped-call]
     contents = read(path)
-    assert ([one.source for one in contents.streams], list(contents.skipped)) == (["/good"], ["/bad"])
+    assert ([stream.source for stream in contents.streams], list(contents.skipped)) == (["/good"], ["/bad"])
 
 
 def test_an_attachment_is_named_as_one_that_is_not_read(tmp_path: Path) -> None:
@@ -222,15 +224,15 @@ def test_one_recording_as_csv_mcap_and_bag_gives_the_same_numbers(lab: Lab) -> N
         "json": ("mcap", ('source = "/skin"', "data_{taxel}", ""), f'source = "/joint_states"\ncolumns = {joints}'),
         **dict.fromkeys(("ros1", *writers.STORAGES), ("rosbag", bag[:3], bag[3])),
     }
-    for way, (command, (skin_of, taxels, more), arm_of) in ways.items():
-        text = LAYOUT.format(skin=skin_of, taxels=taxels, more=more, arm=arm_of)
+    for way, (command, (skin_of, taxels, extra), arm_of) in ways.items():
+        text = LAYOUT.format(skin=skin_of, taxels=taxels, more=extra, arm=arm_of)
         (lab.folder / f"{way}.toml").write_text(text)
         lab.run(f"ingest {command} {way} --layout {way}.toml -o data/{way}")
-        found = tacpipe.open(lab.folder / "data" / way)
+        result = tacpipe.open(lab.folder / "data" / way)
         names = ["t_ns", *(f"taxel{n}" for n in range(16))], ["t_ns", *(f"joint{n}_rad" for n in range(1, 8))]
         tables[way] = {
-            (one.name, stream): one.table(stream).select(columns).replace_schema_metadata()
-            for one in found
+            (entry.name, stream): entry.table(stream).select(columns).replace_schema_metadata()
+            for entry in result
             for stream, columns in zip(("skin", "arm"), names, strict=True)
         }
     skin, arm = _recording(1)
@@ -246,11 +248,11 @@ def test_a_bag_needs_no_layout(lab: Lab) -> None:
     skin, arm = _recording(0)
     writers.ros2(lab.folder / "bags" / "t0", _messages(writers.store(), skin, arm))
     lab.run("ingest rosbag bags -o data/rec")
-    (one,) = tacpipe.open(lab.folder / "data" / "rec")
-    assert set(one.streams) == {"skin", "joint_states"}
-    field = one.table("joint_states").schema.field("t_ns")
+    (entry,) = tacpipe.open(lab.folder / "data" / "rec")
+    assert set(entry.streams) == {"skin", "joint_states"}
+    field = entry.table("joint_states").schema.field("t_ns")
     assert field.metadata == {b"unit": b"ns", b"quantity": b"time", b"clock": b"header stamp", b"frame": b"base"}
-    assert one.table("joint_states").column("t_log_ns").to_pylist() == (arm["t_ns"] + 300_000).tolist()
+    assert entry.table("joint_states").column("t_log_ns").to_pylist() == (arm["t_ns"] + 300_000).tolist()
 
 
 def test_a_layout_may_choose_the_log_time_whatever_the_order_of_the_headers(lab: Lab) -> None:
@@ -264,11 +266,11 @@ def test_a_layout_may_choose_the_log_time_whatever_the_order_of_the_headers(lab:
     (lab.folder / "l.toml").write_text('[streams.w]\nsource = "/w"\ntime = { column = "t_log_ns", unit = "ns" }')
     lab.run("ingest rosbag bags -o data/header")
     lab.run("ingest rosbag bags --layout l.toml -o data/log")
-    found = {}
+    result = {}
     for way in ("header", "log"):
-        (one,) = tacpipe.open(lab.folder / "data" / way)
-        found[way] = one.table("w").column("force_z_n").to_pylist()
-    assert found == {"header": [1, 2, 0], "log": [0, 1, 2]}
+        (entry,) = tacpipe.open(lab.folder / "data" / way)
+        result[way] = entry.table("w").column("force_z_n").to_pylist()
+    assert result == {"header": [1, 2, 0], "log": [0, 1, 2]}
 
 
 def test_a_guess_of_a_bag_given_back_reads_the_same(lab: Lab) -> None:
@@ -297,19 +299,19 @@ def test_a_file_that_tacpipe_exported_comes_back_with_its_names_and_metadata(tmp
         {"field": "force_x", "name": "Force X", "about": {"unit": "count", "quantity": "tactile"}},
         {"field": "frame", "name": "frame", "about": {}},
     ]
-    own = {"tacpipe": json.dumps({"stream": "skin", "columns": columns, "time": {"unit": "ns", "quantity": "time"}})}
+    local = {"tacpipe": json.dumps({"stream": "skin", "columns": columns, "time": {"unit": "ns", "quantity": "time"}})}
     path = tmp_path / "a.mcap"
     with path.open("wb") as file:
         writer = McapWriter(file)
         writer.start()
         writer.add_metadata("tacpipe", {"recording": "a", "attributes": '{"material": "cork", "n": 3}'})
         schema = writer.register_schema("tacpipe_msgs/msg/Skin", "ros2msg", definition.encode())
-        channel = writer.register_channel("/skin_x", "cdr", schema, own)
+        channel = writer.register_channel("/skin_x", "cdr", schema, local)
         derived = writer.register_channel("/skin_x/pose", "cdr", schema, {"tacpipe": '{"derived_from": "/skin_x"}'})
         seconds = (START_NS // 10**9).to_bytes(4, "little")
         content = b"\0\1\0\0" + seconds + bytes(4) + b"\1\0\0\0\0\0" + (7).to_bytes(2, "little") + b"\2\0\0\0ab"
-        for one in (channel, derived):
-            writer.add_message(one, START_NS, content, START_NS)
+        for entry in (channel, derived):
+            writer.add_message(entry, START_NS, content, START_NS)
         writer.finish()  # type: ignore[no-untyped-call]
     contents = read(path)
     (stream,) = contents.streams
@@ -343,10 +345,10 @@ def _touch_type() -> tuple[Any, bytes]:
     timestamp_pb2.DESCRIPTOR.CopyToProto(stamps)
     described = descriptor_pb2.FileDescriptorSet(file=[stamps, file])
     pool = descriptor_pool.DescriptorPool()
-    for one in described.file:
-        pool.Add(one)
-    made = message_factory.GetMessageClass(pool.FindMessageTypeByName("lab.Touch"))
-    return made, described.SerializeToString()
+    for entry in described.file:
+        pool.Add(entry)
+    output = message_factory.GetMessageClass(pool.FindMessageTypeByName("lab.Touch"))
+    return output, described.SerializeToString()
 
 
 def _protobuf(path: Path, contents: list[bytes], schema: bytes) -> Path:
@@ -361,10 +363,12 @@ def _protobuf(path: Path, contents: list[bytes], schema: bytes) -> Path:
 
 
 def test_protobuf_messages_are_read_by_their_descriptors(tmp_path: Path) -> None:
-    made, schema = _touch_type()
+    output, schema = _touch_type()
     contents = []
     for step in range(3):
-        message = made(count=step, force=[0.1, step], contact=step > 1, data=b"\xff" * step, at={"x": 1.5}, name="tip")
+        message = output(
+            count=step, force=[0.1, step], contact=step > 1, data=b"\xff" * step, at={"x": 1.5}, name="tip"
+        )
         message.timestamp.FromNanoseconds(START_NS + step - 5)
         contents.append(message.SerializeToString())
     table = only(_protobuf(tmp_path / "a.mcap", contents, schema))
@@ -384,7 +388,7 @@ def test_protobuf_messages_are_read_by_their_descriptors(tmp_path: Path) -> None
 def test_protobuf_that_does_not_fit_its_descriptors_costs_its_topic(
     tmp_path: Path, content: bytes, schema: bytes | None
 ) -> None:
-    given = _touch_type()[1] if schema is None else schema
-    contents = read(_protobuf(tmp_path / "a.mcap", [content], given))
+    provided = _touch_type()[1] if schema is None else schema
+    contents = read(_protobuf(tmp_path / "a.mcap", [content], provided))
     assert (list(contents.streams), list(contents.skipped)) == ([], ["/touch"])
     assert "lab.Touch" in contents.skipped["/touch"]

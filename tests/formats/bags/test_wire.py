@@ -34,7 +34,7 @@ def _random(types: Any, description: Any, rng: np.random.Generator) -> Any:
     node, inner = int(description[0]), description[1]
     if node == 2:
         fields = types.fielddefs[inner][1]
-        values = {name: _random(types, one, rng) for name, one in fields}
+        values = {name: _random(types, value, rng) for name, value in fields}
         return types.types[inner](**values)
     if node == 1:
         if inner[0] == "string":
@@ -52,8 +52,8 @@ def _random(types: Any, description: Any, rng: np.random.Generator) -> Any:
 
 def _leaves(message: Any, path: tuple[str | int, ...] = ()) -> Iterator[tuple[tuple[str | int, ...], Any]]:
     if isinstance(message, list):
-        for position, one in enumerate(message):
-            yield from _leaves(one, (*path, position))
+        for position, entry in enumerate(message):
+            yield from _leaves(entry, (*path, position))
     elif type(message).__name__.rpartition("__")[2] in STAMPS:
         yield path, message.sec * 10**9 + message.nanosec
     elif hasattr(message, "__msgtype__"):
@@ -75,40 +75,40 @@ def test_every_value_of_a_message_is_where_rosbags_finds_it(name: str, form: str
     rng = np.random.default_rng(7)
     sent = [_random(types, (2, name), rng) for _ in range(40)]
     if form == "ros1":
-        raw = [bytes(types.serialize_ros1(one, name)) for one in sent]
-        back = [types.deserialize_ros1(one, name) for one in raw]
+        raw = [bytes(types.serialize_ros1(entry, name)) for entry in sent]
+        back = [types.deserialize_ros1(entry, name) for entry in raw]
         encoding = ROS1
     else:
-        raw = [bytes(types.serialize_cdr(one, name, little_endian=form == "little")) for one in sent]
-        back = [types.deserialize_cdr(one, name) for one in raw]
+        raw = [bytes(types.serialize_cdr(entry, name, little_endian=form == "little")) for entry in sent]
+        back = [types.deserialize_cdr(entry, name) for entry in raw]
         encoding = wire.cdr_encoding(raw[0])
         assert encoding == Encoding("<" if form == "little" else ">", 4, True, True)
-    seen = []
+    observed = []
     for shape, rows, matrix in wire.group_by_shape(raw, _types(types), name, encoding, []):
         for at, row in enumerate(rows.tolist()):
-            seen.append(row)
-            wanted = dict(_leaves(back[row]))
-            assert [leaf.path for leaf in shape.leaves] == list(wanted)
+            observed.append(row)
+            expected = dict(_leaves(back[row]))
+            assert [leaf.path for leaf in shape.leaves] == list(expected)
             for leaf in shape.leaves:
                 if leaf.kind == wire.TEXT:
                     text = matrix[at, leaf.offset : leaf.offset + (leaf.count or 0)].tobytes().decode()
-                    assert text == wanted[leaf.path]
+                    assert text == expected[leaf.path]
                 else:
-                    np.testing.assert_array_equal(shape.numbers(leaf, matrix)[at], wanted[leaf.path])
-                one = replace(shape, first=matrix[at].tobytes())
+                    np.testing.assert_array_equal(shape.numbers(leaf, matrix)[at], expected[leaf.path])
+                entry = replace(shape, first=matrix[at].tobytes())
                 if leaf.count is None or leaf.kind == wire.TEXT:
-                    np.testing.assert_array_equal(one.value(leaf, None), wanted[leaf.path])
+                    np.testing.assert_array_equal(entry.value(leaf, None), expected[leaf.path])
                 elif leaf.count:
-                    np.testing.assert_array_equal(one.value(leaf, leaf.count - 1), wanted[leaf.path][-1])
-    assert sorted(seen) == list(range(40))
+                    np.testing.assert_array_equal(entry.value(leaf, leaf.count - 1), expected[leaf.path][-1])
+    assert sorted(observed) == list(range(40))
 
 
 def test_messages_of_one_shape_are_decoded_together() -> None:
     types = writers.store()
     name = "std_msgs/msg/Float32MultiArray"
     raw = [bytes(types.serialize_cdr(writers.build(types, name, data=[n] * (3 + n % 2)), name)) for n in range(10)]
-    found = list(wire.group_by_shape(raw, _types(types), name, wire.cdr_encoding(raw[0]), []))
-    assert [len(rows) for _, rows, _ in found] == [5, 5]
+    items = list(wire.group_by_shape(raw, _types(types), name, wire.cdr_encoding(raw[0]), []))
+    assert [len(rows) for _, rows, _ in items] == [5, 5]
 
 
 @pytest.mark.parametrize("cut", [0, 3, 4, 11, 20, 35])

@@ -34,18 +34,18 @@ OWN = {  # message types that no distribution of ROS brings
 
 def store(ros1: bool = False) -> Typestore:
     """Return a typestore with ROS's own types and those of `OWN`."""
-    made = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
+    output = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
     for name, text in OWN.items():
-        made.register(get_types_from_msg(text, name))
-    return made
+        output.register(get_types_from_msg(text, name))
+    return output
 
 
 def build(types: Typestore, kind: str, /, **values: Any) -> Any:
     """Return a message; a field that is not given has zeros, nested ones are given as dicts."""
-    made = {}
+    output = {}
     for field, description in types.fielddefs[kind][1]:
-        made[field] = _value(types, description, values.get(field))
-    return types.types[kind](**made)
+        output[field] = _value(types, description, values.get(field))
+    return types.types[kind](**output)
 
 
 def _value(types: Typestore, description: Any, value: Any) -> Any:
@@ -60,7 +60,7 @@ def _value(types: Typestore, description: Any, value: Any) -> Any:
     if int(element[0]) == 1 and element[1][0] != "string":
         kind = {"byte": "uint8", "char": "uint8"}.get(element[1][0], element[1][0])
         return np.array(np.zeros(count) if value is None else value, kind)
-    return [_value(types, element, one) for one in (value if value is not None else [None] * count)]
+    return [_value(types, element, entry) for entry in (value if value is not None else [None] * count)]
 
 
 def header(types: Typestore, t_ns: int, frame: str = "base") -> Any:

@@ -100,8 +100,8 @@ def write_v3(root: Path, files: Sequence[Sequence[int]] = ((0, 1), (2,)), **info
 
 def _info(root: Path, version: str, **more: Any) -> None:
     (root / "meta").mkdir(parents=True, exist_ok=True)
-    made = {"codebase_version": version, "robot_type": "so100", "fps": FPS, "features": dict(FEATURES), **more}
-    (root / "meta" / "info.json").write_text(json.dumps(made))
+    output = {"codebase_version": version, "robot_type": "so100", "fps": FPS, "features": dict(FEATURES), **more}
+    (root / "meta" / "info.json").write_text(json.dumps(output))
 
 
 def _lines(path: Path, values: Sequence[Mapping[str, Any]]) -> None:

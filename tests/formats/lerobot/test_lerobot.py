@@ -32,7 +32,9 @@ def given(text: str) -> Params:
 
 
 def read(folder: Path, params: Params = NONE) -> dict[str, RecordingOutput]:
-    return {name: lerobot(params, one.files, one.values) for name, one in LEROBOT.discover(params, folder).items()}
+    return {
+        name: lerobot(params, value.files, value.values) for name, value in LEROBOT.discover(params, folder).items()
+    }
 
 
 def about(table: pa.Table, column: str) -> dict[str, str]:
@@ -42,19 +44,19 @@ def about(table: pa.Table, column: str) -> dict[str, str]:
 @pytest.mark.parametrize("write", [files.write_v2, files.write_v3])
 def test_both_versions_give_the_same_recordings(tmp_path: Path, write: Callable[[Path], None]) -> None:
     write(tmp_path / "pick")
-    found = read(tmp_path)
-    assert list(found) == [EPISODE.format(episode) for episode in range(3)]
-    for episode, one in enumerate(found.values()):
-        assert set(one.streams) == {"state", "action", "pad", "next"}
-        table = one.streams["state"]
+    result = read(tmp_path)
+    assert list(result) == [EPISODE.format(episode) for episode in range(3)]
+    for episode, entry in enumerate(result.values()):
+        assert set(entry.streams) == {"state", "action", "pad", "next"}
+        table = entry.streams["state"]
         assert table.column_names == ["t_ns", *files.NAMES]
         assert table.column("joint3_rad").to_pylist() == files.state(episode)[:, 2].tolist()
         assert table.column("t_ns").to_pylist() == [round(row * 10**9 / files.FPS) for row in range(table.num_rows)]
         assert about(table, "t_ns")["made"] == "frame_index / fps"
-        assert one.streams["pad"].column("pad_3").to_pylist()[:2] == [3, 7]
-        assert one.streams["next"].column("done").to_pylist()[-1] is True
-        assert one.attributes["task"] == files.TASKS[episode % 2]
-        assert one.attributes["robot_type"] == "so100"
+        assert entry.streams["pad"].column("pad_3").to_pylist()[:2] == [3, 7]
+        assert entry.streams["next"].column("done").to_pylist()[-1] is True
+        assert entry.attributes["task"] == files.TASKS[episode % 2]
+        assert entry.attributes["robot_type"] == "so100"
 
 
 @pytest.mark.parametrize(
@@ -66,24 +68,24 @@ def test_both_versions_give_the_same_recordings(tmp_path: Path, write: Callable[
 )
 def test_a_video_is_named_with_its_path_and_not_read(tmp_path: Path, write: Callable[[Path], None], path: str) -> None:
     write(tmp_path / "pick")
-    found = read(tmp_path)[EPISODE.format(1)]
-    assert found.attributes["video.observation.images.top"] == path
-    assert path in " ".join(found.notes)
+    result = read(tmp_path)[EPISODE.format(1)]
+    assert result.attributes["video.observation.images.top"] == path
+    assert path in " ".join(result.notes)
 
 
 def test_quantities_and_units_follow_the_names(tmp_path: Path) -> None:
     files.write_v3(tmp_path / "pick")
-    found = read(tmp_path)[EPISODE.format(0)]
-    assert about(found.streams["state"], "joint6_rad") == {"quantity": "joint_position", "unit": "rad"}
-    assert about(found.streams["state"], "gripper") == {}
-    assert about(found.streams["pad"], "pad_0") == {"quantity": "tactile", "unit": "count"}
+    result = read(tmp_path)[EPISODE.format(0)]
+    assert about(result.streams["state"], "joint6_rad") == {"quantity": "joint_position", "unit": "rad"}
+    assert about(result.streams["state"], "gripper") == {}
+    assert about(result.streams["pad"], "pad_0") == {"quantity": "tactile", "unit": "count"}
 
 
 def test_stamps_that_the_rate_does_not_give_are_read_as_they_are(tmp_path: Path) -> None:
     files.write_v2(tmp_path / "pick", episodes=1)
     pq.write_table(files.frames(0, late_s=0.5), tmp_path / "pick" / "data" / "chunk-000" / "episode_000000.parquet")
-    (found,) = read(tmp_path).values()
-    table = found.streams["state"]
+    (result,) = read(tmp_path).values()
+    table = result.streams["state"]
     stamp = files.frames(0, late_s=0.5).column("timestamp")[-1].as_py()
     assert table.column("t_ns").to_pylist()[-1] == round(stamp * 1e9)
     assert "float32" in about(table, "t_ns")["made"]
@@ -96,8 +98,8 @@ def test_frames_of_hours_keep_the_rate_although_float32_seconds_do_not(tmp_path:
     seconds = pa.compute.divide(pa.compute.cast(frame, pa.float64()), float(files.FPS)).cast(pa.float32(), safe=False)
     table = table.set_column(table.column_names.index("frame_index"), "frame_index", frame)
     pq.write_table(table.set_column(table.column_names.index("timestamp"), "timestamp", seconds), path)
-    (found,) = read(tmp_path).values()
-    assert found.streams["state"].column("t_ns").to_pylist()[1] == round(400_001 * 10**9 / files.FPS)
+    (result,) = read(tmp_path).values()
+    assert result.streams["state"].column("t_ns").to_pylist()[1] == round(400_001 * 10**9 / files.FPS)
 
 
 def test_images_in_the_frames_are_kept_as_they_were_encoded(tmp_path: Path) -> None:
@@ -107,20 +109,20 @@ def test_images_in_the_frames_are_kept_as_they_were_encoded(tmp_path: Path) -> N
         features={**files.FEATURES, "observation.images.top": {"dtype": "image", "shape": [3, 4, 4]}},
     )
     pictures = [b"\x89PNG%d" % row for row in range(files.LENGTHS[0])]
-    structs = pa.array([{"bytes": one, "path": f"{row}.png"} for row, one in enumerate(pictures)])
+    structs = pa.array([{"bytes": value, "path": f"{row}.png"} for row, value in enumerate(pictures)])
     table = files.frames(0).append_column("observation.images.top", structs)
     pq.write_table(table, tmp_path / "pick" / "data" / "chunk-000" / "episode_000000.parquet")
-    (found,) = read(tmp_path).values()
-    assert found.streams["top"].column("data").to_pylist() == pictures
+    (result,) = read(tmp_path).values()
+    assert result.streams["top"].column("data").to_pylist() == pictures
 
 
 def test_a_layout_renames_and_adds_what_the_dataset_does_not_state(tmp_path: Path) -> None:
     files.write_v3(tmp_path / "pick")
     text = '[recordings]\nname = "{recording}"\n[streams.robot]\nsource = "action"\ncolumns = [\n'
     text += '{ match = "action_{n}", name = "joint{n}_target_rad", quantity = "target_joint_position", unit = "rad" }]'
-    found = read(tmp_path, given(text))
-    assert set(found) == {"episode_000000", "episode_000001", "episode_000002"}
-    table = found["episode_000002"].streams["robot"]
+    result = read(tmp_path, given(text))
+    assert set(result) == {"episode_000000", "episode_000001", "episode_000002"}
+    table = result["episode_000002"].streams["robot"]
     assert about(table, "joint6_target_rad")["quantity"] == "target_joint_position"
 
 
@@ -144,7 +146,7 @@ def _originals(root: Path) -> dict[str, pa.Table]:
     ]
     columns[50][7] = np.nan
     t_ns = 1_700_000_000_000_000_000 + np.cumsum(rng.integers(0, 9_000_000, 200))
-    arrays = [pa.array(t_ns), *(pa.array(one).cast(field.type) for one, field in zip(columns, fields, strict=True))]
+    arrays = [pa.array(t_ns), *(pa.array(value).cast(field.type) for value, field in zip(columns, fields, strict=True))]
     table = pa.table(arrays, pa.schema([schema.time_field("from mean rate"), *fields]))
     for name in names.to_pylist():
         (root / "tacpipe" / name).mkdir(parents=True)
@@ -155,10 +157,10 @@ def _originals(root: Path) -> dict[str, pa.Table]:
 def test_a_dataset_that_was_exported_gives_the_recordings_back_to_the_bit(tmp_path: Path) -> None:
     files.write_v3(tmp_path / "pick")
     streams = _originals(tmp_path / "pick")
-    found = read(tmp_path)
-    assert set(found) == {"cup", "box", "can"}
-    assert found["box"].attributes == {"material": None, "trial": 1}
-    assert to_parquet(found["cup"].streams["xela1"]) == to_parquet(streams["xela1"])
+    result = read(tmp_path)
+    assert set(result) == {"cup", "box", "can"}
+    assert result["box"].attributes == {"material": None, "trial": 1}
+    assert to_parquet(result["cup"].streams["xela1"]) == to_parquet(streams["xela1"])
 
 
 @pytest.mark.parametrize(
@@ -177,14 +179,14 @@ def test_a_damaged_file_costs_its_own_episode(
 ) -> None:
     files.write_v2(tmp_path / "pick")
     damage(tmp_path / "pick")
-    found = LEROBOT.discover(NONE, tmp_path)
-    assert len(found) == 3
-    for name, one in found.items():
+    sources = LEROBOT.discover(NONE, tmp_path)
+    assert len(sources) == 3
+    for name, entry in sources.items():
         if name != EPISODE.format(1):
-            assert lerobot(NONE, one.files, one.values).streams
+            assert lerobot(NONE, entry.files, entry.values).streams
             continue
         with pytest.raises(TacpipeError) as raised:
-            lerobot(NONE, one.files, one.values)
+            lerobot(NONE, entry.files, entry.values)
         assert all(part in str(raised.value) for part in parts)
 
 
@@ -219,8 +221,8 @@ def test_a_wrong_description_is_one_sentence_with_its_entry(
 
 
 def counts(lab: Lab, more: str = "") -> tuple[int, int]:
-    found = json.loads(lab.run(f"ingest lerobot sets -o data/rec --json {more}").out)
-    return found["ran"], found["reused"]
+    content = json.loads(lab.run(f"ingest lerobot sets -o data/rec --json {more}").out)
+    return content["ran"], content["reused"]
 
 
 def test_an_episode_that_is_added_costs_itself_alone(lab: Lab) -> None:
@@ -228,7 +230,7 @@ def test_an_episode_that_is_added_costs_itself_alone(lab: Lab) -> None:
     assert counts(lab) == (2, 0)
     files.write_v2(lab.folder / "sets" / "pick", episodes=3)
     assert counts(lab) == (1, 2)
-    assert [one.attributes["task"] for one in tacpipe.open("data/rec")] == [
+    assert [entry.attributes["task"] for entry in tacpipe.open("data/rec")] == [
         files.TASKS[0],
         files.TASKS[1],
         files.TASKS[0],

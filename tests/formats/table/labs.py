@@ -17,21 +17,21 @@ START_S = 1_700_000_000
 def frame(rows: int = 50, rate_hz: float = 100.0, seed: int = 0) -> pd.DataFrame:
     """Return stamps in Unix seconds, four taxels as whole numbers and a force."""
     rng = np.random.default_rng(seed)
-    found: dict[str, Any] = {"time": START_S + np.arange(rows) / rate_hz}
-    found |= {f"taxel{taxel}": rng.integers(0, 4096, rows) for taxel in range(1, 5)}
-    found["fx"] = rng.normal(size=rows).round(6)
-    return pd.DataFrame(found)
+    result: dict[str, Any] = {"time": START_S + np.arange(rows) / rate_hz}
+    result |= {f"taxel{taxel}": rng.integers(0, 4096, rows) for taxel in range(1, 5)}
+    result["fx"] = rng.normal(size=rows).round(6)
+    return pd.DataFrame(result)
 
 
 def write(folder: Path, trials: int = 3, **options: Any) -> list[pd.DataFrame]:
     """Write ``trials`` folders with a ``skin.csv`` each and return what they hold."""
-    made = []
+    output = []
     for trial in range(trials):
         place = folder / f"trial_{trial}"
         place.mkdir(parents=True)
-        made.append(frame(seed=trial))
-        made[-1].to_csv(place / "skin.csv", index=False, **options)
-    return made
+        output.append(frame(seed=trial))
+        output[-1].to_csv(place / "skin.csv", index=False, **options)
+    return output
 
 
 def stream(extra: str = "", columns: str = "", files: str = "trial_{trial}/skin.csv") -> StreamLayout:

@@ -15,18 +15,18 @@ from tests.formats.table import labs
 
 def answered(text: str, **answers: str) -> layout.Layout:
     """Return a guessed layout in which what it could not know is replaced, in order."""
-    for wanted, answer in answers.items():
-        text = text.replace(f'{wanted} = "?"', f'{wanted} = "{answer}"')
+    for expected, answer in answers.items():
+        text = text.replace(f'{expected} = "?"', f'{expected} = "{answer}"')
     return layout.parse_layout(text)
 
 
 def test_a_guess_with_its_questions_answered_reads_what_pandas_wrote(tmp_path: Path) -> None:
     frames = labs.write(tmp_path, sep=";", decimal=",")
     text = guess.guess_layout(tmp_path)
-    found = answered(text, unit="N", sensor="mine")
-    assert found.streams[0].separator == ";" and found.streams[0].decimal == ","
-    for one, frame in zip(recordings.find_recordings(found, tmp_path), frames, strict=True):
-        table = reading.read_stream_table(one.files["skin"], found.streams[0])
+    result = answered(text, unit="N", sensor="mine")
+    assert result.streams[0].separator == ";" and result.streams[0].decimal == ","
+    for entry, frame in zip(recordings.find_recordings(result, tmp_path), frames, strict=True):
+        table = reading.read_stream_table(entry.files["skin"], result.streams[0])
         assert np.array_equal(table.column("fx").to_numpy(), frame["fx"].to_numpy())
         assert table.column("taxel3").to_pylist() == frame["taxel3"].tolist()
         assert abs(table.column("t_ns")[0].as_py() - labs.START_S * 10**9) == 0
@@ -65,9 +65,9 @@ def test_tables_and_files_of_labels_are_found(tmp_path: Path) -> None:
     pd.DataFrame({"trial": [0, 1], "material": ["cork", "felt"]}).to_csv(tmp_path / "labels.csv", index=False)
     for trial in range(2):
         (tmp_path / f"trial_{trial}" / "meta.yaml").write_text("object: cup\n")
-    found = answered(guess.guess_layout(tmp_path), unit="N", sensor="mine")
-    made = labels.find_labels(found, tmp_path, recordings.find_recordings(found, tmp_path))
-    assert made["trial-1"] == {"sensor": "mine", "trial": 1, "material": "felt", "object": "cup"}
+    result = answered(guess.guess_layout(tmp_path), unit="N", sensor="mine")
+    sources = labels.find_labels(result, tmp_path, recordings.find_recordings(result, tmp_path))
+    assert sources["trial-1"] == {"sensor": "mine", "trial": 1, "material": "felt", "object": "cup"}
 
 
 def test_two_sensors_of_a_trial_are_two_streams(tmp_path: Path) -> None:
@@ -75,8 +75,8 @@ def test_two_sensors_of_a_trial_are_two_streams(tmp_path: Path) -> None:
         for sensor in (1, 2):
             (tmp_path / f"t{trial}").mkdir(exist_ok=True)
             labs.frame().to_csv(tmp_path / f"t{trial}" / f"skin{sensor}.csv", index=False)
-    found = answered(guess.guess_layout(tmp_path), unit="N", sensor="mine")
-    assert [(one.name, one.files) for one in found.streams] == [
+    result = answered(guess.guess_layout(tmp_path), unit="N", sensor="mine")
+    assert [(stream.name, stream.files) for stream in result.streams] == [
         ("skin1", "t{trial}/skin1.csv"),
         ("skin2", "t{trial}/skin2.csv"),
     ]
@@ -87,8 +87,8 @@ def test_two_sensors_of_a_trial_are_two_streams(tmp_path: Path) -> None:
 def test_how_a_file_is_written_is_found_from_its_lines(separator: str, header: bool) -> None:
     rows = [[f"{row / 100:.2f}", str(row), "1.5"] for row in range(5)]
     lines = [separator.join(row) for row in ([["t", "a", "b"]] if header else []) + rows]
-    found = file_sample.detect_dialect(lines)
-    assert (found.separator, found.header, len(found.rows)) == (separator, header, 5)
+    result = file_sample.detect_dialect(lines)
+    assert (result.separator, result.header, len(result.rows)) == (separator, header, 5)
 
 
 def test_whole_numbers_that_are_written_as_decimal_ones_are_floats(tmp_path: Path) -> None:
@@ -114,18 +114,18 @@ def columns_of(folder: Path, frame: pd.DataFrame) -> dict[str, str]:
 def test_numbered_columns_that_are_or_may_be_taxels_state_which(tmp_path: Path) -> None:
     counts = {f"{name}{n}": [n, 3, 4] for name in ("pad", "t") for n in range(3)}
     joints = {f"q{n}": [0.5, 0.25, n / 8] for n in range(3)}
-    found = columns_of(tmp_path, pd.DataFrame({"time": [1.7e9, 1.7e9 + 1, 1.7e9 + 2], **counts, **joints}))
-    assert 'quantity = "tactile"' in found["pad{taxel}"] and 'quantity = "?"' in found["t{taxel}"]
-    assert 'quantity = "joint_position"' in found["q{number}"]
+    result = columns_of(tmp_path, pd.DataFrame({"time": [1.7e9, 1.7e9 + 1, 1.7e9 + 2], **counts, **joints}))
+    assert 'quantity = "tactile"' in result["pad{taxel}"] and 'quantity = "?"' in result["t{taxel}"]
+    assert 'quantity = "joint_position"' in result["q{number}"]
 
 
 def test_axes_of_taxels_are_one_rule_and_lengths_called_x_y_z_are_a_position(tmp_path: Path) -> None:
     cells = {f"taxel {n} {axis} [counts]": [1, 2] for n in (1, 2) for axis in "xyz"}
     place = {f"{axis} [mm]": [0.5, 0.25] for axis in "xyz"}
-    found = columns_of(tmp_path, pd.DataFrame({"time": [1.7e9, 1.7e9 + 1], **cells, **place}))
-    assert set(found) == {"taxel {taxel} {axis} [counts]", "x [mm]", "y [mm]", "z [mm]"}
-    assert 'name = "taxel_{taxel}_{axis}", quantity = "tactile"' in found["taxel {taxel} {axis} [counts]"]
-    assert all('quantity = "position", unit = "mm"' in found[f"{axis} [mm]"] for axis in "xyz")
+    result = columns_of(tmp_path, pd.DataFrame({"time": [1.7e9, 1.7e9 + 1], **cells, **place}))
+    assert set(result) == {"taxel {taxel} {axis} [counts]", "x [mm]", "y [mm]", "z [mm]"}
+    assert 'name = "taxel_{taxel}_{axis}", quantity = "tactile"' in result["taxel {taxel} {axis} [counts]"]
+    assert all('quantity = "position", unit = "mm"' in result[f"{axis} [mm]"] for axis in "xyz")
 
 
 def test_a_place_beside_a_quaternion_is_a_position_and_one_alone_is_asked_for(tmp_path: Path) -> None:

@@ -45,17 +45,17 @@ def _label(lab: Lab, materials: list[str]) -> None:
 
 def counts(ran: Ran) -> tuple[int, int]:
     """Return how many recordings were read, and how many were in the store."""
-    found = json.loads(ran.out)
-    return found["ran"], found["reused"]
+    content = json.loads(ran.out)
+    return content["ran"], content["reused"]
 
 
 def test_a_labs_own_tables_become_recordings_with_labels(own: Lab) -> None:
     own.run(INGEST)
-    found = tacpipe.open("data/rec")
-    assert [one.name for one in found] == ["trial-0", "trial-1", "trial-2"]
-    assert [one.attributes["material"] for one in found] == ["cork", "felt", "cork"]
+    result = tacpipe.open("data/rec")
+    assert [entry.name for entry in result] == ["trial-0", "trial-1", "trial-2"]
+    assert [entry.attributes["material"] for entry in result] == ["cork", "felt", "cork"]
     frame = labs.frame(seed=1)
-    assert found["trial-1"].table("skin").column("taxel4").to_pylist() == frame["taxel4"].tolist()
+    assert result["trial-1"].table("skin").column("taxel4").to_pylist() == frame["taxel4"].tolist()
 
 
 def test_what_did_not_change_is_not_read_again(own: Lab) -> None:
@@ -68,7 +68,7 @@ def test_one_changed_line_of_a_shared_table_of_labels_costs_one_recording(own: L
     own.run(INGEST)
     _label(own, ["cork", "foam", "cork"])
     assert counts(own.run(f"{INGEST} --json")) == (1, 2)
-    assert [one.attributes["material"] for one in tacpipe.open("data/rec")] == ["cork", "foam", "cork"]
+    assert [entry.attributes["material"] for entry in tacpipe.open("data/rec")] == ["cork", "foam", "cork"]
 
 
 def test_one_changed_file_costs_one_recording_and_is_not_taken_for_the_same(own: Lab) -> None:
@@ -92,15 +92,15 @@ def test_a_guess_needs_no_layout(own: Lab) -> None:
 
 
 def test_many_recordings_in_one_file_are_recordings_each(lab: Lab) -> None:
-    every = pd.concat([labs.frame(seed=trial).assign(trial=f"t{trial}") for trial in range(3)])
+    all_items = pd.concat([labs.frame(seed=trial).assign(trial=f"t{trial}") for trial in range(3)])
     (lab.folder / "own").mkdir()
-    every.to_csv(lab.folder / "own" / "all.csv", index=False)
+    all_items.to_csv(lab.folder / "own" / "all.csv", index=False)
     text = LAYOUT.partition("[[labels]]")[0].replace('"trial_{trial}/skin.csv"', '"all.csv"\nrecording = "trial"')
     (lab.folder / "layout.toml").write_text(text)
     lab.run(INGEST)
-    found = tacpipe.open("data/rec")
-    assert [one.name for one in found] == ["t0", "t1", "t2"]
-    assert found["t2"].table("skin").column("taxel1").to_pylist() == labs.frame(seed=2)["taxel1"].tolist()
+    result = tacpipe.open("data/rec")
+    assert [entry.name for entry in result] == ["t0", "t1", "t2"]
+    assert result["t2"].table("skin").column("taxel1").to_pylist() == labs.frame(seed=2)["taxel1"].tolist()
 
 
 MANY = """
@@ -115,10 +115,10 @@ columns = [{ match = "fx" }, { match = "taxel{taxel}", type = "uint16" }]
 def many(lab: Lab, recordings: int, *, mixed: bool) -> dict[str, pd.DataFrame]:
     """Write one file of many recordings, one after another or with their rows mixed; return these by name."""
     frames = {f"t{number:02d}": labs.frame(20 + number, seed=number) for number in range(recordings)}
-    whole = pd.concat([frame.assign(trial=name) for name, frame in frames.items()], ignore_index=True)
+    full = pd.concat([frame.assign(trial=name) for name, frame in frames.items()], ignore_index=True)
     (lab.folder / "own").mkdir()
-    whole = whole.sort_values("time", kind="stable") if mixed else whole
-    whole.to_csv(lab.folder / "own" / "all.csv", index=False)
+    full = full.sort_values("time", kind="stable") if mixed else full
+    full.to_csv(lab.folder / "own" / "all.csv", index=False)
     (lab.folder / "layout.toml").write_text(MANY)
     return frames
 
@@ -138,9 +138,9 @@ def test_a_file_of_many_recordings_is_read_as_often_for_many_as_for_one(
     monkeypatch.setattr(text, "BLOCK_BYTES", 1000)
     frames = many(lab, 5, mixed=mixed)
     lab.run(INGEST)
-    assert len(times) == 2  # for the names of the recordings, and for their rows
-    found = tacpipe.open("data/rec")
-    assert {one.name: one.table("skin").column("fx").to_pylist() for one in found} == {
+    assert len(times) == 2  # one pass reads the names of the recordings, one their rows
+    result = tacpipe.open("data/rec")
+    assert {entry.name: entry.table("skin").column("fx").to_pylist() for entry in result} == {
         name: frame["fx"].tolist() for name, frame in frames.items()
     }
     assert not list((lab.store.root / "tmp").iterdir())
@@ -149,8 +149,8 @@ def test_a_file_of_many_recordings_is_read_as_often_for_many_as_for_one(
 def test_workers_share_one_cut_of_a_file_and_leave_nothing(lab: Lab) -> None:
     frames = many(lab, 9, mixed=True)
     assert counts(lab.run(f"{INGEST} --json --jobs 2")) == (9, 0)
-    found = tacpipe.open("data/rec")
-    assert {one.name: one.table("skin").column("taxel2").to_pylist() for one in found} == {
+    result = tacpipe.open("data/rec")
+    assert {entry.name: entry.table("skin").column("taxel2").to_pylist() for entry in result} == {
         name: frame["taxel2"].tolist() for name, frame in frames.items()
     }
     assert not list((lab.store.root / "tmp").iterdir())

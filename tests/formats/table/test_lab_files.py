@@ -23,9 +23,9 @@ SHAPE = "shape = [4, 3], axes = ['x', 'y', 'z']"
 
 def streams_of(text: str, folder: Path) -> dict[str, pa.Table]:
     """Return the streams of the first recording below a folder, read with a layout."""
-    made = layout.parse_layout(text)
-    source = next(iter(contained.discover_sources(made, folder, recordings.find_recordings(made, folder)).values()))
-    output = contained.read_recording(made, None, source.files, source.values)
+    result = layout.parse_layout(text)
+    source = next(iter(contained.discover_sources(result, folder, recordings.find_recordings(result, folder)).values()))
+    output = contained.read_recording(result, None, source.files, source.values)
     return {name: table.read_all() for name, table in output.streams.items() if isinstance(table, pa.RecordBatchReader)}
 
 
@@ -86,11 +86,11 @@ def test_arrays_of_two_rates_in_one_archive_are_two_streams(tmp_path: Path) -> N
     np.savez(
         tmp_path / "t1" / "all.npz", tactile=skin, robot_pos=place, t=np.arange(40) / 10, robot_t=np.arange(100) / 25
     )
-    found = streams_of(guessed(tmp_path, unit="m"), tmp_path)
-    assert found["tactile"].column("taxel04_z").to_pylist() == skin[:, 3, 2].tolist()
-    assert found["robot_pos"].column("robot_pos_y").to_pylist() == place[:, 1].tolist()
-    assert found["robot_pos"].schema.field("robot_pos_y").metadata[b"component"] == b"y"
-    assert found["robot_pos"].column("t_ns").to_pylist() == [row * 40_000_000 for row in range(100)]
+    result = streams_of(guessed(tmp_path, unit="m"), tmp_path)
+    assert result["tactile"].column("taxel04_z").to_pylist() == skin[:, 3, 2].tolist()
+    assert result["robot_pos"].column("robot_pos_y").to_pylist() == place[:, 1].tolist()
+    assert result["robot_pos"].schema.field("robot_pos_y").metadata[b"component"] == b"y"
+    assert result["robot_pos"].column("t_ns").to_pylist() == [row * 40_000_000 for row in range(100)]
 
 
 @pytest.mark.parametrize("stamps_file", ["stamps.csv", "stamps.txt"])
@@ -212,22 +212,22 @@ FORMATS = (
 
 @given(st.datetimes(datetime.datetime(1970, 1, 1), datetime.datetime(2060, 1, 1)), st.sampled_from(FORMATS))
 def test_stamps_of_a_format_are_read_as_python_reads_them(time: datetime.datetime, text: str) -> None:
-    written = time.strftime(text)
-    expected = datetime.datetime.strptime(written, text).replace(tzinfo=datetime.UTC)
+    content = time.strftime(text)
+    expected = datetime.datetime.strptime(content, text).replace(tzinfo=datetime.UTC)
     expected_ns = (
         (expected - datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC)) // datetime.timedelta(microseconds=1) * 1000
     )
-    found = stamps.nanoseconds(pa.array([written]), Time(format=text))
-    assert found.tolist() == [expected_ns]
+    stamps_ns = stamps.nanoseconds(pa.array([content]), Time(format=text))
+    assert stamps_ns.tolist() == [expected_ns]
 
 
 @pytest.mark.parametrize(
     "wrong", ["31.02.2026 12:00:00", "01.01.2026 25:00:00", "01.13.2026 12:00:00", "yesterday", ""]
 )
 def test_a_text_that_is_no_time_of_the_format_is_named_by_its_row(wrong: str) -> None:
-    with pytest.raises(stamps.StampError) as found:
+    with pytest.raises(stamps.StampError) as result:
         stamps.nanoseconds(pa.array(["01.01.2026 12:00:00", wrong]), Time(format="%d.%m.%Y %H:%M:%S"))
-    assert found.value.row == 1
+    assert result.value.row == 1
 
 
 def test_times_of_day_go_on_past_midnight_and_have_the_day_that_the_layout_states(tmp_path: Path) -> None:
@@ -235,7 +235,7 @@ def test_times_of_day_go_on_past_midnight_and_have_the_day_that_the_layout_state
     (tmp_path / "a.csv").write_text("\n".join(["clock,fx", *rows]))
     extra = 'time = { column = "clock", format = "%H:%M:%S.%f", start = "1970-01-02", zone = "Europe/Berlin" }'
     table = reading.read_stream_table(tmp_path / "a.csv", labs.stream(extra, '{ match = "fx" }', "{trial}.csv"))
-    midnight_ns = (2 * 86_400 - 3600) * 10**9  # of the third of January in Berlin
+    midnight_ns = (2 * 86_400 - 3600) * 10**9  # midnight of the third of January in Berlin
     assert table.column("t_ns").to_pylist() == [midnight_ns + part * 250_000_000 for part in (-2, -1, 0, 1)]
 
 

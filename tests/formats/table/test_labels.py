@@ -31,8 +31,8 @@ def test_a_yaml_file_labels_its_recording_over_what_all_share(tmp_path: Path) ->
     (tmp_path / "trial_0" / "meta.yaml").write_text(
         "material: cork\nsensor: {name: mine, serial: 7}\nwhen: 2024-05-01\n"
     )
-    rest = '[[labels]]\nfile = "trial_{trial}/meta.yaml"\n[attributes]\nmaterial = "unknown"\nlab = "ours"'
-    assert found(tmp_path, rest)["trial-0"] == {
+    remaining = '[[labels]]\nfile = "trial_{trial}/meta.yaml"\n[attributes]\nmaterial = "unknown"\nlab = "ours"'
+    assert found(tmp_path, remaining)["trial-0"] == {
         "trial": 0,
         "lab": "ours",
         "material": "cork",
@@ -45,8 +45,8 @@ def test_a_yaml_file_labels_its_recording_over_what_all_share(tmp_path: Path) ->
 def test_a_table_of_one_row_labels_its_recording(tmp_path: Path) -> None:
     labs.write(tmp_path, 1)
     (tmp_path / "trial_0" / "meta.csv").write_text("object,seen\ncup,true\n")
-    rest = '[[labels]]\nfile = "trial_{trial}/meta.csv"\ncolumns = ["object"]'
-    assert found(tmp_path, rest)["trial-0"] == {"trial": 0, "object": "cup"}
+    remaining = '[[labels]]\nfile = "trial_{trial}/meta.csv"\ncolumns = ["object"]'
+    assert found(tmp_path, remaining)["trial-0"] == {"trial": 0, "object": "cup"}
 
 
 WRONG = {  # the file; what the sentence must name
@@ -79,15 +79,15 @@ def test_one_yaml_file_labels_all_recordings_by_their_names_or_those_of_their_fo
 ) -> None:
     labs.write(tmp_path, 2)
     (tmp_path / "labels.yaml").write_text(text)
-    made = found(tmp_path, '[[labels]]\nfile = "labels.yaml"')
-    assert {name: one["material"] for name, one in made.items()} == {"trial-0": "felt", "trial-1": "cork"}
+    output = found(tmp_path, '[[labels]]\nfile = "labels.yaml"')
+    assert {name: value["material"] for name, value in output.items()} == {"trial-0": "felt", "trial-1": "cork"}
 
 
 def test_a_table_may_name_recordings_by_their_folders(tmp_path: Path) -> None:
     labs.write(tmp_path, 2)
     (tmp_path / "labels.csv").write_text("folder,material\ntrial_1,cork\ntrial_0,felt\n")
-    made = found(tmp_path, '[[labels]]\nfile = "labels.csv"\nkey = "folder"')
-    assert {name: one["material"] for name, one in made.items()} == {"trial-0": "felt", "trial-1": "cork"}
+    output = found(tmp_path, '[[labels]]\nfile = "labels.csv"\nkey = "folder"')
+    assert {name: value["material"] for name, value in output.items()} == {"trial-0": "felt", "trial-1": "cork"}
 
 
 def test_a_yaml_file_of_all_without_a_recordings_entry_is_refused(tmp_path: Path) -> None:

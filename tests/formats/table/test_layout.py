@@ -37,10 +37,10 @@ WRONG = {  # a layout, and what the sentence about it must name
 
 @pytest.mark.parametrize("text", WRONG)
 def test_a_wrong_layout_is_one_sentence_with_its_entry(text: str) -> None:
-    with pytest.raises(UsageError) as found:
+    with pytest.raises(UsageError) as result:
         layout.parse_layout(text, "layout.toml")
-    assert all(part in str(found.value) for part in ("", *WRONG[text])), str(found.value)
-    assert "\n" not in str(found.value)
+    assert all(part in str(result.value) for part in ("", *WRONG[text])), str(result.value)
+    assert "\n" not in str(result.value)
 
 
 def test_placeholders_that_all_streams_share_make_a_recording() -> None:
@@ -64,9 +64,9 @@ def test_the_format_follows_the_extension_unless_the_layout_names_one() -> None:
 
 
 def test_a_quantity_and_a_unit_of_ones_own_are_read_where_the_layout_declares_them() -> None:
-    own = STREAM.replace('match = "x"', 'match = "x", quantity = "glow", unit = "blink"')
+    local = STREAM.replace('match = "x"', 'match = "x", quantity = "glow", unit = "blink"')
     for declared in ("", '[vocabulary]\nquantities = ["glow"]'):
         with pytest.raises(UsageError, match="blink" if declared else "glow"):
-            layout.parse_layout(own + declared)
-    made = layout.parse_layout(own + '[vocabulary]\nquantities = ["glow"]\nunits = ["blink"]')
-    assert (made.streams[0].columns[0].quantity, made.streams[0].columns[0].unit) == ("glow", "blink")
+            layout.parse_layout(local + declared)
+    output = layout.parse_layout(local + '[vocabulary]\nquantities = ["glow"]\nunits = ["blink"]')
+    assert (output.streams[0].columns[0].quantity, output.streams[0].columns[0].unit) == ("glow", "blink")

@@ -21,7 +21,7 @@ time = { column = "time", unit = "s" }
 columns = [{ match = "c{channel}" }]
 """
 COLUMNS, ROWS, BLOCK = 16, 4_000_000, 100_000  # a CSV of 0.6 GB; as a table 0.54 GB, stored 0.4 GB
-MOST_KB = 800_000  # in memory: the program and its libraries, blocks of the file, one group of rows
+MOST_KB = 800_000  # bytes in memory: the program and its libraries, blocks of the file, one group of rows
 LONG_LAYOUT = """
 [streams.arm]
 files = "all.csv"
@@ -49,25 +49,25 @@ def rows(start: int, values: np.ndarray, recordings: int) -> pa.Table:
 
 def written(path: Path, recordings: int = 1) -> None:
     values = np.random.default_rng(0).normal(size=BLOCK).round(6)
-    made = (rows(start, values, recordings) for start in range(0, ROWS, BLOCK))
-    first = next(made)
+    output = (rows(start, values, recordings) for start in range(0, ROWS, BLOCK))
+    first = next(output)
     if path.suffix == ".parquet":
         with pq.ParquetWriter(path, first.schema) as writer:
-            for table in (first, *made):
+            for table in (first, *output):
                 writer.write_table(table)
         return
     with path.open("wb") as sink, pc.CSVWriter(sink, first.schema) as writer:
-        for table in (first, *made):
+        for table in (first, *output):
             writer.write_table(table)
 
 
 def ran(folder: Path, command: str) -> str:
     """Run a command, which must succeed in so little memory, and return what it printed."""
-    given = [sys.executable, "-c", RUN, *command.split()]
-    made = subprocess.run(given, cwd=folder, capture_output=True, text=True, check=False)
-    assert made.returncode == 0, made.stderr
-    assert int(made.stderr.split()[-1]) < MOST_KB
-    return made.stdout
+    provided = [sys.executable, "-c", RUN, *command.split()]
+    output = subprocess.run(provided, cwd=folder, capture_output=True, text=True, check=False)
+    assert output.returncode == 0, output.stderr
+    assert int(output.stderr.split()[-1]) < MOST_KB
+    return output.stdout
 
 
 @pytest.mark.long
@@ -112,8 +112,8 @@ def test_a_table_in_long_form_whose_channels_follow_one_another_is_read(tmp_path
     (tmp_path / "layout.toml").write_text(LONG_LAYOUT)
     ran(tmp_path, "ingest table own --layout layout.toml -o rec")
     (shard,) = (tmp_path / "rec").rglob("arm.parquet")
-    found = pq.ParquetFile(shard)
-    assert (found.metadata.num_rows, found.metadata.num_columns) == (moments, 1 + COLUMNS)
+    result = pq.ParquetFile(shard)
+    assert (result.metadata.num_rows, result.metadata.num_columns) == (moments, 1 + COLUMNS)
 
 
 @pytest.mark.long

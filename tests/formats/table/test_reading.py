@@ -69,10 +69,10 @@ def test_a_file_without_header_has_numbered_columns(tmp_path: Path) -> None:
         '{ match = "column6", name = "force_x_n", unit = "N" }, '
         '{ match = "column{taxel}", name = "cell{taxel}", type = "uint16" }'
     )
-    found = reading.read_stream_table(
+    table = reading.read_stream_table(
         tmp_path / "skin.csv", labs.stream('header = false\ntime = { column = "column1" }', columns)
     )
-    assert found.column("cell2").to_pylist() == frame["taxel1"].tolist()
+    assert table.column("cell2").to_pylist() == frame["taxel1"].tolist()
 
 
 def test_parquet_npz_and_json_lines_give_the_same_as_csv(tmp_path: Path) -> None:
@@ -81,36 +81,36 @@ def test_parquet_npz_and_json_lines_give_the_same_as_csv(tmp_path: Path) -> None
     np.savez(tmp_path / "skin.npz", allow_pickle=False, **{str(name): frame[name].to_numpy() for name in frame})
     frame.to_json(tmp_path / "skin.jsonl", orient="records", lines=True, double_precision=15)
     for name in ("skin.parquet", "skin.npz", "skin.jsonl"):
-        found = reading.read_stream_table(tmp_path / name, labs.stream())
-        expect(found.set_column(0, "t_ns", pa.array(T_NS)), frame)
-        assert np.abs(found.column("t_ns").to_numpy() - T_NS).max() < 240  # what float64 keeps of Unix seconds
+        table = reading.read_stream_table(tmp_path / name, labs.stream())
+        expect(table.set_column(0, "t_ns", pa.array(T_NS)), frame)
+        assert np.abs(table.column("t_ns").to_numpy() - T_NS).max() < 240  # resolution of Unix seconds in float64
 
 
 def test_arrays_of_two_dimensions_are_columns(tmp_path: Path) -> None:
     grid = np.arange(12, dtype=np.uint16).reshape(3, 2, 2)
     np.savez(tmp_path / "skin.npz", stamp=np.arange(3) * 10**9, grid=grid)
     columns = '{ match = "grid_{cell}", type = "uint16" }'
-    found = reading.read_stream_table(
+    table = reading.read_stream_table(
         tmp_path / "skin.npz", labs.stream('time = { column = "stamp", unit = "ns" }', columns)
     )
-    assert [found.column(f"grid_{cell}").to_pylist() for cell in range(4)] == grid.reshape(3, 4).T.tolist()
+    assert [table.column(f"grid_{cell}").to_pylist() for cell in range(4)] == grid.reshape(3, 4).T.tolist()
 
 
 def test_long_form_becomes_a_column_a_channel(tmp_path: Path) -> None:
     frame = labs.frame()
     frame.melt("time", var_name="sensor", value_name="reading").to_csv(tmp_path / "skin.csv", index=False)
-    found = reading.read_stream_table(
+    table = reading.read_stream_table(
         tmp_path / "skin.csv", labs.stream('long = { channel = "sensor", value = "reading" }')
     )
-    expect(found, frame)
+    expect(table, frame)
 
 
 def test_a_moment_at_which_a_channel_is_missing_is_nan_in_long_form(tmp_path: Path) -> None:
     (tmp_path / "skin.csv").write_text("time,sensor,reading\n0,fx,1\n0,fy,2\n1,fx,3\n")
     extra = 'long = { channel = "sensor", value = "reading" }\ntime = { column = "time", origin = "start" }'
-    found = reading.read_stream_table(tmp_path / "skin.csv", labs.stream(extra, '{ match = "f{component}" }'))
-    assert found.column("fx").to_pylist() == [1.0, 3.0]
-    assert np.isnan(found.column("fy")[1].as_py())
+    table = reading.read_stream_table(tmp_path / "skin.csv", labs.stream(extra, '{ match = "f{component}" }'))
+    assert table.column("fx").to_pylist() == [1.0, 3.0]
+    assert np.isnan(table.column("fy")[1].as_py())
 
 
 def test_two_values_of_a_channel_at_one_moment_are_refused(tmp_path: Path) -> None:
@@ -123,8 +123,8 @@ def test_two_values_of_a_channel_at_one_moment_are_refused(tmp_path: Path) -> No
 
 def test_the_rows_of_one_recording_are_picked_from_a_file_of_many(tmp_path: Path) -> None:
     frames = {f"t{trial}": labs.frame(seed=trial) for trial in range(3)}
-    every = pd.concat([frame.assign(trial=name) for name, frame in frames.items()])
-    every.to_csv(tmp_path / "all.csv", index=False)
+    all_items = pd.concat([frame.assign(trial=name) for name, frame in frames.items()])
+    all_items.to_csv(tmp_path / "all.csv", index=False)
     stream = labs.stream('recording = "trial"', files="all.csv")
     for name, frame in frames.items():
         expect(reading.read_stream_table(tmp_path / "all.csv", stream, name), frame)
@@ -134,24 +134,24 @@ def test_a_rate_makes_the_stamps_where_no_column_has_them(tmp_path: Path) -> Non
     frame = labs.frame().drop(columns="time")
     frame.to_csv(tmp_path / "skin.csv", index=False)
     extra = 'time = { rate_hz = 100, start = "2023-11-14T22:13:20" }'
-    found = reading.read_stream_table(tmp_path / "skin.csv", labs.stream(extra))
-    expect(found, frame)
-    assert found.schema.field("t_ns").metadata[b"made"] == b"from rate"
+    table = reading.read_stream_table(tmp_path / "skin.csv", labs.stream(extra))
+    expect(table, frame)
+    assert table.schema.field("t_ns").metadata[b"made"] == b"from rate"
 
 
 def test_missing_cells_are_nan_where_they_are_declared(tmp_path: Path) -> None:
     (tmp_path / "skin.csv").write_text("time,fx\n0,1.5\n1,NA\n2,\n")
-    found = reading.read_stream_table(tmp_path / "skin.csv", labs.stream('missing = ["NA", ""]', '{ match = "fx" }'))
-    assert found.column("fx").to_pylist()[0] == 1.5
-    assert np.isnan(found.column("fx").to_numpy()[1:]).all()
+    table = reading.read_stream_table(tmp_path / "skin.csv", labs.stream('missing = ["NA", ""]', '{ match = "fx" }'))
+    assert table.column("fx").to_pylist()[0] == 1.5
+    assert np.isnan(table.column("fx").to_numpy()[1:]).all()
 
 
 def test_a_scaled_column_is_in_its_unit(tmp_path: Path) -> None:
     (tmp_path / "skin.csv").write_text("time,fx\n0,1500\n1,-20\n")
-    found = reading.read_stream_table(
+    table = reading.read_stream_table(
         tmp_path / "skin.csv", labs.stream("", '{ match = "fx", unit = "N", scale = 0.001 }')
     )
-    assert found.column("fx").to_pylist() == [1.5, -0.02]
+    assert table.column("fx").to_pylist() == [1.5, -0.02]
 
 
 WRONG = {  # content of a file, and what the sentence about it must name
@@ -178,10 +178,10 @@ WRONG = {  # content of a file, and what the sentence about it must name
 def test_a_wrong_file_is_one_sentence_with_its_place(tmp_path: Path, content: str) -> None:
     path = tmp_path / "skin.csv"
     path.write_text(content)
-    with pytest.raises(TacpipeError) as found:
+    with pytest.raises(TacpipeError) as result:
         reading.read_stream_table(path, labs.stream())
-    assert all(part in str(found.value) for part in (str(path), *WRONG[content])), str(found.value)
-    assert "\n" not in str(found.value)
+    assert all(part in str(result.value) for part in (str(path), *WRONG[content])), str(result.value)
+    assert "\n" not in str(result.value)
 
 
 def test_a_value_that_is_wrong_in_a_later_block_is_named_by_its_line(
@@ -211,12 +211,12 @@ def same_in_blocks(
     monkeypatch: pytest.MonkeyPatch, path: Path, stream: StreamLayout, recording: str | None = None
 ) -> pa.Table:
     """Return what a file holds, which is read to the same bytes in one block and in many."""
-    whole = reading.read_stream_table(path, stream, recording)
+    table = reading.read_stream_table(path, stream, recording)
     for module in (text, binary):
         monkeypatch.setattr(module, "BLOCK_BYTES", 200)
     batches = list(reading.stream_batches(rows.open_rows(path, stream), stream, recording))
-    assert len(batches) > 1 and to_parquet(pa.Table.from_batches(batches)) == to_parquet(whole)
-    return whole
+    assert len(batches) > 1 and to_parquet(pa.Table.from_batches(batches)) == to_parquet(table)
+    return table
 
 
 @pytest.mark.parametrize("name", ["skin.csv", "skin.csv.gz", "skin.parquet", "skin.npz", "skin.jsonl", "skin.jsonl.gz"])
@@ -230,19 +230,19 @@ def test_a_file_is_read_block_by_block_to_the_same_bytes(
     elif "jsonl" in name:
         frame.to_json(path, orient="records", lines=True, double_precision=15)
     elif name == "skin.npz":
-        np.savez_compressed(path, allow_pickle=False, **{str(one): frame[one].to_numpy() for one in frame})
+        np.savez_compressed(path, allow_pickle=False, **{str(entry): frame[entry].to_numpy() for entry in frame})
     else:
         pq.write_table(pa.Table.from_pandas(frame), path)
-    given = labs.stream('missing = ["NA", "nan"]')
-    found = same_in_blocks(monkeypatch, path, given)
-    assert found.column("taxel3").to_pylist() == frame["taxel3"].tolist()
-    assert np.array_equal(found.column("force_x_n").to_numpy(), frame["fx"].to_numpy(), equal_nan=True)
+    provided = labs.stream('missing = ["NA", "nan"]')
+    result = same_in_blocks(monkeypatch, path, provided)
+    assert result.column("taxel3").to_pylist() == frame["taxel3"].tolist()
+    assert np.array_equal(result.column("force_x_n").to_numpy(), frame["fx"].to_numpy(), equal_nan=True)
 
 
 def test_the_stamps_of_a_rate_go_on_from_block_to_block(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     labs.frame().drop(columns="time").to_csv(tmp_path / "skin.csv", index=False)
-    given = labs.stream('time = { rate_hz = 30, start = "2024-02-29T12:00:00Z" }')
-    t_ns = same_in_blocks(monkeypatch, tmp_path / "skin.csv", given).column("t_ns").to_numpy()
+    provided = labs.stream('time = { rate_hz = 30, start = "2024-02-29T12:00:00Z" }')
+    t_ns = same_in_blocks(monkeypatch, tmp_path / "skin.csv", provided).column("t_ns").to_numpy()
     assert (t_ns - t_ns[0]).tolist() == [round(row * 1e9 / 30) for row in range(50)]
 
 
@@ -264,8 +264,8 @@ def test_arrays_of_an_archive_are_read_in_either_order(
     values = np.arange(600, dtype=">u2").reshape(200, 3)
     np.savez(tmp_path / "skin.npz", allow_pickle=False, time=np.arange(200), taxel=np.array(values, order=order))
     columns = '{ match = "taxel_{taxel}", type = "uint16" }'
-    found = same_in_blocks(monkeypatch, tmp_path / "skin.npz", labs.stream("", columns))
-    assert [found.column(f"taxel_{one}").to_pylist() for one in range(3)] == values.T.tolist()
+    result = same_in_blocks(monkeypatch, tmp_path / "skin.npz", labs.stream("", columns))
+    assert [result.column(f"taxel_{index}").to_pylist() for index in range(3)] == values.T.tolist()
 
 
 def test_an_archive_that_declares_more_than_it_holds_is_refused(tmp_path: Path) -> None:
@@ -283,10 +283,10 @@ def test_a_key_that_only_later_lines_have_is_a_column_and_lists_of_two_lengths_a
     monkeypatch.setattr(binary, "BLOCK_BYTES", 30)
     lines = [{"time": row, **({"fx": row / 2} if row > 30 else {})} for row in range(50)]
     (tmp_path / "skin.jsonl").write_text("\n".join(map(json.dumps, lines)))
-    found = (
+    table = (
         reading.read_stream_table(tmp_path / "skin.jsonl", labs.stream("", '{ match = "fx" }')).column("fx").to_numpy()
     )
-    assert np.isnan(found[:31]).all() and found[31:].tolist() == [row / 2 for row in range(31, 50)]
+    assert np.isnan(table[:31]).all() and table[31:].tolist() == [row / 2 for row in range(31, 50)]
     uneven = [{"time": row, "x": [1] * (2 + row // 30)} for row in range(50)]
     (tmp_path / "skin.jsonl").write_text("\n".join(map(json.dumps, uneven)))
     with pytest.raises(TacpipeError, match="lists of x have 2 lengths"):
@@ -317,10 +317,10 @@ def test_pickles_in_an_archive_are_refused(tmp_path: Path) -> None:
 def test_json_lines_with_lists_are_columns(tmp_path: Path) -> None:
     lines = [json.dumps({"time": row, "taxels": [row, row + 1]}) for row in range(3)]
     (tmp_path / "skin.jsonl").write_text("\n".join(lines))
-    found = reading.read_stream_table(
+    table = reading.read_stream_table(
         tmp_path / "skin.jsonl", labs.stream("", '{ match = "taxels_{taxel}", type = "uint16" }')
     )
-    assert found.column("taxels_1").to_pylist() == [1, 2, 3]
+    assert table.column("taxels_1").to_pylist() == [1, 2, 3]
 
 
 @pytest.mark.parametrize("order", ["melted", "by time", "mixed"])
@@ -337,14 +337,14 @@ def test_a_long_form_of_many_runs_is_the_table_that_pandas_pivots(
     rows = rows.sample(frac=1.0, random_state=2) if order == "mixed" else rows
     rows.to_csv(tmp_path / "skin.csv", index=False)
     columns = '{ match = "*" }'
-    found = reading.read_stream_table(
+    table = reading.read_stream_table(
         tmp_path / "skin.csv", labs.stream('long = { channel = "sensor", value = "reading" }', columns)
     )
     expected = rows.pivot(index="time", columns="sensor", values="reading")
-    assert found.column_names == ["t_ns", *rows["sensor"].unique()]
-    assert found.column("t_ns").to_pylist() == [round(time * 1000) * 10**6 for time in expected.index]
+    assert table.column_names == ["t_ns", *rows["sensor"].unique()]
+    assert table.column("t_ns").to_pylist() == [round(time * 1000) * 10**6 for time in expected.index]
     for name in expected:
-        np.testing.assert_array_equal(found.column(name).to_numpy(), expected[name].to_numpy())
+        np.testing.assert_array_equal(table.column(name).to_numpy(), expected[name].to_numpy())
 
 
 def test_of_a_long_form_of_many_runs_the_second_of_two_values_is_named_by_its_line(

@@ -27,8 +27,8 @@ def found(text: str, folder: Path) -> dict[str, dict[str, str]]:
     from tacpipe.formats.table import layout
 
     return {
-        one.name: {stream: path.relative_to(folder).as_posix() for stream, path in one.files.items()}
-        for one in recordings.find_recordings(layout.parse_layout(text), folder)
+        source.name: {stream: path.relative_to(folder).as_posix() for stream, path in source.files.items()}
+        for source in recordings.find_recordings(layout.parse_layout(text), folder)
     }
 
 
@@ -48,7 +48,10 @@ def test_a_layout_names_recordings(tmp_path: Path) -> None:
 def test_one_file_holds_many_recordings(tmp_path: Path) -> None:
     made(tmp_path, "all.csv")
     layout = labs.of('recording = "trial"', '{ match = "x" }', "all.csv")
-    assert [(one.name, one.episode) for one in recordings.find_recordings(layout, tmp_path)] == [("a", "a"), ("b", "b")]
+    assert [(source.name, source.episode) for source in recordings.find_recordings(layout, tmp_path)] == [
+        ("a", "a"),
+        ("b", "b"),
+    ]
 
 
 WRONG = {  # files; the layout; what the sentence must name

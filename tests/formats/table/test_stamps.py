@@ -38,10 +38,10 @@ def test_more_decimals_than_nanoseconds_are_rounded() -> None:
 )
 def test_seconds_of_eighteen_decimals_are_rounded_half_to_even(whole: int, ns: int, beyond: int) -> None:
     text = f"{whole}.{ns:09d}{beyond:09d}"
-    wanted = int((Decimal(text) * 10**9).quantize(Decimal(1), ROUND_HALF_EVEN))
+    expected = int((Decimal(text) * 10**9).quantize(Decimal(1), ROUND_HALF_EVEN))
     column = pa.array(["0", text, "1.5"]).cast(stamps.DECIMAL).slice(1, 1)
-    if abs(wanted) <= YEAR_2262_NS:
-        assert stamps.nanoseconds(column, Time()).tolist() == [wanted]
+    if abs(expected) <= YEAR_2262_NS:
+        assert stamps.nanoseconds(column, Time()).tolist() == [expected]
     else:
         with pytest.raises(stamps.StampError):
             stamps.nanoseconds(column, Time())
@@ -50,8 +50,8 @@ def test_seconds_of_eighteen_decimals_are_rounded_half_to_even(whole: int, ns: i
 @given(st.integers(0, 2**33), st.integers(0, 2**20 - 1))
 def test_float_seconds_are_read_as_near_as_the_float_is(whole: int, part: int) -> None:
     value = whole + part / 2**20  # exact in float64
-    (found,) = stamps.nanoseconds(pa.array([value]), Time()).tolist()
-    assert abs(found - Decimal(value).scaleb(9)) <= Decimal("0.5")
+    (result,) = stamps.nanoseconds(pa.array([value]), Time()).tolist()
+    assert abs(result - Decimal(value).scaleb(9)) <= Decimal("0.5")
 
 
 @pytest.mark.parametrize(
@@ -70,8 +70,8 @@ def test_iso_stamps_are_read_in_their_zone(text: str, zone: str, hours: float) -
 
 
 def test_the_comma_of_pythons_logging_is_a_decimal_one() -> None:
-    found = stamps.nanoseconds(pa.array(["1970-01-01 00:00:01,250"]), Time(unit="iso8601"))
-    assert found.tolist() == [1_250_000_000]
+    stamps_ns = stamps.nanoseconds(pa.array(["1970-01-01 00:00:01,250"]), Time(unit="iso8601"))
+    assert stamps_ns.tolist() == [1_250_000_000]
 
 
 @pytest.mark.parametrize(
@@ -86,9 +86,9 @@ def test_the_comma_of_pythons_logging_is_a_decimal_one() -> None:
     ],
 )
 def test_a_stamp_that_is_none_is_named_by_its_row(column: pa.Array, unit: TimeUnit, row: int) -> None:
-    with pytest.raises(stamps.StampError) as found:
+    with pytest.raises(stamps.StampError) as result:
         stamps.nanoseconds(column, Time(unit=unit))
-    assert found.value.row == row
+    assert result.value.row == row
 
 
 @pytest.mark.parametrize("unit", ["s", "ms", "us", "ns"])

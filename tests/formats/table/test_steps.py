@@ -11,22 +11,22 @@ from tacpipe.formats.table.preview import Steps
 @pytest.mark.parametrize("count", [0, 1, 2, 5, 1000])
 def test_steps_that_are_counted_have_the_median_of_all(count: int) -> None:
     values = np.random.default_rng(count).integers(0, 300, count)
-    found = Steps()
+    result = Steps()
     for part in np.array_split(values, 3):
-        found.add(part)
-    assert found.median_ns() == (np.median(values) if count else 0)
-    assert found.longer(100) == (values > 100).sum() and found.longest_ns() == values.max(initial=0)
+        result.add(part)
+    assert result.median_ns() == (np.median(values) if count else 0)
+    assert result.longer(100) == (values > 100).sum() and result.longest_ns() == values.max(initial=0)
 
 
 def test_steps_that_all_differ_are_counted_in_bounded_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(preview, "MAX_DIFFERENT", 500)
     values = np.random.default_rng(0).normal(1e6, 1e4, 20_000).astype(np.int64)
-    found = Steps()
+    result = Steps()
     for part in np.array_split(values, 50):
-        found.add(part)
-    assert len(found._steps) <= 500
-    assert abs(found.median_ns() - np.median(values)) < 300
-    assert found.longest_ns() == values.max()
+        result.add(part)
+    assert len(result._steps) <= 500
+    assert abs(result.median_ns() - np.median(values)) < 300
+    assert result.longest_ns() == values.max()
 
 
 def test_a_preview_of_batches_is_that_of_their_table() -> None:
@@ -36,8 +36,8 @@ def test_a_preview_of_batches_is_that_of_their_table() -> None:
     fx[100:300] = np.nan
     table = pa.table({"t_ns": t_ns, "fx": fx, "on": rng.random(1000) > 0.5, "note": ["x"] * 1000})
     batches = pa.RecordBatchReader.from_batches(table.schema, iter(table.to_batches(max_chunksize=7)))
-    found = preview.summarize_stream(batches)
-    assert found == preview.summarize_stream(table)
-    assert (found.rows, found.rate_hz, found.gaps) == (1000, 1e9 / 10, int((np.diff(t_ns) > 30).sum()))
-    assert found.columns["fx"][3:] == (np.nanmin(fx), np.nanmax(fx))
-    assert found.first.equals(table.slice(0, preview.SHOWN_ROWS))
+    result = preview.summarize_stream(batches)
+    assert result == preview.summarize_stream(table)
+    assert (result.rows, result.rate_hz, result.gaps) == (1000, 1e9 / 10, int((np.diff(t_ns) > 30).sum()))
+    assert result.columns["fx"][3:] == (np.nanmin(fx), np.nanmax(fx))
+    assert result.first.equals(table.slice(0, preview.SHOWN_ROWS))
