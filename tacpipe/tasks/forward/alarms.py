@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 
 from tacpipe.arrays import AnyFloats, Int64s
-from tacpipe.signals import anticipation, holds
-from tacpipe.signals.loads import loads
+from tacpipe.signals import holds
+from tacpipe.tasks.forward import anticipation
 from tacpipe.tasks.forward.headline import BASELINE, MODEL
+from tacpipe.tasks.forward.loads import loads
 from tacpipe.tasks.forward.predictors import Predicted, Prediction
 from tacpipe.tasks.forward.tracks import Track
 

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from tacpipe.arrays import AnyFloats, Bools, Floats, Int64s, Times
-from tacpipe.signals import anticipation
-from tacpipe.signals.leads import Leads, events, leads, near, summed
-from tacpipe.signals.shear import Layout, floors, rise_and_fall
+from tacpipe.tasks.forward import anticipation
 from tacpipe.tasks.forward.alarms import WATCHED
+from tacpipe.tasks.forward.leads import Leads, events, leads, near, summed
+from tacpipe.tasks.forward.shear import Layout, floors, rise_and_fall
 from tacpipe.tasks.forward.tracks import Track
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ class Rows:
 
 @dataclass
 class SlipAlarms:
-    """The slip alarm's scores (`tacpipe.signals.shear`) of predictors, on recordings one after another."""
+    """The slip alarm's scores (`tacpipe.tasks.forward.shear`) of predictors, on recordings one after another."""
 
     layout: Layout
     floors: AnyFloats  # (skin,), of the model's training

@@ -11,7 +11,7 @@ import pyarrow as pa
 import pytest
 
 from tacpipe.arrays import AnyFloats, Bools
-from tacpipe.signals.shear import Layout
+from tacpipe.tasks.forward.shear import Layout
 from tacpipe.tasks.forward.slip_alarms import SlipAlarms
 from tacpipe.tasks.forward.slip_labels import slips_of
 from tacpipe.tasks.forward.tracks import Track

@@ -2,10 +2,10 @@
 
 Two scores. *Load*: by how much the mean count of an axis of a sensor is predicted to change within the horizon, over the
 level of that axis; the largest of all axes counts. *Slip*: how far the load along the skin is predicted to rise and then to
-fall again, as a fraction of what presses (`tacpipe.signals.shear`); one level for all sensors.
+fall again, as a fraction of what presses (`tacpipe.tasks.forward.shear`); one level for all sensors.
 
-Levels are set on validation recordings, as `tacpipe evaluate` sets its own (`tacpipe.signals.anticipation`): the least that
-gives no more than a number of false alarms an hour. An alarm of load is false where no load changes, and each axis gets its
+Levels are set on validation recordings, as `tacpipe evaluate` sets its own (`tacpipe.tasks.forward.anticipation`): the least
+that gives no more than a number of false alarms an hour. An alarm of load is false where no load changes. Each axis gets its
 part of them; one of slip is false where the object does not slip, and wherever no recording states that.
 """
 
@@ -21,8 +21,8 @@ import numpy as np
 from tacpipe.arrays import AnyFloats
 from tacpipe.errors import UsageError
 from tacpipe.sensors.live import OFF, ON, UNKNOWN
-from tacpipe.signals.loads import axes, loads
-from tacpipe.signals.shear import rise_and_fall
+from tacpipe.tasks.forward.loads import axes, loads
+from tacpipe.tasks.forward.shear import rise_and_fall
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
@@ -115,7 +115,7 @@ def _state(scores: AnyFloats, levels: AnyFloats) -> State:
 
 def set_on(changes: Loads, slipping: SlipAlarms, predictor: str, per_hour: float) -> Alarms:
     """Return alarms with levels for ``per_hour`` false alarms each, set on the recordings that were added."""
-    from tacpipe.signals import anticipation
+    from tacpipe.tasks.forward import anticipation
 
     truth, groups = np.concatenate(changes.truth), np.concatenate(changes.groups)
     places = axes(changes.layout)

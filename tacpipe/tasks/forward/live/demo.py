@@ -24,12 +24,12 @@ from tacpipe.live.preparation import free_ports
 from tacpipe.recording import rig as rigs
 from tacpipe.recording import rig_text
 from tacpipe.sensors import plan as plans
-from tacpipe.signals.leads import Leads, leads
-from tacpipe.signals.leads import events as events_of
-from tacpipe.signals.shear import shear
 from tacpipe.simulation import pick_and_move
 from tacpipe.simulation.emulation.emulator import Emulator
 from tacpipe.simulation.emulation.world import World
+from tacpipe.tasks.forward.leads import Leads, leads
+from tacpipe.tasks.forward.leads import events as events_of
+from tacpipe.tasks.forward.shear import shear
 
 GAP_PERIODS = 5.0  # periods without a forecast that break the line
 BEFORE_MS, AFTER_MS = 400.0, 150.0  # time around a slip that is drawn enlarged

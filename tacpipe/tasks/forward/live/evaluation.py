@@ -21,17 +21,16 @@ from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.live.stages import RecordingsInMemory, run_stages, streams_as_recorded
 from tacpipe.metrics import headline
 from tacpipe.plugins.stage import Result
-from tacpipe.signals import anticipation
-from tacpipe.signals.leads import Leads, events, leads
-from tacpipe.signals.loads import loads
-from tacpipe.tasks.forward import evaluation, tracks, units
+from tacpipe.tasks.forward import anticipation, evaluation, tracks, units
 from tacpipe.tasks.forward import headline as headlines
 from tacpipe.tasks.forward.forecaster import Forecaster
+from tacpipe.tasks.forward.leads import Leads, events, leads
 from tacpipe.tasks.forward.levels import Levels
 from tacpipe.tasks.forward.live import measures, replay
 from tacpipe.tasks.forward.live.alarms import NAMES, Alarms
 from tacpipe.tasks.forward.live.chain import Chain, Forecast
 from tacpipe.tasks.forward.live.measures import LIVE, LIVE_STILL, OFFLINE, STILL, Session, Sums, summed
+from tacpipe.tasks.forward.loads import loads
 from tacpipe.tasks.forward.predictors import forecasts
 from tacpipe.tasks.forward.tracks import Track
 

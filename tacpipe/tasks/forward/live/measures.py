@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tacpipe.arrays import AnyFloats, Bools, Float32s, Floats, Int64s, Times
-from tacpipe.signals import leads
-from tacpipe.signals.leads import Leads
+from tacpipe.tasks.forward import leads
+from tacpipe.tasks.forward.leads import Leads
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tacpipe.errors import TacpipeError
-from tacpipe.signals import anticipation
-from tacpipe.signals.anticipation import Anticipation
+from tacpipe.tasks.forward import anticipation
+from tacpipe.tasks.forward.anticipation import Anticipation
 
 HORIZON, RATE_HZ = 10, 50.0
 MINUTE = int(60 * RATE_HZ)
