@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from tacpipe.codecs.frame_stacking import INCREMENTS, LEVELS
+from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError
 
 if TYPE_CHECKING:
@@ -138,4 +138,4 @@ def latent_names(count: int) -> tuple[str, ...]:
 
 def description(content: Mapping[str, Any]) -> bytes:
     """Return the bytes of ``codec.json``: keys sorted, so that one codec has one content."""
-    return (json.dumps(content, indent=1, sort_keys=True) + "\n").encode()
+    return model_files.to_json(content)

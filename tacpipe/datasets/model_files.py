@@ -87,6 +87,15 @@ def tree(files: Mapping[str, bytes], name: str, needed: Mapping[str, Kind] | Non
     return found
 
 
+def to_json(tree: Mapping[str, Any]) -> bytes:
+    """Return the text of a JSON file of a model or a result: keys sorted, one per line.
+
+    >>> to_json({"b": [1], "a": None})
+    b'{\\n "a": null,\\n "b": [\\n  1\\n ]\\n}\\n'
+    """
+    return (json.dumps(tree, indent=1, sort_keys=True) + "\n").encode()
+
+
 def tensors(content: bytes, name: str) -> dict[str, torch.Tensor]:
     """Return the tensors of a safetensors file, all finite. Raises `TacpipeError` where it is none."""
     from safetensors import SafetensorError

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from tacpipe.datasets import model_files
 from tacpipe.errors import UsageError
 from tacpipe.io import progress
 from tacpipe.metrics import conformal
@@ -51,7 +51,7 @@ def calibrate(model: Mapping[str, bytes], asked: Asked, training: Dataset, calib
     config["trained_on"] = _seen(config["trained_on"], training, calibration)
     return {
         **model,
-        CONFIG: (json.dumps(config, indent=1, sort_keys=True) + "\n").encode(),
+        CONFIG: model_files.to_json(config),
         FILE: uncertainty.to_bytes(),
     }
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
@@ -11,6 +10,7 @@ import pyarrow as pa
 
 from tacpipe.arrays import Float32s, Int64s
 from tacpipe.codecs import codec as codecs
+from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError
 from tacpipe.io import progress
 from tacpipe.io.spill import Gathered, Spill
@@ -81,7 +81,7 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
         headline.FILE: headline.write(
             metrics.headline(method, trials, forecaster.horizon, units.of_model(forecaster.config))
         ),
-        "metrics.json": (json.dumps(tree, indent=1, sort_keys=True) + "\n").encode(),
+        "metrics.json": model_files.to_json(tree),
         "horizons.csv": metrics.horizons_csv(tree, forecaster.config["rate_hz"]),
         "trials.csv": metrics.trials_csv(trials),
         "errors.parquet": metrics.errors_parquet(trials, groups, forecaster.channel_scale),

@@ -20,6 +20,7 @@ from tacpipe.channels import masks
 from tacpipe.channels.pose import NAMED, Pose
 from tacpipe.codecs import codec as codecs
 from tacpipe.codecs.frame_stacking import INCREMENTS
+from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError
 from tacpipe.io.mapped import MappedArrays
 from tacpipe.models import forecasts
@@ -219,7 +220,7 @@ def _alarms(forecaster: Forecaster, part: Sequence[Track]) -> dict[str, Any]:
 
 
 def _json(config: Config) -> bytes:
-    return (json.dumps(config, indent=1, sort_keys=True) + "\n").encode()
+    return model_files.to_json(config)
 
 
 def check_codec(model: Mapping[str, bytes], recordings: Mapping[str, bytes]) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -11,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 
 from tacpipe.arrays import Bools, Float32s, Int64s
-from tacpipe.datasets import origin
+from tacpipe.datasets import model_files, origin
 from tacpipe.errors import TacpipeError
 from tacpipe.io import progress
 from tacpipe.metrics import headline
@@ -87,7 +86,7 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
     ]
     files = {
         headline.FILE: headline.write(_headlines(evaluated, classifier)),
-        "metrics.json": (json.dumps(tree, indent=1, sort_keys=True) + "\n").encode(),
+        "metrics.json": model_files.to_json(tree),
         "confusion.csv": metrics.confusion_csv(
             [sensor for sensor, _, _ in rows],
             [classifier.naming.named(one.slides.materials[[at]])[0] for _, one, at in rows],

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping
 
 import numpy as np
 from safetensors.numpy import save
 
+from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.models import transfer
 from tacpipe.models.level import Level
@@ -191,7 +191,7 @@ def packed(arrays: Mapping[str, np.ndarray]) -> bytes:
 
 def config_file(config: Config) -> bytes:
     """Return a config as a file."""
-    return (json.dumps(config, indent=1, sort_keys=True) + "\n").encode()
+    return model_files.to_json(config)
 
 
 def _files(config: Config, tensors: Arrays, baselines: Arrays) -> dict[str, bytes]:

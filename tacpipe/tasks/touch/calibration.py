@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.metrics.quantiles import check_levels
 from tacpipe.tasks.touch import grasps as grasps_of
@@ -48,4 +48,4 @@ def calibrate(model: Mapping[str, bytes], asked: Asked, training: Dataset, valid
         "grasps": len(watched),
     }
     config = {**predictor.config, "quantiles": stated, "trained_on": trained_on}
-    return {**model, CONFIG: (json.dumps(config, indent=1, sort_keys=True) + "\n").encode(), FILE: made.to_bytes()}
+    return {**model, CONFIG: model_files.to_json(config), FILE: made.to_bytes()}

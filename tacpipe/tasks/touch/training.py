@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from tacpipe.arrays import Bools, Floats
 from tacpipe.channels import biotac_sp
 from tacpipe.clouds import geometry
+from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError
 from tacpipe.models.forest import Forest
 from tacpipe.plugins import params as params_of
@@ -78,7 +79,7 @@ def train(
     if params.baselines:
         config["learned_objects"] = list(known.objects)
         files[BASELINES] = save_arrays(Baselines.of(known).tensors())
-    return {CONFIG: (json.dumps(config, indent=1, sort_keys=True) + "\n").encode(), **files}
+    return {CONFIG: model_files.to_json(config), **files}
 
 
 def _config(params: Params, targets: Sequence[str], known: Grasps, watched: Grasps | None) -> Config:

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from tacpipe.arrays import AnyFloats, Float32s, Int64s, Times
+from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.live.stages import RecordingsInMemory, run_stages, streams_as_recorded
 from tacpipe.metrics import headline
@@ -77,7 +78,7 @@ def evaluate(model: Model, recordings: Dataset) -> Result:
     added = _headline(forecaster, sessions, steps, channels)
     files = {
         **result.files,
-        "metrics.json": (json.dumps(tree, indent=1, sort_keys=True) + "\n").encode(),
+        "metrics.json": model_files.to_json(tree),
         "live.csv": measures.table(tree["live"], steps),
         headline.FILE: headline.write([*headlines_offline, *added]),
     }
