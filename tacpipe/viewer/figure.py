@@ -150,12 +150,14 @@ def _diagram(axes: Any, lanes: dict[str, list[Span]], start_ns: int) -> None:
     width_s = max(_s(span.stop_ns, start_ns) for spans in lanes.values() for span in spans)
     for place, (lane, spans) in enumerate(lanes.items()):
         colour = palette.FAULT if lane == "gaps" else palette.numbered(place)
+        bars: dict[tuple[tuple[str, str], ...], list[tuple[float, float]]] = {}  # by look, which are drawn at once
         for span in spans:
             left, width = _s(span.start_ns, start_ns), (span.stop_ns - span.start_ns) / 1e9
-            look = {"edgecolor": "white", **_look(span, colour)}
-            axes.broken_barh([(left, width)], (place - 0.35, 0.7), linewidth=0.5, **look)
+            bars.setdefault(tuple(_look(span, colour).items()), []).append((left, width))
             if width > 0.012 * width_s * len(span.text):
                 axes.text(left + width / 2, place, span.text, ha="center", va="center", fontsize=7)
+        for look, extents in bars.items():
+            axes.broken_barh(extents, (place - 0.35, 0.7), linewidth=0.5, **{"edgecolor": "white", **dict(look)})
     axes.set_yticks(range(len(lanes)), [plain(lane) for lane in lanes])
     axes.invert_yaxis()
     padded = any(span.text == PADDING for spans in lanes.values() for span in spans)
