@@ -122,16 +122,18 @@ def contacts(params: Params, recording: Recording) -> RecordingOutput:
             limits.append(_given(params, noise_thresholds(repeated, load, t_ns, params.rest_s, rows)))
         zero = tared(params.tare, next(blocks()), level, axes)
         rest |= {name: {"rest": repr(float(value))} for name, value in zip(names, zero, strict=True)}
+    stacked = np.array(loads)  # (sensor, time)
+    loads.clear()
     if params.begins == "grasped":
         intervals = np.array([[0, len(t_ns)]])
     else:
         on, off = np.array(limits).T
-        intervals = contact_intervals(np.array(loads), t_ns, on, off, params.min_s, params.merge_s, params.pad_s)
+        intervals = contact_intervals(stacked, t_ns, on, off, params.min_s, params.merge_s, params.pad_s)
     numbers = np.full(len(t_ns), -1, dtype=np.int32)
     for number, (start, stop) in enumerate(intervals):
         numbers[start:stop] = number
     field = pa.field("contact", pa.int32(), metadata={"unit": "1", "quantity": "label"})
-    largest = [float(np.nanmax(one, initial=0.0)) for one in loads]
+    largest = [float(np.nanmax(load, initial=0.0)) for load in stacked]
     notes = [] if len(intervals) else [_no_contact(params, units, limits, largest, fixed)]
 
     def mark(table: pa.Table, first: int) -> pa.Table:

@@ -98,6 +98,7 @@ def change(columns: Columns, change_rows: Callable[[pa.Table, int], pa.Table]) -
         return change_rows(columns.read(columns.column_names), 0)
 
     def changed() -> Iterator[pa.RecordBatch]:
+        release()  # the memory of what was read before
         first = 0
         for table in columns.batches(rows=SOME_ROWS):
             yield from change_rows(table, first).combine_chunks().to_batches()
