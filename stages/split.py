@@ -1,4 +1,4 @@
-"""Assign each recording a role: train, val, calibration or test.
+"""Assign roles to recordings: train, val, calibration, test.
 
 Example: tacpipe split data/segments -o data/split
 """
