@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from tacpipe.datasets.dataset import Dataset, Recording
+    from tacpipe.io.columns import Columns
 
 EARLIER_VERSIONS = {"synchronize": (2,)}  # today's stage reads their params and gives the same rows
 
@@ -53,9 +54,12 @@ class RecordingInMemory:
         """Return a stream."""
         return self.tables[stream] if columns is None else self.tables[stream].select(list(columns))
 
-    def columns(self, stream: str = "") -> pa.Table:
-        """Return a stream, whose columns are in memory already."""
-        return self.tables[stream]
+    def columns(self, stream: str = "") -> Columns:
+        """Return the columns of a stream, as those of a stored recording."""
+        from tacpipe.io.columns import Columns
+        from tacpipe.io.parquet import to_parquet
+
+        return Columns(to_parquet(self.tables[stream]))
 
 
 @dataclass(frozen=True)
