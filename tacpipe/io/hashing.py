@@ -45,7 +45,7 @@ def parts(value: Any) -> Iterator[bytes]:
         within[name] = one
         return name
 
-    text = _canonical(value, named)
+    text = _canonical(value, _encoder(named))
     for found in re.split("|".join(f'"({name})"' for name in within), text) if within else [text]:
         if found in within:
             yield from within[found].written()
@@ -62,7 +62,7 @@ def canonical(value: Any) -> bytes:
     b'{"a":[1.5,null],"b":1}'
     """
     try:
-        return _canonical(value, _refused).encode()
+        return _canonical(value, _PLAIN).encode()
     except _WithinError:
         return b"".join(parts(value))
 
@@ -73,11 +73,18 @@ def _refused(one: Any) -> str:
     raise TypeError(f"Object of type {type(one).__name__} is not JSON serializable")
 
 
-def _canonical(value: Any, default: Callable[[Any], str]) -> str:
+def _encoder(default: Callable[[Any], str]) -> json.JSONEncoder:
+    return json.JSONEncoder(sort_keys=True, separators=(",", ":"), allow_nan=False, default=default)
+
+
+_PLAIN = _encoder(_refused)  # made once: a dataset has a digest per recording
+
+
+def _canonical(value: Any, encoder: json.JSONEncoder) -> str:
     try:
-        text = json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False, default=default)
+        text = encoder.encode(value)
         if "\\ud" in text:  # beyond 16 bits, or half a character, of which two would read as a whole one
-            json.dumps(value, ensure_ascii=False, default=default).encode()
+            json.dumps(value, ensure_ascii=False, default=encoder.default).encode()
         return text
     except (TypeError, ValueError, RecursionError) as error:
         raise TacpipeError(
@@ -92,7 +99,7 @@ def digest(value: Any) -> str:
     '44136fa3'
     """
     try:
-        return hashlib.sha256(_canonical(value, _refused).encode()).hexdigest()
+        return hashlib.sha256(_canonical(value, _PLAIN).encode()).hexdigest()
     except _WithinError:
         found = hashlib.sha256()
         for part in parts(value):
