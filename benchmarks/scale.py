@@ -90,7 +90,7 @@ class Lab:
                 made = {"recordings": {"": {**result["recordings"][""], "shards": shards}}, "files": {}}
                 self.store.commit(task.identity, made, provenance)
         manifest = replace(self._made, recordings=self.entries)
-        self.store.put(manifest.content)
+        manifest.keep(self.store)
         directory.publish(self.store, manifest, self.folder / "recordings")
 
     def list_alone(self, count: int) -> None:
@@ -108,7 +108,7 @@ class Lab:
                 else {"datasets": [{"dataset": self._listed[0], "manifest": self._listed[1]}]}
             )
             listed = replace(found, recordings=entries, inputs=inputs)
-            self._listed = listed.digest, self.store.put(listed.content).digest
+            self._listed = listed.digest, listed.keep(self.store).digest
             self.store.roots.set(self.folder / place, self._listed[1])
             (self.folder / place / NAME).write_bytes(listed.content)
 

@@ -20,7 +20,7 @@ import pytest
 from hypothesis import settings
 
 from tacpipe.cli import main
-from tacpipe.datasets.manifest import Manifest, parse
+from tacpipe.datasets.manifest import Manifest, find
 from tacpipe.plugins import architectures, registry
 from tacpipe.store.store import Store
 
@@ -130,7 +130,7 @@ class Lab:
 
     def manifest(self, path: str) -> Manifest:
         """Return the manifest of a dataset."""
-        return parse((self.folder / path / "manifest.json").read_bytes(), path)
+        return find(self.folder / path).manifest
 
     @property
     def store(self) -> Store:

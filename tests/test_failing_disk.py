@@ -166,7 +166,7 @@ def opening(store: Store, folder: Path) -> dict[str, Callable[[], Any]]:
         "checkout.known": lambda: checkout.known(store),
         "garbage.live": lambda: garbage.live(store),
         "pushed.lasting": lambda: pushed.lasting(store, root["manifest"]),
-        "unnamed.kept": lambda: unnamed.kept(objects, ()),
+        "unnamed.kept": lambda: unnamed.kept(store, objects, ()),
         "manifest.find": lambda: manifest.find(folder / "data/s"),
         "adoption.beside": lambda: adoption.beside("ab" * 32, "manifest.json", (str(folder / "data/s"),)),
         "leases.runs": lambda: store.leases.runs(),

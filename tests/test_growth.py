@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 import tacpipe
-from tacpipe.datasets import directory, groups, manifest, page_text, pages
+from tacpipe.datasets import directory, manifest, pages
 from tacpipe.errors import DamagedError
 from tacpipe.store.store import Store
 from tests.conftest import Lab
@@ -52,7 +49,7 @@ def test_one_more_recording_reads_the_records_of_its_group_and_places_its_own_fi
     lab.run(f"simulate toy --rows 2 --trials {COUNT} -o data/toy")
     lab.run("scale data/toy -o data/scaled --jobs 1")
     names = list(tacpipe.open(lab.folder / "data/toy").recordings)
-    sizes = [len(group) for group in groups.of_names(names)]
+    sizes = [len(group) for group in pages.group_names(names)]
     assert max(sizes) < COUNT / 2
     before = {path: path.stat().st_ino for path in (lab.folder / "data/toy").rglob("*.parquet")}
 
@@ -121,26 +118,6 @@ def test_the_provenance_of_a_group_keeps_what_its_stage_noted(lab: Lab) -> None:
 
     assert group["provenance"]["code"] == {"scale": {singles[0]["provenance"]["code"]: 3}}
     assert set(group["result"]["recordings"]) == {"trial-000", "trial-001", "trial-002"}
-
-
-VALUES = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(),
-    lambda inner: st.lists(inner) | st.tuples(inner, inner) | st.dictionaries(st.text(), inner),
-    max_leaves=20,
-)
-
-
-@given(VALUES)
-def test_a_manifest_is_indented_as_the_standard_library_does(value: Any) -> None:
-    assert page_text.indented(value) == json.dumps(value, sort_keys=True, indent=1, allow_nan=False)
-
-
-def test_what_json_cannot_hold_is_refused_as_by_the_standard_library() -> None:
-    for value in ({"a": float("nan")}, [float("inf")], {"a": {1: 2, "b": 3}}, {"a": object()}):
-        with pytest.raises((ValueError, TypeError)) as expected:
-            json.dumps(value, sort_keys=True, indent=1, allow_nan=False)
-        with pytest.raises(expected.type):
-            page_text.indented(value)
 
 
 def test_a_manifest_that_was_edited_is_refused_though_the_sound_one_was_read(lab: Lab) -> None:

@@ -1,23 +1,25 @@
-"""Recordings of a manifest that are kept as its text: what they give is what all of it parsed at once gives."""
+"""Datasets whose manifest lists pages: they hold what a manifest that holds the recordings itself does."""
 
 from __future__ import annotations
 
 import json
+import os
 import pickle
-import tracemalloc
+import shutil
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import example, given
+from hypothesis import given
 from hypothesis import strategies as st
 
 import tacpipe
-from tacpipe.datasets import manifest, page_text, pages
-from tacpipe.datasets.dataset_digest import DatasetDigest
-from tacpipe.datasets.described import Described
+from tacpipe.datasets import manifest, pages
 from tacpipe.datasets.manifest import Manifest
+from tacpipe.datasets.pages import Item, Page, Pages
 from tacpipe.engine import keys
-from tacpipe.errors import DamagedError, TacpipeError
+from tacpipe.errors import DAMAGED, DamagedError, TacpipeError
 from tacpipe.io import hashing
 from tests.conftest import Lab
 from tests.promises.test_hostile_manifest import HOSTILE
@@ -33,266 +35,313 @@ ENTRIES = st.fixed_dictionaries(
         "shards": st.dictionaries(NAMES, SHARDS, max_size=2),
     }
 )
-MANY = st.dictionaries(NAMES, ENTRIES, min_size=1, max_size=12)
-COLON = {
-    ": ": {"attributes": {": ": ": "}, "shards": {}},
-    "a": {"attributes": {"b ": ": c"}, "shards": {}},
-}  # as after a name
+LABELS = st.none() | st.dictionaries(st.text(max_size=3), VALUES, min_size=1, max_size=2)
+ITEMS = st.builds(Item, ENTRIES, LABELS, st.none() | st.just({"raw": "0" * 64}))
+MANY = st.dictionaries(NAMES, ITEMS, min_size=2, max_size=12)
+FILES = {"a": {"digest": "0" * 64, "bytes": 1}}
+
+
+def of_items(items: dict[str, Item]) -> Manifest:
+    """Return a manifest that was not divided into pages before."""
+    return Manifest(
+        "stage",
+        1,
+        files=FILES,
+        recordings={name: item.entry for name, item in items.items()},
+        labels={name: item.labels for name, item in items.items() if item.labels is not None},
+        sources={name: item.sources for name, item in items.items() if item.sources is not None},
+    )
+
+
+class Objects:
+    """Reads pages from memory."""
+
+    def __init__(self, content: dict[str, bytes]) -> None:
+        self.content, self.place, self.reads = content, "memory", 0
+
+    def __call__(self, page: Page) -> bytes:
+        self.reads += 1
+        return self.content[page.digest]
+
+
+def read_again(whole: Manifest) -> tuple[Manifest, Objects]:
+    """Return a manifest as another process reads it, and its pages."""
+    assert whole.pages is not None
+    objects = Objects(dict(whole.pages.fresh))
+    manifest._parsed.clear()
+    return manifest.parse(whole.content, "manifest", objects), objects
 
 
 @pytest.fixture
 def few_are_many(monkeypatch: pytest.MonkeyPatch) -> None:
-    """All recordings are kept as text, two a page in the mean."""
-    monkeypatch.setattr(pages, "LARGE", 0)
-    monkeypatch.setattr(pages, "MANY", 1)
+    """All datasets of two recordings and more have pages, with two recordings in the mean."""
+    monkeypatch.setattr(pages, "INLINE", 1)
     monkeypatch.setattr(pages, "GROUPED", 2)
     monkeypatch.setattr(manifest, "_parsed", {})
 
 
-def paged(whole: Manifest, grouped: int) -> Manifest:
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(pages, "LARGE", 1 << 20)
-        patched.setattr(pages, "GROUPED", grouped)
-        value = pages.split(whole.content, "given")
-    assert value is not None
-    assert isinstance(value["recordings"], pages.Pages)
-    del value["format"], value["digest"]
-    return Manifest(**value)
+def divided(grouped: int) -> pytest.MonkeyPatch:
+    patched = pytest.MonkeyPatch()
+    patched.setattr(pages, "INLINE", 1)
+    patched.setattr(pages, "GROUPED", grouped)
+    return patched
+
+
+def test_a_dataset_of_a_thousand_recordings_has_the_manifest_that_it_always_had() -> None:
+    entry = {"attributes": {}, "shards": {"": {"digest": "0" * 64, "rows": 1, "bytes": 1}}}
+    few, many = ({f"r{number:05d}": entry for number in range(count)} for count in (1000, 1001))
+
+    value = json.loads(Manifest("stage", 1, recordings=few).content)
+    assert value["format"] == 1
+    assert value["recordings"] == few
+    assert Manifest("stage", 1, recordings=few).content == (json.dumps(value, sort_keys=True, indent=1) + "\n").encode()
+    root = json.loads(Manifest("stage", 1, recordings=many).content)
+    assert root["format"] == 2
+    assert "recordings" not in root
+    assert sum(page["recordings"] for page in root["pages"]) == 1001
 
 
 @given(MANY, st.integers(1, 5))
-def test_a_manifest_in_pages_holds_what_it_holds_parsed_at_once(recordings: dict[str, Any], grouped: int) -> None:
-    whole = Manifest("stage", 1, recordings=recordings, files={"a": {"digest": "0" * 64, "bytes": 1}})
-    found = paged(whole, grouped)
+def test_a_manifest_that_lists_pages_holds_what_it_was_made_of(items: dict[str, Item], grouped: int) -> None:
+    with divided(grouped).context():
+        whole = of_items(items)
+        found, _ = read_again(whole)
 
-    assert (
-        list(found.recordings.items())
-        == sorted(recordings.items())
-        == list(zip(found.recordings, found.recordings.values(), strict=True))
-    )
-    assert len(found.recordings) == len(recordings)
-    assert all(found.recordings[name] == entry for name, entry in recordings.items())
-    assert found.recordings.get("not there/") is None
-    assert (found.digest, found.content, found.rows) == (whole.digest, whole.content, whole.rows)
-    assert sorted(found.contents()) == sorted(whole.contents())
-    assert found.included == whole.included
-    assert pickle.loads(pickle.dumps(found.recordings)) == recordings
+        assert dict(found.recordings) == whole.recordings
+        assert list(found.recordings) == sorted(items)
+        assert dict(found.labels) == whole.labels
+        assert dict(found.sources) == whole.sources
+        assert found.recordings.get("not there/") is None
+        assert (found.digest, found.rows, found.shard_bytes) == (whole.digest, whole.rows, whole.shard_bytes)
+        shards = [(path, name, size) for path, name, size in found.contents() if not path.startswith("page-")]
+        assert sorted(shards) == sorted((p, n, s) for p, n, s in whole.contents() if not p.startswith("page-"))
+        assert dict(found.included) == {
+            name: item.entry for name, item in items.items() if not item.entry["attributes"].get("excluded")
+        }
+        assert pickle.loads(pickle.dumps(found.recordings)) == whole.recordings
+        again = Manifest("stage", 1, files=FILES, recordings=dict(found.recordings), labels=found.labels)
+        assert again.digest == found.digest  # how the recordings came together does not count
 
 
-@given(MANY, ENTRIES, st.integers(1, 5), st.data())
-def test_what_is_changed_in_pages_is_what_is_changed_in_a_mapping(
-    recordings: dict[str, Any], entry: Any, grouped: int, data: st.DataObject
+@given(MANY, st.data(), st.integers(1, 5))
+def test_recordings_that_come_change_or_go_give_the_pages_of_a_dataset_made_at_once(
+    items: dict[str, Item], data: st.DataObject, grouped: int
 ) -> None:
-    whole = Manifest("stage", 1, recordings=recordings)
-    some = data.draw(st.dictionaries(st.sampled_from(sorted(recordings)), st.none() | st.just(entry)))
-    found = pages.changed(paged(whole, grouped).recordings, some)
+    with divided(grouped).context():
+        found, _ = read_again(of_items(items))
+        changes = data.draw(st.dictionaries(st.sampled_from(sorted(items)) | NAMES, st.none() | ITEMS, max_size=5))
+        expected = {name: item for name, item in {**items, **changes}.items() if item is not None}
+        changed = found.with_recordings(changes)
 
-    expected = {**recordings, **some}
-    expected = {name: one for name, one in expected.items() if one is not None}
-    assert dict(found) == pages.changed(recordings, some) == expected
-    assert len(found) == len(expected)
-    assert Manifest("stage", 1, recordings=found).content == Manifest("stage", 1, recordings=expected).content
+        assert dict(changed.recordings) == {name: item.entry for name, item in expected.items()}
+        assert changed.content == of_items(dict(sorted(expected.items()))).content
 
 
-@pytest.mark.usefixtures("few_are_many")
-@pytest.mark.parametrize("case", HOSTILE)
-def test_a_hostile_manifest_is_refused_in_pages_as_it_is_parsed_at_once(case: str) -> None:
+@given(MANY, st.integers(1, 5))
+def test_a_key_over_a_dataset_in_pages_is_that_of_its_recordings(items: dict[str, Item], grouped: int) -> None:
+    with divided(grouped).context():
+        found, _ = read_again(of_items(items))
+        value = keys.of_dataset(found, None, found.included)
+    plain = {name: keys.of_recording(item.entry, None) for name, item in sorted(items.items())}
+    included = {name: entry for name, entry in plain.items() if not entry["attributes"].get("excluded")}
+    assert hashing.digest(value) == hashing.digest({**value, "recordings": included})
+
+
+def test_one_changed_recording_reads_and_writes_one_page(few_are_many: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pages, "GROUPED", 16)
+    shard = {"digest": "0" * 64, "rows": 1, "bytes": 1}
+    whole = of_items({f"r{number:04d}": Item({"attributes": {}, "shards": {"": shard}}) for number in range(400)})
+    found, objects = read_again(whole)
+    changed = found.labelled({"r0123": {"material": "felt"}})
+    assert changed.pages is not None
+    assert len(changed.content) > 0
+    assert objects.reads == 1
+    assert len(changed.pages.fresh) == 1
+
+
+ROOT_CHANGES: dict[str, Callable[[dict[str, Any]], object]] = {
+    "a page of another order": lambda root: root["pages"].reverse(),
+    "a page twice": lambda root: root["pages"].append(root["pages"][-1]),
+    "no digest": lambda root: root["pages"][0].update(digest="../../x"),
+    "a negative size": lambda root: root["pages"][0].update(bytes=-1),
+    "no first name": lambda root: root["pages"][0].update(first=None),
+    "no recording": lambda root: root["pages"][0].update(recordings=0),
+    "unknown counts": lambda root: root["pages"][0].update(more=1),
+    "no list": lambda root: root.update(pages={}),
+    "recordings too": lambda root: root.update(recordings={}),
+    "another content": lambda root: root["pages"][0].update(content="0" * 64),
+    "a newer format": lambda root: root.update(format=3),
+    "few recordings": lambda root: root.update(pages=[]),
+}
+
+
+@pytest.mark.parametrize("change", ROOT_CHANGES)
+def test_a_root_that_none_can_be_is_refused_before_a_page_is_read(few_are_many: None, change: str) -> None:
+    shard = {"digest": "0" * 64, "rows": 1, "bytes": 1}
+    whole = of_items({f"r{number}": Item({"attributes": {}, "shards": {"": shard}}) for number in range(9)})
+    root = json.loads(whole.content)
+    ROOT_CHANGES[change](root)
     with pytest.raises(TacpipeError):
-        manifest.parse(HOSTILE[case], "given")
+        manifest.parse(json.dumps(root).encode(), "given", Objects({}))
 
 
-SHARD = {"digest": "0" * 64, "rows": 1, "bytes": 1}
-ENTRY = {"attributes": {}, "shards": {"": SHARD}}
-
-
-def reordered(text: str) -> str:
-    lines = text.split("\n")
-    first, second = (next(place for place, line in enumerate(lines) if line.startswith(f'  "{name}"')) for name in "ab")
-    lines[first], lines[second] = lines[second], lines[first]
-    return "\n".join(lines)
-
-
-@pytest.mark.usefixtures("few_are_many")
-@pytest.mark.parametrize(
-    "other",
-    [
-        lambda text: json.dumps(json.loads(text)),
-        lambda text: json.dumps(json.loads(text), indent=2),
-        lambda text: text.replace('"a"', '"\\u0061"'),
-        lambda text: text.replace("\n", "\n\n"),
-        reordered,
-        lambda text: text.replace('\n  "b": {', '\n  "a": {'),  # two of one name
-        lambda text: text.replace('\n  "b": {', '\n  "b": {}, "c": {'),
-    ],
-)
-def test_a_manifest_that_another_program_wrote_is_what_json_makes_of_it(other: Any) -> None:
-    text = Manifest("stage", 1, recordings=dict.fromkeys("abcd", ENTRY)).content.decode()
-    assert isinstance(manifest.parse(text.encode(), "ours").recordings, pages.Pages)
-    given = other(text)
-    recordings = json.loads(given)["recordings"]
+@pytest.mark.parametrize("case", HOSTILE)
+def test_a_page_that_holds_what_no_manifest_can_is_refused_when_it_is_read(few_are_many: None, case: str) -> None:
     try:
-        found = manifest.parse(given.encode(), "given").recordings
-    except DamagedError:
-        with pytest.MonkeyPatch.context() as patched:
-            patched.setattr(pages, "LARGE", 1 << 30)
-            with pytest.raises(DamagedError):
-                manifest.parse(given.encode(), "given")
+        entries = json.loads(HOSTILE[case])["recordings"]
+        stored = hashing.canonical({"labels": {}, "recordings": entries, "sources": {}})
+        manifest.check(Manifest("stage", 1, recordings=entries))
+    except (ValueError, TypeError, KeyError, AttributeError, TacpipeError, RecursionError):
+        pass
     else:
-        assert found == recordings
-
-
-def test_two_recordings_on_two_pages_that_name_one_path_are_refused(few_are_many: None) -> None:
-    between = {f"a-{number:03d}": ENTRY for number in range(20)}
-    recordings = {"a": {"attributes": {}, "shards": {"b": SHARD}}, **between, "a/b": ENTRY}
-    with pytest.raises(DamagedError):
-        manifest.parse(Manifest("stage", 1, recordings=recordings).content, "given")
-
-
-def test_a_large_manifest_takes_little_more_memory_than_its_text(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pages, "LARGE", 1 << 18)
-    monkeypatch.setattr(pages, "GROUPED", 20)
-    attributes = {"material": "felt", "sensor": "xela-uskin", "speed_m_s": 0.25}
-    entries = {f"trial-{number:06d}": {"attributes": attributes, "shards": {"": SHARD}} for number in range(2_000)}
-    content = Manifest("stage", 1, recordings=entries).content
-    assert len(content) > pages.LARGE
-    entries.clear()
-    tracemalloc.start()
+        return  # what is hostile is not in its recordings
     try:
-        found = manifest.parse(content, "given")
-        assert sum(size for _, size in found.sizes()) == 2_000
-        peak = tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
-    assert peak < len(content)
+        page = Page(next(iter(entries)), hashing.bytes_digest(stored), len(stored), "0" * 64, len(entries), 1, 1)
+        found = Pages([page], Objects({page.digest: stored}), {})
+    except (TypeError, AttributeError, UnboundLocalError, StopIteration):
+        return
+    with pytest.raises(DamagedError):
+        found.load(0)
+
+
+@pytest.mark.parametrize("field", ["first", "content", "recordings", "rows", "shard_bytes", "labelled", "excluded"])
+def test_a_page_that_is_not_what_its_root_states_is_refused(few_are_many: None, field: str) -> None:
+    shard = {"digest": "0" * 64, "rows": 1, "bytes": 1}
+    whole = of_items({f"r{number}": Item({"attributes": {}, "shards": {"": shard}}) for number in range(9)})
+    assert whole.pages is not None
+    value = whole.pages.pages[0].to_json()
+    value[field] = value.get(field, 0) + 1 if field not in ("first", "content") else "a" * 64
+    found = Pages([Page.from_json(value)], Objects(dict(whole.pages.fresh)), {})
+    with pytest.raises(DamagedError):
+        found.load(0)
+
+
+def large(lab: Lab, count: int = 9) -> Pages:
+    """Make data/r and data/s of it, whose manifests list pages, and return the pages of data/r."""
+    lab.run(f"simulate toy --rows 3 --trials {count} -o data/r --jobs 1")
+    lab.run("scale data/r -o data/s --jobs 1")
+    found = tacpipe.open(lab.folder / "data/r").source.pages
+    assert found is not None and len(found) > 1
+    return found
 
 
 @pytest.mark.usefixtures("few_are_many")
-def test_stages_give_the_same_datasets_where_recordings_are_kept_as_text(
+def test_a_damaged_page_costs_its_page_and_the_copy_in_the_directory_replaces_it(lab: Lab) -> None:
+    page = large(lab).pages[0]
+    path = Path(lab.store.object_path(page.digest))
+    path.chmod(0o644)
+    path.write_bytes(b"{}")
+    manifest._parsed.clear()
+    assert len(list(tacpipe.open(lab.folder / "data/r"))) == 9
+    assert hashing.file_digest(path) == page.digest
+
+
+@pytest.mark.usefixtures("few_are_many")
+def test_a_missing_page_is_an_error_that_says_so_and_the_other_pages_are_read(lab: Lab) -> None:
+    page, *_, last = large(lab).pages
+    Path(lab.store.object_path(page.digest)).unlink()
+    (lab.folder / "data/r" / page.path).unlink()
+    manifest._parsed.clear()
+    opened = tacpipe.open(lab.folder / "data/r")
+    assert opened[last.first].table("left").num_rows == 3
+    with pytest.raises(DamagedError, match="page of the manifest"):
+        list(opened)
+    for command in ("show data/r", "scale data/r -o data/t --factor 5 --jobs 1", "store gc"):
+        ran = lab.call(command)
+        assert (ran.code, page.digest[:12] in ran.err) == (DAMAGED, True), (command, ran.err)
+
+
+@pytest.mark.usefixtures("few_are_many")
+def test_a_missing_page_of_a_result_is_made_again_by_its_stage(lab: Lab) -> None:
+    large(lab)
+    found = tacpipe.open(lab.folder / "data/s").source
+    before = found.content
+    assert found.pages is not None
+    for page in found.pages.pages:
+        Path(lab.store.object_path(page.digest)).unlink()
+        (lab.folder / "data/s" / page.path).unlink()
+    manifest._parsed.clear()
+    assert "0 ran, 9 reused" in lab.run("scale data/r -o data/s --jobs 1").err
+    assert (lab.folder / "data/s/manifest.json").read_bytes() == before
+    lab.run("store verify")
+    assert len(list(tacpipe.open(lab.folder / "data/s"))) == 9
+
+
+@pytest.mark.usefixtures("few_are_many")
+def test_collections_keep_pages_of_labels_even_where_no_manifest_names_them(lab: Lab) -> None:
+    large(lab)
+    lab.run("label data/r trial-003 --set material=felt")
+    manifest._parsed.clear()
+    found = tacpipe.open(lab.folder / "data/r").source
+    assert found.pages is not None
+    labelled = next(page for page in found.pages.pages if page.labelled)
+    for path in (lab.folder / ".tacpipe").rglob("*"):
+        if path.is_file():
+            os.utime(path, (1, 1))  # what was written just now is left alone
+    shutil.rmtree(lab.folder / "data/r")
+    for folder in ("roots", "records"):
+        shutil.rmtree(lab.folder / ".tacpipe" / folder)
+        (lab.folder / ".tacpipe" / folder).mkdir()
+    Path(lab.store.object_path(found.content_digest)).unlink()
+    lab.run("store gc --grace-days 0")
+    assert lab.store.has(labelled.digest)
+    shards = shards_of(pages.PageContent.from_bytes(lab.store.read(labelled.digest)))
+    assert all(lab.store.has(name) for name in shards)
+    unlabelled = [page.digest for page in found.pages.pages if not page.labelled]
+    assert not any(lab.store.has(name) for name in unlabelled)
+
+
+def shards_of(content: pages.PageContent) -> list[str]:
+    return [shard["digest"] for entry in content.recordings.values() for shard in entry["shards"].values()]
+
+
+@pytest.mark.usefixtures("few_are_many")
+def test_a_dataset_in_pages_is_pushed_pulled_and_checked_out(
+    lab: Lab, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    large(lab)
+    lab.run("label data/r trial-003 --set material=felt")
+    remote = tmp_path_factory.mktemp("remote") / "store"
+    lab.run(f"store push {remote} data/r data/s")
+    content = {name: (lab.folder / name / "manifest.json").read_bytes() for name in ("data/r", "data/s")}
+    other = tmp_path_factory.mktemp("other")
+    (other / ".tacpipe").mkdir()
+    monkeypatch.chdir(other)
+    manifest._parsed.clear()
+    (other / "data/r").mkdir(parents=True)
+    (other / "data/r/manifest.json").write_bytes(content["data/r"])  # as git or DVC brings it
+    ran = lab.call("scale data/r -o data/s --jobs 1")
+    assert ran.code == DAMAGED and "store pull" in ran.err
+    lab.run(f"store pull {remote} data/r")
+    manifest._parsed.clear()
+    opened = tacpipe.open(other / "data/r")
+    assert opened["trial-003"].attributes["material"] == "felt"
+    assert all(recording.table("left").num_rows == 3 for recording in opened)
+    shutil.rmtree(other / "data/r")
+    manifest._parsed.clear()
+    lab.run(f"store checkout {hashing.bytes_digest(content['data/s'])} --store {remote} -o data/s")
+    assert (other / "data/s/manifest.json").read_bytes() == content["data/s"]
+    lab.run("store verify")
+
+
+@pytest.mark.usefixtures("few_are_many")
+def test_a_dataset_of_an_older_manifest_is_read_extended_and_then_lists_pages(
     lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def chain(place: str) -> list[str]:
-        lab.run(f"simulate toy --rows 2 --trials 12 -o {place}/toy --jobs 1")
-        lab.run(f"scale {place}/toy -o {place}/scaled --jobs 1")
-        lab.run(f"label {place}/toy trial-003 --set material=felt")
-        lab.run(f"label {place}/toy trial-007 --exclude dropped")
-        lab.run(f"simulate toy --rows 2 --trials 13 -o {place}/toy --jobs 1")
-        ran = lab.run(f"scale {place}/toy -o {place}/scaled --jobs 1 --json")
-        assert '"ran": 1,' in ran.out or place == "second"
-        assert "0 ran" in lab.run(f"scale {place}/toy -o {place}/scaled --jobs 1").err
-        assert not (lab.folder / place / "scaled/trial-007.parquet").exists()
-        opened = tacpipe.open(lab.folder / place / "scaled")
-        assert opened["trial-003"].attributes["material"] == "felt"
-        assert len(opened) == 12
-        return [opened.digest, tacpipe.open(lab.folder / place / "toy").digest]
-
-    text = chain("first")
-    assert isinstance(tacpipe.open(lab.folder / "first/scaled").source.recordings, pages.Pages)
-    monkeypatch.undo()
-    monkeypatch.chdir(lab.folder)
-    assert chain("second") == text
-
-
-@pytest.mark.usefixtures("few_are_many")
-def test_a_dataset_in_pages_opens_its_recordings_when_they_are_asked_for(lab: Lab) -> None:
-    lab.run("simulate toy --rows 2 --trials 9 -o data/toy")
-    lab.run("label data/toy trial-002 --exclude dropped")
-    opened = tacpipe.open(lab.folder / "data/toy")
-    names = [f"trial-{number:03d}" for number in range(9) if number != 2]
-
-    assert list(opened.recordings) == [one.name for one in opened] == names
-    assert (len(opened), "trial-002" in opened, "trial-003" in opened) == (8, False, True)
-    with pytest.raises(tacpipe.UsageError):
-        opened["trial-002"]
-    some = opened.only(["trial-007", "trial-001"])
-    assert [one.name for one in some] == ["trial-001", "trial-007"]
-    assert some["trial-001"].table("left").equals(opened.recordings["trial-001"].table("left"))
-    copied = pickle.loads(pickle.dumps(some))
-    assert copied.to_pandas("left").equals(some.to_pandas("left"))
-    assert [one.name for one in opened.select(trial=lambda trial: trial > 6)] == ["trial-007", "trial-008"]
-
-
-@given(MANY, st.integers(1, 5))
-def test_the_size_of_a_shard_is_found_by_its_path(recordings: dict[str, Any], grouped: int) -> None:
-    whole = Manifest("stage", 1, recordings=recordings, files={"a/b": {"digest": "0" * 64, "bytes": 7}})
-    found = paged(whole, grouped)
-    for path, name, size in whole.contents():
-        assert found.size_of(name, path) == whole.size_of(name, path) == size
-        assert found.size_of("1" * 64, path) is None
-    assert whole.size_of("0" * 64, "not/there") is None
-
-
-@given(MANY, st.integers(1, 5))
-@example(COLON, 1)
-def test_what_a_digest_is_made_of_is_the_same_of_text_as_of_what_was_parsed(
-    recordings: dict[str, Any], grouped: int
-) -> None:
-    whole = Manifest("stage", 1, recordings=recordings)
-    found = paged(whole, grouped).recordings
-    assert isinstance(found, pages.Pages)
-    by_text, by_value = DatasetDigest({}), DatasetDigest({})
-    for number, text in enumerate(found.texts):
-        described = page_text.described(text)
-        part = found.part(number)
-        if described is None:
-            assert b'\\": ' in bytes(text) or b' ": ' in bytes(text)
-            by_text.add(part)
-        else:
-            by_text.add_described(described)
-        by_value.add(part)
-    assert by_text.digest() == by_value.digest() == whole.digest
-
-
-@given(MANY, st.dictionaries(NAMES, st.none() | ENTRIES, max_size=4), st.integers(1, 5))
-def test_what_differs_between_two_datasets_in_pages_is_what_differs_between_two_mappings(
-    recordings: dict[str, Any], other: dict[str, Any], grouped: int
-) -> None:
-    after = {name: one for name, one in {**recordings, **other}.items() if one is not None}
-    before, now = (
-        paged(Manifest("stage", 1, recordings=some), grouped).recordings if some else some
-        for some in (recordings, after)
-    )
-    unlike = {name: (old, new) for name, old, new in pages.beside(*pages.differing(before, now)) if old != new}
-    expected = {name for name in {*recordings, *after} if recordings.get(name) != after.get(name)}
-    assert set(unlike) == expected
-    assert all(unlike[name] == (recordings.get(name), after.get(name)) for name in expected)
-
-
-def test_one_more_recording_leaves_all_pages_but_its_own_as_they_were() -> None:
-    recordings = {f"trial-{number:05d}": ENTRY for number in range(3_000)}
-    before, now = (
-        paged(Manifest("stage", 1, recordings=some), pages.GROUPED).recordings
-        for some in (recordings, {**recordings, "trial-01500-again": ENTRY})
-    )
-    assert isinstance(before, pages.Pages) and isinstance(now, pages.Pages)
-    assert len(before.texts) > 4
-    assert len(now.texts) - len(pages.shared(before, now)) <= 2
-
-
-@given(MANY, st.sampled_from([None, ("*",)]), st.integers(1, 5))
-@example(COLON, None, 1)
-def test_a_key_made_of_text_is_the_key_made_of_what_was_parsed(
-    recordings: dict[str, Any], reads: tuple[str, ...] | None, grouped: int
-) -> None:
-    whole = Manifest("stage", 1, recordings=recordings)
-    found = paged(whole, grouped)
-    assert found.digest == whole.digest
-    by_value = keys.of_dataset(whole, reads, whole.included)
-    if not whole.included:
-        return
-    by_text = keys.of_dataset(found, reads, found.included)
-    kept = by_text["recordings"]
-    assert isinstance(kept, Described)
-    assert hashing.canonical({"b": by_text, "a": 1}) == hashing.canonical({"b": by_value, "a": 1})
-    assert hashing.digest(by_text) == hashing.digest(by_value)
-    assert dict(kept) == by_value["recordings"]
-    assert dict(pickle.loads(pickle.dumps(kept))) == by_value["recordings"]
-
-
-def test_of_text_that_tacpipe_would_not_write_a_key_is_made_of_what_was_parsed(few_are_many: None) -> None:
-    whole = Manifest("stage", 1, recordings={name: {**ENTRY, "attributes": {"n": 1.5}} for name in "abcdef"})
-    content = whole.content.replace(b'"n": 1.5', b'"n": 1.50', 1)
-    found = manifest.parse(content, "given")
-    assert found.digest == whole.digest and isinstance(found.recordings, pages.Pages)
-    by_text, by_value = (keys.of_dataset(one, None, one.included) for one in (found, whole))
-    assert not isinstance(by_text["recordings"], Described)
-    assert hashing.digest(by_text) == hashing.digest(by_value)
+    monkeypatch.setattr(pages, "INLINE", 1000)
+    lab.run("simulate toy --rows 3 --trials 9 -o data/r --jobs 1")
+    lab.run("scale data/r -o data/s --jobs 1")
+    monkeypatch.setattr(pages, "INLINE", 1)
+    manifest._parsed.clear()
+    assert "0 ran, 9 reused" in lab.run("scale data/r -o data/s --jobs 1").err
+    assert json.loads((lab.folder / "data/s/manifest.json").read_bytes())["format"] == 1
+    lab.run("label data/r trial-003 --set material=felt")
+    assert json.loads((lab.folder / "data/r/manifest.json").read_bytes())["format"] == 2
+    lab.run("explain data/s")
+    lab.run("simulate toy --rows 3 --trials 10 -o data/r --jobs 1")
+    ran = lab.run("scale data/r -o data/s --jobs 1")
+    assert json.loads((lab.folder / "data/s/manifest.json").read_bytes())["format"] == 2
+    assert "9 reused" in ran.err
+    assert tacpipe.open(lab.folder / "data/r")["trial-003"].attributes["material"] == "felt"
+    lab.run("store verify")
+    lab.run("store gc --dry-run")

@@ -31,8 +31,7 @@ def shows(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Path]]:
 
     monkeypatch.setattr(directory, "showing", looked)
     monkeypatch.setattr(presence.Look, "_clock_ns", lambda self: clock_ns(self) + DAY_NS)
-    monkeypatch.setattr(pages, "LARGE", 0)
-    monkeypatch.setattr(pages, "MANY", 1)
+    monkeypatch.setattr(pages, "INLINE", 1)
     monkeypatch.setattr(pages, "GROUPED", 2)
     monkeypatch.setattr(manifest, "_parsed", {})
     yield asked
@@ -299,12 +298,3 @@ def test_a_store_that_cannot_be_written_is_a_hit_all_the_same(noted: Lab, monkey
 
     monkeypatch.setattr(notes, "write", refused)
     assert '"reused": 4' in noted.run(f"{SCALE} --json").out
-
-
-def test_a_manifest_that_changes_between_its_digest_and_its_reading_is_refused(noted: Lab) -> None:
-    found = manifest.find(noted.folder / "data/r")
-    manifest._parsed.clear()
-    path = noted.folder / "data/r/manifest.json"
-    path.write_bytes(path.read_bytes() + b"\n")
-    with pytest.raises(Exception, match="changed by another program"):
-        found.manifest  # noqa: B018

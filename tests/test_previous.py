@@ -12,18 +12,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from tacpipe.datasets import checks, groups, manifest, pages
-from tacpipe.datasets.manifest import Manifest
+from tacpipe.datasets import manifest, pages
 from tacpipe.engine.previous import Previous, Taken
 from tacpipe.errors import DAMAGED
 from tacpipe.io.hashing import file_digest
 from tacpipe.store import presence
 from tacpipe.store.store import Store
 from tests.conftest import Lab
-from tests.test_pages import ENTRIES, MANY, NAMES, paged
 from tests.test_presence import DAY_NS, FAULTS
 
 NAMED = "named data/r -o data/s --jobs 1"
@@ -44,8 +40,7 @@ def taken(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
         return found
 
     monkeypatch.setattr(Previous, "taken", taking)
-    monkeypatch.setattr(pages, "LARGE", 0)
-    monkeypatch.setattr(pages, "MANY", 1)
+    monkeypatch.setattr(pages, "INLINE", 1)
     monkeypatch.setattr(pages, "GROUPED", 2)
     monkeypatch.setattr(manifest, "_parsed", {})
     yield counts
@@ -147,7 +142,7 @@ def test_of_a_dataset_of_which_one_recording_changed_no_other_group_is_asked_for
     lab.run(f"simulate toy --rows 2 --trials {count} -o data/r --jobs 1")
     lab.run(NAMED)
     lab.run("label data/r trial-030 --set material=felt")
-    sizes = [len(group) for group in groups.of_names(f"trial-{number:03d}" for number in range(count))]
+    sizes = [len(group) for group in pages.group_names(f"trial-{number:03d}" for number in range(count))]
     keys: list[str] = []
     read = Store.read_record
     monkeypatch.setattr(Store, "read_record", lambda self, key: read(self, keys.append(key) or key))  # type: ignore[func-returns-value]
@@ -218,16 +213,15 @@ def test_results_that_other_code_gave_are_not_taken_over_as_it_is_not_known_whic
     assert (ran["ran"], ran["reused"]) == (1, TRIALS - 1)
 
 
-@pytest.mark.parametrize("name", ["trial-003", "trial-012"])
-def test_a_dataset_that_was_edited_by_hand_is_refused_whichever_page_it_is_on(
-    lab: Lab, taken: list[int], name: str
-) -> None:
+@pytest.mark.parametrize("number", [0, -1])
+def test_a_manifest_that_lists_pages_and_was_edited_by_hand_is_refused(lab: Lab, taken: list[int], number: int) -> None:
     lab.run(f"simulate toy --rows 3 --trials {TRIALS} -o data/r --jobs 1")
     lab.run(NAMED)
     lab.run("label data/r trial-003 --set material=felt")
     file = lab.folder / "data/r/manifest.json"
-    before, mark, after = file.read_text().partition(f'  "{name}": {{')
-    file.write_text(before + mark + after.replace('"trial": ', '"trial": 1', 1))
+    root = json.loads(file.read_bytes())
+    root["pages"][number]["content"] = "0" * 64
+    file.write_text(json.dumps(root))
     kept = shown(lab.folder / "data/s")
     ran = lab.call(NAMED)
     assert ran.code == DAMAGED
@@ -242,23 +236,3 @@ def test_another_stage_and_other_params_take_over_nothing(lab: Lab, taken: list[
     assert taken[-1] == 0
     lab.run(f"{NAMED} --replace")
     assert taken[-1] == 0
-
-
-@given(MANY, st.dictionaries(NAMES, st.none() | ENTRIES, max_size=4), st.integers(1, 5))
-def test_a_manifest_checked_beside_another_has_the_digest_that_it_has_checked_alone(
-    recordings: dict[str, Any], other: dict[str, Any], grouped: int
-) -> None:
-    after = {name: one for name, one in {**recordings, **other}.items() if one is not None}
-    if not after:
-        return
-    known, now = (paged(Manifest("stage", 1, recordings=some), grouped) for some in (recordings, after))
-    alone = paged(Manifest("stage", 1, recordings=after), grouped)
-    checks.check(known)
-    try:
-        checks.check(alone)
-    except (ValueError, TypeError) as error:
-        with pytest.raises(type(error)):
-            checks.check_beside(now, known)
-        return
-    assert checks.check_beside(now, known)
-    assert (now.digest, now.rows) == (alone.digest, alone.rows)

@@ -51,7 +51,7 @@ def record_anew(folder: Path, name: str, entry: dict[str, object]) -> None:
     before = tacpipe.open(folder / "data/recordings").source
     changed = Manifest(before.stage, before.version, before.params, recordings={**before.recordings, name: entry})
     store = Store(folder / ".tacpipe")
-    store.put(changed.content)
+    changed.keep(store)
     directory.publish(store, changed, folder / "data/recordings")
 
 

@@ -15,7 +15,6 @@ from tacpipe.channels import streams
 from tacpipe.cli import model_overview
 from tacpipe.cli.show_recording import RATES, StreamFigures, gaps_text, stream_figures
 from tacpipe.datasets import manifest as manifest_of
-from tacpipe.datasets import pages
 from tacpipe.datasets.attributes import OfRecordings
 from tacpipe.datasets.dataset import Dataset
 from tacpipe.engine import execution
@@ -95,8 +94,7 @@ def _folds(opened: Dataset) -> dict[str, dict[str, int]]:
 
 
 def _excluded(opened: Dataset) -> dict[str, str]:
-    some = pages.holding(opened.source.recordings, b'"excluded"')
-    return {name: str(why) for part in some for name, one in part.items() if (why := one["attributes"].get("excluded"))}
+    return {name: str(why) for name, why in opened.source.excluded.items()}
 
 
 def _figures(opened: Dataset, names: Sequence[str], most_bytes: int | None) -> dict[str, dict[str, StreamFigures]]:

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tacpipe.datasets.manifest import Manifest
 from tacpipe.errors import StorageError
 from tacpipe.io import regular
 from tacpipe.io.files import unread
 from tacpipe.io.hashing import bytes_digest
-from tacpipe.store.store import Store
 
 
 def beside(name: str, path: str, directories: tuple[str, ...], size: int | None = None) -> bytes | None:
@@ -36,12 +34,3 @@ def beside(name: str, path: str, directories: tuple[str, ...], size: int | None 
     if failed is not None:
         raise failed
     return None
-
-
-def adopt(store: Store, directory: Path, manifest: Manifest) -> None:
-    """Store what ``manifest`` names and lies in its directory alone, as after a copy of a dataset without its store."""
-    sizes = dict(manifest.sizes())
-    for path, name in manifest.objects():
-        content = None if store.has(name) else beside(name, path, (str(directory),), sizes[name])
-        if content is not None:
-            store.put(content, durable=True)

@@ -10,8 +10,8 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 from weakref import WeakValueDictionary
 
+from tacpipe.datasets import pages
 from tacpipe.datasets.manifest import Entry, Manifest
-from tacpipe.datasets.pages import Pages
 from tacpipe.datasets.paths import shard_path
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io.hashing import digest
@@ -190,7 +190,7 @@ class Dataset:
     ) -> None:
         self.source = manifest
         self.path = directory  # where it was opened; None for one that a stage was given
-        self.recordings: Mapping[str, Recording] = _recordings(self, manifest.included, read, names)
+        self.recordings: Mapping[str, Recording] = _Recordings(self, manifest.included, read, names)
         self.files: Mapping[str, bytes] = LazyFiles(manifest.files, read)
         self._read, self._opener = read, opener
 
@@ -279,9 +279,11 @@ class Dataset:
 
     @property
     def manifest(self) -> dict[str, Any]:
-        """The manifest as plain values."""
+        """The manifest as plain values, the recordings of all pages included."""
         value: dict[str, Any] = json.loads(self.source.content)
-        return value
+        value.pop("pages", None)
+        per_recording = ("recordings", "labels", "sources")
+        return {**value, **{name: dict(getattr(self.source, name)) for name in per_recording}}
 
     @property
     def digest(self) -> str:
@@ -431,36 +433,28 @@ class Dataset:
 
 
 class _Recordings(Mapping[str, Recording]):
-    """Recordings of a large dataset by name, each made when it is asked for."""
+    """Recordings by name, in the order of names, each made when it is asked for."""
 
     def __init__(
-        self, dataset: Dataset, entries: Mapping[str, Entry], read: Reader, names: Sequence[str] | None
+        self, dataset: Dataset, entries: Mapping[str, Entry], read: Reader, names: Iterable[str] | None
     ) -> None:
         self._dataset, self._entries, self._read = dataset, entries, read
-        self._names = None if names is None else dict.fromkeys(names)  # of a part of the dataset
+        self._names: Mapping[str, object] = entries
+        if names is not None or not isinstance(entries, pages.Recordings):
+            self._names = dict.fromkeys(sorted(entries if names is None else names))
+        for name in names or ():
+            entries[name]
 
     def __getitem__(self, name: str) -> Recording:
-        if self._names is not None and name not in self._names:
+        if name not in self._names:
             raise KeyError(name)
         return Recording(name, self._entries[name], self._read, self._dataset)
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._entries if self._names is None else self._names)
+        return iter(self._names)
 
     def __len__(self) -> int:
-        return len(self._entries if self._names is None else self._names)
-
-
-def _recordings(
-    dataset: Dataset, entries: Mapping[str, Entry], read: Reader, names: Iterable[str] | None
-) -> Mapping[str, Recording]:
-    """Return recordings by name, in the order of names; all of ``entries``, or those of these names."""
-    if isinstance(entries, Pages) and names is None:
-        return _Recordings(dataset, entries, read, None)
-    chosen = sorted(entries if names is None else names)
-    if isinstance(entries, Pages):
-        return _Recordings(dataset, entries, read, [name for name in chosen if entries[name]])
-    return {name: Recording(name, entries[name], read, dataset) for name in chosen}
+        return len(self._names)
 
 
 def _reopened(

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from tacpipe.datasets.manifest import Manifest, parse
+from tacpipe.datasets.pages import StoredPages
 from tacpipe.errors import StorageError
 from tacpipe.io import progress
 from tacpipe.io.hashing import bytes_digest
@@ -31,7 +32,7 @@ def deliver(store: Store, directory: Path, manifest: Manifest, *, lasting: bool 
         if name == wanted:
             return _needs(store, manifest)
         try:
-            return _needs(store, parse(b"".join(store.read_here(name)), name, verified=True))
+            return _needs(store, parse(b"".join(store.read_here(name)), name, StoredPages(store), verified=True))
         except MissingError:
             return {}
 

@@ -35,7 +35,7 @@ class Change:
     Shards at the paths ``may_lack`` stay as they are where they are damaged: a lost recording must not hinder the next one.
     Where a dataset was only ``relabelled`` nothing goes and no shard is looked at: a label costs what it changes. Where it
     was found ``whole`` what it shows already is not looked at again. Files of an export that somebody edited are refused
-    unless ``replace``: then their content stays in the store.
+    unless ``replace``: then their content stays in the store. ``key`` names the run that gave the manifest.
     """
 
     manifest: Manifest
@@ -43,6 +43,7 @@ class Change:
     relabelled: bool = False
     whole: bool = False
     replace: bool = False
+    key: str = ""
 
 
 def publish(store: Store, manifest: Manifest, directory: Path, *, replace: bool = False) -> None:
@@ -89,7 +90,7 @@ def change(store: Store, directory: Path, decide: Callable[[], Change]) -> Manif
     with changing(store, directory):
         wanted = decide()
         if wanted.manifest.recorded:
-            store.put(wanted.manifest.content, durable=True)
+            wanted.manifest.keep(store, durable=True)
         _show(store, wanted, directory)
     return wanted.manifest
 
@@ -112,8 +113,13 @@ def _show(store: Store, wanted: Change, directory: Path) -> None:
         manifest.exported and not relabelled
     ):  # files of an export are large copies: those that are right stay
         stale = dict(_stale(store, manifest, directory))
-    if not current and not relabelled:  # what was named already stays, so that a recording that comes costs itself
-        unlike, gone = _compared(_shown(directory), manifest, directory, whole=wanted.whole)
+    if not current and relabelled:
+        stale, gone = _pages_compared(_shown(directory), manifest, directory)
+    elif not current:  # what was named already stays, so that a recording that comes costs itself
+        before = _shown(directory)
+        unlike, gone = _compared(before, manifest, directory, whole=wanted.whole)
+        if before is None:  # its pages have other names than those of the manifest that was there
+            gone |= _pages_compared(replacing.former(store, directory), manifest, directory)[1]
         stale = stale if manifest.exported else unlike
     refuse_links(directory, {*stale, *gone})
     edited = []
@@ -128,9 +134,10 @@ def _show(store: Store, wanted: Change, directory: Path) -> None:
             _keep_edited(store, manifest, directory, edited)
             before, lasting = None, True
         if before is not None and lasting:
-            adoption.adopt(store, directory, before)
+            _adopt(store, directory, before)
         deliver(store, directory, manifest, lasting=lasting)
-        store.roots.set(directory, manifest.content_digest, durable=True, lasting=lasting)
+        key = (store.roots.get(directory) or {}).get("key", "") if relabelled else wanted.key
+        store.roots.set(directory, manifest.content_digest, durable=True, lasting=lasting, key=key)
         store.fetch(stale.values())
         sweep(directory, shards=bool(stale), deep=manifest.exported)
         for path in stale:
@@ -141,6 +148,14 @@ def _show(store: Store, wanted: Change, directory: Path) -> None:
             write_whole(str(directory / NAME), manifest.content, str(directory / f".{NAME}{_DRAFT}"))
         if manifest.recorded:
             _settle(store, directory, stale)
+
+
+def _adopt(store: Store, directory: Path, manifest: Manifest) -> None:
+    """Store what ``manifest`` names and lies in its directory alone, as after a copy of a dataset without its store."""
+    for path, name, size in manifest.contents():
+        content = None if store.has(name) else adoption.beside(name, path, (str(directory),), size)
+        if content is not None:
+            store.put(content, durable=True)
 
 
 def edited_files(store: Store, manifest: Manifest, directory: Path) -> list[str]:
@@ -171,7 +186,7 @@ def _keep_edited(store: Store, manifest: Manifest, directory: Path, paths: Itera
         files[path] = vars(stored)
     before = _shown(directory) or manifest
     edited = replace(before, files=dict(sorted({**before.files, **files}.items())))
-    store.put(edited.content, durable=True)
+    edited.keep(store, durable=True)
     store.roots.set(directory, edited.content_digest)
 
 
@@ -245,11 +260,10 @@ def _compared(
     Placed is what it lacks, in this size, and what ``shown``, its manifest, has otherwise. Where all that it names was found
     there, ``whole``, pages that both have are passed over.
     """
-    stale: dict[str, str] = {}
-    gone: set[str] = set()
+    stale, gone = _pages_compared(shown, manifest, directory)
     files = {} if shown is None else shown.files
     both = {} if shown is None else shown.recordings, manifest.recordings
-    for name, before, now in pages.beside(*(pages.differing(*both) if whole else both)):
+    for name, before, now in pages.compared(*(pages.differing(*both) if whole else both)):
         old, new = ({} if one is None else one["shards"] for one in (before, now))
         gone.update(shard_path(name, stream) for stream in old if stream not in new)
         for stream, shard in new.items():
@@ -261,6 +275,16 @@ def _compared(
         if not (_same(files.get(path), file) and _lies(directory, path, file["bytes"])):
             stale[path] = file["digest"]
     return stale, {path for path in gone if manifest.at(path) is None}
+
+
+def _pages_compared(shown: Manifest | None, manifest: Manifest, directory: Path) -> tuple[dict[str, str], set[str]]:
+    """Do as `_compared` for the pages of a manifest alone."""
+    before, now = (
+        {} if one is None or one.pages is None else {page.path: page for page in one.pages.pages}
+        for one in (shown, manifest)
+    )
+    lies = {path for path, page in now.items() if path in before and _lies(directory, path, page.bytes)}
+    return {path: page.digest for path, page in now.items() if path not in lies}, before.keys() - now.keys()
 
 
 def _same(before: Mapping[str, Any] | None, now: Mapping[str, Any]) -> bool:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from tacpipe.datasets import directory as directory_of
 from tacpipe.datasets import manifest as manifest_of
+from tacpipe.datasets import pages
 from tacpipe.datasets.manifest import Found, Manifest
 from tacpipe.errors import UsageError
 from tacpipe.plugins.stage import Attribute
@@ -88,7 +89,8 @@ def planned(path: Path, wanted: Callable[[ByRecording], ByRecording]) -> tuple[B
 
 def attributes(manifest: Manifest) -> ByRecording:
     """Return the attributes of each recording by name."""
-    return {name: entry["attributes"] for name, entry in manifest.recordings.items()}
+    parts = pages.parts(manifest.recordings)
+    return {name: entry["attributes"] for part in parts for name, entry in part.items()}
 
 
 def differing(now: ByRecording, wanted: ByRecording) -> dict[str, dict[str, Attribute]]:
@@ -118,7 +120,7 @@ def _change(path: Path, wanted: Callable[[Found], ByRecording]) -> Changed:
         here = manifest_of.find(directory)  # once more: another process may have changed it while this one waited
         labels = {name: dict(values) for name, values in wanted(here).items()}
         names.extend(labels)
-        store.put(here.content)
+        here.manifest.keep(store)
         return directory_of.Change(here.manifest.labelled(labels), relabelled=True)
 
     with store.at_work([found.digest]):
@@ -138,6 +140,10 @@ def _matching(found: Found, patterns: Sequence[str]) -> list[str]:
     recordings = found.manifest.recordings
     names: set[str] = set()
     for pattern in patterns:
+        if pattern in recordings:  # of a large dataset, one page is read
+            names.add(pattern)
+            if not any(mark in pattern for mark in "*?["):
+                continue
         matching = {name for name in recordings if fnmatchcase(name, pattern)}
         if not matching:
             there = listed(sorted(recordings), _NAMED)

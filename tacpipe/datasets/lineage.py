@@ -30,14 +30,15 @@ def of(path: Path) -> dict[str, Any]:
     if path.is_file() and path.name != manifest_of.NAME:
         if root is None:
             raise UsageError(f"{path} was not written by tacpipe, or into another store than {store.root}.")
-        found = manifest_of.Found(path.parent, store.read(root["manifest"]))
+        found = manifest_of.Found(path.parent, store.read(root["manifest"]), store)
     else:
         found = manifest_of.find(path)
     places = {other["manifest"]: other["path"] for other in store.roots.all()}
     tree = _node(store, found.manifest, found.digest, places)
     changed = _changes(store, root, found.manifest)
     written_s = 0 if root is None else int(root.get("written_s", 0))
-    return {**tree, "provenance": _provenance(store, found.digest, written_s), "changes": changed}
+    provenance = _provenance(store, found.digest, written_s, "" if root is None else root.get("key", ""))
+    return {**tree, "provenance": provenance, "changes": changed}
 
 
 def _node(store: Store, manifest: Manifest, name: str, places: dict[str, str]) -> dict[str, Any]:
@@ -46,7 +47,7 @@ def _node(store: Store, manifest: Manifest, name: str, places: dict[str, str]) -
         inputs[argument] = []
         for given in several:
             try:
-                found = manifest_of.parse(store.read(given["manifest"]), given["manifest"])
+                found = manifest_of.stored(store, given["manifest"])
                 inputs[argument].append(_node(store, found, given["manifest"], places))
             except StorageError:
                 raise
@@ -70,9 +71,13 @@ def _node(store: Store, manifest: Manifest, name: str, places: dict[str, str]) -
     }
 
 
-def _provenance(store: Store, manifest: str, written_s: int) -> dict[str, Any] | None:
-    """Return how a manifest was made, which was written at its path at ``written_s``; None where no record states it."""
-    for record in records.naming(store, manifest, written_s):
+def _provenance(store: Store, manifest: str, written_s: int, key: str) -> dict[str, Any] | None:
+    """Return how a manifest was made, which was written at its path at ``written_s``; None where no record states it.
+
+    ``key`` names the run that made it or what it was labelled in, if its root states that: then no other record is read.
+    """
+    of_run = store.record(key) if key else None
+    for record in records.naming(store, manifest, written_s) if of_run is None else [of_run]:
         file = record["result"]["files"].get(manifest_of.NAME)
         if file is not None and file["digest"] == manifest:
             return dict(record["provenance"])
@@ -84,7 +89,7 @@ def _changes(store: Store, root: dict[str, Any] | None, now: Manifest) -> list[s
     if root is None or root.get("previous") is None:
         return None
     try:
-        before = manifest_of.parse(store.read(root["previous"]), "the manifest before", verified=True, beside=now)
+        before = manifest_of.stored(store, root["previous"], "the manifest before")
     except StorageError:
         raise
     except TacpipeError:
@@ -105,24 +110,30 @@ def changes(store: Store, before: Manifest, now: Manifest) -> list[str]:
         for name in sorted({*old, *new})
         if old.get(name) != new.get(name)
     ]
-    found += _compared("sources", dict(before.sources), dict(now.sources))
+    found += _compared("sources", *pages.differing(before.sources, now.sources))
     for argument in sorted({*before.inputs, *now.inputs}):
         found += _input_changes(store, argument, before.inputs.get(argument, []), now.inputs.get(argument, []))
-    found += _compared("labels", dict(before.labels), dict(now.labels))
-    if not found and before.digest != now.digest:
+    found += _compared("labels", *pages.differing(before.labels, now.labels))
+    if not found and before.digest != now.digest and not _alike(before, now):
         found.append("result: the same key gave other bytes")
     return found
+
+
+def _alike(before: Manifest, now: Manifest) -> bool:
+    """Return whether two manifests hold the same, of which one lists pages and the other has no pages yet."""
+    if (before.pages is None) == (now.pages is None) or len(before.recordings) != len(now.recordings):
+        return False
+    every = pages.compared(before.recordings, now.recordings)
+    return before.files == now.files and all(old == new for _, old, new in every)
 
 
 def _input_changes(store: Store, argument: str, before: list[dict[str, str]], now: list[dict[str, str]]) -> list[str]:
     if [given["dataset"] for given in before] == [given["dataset"] for given in now]:
         return []
     try:
-        new = [manifest_of.parse(store.read(given["manifest"]), argument, verified=True) for given in now]
-        beside = new[0] if len(new) == 1 else None
-        old = [
-            manifest_of.parse(store.read(given["manifest"]), argument, verified=True, beside=beside) for given in before
-        ]
+        old, new = (
+            [manifest_of.stored(store, given["manifest"], argument) for given in some] for some in (before, now)
+        )
     except StorageError:
         raise
     except TacpipeError:
@@ -143,7 +154,7 @@ def _recordings_compared(what: str, before: Mapping[str, Entry], now: Mapping[st
     new: list[str] = []
     gone: list[str] = []
     others: dict[str, list[str]] = {"shards": [], "attributes": []}
-    for name, old, entry in pages.beside(*pages.differing(before, now)):
+    for name, old, entry in pages.compared(*pages.differing(before, now)):
         if old is None or entry is None:
             (new if old is None else gone).append(name)
             continue
@@ -153,7 +164,7 @@ def _recordings_compared(what: str, before: Mapping[str, Entry], now: Mapping[st
     return [*_counted(f"{what}.shards", shards), *_counted(f"{what}.attributes", {"other": others["attributes"]})]
 
 
-def _compared(what: str, before: dict[str, Any], now: dict[str, Any]) -> list[str]:
+def _compared(what: str, before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
     groups = {
         "new": sorted(set(now) - set(before)),
         "gone": sorted(set(before) - set(now)),

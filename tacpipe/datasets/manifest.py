@@ -2,36 +2,35 @@
 
 from __future__ import annotations
 
-import contextlib
-import hashlib
 import json
-import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from tacpipe.datasets import page_text, pages
-from tacpipe.datasets.checks import Listed, check, check_beside
-from tacpipe.datasets.dataset_digest import DatasetDigest
+from tacpipe.datasets import pages as pages_of
+from tacpipe.datasets import paths
+from tacpipe.datasets.pages import Item, ObjectReader, Page, PageReader, Pages, StoredPages
 from tacpipe.datasets.paths import MANIFEST, shard_path
-from tacpipe.errors import DamagedError, StorageError, UsageError
-from tacpipe.io import files, regular
+from tacpipe.errors import DamagedError, UsageError
+from tacpipe.io import files as files_of
+from tacpipe.io import regular
 from tacpipe.io.files import unread
-from tacpipe.io.hashing import bytes_digest, remembered_file_digest
+from tacpipe.io.hashing import DIGEST, bytes_digest, digest
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import excerpt, plain
+from tacpipe.store.store import Object, Store
 
-FORMAT = 1
+FORMAT, PAGED_FORMAT = 1, 2  # 1: the manifest holds its recordings; 2: it lists pages of them
 NAME = MANIFEST
 VALUES = "{values}"  # among the files of a source: the digest of what was read beside them, as labels
 EXPORT = "export."  # begins the names of stages whose result is other tools' files
 ACQUIRE = "acquire"  # the command that records a rig; it stands where others name their stage, and has no key
-Entry = page_text.Entry
+Entry = pages_of.Entry
 _REMEMBERED = 3
-_STATED = ("format", "digest")  # in the file, besides what a manifest has
-_parsed: dict[str, Manifest] = {}  # by the digest of their content, the last ones that were verified
+_PER_RECORDING = ("recordings", "labels", "sources")  # fields that pages hold
+_parsed: dict[tuple[str, str], Manifest] = {}  # keys: digest, place of pages; the last verified ones
 
 
 @dataclass(frozen=True)
@@ -50,23 +49,52 @@ class Manifest:
     labels: Mapping[str, Mapping[str, Attribute]] = field(default_factory=dict)
 
     @cached_property
+    def pages(self) -> Pages | None:
+        """The pages of a large dataset; None where the manifest holds the recordings itself."""
+        recordings, labels, sources = self.recordings, self.labels, self.sources
+        if len(recordings) <= pages_of.INLINE:
+            return None
+        if isinstance(recordings, pages_of.Recordings):
+            pages = recordings.pages
+            if _same_pages(labels, pages, "labelled") and _same_pages(sources, pages, "sourced"):
+                return pages
+        return Pages.from_items(
+            (name, Item(entry, labels.get(name), sources.get(name)))
+            for part in pages_of.parts(recordings)
+            for name, entry in sorted(part.items())
+        )
+
+    @cached_property
     def digest(self) -> str:
         """The dataset's digest: of names, attributes, shards and files, and not of how they were made."""
-        hashed = DatasetDigest(self.files)
-        for part in pages.parts(self.recordings):
-            hashed.add(part)
-        return hashed.digest()
+        if self.pages is not None:
+            files = {name: file["digest"] for name, file in self.files.items()}
+            return digest({"files": files, "pages": [page.content for page in self.pages.pages]})
+        return _inline_digest(self)
 
     @cached_property
     def content(self) -> bytes:
         """The bytes of ``manifest.json``: the same manifest gives the same bytes."""
-        fields = {name: getattr(self, name) for name in self.__dataclass_fields__}
-        return pages.write({"format": FORMAT, "digest": self.digest, **fields})
+        values = {name: getattr(self, name) for name in self.__dataclass_fields__} | {"digest": self.digest}
+        if self.pages is None:
+            inline = {name: dict(values[name]) for name in _PER_RECORDING}
+            return (_indented({**values, **inline, "format": FORMAT}) + "\n").encode()
+        lines = ",\n".join(f"  {json.dumps(page.to_json(), sort_keys=True)}" for page in self.pages.pages)
+        stated = {name: value for name, value in values.items() if name not in _PER_RECORDING}
+        head, empty, tail = _indented({**stated, "format": PAGED_FORMAT, "pages": []}).partition('\n "pages": []')
+        assert empty
+        return f'{head}\n "pages": [\n{lines}\n ]{tail}\n'.encode()
 
     @cached_property
     def content_digest(self) -> str:
         """The digest of ``manifest.json``."""
         return bytes_digest(self.content)
+
+    def keep(self, store: Store, *, durable: bool = False) -> Object:
+        """Have a store hold the manifest, after its pages. Raises `MissingPageError` for a page that is nowhere."""
+        if self.pages is not None:
+            self.pages.keep(store, durable=durable)
+        return store.put(self.content, durable=durable)
 
     @property
     def recorded(self) -> bool:
@@ -86,49 +114,111 @@ class Manifest:
     @cached_property
     def included(self) -> Mapping[str, Entry]:
         """The recordings that nobody excluded."""
+        excluded = self.excluded
+        if not excluded:
+            return self.recordings
+        if isinstance(self.recordings, pages_of.Recordings):
+            return pages_of.Recordings(self.recordings.pages.changed(dict.fromkeys(excluded)))
+        return {name: entry for name, entry in self.recordings.items() if name not in excluded}
+
+    @cached_property
+    def excluded(self) -> Mapping[str, Attribute]:
+        """The reason by name of each recording that somebody excluded."""
         recordings = self.recordings
-        some = pages.holding(recordings, b'"excluded"')
-        excluded = [name for part in some for name, entry in part.items() if entry["attributes"].get("excluded")]
-        return pages.changed(self.recordings, dict.fromkeys(excluded)) if excluded else self.recordings
+        some: Iterable[Mapping[str, Entry]] = [recordings]
+        if isinstance(recordings, pages_of.Recordings):
+            pages = recordings.pages
+            some = (pages.load(number).recordings for number, page in enumerate(pages.pages) if page.excluded)
+        found = ((name, entry["attributes"].get(pages_of.EXCLUDED)) for part in some for name, entry in part.items())
+        return {name: why for name, why in found if why}
+
+    def with_recordings(self, items: Mapping[str, Item | None]) -> Manifest:
+        """Return the manifest with recordings added or replaced; None leaves one out."""
+        recordings: Mapping[str, Entry]
+        sources: Mapping[str, Any]
+        labels: Mapping[str, Any]
+        if isinstance(self.recordings, pages_of.Recordings) and self.pages is not None:
+            pages = self.pages.changed(items)
+            recordings = pages_of.Recordings(pages)
+            sources, labels = pages_of.Sources(pages), pages_of.Labels(pages)
+        else:
+            fields: list[dict[str, Any]] = [{**self.recordings}, {**self.sources}, {**self.labels}]
+            for name, item in items.items():
+                values = (None, None, None) if item is None else (item.entry, item.sources, item.labels)
+                for field_values, value in zip(fields, values, strict=True):
+                    if value is not None:
+                        field_values[name] = value
+                    else:
+                        field_values.pop(name, None)
+            recordings, sources, labels = (dict(sorted(field_values.items())) for field_values in fields)
+        return replace(self, recordings=recordings, sources=sources, labels=labels)
+
+    def item(self, name: str) -> Item:
+        """Return a recording with its labels and raw files."""
+        return Item(self.recordings[name], self.labels.get(name), self.sources.get(name))
 
     def labelled(self, labels: Mapping[str, Mapping[str, Attribute]]) -> Manifest:
         """Return the manifest with attributes set by hand; labels of recordings that are not here are dropped."""
-        kept = {
-            name: {**self.labels.get(name, {}), **values} for name, values in labels.items() if name in self.recordings
-        }
-        changed = {}
-        for name, values in sorted(kept.items()):
-            attributes = {**self.recordings[name]["attributes"], **values}
+        items = {}
+        for name, values in sorted(labels.items()):
+            if name not in self.recordings:
+                continue
+            item = self.item(name)
+            attributes = {**item.entry["attributes"], **(item.labels or {}), **values}
             known = {key: value for key, value in attributes.items() if value is not None}
-            changed[name] = {**self.recordings[name], "attributes": known}
-        recordings = pages.changed(self.recordings, changed)
-        return replace(self, recordings=recordings, labels={**self.labels, **kept})
+            items[name] = item._replace(
+                entry={**item.entry, "attributes": known}, labels={**(item.labels or {}), **values}
+            )
+        return self.with_recordings(items) if items else self
 
     def contents(self) -> Iterator[tuple[str, str, int]]:
-        """Yield path in the directory, digest and size in bytes of every shard and file."""
-        if self._listing is not None:
-            for paths, digests, sizes in self._listing:
-                yield from zip(paths.split("\n"), digests.split("\n"), sizes, strict=False)
-            return
-        for name, entry in self.recordings.items():
-            for stream, shard in entry["shards"].items():
-                yield shard_path(name, stream), shard["digest"], shard["bytes"]
+        """Yield path in the directory, digest and size in bytes of every page, shard and file."""
+        for page in () if self.pages is None else self.pages.pages:
+            yield page.path, page.digest, page.bytes
+        for part in pages_of.parts(self.recordings):
+            for name, entry in part.items():
+                for stream, shard in entry["shards"].items():
+                    yield shard_path(name, stream), shard["digest"], shard["bytes"]
         for name, file in self.files.items():
             yield name, file["digest"], file["bytes"]
 
     def objects(self) -> Iterable[tuple[str, str]]:
-        """Yield (path in the directory, digest) of every shard and file."""
+        """Yield (path in the directory, digest) of every page, shard and file."""
         return ((path, name) for path, name, _ in self.contents())
 
     def sizes(self) -> Iterable[tuple[str, int]]:
-        """Yield digest and size in bytes of every shard and file."""
+        """Yield digest and size in bytes of every page, shard and file."""
         return ((name, size) for _, name, size in self.contents())
 
+    def reached(self, walked: dict[str, set[str]], *, lenient: bool = False) -> set[str]:
+        """Return the digests of all pages, shards and files; ``walked`` has those of pages that were read, by digest.
+
+        ``lenient``: what a missing page names is left out. Raises `MissingPageError` without that.
+        """
+        pages = self.pages
+        if pages is None:
+            return {name for _, name in self.objects()}
+        reached = {file["digest"] for file in self.files.values()}
+        for number, page in enumerate(pages.pages):
+            if page.digest not in walked:
+                try:
+                    entries = pages.load(number).recordings.values()
+                    walked[page.digest] = {shard["digest"] for entry in entries for shard in entry["shards"].values()}
+                except pages_of.MissingPageError:
+                    if not lenient:
+                        raise
+            reached |= {page.digest, *walked.get(page.digest, ())}
+        return reached
+
     def at(self, path: str) -> Mapping[str, Any] | None:
-        """Return digest and size of the shard or file at ``path``, None where there is none."""
+        """Return digest and size of the page, shard or file at ``path``, None where there is none."""
         if path in self.files:
             file: Mapping[str, Any] = self.files[path]
             return file
+        if self.pages is not None and path.startswith(pages_of.PAGE):
+            page = next((page for page in self.pages.pages if page.path == path), None)
+            if page is not None:
+                return {"digest": page.digest, "bytes": page.bytes}
         bare = path.removesuffix(".parquet")
         parts = bare.split("/")
         places = [(bare, ""), *(("/".join(parts[:at]), "/".join(parts[at:])) for at in range(1, len(parts)))]
@@ -137,148 +227,118 @@ class Manifest:
         return next((shard for shard in shards if shard is not None), None)
 
     def size_of(self, name: str, path: str) -> int | None:
-        """Return how many bytes the shard or file of this digest has at ``path``, None where there is none."""
+        """Return how many bytes the page, shard or file of this digest has at ``path``, None where there is none."""
         found = self.at(path)
         return found["bytes"] if found is not None and found["digest"] == name else None
 
     @cached_property
-    def _listing(self) -> list[Listed] | None:
-        """What `check` found of a manifest of many recordings, so that `contents` parses them not again."""
-        return None
-
-    @cached_property
     def shard_bytes(self) -> int:
         """How many bytes all shards have together."""
+        if self.pages is not None:
+            return self.pages.total("shard_bytes")
         return sum(shard["bytes"] for entry in self.recordings.values() for shard in entry["shards"].values())
 
     @cached_property
     def rows(self) -> int:
         """How many rows all shards have together."""
+        if self.pages is not None:
+            return self.pages.total("rows")
         return sum(shard["rows"] for entry in self.recordings.values() for shard in entry["shards"].values())
 
 
-def parse(content: bytes, where: str, *, verified: bool = False, beside: Manifest | None = None) -> Manifest:
-    """Return the manifest of these bytes; ``verified`` ones come from the store and need no second look.
+def _same_pages(view: Mapping[str, Any], pages: Pages, count: str) -> bool:
+    """Return whether labels or sources are those that pages hold."""
+    return getattr(view, "pages", None) is pages or (not view and not pages.total(count))
 
-    Of a large one that shares pages with the manifest ``beside``, which was checked, the others alone are parsed. Raises
-    `DamagedError` if they are not a manifest, or if what they name does not give their digest.
+
+def _indented(value: Mapping[str, Any]) -> str:
+    return json.dumps(value, sort_keys=True, indent=1, allow_nan=False)
+
+
+def parse(content: bytes, where: str, read: PageReader | None = None, *, verified: bool = False) -> Manifest:
+    """Return the manifest of these bytes, whose pages ``read`` reads; ``verified`` ones come from the store.
+
+    Raises `DamagedError` if they are not a manifest, or if what they name does not give their digest.
     """
     name = bytes_digest(content)
-    if name in _parsed:  # a command meets the same manifest several times
-        return _parsed[name]
+    place = name, "" if read is None else read.place
+    if place in _parsed:  # a command meets the same manifest several times
+        return _parsed[place]
+    regular.expect_parsed(where, len(content))
     try:
-        manifest, stored = _read(content, where, verified=verified, beside=beside)
+        manifest, stated = _read(json.loads(content), where, read)
+        if manifest.pages is not None or not verified:
+            check(manifest)
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise DamagedError(
             f"{where} is not a manifest of tacpipe ({plain(str(error), 200)}). Restore it, or run the stage that made it "
             f"again."
         ) from None
-    manifest.__dict__.update(content=content, content_digest=name)  # primes cached properties: both are at hand
-    computed = stored if verified else manifest.digest
-    if computed != stored:
+    computed = stated
+    if manifest.pages is not None:
+        computed = manifest.digest
+    elif not verified:
+        computed = _inline_digest(manifest)
+    if computed != stated:
         raise DamagedError(
-            f"{where} was edited by hand: what it names has the digest {computed[:12]}, it states {excerpt(stored)[1:13]}. "
+            f"{where} was edited by hand: what it names has the digest {computed[:12]}, it states {excerpt(stated)[1:13]}. "
             f"Run the stage that made it again; labels are changed with `tacpipe label`."
         )
+    manifest.__dict__.update(content=content, content_digest=name, digest=stated)  # primes cached properties
     if not verified:  # all of it was looked at
-        _remember(manifest, name)
+        _parsed[place] = manifest
+        for oldest in list(_parsed)[:-_REMEMBERED]:
+            del _parsed[oldest]
     return manifest
 
 
-def unparsed(content: bytes, where: str) -> Manifest | None:
-    """Return the manifest of bytes that were checked before, none of whose recordings is parsed yet.
-
-    None where it is not kept in pages. Raises `StorageError` where memory is short.
-    """
-    value = pages.split(content, where) if len(content) >= pages.LARGE else None
-    if value is None or value.pop("format") != FORMAT:
-        return None
-    stored = value.pop("digest")
-    manifest = Manifest(**value)
-    manifest.__dict__.update(content=content, content_digest=bytes_digest(content), digest=stored)
-    return manifest
-
-
-def noted(file: Path, wanted: str, rows: int) -> None:
-    """Have whoever asks next for the manifest in ``file`` get it `unparsed`: it was checked before, if it has this digest.
-
-    ``rows`` are those that its shards have together.
-    """
-    if wanted in _parsed:
-        return
-    found = unparsed(regular.content(file, regular.JSON_BYTES), str(file))
-    if found is not None and found.content_digest == wanted:
-        found.__dict__["rows"] = rows
-        _remember(found, wanted)
-
-
-def _remember(manifest: Manifest, name: str) -> None:
-    _parsed[name] = manifest
-    for oldest in list(_parsed)[:-_REMEMBERED]:
-        del _parsed[oldest]
-
-
-def _read(content: bytes, where: str, *, verified: bool, beside: Manifest | None) -> tuple[Manifest, str]:
-    """Return the manifest of these bytes, with its own digest at hand, and the digest that they state."""
-    if len(content) >= pages.LARGE and (value := pages.split(content, where)) is not None:
-        with contextlib.suppress(ValueError):  # pages that are not as they should be: all of it is parsed
-            if beside is not None and value["format"] == FORMAT:
-                manifest = Manifest(**{key: one for key, one in value.items() if key not in _STATED})
-                if check_beside(manifest, beside) and manifest.digest == value["digest"]:
-                    return manifest, manifest.digest
-            return _checked(value, where, verified=verified)
-    regular.expect_parsed(where, len(content))
-    return _checked(json.loads(content), where, verified=verified)
-
-
-def _checked(value: dict[str, Any], where: str, *, verified: bool) -> tuple[Manifest, str]:
-    found, stored = value.pop("format"), value.pop("digest")
-    if found != FORMAT:
-        if type(found) is not int or found < FORMAT:
-            raise ValueError(f"its format is {excerpt(found)}")
+def _read(value: dict[str, Any], where: str, read: PageReader | None) -> tuple[Manifest, str]:
+    """Return the manifest that a JSON value holds, and the digest that it states."""
+    written, stated = value.pop("format"), value.pop("digest")
+    if type(written) is not int or written < FORMAT:
+        raise ValueError(f"its format is {excerpt(written)}")
+    if written > PAGED_FORMAT:
         raise UsageError(
-            f"{where} has manifest format {found}; this tacpipe reads format {FORMAT}. Install a newer tacpipe."
+            f"{where} has manifest format {written}; this tacpipe reads formats {FORMAT} and {PAGED_FORMAT}. "
+            f"Install a newer tacpipe."
         )
-    manifest = Manifest(**value)
-    if verified and isinstance(manifest.recordings, pages.Pages):
-        listing: list[Listed] = []
-        check(manifest, listing=listing, hashed=False)
-        manifest.__dict__["_listing"] = listing
-        return manifest, stored
-    check(manifest, hashed=not verified)
-    return manifest, stored
+    if written == FORMAT:
+        manifest = Manifest(**value)
+        manifest.__dict__["pages"] = None  # however many recordings it holds
+        return manifest, stated
+    pages = Pages([Page.from_json(page) for page in value.pop("pages")], read, {})
+    if pages.total("recordings") <= pages_of.INLINE:
+        raise ValueError(f"it lists pages of {pages.total('recordings')} recordings, which a manifest holds itself")
+    if not value.keys().isdisjoint(_PER_RECORDING):
+        raise ValueError("it holds recordings next to pages of them")
+    views: Any = pages_of.Recordings(pages), pages_of.Labels(pages), pages_of.Sources(pages)
+    return Manifest(**value, **dict(zip(_PER_RECORDING, views, strict=True))), stated
+
+
+def stored(store: ObjectReader, name: str, where: str = "") -> Manifest:
+    """Return the manifest of this digest from a store. Raises `MissingError`, and as `parse` does."""
+    return parse(store.read(name, regular.JSON_BYTES), where or name, StoredPages(store), verified=True)
+
+
+def _inline_digest(manifest: Manifest) -> str:
+    """Return the digest of a dataset whose manifest holds the recordings itself."""
+    files = {name: file["digest"] for name, file in manifest.files.items()}
+    return digest({"files": files, "recordings": pages_of.described(manifest.recordings)})
 
 
 class Found:
-    """A manifest as it was found: the directory of its dataset, and its bytes.
+    """A manifest as it was found: the directory of its dataset, and its bytes. Its pages are in ``store`` if given."""
 
-    Those of a large one are hashed at once, and read when they are asked for.
-    """
-
-    def __init__(self, directory: Path, content: bytes | None = None) -> None:
-        self.directory = directory
-        self.digest = hashed(directory / NAME) if content is None else bytes_digest(content)
-        if content is not None:
-            self.__dict__["content"] = content
-
-    @cached_property
-    def content(self) -> bytes:
-        """The bytes of the manifest file. Raises `StorageError` where they are no longer those that gave its digest."""
-        file = self.directory / NAME
-        try:
-            content = regular.content(file, regular.JSON_BYTES)
-        except OSError as error:
-            raise unread(file, error) from error
-        if bytes_digest(content) != self.digest:
-            raise StorageError(f"{file} was changed by another program meanwhile. Run the same command again.")
-        return content
+    def __init__(self, directory: Path, content: bytes, store: ObjectReader | None = None) -> None:
+        self.directory, self.content = directory, content
+        self.digest = bytes_digest(content)
+        self._store = store
 
     @cached_property
     def manifest(self) -> Manifest:
         """The manifest, checked. Raises `DamagedError` if it was edited by hand."""
-        if self.digest in _parsed:  # it need not be read
-            return _parsed[self.digest]
-        return parse(self.content, str(self.directory / NAME))
+        where = str(self.directory / NAME)
+        return parse(self.content, where, StoredPages(self._store, self.directory.absolute()))
 
 
 def find(path: Path | str) -> Found:
@@ -286,11 +346,10 @@ def find(path: Path | str) -> Found:
 
     Raises `UsageError` where there is none, and `StorageError` where the system fails to read it.
     """
-    given = files.local(path)
+    given = files_of.local(path)
     file = given if given.name == NAME else given / NAME
     try:
-        large = os.stat(file).st_size >= pages.LARGE  # noqa: PTH116  (of a pipe or a device it is 0)
-        return Found(file.parent, None if large else regular.content(file, regular.JSON_BYTES))
+        return Found(file.parent, regular.content(file, regular.JSON_BYTES))
     except regular.IrregularError as error:
         raise UsageError(f"{error} There is no dataset.") from None
     except (FileNotFoundError, NotADirectoryError):
@@ -302,16 +361,57 @@ def find(path: Path | str) -> Found:
         raise unread(file, error) from error
 
 
-def hashed(file: Path) -> str:
-    """Return the digest of a manifest file, of which memory holds a block at a time; raises as `regular.content`.
+def check(manifest: Manifest) -> None:
+    """Raise `ValueError`, `TypeError` or `KeyError` where a manifest holds what none can: it may be untrusted.
 
-    One that this process has read and that did not change since is not read again.
+    Pages are checked when they are read.
     """
-    return remembered_file_digest(file, _hashed)
+    _check_lineage(manifest)
+    pages_of.check_contents(manifest.files.values())
+    paths.check([*manifest.files], ())
+    if manifest.pages is None:
+        paths.check(pages_of.check_entries(manifest.recordings), manifest.files)
+    else:
+        paths.check([page.path for page in manifest.pages.pages], manifest.files)
 
 
-def _hashed(file: Path | str) -> str:
-    found = hashlib.sha256()
-    for block in regular.blocks(file, regular.JSON_BYTES):
-        found.update(block)
-    return found.hexdigest()
+def check_pages(manifest: Manifest, *, fresh: bool = False) -> None:
+    """Do as `check` for all pages, or for those that were made in this process. Raises as `Pages.load` does too."""
+    check(manifest)
+    pages, in_folders = manifest.pages, False
+    for number, page in enumerate(() if pages is None else pages.pages):
+        assert pages is not None
+        if page.digest in pages.fresh or not fresh:
+            content = pages.load(number)
+            if page.digest in pages.fresh:  # else it was checked as it was read
+                content.check()
+            in_folders |= any("/" in name for name in content.recordings)
+    if in_folders:  # two pages may name one path
+        paths.refuse_shared([path for path, _ in manifest.objects()])
+
+
+def _check_lineage(manifest: Manifest) -> None:
+    for several in manifest.inputs.values():
+        for given in several:
+            _expect_digest(given["manifest"])
+            _expect_digest(given["dataset"])
+    for step in ({"stage": manifest.stage, "version": manifest.version, "params": manifest.params}, *manifest.chain):
+        if not isinstance(step["stage"], str) or not isinstance(step["version"], int):
+            raise TypeError("a stage or its version is not named")
+        _expect_mapping(step["params"], "params")
+        _expect_mapping(step.get("fitted") or {}, "fitted")
+    for part in pages_of.parts(manifest.labels) if manifest.pages is None else ():
+        for labels in part.values():
+            _expect_mapping(labels, "labels")
+    _expect_mapping(manifest.skipped, "skipped")
+    _expect_mapping(manifest.sources, "sources")
+
+
+def _expect_mapping(value: object, what: str) -> None:
+    if not isinstance(value, Mapping):
+        raise TypeError(f"its {what} are a {type(value).__name__}")
+
+
+def _expect_digest(name: object) -> None:
+    if not isinstance(name, str) or not DIGEST.fullmatch(name):
+        raise ValueError(f"{str(name)[:80]!r} is not a digest")

@@ -19,11 +19,11 @@ def merge(manifests: Sequence[Manifest]) -> Manifest:
     recordings: dict[str, Entry] = {}
     files: dict[str, Any] = {}
     for manifest in manifests:
-        for name in manifest.recordings:
-            if name in recordings:
-                raise UsageError(
-                    f"Two of the datasets hold a recording named {name}. Names must be unique; leave one dataset out."
-                )
+        shared = next((name for name in manifest.recordings if name in recordings), None)
+        if shared is not None:
+            raise UsageError(
+                f"Two of the datasets hold a recording named {shared}. Names must be unique; leave one dataset out."
+            )
         if manifest.chain != manifests[0].chain:
             raise UsageError(
                 f"These datasets were made in different ways and cannot be read as one: "

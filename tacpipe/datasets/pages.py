@@ -1,202 +1,519 @@
-"""Recordings of a large dataset, kept as the text of its manifest: a page of some hundred is parsed when it is asked for.
+"""The pages of a large dataset: its recordings, divided by name, each page a small JSON object in the store.
 
-Parsed, a recording takes four times the memory of its text, and most commands look at each once, or at a few of them.
+The manifest of such a dataset is a root that lists the pages with their digests and counts. A recording that changes costs
+its page and the root. Where a page begins depends on a recording's name alone, so the same recordings give the same pages.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
-import re
 import zlib
 from bisect import bisect_right
-from collections.abc import Collection, ItemsView, Iterable, Iterator, Mapping, Sequence, ValuesView
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import asdict, dataclass, fields
+from operator import attrgetter
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
 
-from tacpipe.datasets.page_text import Entry, indented, page
+from tacpipe.datasets import adoption, paths
+from tacpipe.errors import DamagedError, TacpipeError
 from tacpipe.io import regular
+from tacpipe.io.hashing import DIGEST, Written, bytes_digest, canonical, digest
+from tacpipe.plugins.stage import Attribute
+from tacpipe.printable import plain
+from tacpipe.store.location import locate, opened
+from tacpipe.store.store import MissingError, Store
 
-LARGE = 1 << 20  # bytes of a manifest from which on its recordings are kept as text
-MANY = 3_000  # recordings from which on a result is: they have about as many bytes
-GROUPED = 256  # recordings of a page, in the mean
-_MOST_BYTES = 1 << 24  # of a page
-_KEPT = 4  # pages that stay parsed
-_BEGIN, _END = b'\n "recordings": {\n', b"\n }"
-_MEMBER = b'\n  "'  # begins a line of a recording's name, and no other line
-_NAME = re.compile(rb'  ("(?:[^"\\]|\\.)*"): ')
-ORDER = "its recordings are not in the order of their names"
-_NAMES = re.compile(rb'\n  ("(?:[^"\\]|\\.)*"): ')  # literal from the start, so that searching is fast
-_FOLDERED = re.compile(rb'\n  "(?:[^"\\/]|\\.)*/')
-_FOLLOWING = re.compile(rb',\n  ("(?:[^"\\]|\\.)*"): ')  # a name that is not the first
+Entry = dict[str, Any]  # {"attributes": {...}, "shards": {stream: {"digest", "rows", "bytes"}}}
+INLINE = 1000  # recordings up to which a manifest holds them itself
+GROUPED = 256  # recordings per page, in the mean
+PAGE = "page-"  # begins the name of every page's file in the directory of a dataset
+BEGINS = b'{"labels":'  # begins the object of every page
+EXCLUDED = "excluded"  # the attribute of recordings that stages leave out
+_PARSED = 256  # pages that stay parsed: some 80 MB
+_WRITTEN_BYTES = 1 << 25  # JSON of a key that is kept
+_COUNTS = ("bytes", "recordings", "rows", "shard_bytes", "labelled", "sourced", "excluded")
+_ATTRIBUTES = frozenset((str, int, float, bool, type(None)))
+
+
+class Item(NamedTuple):
+    """A recording of a dataset: its entry, the labels that were set by hand, and the digests of its raw files by name."""
+
+    entry: Entry
+    labels: Mapping[str, Attribute] | None = None
+    sources: Mapping[str, str] | None = None
+
+
+@dataclass(frozen=True)
+class Page:
+    """The entry of a page in a root."""
+
+    first: str  # name of its first recording
+    digest: str  # names the page's object
+    bytes: int  # size of the page's object
+    content: str  # digest of names, attributes and digests of shards: what the digest of the dataset is made of
+    recordings: int
+    rows: int
+    shard_bytes: int
+    labelled: int = 0  # recordings with labels set by hand
+    sourced: int = 0  # recordings with raw files
+    excluded: int = 0
+
+    @classmethod
+    def from_json(cls, value: Mapping[str, Any]) -> Page:
+        """Return a page from a root. Raises `ValueError`, `TypeError` or `KeyError` for what no root holds."""
+        page = cls(**value)
+        if type(page.first) is not str or page.recordings < 1:
+            raise ValueError(f"a page begins with {str(page.first)[:80]!r} and has {page.recordings} recordings")
+        for name in (page.digest, page.content):
+            if type(name) is not str or not DIGEST.fullmatch(name):
+                raise ValueError(f"{str(name)[:80]!r} is not a digest")
+        for count in (getattr(page, name) for name in _COUNTS):
+            if type(count) is not int or count < 0:
+                raise ValueError(f"{str(count)[:80]!r} is not a count")
+        return page
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the page as a root states it, without counts that are 0."""
+        optional = {field.name for field in fields(self) if field.default == 0}
+        return {name: value for name, value in asdict(self).items() if value or name not in optional}
+
+    @property
+    def path(self) -> str:
+        """The path of the page's object in the directory of its dataset."""
+        return f"{PAGE}{self.digest[:32]}.json"
+
+
+@dataclass(frozen=True)
+class PageContent:
+    """The recordings of a page, in the order of names, with hand-set labels and raw files of those that have them."""
+
+    recordings: dict[str, Entry]
+    labels: dict[str, Mapping[str, Attribute]]
+    sources: dict[str, Mapping[str, str]]
+
+    @classmethod
+    def from_items(cls, items: Mapping[str, Item]) -> PageContent:
+        """Return the content of a page with these recordings."""
+        ordered = sorted(items.items())
+        return cls(
+            {name: item.entry for name, item in ordered},
+            {name: item.labels for name, item in ordered if item.labels is not None},
+            {name: item.sources for name, item in ordered if item.sources is not None},
+        )
+
+    @classmethod
+    def from_bytes(cls, content: bytes) -> PageContent:
+        """Return the content of a page's object. Raises `ValueError`, `TypeError` or `KeyError` for what is not one."""
+        page = cls(**json.loads(content))
+        if not all(type(part) is dict for part in (page.recordings, page.labels, page.sources)):
+            raise TypeError("it is not a page")
+        return page
+
+    def to_bytes(self) -> bytes:
+        """Return the page's object: the same content gives the same bytes."""
+        return canonical(vars(self))
+
+    def describe(self, stored: bytes, *, name: str = "") -> Page:
+        """Return what a root states of this page, whose object is ``stored``; ``name`` is its digest, if known."""
+        shards = [shard for entry in self.recordings.values() for shard in entry["shards"].values()]
+        return Page(
+            next(iter(self.recordings)),
+            name or bytes_digest(stored),
+            len(stored),
+            digest(described(self.recordings)),
+            len(self.recordings),
+            sum(shard.get("rows", 0) for shard in shards),  # the input of a key has neither
+            sum(shard.get("bytes", 0) for shard in shards),
+            len(self.labels),
+            len(self.sources),
+            sum(bool(entry["attributes"].get(EXCLUDED)) for entry in self.recordings.values()),
+        )
+
+    def items(self) -> dict[str, Item]:
+        """Return the recordings with their labels and raw files, by name."""
+        return {
+            name: Item(entry, self.labels.get(name), self.sources.get(name)) for name, entry in self.recordings.items()
+        }
+
+    def check(self) -> None:
+        """Raise `ValueError`, `TypeError` or `KeyError` where a page holds what none can: it may be untrusted."""
+        names = list(self.recordings)
+        if names != sorted(names) or not {*self.labels, *self.sources} <= self.recordings.keys():
+            raise ValueError("its recordings are not in the order of their names")
+        check_entries(self.recordings)
+        for values in (*self.labels.values(), *self.sources.values()):
+            if not isinstance(values, Mapping):
+                raise TypeError(f"labels or sources of a recording are a {type(values).__name__}")
+
+
+class PageReader(Protocol):
+    """Reads the object of a page."""
+
+    place: str  # names where it reads
+
+    def __call__(self, page: Page) -> bytes:
+        """Return the verified bytes of a page's object. Raises `MissingPageError`."""
+
+
+class MissingPageError(MissingError):
+    """A page of a manifest is missing or damaged, so its recordings are unknown."""
+
+
+class ObjectReader(Protocol):
+    """A store, in a folder or in a bucket, as far as pages are read from it."""
+
+    @property
+    def place(self) -> str:
+        """The path or address of the store."""
+
+    def read(self, name: str, size: int | None = None) -> bytes:
+        """Return the verified content of an object. Raises `MissingError`."""
+
+
+class StoredPages:
+    """Reads pages from a store, or from the ``directory`` of their dataset where the store lacks them."""
+
+    def __init__(self, store: ObjectReader | None, directory: Path | None = None) -> None:
+        self._store, self._directory = store, directory
+        self.place = f"{directory or ''} {'' if store is None else store.place}"
+
+    def __call__(self, page: Page) -> bytes:
+        """Return the verified bytes of a page's object. Raises `MissingPageError`."""
+        if self._store is None:
+            assert self._directory is not None
+            self._store = locate(self._directory.absolute())
+        try:
+            return self._store.read(page.digest, page.bytes)
+        except MissingError as error:
+            copy = None
+            if self._directory is not None:
+                copy = adoption.beside(page.digest, page.path, (str(self._directory),), page.bytes)
+            if copy is None:
+                raise MissingPageError(
+                    f"{error} It is the page of the manifest that holds {plain(page.first)} and {page.recordings - 1} "
+                    f"recordings after it. Bring it with `tacpipe store pull` or `tacpipe store checkout`, or run the stage "
+                    f"that made the dataset again."
+                ) from None
+        if isinstance(self._store, Store) and self._store.check():
+            with contextlib.suppress(
+                TacpipeError
+            ):  # the store may be read-only, and the copy in the directory is as good
+                self._store.put(copy, durable=True)
+        return copy
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _pages_at, (None if self._store is None else self._store.place, self._directory)
+
+
+def _pages_at(place: str | None, directory: Path | None) -> StoredPages:
+    return StoredPages(None if place is None else opened(place), directory)
+
+
+class Pages:
+    """The pages of a dataset, in the order of names, each read and checked when it is needed.
+
+    ``fresh`` are the objects of those pages that were made in this process and may not be in a store yet, by digest.
+    """
+
+    def __init__(self, pages: Iterable[Page], read: PageReader | None, fresh: Mapping[str, bytes]) -> None:
+        self.pages = tuple(pages)
+        self._firsts = [page.first for page in self.pages]
+        if any(a >= b for a, b in zip(self._firsts, self._firsts[1:], strict=False)):
+            raise ValueError("its pages are not in the order of the names of recordings")
+        self._read = read
+        self.fresh = fresh
+        self._parsed: dict[int, PageContent] = {}
+        self._checked: set[int] = set()  # numbers of pages
+
+    @classmethod
+    def from_items(cls, items: Iterable[tuple[str, Item]], read: PageReader | None = None) -> Pages:
+        """Return the pages of recordings that come in the order of names."""
+        divided: list[Page] = []
+        fresh: dict[str, bytes] = {}
+
+        def add(group: dict[str, Item]) -> None:
+            content = PageContent.from_items(group)
+            stored = content.to_bytes()
+            page = content.describe(stored)
+            divided.append(page)
+            fresh[page.digest] = stored
+
+        group: dict[str, Item] = {}
+        for name, item in items:
+            if group and begins(name):
+                add(group)
+                group = {}
+            group[name] = item
+        if group:
+            add(group)
+        return cls(divided, read, fresh)
+
+    @classmethod
+    def joined(cls, parts: Iterable[Pages]) -> Pages:
+        """Return the recordings of several parts, which come in the order of names, divided into pages as ever."""
+        divided: list[Page] = []
+        fresh: dict[str, bytes] = {}
+        read: PageReader | None = None
+        for part in parts:
+            read = read or part._read
+            for number, page in enumerate(part.pages):
+                if divided and not begins(page.first):  # the recording that began the page is gone
+                    last = cls([divided.pop()], read, fresh).load(0)
+                    merged = cls.from_items(sorted((last.items() | part.load(number).items()).items()))
+                    divided += merged.pages
+                    fresh |= merged.fresh
+                    continue
+                divided.append(page)
+                if page.digest in part.fresh:
+                    fresh[page.digest] = part.fresh[page.digest]
+        digests = {page.digest for page in divided}
+        return cls(divided, read, {name: content for name, content in fresh.items() if name in digests})
+
+    def __len__(self) -> int:
+        return len(self.pages)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Pages, (self.pages, self._read, self.fresh)
+
+    def part(self, number: int) -> Pages:
+        """Return one page."""
+        page = self.pages[number]
+        fresh = {page.digest: self.fresh[page.digest]} if page.digest in self.fresh else {}
+        return Pages([page], self._read, fresh)
+
+    def changed(self, items: Mapping[str, Item | None]) -> Pages:
+        """Return the pages with recordings added or replaced; None leaves one out."""
+        if not items:
+            return self
+        by_page: dict[int, dict[str, Item | None]] = {}
+        for name, item in items.items():
+            by_page.setdefault(self.number(name), {})[name] = item
+
+        def parts() -> Iterator[Pages]:
+            for number in range(max(1, len(self.pages))):
+                if number not in by_page:
+                    yield self.part(number)
+                    continue
+                existing = self.load(number).items() if self.pages else {}
+                changed = sorted({**existing, **by_page[number]}.items())
+                yield Pages.from_items(((name, item) for name, item in changed if item is not None), self._read)
+
+        return Pages.joined(parts())
+
+    def number(self, name: str) -> int:
+        """Return the number of the page on which a recording of this name is, or would be."""
+        return max(0, bisect_right(self._firsts, name) - 1)
+
+    def object(self, page: Page) -> bytes:
+        """Return the object of a page. Raises `MissingPageError` where it is missing or damaged."""
+        if page.digest in self.fresh:
+            return self.fresh[page.digest]
+        if self._read is None:
+            raise MissingPageError(f"The page {page.digest[:12]} of a manifest cannot be read: its store is unknown.")
+        return self._read(page)
+
+    def load(self, number: int) -> PageContent:
+        """Return the content of a page, checked.
+
+        Raises `MissingPageError` where its object is missing or damaged, and `DamagedError` where it is not what the root
+        states.
+        """
+        content = self._parsed.get(number)
+        if content is None:
+            page = self.pages[number]
+            stored = self.object(page)
+            regular.expect_parsed(f"The page {page.digest[:12]} of a manifest", len(stored))
+            try:
+                content = PageContent.from_bytes(stored)
+                if page.digest not in self.fresh and number not in self._checked:
+                    self._check(content, stored, number)
+                    self._checked.add(number)
+            except (ValueError, KeyError, TypeError, AttributeError, RecursionError, StopIteration) as error:
+                raise DamagedError(
+                    f"The page {page.digest[:12]} of a manifest is not one of tacpipe ({plain(str(error), 200)}). Restore "
+                    f"the manifest, or run the stage that made it again."
+                ) from None
+            while len(self._parsed) >= _PARSED:
+                del self._parsed[next(iter(self._parsed))]
+            self._parsed[number] = content
+        return content
+
+    def _check(self, content: PageContent, stored: bytes, number: int) -> None:
+        page = self.pages[number]
+        content.check()
+        if content.describe(stored, name=page.digest) != page:
+            raise ValueError("it does not hold what the root states of it")
+        if number + 1 < len(self.pages) and next(reversed(content.recordings)) >= self._firsts[number + 1]:
+            raise ValueError("its recordings belong to another page")
+
+    def total(self, count: str) -> int:
+        """Return the sum of a count over all pages."""
+        return sum(map(attrgetter(count), self.pages))
+
+    def differing(self, other: Pages) -> Pages:
+        """Return the pages that the other dataset does not have."""
+        theirs = {page.digest for page in other.pages}
+        return Pages([page for page in self.pages if page.digest not in theirs], self._read, self.fresh)
+
+    def missing(self, has: Callable[[str, int], bool]) -> list[Page]:
+        """Return the pages whose object a store lacks, given what asks it for digest and bytes of an object."""
+        return [page for page in self.pages if not has(page.digest, page.bytes)]
+
+    def keep(self, store: Store, *, durable: bool = False) -> None:
+        """Have a store hold the object of every page. Raises `MissingPageError` for one that is nowhere."""
+        store.announce([page.digest for page in self.pages])
+        for page in self.pages:
+            if (durable and page.digest in self.fresh) or not store.has(page.digest, page.bytes):
+                store.put(self.object(page), durable=durable)
+
+
+class _View(Mapping[str, Any]):
+    """A part of what pages hold of recordings, by name."""
+
+    part: str  # field of `PageContent`
+    count: str  # field of `Page`
+
+    def __init__(self, pages: Pages) -> None:
+        self.pages = pages
+
+    def __getitem__(self, name: str) -> Any:
+        if not self.pages.pages:
+            raise KeyError(name)
+        number = self.pages.number(name)
+        if not getattr(self.pages.pages[number], self.count):
+            raise KeyError(name)
+        return getattr(self.pages.load(number), self.part)[name]
+
+    def __iter__(self) -> Iterator[str]:
+        for part in self.parts():
+            yield from part
+
+    def __len__(self) -> int:
+        return self.pages.total(self.count)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.pages,)
+
+    def parts(self) -> Iterator[Mapping[str, Any]]:
+        """Yield the content page by page."""
+        for number, page in enumerate(self.pages.pages):
+            if getattr(page, self.count):
+                yield getattr(self.pages.load(number), self.part)
+
+
+class Recordings(_View):
+    """The recordings of a dataset in pages."""
+
+    part, count = "recordings", "recordings"
+
+
+class Labels(_View):
+    """The labels set by hand on recordings of a dataset in pages."""
+
+    part, count = "labels", "labelled"
+
+
+class Sources(_View):
+    """The digests of the raw files of recordings of a dataset in pages."""
+
+    part, count = "sources", "sourced"
+
+
+class KeyRecordings(Recordings, Written):
+    """The part of each recording that a key holds: attributes and digests of streams. It is written page by page."""
+
+    def __init__(self, pages: Pages) -> None:
+        super().__init__(pages)
+        self._written: dict[int, bytes] = {}  # JSON by number of the page, up to `_WRITTEN_BYTES`
+        self._written_bytes = 0
+
+    def __getitem__(self, name: str) -> Entry:
+        return key_entry(super().__getitem__(name))
+
+    def parts(self) -> Iterator[Mapping[str, Entry]]:
+        """Yield the recordings page by page."""
+        for part in super().parts():
+            yield {name: key_entry(entry) for name, entry in part.items()}
+
+    def written(self) -> Iterator[bytes]:
+        """Yield the canonical JSON of all recordings, a page at a time; a key and its record ask several times for it."""
+        yield b"{"
+        for number in range(len(self.pages)):
+            text = self._written.get(number)
+            if text is None:
+                entries = self.pages.load(number).recordings
+                text = canonical({name: key_entry(entry) for name, entry in entries.items()})[1:-1]
+                if self._written_bytes + len(text) <= _WRITTEN_BYTES:
+                    self._written[number] = text
+                    self._written_bytes += len(text)
+            yield b"," * bool(number) + text
+        yield b"}"
+
+
+class Group(NamedTuple):
+    """Recordings that follow each other in the order of names, whose results have one record together."""
+
+    page: str  # digest of the page that holds exactly these; empty where recordings are not in pages
+    entries: Callable[[], Mapping[str, Entry]]
 
 
 def begins(name: str) -> bool:
     """Return whether a page, and a group of recordings that has a record, begins with the recording of this name.
 
-    That rests on the name alone: so a recording that comes or goes changes one page, or two.
+    That depends on the name alone, so a recording that comes or goes changes one page, or two.
     """
     return zlib.crc32(name.encode(errors="surrogatepass")) % GROUPED == 0
 
 
-class Pages(Mapping[str, Entry]):
-    """Recordings by name, in the order of names; what `page` made of each part of them is given in that order."""
+def group_names(names: Iterable[str]) -> Iterator[list[str]]:
+    """Yield names, sorted, in groups of about `GROUPED`, of which one more or one less name changes one or two.
 
-    def __init__(self, texts: Sequence[bytes | memoryview], count: int) -> None:
-        self.texts = texts
-        self._count = count
-        self._first = [json.loads(found[1]) for text in texts if (found := _NAME.match(text))]
-        if len(self._first) < len(texts) or any(a >= b for a, b in zip(self._first, self._first[1:], strict=False)):
-            raise ValueError(ORDER)
-        self._sound = bytearray(len(texts))  # whether a page holds what its lines begin with, in order
-        self._parsed: dict[int, dict[str, Entry]] = {}
-
-    def __getitem__(self, name: str) -> Entry:
-        return self._page(max(0, bisect_right(self._first, name) - 1))[name]
-
-    def __len__(self) -> int:
-        return self._count
-
-    def __iter__(self) -> Iterator[str]:
-        for number in range(len(self.texts)):
-            yield from self._names(number)
-
-    def items(self) -> ItemsView[str, Entry]:
-        """Return names and entries; each page is parsed as it comes."""
-        return _Items(self)
-
-    def values(self) -> ValuesView[Entry]:
-        """Return the entries; each page is parsed as it comes."""
-        return _Values(self)
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return Pages, ([bytes(text) for text in self.texts], self._count)
-
-    def parts(self) -> Iterator[dict[str, Entry]]:
-        """Yield the recordings a page at a time.
-
-        Raises `ValueError` for a page that is not one, and in the end where there are not as many recordings as there should
-        be, in the order of their names.
-        """
-        count, last = 0, ""
-        for number in range(len(self.texts)):
-            part = self.part(number, last)
-            count, last = count + len(part), next(reversed(part))
-            yield part
-        if count != self._count:
-            raise ValueError("two of its recordings share a name")
-
-    def part(self, number: int, before: str = "") -> dict[str, Entry]:
-        """Return the recordings of a page, whose names come after ``before``. Raises `ValueError` where it is not one."""
-        part = self._page(number)
-        names = list(part)
-        if not self._sound[number]:
-            if not names or names != sorted(names) or names != self._names(number):
-                raise ValueError(ORDER)
-            self._sound[number] = True
-        if before and names[0] <= before:
-            raise ValueError(ORDER)
-        return part
-
-    def of(self, numbers: Collection[int]) -> Pages:
-        """Return some of the pages, in their order."""
-        texts = [self.texts[number] for number in sorted(numbers)]
-        return Pages(texts, sum(map(_count, texts)))
-
-    def grouped(self) -> Iterator[list[int]]:
-        """Yield the pages of each group that has a record: one, and more where the recording that began one is gone."""
-        group: list[int] = []
-        for number, name in enumerate(self._first):
-            if group and begins(name):
-                yield group
-                group = []
-            group.append(number)
-        if group:
+    >>> names = [f"trial-{number:04d}" for number in range(2000)]
+    >>> before, now = (set(map(tuple, group_names(some))) for some in (names, [*names, "trial-0500-again"]))
+    >>> len(before) > 2, len(now - before) <= 2
+    (True, True)
+    """
+    group: list[str] = []
+    for name in sorted(names):
+        if group and begins(name):
             yield group
-
-    def names(self, numbers: Iterable[int]) -> list[bytes]:
-        """Return the names on pages, as they are written."""
-        return [name for number in numbers for name in _NAMES.findall(b"\n" + bytes(self.texts[number]))]
-
-    def ends(self, number: int) -> tuple[str, str]:
-        """Return the names with which a page begins and ends, as its lines state them."""
-        text = bytes(self.texts[number])
-        last = _NAME.match(text, text.rfind(_MEMBER) + 1)
-        return self._first[number], self._first[number] if last is None else json.loads(last[1])
-
-    @property
-    def beginnings(self) -> Sequence[str]:
-        """The name with which each page begins."""
-        return self._first
-
-    def count(self, number: int) -> int:
-        """Return how many recordings are on a page, as its lines state them."""
-        return _count(self.texts[number])
-
-    def changed(self, entries: Mapping[str, Entry | None]) -> Pages:
-        """Return the recordings with others in the place of some that are there; None leaves one out."""
-        texts = list(self.texts)
-        for number in sorted({bisect_right(self._first, name) - 1 for name in entries}):
-            part: Mapping[str, Entry | None] = {**self._page(number), **entries}
-            now = {name: part[name] for name in self._page(number)}
-            texts[number] = page({name: entry for name, entry in now.items() if entry is not None})
-        gone = sum(entry is None for entry in entries.values())
-        return Pages([text for text in texts if len(text)], self._count - gone)
-
-    def holding(self, word: bytes) -> Iterator[dict[str, Entry]]:
-        """Yield those pages alone in whose text a word stands."""
-        for number, text in enumerate(self.texts):
-            if word in bytes(text):
-                yield self._page(number)
-
-    def _names(self, number: int) -> list[str]:
-        found: list[str] = json.loads(b"[%b]" % b",".join(self.names([number])))
-        return found
-
-    def _page(self, number: int) -> dict[str, Entry]:
-        found = self._parsed.get(number)
-        if found is None:
-            found = json.loads(f"{{{str(self.texts[number], 'ascii')}}}")
-            while len(self._parsed) >= _KEPT:
-                del self._parsed[next(iter(self._parsed))]
-            self._parsed[number] = found
-        return found
+            group = []
+        group.append(name)
+    if group:
+        yield group
 
 
-def _count(text: bytes | memoryview) -> int:
-    return bytes(text).count(_MEMBER) + 1
+def groups(recordings: Mapping[str, Entry]) -> Iterator[Group]:
+    """Yield the groups of recordings; of a dataset in pages none is read yet."""
+    if isinstance(recordings, Recordings):
+        pages = recordings.pages
+        for number, page in enumerate(pages.pages):
+            yield Group(page.digest, lambda number=number: pages.load(number).recordings)  # type: ignore[misc]
+        return
+    for names in group_names(recordings):
+        yield Group("", lambda names=names: {name: recordings[name] for name in names})  # type: ignore[misc]
 
 
-class _Items(ItemsView[str, Entry]):
-    _mapping: Pages
-
-    def __iter__(self) -> Iterator[tuple[str, Entry]]:
-        for part in self._mapping.parts():
-            yield from part.items()
-
-
-class _Values(ValuesView[Entry]):
-    _mapping: Pages
-
-    def __iter__(self) -> Iterator[Entry]:
-        for part in self._mapping.parts():
-            yield from part.values()
+def parts(recordings: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
+    """Yield what is known of recordings by name: a page at a time, or all at once where they are not in pages."""
+    if isinstance(recordings, _View):
+        yield from recordings.parts()
+    else:
+        yield recordings
 
 
-def holding(recordings: Mapping[str, Entry], word: bytes) -> Iterable[Mapping[str, Entry]]:
-    """Return the recordings, of those kept as text only pages in which a word stands."""
-    return recordings.holding(word) if isinstance(recordings, Pages) else [recordings]
+def differing(before: Mapping[str, Any], now: Mapping[str, Any]) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
+    """Return what is known of those recordings of two datasets that are not on a page which both have."""
+    if isinstance(before, _View) and isinstance(now, _View):
+        return type(before)(before.pages.differing(now.pages)), type(now)(now.pages.differing(before.pages))
+    return before, now
 
 
-def changed(recordings: Mapping[str, Entry], entries: Mapping[str, Entry | None]) -> Mapping[str, Entry]:
-    """Return recordings with others in the place of some that are there; None leaves one out."""
-    if isinstance(recordings, Pages):
-        return recordings.changed(entries)
-    found = {name: entries.get(name, entry) for name, entry in recordings.items()}
-    return {name: entry for name, entry in found.items() if entry is not None}
-
-
-def beside(before: Mapping[str, Entry], now: Mapping[str, Entry]) -> Iterator[tuple[str, Entry | None, Entry | None]]:
+def compared(before: Mapping[str, Entry], now: Mapping[str, Entry]) -> Iterator[tuple[str, Entry | None, Entry | None]]:
     """Yield name and entry, before and now, of all recordings of two datasets, in the order of names."""
-    left, right = ordered(before), ordered(now)
+    left, right = (iter(_in_order(recordings)) for recordings in (before, now))
     old, new = next(left, None), next(right, None)
     while old is not None or new is not None:
         if new is None or (old is not None and old[0] < new[0]):
@@ -211,91 +528,57 @@ def beside(before: Mapping[str, Entry], now: Mapping[str, Entry]) -> Iterator[tu
             old, new = next(left, None), next(right, None)
 
 
-def shared(before: Pages, now: Pages) -> dict[int, int]:
-    """Return the pages that two datasets have both, byte for byte: the number in ``now`` to that in ``before``."""
-    places = {name: number for number, name in enumerate(before.beginnings)}
-    found = {number: places[name] for number, name in enumerate(now.beginnings) if name in places}
-    return {number: place for number, place in found.items() if same(before.texts[place], now.texts[number])}
+def _in_order(recordings: Mapping[str, Entry]) -> Iterator[tuple[str, Entry]]:
+    return ((name, entry) for part in parts(recordings) for name, entry in sorted(part.items()))
 
 
-def same(one: bytes | memoryview, other: bytes | memoryview) -> bool:
-    """Return whether the texts of two pages are the same."""
-    return one is other or (len(one) == len(other) and bytes(one) == bytes(other))
+def described(recordings: Mapping[str, Entry]) -> dict[str, Any]:
+    """Return the part of recordings that the digest of a dataset is made of."""
+    return {
+        name: {
+            "attributes": entry["attributes"],
+            "shards": {stream: shard["digest"] for stream, shard in entry["shards"].items()},
+        }
+        for name, entry in recordings.items()
+    }
 
 
-def foldered(recordings: Pages) -> bool:
-    """Return whether a name may lead into a folder: then recordings of two pages may name one path."""
-    return any(map(_foldered, map(bytes, recordings.texts)))
+def key_entry(entry: Entry) -> Entry:
+    """Return the part of a recording that a key holds: attributes, and the digests of streams."""
+    shards = {stream: {"digest": shard["digest"]} for stream, shard in entry["shards"].items()}
+    return {"attributes": entry["attributes"], "shards": shards}
 
 
-def _foldered(text: bytes) -> bool:
-    return b"\\u002" in text or (b"/" in text and _FOLDERED.search(b"\n" + text) is not None)
+def check_entries(recordings: Mapping[str, Entry]) -> list[str]:
+    """Return the paths of all shards. Raises `ValueError`, `TypeError` or `KeyError` for an entry that none can be."""
+    for entry in recordings.values():
+        if not _ATTRIBUTES.issuperset(map(type, entry["attributes"].values())):
+            _refuse_attributes(entry["attributes"])
+    shards = [shard for entry in recordings.values() for shard in entry["shards"].values()]
+    check_contents(shards)
+    check_counts([shard["rows"] for shard in shards])
+    places = [paths.shard_path(name, stream) for name, entry in recordings.items() for stream in entry["shards"]]
+    paths.check(places, ())
+    return places
 
 
-def differing(before: Mapping[str, Entry], now: Mapping[str, Entry]) -> tuple[Mapping[str, Entry], Mapping[str, Entry]]:
-    """Return those recordings of two datasets among which all are that are not in both, or not the same in both."""
-    if not (isinstance(before, Pages) and isinstance(now, Pages)):
-        return before, now
-    both = shared(before, now)
-    gone = set(range(len(before.texts))).difference(both.values())
-    return before.of(gone), now.of(set(range(len(now.texts))).difference(both))
+def _refuse_attributes(attributes: Mapping[str, Any]) -> None:
+    for name, value in attributes.items():
+        if not isinstance(value, str | int | float | None):
+            raise TypeError(f"the attribute {name[:80]!r} is a {type(value).__name__}")
 
 
-def ordered(recordings: Mapping[str, Entry]) -> Iterator[tuple[str, Entry]]:
-    """Return names and entries in the order of names."""
-    return iter(recordings.items() if isinstance(recordings, Pages) else sorted(recordings.items()))
+def check_contents(contents: Iterable[Mapping[str, Any]]) -> None:
+    """Raise `ValueError`, `TypeError` or `KeyError` where shards or files have no digest, or no size in bytes."""
+    contents = list(contents)
+    check_counts([content["bytes"] for content in contents])
+    for name in (content["digest"] for content in contents):
+        if type(name) is not str or not DIGEST.fullmatch(name):
+            raise ValueError(f"{str(name)[:80]!r} is not a digest")
 
 
-def parts(recordings: Mapping[str, Entry]) -> Iterator[Mapping[str, Entry]]:
-    """Yield recordings as they lie in memory: a page at a time where they are text, else all at once."""
-    if isinstance(recordings, Pages):
-        yield from recordings.parts()
-    else:
-        yield recordings
-
-
-def write(value: Mapping[str, Any]) -> bytes:
-    """Return the bytes of a manifest with these fields, whose recordings may be `Pages`."""
-    recordings = value["recordings"]
-    if not isinstance(recordings, Pages) or not recordings:
-        return indented({**value, "recordings": dict(recordings)}).encode() + b"\n"
-    head = indented({**value, "recordings": {}}).encode() + b"\n"
-    before, empty, after = head.partition(b'\n "recordings": {}')
-    assert empty
-    texts = (text for number, one in enumerate(recordings.texts) for text in ((b",\n" if number else b""), one))
-    return b"".join([before, _BEGIN, *texts, _END, after])
-
-
-def split(content: bytes, where: str) -> dict[str, Any] | None:
-    """Return the value of a manifest with its recordings as `Pages`; None where the bytes are not as tacpipe writes them.
-
-    What is returned is what ``json.loads`` would return, once all of `Pages.parts` were gone through without an error.
-    Raises `StorageError` where memory is short.
-    """
-    begin = content.find(_BEGIN + b'  "')
-    end = content.find(_END, begin)
-    if begin < 0 or end < 0:
-        return None
-    head = content[:begin] + b'\n "recordings": {}' + content[end + len(_END) :]
-    regular.expect_parsed(where, len(head))
-    try:
-        value = json.loads(head)
-        if type(value) is not dict or indented(value).encode() + b"\n" != head:
-            return None
-        texts = [*_texts(content, begin + len(_BEGIN), end)]
-        if max(map(len, texts)) > _MOST_BYTES:  # one recording has most of it
-            return None
-        found = Pages(texts, content.count(_MEMBER, begin, end))
-    except (ValueError, TypeError, RecursionError):
-        return None
-    return {**value, "recordings": found}
-
-
-def _texts(content: bytes, begin: int, end: int) -> Iterator[memoryview]:
-    view, crc, grouped = memoryview(content), zlib.crc32, GROUPED  # what is called once a recording has a name here
-    for found in _FOLLOWING.finditer(content, begin, end):
-        name = found[1]
-        if begins(json.loads(name)) if b"\\" in name else crc(name[1:-1]) % grouped == 0:
-            yield view[begin : found.start()]
-            begin = found.start() + len(b",\n")
-    yield view[begin:end]
+def check_counts(counts: Iterable[Any]) -> None:
+    """Raise `ValueError` for what is not a count of rows or bytes."""
+    for count in counts:
+        if type(count) is not int or count < 0:
+            raise ValueError(f"{str(count)[:80]!r} is not a count of rows or bytes")

@@ -18,8 +18,9 @@ from pathlib import Path
 from typing import Any
 
 from tacpipe.datasets import manifest as manifest_of
-from tacpipe.datasets import recording_names
+from tacpipe.datasets import pages, recording_names
 from tacpipe.datasets.manifest import ACQUIRE, VALUES, Manifest
+from tacpipe.datasets.pages import Item
 from tacpipe.errors import DamagedError, StorageError, TacpipeError, UsageError
 from tacpipe.io import files, regular
 from tacpipe.io.hashing import digest
@@ -107,7 +108,7 @@ def former(store: Store, output: Path) -> Manifest | None:
     root = store.roots.get(output.absolute())
     try:
         if root is not None:
-            return manifest_of.parse(store.read(root["manifest"]), "the stored manifest", verified=True)
+            return manifest_of.stored(store, root["manifest"], "the stored manifest")
     except StorageError:
         raise
     except TacpipeError:
@@ -130,23 +131,29 @@ def possessions(manifest: Manifest) -> Iterator[tuple[tuple[str, ...], Any]]:
 
     Each is (what it is, value): a recording by name and content, and a label by that and its own name, with its value.
     """
-    for name, entry in manifest.recordings.items():
-        content = digest({stream: shard["digest"] for stream, shard in entry["shards"].items()})
-        if irreplaceable(manifest):
+    lasts = irreplaceable(manifest)
+    for name in manifest.recordings if lasts else manifest.labels:
+        if name not in manifest.recordings:
+            continue
+        item = manifest.item(name)
+        content = digest({stream: shard["digest"] for stream, shard in item.entry["shards"].items()})
+        if lasts:
             yield (name, content), None
-        for label, value in manifest.labels.get(name, {}).items():
+        for label, value in (item.labels or {}).items():
             yield (name, content, label), value
 
 
 def losses(before: Manifest, after: Manifest) -> Losses:
     """Return what of ``before`` cannot be computed again and is not in ``after``."""
-    gone = [] if not irreplaceable(before) else [name for name in before.recordings if _gone(name, before, after)]
-    unlabelled = [
-        name
-        for name, labels in before.labels.items()
-        if name not in gone and any(after.labels.get(name, {}).get(key) != value for key, value in labels.items())
-    ]
-    return Losses(sorted(gone), sorted(unlabelled))
+    if not lasting(before):
+        return Losses()
+    lost: dict[bool, list[str]] = {True: [], False: []}  # names by whether the recording is lost, or labels alone
+    for name in pages.differing(before.recordings, after.recordings)[0]:
+        if irreplaceable(before) and _gone(name, before, after):
+            lost[True].append(name)
+        elif any(after.labels.get(name, {}).get(key) != value for key, value in before.labels.get(name, {}).items()):
+            lost[False].append(name)
+    return Losses(sorted(lost[True]), sorted(lost[False]))
 
 
 def _gone(name: str, before: Manifest, after: Manifest) -> bool:
@@ -243,10 +250,10 @@ def appended(before: Manifest, made: Manifest) -> Manifest:
 
     Recordings that could not be read this time stay as they were.
     """
-    recordings = dict(sorted({**before.recordings, **made.recordings}.items()))
-    skipped = {name: why for name, why in {**before.skipped, **made.skipped}.items() if name not in recordings}
-    sources = dict(sorted({**before.sources, **made.sources}.items()))
-    return replace(made, recordings=recordings, skipped=skipped, sources=sources)
+    items = {name: Item(entry, None, made.sources.get(name)) for name, entry in made.recordings.items()}
+    kept = before.with_recordings(items)
+    skipped = {name: why for name, why in {**before.skipped, **made.skipped}.items() if name not in kept.recordings}
+    return replace(made, recordings=kept.recordings, skipped=skipped, sources=kept.sources, labels=kept.labels)
 
 
 def returning_labels(
@@ -267,7 +274,7 @@ def returning_labels(
     found: dict[str, Mapping[str, Any]] = {}
     for name in names if before is None else [name for name in names if name != before.content_digest]:
         try:
-            known = manifest_of.parse(store.read(name), "the stored manifest", verified=True)
+            known = manifest_of.stored(store, name, "the stored manifest")
         except StorageError:
             raise
         except TacpipeError:
@@ -294,7 +301,7 @@ def outgoing(store: Store, directory: Path) -> Manifest | None:
     root = store.roots.get(directory)
     if root is None or root["manifest"] != found.digest:
         known = former(store, directory)
-        store.put(found.content, durable=here.recorded)
+        here.keep(store, durable=here.recorded)
         store.roots.set(directory, found.digest, lasting=known is not None and bool(losses(known, here)))
     return here
 

@@ -6,8 +6,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from tacpipe.datasets import groups, merging, pages
+from tacpipe.datasets import merging, pages
 from tacpipe.datasets.manifest import Entry, Manifest
+from tacpipe.datasets.pages import Item
 from tacpipe.engine import computing, execution, keys, provenance
 from tacpipe.engine.executors.executor import Chosen
 from tacpipe.engine.outcome import Outcome
@@ -20,6 +21,8 @@ from tacpipe.io.hashing import digest
 from tacpipe.plugins import registry
 from tacpipe.store import records
 from tacpipe.store.store import Store
+
+Answer = Mapping[str, Entry] | pages.Pages  # results of a group of recordings
 
 
 @dataclass(frozen=True)
@@ -44,25 +47,31 @@ class ByRecording:
         """Return what the map stage of a link of a chain gives for each recording of ``given``; raises as `run`.
 
         A group of recordings has a record of its own, besides those of its recordings. So a dataset of which one recording
-        changed takes one record a group, and one for each recording of the group that changed. What is answered is kept as
-        text where recordings are many.
+        changed takes one record a group, and one for each recording of the group that changed. What is answered is kept in
+        pages where recordings are many.
         """
         entries, name, stage = given.included, step["stage"], execution.stage_of(step["stage"])
-        answered: list[groups.Kept | _Asked] = []
+        answered: list[Answer | _Asked] = []
         missing: list[Task] = []
         stored: dict[str, Mapping[str, Any]] = {}  # of groups of which something is missing
         taken = None if self.previous is None else self.previous.taken(entries, step)
-        many = taken is not None or len(entries) >= pages.MANY
+        known: Mapping[str, pages.Pages] = {}
         if taken is not None:
+            known = taken.pages
             self.outcome.reused += taken.count
             self.outcome.add_group(taken.stated)
         else:
-            self.store.expect(digest(keys.of_group(step, stage, some)) for _, some in groups.of(entries))
-        known = {} if taken is None else taken.groups
-        for first, some in groups.of(entries, known):
-            if first in known:
-                answered.append(known[first])
+            self.store.expect(digest(keys.of_group(step, stage, group.entries())) for group in pages.groups(entries))
+        many = len(entries) > pages.INLINE
+
+        def answer(made: Mapping[str, Entry]) -> Answer:
+            return pages.Pages.from_items((one, Item(entry)) for one, entry in made.items()) if many else made
+
+        for group in pages.groups(entries):
+            if group.page in known:
+                answered.append(known[group.page])
                 continue
+            some = group.entries()
             asked = _Asked(keys.of_group(step, stage, some), some)
             made = None if self.request.compare or self._reruns(name) else self._of_group(asked)
             if made is None:
@@ -74,19 +83,21 @@ class ByRecording:
                     answered.append(asked)
                     continue
                 made = self._remember_group(name, asked, found)
-            answered.append(groups.kept(_after(made, some), as_text=many))
+            answered.append(answer(_after(made, some)))
         computed = self._computed(name, missing, stored, len(entries))
 
-        def parts() -> Iterator[groups.Kept]:
+        def parts() -> Iterator[Answer]:
             for one in answered:
                 if not isinstance(one, _Asked):
                     yield one
                     continue
                 records_of = {recording: computed[recording] for recording in one.entries if recording in computed}
                 made = self._remember_group(name, one, records_of)
-                yield groups.kept(_after(made, one.entries), as_text=many)
+                yield answer(_after(made, one.entries))
 
-        return groups.joined(parts())
+        if many:
+            return pages.Recordings(pages.Pages.joined(part for part in parts() if isinstance(part, pages.Pages)))
+        return {one: entry for part in parts() if isinstance(part, Mapping) for one, entry in part.items()}
 
     def _of_group(self, asked: _Asked) -> Mapping[str, Entry] | None:
         """Return what the record of a group holds, None where there is none or an object is gone."""

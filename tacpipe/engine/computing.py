@@ -169,7 +169,7 @@ def _computed(task: Task, store: Store, key: str, leases: ExitStack) -> Done | _
     origin = {**provenance.of(round(time.perf_counter() - started, 4)), "irreplaceable": stage.source}
     origin |= {"code": code, "packages": provenance.code_of_packages(task.identity, packages), "notes": notes}
     if stage.source:  # the record alone would mark this as a recording, until a dataset's manifest does
-        store.put(_manifest_of(task, stage, result).content, durable=True)
+        _manifest_of(task, stage, result).keep(store, durable=True)
     return _Made(result, origin, replace, stage.source)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from tacpipe.datasets import described
+from tacpipe.datasets import pages
 from tacpipe.datasets.manifest import Entry, Manifest
 from tacpipe.engine import execution
 from tacpipe.engine.task import Task
@@ -29,16 +29,15 @@ def of_recording(entry: Entry, reads: tuple[str, ...] | None) -> dict[str, Any]:
     attributes = entry["attributes"]
     if reads is not None and reads != ALL:
         attributes = {name: attributes[name] for name in reads if name in attributes}
-    return {
-        "attributes": attributes,
-        "shards": {stream: {"digest": shard["digest"]} for stream, shard in entry["shards"].items()},
-    }
+    return {**pages.key_entry(entry), "attributes": attributes}
 
 
 def of_dataset(manifest: Manifest, reads: tuple[str, ...] | None, chosen: Mapping[str, Entry]) -> dict[str, Any]:
     """Return what a whole-dataset key holds of the ``chosen`` recordings: names, attributes, digests, chain, files."""
-    recordings: Mapping[str, Entry] | None = described.of(manifest, chosen) if reads in (None, ALL) else None
-    if recordings is None:
+    recordings: Mapping[str, Entry]
+    if isinstance(chosen, pages.Recordings) and reads in (None, ALL):
+        recordings = pages.KeyRecordings(chosen.pages)
+    else:
         recordings = {name: of_recording(entry, reads) for name, entry in sorted(chosen.items())}
     return {
         "lineage": {

@@ -220,7 +220,7 @@ class _Directory(_Place):
         if note is None or root is None or root["manifest"] != note.head.manifest:
             return None
         with suppress(OSError, TacpipeError):
-            if manifest_of.hashed(self.path / manifest_of.NAME) == note.head.manifest:
+            if manifest_of.find(self.path).digest == note.head.manifest:
                 return note
         return None
 
@@ -237,8 +237,8 @@ class _Directory(_Place):
         return None
 
     def look(self) -> Look | None:
-        with suppress(OSError):
-            if (self.path / manifest_of.NAME).stat().st_size >= pages.LARGE:
+        with suppress(OSError, TacpipeError):
+            if len(manifest_of.find(self.path).manifest.recordings) > pages.INLINE:
                 return Look(self.store, self.path)
         return None
 
@@ -255,8 +255,8 @@ class _Directory(_Place):
         return None if self._noted is None else previous_of.found(self.store, self.path, self._noted)
 
     def published(self, work: Work, made: Manifest, previous: Previous | None = None) -> Manifest:
-        shown = self.publish(made, previous)
-        if made.copied or len(shown.content) < pages.LARGE:
+        shown = self.publish(made, previous, work.key)
+        if made.copied or shown.pages is None:
             return shown
         head = _head(work, shown)
         if previous is not None and previous.succeed(head, shown):
@@ -272,9 +272,6 @@ class _Directory(_Place):
 
     def refuse(self, plan: replacing.Plan) -> None:
         directory.check_output(self.store, self.request.output)
-        if self._noted is not None:  # it was checked then, and need not be parsed
-            with suppress(OSError, TacpipeError):
-                manifest_of.noted(self.path / manifest_of.NAME, self._noted.head.manifest, self._noted.head.rows)
         if not self.request.replace:
             replacing.refuse_plan(self._occupant(), self.request.output, plan)
 
@@ -304,17 +301,17 @@ class _Directory(_Place):
             raise replacing.edited(self.request.output, edited)
         super().check(made)
 
-    def publish(self, made: Manifest, previous: Previous | None = None) -> Manifest:
+    def publish(self, made: Manifest, previous: Previous | None = None, key: str = "") -> Manifest:
         if not made.recorded and directory.shows(self.store, made, self.path):
             deliver(self.store, self.path, made)
-            self.store.roots.set(self.path, made.content_digest)
+            self.store.roots.set(self.path, made.content_digest, key=key)
             return made
 
         def decided() -> directory.Change:  # somebody may have labelled what is there
             wanted = self.settled(made)
             self._refuse_losses(wanted)
             complete = previous is not None and previous.stands()
-            return directory.Change(wanted, whole=complete, replace=self.request.replace)
+            return directory.Change(wanted, whole=complete, replace=self.request.replace, key=key)
 
         return directory.change(self.store, self.request.output, decided)
 

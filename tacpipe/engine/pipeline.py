@@ -10,7 +10,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from tacpipe.datasets import checks, manifest, replacing, roles
+from tacpipe.datasets import manifest, replacing, roles
 from tacpipe.datasets.dataset import Dataset
 from tacpipe.datasets.manifest import Entry, Manifest
 from tacpipe.datasets.paths import shard_path
@@ -154,12 +154,13 @@ class _Run:
         name = record["result"]["files"][manifest.NAME]["digest"]
         self.store.announce([name])
         try:
-            content = self.store.read(name)
-        except MissingError:
+            found = manifest.stored(self.store, name, "the stored manifest")
+            self.store.announce(page.digest for page in (found.pages.pages if found.pages is not None else ()))
+            sizes = list(found.sizes())
+        except MissingError:  # the manifest, or a page of it
             return None
-        found = manifest.parse(content, "the stored manifest", verified=True)
-        self.store.announce(wanted for _, wanted in found.objects())
-        if not all(self.store.has(name, size) for name, size in found.sizes()):
+        self.store.announce(name for name, _ in sizes)
+        if not all(self.store.has(name, size) for name, size in sizes):
             return None
         self.outcome.restore(record["provenance"])
         self.outcome.reused = self.count(found)
@@ -180,16 +181,13 @@ class _Run:
 
     def make(self) -> Manifest:
         """Return the manifest of the result, having run what was missing."""
-        if self.previous is not None:
-            self.previous.checked(self.inputs.datasets[0])
         for found in self.inputs.used:
-            found.manifest  # noqa: B018  (a manifest edited by hand is refused before anything is written)
+            given = found.manifest  # one edited by hand is refused before anything is written
             if self.store.run:
-                self.store.put(found.content)  # explain and gc follow a dataset to the manifests it descends from
+                given.keep(self.store)  # explain and gc follow a dataset to the manifests it descends from
         made = self._make()
         try:
-            if self.previous is None or not checks.check_beside(made, self.previous.made):
-                checks.check(made)
+            manifest.check_pages(made, fresh=True)
         except (ValueError, TypeError, KeyError) as error:
             raise TacpipeError(f"{self.request.name} gave what no dataset can hold: {error}.") from None
         return made
@@ -398,7 +396,7 @@ class _Run:
 
     def _remember(self, made: Manifest) -> None:
         """Store the manifest, and the run if every recording was good: then a rerun is answered at once."""
-        stored = vars(self.store.put(made.content, durable=made.recorded))
+        stored = vars(made.keep(self.store, durable=made.recorded))
         if not self.outcome.bad:
             result = {"recordings": {}, "files": {manifest.NAME: stored}}
             made_by = {**provenance.of(0.0), **self.outcome.of_results()}

@@ -1,9 +1,8 @@
-"""The run that gave what an output shows: of recordings that did not change since, its results are taken over as text.
+"""The run that gave what an output shows: of pages of recordings that did not change since, its results are taken over.
 
-That rests on what a hit rests on: the record of that run names the manifest that it read and the one that it gave, and both
-are read by their digests. A group of recordings whose text is the same in the manifest of then and in that of now has the
-same keys, and so the same text of results. The objects of these are there as a note on the directory states, once it was
-found to hold.
+That rests on what a hit rests on: the record of that run names the manifest that it read and the one that it gave. A page
+that is the same in both manifests, of then and of now, has the same keys, and so the same page of results. A note on the
+directory states that the objects of these are there, once it was found to hold.
 """
 
 from __future__ import annotations
@@ -13,10 +12,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tacpipe.datasets import groups as groups_of
 from tacpipe.datasets import manifest as manifest_of
 from tacpipe.datasets import pages
-from tacpipe.datasets.manifest import Entry, Found, Manifest
+from tacpipe.datasets.manifest import Entry, Manifest
+from tacpipe.datasets.pages import Pages
 from tacpipe.datasets.paths import shard_path
 from tacpipe.errors import StorageError, TacpipeError
 from tacpipe.io.hashing import digest
@@ -27,15 +26,15 @@ from tacpipe.store.store import Store
 
 @dataclass(frozen=True)
 class Taken:
-    """Results that are taken over: of groups of recordings, by the name of the first, and what their records state."""
+    """Results that are taken over: pages by the digest of the page that they are results of, and what records state."""
 
-    groups: Mapping[str, groups_of.Kept]
+    pages: Mapping[str, Pages]
     stated: Mapping[str, Any]  # as `Outcome.add_group` takes it
 
     @property
     def count(self) -> int:
         """How many recordings they are."""
-        return sum(kept.count for kept in self.groups.values())
+        return sum(part.total("recordings") for part in self.pages.values())
 
 
 @dataclass
@@ -47,40 +46,38 @@ class Previous:
     note: Note
     look: Look
     record: Mapping[str, Any]
-    given: Manifest | None  # what it read, of which nothing is parsed yet; None once all that is asked of it was asked
-    made: Manifest  # what it gave
-
-    def checked(self, found: Found) -> None:
-        """Check the manifest that is read now; of one that differs little from the one of then little is parsed."""
-        manifest_of.parse(found.content, str(found.directory / manifest_of.NAME), beside=self.given)
+    given: Manifest  # its input
+    made: Manifest  # its result
 
     def taken(self, entries: Mapping[str, Entry], step: Mapping[str, Any]) -> Taken | None:
-        """Return what is taken over of the results of a link of a chain for ``entries``; None where nothing can be.
-
-        It is asked once: what the run read is not kept.
-        """
-        made, before = self.made, self.given
-        self.given = None
-        if before is None or not isinstance(entries, pages.Pages) or not self._gave(step, before.content_digest):
+        """Return what is taken over of the results of a link of a chain for ``entries``; None where nothing can be."""
+        before, results = self.given.included, self.made.pages
+        if results is None or not (isinstance(entries, pages.Recordings) and isinstance(before, pages.Recordings)):
             return None
-        given = before.included
-        if not isinstance(given, pages.Pages):
+        if not self._gave(step):
             return None
-        assert isinstance(made.recordings, pages.Pages)
-        both, results = pages.shared(given, entries), made.recordings
-        places = {name: number for number, name in enumerate(results.beginnings)}
-        groups: dict[str, groups_of.Kept] = {}
-        for group in entries.grouped():
-            first = entries.beginnings[group[0]]
-            place = places.get(first)
-            if place is None or not all(number in both for number in group):
+        now = {page.digest for page in entries.pages.pages}
+        firsts = [page.first for page in results.pages] + [""]
+        places = {first: number for number, first in enumerate(firsts)}
+        read = before.pages.pages
+        followers = [*(page.first for page in read[1:]), ""]
+        found: dict[str, Pages] = {}
+        left = set(range(len(results)))
+        for page, follower in zip(read, followers, strict=True):
+            number = places.get(page.first)
+            if page.digest not in now or number is None or number == len(results):
                 continue
-            names = entries.names(group)
-            if names == results.names([place]):  # no recording came between two that did not change
-                groups[first] = groups_of.Kept(results.texts[place], len(names))
-                del places[first]
-        stated = self._stated(step["stage"], results.of(places.values()), sum(one.count for one in groups.values()))
-        return None if stated is None else Taken(groups, stated)
+            result = results.pages[
+                number
+            ]  # with both ends and as many recordings, it holds the results of all of these
+            whole = firsts[number + 1] == follower and result.recordings == page.recordings
+            if whole and self.store.has(result.digest, result.bytes):
+                found[page.digest] = results.part(number)
+                left.discard(number)
+        others = {name for number in left for name in results.load(number).recordings}
+        count = sum(part.total("recordings") for part in found.values())
+        stated = self._stated(step["stage"], others, count)
+        return None if stated is None else Taken(found, stated)
 
     def stands(self) -> bool:
         """Return whether the directory still shows what the run gave, with the files that were found there."""
@@ -96,21 +93,24 @@ class Previous:
             for name, entry in now.items()
             for stream, shard in entry["shards"].items()
         ]
+        for manifest in (self.made, shown):
+            for page in () if manifest.pages is None else manifest.pages.pages:
+                gone += [page.path] if manifest is self.made else []
+                placed += [(page.path, page.digest, page.bytes)] if manifest is shown else []
         files = [(path, file["digest"], file["bytes"]) for path, file in shown.files.items()]
         return self.look.succeed(self.note, head, [*gone, *self.made.files], [*placed, *files])
 
-    def _gave(self, step: Mapping[str, Any], given: str) -> bool:
+    def _gave(self, step: Mapping[str, Any]) -> bool:
         made = self.made
         named = [one["manifest"] for one in made.inputs.get("datasets", ())]
         return (
-            isinstance(made.recordings, pages.Pages)
-            and made.stage == self.record["identity"]["run"] == step["stage"]
-            and named == [given]
+            made.stage == self.record["identity"]["run"] == step["stage"]
+            and named == [self.given.content_digest]
             and bool(made.chain)
             and digest(made.chain[-1]) == digest(step)
         )
 
-    def _stated(self, stage: str, others: pages.Pages, count: int) -> Mapping[str, Any] | None:
+    def _stated(self, stage: str, others: set[str], count: int) -> Mapping[str, Any] | None:
         """Return what records state of results of which ``others`` are left out; None where that is not known."""
         provenance = self.record["provenance"]
         codes: Mapping[str, int] = (provenance.get("code") or {}).get(stage) or {}
@@ -149,11 +149,10 @@ def found(store: Store, directory: Path, note: Note) -> Previous | None:
     if not look.holds(note, listed=True):
         return None
     try:
-        made = manifest_of.find(directory)
-        given = manifest_of.unparsed(store.read(named[0]), "the stored manifest")
-        if made.digest != note.head.manifest or given is None:
+        made, given = manifest_of.stored(store, note.head.manifest), manifest_of.stored(store, named[0])
+        if manifest_of.find(directory).digest != note.head.manifest or given.pages is None:
             return None
-        return Previous(store, directory, note, look, record, given, made.manifest)
+        return Previous(store, directory, note, look, record, given, made)
     except StorageError:
         raise
     except TacpipeError:

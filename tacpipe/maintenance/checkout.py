@@ -13,6 +13,7 @@ from tacpipe.datasets import directory as directory_of
 from tacpipe.datasets import manifest as manifest_of
 from tacpipe.datasets import replacing
 from tacpipe.datasets.manifest import Manifest
+from tacpipe.datasets.pages import StoredPages
 from tacpipe.engine import execution
 from tacpipe.errors import StorageError, TacpipeError, UsageError
 from tacpipe.io import regular
@@ -55,7 +56,7 @@ def known(store: AnyStore) -> list[Known]:
         for entry in [root, *root.get("history", [])]:
             name, path = entry["manifest"], str(root["path"])
             try:
-                manifest = manifest_of.parse(store.read(name, regular.JSON_BYTES), name, verified=True)
+                manifest = manifest_of.stored(store, name)
             except StorageError:
                 raise
             except TacpipeError:
@@ -130,13 +131,13 @@ def checkout(name: str, output: Path, *, replace: bool = False, source: AnyStore
     wanted = _named(source or store, name)
     with store.at_work([wanted]):
         content = (source or store).read(wanted, regular.JSON_BYTES)
-        manifest = manifest_of.parse(content, wanted, verified=source is None)
+        manifest = manifest_of.parse(content, wanted, StoredPages(source or store), verified=source is None)
         directory_of.check_output(store, output)
         if not replace:
             replacing.refuse_losses(replacing.occupant(store, output), output, manifest)
         read = execution.reader(store, (str(output.absolute()),), dict(manifest.sizes()))
         if source is not None:
-            transfer.bring(source, store, manifest_of.Found(output, content), copying.Transferred())
+            transfer.bring(source, store, manifest_of.Found(output, content, source), copying.Transferred())
         for first in (True, False):
             try:
                 directory_of.publish(store, manifest, output, replace=replace)
@@ -154,7 +155,7 @@ def _is_manifest(store: AnyStore, name: str) -> bool:
     if not DIGEST.fullmatch(name) or not store.has(name):
         return False
     try:
-        manifest_of.parse(store.read(name, regular.JSON_BYTES), name, verified=True)
+        manifest_of.stored(store, name)
     except StorageError:
         raise
     except TacpipeError:

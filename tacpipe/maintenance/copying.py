@@ -7,11 +7,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from tacpipe.datasets import manifest as manifest_of
+from tacpipe.datasets.manifest import Manifest
 from tacpipe.engine import execution
 from tacpipe.errors import DamagedError, StorageError
-from tacpipe.io import progress, regular, threads
+from tacpipe.io import progress, threads
 from tacpipe.maintenance import garbage
 from tacpipe.maintenance.pushed import AnyStore
+from tacpipe.printable import plain
 from tacpipe.store import layout, records
 from tacpipe.store.remote import RemoteStore
 from tacpipe.store.store import MissingError
@@ -52,16 +54,25 @@ def _planned(source: AnyStore, target: AnyStore, found: manifest_of.Found, *, an
             continue
         seen.add(name)
         try:
-            content = found.content if name == found.digest else _manifest(source, target, name)
+            manifest = found.manifest if name == found.digest else _manifest(source, target, name)
         except MissingError:
             continue
-        plan.manifests[name] = content
-        manifest = manifest_of.parse(content, name, verified=True)
+        plan.manifests[name] = manifest.content
         todo += garbage.ancestors(manifest)
         if ancestors or name == found.digest:
-            sizes = dict(manifest.sizes())
-            plan.objects.update({one: (path, sizes[one]) for path, one in manifest.objects()})
+            _expect_formed(manifest, name)
+            plan.objects.update({one: (path, size) for path, one, size in manifest.contents()})
+        elif manifest.pages is not None:
+            plan.objects.update({page.digest: (page.path, page.bytes) for page in manifest.pages.pages})
     return plan
+
+
+def _expect_formed(manifest: Manifest, name: str) -> None:
+    """Raise `DamagedError` where a page of a manifest holds what none can: it may be untrusted."""
+    try:
+        manifest_of.check_pages(manifest)
+    except (ValueError, TypeError, KeyError) as error:
+        raise DamagedError(f"{name} is not a manifest of tacpipe ({plain(str(error), 200)}).") from None
 
 
 def copy(
@@ -168,11 +179,11 @@ def _copy_records(
     target.note_records(found.digest, keys)
 
 
-def _manifest(source: AnyStore, target: AnyStore, name: str) -> bytes:
+def _manifest(source: AnyStore, target: AnyStore, name: str) -> Manifest:
     try:
-        return source.read(name, regular.JSON_BYTES)
+        return manifest_of.stored(source, name)
     except MissingError:
-        return target.read(name, regular.JSON_BYTES)
+        return manifest_of.stored(target, name)
 
 
 class _Counted:

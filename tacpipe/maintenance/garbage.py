@@ -21,7 +21,7 @@ from tacpipe.datasets.manifest import Manifest
 from tacpipe.errors import DamagedError, StorageError, TacpipeError
 from tacpipe.io import regular
 from tacpipe.io.files import readable_errors
-from tacpipe.io.hashing import DIGEST, bytes_digest
+from tacpipe.io.hashing import DIGEST
 from tacpipe.maintenance import unnamed
 from tacpipe.store import layout, notes
 from tacpipe.store.records import named
@@ -52,6 +52,7 @@ class Live:
     objects: set[str] = field(default_factory=set)  # digests, of manifests too
     lasting: set[str] = field(default_factory=set)  # digests of what was replaced and cannot be computed again
     replaced: set[str] = field(default_factory=set)  # digests of the manifests that name it
+    pages: set[str] = field(default_factory=set)  # digests of the pages of manifests, among all these
     manifests: list[Manifest] = field(default_factory=list)  # of recordings, among all these
     doubtful: set[Path] = field(default_factory=set)  # files in quarantine that name what may be recordings
     runs: set[str] = field(default_factory=set)  # names of running processes' leases, with which their drafts begin
@@ -67,16 +68,17 @@ def live(store: Store, grace_days: float = GRACE_DAYS, *, dry_run: bool = False,
         found.runs.add(run.path.stem)
         found.objects |= run.objects
         wanted += run.manifests
-    contents: dict[str, bytes] = {}
+    shown: dict[str, manifest_of.Found] = {}  # manifests that directories show, by digest
+    walked: dict[str, set[str]] = {}  # digests of all that a page names, by its digest
     for root in store.roots.all():
         path = Path(root["path"])
         here, reached = None, root["kind"] == PUSHED
         if not reached:
             here, reached = content(path)
         if here is not None:
-            _expect_sound(here, path)
-            contents[bytes_digest(here)] = here
-            wanted.append(bytes_digest(here))
+            one = _sound(here, path)
+            shown[one.digest] = one
+            wanted.append(one.digest)
         expired = has_expired(store, root, grace_days, reached=reached, dry_run=dry_run)
         if here is None and not expired:
             wanted.append(root["manifest"])
@@ -94,16 +96,16 @@ def live(store: Store, grace_days: float = GRACE_DAYS, *, dry_run: bool = False,
         )
     doubtful = _doubtful(store)
     found.doubtful = set(doubtful)
-    found.objects |= _closure(store, wanted, contents, found.manifests).union(*doubtful.values())
-    found.lasting = _closure(store, list(replaced), contents, found.manifests) - found.objects
-    found.replaced = set(replaced)
+    found.objects |= _closure(store, wanted, shown, walked, found.manifests).union(*doubtful.values())
+    found.lasting = _closure(store, list(replaced), shown, walked, found.manifests) - found.objects
+    found.pages, found.replaced = set(walked), set(replaced)
     return found
 
 
 def _lasting(store: Store, name: str) -> bool:
     """Return whether a manifest whose directory is gone holds recordings or labels that cannot be computed again."""
     try:
-        manifest = manifest_of.parse(store.read(name), name, verified=True)
+        manifest = manifest_of.stored(store, name)
     except MissingError:
         return False
     return replacing.lasting(manifest)
@@ -139,10 +141,10 @@ def _collect(store: Store, *, dry_run: bool, recordings: bool, grace_days: float
     kept |= needed.objects
     objects = [path.name for path in layout.entries(store.root, "objects") if path.name not in kept]
     unknown = (Path(store.object_path(name)) for name in objects)
-    named_by = {} if recordings else unnamed.kept(unknown, needed.manifests)
+    named_by = {} if recordings else unnamed.kept(store, unknown, needed.manifests)
     kept = kept.union(named_by, *named_by.values())
     collected.records = sum(_remove_record(Path(store.record_path(key)), dry_run=dry_run) for key in unneeded)
-    collected.kept_recordings = len(kept - needed.objects - needed.replaced - set(named_by))
+    collected.kept_recordings = len(kept - needed.objects - needed.replaced - needed.pages - set(named_by))
     aside = []
     for path in (Path(store.object_path(name)) for name in objects if name not in kept):
         if _young(path):
@@ -206,10 +208,17 @@ def _remove_record(path: Path, *, dry_run: bool) -> bool:
     return True
 
 
-def _closure(store: Store, wanted: list[str], contents: dict[str, bytes], of_recordings: list[Manifest]) -> set[str]:
+def _closure(
+    store: Store,
+    wanted: list[str],
+    shown: Mapping[str, manifest_of.Found],
+    walked: dict[str, set[str]],
+    of_recordings: list[Manifest],
+) -> set[str]:
     """Return the digests of manifests, of those they descend from, and of all objects that these name.
 
-    Manifests of recordings are added to ``of_recordings``.
+    Manifests of recordings are added to ``of_recordings``. A page that was ``walked`` is not read again. Raises
+    `DamagedError` where something damaged is needed to know that, as a page of a manifest that a directory shows.
     """
     objects: set[str] = set()
     manifests: set[str] = set()
@@ -219,18 +228,18 @@ def _closure(store: Store, wanted: list[str], contents: dict[str, bytes], of_rec
             continue
         manifests.add(name)
         try:
-            manifest = manifest_of.parse(contents.get(name) or store.read(name), name, verified=True)
+            manifest = shown[name].manifest if name in shown else manifest_of.stored(store, name)
+            objects |= manifest.reached(walked)
         except StorageError:  # the disk failed, or memory is short: what the manifest names is not known
             raise
         except TacpipeError as error:
-            if store.quarantined(name) or store.has(name):  # as on a disk that fails to read it
+            if name in shown or store.quarantined(name) or store.has(name):  # as on a disk that fails to read it
                 raise DamagedError(
-                    f"The manifest {name[:12]}, which something in {store.root} descends from, is damaged, so it is "
+                    f"{error} The manifest {name[:12]}, which something in {store.root} descends from, is damaged, so it is "
                     "not known what it needs; nothing was removed. `tacpipe store repair` may bring it back; to "
                     "continue without it, remove it from objects/ and quarantine/."
                 ) from error
             continue  # it never came here: of a dataset that was copied or pulled without what it descends from
-        objects |= {found for _, found in manifest.objects()}
         wanted += ancestors(manifest)
         of_recordings += [manifest] if manifest.recorded else []
     return objects | manifests
@@ -249,7 +258,7 @@ def _doubtful(store: Store) -> dict[Path, set[str]]:
         with contextlib.suppress(FileNotFoundError, regular.IrregularError):  # what is larger was a shard
             names = unnamed.digests(regular.content(path, regular.JSON_BYTES, follow=False))
             if names:
-                found[path] = names
+                found[path] = names | unnamed.named_by_pages(store, names)
     return found
 
 
@@ -273,15 +282,18 @@ def content(path: Path) -> tuple[bytes | None, bool]:
     return None, True
 
 
-def _expect_sound(content: bytes, path: Path) -> None:
+def _sound(content: bytes, path: Path) -> manifest_of.Found:
+    """Return the manifest that lies at a path. Raises `DamagedError` where it is not sound."""
+    found = manifest_of.Found(path, content)
     try:
-        manifest_of.parse(content, str(path / manifest_of.NAME))
+        found.manifest  # noqa: B018  (is it sound?)
     except StorageError:
         raise
     except TacpipeError as error:
         raise DamagedError(
             f"{error} It is not known what it needs, so nothing was removed; `tacpipe store repair` may bring it back."
         ) from None
+    return found
 
 
 def has_expired(store: Store, root: dict[str, Any], grace_days: float, *, reached: bool, dry_run: bool) -> bool:

@@ -135,7 +135,7 @@ def refuse_newer(there: AnyStore, before: Root, seen: Collection[str], name: str
 def lasting(store: AnyStore, manifest: str) -> bool:
     """Return whether a pushed manifest holds recordings or labels set by hand, or cannot be read to know that."""
     try:
-        found = manifest_of.parse(store.read(manifest), manifest, verified=True)
+        found = manifest_of.stored(store, manifest)
     except StorageError:
         raise
     except TacpipeError:

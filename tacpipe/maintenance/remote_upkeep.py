@@ -17,11 +17,12 @@ from pathlib import Path
 from typing import TypeVar
 
 from tacpipe.datasets import manifest as manifest_of
-from tacpipe.datasets import replacing
+from tacpipe.datasets import pages, replacing
 from tacpipe.datasets.manifest import Manifest
 from tacpipe.errors import DamagedError, StorageError, TacpipeError
 from tacpipe.io import progress, threads
 from tacpipe.io.hashing import DIGEST
+from tacpipe.maintenance import unnamed
 from tacpipe.maintenance.garbage import GRACE_DAYS, Collected, ancestors
 from tacpipe.maintenance.repair import Soundness
 from tacpipe.store import layout
@@ -104,7 +105,8 @@ def _wanted(store: RemoteStore) -> set[str]:
     for root in store.roots.all():
         wanted.add(root["manifest"])
         with contextlib.suppress(MissingError):
-            manifest = manifest_of.parse(store.read(root["manifest"]), root["manifest"], verified=True)
+            manifest = manifest_of.stored(store, root["manifest"])
+            wanted.update(page.digest for page in (manifest.pages.pages if manifest.pages is not None else ()))
             wanted.update(name for _, name in manifest.objects())
     return wanted
 
@@ -217,6 +219,7 @@ def _needed(store: RemoteStore) -> _Needed:
     """Return what announcements and roots need. Announcements first: who ends meanwhile has written its root by then."""
     needed = _Needed()
     wanted: list[str] = []
+    walked: dict[str, set[str]] = {}
     for _, run in store.runs().values():
         needed.objects |= run.objects
         wanted += run.manifests
@@ -235,7 +238,7 @@ def _needed(store: RemoteStore) -> _Needed:
         wanted = []
         for manifest in threads.map_in_threads(lambda name: _manifest(store, name), todo, AT_ONCE):
             if manifest is not None:
-                needed.objects |= {one for _, one in manifest.objects()}
+                needed.objects |= manifest.reached(walked)
                 wanted += ancestors(manifest)
                 needed.recorded += [manifest] if manifest.recorded else []
     needed.objects |= needed.manifests
@@ -245,7 +248,7 @@ def _needed(store: RemoteStore) -> _Needed:
 def _manifest(store: RemoteStore, name: str) -> Manifest | None:
     """Return a manifest, None for one that never came here. Raises `DamagedError` for one that is damaged."""
     try:
-        return manifest_of.parse(store.read(name), name, verified=True)
+        return manifest_of.stored(store, name)
     except AbsentError:
         return None
     except StorageError:
@@ -263,17 +266,21 @@ def _unnamed(store: RemoteStore, names: Collection[str], recorded: Iterable[Mani
     covered = {one for manifest in recorded for one, _ in replacing.possessions(manifest)}
     kept: set[str] = set()
     for name, manifest in threads.map_in_threads(lambda name: (name, _perhaps(store, name)), names, AT_ONCE):
-        if manifest is not None and any(one not in covered for one, _ in replacing.possessions(manifest)):
-            kept |= {name, *(one for _, one in manifest.objects())}
+        if manifest is None:
+            continue
+        with contextlib.suppress(pages.MissingPageError):  # without all of its pages it may have held anything
+            if all(one in covered for one, _ in replacing.possessions(manifest)):
+                continue
+        kept |= {name, *manifest.reached({}, lenient=True)}
     return kept
 
 
 def _perhaps(store: RemoteStore, name: str) -> Manifest | None:
     """Return the manifest that an object is, None where it is not one."""
     try:
-        if not store.begins(name, MANIFEST):
-            return None
-        return manifest_of.parse(store.read(name), name, verified=True)
+        if store.begins(name, pages.BEGINS):
+            return unnamed.from_page(store.read(name))
+        return manifest_of.stored(store, name) if store.begins(name, MANIFEST) else None
     except StorageError:
         raise
     except TacpipeError:

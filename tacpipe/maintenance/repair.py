@@ -18,7 +18,7 @@ from tacpipe.datasets.delivery import deliver
 from tacpipe.engine import execution
 from tacpipe.errors import StorageError, TacpipeError
 from tacpipe.io.files import readable_errors, walk, write_whole
-from tacpipe.io.hashing import bytes_digest, file_digest
+from tacpipe.io.hashing import file_digest
 from tacpipe.printable import plain
 from tacpipe.store import layout
 from tacpipe.store.location import locate
@@ -118,7 +118,7 @@ def repair(store: Store) -> Soundness:
         manifests = [one for one in (_find(root) for root in roots) if one is not None]
         for one in manifests:
             if not store.has(one.digest):
-                store.put(one.content)
+                one.manifest.keep(store)
                 found.repaired.append(one.digest)
         wanted = _wanted(store, found)
         read = execution.reader(store, tuple(root["path"] for root in roots))
@@ -197,7 +197,7 @@ def link(path: Path) -> int:
             directory_of.sweep(directory, deep=manifest.exported)
             for name, digest in stale:
                 directory_of.place(store, digest, directory / name, copy=manifest.recorded)
-        store.put(found.content)
+        manifest.keep(store)
         deliver(store, directory.absolute(), manifest)
         store.roots.set(directory.absolute(), found.digest)
     return len(stale)
@@ -271,11 +271,11 @@ def _wanted(store: Store, found: Soundness) -> dict[str, str]:
             wanted[root["manifest"]] = manifest_of.NAME
             continue
         try:
-            content = store.read(root["manifest"]) if here is None else here.content
-            name = bytes_digest(content)
-            manifest = manifest_of.parse(content, name, verified=True)
-            if not store.has(name):
-                wanted[name] = manifest_of.NAME
+            manifest = manifest_of.stored(store, root["manifest"]) if here is None else here.manifest
+            if not store.has(manifest.content_digest):
+                wanted[manifest.content_digest] = manifest_of.NAME
+            absent = [] if manifest.pages is None else manifest.pages.missing(store.has)
+            wanted.update({page.digest: page.path for page in absent})
             wanted.update({name: path for path, name in manifest.objects() if not store.has(name)})
         except StorageError as error:
             found.unread[root["manifest"]] = str(error)

@@ -231,7 +231,7 @@ def _wanted(path: Path, there: AnyStore) -> tuple[manifest_of.Found, str]:
     """Return the manifest at a path, else that which was pushed from there or by the project that is named, and its name."""
     directory = path.parent if path.name == manifest_of.NAME else path
     if (directory / manifest_of.NAME).exists():
-        return manifest_of.find(directory), str(directory)
+        return manifest_of.Found(directory, manifest_of.find(directory).content, there), str(directory)
     folder, name = projects.place(directory)
     local_store = locate(directory)
     root = pushed.find(there, str(path), name, projects.known(local_store, folder))
@@ -243,4 +243,4 @@ def _wanted(path: Path, there: AnyStore) -> tuple[manifest_of.Found, str]:
             )
         directory = folder / root["path"]
     content = there.read(root["manifest"], regular.JSON_BYTES)
-    return manifest_of.Found(directory, content), pushed.label(root, pushed.roots(there))
+    return manifest_of.Found(directory, content, there), pushed.label(root, pushed.roots(there))

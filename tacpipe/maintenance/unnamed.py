@@ -1,57 +1,88 @@
 """Manifests in a store that no root names any more, and that hold what cannot be computed again.
 
 A recording is marked as one by its record, by the manifests that name it, and by the roots that name these. Each of the
-three is enough: a manifest states by itself what it holds, so it is found among the objects where its root was lost.
+three is enough: a manifest states by itself what it holds, so it is found among the objects where its root was lost. So is a
+page of a manifest: a recording with its raw files, and a label that was set by hand, is kept for the page alone.
 """
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 from tacpipe.datasets import manifest as manifest_of
-from tacpipe.datasets import replacing
+from tacpipe.datasets import pages, replacing
 from tacpipe.datasets.manifest import Manifest
+from tacpipe.datasets.pages import MissingPageError, PageContent, StoredPages
 from tacpipe.errors import StorageError, TacpipeError
 from tacpipe.io import regular
 from tacpipe.io.files import readable_errors
 from tacpipe.io.hashing import DIGEST, bytes_digest
+from tacpipe.store.store import Store
 
 _BEGINS = b"{\n"  # every manifest, and no Parquet file
 _SHARD = b"PAR1"  # a Parquet file begins and ends with it
 
 
-def kept(objects: Iterable[Path], known: Iterable[Manifest]) -> dict[str, set[str]]:
-    """Return the digests of those manifests among ``objects`` that must be kept, each with those of all that it names.
+@dataclass(frozen=True)
+class _Candidate:
+    """A manifest or a page that no root names: its digest, what it holds that cannot be computed again, what it names."""
 
-    Those are the manifests with recordings or labels that are neither in a ``known`` manifest nor in another one that is
-    kept. An object that may be a manifest and is damaged is kept with whatever it names: nobody knows what it held.
+    name: str
+    holds: set[tuple[object, ...]]
+    objects: set[str]
+
+
+def kept(store: Store, objects: Iterable[Path], known: Iterable[Manifest]) -> dict[str, set[str]]:
+    """Return the digests of those manifests and pages among ``objects`` that must be kept, with those of all that they name.
+
+    Those are the ones with recordings or labels that are neither in a ``known`` manifest nor in another one that is kept. An
+    object that may be a manifest or a page and is damaged is kept with whatever it names: nobody knows what it held.
     """
     covered = {one for manifest in known for one, _ in replacing.possessions(manifest)}
     names: dict[str, set[str]] = {}
-    found: list[tuple[str, Manifest, set[tuple[object, ...]]]] = []
+    candidates: dict[bool, list[_Candidate]] = {True: [], False: []}  # by whether it is a page
     for name, content in _candidates(objects):
         if bytes_digest(content) != name:
             names[name] = digests(content)
             continue
+        is_page = content.startswith(pages.BEGINS)
         try:
-            manifest = manifest_of.parse(content, name, verified=True)
+            manifest = (
+                from_page(content) if is_page else manifest_of.parse(content, name, StoredPages(store), verified=True)
+            )
         except StorageError:
             raise
         except TacpipeError:
             continue
-        unlike = [(one, value) for one, value in replacing.possessions(manifest) if one not in covered]
-        if unlike:
-            found.append((name, manifest, {(*one, value) for one, value in unlike}))
+        try:
+            unlike = {(*one, value) for one, value in replacing.possessions(manifest) if one not in covered}
+            if unlike:
+                named = {digest for _, digest in manifest.objects()}
+                candidates[is_page].append(_Candidate(name, unlike, named))
+        except MissingPageError:  # it may have held anything
+            names[name] = manifest.reached({}, lenient=True)
     there: set[tuple[object, ...]] = set()
-    for name, manifest, holds in sorted(
-        found, key=lambda one: (-len(one[2]), one[0])
-    ):  # what is appended to comes first
-        if not holds <= there:
-            there |= holds
-            names[name] = {digest for _, digest in manifest.objects()}
+    for is_page in (False, True):  # what is appended to comes first
+        for candidate in sorted(candidates[is_page], key=lambda one: (-len(one.holds), one.name)):
+            if not candidate.holds <= there:
+                there |= candidate.holds
+                names[candidate.name] = candidate.objects
     return names
+
+
+def from_page(content: bytes) -> Manifest:
+    """Return a manifest of what a page holds. Raises `TacpipeError` for what is not a page."""
+    try:
+        page = PageContent.from_bytes(content)
+        page.check()
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        raise TacpipeError("It is not a page of a manifest.") from None
+    manifest = Manifest("", 0, recordings=page.recordings, labels=page.labels, sources=page.sources)
+    manifest.__dict__["pages"] = None  # it is one
+    return manifest
 
 
 def digests(content: bytes) -> set[str]:
@@ -61,11 +92,22 @@ def digests(content: bytes) -> set[str]:
     return set(DIGEST.findall(content.decode("latin-1")))
 
 
+def named_by_pages(store: Store, names: Collection[str]) -> set[str]:
+    """Return the digests in those objects of these names that are pages of a manifest."""
+    paths = (Path(store.object_path(name)) for name in names)
+    return {one for _, content in _beginning(paths, (pages.BEGINS,)) for one in digests(content)}
+
+
 def _candidates(objects: Iterable[Path]) -> Iterator[tuple[str, bytes]]:
-    """Yield digest and content of the objects that begin as a manifest does."""
+    """Yield digest and content of the objects that begin as a manifest or a page does."""
+    return _beginning(objects, (_BEGINS, pages.BEGINS))
+
+
+def _beginning(objects: Iterable[Path], marks: tuple[bytes, ...]) -> Iterator[tuple[str, bytes]]:
+    """Yield digest and content of the objects that begin with a mark."""
     for path in objects:
         with contextlib.suppress(FileNotFoundError, regular.IrregularError), readable_errors(path, reading=True):
             with regular.opened(path, follow=False) as file:
-                if file.read(len(_BEGINS)) != _BEGINS:
+                if not file.read(max(map(len, marks))).startswith(marks):
                     continue
             yield path.name, regular.content(path, regular.JSON_BYTES, follow=False)

@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import numpy as np
 
 from tacpipe.channels.streams import EVENTS
-from tacpipe.datasets import checks, directory, recording_names
+from tacpipe.datasets import directory, recording_names
 from tacpipe.datasets import manifest as manifest_of
 from tacpipe.datasets.manifest import ACQUIRE, Entry, Manifest
+from tacpipe.datasets.pages import Item
 from tacpipe.engine import keys, provenance
 from tacpipe.errors import DamagedError, TacpipeError, UsageError
 from tacpipe.plugins.stage import Attribute
@@ -74,14 +75,10 @@ def append(store: Store, output: Path, spooled: Spooled, rig: Rig, sealed: Mappi
             return directory.Change(before, may_lack=_others(before, known, named))
         name = _free(spooled.header["recording"], there)
         now = before or Manifest(ACQUIRE, VERSION)
-        now = replace(
-            now,
-            recordings=dict(sorted({**now.recordings, name: entry}.items())),
-            files=dict(sorted({**now.files, named: text}.items())),
-            sources=dict(sorted({**now.sources, name: {RIG: text["digest"]}}.items())),
-        )
+        now = now.with_recordings({name: Item(entry, None, {RIG: text["digest"]})})
+        now = replace(now, files=dict(sorted({**now.files, named: text}.items())))
         try:
-            checks.check(now)
+            manifest_of.check_pages(now, fresh=True)
             now.content  # noqa: B018  (what JSON cannot hold is refused here)
         except (ValueError, TypeError, KeyError) as error:  # what every reader would refuse is never published
             raise TacpipeError(

@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 
 BESIDE, ABSOLUTE, PUSHED = "beside", "absolute", "pushed"  # kinds of roots
 # {"path", "kind", "manifest", "previous", "written_s", "history"}, and "missing_since_s" while out of reach. "pushed" are
-# manifests of this path that went to other stores, newest first; of what was pushed here, "project" states whose it is
+# manifests of this path that went to other stores, newest first; of what was pushed here, "project" states whose it is;
+# "key" names the run that gave the manifest, or what it was labelled in
 Root = dict[str, Any]
 ROOT_BYTES = 1 << 24  # the largest root that is read: a history of 100,000 entries
 HISTORY = 20  # manifests that a path held before and that are remembered; ``lasting`` ones are remembered for ever
@@ -33,8 +34,8 @@ class Roots:
     def __init__(self, store: Store) -> None:
         self.store = store
 
-    def set(self, path: Path, manifest: str, *, durable: bool = False, lasting: bool = False) -> None:
-        """Note that ``path`` now holds ``manifest``; the one before goes into the history of the path.
+    def set(self, path: Path, manifest: str, *, durable: bool = False, lasting: bool = False, key: str = "") -> None:
+        """Note that ``path`` now holds ``manifest``, which the run of ``key`` gave; the one before goes into the history.
 
         That one is ``lasting`` where it held recordings or labels that are not in the new one: `gc` then keeps it.
         """
@@ -42,7 +43,8 @@ class Roots:
         known = self.get(path)
         if known is None or known["manifest"] != manifest:
             pushed = {"pushed": known["pushed"]} if known and "pushed" in known else {}
-            self.write({"path": name, "kind": kind, **succeeding(known, manifest, lasting=lasting), **pushed})
+            stated = {**pushed, **({"key": key} if key else {})}
+            self.write({"path": name, "kind": kind, **succeeding(known, manifest, lasting=lasting), **stated})
         if durable:
             self.store.sync(self._file(kind, name))
 

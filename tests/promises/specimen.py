@@ -15,7 +15,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 import tacpipe
-from tacpipe.datasets.manifest import NAME, Manifest, parse
+from tacpipe.datasets.manifest import NAME, Found, Manifest
+from tacpipe.datasets.pages import PAGE
 from tacpipe.errors import DAMAGED, TacpipeError, UsageError
 from tacpipe.io.hashing import bytes_digest
 from tacpipe.io.parquet import owned
@@ -88,7 +89,7 @@ class Specimen:
 
     def expected(self, dataset: str) -> Contents:
         """Return what a dataset held."""
-        paths = [path for path, _ in self.manifests[dataset].objects()]
+        paths = [path for path, _ in self.manifests[dataset].objects() if not path.startswith(PAGE)]
         return {path: stated(self.sound[f"{dataset}/{path}"], path) for path in paths}
 
     def rerun(self) -> list[Ran]:
@@ -140,7 +141,11 @@ def copy(made: Path, lab: Lab) -> Specimen:
         shutil.rmtree(path)
     clone(made, lab.folder)
     sound = files(made / "data")
-    manifests = {name.parent.name: parse(sound[str(name)], str(name)) for name in map(Path, sound) if name.name == NAME}
+    manifests = {
+        name.parent.name: Found(made / "data" / name.parent, sound[str(name)]).manifest
+        for name in map(Path, sound)
+        if name.name == NAME
+    }
     return Specimen(lab, sound, manifests)
 
 
