@@ -139,7 +139,7 @@ def _show(store: Store, wanted: Change, directory: Path) -> None:
         key = (store.roots.get(directory) or {}).get("key", "") if relabelled else wanted.key
         store.roots.set(directory, manifest.content_digest, durable=True, lasting=lasting, key=key)
         store.fetch(stale.values())
-        sweep(directory, shards=bool(stale), deep=manifest.exported)
+        sweep(directory, shards=any("/" in path for path in stale), deep=manifest.exported)
         for path in stale:
             with contextlib.suppress(*([MissingError] if path in wanted.may_lack else [])):
                 place(store, stale[path], directory / path, copy=manifest.copied)
