@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
+from tacpipe.errors import TacpipeError
 from tacpipe.metrics import calibration
-from tacpipe.models.class_distance import NAMES, ClassDistance
+from tacpipe.models.class_distance import ClassDistance
 from tacpipe.models.minirocket_classifier import with_profile
 from tacpipe.models.statistics_classifier import statistics
 
@@ -27,18 +29,46 @@ def test_the_nearest_class_is_the_slides_own_and_other_textures_are_far() -> Non
     assert calibration.auroc(scores.max(axis=1), fitted.scores(others).max(axis=1)) > 0.95
 
 
-def test_the_distance_is_that_to_a_class_less_that_to_all_slides() -> None:
-    frames, labels = slides((0, 2, 5), 60, 0)
-    fitted = ClassDistance.fit(frames, labels)
-    assert fitted.patterns is not None
-    features = np.hstack([statistics(frames), fitted.patterns.transform(with_profile(frames))])
-    placed = (features - fitted.centre) @ fitted.projection  # (slide, component), whitened within classes
-    apart = placed - placed.mean(axis=0)
-    overall = np.einsum("ij,jk,ik->i", apart, np.linalg.inv(np.cov(placed.T)), apart)
-    own = np.square(placed - fitted.means[np.searchsorted(fitted.classes, labels)]).sum(axis=1)
-    assert 0.5 < own.mean() / placed.shape[1] < 1.2  # about as much as there are components
-    found = fitted.scores(frames)[np.arange(len(labels)), np.searchsorted(fitted.classes, labels)]
-    np.testing.assert_allclose(found, (overall - own) / 2, rtol=1e-3, atol=1e-3)
+def test_a_slide_far_from_all_training_slides_scores_lower_than_each_slide_of_a_learned_class() -> None:
+    fitted = ClassDistance.fit(*slides((0, 2, 5), 60, 0))
+    learned = fitted.scores(slides((0, 2, 5), 20, 1)[0]).max(axis=1)
+    for kind in (100, 1000, 10_000):
+        assert fitted.scores(slides((kind,), 20, 2)[0]).max() < learned.min()
+
+
+def test_no_direction_counts_more_in_the_distance_to_all_slides_than_in_the_distance_to_a_class() -> None:
+    fitted = ClassDistance.fit(*slides((0, 2, 5), 60, 0))
+    assert np.linalg.norm(fitted.overall, 2) <= 1 + 1e-9  # else a slide far enough in that direction scores highest
+
+
+def test_the_score_of_a_class_compares_distances_to_all_slides_to_its_mean_and_to_its_nearest_slide() -> None:
+    learned, labels = slides((0, 2, 5), 60, 0)
+    fitted = ClassDistance.fit(learned, labels)
+
+    def components(frames: np.ndarray) -> np.ndarray:
+        features = np.hstack([statistics(frames), fitted.patterns.transform(with_profile(frames))])
+        return (features - fitted.centre) @ fitted.projection  # (slide, component)
+
+    frames, _ = slides((2,), 1, 1)
+    plain_training, (plain,) = components(learned), components(frames)
+    training, slide = plain_training * fitted.gain, plain * fitted.gain
+    means = np.stack([training[labels == kind].mean(axis=0) for kind in (0, 2, 5)])
+    deviations = np.concatenate([training[labels == kind] - mean for kind, mean in zip((0, 2, 5), means, strict=True)])
+    assert 0.5 < np.square(deviations).sum(axis=1).mean() / len(slide) < 1.2  # about the number of components
+    to_all = slide @ np.linalg.inv(np.eye(len(slide)) + np.cov(means.T)) @ slide
+    expected = [
+        np.log(to_all * np.linalg.norm(plain))
+        - np.log(np.square(slide - mean).sum())
+        - np.log(np.square(slide - training[labels == kind]).sum(axis=1).min())
+        - np.log(np.square(plain - plain_training[labels == kind]).sum(axis=1).min())
+        for kind, mean in zip((0, 2, 5), means, strict=True)
+    ]
+    np.testing.assert_allclose(fitted.scores(frames)[0], expected, rtol=1e-6)
+
+
+def test_training_slides_themselves_have_a_finite_score() -> None:
+    frames, labels = slides((0, 5), 10, 0)
+    assert np.isfinite(ClassDistance.fit(frames, labels).scores(frames)).all()
 
 
 def test_tensors_give_back_the_distance() -> None:
@@ -47,14 +77,6 @@ def test_tensors_give_back_the_distance() -> None:
     assert (ClassDistance.from_tensors(fitted.to_tensors()).scores(frames) == fitted.scores(frames)).all()
 
 
-def test_tensors_without_patterns_are_of_models_that_read_only_statistics() -> None:
-    frames, labels = slides((0, 5), 10, 0)
-    fitted = ClassDistance.fit(frames, labels)
-    count = statistics(frames).shape[1]
-    tensors = {name: tensor for name, tensor in fitted.to_tensors().items() if name in NAMES}
-    tensors |= {"centre": fitted.centre[:count], "projection": fitted.projection[:count]}
-    older = ClassDistance.from_tensors(tensors)
-    placed = (statistics(frames) - older.centre) @ older.projection
-    apart = np.square(placed[:, None] - older.means[None]).sum(axis=2)
-    away = np.square((placed - older.middle) @ older.overall).sum(axis=1)[:, None]
-    np.testing.assert_allclose(older.scores(frames), (away - apart) / 2, rtol=1e-6)
+def test_tensors_of_an_earlier_version_ask_for_another_calibration() -> None:
+    with pytest.raises(TacpipeError, match="tacpipe calibrate"):
+        ClassDistance.from_tensors({"classes": np.arange(2), "means": np.zeros((2, 3))})
