@@ -32,6 +32,11 @@ def check_levels(percents: tuple[int, ...]) -> None:
         )
 
 
+def pinball(above: AnyFloats, levels: AnyFloats) -> AnyFloats:
+    """Return the loss by value and level (..., level) where the true value lies ``above`` (..., level) the quantile."""
+    return np.maximum(levels * above, (levels - 1) * above)
+
+
 @dataclass(frozen=True)
 class Sums:
     """Sums over the values of one recording: what adds up."""
@@ -51,7 +56,7 @@ class Sums:
         above = truth[..., None].astype(np.float64) - predicted
         within = (above[..., 0] >= 0) & (above[..., -1] <= 0)
         return cls(
-            np.maximum(levels * above, (levels - 1) * above).sum(axis=0),
+            pinball(above, levels).sum(axis=0),
             (above <= 0).sum(axis=0).astype(np.float64),
             within.sum(axis=0).astype(np.float64),
             (predicted[..., -1].astype(np.float64) - predicted[..., 0]).sum(axis=0),

@@ -12,7 +12,7 @@ from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.metrics.quantiles import check_levels
 from tacpipe.tasks.touch import grasps as grasps_of
 from tacpipe.tasks.touch.predictor import CONFIG, Predictor
-from tacpipe.tasks.touch.uncertainty import FILE, Uncertainty
+from tacpipe.tasks.touch.quantiles import FILE, ReadingQuantiles
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
@@ -39,7 +39,7 @@ def calibrate(model: Mapping[str, bytes], asked: Asked, training: Dataset, valid
         )
     levels = np.array(asked.quantiles) / 100
     predicted = predictor.predict_grasps(watched)
-    made = Uncertainty.fit(levels, known, watched, predicted, promised=asked.promise)
+    made = ReadingQuantiles.fit(levels, known, watched, predicted, promised=asked.promise)
     trained_on = {**predictor.config["trained_on"]}
     trained_on |= {name: one for name, one in zip(watched.names, watched.digests, strict=True) if one not in learned}
     stated = {

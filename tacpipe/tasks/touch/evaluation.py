@@ -18,9 +18,9 @@ from tacpipe.errors import TacpipeError
 from tacpipe.io import progress
 from tacpipe.metrics import headline, regression
 from tacpipe.plugins.stage import RecordingOutput, Result
-from tacpipe.tasks.touch import bands, metrics
 from tacpipe.tasks.touch import grasps as grasps_of
 from tacpipe.tasks.touch import headline as headlines
+from tacpipe.tasks.touch import metrics, quantiles
 from tacpipe.tasks.touch.grasps import Grasps
 from tacpipe.tasks.touch.metrics import Readings, Tree
 from tacpipe.tasks.touch.predictor import CONFIG, HISTORY, Predictor
@@ -83,8 +83,8 @@ def _evaluated(
         "by_object.csv": _by_object_csv(tree),
         **{name: model[name] for name in (CONFIG, HISTORY) if name in model},
     }
-    if predictor.uncertainty is not None:
-        files[COVERAGE] = bands.coverage(predictor.uncertainty, grasps, predicted, ~seen, known)
+    if predictor.quantiles is not None:
+        files[COVERAGE] = quantiles.coverage(predictor.quantiles, grasps, predicted, ~seen, known)
     streams[GRASPS] = _about(grasps, seen, known)
     attributes = origin.together(shard.attributes for shard in recordings.recordings.values())
     return Result({PREDICTIONS: RecordingOutput(streams, attributes)}, files)
@@ -94,12 +94,13 @@ def _quantiles(
     predictor: Predictor, grasps: Grasps, predicted: Mapping[str, Readings], seen: Bools, known: Bools
 ) -> Tree:
     """Return the measures of a calibrated model's quantiles, of known objects and of novel ones; empty for others."""
-    if predictor.uncertainty is None:
+    if predictor.quantiles is None:
         return {}
     parts = {"known": known & ~seen, "novel": ~known & ~seen}
     clusters = {"known": grasps.names, "novel": grasps.objects}
     trees = {
-        name: bands.tree(predictor.uncertainty, grasps, predicted, mask, clusters[name]) for name, mask in parts.items()
+        name: quantiles.tree(predictor.quantiles, grasps, predicted, mask, clusters[name])
+        for name, mask in parts.items()
     }
     return {**predictor.config["quantiles"], **{name: one for name, one in trees.items() if one}}
 

@@ -39,8 +39,8 @@ def predictions(predictor: Predictor, recordings: Dataset, quantiles: Sequence[i
         raise TacpipeError("There is no grasp to predict. Give a dataset with recordings of the role asked for.")
     predicted = predictor.predict_grasps(grasps)
     bands = {}
-    if quantiles and predictor.uncertainty is not None:
-        found = predictor.uncertainty.quantiles(predicted)
+    if quantiles and predictor.quantiles is not None:
+        found = predictor.quantiles.quantiles(predicted)
         bands = {
             one: {target: values[..., level] for target, values in found.items()}
             for one, level in zip(quantiles, at, strict=True)

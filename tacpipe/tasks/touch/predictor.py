@@ -24,9 +24,9 @@ from tacpipe.tasks.touch import members
 from tacpipe.tasks.touch.baselines import Baselines
 from tacpipe.tasks.touch.grasps import Grasps, check
 from tacpipe.tasks.touch.params import Params
+from tacpipe.tasks.touch.quantiles import FILE as QUANTILES
+from tacpipe.tasks.touch.quantiles import ReadingQuantiles
 from tacpipe.tasks.touch.shrinkage import Shrinkage
-from tacpipe.tasks.touch.uncertainty import FILE as QUANTILES
-from tacpipe.tasks.touch.uncertainty import Uncertainty
 from tacpipe.training import devices
 from tacpipe.training.scaling import Affine
 
@@ -67,7 +67,7 @@ class Predictor:
     baselines: Baselines | None
     chain: Chain | None = None  # the stages that it was trained behind; None: unknown
     shrinkage: Shrinkage | None = None  # of predictions for objects that it was not trained on
-    uncertainty: Uncertainty | None = None  # of a model that `tacpipe calibrate` made
+    quantiles: ReadingQuantiles | None = None  # of a model that `tacpipe calibrate` made
 
     @classmethod
     def load(cls, files: Mapping[str, bytes], chain: Chain | None = None) -> Self:
@@ -94,8 +94,8 @@ class Predictor:
                 raise ValueError(f"its members do not predict {excerpt(config['targets'])}")
             shrunk = {name: value.numpy() for name, value in under(SHRINKAGE, tensors).items()}
             shrinkage = Shrinkage.from_tensors(shrunk, config["targets"]) if shrunk else None
-            uncertainty = Uncertainty.load(files[QUANTILES], config["targets"]) if QUANTILES in files else None
-        return cls(params, config, found, baselines, chain, shrinkage, uncertainty)
+            quantiles = ReadingQuantiles.load(files[QUANTILES], config["targets"]) if QUANTILES in files else None
+        return cls(params, config, found, baselines, chain, shrinkage, quantiles)
 
     @cached_property
     def targets(self) -> tuple[str, ...]:
@@ -117,9 +117,9 @@ class Predictor:
             predicted, np.array([name not in self.config["objects"] for name in grasps.objects])
         )
 
-    def quantiles_of(self, percents: Sequence[int]) -> tuple[Uncertainty, list[int]]:
+    def quantiles_of(self, percents: Sequence[int]) -> tuple[ReadingQuantiles, list[int]]:
         """Return `tacpipe.tasks.calibrated.quantiles_of` of the model."""
-        return calibrated.quantiles_of(self.uncertainty, percents)
+        return calibrated.quantiles_of(self.quantiles, percents)
 
     def predict_all(self, cloud: Cloud, grasps: Sequence[Grasp]) -> list[Touch]:
         """Return the touch of several grasps on one cloud, in one pass; `model.TouchModel.predict` describes both."""

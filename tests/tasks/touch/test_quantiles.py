@@ -50,16 +50,16 @@ def test_a_calibrated_model_predicts_the_same_and_adds_its_quantiles(
     assert found.select(before.column_names).equals(before)
     assert found.column_names[1:4] == ["pdc_th", "pdc_th_q10", "pdc_th_q90"]
     assert (found["e_mf_07_q10"].to_numpy() < found["e_mf_07_q90"].to_numpy()).all()
-    assert TouchModel.load(model).uncertainty.percents == PERCENTS  # type: ignore[union-attr]
+    assert TouchModel.load(model).quantiles.percents == PERCENTS  # type: ignore[union-attr]
 
 
 def test_as_many_values_of_calibration_grasps_lie_below_a_quantile_as_its_level_states(
     model: dict[str, bytes], watched: Any
 ) -> None:
     loaded = TouchModel.load(model)
-    assert loaded.uncertainty is not None
+    assert loaded.quantiles is not None
     grasps = grasps_of.read(watched)
-    for target, bands in loaded.uncertainty.quantiles(loaded.predict_grasps(grasps)).items():
+    for target, bands in loaded.quantiles.quantiles(loaded.predict_grasps(grasps)).items():
         below = (grasps.readings[target][..., None] <= bands + 1e-9).mean(axis=(0, 1))
         assert (below >= np.array(PERCENTS) / 100 - 1e-9).all()
         assert (below <= np.array(PERCENTS) / 100 + 1.5 / len(grasps)).all()

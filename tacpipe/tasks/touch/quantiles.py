@@ -1,4 +1,4 @@
-"""How uncertain a predicted reading is, of a model of any architecture: quantiles about what it predicts.
+"""Quantiles of predicted readings, for a model of any architecture: their fit, their coverage and their pinball loss.
 
 Grasps are few, so that no spread can be learned for each: a value's error is measured in units of its own standard
 deviation over training grasps, and of these units the quantiles are those of all values of a target together, each
@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from safetensors.numpy import save
@@ -19,20 +19,24 @@ from tacpipe.arrays import AnyArray, Bools, Floats
 from tacpipe.channels import biotac_sp
 from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError
-from tacpipe.metrics import conformal
+from tacpipe.io.parquet import to_parquet
+from tacpipe.metrics import conformal, quantiles
+from tacpipe.metrics.quantiles import Sums
 from tacpipe.models.tensors import under
 from tacpipe.tasks import calibrated
 from tacpipe.tasks.touch.grasps import Grasps
+from tacpipe.tasks.touch.result_names import CONSTANT, MODEL, OBJECT_MEAN
 
 FILE = "quantiles.safetensors"
 LEVELS = "levels"
-MODEL, CONSTANT, OBJECT_MEAN = "model", "constant", "object_mean"
+MEAN = "mean"
+
 Readings = Mapping[str, Floats]  # by target (grasp, value), device counts
 Offsets = Mapping[str, Floats]  # by target (level, value), device counts
 
 
 @dataclass(frozen=True)
-class Uncertainty:
+class ReadingQuantiles:
     """By how much quantiles lie beyond a prediction: of the model, of the constant and of the object's mean."""
 
     levels: Floats  # (level,), fractions in ascending order
@@ -84,6 +88,84 @@ class Uncertainty:
             if shapes != {target: (len(found[LEVELS]), biotac_sp.width(target)) for target in targets}:
                 raise ValueError(f"the quantiles are of {shapes}")
         return cls(found[LEVELS], offsets)
+
+
+def tree(
+    fitted: ReadingQuantiles, grasps: Grasps, predicted: Mapping[str, Readings], mask: Bools, clusters: Sequence[str]
+) -> dict[str, Any]:
+    """Return measures of the quantiles of grasps that a mask (grasp,) chooses, by predictor, measure and target.
+
+    ``pinball`` and ``width`` are in device counts; the interval of ``coverage`` is over ``clusters`` (grasp,), and
+    ``pinball_skill`` is over the constant with its empirical quantiles. Empty without grasps.
+    """
+    if not mask.any():
+        return {}
+    found: dict[str, Any] = {}
+    names = np.asarray(clusters)[mask]
+    for predictor in (MODEL, CONSTANT, OBJECT_MEAN):
+        for target in predicted[MODEL]:
+            own, still = (
+                _sums(fitted, grasps, predicted, (name, target), mask, names) for name in (predictor, CONSTANT)
+            )
+            for measure, values in quantiles.tree(own, fitted.percents, still).items():
+                if MEAN in values:
+                    found.setdefault(predictor, {}).setdefault(measure, {})[target] = values[MEAN]
+    return {"n": int(mask.sum()), **found}
+
+
+def coverage(
+    fitted: ReadingQuantiles, grasps: Grasps, predicted: Mapping[str, Readings], mask: Bools, known: Bools
+) -> bytes:
+    """Return ``coverage.parquet``: of grasps that a mask (grasp,) chooses a row a predictor and value.
+
+    It states whether the true value lies in the band from the lowest to the highest quantile, how wide that is and the
+    pinball loss, both in device counts; ``known`` (grasp,) is whether the model knows the object.
+    """
+    import pyarrow as pa
+
+    names, objects = (np.asarray(one)[mask] for one in (grasps.names, grasps.objects))
+    parts = []
+    for predictor in (MODEL, CONSTANT, OBJECT_MEAN):
+        for target, values in predicted[predictor].items():
+            bands = fitted.quantiles({target: values[mask]}, predictor)[target]  # (grasp, value, level)
+            truth = grasps.readings[target][mask]
+            above = truth[..., None] - bands
+            lost = quantiles.pinball(above, fitted.levels).mean(axis=2)
+            count = truth.shape[1]
+            parts.append(
+                pa.table(
+                    {
+                        "recording": np.repeat(names, count),
+                        "object": np.repeat(objects, count),
+                        "known": np.repeat(known[mask], count),
+                        "predictor": [predictor] * truth.size,
+                        "target": [target] * truth.size,
+                        "value": np.tile(np.arange(1, count + 1, dtype=np.int32), len(truth)),
+                        "covered": ((above[..., 0] >= 0) & (above[..., -1] <= 0)).ravel(),
+                        "width": (bands[..., -1] - bands[..., 0]).astype(np.float32).ravel(),
+                        "pinball": lost.astype(np.float32).ravel(),
+                    }
+                )
+            )
+    return to_parquet(pa.concat_tables(parts))
+
+
+def _sums(
+    fitted: ReadingQuantiles,
+    grasps: Grasps,
+    predicted: Mapping[str, Readings],
+    about: tuple[str, str],
+    mask: Bools,
+    clusters: np.ndarray[Any, np.dtype[np.str_]],
+) -> list[Sums]:
+    """Return the sums over the values of each cluster of grasps, of a predictor and target."""
+    predictor, target = about
+    bands = fitted.quantiles({target: predicted[predictor][target][mask]}, predictor)[target]
+    truth = grasps.readings[target][mask]
+    return [
+        Sums.of(truth[some].reshape(-1, 1), bands[some].reshape(-1, 1, bands.shape[2]), fitted.levels)
+        for some in (clusters == name for name in sorted(set(clusters.tolist())))
+    ]
 
 
 def _quantiles(errors: Floats, levels: Floats, promised: bool) -> Floats:
