@@ -161,6 +161,6 @@ def _rate_hz(name: str, t_ns: Times) -> float:
     if not mean_ns > 0 or np.abs(steps_ns - mean_ns).max() > EVEN * mean_ns:
         raise TacpipeError(
             f"Recording {name} has rows {steps_ns.min() / 1e6:g} to {steps_ns.max() / 1e6:g} ms apart, and slip is detected "
-            f"on even ones. Synchronize with `--grid uniform`."
+            f"on even ones. Synchronize with --rate-hz, as --rate-hz 50."
         )
     return 1e9 / mean_ns

@@ -444,11 +444,15 @@ class _Recordings(Mapping[str, Recording]):
             self._names = dict.fromkeys(sorted(entries if names is None else names))
         for name in names or ():
             entries[name]
+        self._opened: WeakValueDictionary[str, Recording] = WeakValueDictionary()
 
     def __getitem__(self, name: str) -> Recording:
         if name not in self._names:
             raise KeyError(name)
-        return Recording(name, self._entries[name], self._read, self._dataset)
+        recording = self._opened.get(name)
+        if recording is None:
+            recording = self._opened[name] = Recording(name, self._entries[name], self._read, self._dataset)
+        return recording
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._names)

@@ -173,7 +173,7 @@ def loss_chart(
 def without_gaps(values: Sequence[float | None]) -> list[float]:
     """Return one value an epoch, NaN where an epoch states none; empty where no epoch states any.
 
-    >>> stated([None, 1]), stated([None, None])
+    >>> without_gaps([None, 1]), without_gaps([None, None])
     ([nan, 1.0], [])
     """
     return (

@@ -75,7 +75,7 @@ def _spec_markup(spec: Any) -> Markup:
 def _pack_spec(spec: Any) -> Any:
     """Return a specification whose data are by column: what is the same in all rows once, other texts by their place.
 
-    >>> _packed({"data": {"values": [{"a": 1, "b": "x"}, {"a": 2, "b": "x"}]}})
+    >>> _pack_spec({"data": {"values": [{"a": 1, "b": "x"}, {"a": 2, "b": "x"}]}})
     {'data': {'rows': 2, 'columns': {'a': [1, 2], 'b': {'of': ['x'], 'at': 0}}}}
     """
     if isinstance(spec, dict):

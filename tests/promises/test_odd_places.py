@@ -123,11 +123,11 @@ def test_a_record_in_the_place_of_another_is_none(one: Specimen) -> None:
 
 def test_a_manifest_of_a_later_format_is_refused_and_left_as_it_is(one: Specimen) -> None:
     path = one.folder / "data/recordings/manifest.json"
-    later = path.read_bytes().replace(b'"format": 1', b'"format": 2')
+    later = path.read_bytes().replace(b'"format": 1', b'"format": 3')
     damages.overwrite(path, later)
     for command in ("scale data/recordings -o data/other", "show data/recordings", "store gc"):
         failed = one.lab.call(command)
-        assert failed.code in (2, DAMAGED) and "manifest format 2" in failed.err, failed
+        assert failed.code in (2, DAMAGED) and "manifest format 3" in failed.err, failed
     assert path.read_bytes() == later
 
 

@@ -156,7 +156,7 @@ def test_a_dataset_of_another_stage_is_refused_before_a_device_is_opened(lab: La
 @pytest.mark.parametrize(
     ("options", "told"),
     [
-        ("", "acquire needs -o: the dataset of recordings to append to."),
+        ("", "Missing option -o. Give the dataset of recordings to append to, as -o data/recordings."),
         ("-o rec --start bell", "There is no --start bell; it must be one of now, key, contact, tap."),
         ("-o rec --stop bell", "There is no --stop bell; it must be one of duration, key, contact, tap."),
         ("-o rec --trials 0", "--trials and --duration must be above 0."),
@@ -179,7 +179,7 @@ def test_what_cannot_be_meant_is_refused_before_a_device_is_opened(lab: Lab, opt
 def test_without_a_rig_file_an_example_is_told(lab: Lab) -> None:
     refused = lab.call("acquire")
 
-    assert refused.code == 2 and "`tacpipe acquire rig.toml -o data/recordings`" in refused.err
+    assert refused.code == 2 and "tacpipe acquire rig.toml -o data/recordings" in refused.err
 
 
 def test_two_recordings_at_once_are_both_appended(lab: Lab, rig: Emulator) -> None:

@@ -331,7 +331,7 @@ def test_recordings_in_which_slip_cannot_be_told_are_refused(shard: Recording) -
     with pytest.raises(TacpipeError, match="no column depth; proximity is in proximity_distance"):
         slips(slips.params(channel="depth"), shard({"": looked_at(np.ones(9))}))
     uneven = looked_at(np.ones(9)).take([0, 1, 2, 5, 6])
-    with pytest.raises(TacpipeError, match=r"rows 20 to 60 ms apart.*--grid uniform"):
+    with pytest.raises(TacpipeError, match=r"rows 20 to 60 ms apart.*--rate-hz"):
         slips(slips.params(), shard({"": uneven}))
     with pytest.raises(TacpipeError, match="has 1 rows"):
         slips(slips.params(), shard({"": uneven.slice(0, 1)}))

@@ -676,7 +676,7 @@ def one_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
     """Requests follow each other, so that a step is the same one each time."""
     from tacpipe.io import threads
 
-    monkeypatch.setattr(threads, "each", lambda work, items, at_once: map(work, items))
+    monkeypatch.setattr(threads, "map_in_threads", lambda work, items, at_once: map(work, items))
 
 
 STEPS = pytest.mark.parametrize(

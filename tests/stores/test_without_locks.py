@@ -28,7 +28,7 @@ def one_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
     def each(work: Callable[[Item], object], items: Iterable[Item], at_once: int) -> Iterator[object]:
         return map(work, items)
 
-    monkeypatch.setattr(threads, "each", each)
+    monkeypatch.setattr(threads, "map_in_threads", each)
 
 
 def push(monkeypatch: pytest.MonkeyPatch, files: Bucket, path: str, **more: Any) -> None:

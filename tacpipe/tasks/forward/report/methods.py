@@ -257,7 +257,7 @@ def read_runs(results: Sequence[Dataset]) -> list[Run]:
 def kind_of_predictor(predictor: str) -> Kind:
     """Return what a predictor is.
 
-    >>> [kind(one) for one in ("model", "model_anchored", "ridge", "codec", "codec_persistence PCA-20")]
+    >>> [kind_of_predictor(one) for one in ("model", "model_anchored", "ridge", "codec", "codec_persistence PCA-20")]
     ['model', 'variant', 'baseline', 'oracle', 'control']
     """
     if predictor.startswith("model"):
@@ -270,7 +270,7 @@ def kind_of_predictor(predictor: str) -> Kind:
 def predictor_name(predictor: str) -> str:
     """Return what tables call a predictor: its name in ``metrics.json`` with spaces.
 
-    >>> called("model_anchored"), called("codec_persistence PCA-20")
+    >>> predictor_name("model_anchored"), predictor_name("codec_persistence PCA-20")
     ('anchored', 'codec persistence PCA-20')
     """
     return predictor.removeprefix("model_").replace("_", " ")
@@ -279,7 +279,7 @@ def predictor_name(predictor: str) -> str:
 def name_with_codec(predictor: str, codec: str) -> str:
     """Return the name of a predictor among several representations: those that go through a codec state which.
 
-    >>> through("ridge", "PCA-20"), through("codec_persistence", "PCA-20")
+    >>> name_with_codec("ridge", "PCA-20"), name_with_codec("codec_persistence", "PCA-20")
     ('ridge', 'codec_persistence PCA-20')
     """
     return f"{predictor} {codec}" if predictor.startswith("codec") else predictor

@@ -47,7 +47,7 @@ def read_codecs(datasets: Sequence[Dataset]) -> list[Tree]:
 def codec_series(codec: Tree) -> str:
     """Return what codecs that differ in width alone are called together.
 
-    >>> series({"kind": "autoencoder", "frames": 2, "of": "increments"})
+    >>> codec_series({"kind": "autoencoder", "frames": 2, "of": "increments"})
     'AE-C2 increments'
     """
     name = f"AE-C{codec.get('frames', 1)}" if codec["kind"] == "autoencoder" else str(codec["kind"]).upper()

@@ -183,7 +183,7 @@ def ordered_sensors(sensors: Collection[str]) -> tuple[str, ...]:
 def sensor_title(sensor: str) -> str:
     """Return a sensor's name as texts have it.
 
-    >>> shown("biotac"), shown("xela1")
+    >>> sensor_title("biotac"), sensor_title("xela1")
     ('BioTac', 'xela1')
     """
     return SENSORS.get(sensor, sensor)
@@ -194,7 +194,7 @@ def slides_kept(slides: int, batch: int, ratio: int) -> int:
 
     90 % leaves out each tenth batch, the others keep each second, fourth, sixth and ninth.
 
-    >>> [kept(600, 32, ratio) for ratio in (100, 90, 50, 25, 17, 11)]
+    >>> [slides_kept(600, 32, ratio) for ratio in (100, 90, 50, 25, 17, 11)]
     [600, 512, 288, 160, 96, 64]
     """
     steps = {50: 2, 25: 4, 17: 6, 11: 9}

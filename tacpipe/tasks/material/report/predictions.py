@@ -98,13 +98,13 @@ def _counted_slides(table: pa.Table, config: Mapping[str, Any], naming: Naming) 
     """Return which rows count (slide,)."""
     sensors = np.array(table["sensor"].to_pylist(), dtype=np.str_)
     materials = _numbers(table, "material", naming)
-    params = params_of.counting(registry.load("train.material"), config.get("params", {}))
+    settings = params_of.counting(registry.load("train.material"), config.get("params", {}))
     counted: Bools = ~table["seen"].to_numpy(zero_copy_only=False).astype(bool)
-    counted &= sensors != str(params.get("frozen_sensor", ""))
+    counted &= sensors != str(settings.get("frozen_sensor", ""))
     for sensor, held_out in config.get("held_out", {}).items():
         counted &= ~((sensors == sensor) & np.isin(materials, held_out))
-    if params.get("drop_last"):
-        batch = int(params["batch"])
+    if settings.get("drop_last"):
+        batch = int(settings["batch"])
         for sensor in np.unique(sensors):
             rows = np.flatnonzero(sensors == sensor)
             counted[rows[len(rows) // batch * batch :]] = False

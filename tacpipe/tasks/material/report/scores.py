@@ -194,7 +194,7 @@ def caution(methods: Sequence[Method]) -> str:
 def format_percent(fraction: float) -> str:
     """Return a share in percent.
 
-    >>> percent(0.995), percent(float("nan"))
+    >>> format_percent(0.995), format_percent(float("nan"))
     ('99.5', '–')
     """
     return fixed(100 * fraction, 1)
@@ -210,7 +210,7 @@ def accuracy_cell(counted: Accuracy | None) -> Cell:
 def count_cell(correct: int, evaluated: int, low: float, high: float, sd: float) -> Cell:
     """Return a share in percent, with its standard deviation where there is one, above what it rests on.
 
-    >>> counted(190, 200, 0.91, 0.97, float("nan"))
+    >>> count_cell(190, 200, 0.91, 0.97, float("nan"))
     Cell(text='95.0', below='190/200 · 91.0 to 97.0', value=0.95, copy='')
     """
     spread = "" if math.isnan(sd) else f" ± {format_percent(sd)}"

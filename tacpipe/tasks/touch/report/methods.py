@@ -210,7 +210,7 @@ def caution(methods: Sequence[Method]) -> str:
 def baseline_name(predictor: str) -> str:
     """Return what a table calls a predictor that is not a model's own.
 
-    >>> baseline("object_mean"), baseline("nearest_neighbours")
+    >>> baseline_name("object_mean"), baseline_name("nearest_neighbours")
     ('mean of the object', 'nearest neighbours')
     """
     return BASELINES.get(predictor, predictor.replace("_", " "))
@@ -219,7 +219,7 @@ def baseline_name(predictor: str) -> str:
 def short_r2(value: float) -> str:
     """Return R² where there is little room.
 
-    >>> [signed_short(value) for value in (0.456, -0.02, -3.04, -1234.5)]
+    >>> [short_r2(value) for value in (0.456, -0.02, -3.04, -1234.5)]
     ['0.46', '−0.02', '−3.0', '< −9']
     """
     if value >= -1 or math.isnan(value):
@@ -235,7 +235,7 @@ def split_name(described: str) -> str:
 def describe_split(described: str, simulated: bool) -> str:
     """Return how grasps were parted and whether they were simulated.
 
-    >>> place("by-day", True), place("simulated", True), place("", False)
+    >>> describe_split("by-day", True), describe_split("simulated", True), describe_split("", False)
     ('by day, simulated', 'simulated', 'one split')
     """
     name = split_name(described)
@@ -271,7 +271,7 @@ def describe_training(methods: Sequence[Method]) -> str:
 def format_span(counts: Sequence[int]) -> str:
     """Return the least and the largest of sorted counts.
 
-    >>> span([412, 9000]), span([7])
+    >>> format_span([412, 9000]), format_span([7])
     ('412 to 9,000', '7')
     """
     return " to ".join(f"{count:,}" for count in dict.fromkeys((counts[0], counts[-1])))
@@ -288,7 +288,7 @@ def read_runs(results: Sequence[Dataset]) -> list[Run]:
 def predictor_name(predictor: str) -> str:
     """Return what tables call a predictor.
 
-    >>> called("object_mean"), called("nearest_neighbours")
+    >>> predictor_name("object_mean"), predictor_name("nearest_neighbours")
     ('mean of the object', 'nearest neighbours')
     """
     return headline.BASELINES.get(predictor, predictor.replace("_", " "))

@@ -114,7 +114,7 @@ class Score:
 def to_counts(target: str, fraction: float) -> float:
     """Return a fraction of a target's range in device counts.
 
-    >>> in_counts("pdc_th", 0.1)
+    >>> to_counts("pdc_th", 0.1)
     90.0
     """
     low, high = biotac_sp.RANGES[target]
