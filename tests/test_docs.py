@@ -353,8 +353,6 @@ def test_every_page_is_in_the_navigation_and_every_link_leads_to_a_page() -> Non
             assert place.exists() or place.relative_to(ROOT / "docs").as_posix() in generated, f"{path}: {target}"
 
 
-@pytest.mark.long
-@pytest.mark.skipif(importlib.util.find_spec("mkdocs") is None, reason="the extra docs is not installed")
 def test_every_page_is_at_most_two_links_from_the_readme() -> None:
     reached = {ROOT / "README.md"}
     for _ in range(2):
@@ -365,6 +363,8 @@ def test_every_page_is_at_most_two_links_from_the_readme() -> None:
     assert {str(page.relative_to(ROOT)) for page in pages - reached} == set()
 
 
+@pytest.mark.long
+@pytest.mark.skipif(importlib.util.find_spec("mkdocs") is None, reason="the extra docs is not installed")
 def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "-d", str(tmp_path / "site")],
