@@ -69,7 +69,7 @@ def probe(
     """
     from tacpipe.links import probing
 
-    found = [(_address(port), _usb_id(port))] if port else list(probing.found_ports())
+    found = [(_address(port), _usb_id(port))] if port else list(probing.list_addresses())
     reports = []
     for address, usb_id in found:
         unasked = passive or (port is None and not usb_id)  # a machine's own port may lead anywhere, a console even
@@ -139,7 +139,7 @@ def _text(report: Report) -> str:
         return f"{described}; describe the sensor with `generic`, or with `lines` if it sends text."
     first, *others = report.findings
     at = f" at {report.baud:,} baud" if report.baud else ""
-    when = " once asked" if report.asked else ""
+    when = " once asked" if report.requested else ""
     lines = [f"{report.address} speaks {first}{at}{when}."]
     lines += [f"    or {other}" for other in others]
     return "\n".join([*lines, *(f"    {line}" for line in _stanza(report))])
@@ -177,7 +177,7 @@ def _json(report: Report) -> dict[str, Any]:
     return {
         "address": report.address,
         "baud": report.baud,
-        "asked": report.asked,
+        "asked": report.requested,
         "bytes": report.heard,
         "error": report.error or None,
         "certain": report.certain,

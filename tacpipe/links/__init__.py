@@ -1,1 +1,1 @@
-"""What carries a sensor's bytes: serial ports, HID, UDP, TCP, websockets, CAN, a watched folder. One kind a file."""
+"""Read and write a sensor's bytes over serial ports, HID, UDP, TCP, websockets, CAN, LSL, cameras and watched folders."""

@@ -1,17 +1,17 @@
-"""When something arrived: stamps of the wall clock, which kernels and files carry, stated on the monotonic one."""
+"""Convert arrival stamps of the wall clock, as kernels and files carry them, to the monotonic clock."""
 
 from __future__ import annotations
 
 import time
 
-OLDEST_NS = 60_000_000_000  # what seems older than that was stamped before the wall clock was set
-LOOKS = 3  # at both clocks, of which the quickest counts: another program may run between two readings
+OLDEST_NS = 60_000_000_000  # an older stamp was made before the wall clock was set
+READINGS = 3  # both clocks are read so often and the quickest reading counts: another program may run in between
 
 
 class Arrivals:
-    """Maps wall-clock stamps of arrivals to the monotonic clock; what is given out never goes back.
+    """Convert wall-clock stamps of arrivals to the monotonic clock, in times that never decrease.
 
-    How far apart two stamps are stays as it was given, because the distance of the clocks is changed only when it must be.
+    Distances between stamps stay as they are: the offset of the clocks changes only when a reading contradicts it.
     """
 
     def __init__(self) -> None:
@@ -20,19 +20,19 @@ class Arrivals:
         self._last_ns = self._last_wall_ns = 0
 
     def look(self) -> None:
-        """Read both clocks anew: call it once for all that was fetched, and after it, so that no stamp lies ahead.
+        """Read both clocks. Call it once per batch, after the fetch, so that no stamp lies ahead of the reading.
 
-        The wall clock may be set at any time: the distance moves just so far that it agrees with the readings.
+        The wall clock may be set at any time: the offset moves only as far as the readings require.
         """
-        before_ns, self._wall_ns, self._now_ns = min((_readings() for _ in range(LOOKS)), key=lambda r: r[2] - r[0])
+        before_ns, self._wall_ns, self._now_ns = min((_readings() for _ in range(READINGS)), key=lambda r: r[2] - r[0])
         least_ns, most_ns = before_ns - self._wall_ns, self._now_ns - self._wall_ns
-        known_ns = (least_ns + most_ns) // 2 if self._ahead_ns is None else self._ahead_ns
-        self._ahead_ns = min(max(known_ns, least_ns), most_ns)
+        offset_ns = (least_ns + most_ns) // 2 if self._ahead_ns is None else self._ahead_ns
+        self._ahead_ns = min(max(offset_ns, least_ns), most_ns)
 
-    def of(self, wall_ns: int) -> int:
-        """Return the monotonic time in ns of a stamp; one from the future, or far back, arrived just now.
+    def to_monotonic(self, wall_ns: int) -> int:
+        """Return the monotonic time in ns of a stamp. A stamp of the future or the far past counts as arrived now.
 
-        A later stamp gives a later time, if only by 1 ns where the clocks' distance shrank meanwhile.
+        A later stamp gives a later time, by at least 1 ns even where the offset of the clocks shrank.
         """
         assert self._ahead_ns is not None, "look first"
         is_plausible = 0 <= self._wall_ns - wall_ns <= OLDEST_NS
@@ -43,7 +43,7 @@ class Arrivals:
 
 
 def _readings() -> tuple[int, int, int]:
-    """Return the wall clock between two readings of the monotonic clock."""
+    """Return a reading of the monotonic clock, one of the wall clock and another of the monotonic clock, in ns."""
     before_ns = time.monotonic_ns()
     wall_ns = time.time_ns()
     return before_ns, wall_ns, time.monotonic_ns()

@@ -1,4 +1,4 @@
-"""Depth cameras: Intel RealSense, through Open3D; one image of depth and colour an entry."""
+"""Depth cameras: Intel RealSense, through Open3D. Each entry is one image of depth and colour."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import numpy as np
 
 from tacpipe.clouds.depth_frame import DepthFrame
 from tacpipe.errors import DeviceError, UsageError
-from tacpipe.links.opened import Arrived, Opened
+from tacpipe.links.link import Arrived, Opened
 from tacpipe.plugins import extras
 from tacpipe.sensors.sensor import Sensor
 
-PAUSE_S = 0.002  # between looks for a frame; at the fastest they are 11 ms apart
+PAUSE_S = 0.002  # pause between polls; frames are at least 11 ms apart
 
 
 def open_camera(place: str, sensor: Sensor, name: str) -> CameraLink:
@@ -27,8 +27,8 @@ def open_camera(place: str, sensor: Sensor, name: str) -> CameraLink:
     kind = getattr(open3d.t.io, "RealSenseSensor", None)
     if kind is None:
         raise DeviceError(f"{name}: this Open3D was built without RealSense; record clouds by folder:PATH instead.")
-    there = [str(device.serial) for device in kind.enumerate_devices()]
-    serial = _serial(place, there, name)
+    serials = [str(device.serial) for device in kind.enumerate_devices()]
+    serial = _serial(place, serials, name)
     camera = kind()
     try:
         camera.init_sensor(open3d.t.io.RealSenseSensorConfig({"serial": serial}), 0)
@@ -40,15 +40,15 @@ def open_camera(place: str, sensor: Sensor, name: str) -> CameraLink:
     return CameraLink(name, camera)
 
 
-def _serial(place: str, there: list[str], name: str) -> str:
-    """Return the serial number of the camera that an address means."""
-    if place in there:
+def _serial(place: str, serials: list[str], name: str) -> str:
+    """Return the serial number of the camera that ``place``, a number or a serial number, names."""
+    if place in serials:
         return place
     if not place.isdigit():
         raise UsageError(f"camera:{place} names no camera; it should read camera:0, or hold a serial number.")
-    if len(place) < 4 and int(place) < len(there):
-        return there[int(place)]
-    described = f"there are {', '.join(there)}" if there else "there is none at all"
+    if len(place) < 4 and int(place) < len(serials):
+        return serials[int(place)]
+    described = f"there are {', '.join(serials)}" if serials else "there is none at all"
     raise DeviceError(f"{name}: no RealSense camera {place} is connected; {described}. Plug it in to a USB 3 port.")
 
 
@@ -64,7 +64,7 @@ class CameraLink(Opened):
         matrix = np.asarray(metadata.intrinsics.intrinsic_matrix)
         self._focal = float(matrix[0, 0]), float(matrix[1, 1])
         self._centre = float(matrix[0, 2]), float(matrix[1, 2])
-        self._unit_m = 1 / float(metadata.depth_scale)  # which RealSense gives in counts a metre
+        self._unit_m = 1 / float(metadata.depth_scale)  # RealSense states counts per metre
 
     def _receive(self, timeout_s: float) -> Arrived:
         until = time.monotonic() + timeout_s
@@ -86,5 +86,5 @@ class CameraLink(Opened):
             time.sleep(PAUSE_S)
 
     def _release(self) -> None:
-        with contextlib.suppress(RuntimeError):  # of a camera that was unplugged
+        with contextlib.suppress(RuntimeError):  # the camera was unplugged
             self.camera.stop_capture()

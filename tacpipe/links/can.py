@@ -1,4 +1,4 @@
-"""CAN buses through python-can: one frame an entry, 13 bytes each."""
+"""Read and write CAN buses through python-can. Each entry is one frame of 13 bytes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tacpipe.errors import DeviceError, UsageError
 from tacpipe.io.files import listed
 from tacpipe.links import serial_port
 from tacpipe.links.arrival import Arrivals
-from tacpipe.links.opened import Arrived, Opened
+from tacpipe.links.link import Arrived, Opened
 from tacpipe.plugins import extras
 from tacpipe.sensors.sensor import Sensor
 
@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     import can
 
 KINDS = ("socketcan", "slcan", "virtual")
-FRAME = struct.Struct("<IB8s")  # identifier, how many data bytes, and those, filled up with zeros
-EXTENDED = 1 << 31  # in the identifier: it has 29 bits
+FRAME = struct.Struct("<IB8s")  # identifier, number of data bytes, data bytes padded with zeros
+EXTENDED = 1 << 31  # flag of an identifier with 29 bits
 SEND_S = 1.0
 INTERFACES = Path("/sys/class/net")
 IS_CAN = "280"  # ARPHRD_CAN of <linux/if_arp.h>
@@ -32,7 +32,7 @@ def open_can(place: str, sensor: Sensor, name: str) -> CanLink:
 
     Raises `UsageError` for an address that is none, `DeviceError` for an interface that is missing, down, or not permitted.
     """
-    kind, channel, bitrate = parsed(place)
+    kind, channel, bitrate = parse_place(place)
     with extras.named(name):
         import can
     if kind == "slcan":
@@ -41,18 +41,18 @@ def open_can(place: str, sensor: Sensor, name: str) -> CanLink:
     try:
         bus = can.Bus(interface=kind, channel=channel, ignore_config=True, **options)
     except (can.CanError, OSError, ValueError) as error:
-        raise _refused(error, kind, channel, bitrate, name) from error
+        raise _open_error(error, kind, channel, bitrate, name) from error
     return CanLink(name, bus)
 
 
-def parsed(place: str) -> tuple[str, str, int | None]:
-    """Return kind, channel and bit rate of an address, None where it states none.
+def parse_place(place: str) -> tuple[str, str, int | None]:
+    """Return kind, channel and bit rate of an address. The bit rate is None where the address states none.
 
-    >>> parsed("slcan:/dev/ttyACM0@1000000"), parsed("socketcan:can0")
+    >>> parse_place("slcan:/dev/ttyACM0@1000000"), parse_place("socketcan:can0")
     (('slcan', '/dev/ttyACM0', 1000000), ('socketcan', 'can0', None))
     """
-    kind, _, rest = place.partition(":")
-    channel, at, bitrate = rest.partition("@")
+    kind, _, channel_text = place.partition(":")
+    channel, at, bitrate = channel_text.partition("@")
     if kind not in KINDS or not channel or (at and not bitrate.isdigit()):
         raise UsageError(
             f"can:{place} is not a CAN bus; it should read can:KIND:CHANNEL or can:KIND:CHANNEL@BITRATE with one of "
@@ -61,20 +61,20 @@ def parsed(place: str) -> tuple[str, str, int | None]:
     return kind, channel, int(bitrate) if at else None
 
 
-def _refused(error: Exception, kind: str, channel: str, bitrate: int | None, name: str) -> DeviceError:
+def _open_error(error: Exception, kind: str, channel: str, bitrate: int | None, name: str) -> DeviceError:
     if kind == "slcan":
-        within = error if isinstance(error, OSError) else error.__cause__ or error.__context__
-        return serial_port.refused(within if isinstance(within, OSError) else OSError(str(error)), channel, name)
-    there = [path.name for path in listed(INTERFACES) if _type(path) == IS_CAN]
-    if kind == "socketcan" and channel not in there:
+        cause = error if isinstance(error, OSError) else error.__cause__ or error.__context__
+        return serial_port.refused(cause if isinstance(cause, OSError) else OSError(str(error)), channel, name)
+    interfaces = [path.name for path in listed(INTERFACES) if _hardware_type(path) == IS_CAN]
+    if kind == "socketcan" and channel not in interfaces:
         return DeviceError(
-            f"{name}: there is no CAN interface {channel}; there {'are' if len(there) > 1 else 'is'} "
-            f"{', '.join(there) or 'none'}. Plug the adapter in, or correct the transport."
+            f"{name}: there is no CAN interface {channel}; there {'are' if len(interfaces) > 1 else 'is'} "
+            f"{', '.join(interfaces) or 'none'}. Plug the adapter in, or correct the transport."
         )
     return DeviceError(f"{name}: {channel} cannot be opened: {error}. {_bring_up(channel, bitrate)}")
 
 
-def _type(interface: Path) -> str:
+def _hardware_type(interface: Path) -> str:
     try:
         return (interface / "type").read_text().strip()
     except OSError:
@@ -98,24 +98,24 @@ class CanLink(Opened):
     def _receive(self, timeout_s: float) -> Arrived:
         import can
 
-        found: Arrived = []
+        entries: Arrived = []
         try:
             message = self.bus.recv(timeout_s)
             while message is not None:
                 if not message.is_error_frame and not message.is_remote_frame and len(message.data) <= 8:
                     self._arrivals.look()
-                    found.append((self._arrivals.of(int(message.timestamp * 1e9)), packed(message)))
+                    entries.append((self._arrivals.to_monotonic(int(message.timestamp * 1e9)), pack_frame(message)))
                 message = self.bus.recv(0)
         except (can.CanError, OSError, ValueError) as error:
-            if not found:
+            if not entries:
                 raise self.lost(str(error)) from error
-        return found
+        return entries
 
     def _send(self, data: bytes) -> None:
         import can
 
         try:
-            for message in unpacked(data):
+            for message in unpack_frames(data):
                 self.bus.send(message, timeout=SEND_S)
         except (can.CanError, OSError, ValueError) as error:
             raise self.lost(str(error)) from error
@@ -125,26 +125,21 @@ class CanLink(Opened):
 
         try:
             self.bus.shutdown()
-        except (
-            can.CanError,
-            OSError,
-            ValueError,
-            termios.error,
-        ):  # an adapter that is gone cannot be determined to stop
-            port = getattr(self.bus, "serialPortOrig", None)  # of slcan, which stays open then
+        except (can.CanError, OSError, ValueError, termios.error):  # an unplugged adapter does not answer
+            port = getattr(self.bus, "serialPortOrig", None)  # slcan leaves its serial port open then
             if port is not None:
                 with contextlib.suppress(OSError):
                     port.close()
 
 
-def packed(message: can.Message) -> bytes:
-    """Return the 13 bytes of a frame."""
+def pack_frame(message: can.Message) -> bytes:
+    """Return the 13 bytes of a CAN frame."""
     identifier = message.arbitration_id | (EXTENDED if message.is_extended_id else 0)
     return FRAME.pack(identifier, len(message.data), bytes(message.data))
 
 
-def unpacked(data: bytes) -> list[can.Message]:
-    """Return the frames of 13 bytes each."""
+def unpack_frames(data: bytes) -> list[can.Message]:
+    """Return the CAN frames that ``data``, 13 bytes per frame, encodes."""
     import can
 
     return [

@@ -1,4 +1,4 @@
-"""A watched folder: each new file, once it is whole, is one entry."""
+"""Watch a folder. Each new file is one entry once it is completely written."""
 
 from __future__ import annotations
 
@@ -12,17 +12,24 @@ from pathlib import Path
 
 from tacpipe.errors import DeviceError
 from tacpipe.links.arrival import Arrivals
-from tacpipe.links.opened import Arrived, Opened
+from tacpipe.links.link import Arrived, Opened
 from tacpipe.sensors.sensor import Sensor
 
-LOOK_S = 0.02  # between looks at the folder
-SETTLED_S = 0.1  # that a file must not have grown or changed for
-UNFINISHED = (".tmp", ".part", ".partial", ".crdownload", ".swp", "~")  # ends of names that writers rename later
-Face = tuple[int, int, int]  # inode, bytes, and when it was changed, in ns
+LOOK_S = 0.02  # pause between scans of the folder
+SETTLED_S = 0.1  # a file counts as written when it did not change for so long
+UNFINISHED = (
+    ".tmp",
+    ".part",
+    ".partial",
+    ".crdownload",
+    ".swp",
+    "~",
+)  # endings of names that writers rename at the end
+Face = tuple[int, int, int]  # inode, size in bytes, time of the last change in ns
 
 
 def open_folder(place: str, sensor: Sensor, name: str) -> FolderLink:
-    """Return a watch on a folder; the files that are there already are left alone.
+    """Return a watch on a folder, which ignores the files that exist already.
 
     Raises `DeviceError` for a folder that is missing or may not be read.
     """
@@ -37,46 +44,46 @@ def open_folder(place: str, sensor: Sensor, name: str) -> FolderLink:
 
 
 class FolderLink(Opened):
-    """A watch on a folder. A file is whole when nobody has it open for writing and it held still for a while."""
+    """A watch on a folder. A file is complete when no process has it open for writing and it stopped changing."""
 
     packets = True
 
-    def __init__(self, name: str, folder: Path, taken: dict[str, Face]) -> None:
+    def __init__(self, name: str, folder: Path, existing: dict[str, Face]) -> None:
         super().__init__(name)
         self.folder = folder
-        self._taken = taken  # as they looked when they were given out, or when the watch began
-        self._growing: dict[str, tuple[Face, float]] = {}  # and since when they look so
+        self._delivered = existing  # files as they were when they were delivered, or when the watch began
+        self._growing: dict[str, tuple[Face, float]] = {}  # changed files, and since when they have not changed again
         self._arrivals = Arrivals()
         self._woken = threading.Event()
 
     def _receive(self, timeout_s: float) -> Arrived:
         until = time.monotonic() + timeout_s
         while True:
-            found = self._look()
+            entries = self._look()
             left_s = until - time.monotonic()
-            if found or left_s <= 0 or self._woken.wait(min(LOOK_S, left_s)):
-                return found
+            if entries or left_s <= 0 or self._woken.wait(min(LOOK_S, left_s)):
+                return entries
 
     def _look(self) -> Arrived:
-        """Return the content of the files that became whole, in the order of their writing."""
+        """Return the content of the files that became complete, in the order of their last change."""
         try:
             faces = _faces(self.folder)
         except OSError as error:
             raise self.lost(f"the folder cannot be read any more ({error.strerror})") from error
         now = time.monotonic()
-        self._taken = {name: face for name, face in self._taken.items() if name in faces}
-        new = {name: face for name, face in faces.items() if self._taken.get(name) != face}
+        self._delivered = {name: face for name, face in self._delivered.items() if name in faces}
+        new = {name: face for name, face in faces.items() if self._delivered.get(name) != face}
         self._growing = {name: _since(self._growing.get(name), face, now) for name, face in new.items()}
         settled = [name for name, (_, since) in self._growing.items() if now - since >= SETTLED_S]
         self._arrivals.look()
-        found: Arrived = []
+        entries: Arrived = []
         for name in sorted(settled, key=lambda name: (new[name][2], name)):
-            data = _whole(self.folder / name, new[name])
+            data = _read_complete(self.folder / name, new[name])
             if data is not None:
-                found.append((self._arrivals.of(new[name][2]), data))
-                self._taken[name] = new[name]
+                entries.append((self._arrivals.to_monotonic(new[name][2]), data))
+                self._delivered[name] = new[name]
                 del self._growing[name]
-        return found
+        return entries
 
     def _wake(self) -> None:
         self._woken.set()
@@ -87,7 +94,7 @@ def _since(before: tuple[Face, float] | None, face: Face, now: float) -> tuple[F
 
 
 def _faces(folder: Path) -> dict[str, Face]:
-    """Return how the files of a folder look, those left out that hold nothing or have a name to be changed later."""
+    """Return the face of each file in a folder, without empty files and files that will be renamed."""
     faces = {}
     with os.scandir(folder) as entries:
         for entry in entries:
@@ -100,8 +107,8 @@ def _faces(folder: Path) -> dict[str, Face]:
     return faces
 
 
-def _whole(path: Path, face: Face) -> bytes | None:
-    """Return the content of a file, None while it is being written, is gone, or is no longer the one that was seen."""
+def _read_complete(path: Path, face: Face) -> bytes | None:
+    """Return the content of a file, or None while it is written, or where it is gone or no longer has this face."""
     try:
         with path.open("rb") as file:
             if _is_written(file.fileno()):
@@ -114,9 +121,11 @@ def _whole(path: Path, face: Face) -> bytes | None:
 
 
 def _is_written(fileno: int) -> bool:
-    """Whether anyone has the file open for writing: then, and only then, Linux refuses a read lease with EAGAIN."""
+    """Return whether a process has the file open for writing: only then Linux refuses a read lease with EAGAIN."""
     try:
-        fcntl.fcntl(fileno, fcntl.F_SETSIG, signal.SIGURG)  # one that is ignored: a lease that breaks sends SIGIO else
+        fcntl.fcntl(
+            fileno, fcntl.F_SETSIG, signal.SIGURG
+        )  # ignored by default; a broken lease would otherwise send SIGIO
         fcntl.fcntl(fileno, fcntl.F_SETLEASE, fcntl.F_RDLCK)
     except BlockingIOError:
         return True

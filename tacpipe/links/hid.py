@@ -1,49 +1,52 @@
-"""USB HID through hidapi: one report an entry."""
+"""Read and write USB HID devices through hidapi. Each entry is one report."""
 
 from __future__ import annotations
 
 import os
 import time
+from dataclasses import dataclass, field
 from typing import Any
 from urllib.parse import parse_qsl
 
 from tacpipe.errors import DeviceError, UsageError
-from tacpipe.links import ports, report_descriptor
-from tacpipe.links.opened import Arrived, Opened
+from tacpipe.links import ports
+from tacpipe.links.link import Arrived, Opened
 from tacpipe.sensors.sensor import Sensor
 
 LONGEST_WAIT_S = 0.03  # the kernel keeps 63 reports, 63 ms of the fastest device, and then drops the newest
-CHOICES = ("interface", "usage_page", "serial")  # what an address may state behind its ?
+CHOICES = ("interface", "usage_page", "serial")  # keys that an address may state after its ?
+LONG = 0xFE  # prefix of a long item; the next byte is its size
+INPUT, USAGE_PAGE, REPORT_SIZE, REPORT_ID, REPORT_COUNT, PUSH, POP = 0x80, 0x04, 0x74, 0x84, 0x94, 0xA4, 0xB4
 
 
 def open_hid(place: str, sensor: Sensor, name: str) -> HidLink:
     """Return the open device of ``VENDOR:PRODUCT``, ``VENDOR:PRODUCT?interface=0&serial=1234``, or a path.
 
-    Of the interfaces of one device that is taken which the address names, else the one of the sensor's ``usage_page``, else
-    the first. Raises `DeviceError` for a device that is missing, there twice, or not permitted.
+    A device with several interfaces is opened at the interface that the address names, otherwise at the one of the sensor's
+    ``usage_page``, otherwise at the first. Raises `DeviceError` for a device that is missing, ambiguous, or not permitted.
     """
     module = ports.hid_module()
-    info = chosen(place, module.enumerate(), sensor.usage_page, name)
+    info = choose_interface(place, module.enumerate(), sensor.usage_page, name)
     path: bytes = info["path"]
     device = module.device()
     try:
         device.open_path(path)
     except OSError as error:
-        raise _refused(path.decode(), info, name) from error
+        raise _open_error(path.decode(), info, name) from error
     device.set_nonblocking(1)
     return HidLink(name, device)
 
 
-def chosen(place: str, there: list[dict[str, Any]], usage_page: int | None, name: str) -> dict[str, Any]:
-    """Return the interface that an address means of those that hidapi lists.
+def choose_interface(place: str, interfaces: list[dict[str, Any]], usage_page: int | None, name: str) -> dict[str, Any]:
+    """Return the one of hidapi's ``interfaces`` that an address names.
 
-    Raises `UsageError` for an address that is none, `DeviceError` where none or more than one device fits.
+    Raises `UsageError` for an invalid address, and `DeviceError` where no device or more than one matches.
     """
-    which, _, query = place.partition("?")
-    wanted = dict(parse_qsl(query))
-    if unknown := set(wanted) - set(CHOICES):
+    device, _, query = place.partition("?")
+    options = dict(parse_qsl(query))
+    if unknown := set(options) - set(CHOICES):
         raise UsageError(f"hid:{place}: there is no {', '.join(sorted(unknown))}; there are {', '.join(CHOICES)}.")
-    fitting = [info for info in there if _is(info, which, wanted)]
+    fitting = [info for info in interfaces if _matches(info, device, options)]
     if not fitting:
         raise DeviceError(
             f"{name}: there is no HID device {place}; {ports.listed(ports.hid_ports())}. Plug it in, or correct the "
@@ -53,7 +56,7 @@ def chosen(place: str, there: list[dict[str, Any]], usage_page: int | None, name
     lowest = min(info["interface_number"] for info in ours)
     ours = [info for info in ours if info["interface_number"] == lowest]
     if len({info["path"] for info in ours}) > 1:
-        serials = ", ".join(f"hid:{which}?serial={info['serial_number'] or '...'}" for info in ours)
+        serials = ", ".join(f"hid:{device}?serial={info['serial_number'] or '...'}" for info in ours)
         paths = ", ".join(f"hid:{info['path'].decode()}" for info in ours)
         raise DeviceError(
             f"{name}: {len(ours)} devices are {place}; name one by its serial, {serials}, or its path, {paths}."
@@ -61,17 +64,17 @@ def chosen(place: str, there: list[dict[str, Any]], usage_page: int | None, name
     return ours[0]
 
 
-def _is(info: dict[str, Any], which: str, wanted: dict[str, str]) -> bool:
-    if info["path"].decode() != which and f"{info['vendor_id']:04x}:{info['product_id']:04x}" != which.lower():
+def _matches(info: dict[str, Any], device: str, options: dict[str, str]) -> bool:
+    if info["path"].decode() != device and f"{info['vendor_id']:04x}:{info['product_id']:04x}" != device.lower():
         return False
     return (
-        wanted.get("serial", info["serial_number"]) == info["serial_number"]
-        and wanted.get("interface", str(info["interface_number"])) == str(info["interface_number"])
-        and wanted.get("usage_page", f"{info['usage_page']:04x}").lower() == f"{info['usage_page']:04x}"
+        options.get("serial", info["serial_number"]) == info["serial_number"]
+        and options.get("interface", str(info["interface_number"])) == str(info["interface_number"])
+        and options.get("usage_page", f"{info['usage_page']:04x}").lower() == f"{info['usage_page']:04x}"
     )
 
 
-def _refused(path: str, info: dict[str, Any], name: str) -> DeviceError:
+def _open_error(path: str, info: dict[str, Any], name: str) -> DeviceError:
     if os.access(path, os.R_OK | os.W_OK):
         return DeviceError(f"{name}: {path} cannot be opened; unplug the device and plug it in again.")
     rule = (
@@ -92,27 +95,27 @@ class HidLink(Opened):
     def __init__(self, name: str, device: Any) -> None:
         super().__init__(name)
         self.device = device
-        self.reports = report_descriptor.parse(_descriptor(device))
+        self.reports = parse_report_descriptor(_descriptor(device))
 
     def _receive(self, timeout_s: float) -> Arrived:
         until = time.monotonic() + timeout_s
-        found: Arrived = []
+        entries: Arrived = []
         try:
-            while not found and not self._closed:
+            while not entries and not self._closed:
                 left_s = min(until - time.monotonic(), LONGEST_WAIT_S)
-                report = self.device.read(self.reports.most, max(1, int(left_s * 1000)))
+                report = self.device.read(self.reports.longest, max(1, int(left_s * 1000)))
                 while report:
-                    found.append((time.monotonic_ns(), bytes(report)))
-                    report = self.device.read(self.reports.most)
+                    entries.append((time.monotonic_ns(), bytes(report)))
+                    report = self.device.read(self.reports.longest)
                 if left_s < LONGEST_WAIT_S:
                     break
         except (OSError, ValueError) as error:
-            if not found:
+            if not entries:
                 raise self.lost(f"it was unplugged ({error})") from error
-        return found
+        return entries
 
     def _send(self, data: bytes) -> None:
-        leading = b"" if self.reports.numbered else b"\0"  # hidapi wants a report's number, 0 where there is none
+        leading = b"" if self.reports.numbered else b"\0"  # hidapi requires a report number, 0 where there is none
         try:
             sent = self.device.write(leading + data)
         except (OSError, ValueError) as error:
@@ -125,8 +128,61 @@ class HidLink(Opened):
 
 
 def _descriptor(device: Any) -> bytes:
-    """Return the report descriptor, nothing where hidapi is older than 0.14 or the system does not state."""
+    """Return the report descriptor, empty where hidapi is older than 0.14 or the system does not provide it."""
     try:
         return bytes(device.get_report_descriptor())
     except (AttributeError, OSError, ValueError):
         return b""
+
+
+@dataclass(frozen=True)
+class Reports:
+    """The reports that a HID device sends."""
+
+    usage_page: int = 0  # the first usage page
+    bits: dict[int, int] = field(
+        default_factory=dict
+    )  # bits per report by report number, 0 where reports have no number
+
+    @property
+    def numbered(self) -> bool:
+        """True where the first byte of each report is its number."""
+        return any(self.bits)
+
+    @property
+    def longest(self) -> int:
+        """Bytes of the longest report with its number, 64 where the device does not state its reports."""
+        return max((-(-bits // 8) for bits in self.bits.values()), default=64) + self.numbered
+
+
+def parse_report_descriptor(descriptor: bytes) -> Reports:
+    """Return the reports that a HID report descriptor declares.
+
+    Source: Device Class Definition for Human Interface Devices (HID), version 1.11, section 6.2.2.
+
+    >>> parse_report_descriptor(bytes.fromhex("06abff 0a0002 a101 7508 1500 26ff00 9540 0901 8102 9540 0902 9102 c0"))
+    Reports(usage_page=65451, bits={0: 512})
+    """
+    bits: dict[int, int] = {}
+    state, stack = {USAGE_PAGE: 0, REPORT_SIZE: 0, REPORT_COUNT: 0, REPORT_ID: 0}, []
+    first_page, place = 0, 0
+    while place < len(descriptor):
+        prefix = descriptor[place]
+        if prefix == LONG:
+            place += 3 + (descriptor[place + 1] if place + 1 < len(descriptor) else 0)
+            continue
+        size = (0, 1, 2, 4)[prefix & 3]
+        value = int.from_bytes(descriptor[place + 1 : place + 1 + size], "little")
+        item = prefix & 0xFC
+        place += 1 + size
+        if item == INPUT:
+            number = state[REPORT_ID]
+            bits[number] = bits.get(number, 0) + state[REPORT_SIZE] * state[REPORT_COUNT]
+        elif item == PUSH:
+            stack.append(dict(state))
+        elif item == POP and stack:
+            state = stack.pop()
+        elif item in state:
+            state[item] = value
+            first_page = first_page or state[USAGE_PAGE]
+    return Reports(first_page, bits)

@@ -1,7 +1,12 @@
-"""What a link is: it opens, gives what came with its arrival, states when it is lost, and closes; all kinds alike."""
+"""Define addresses, the interface of links, and the base classes of open links."""
 
 from __future__ import annotations
 
+import contextlib
+import os
+import select
+import threading
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -21,7 +26,10 @@ SCHEMES = {
     "camera": "camera:0",
     "lsl": "lsl:NAME, or lsl:?type=Force&source_id=ft-7",
 }
-LONGEST = 4096  # characters of a place, as of a path
+LONGEST = 4096  # characters of a place, the limit of a path
+Arrived = list[tuple[int, bytes]]  # (arrival on the monotonic clock in ns, bytes)
+
+WRITE_S = 5.0  # a device that accepts no byte for so long is gone
 
 
 class LinkLostError(DeviceError):
@@ -30,7 +38,7 @@ class LinkLostError(DeviceError):
 
 @dataclass(frozen=True)
 class Address:
-    """Where a device is: the kind of link, and what is given behind the colon."""
+    """The address of a device: the kind of link, and the text after the colon."""
 
     scheme: str
     place: str
@@ -40,12 +48,12 @@ class Address:
 
 
 class Link(Protocol):
-    """An open link. ``read`` is called by one thread alone; ``write`` and ``close`` may come from another."""
+    """An open link. Only one thread calls ``read``; others may call ``write`` and ``close``."""
 
     def read(self, timeout_s: float) -> list[tuple[int, bytes]]:
-        """Return what came since the last call as (arrival on the monotonic clock in ns, bytes), waiting for it at first.
+        """Wait for bytes and return them as (arrival on the monotonic clock in ns, bytes).
 
-        An empty list after ``timeout_s`` without any. Of a link of packets each entry is one packet.
+        The list is empty after ``timeout_s`` without any. Each entry of a link of packets is one packet.
         Raises `LinkLostError` when the device is gone.
         """
 
@@ -53,23 +61,23 @@ class Link(Protocol):
         """Send ``data``. Raises `LinkLostError` when the device is gone."""
 
     def close(self) -> None:
-        """Close the link; once more does nothing."""
+        """Close the link. A second call does nothing."""
 
     @property
     def local(self) -> Mapping[str, Any]:
-        """What a sensor may need to know to open its stream, as the ``port`` that packets are awaited on."""
+        """Values that a sensor may need to open its stream, such as the ``port`` on which this computer listens."""
 
     @property
     def overruns(self) -> int:
-        """How many packets this computer dropped so far because they were not fetched in time, where it states."""
+        """The number of packets that this computer dropped because they were not fetched in time, where it is stated."""
 
     @property
     def foreign(self) -> int:
-        """How many packets of other senders were left out so far, where the address names the one that counts."""
+        """The number of packets of other senders that were left out, where the address names one sender."""
 
     @property
     def kernel_stamped(self) -> bool:
-        """Whether the kernel stamps what arrives: its stamps are right however late it is read."""
+        """True where the kernel stamps packets as they arrive, so that a late read does not change their stamps."""
 
 
 def parse(text: str) -> Address:
@@ -87,3 +95,122 @@ def parse(text: str) -> Address:
             f"{excerpt(text)} is not an address of a device; it should read like one of these: {examples}."
         )
     return Address(scheme, place)
+
+
+class Opened:
+    """The base class of open links. Subclasses receive, send, wake a waiting reader and release their resources."""
+
+    packets = False  # True where each entry of `read` is one packet
+
+    def __init__(self, name: str) -> None:
+        self.name = name  # stream and address, for sentences
+        self._closed = False
+        self._ending, self._reading, self._writing = threading.Lock(), threading.Lock(), threading.Lock()
+
+    def read(self, timeout_s: float) -> Arrived:
+        """Return entries of (arrival in ns, bytes), none after ``timeout_s`` or when the link is closed meanwhile.
+
+        Raises `LinkLostError` when the device is gone or the link was closed before.
+        """
+        with self._reading:
+            self._refuse_closed()
+            return self._receive(timeout_s)
+
+    def write(self, data: bytes) -> None:
+        """Send ``data``. Raises `LinkLostError` when the device is gone."""
+        with self._writing:
+            self._refuse_closed()
+            self._send(data)
+
+    def hasten(self) -> None:
+        """Deliver bytes with less delay, where the link delays them."""
+
+    def close(self) -> None:
+        """Close the link after the reader has returned. A second call does nothing."""
+        with self._ending:
+            if self._closed:
+                return
+            self._closed = True
+        self._wake()
+        with self._reading, self._writing:
+            self._release()
+
+    @property
+    def local(self) -> Mapping[str, Any]:
+        """Values that a sensor may need to open its stream; empty here."""
+        return {}
+
+    @property
+    def overruns(self) -> int:
+        """The number of packets that this computer dropped, 0 where it is not stated."""
+        return 0
+
+    @property
+    def foreign(self) -> int:
+        """The number of packets of other senders that were left out, 0 where any sender counts."""
+        return 0
+
+    @property
+    def kernel_stamped(self) -> bool:
+        """False: arrivals are stamped when they are read."""
+        return False
+
+    def lost(self, reason: str, check: str = "its cable and its power") -> LinkLostError:
+        """Return the error for a device that is gone, with the reason and what to check."""
+        return LinkLostError(f"{self.name} is lost: {reason}. Check {check}.")
+
+    def _refuse_closed(self) -> None:
+        if self._closed:
+            raise LinkLostError(f"{self.name} was closed; open it again.")
+
+    def _receive(self, timeout_s: float) -> Arrived:
+        raise NotImplementedError
+
+    def _send(self, data: bytes) -> None:
+        raise DeviceError(f"{self.name} cannot be written to; take a sensor there that needs no word from us.")
+
+    def _wake(self) -> None:
+        """Make a waiting reader return, where that is possible."""
+
+    def _release(self) -> None:
+        """Release the resources of the link."""
+
+
+class Descriptor(Opened):
+    """A link over a non-blocking file descriptor, with one ``poll`` and one read per wake-up."""
+
+    def __init__(self, name: str, fileno: int, *extra_filenos: int) -> None:
+        super().__init__(name)
+        self._fileno = fileno
+        self._alarm, self._bell = os.pipe()
+        self._poll = select.poll()
+        for watched in (fileno, *extra_filenos, self._alarm):
+            self._poll.register(watched, select.POLLIN)
+
+    def _receive(self, timeout_s: float) -> Arrived:
+        ready = self._poll.poll(timeout_s * 1000)
+        return self._fetch(ready) if ready and not self._closed else []
+
+    def _fetch(self, ready: list[tuple[int, int]]) -> Arrived:
+        """Return the waiting entries. ``ready`` has the descriptors and their events."""
+        raise NotImplementedError
+
+    def _send(self, data: bytes) -> None:
+        remaining, start_s = memoryview(data), time.monotonic()
+        while remaining:
+            try:
+                remaining = remaining[os.write(self._fileno, remaining) :]
+            except BlockingIOError:
+                if time.monotonic() - start_s > WRITE_S:
+                    raise self.lost(f"it took no byte for {WRITE_S:g} s") from None
+                select.select([], [self._fileno], [], 0.1)
+            except OSError as error:
+                raise self.lost(error.strerror or str(error)) from error
+
+    def _wake(self) -> None:
+        os.write(self._bell, b"!")
+
+    def _release(self) -> None:
+        for fileno in (self._alarm, self._bell):
+            with contextlib.suppress(OSError):
+                os.close(fileno)

@@ -1,4 +1,4 @@
-"""Hosts and ports: what an address means, connecting to it, and sentences for what the network answers."""
+"""Parse hosts and ports, connect to them, and put network errors into sentences."""
 
 from __future__ import annotations
 
@@ -9,13 +9,17 @@ from tacpipe.errors import DeviceError, UsageError
 from tacpipe.links.link import SCHEMES
 
 CONNECT_S = 5.0
-IDLE_S, EVERY_S, TIMES = 2, 1, 3  # a connection on which nothing comes is asked so often whether it lives
+IDLE_S, EVERY_S, TIMES = (
+    2,
+    1,
+    3,
+)  # keep-alive probes: silence before the first, pause, number
 
 
 def place(scheme: str, text: str) -> tuple[str, int]:
-    """Return host and port of what stands behind the colon of an address; the host is empty for all interfaces.
+    """Return host and port of the text after the colon of an address. The host is empty for all interfaces.
 
-    Raises `UsageError` for a port that is none.
+    Raises `UsageError` for an invalid port.
 
     >>> place("udp", "[fe80::1]:4010"), place("udp", ":4010")
     (('fe80::1', 4010), ('', 4010))
@@ -27,25 +31,25 @@ def place(scheme: str, text: str) -> tuple[str, int]:
 
 
 def connect(host: str, port: int, name: str) -> socket.socket:
-    """Return a TCP connection, non-blocking, on which small messages leave at once and a dead peer is noticed.
+    """Return a non-blocking TCP connection that sends small messages at once and detects a dead peer.
 
     Raises `DeviceError` for a host that is unknown, unreachable, or refuses.
     """
     try:
-        made = socket.create_connection((host, port), timeout=CONNECT_S)
+        connection = socket.create_connection((host, port), timeout=CONNECT_S)
     except OSError as error:
         raise failed(error, host, port, name) from error
-    made.setblocking(False)
-    made.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-    made.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    connection.setblocking(False)
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     for option, value in (("TCP_KEEPIDLE", IDLE_S), ("TCP_KEEPINTVL", EVERY_S), ("TCP_KEEPCNT", TIMES)):
         if hasattr(socket, option):
-            made.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
-    return made
+            connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
+    return connection
 
 
 def failed(error: OSError, host: str, port: int, name: str) -> DeviceError:
-    """Return the sentence for an error of reaching ``host``."""
+    """Return the `DeviceError` for a ``host`` that could not be reached."""
     if isinstance(error, socket.gaierror):
         return DeviceError(f"{name}: the host {host} is not known; check its name, or give its IP address.")
     if isinstance(error, ConnectionRefusedError):

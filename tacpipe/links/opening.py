@@ -1,4 +1,4 @@
-"""Opening the link that an address names."""
+"""Open the link that an address names."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ OPENERS: dict[str, Callable[[str, Sensor, str], Link]] = {
 
 
 def open_link(address: Address, sensor: Sensor, stream: str) -> Link:
-    """Return an open link to a sensor; ``stream`` names it in errors. Nothing is sent to the device yet, see `dialogue`.
+    """Return an open link to a sensor. ``stream`` names it in errors. Nothing is sent to the device yet, see `dialogue`.
 
-    Raises `DeviceError` with what to do where the device is missing, busy, not permitted, or refuses.
+    Raises `DeviceError` where the device is missing, busy, not permitted, or refuses.
     """
     return OPENERS[address.scheme](address.place, sensor, f"Stream {stream} ({address})")

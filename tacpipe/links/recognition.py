@@ -1,4 +1,4 @@
-"""Which sensor speaks: each driver's framer tries the bytes, and the same bytes shuffled state what it takes by chance."""
+"""Recognise a sensor by its bytes: each driver's framer tries them, and tries them shuffled to measure chance."""
 
 from __future__ import annotations
 
@@ -14,25 +14,17 @@ from tacpipe.sensors import variants
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Sensor
 
-PACKETS = (
-    "udp",
-    "tcp+udp",
-    "ws",
-    "hid",
-    "can",
-    "folder",
-    "camera",
-    "lsl",
-)  # kinds of links whose chunks have a size that states
-MOST = 1 << 18  # bytes that are looked at
-CERTAIN = 0.8  # fraction of the bytes beyond chance from which on there is no doubt
-POSSIBLE = 0.2  # below it, nothing speaks for a driver
-FEWEST = 3  # frames
+# Kinds of links whose entries are packets, whose size is evidence too
+PACKETS = ("udp", "tcp+udp", "ws", "hid", "can", "folder", "camera", "lsl")
+MOST = 1 << 18  # number of bytes that are examined
+CERTAIN = 0.8  # fraction of the bytes beyond chance above which there is no doubt
+POSSIBLE = 0.2  # smallest fraction that is evidence for a driver
+FEWEST = 3  # smallest number of frames
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A sensor that might speak, with its options."""
+    """A sensor that may have sent the bytes, with its options."""
 
     kind: str  # registered name
     sensor: Sensor
@@ -49,13 +41,13 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Finding:
-    """What speaks for a candidate."""
+    """The evidence for a candidate."""
 
     candidate: Candidate
     frames: int
-    rate_hz: float  # of frames, 0 where fewer than two arrivals state it
-    bytes: int  # that were looked at
-    explained: float  # fraction of them that is in frames
+    rate_hz: float  # rate of frames, 0 with fewer than two arrivals
+    bytes: int  # number of bytes that were examined
+    explained: float  # fraction of the bytes that is in frames
     chance: float  # fraction of the same bytes in random order that would be
 
     @property
@@ -65,59 +57,59 @@ class Finding:
 
     @property
     def evidence(self) -> float:
-        """What it explains beyond chance: from 0 to 1."""
+        """The fraction of the bytes that it explains beyond chance, 0 to 1."""
         return max(0.0, self.explained - self.chance)
 
     def __str__(self) -> str:
         rate = f" at {self.rate_hz:.4g} Hz" if self.rate_hz else ""
-        alone = "by the size of the packets alone"
-        chance = alone if self.chance > POSSIBLE else f"{100 * self.chance:.1f} % by chance"
+        by_size = "by the size of the packets alone"
+        chance = by_size if self.chance > POSSIBLE else f"{100 * self.chance:.1f} % by chance"
         part = f"{100 * self.explained:.1f} % of {self.bytes:,} bytes"
         return f"{self.candidate}: {self.frames:,} frames{rate}, {part} ({chance})"
 
 
 def candidates(data: Chunks, scheme: str) -> list[Candidate]:
-    """Return the sensors that are reached by links of this kind, with the options that the bytes suggest."""
-    found = []
+    """Return the sensors that use links of this kind, with the options that the bytes suggest."""
+    sensors = []
     for kind in registry.sensors():
         try:
             loaded = registry.load_sensor(kind)
-        except TacpipeError:  # a plug-in that cannot be imported spoils no other's recognition
+        except TacpipeError:  # a plug-in that cannot be imported does not stop the others
             continue
         if scheme not in loaded.links:
             continue
         for options in variants.of(kind, data):
             try:
-                found.append(Candidate(kind, params.filled(loaded, options, kind, "option"), options))
-            except TacpipeError:  # it cannot be guessed, as a generic driver's columns
+                sensors.append(Candidate(kind, params.filled(loaded, options, kind, "option"), options))
+            except TacpipeError:  # its options cannot be guessed, such as the columns of a generic driver
                 continue
-    return found
+    return sensors
 
 
 def recognise(data: Chunks, scheme: str, sensors: Iterable[Candidate] | None = None) -> list[Finding]:
-    """Return what speaks for each of ``sensors``, the likeliest first; those for which nothing speaks are left out.
+    """Return the findings for ``sensors``, the likeliest first. Sensors without evidence are left out.
 
-    ``data`` came over a link of the kind ``scheme``. By default all sensors are tried that such links reach.
+    ``data`` came over a link of the kind ``scheme``. By default all sensors of such links are tried.
     """
     if not data.data:
         return []
     data = _first(data)
     shuffled, noise = _shuffled(data), _noise(data)
-    found = []
+    findings = []
     for candidate in candidates(data, scheme) if sensors is None else sensors:
-        frames, part, rate_hz = _tried(candidate.sensor, data)
+        frames, part, rate_hz = _count_frames(candidate.sensor, data)
         if frames < FEWEST or part < POSSIBLE:
             continue
-        # Digits in any order are lines of one number: what is described by the bytes is compared with any bytes at all.
-        _, chance, _ = _tried(candidate.sensor, noise if candidate.sensor.described else shuffled)
+        # Shuffled digits are still lines of one number, so a sensor that the bytes describe is compared with random bytes.
+        _, chance, _ = _count_frames(candidate.sensor, noise if candidate.sensor.described else shuffled)
         finding = Finding(candidate, frames, rate_hz, len(data.data), part, chance)
         if scheme in PACKETS or finding.evidence >= POSSIBLE:
-            found.append(finding)
-    return sorted(found, key=_rank)
+            findings.append(finding)
+    return sorted(findings, key=_rank)
 
 
 def _rank(finding: Finding) -> tuple[float, bool, float, float, int]:
-    """Return what findings are sorted by: evidence in steps, because a cut frame decides nothing, then the rate.
+    """Return the sort key of a finding: evidence rounded, because one cut frame decides nothing, then the rate.
 
     A product comes before a board that the bytes themselves describe.
     """
@@ -132,7 +124,7 @@ def _rank(finding: Finding) -> tuple[float, bool, float, float, int]:
     )
 
 
-def _tried(sensor: Sensor, data: Chunks) -> tuple[int, float, float]:
+def _count_frames(sensor: Sensor, data: Chunks) -> tuple[int, float, float]:
     """Return how many frames a sensor finds, the fraction of the bytes in them, and their rate in hertz."""
     framer = sensor.framer()
     runs = [*framer.feed(data)[0], *framer.flush()[0]]

@@ -1,4 +1,4 @@
-"""TCP connections to a device, alone or with the data coming by UDP."""
+"""Connect to a device by TCP, with data over the connection or over UDP."""
 
 from __future__ import annotations
 
@@ -7,11 +7,10 @@ import socket
 import time
 
 from tacpipe.links import network, udp
-from tacpipe.links.link import LinkLostError
-from tacpipe.links.opened import Arrived, Descriptor
+from tacpipe.links.link import Arrived, Descriptor, LinkLostError
 from tacpipe.sensors.sensor import Sensor
 
-MOST = 1 << 16  # bytes a read
+MOST = 1 << 16  # bytes per read
 
 
 def open_tcp(place: str, sensor: Sensor, name: str) -> TcpLink:
@@ -21,15 +20,15 @@ def open_tcp(place: str, sensor: Sensor, name: str) -> TcpLink:
 
 
 def open_both(place: str, sensor: Sensor, name: str) -> ControlledLink:
-    """Return a connection for control with a free local UDP port for data. Raises `DeviceError` as `open_tcp`."""
+    """Return a control connection with a free local UDP port for data. Raises `DeviceError` as `open_tcp`."""
     host, port = network.place("tcp+udp", place)
     control = TcpLink(name, network.connect(host, port, name))
-    own = control.socket.getsockname()[0]
-    return ControlledLink(name, udp.bound(own, 0, name), control, prompt=udp.hurries(sensor))
+    local_host = control.socket.getsockname()[0]
+    return ControlledLink(name, udp.bind_port(local_host, 0, name), control, prompt=udp.needs_prompt_reads(sensor))
 
 
 class TcpLink(Descriptor):
-    """A connection whose bytes come as they come."""
+    """A TCP connection."""
 
     def __init__(self, name: str, connection: socket.socket) -> None:
         super().__init__(name, connection.fileno())
@@ -52,7 +51,7 @@ class TcpLink(Descriptor):
 
 
 class ControlledLink(udp.UdpLink):
-    """Datagrams that a device sends as long as its control connection stands, which `write` and dialogues go over."""
+    """Datagrams of a device that sends while its control connection is open. `write` and dialogues use the connection."""
 
     def __init__(self, name: str, data: socket.socket, control: TcpLink, *, prompt: bool) -> None:
         super().__init__(name, data, prompt=prompt)
@@ -62,7 +61,7 @@ class ControlledLink(udp.UdpLink):
     def _fetch(self, ready: list[tuple[int, int]]) -> Arrived:
         if any(fileno == self.control.socket.fileno() for fileno, _ in ready):
             try:
-                self.control.read(0)  # beyond a dialogue nothing comes there but its end
+                self.control.read(0)  # after the dialogue only the end of the connection comes here
             except LinkLostError as error:
                 self._failed = error
         return super()._fetch(ready)

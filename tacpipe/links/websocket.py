@@ -1,4 +1,4 @@
-"""Websockets: one message an entry, text as UTF-8."""
+"""Read and write websockets. Each entry is one message, text as UTF-8."""
 
 from __future__ import annotations
 
@@ -9,18 +9,20 @@ from typing import TYPE_CHECKING
 
 from tacpipe.errors import DeviceError
 from tacpipe.links import network
-from tacpipe.links.opened import Arrived, Opened
+from tacpipe.links.link import Arrived, Opened
 from tacpipe.plugins import extras
 from tacpipe.sensors.sensor import Sensor
 
 if TYPE_CHECKING:
     from websockets.sync.client import ClientConnection
 
-MOST = 1 << 24  # bytes of the largest message
-SILENT = logging.getLogger("tacpipe.links.websocket")  # a lost connection is reported as such, not by a traceback
+MOST = 1 << 24  # limit of a message in bytes
+SILENT = logging.getLogger(
+    "tacpipe.links.websocket"
+)  # a lost connection is an error of its own, not a logged traceback
 SILENT.addHandler(logging.NullHandler())
 SILENT.propagate = False
-CLOSE_S = 1.0  # that the other end has to close the connection
+CLOSE_S = 1.0  # time that the other end has to close the connection
 
 
 def open_websocket(place: str, sensor: Sensor, name: str) -> WebsocketLink:
@@ -32,12 +34,14 @@ def open_websocket(place: str, sensor: Sensor, name: str) -> WebsocketLink:
         from websockets.exceptions import WebSocketException
         from websockets.sync.client import connect
 
-    where, _, path = place.partition("/")
-    host, port = network.place("ws", where)
-    wire = network.connect(host, port, name)  # ours, which goes by no proxy and fails in the same words as all
+    host_and_port, _, path = place.partition("/")
+    host, port = network.place("ws", host_and_port)
+    wire = network.connect(
+        host, port, name
+    )  # our own connection uses no proxy and has the same error texts as all links
     try:
         connection = connect(
-            f"ws://{where}/{path}",
+            f"ws://{host_and_port}/{path}",
             sock=wire,
             compression=None,
             max_size=MOST,
@@ -66,17 +70,17 @@ class WebsocketLink(Opened):
     def _receive(self, timeout_s: float) -> Arrived:
         from websockets.exceptions import ConnectionClosed
 
-        found: Arrived = []
+        entries: Arrived = []
         try:
             while True:
-                message = self.connection.recv(timeout=0 if found else timeout_s)
+                message = self.connection.recv(timeout=0 if entries else timeout_s)
                 data = message.encode() if isinstance(message, str) else message
-                found.append((time.monotonic_ns(), data))
+                entries.append((time.monotonic_ns(), data))
         except TimeoutError:
-            return found
+            return entries
         except ConnectionClosed as error:
-            if found or self._closed:
-                return found
+            if entries or self._closed:
+                return entries
             raise self.lost(f"the other end closed the websocket ({error})") from error
 
     def _send(self, data: bytes) -> None:
@@ -84,7 +88,7 @@ class WebsocketLink(Opened):
 
         try:
             try:
-                self.connection.send(data.decode())  # servers of sensors take text
+                self.connection.send(data.decode())  # servers of sensors expect text
             except UnicodeDecodeError:
                 self.connection.send(data)
         except ConnectionClosed as error:

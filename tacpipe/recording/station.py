@@ -12,8 +12,7 @@ from dataclasses import replace
 from tacpipe.errors import DeviceError, TacpipeError
 from tacpipe.links import dialogue, opening
 from tacpipe.links.dialogue import NoReplyError
-from tacpipe.links.link import Link, LinkLostError
-from tacpipe.links.opened import Opened
+from tacpipe.links.link import Link, LinkLostError, Opened
 from tacpipe.recording import clock, silence_diagnosis
 from tacpipe.recording.pace import WAITED_NS, Pace
 from tacpipe.recording.rig import Stream
@@ -123,7 +122,7 @@ class Station:
 
         def order(link: Link) -> None:
             try:
-                self._keep(dialogue.hold(link, sensor.taring(), name))
+                self._keep(dialogue.run_dialogue(link, sensor.taring(), name))
             except DeviceError as error:
                 failed.append(error)
             done.set()
@@ -153,7 +152,7 @@ class Station:
         sensor = self.stream.sensor
         link = opening.open_link(self.stream.address, sensor, self.stream.name)
         try:
-            early = dialogue.hold(link, sensor.opening(link.local), self.stream.name)
+            early = dialogue.run_dialogue(link, sensor.opening(link.local), self.stream.name)
         except BaseException:
             link.close()
             raise

@@ -18,7 +18,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from tacpipe.links.can import packed, unpacked
+from tacpipe.links.can import pack_frame, unpack_frames
 from tacpipe.links.link import Link, parse
 from tacpipe.links.opening import open_link
 from tacpipe.sensors.optoforce import OptoForce
@@ -160,13 +160,13 @@ def can_virtual() -> Iterator[Peer]:
     with can.Bus(interface="virtual", channel=channel) as bus:
 
         def send(data: bytes) -> None:
-            for message in unpacked(data):
+            for message in unpack_frames(data):
                 bus.send(message)
 
         def heard(count: int) -> bytes:
             message = bus.recv(SOON_S)
             assert message is not None
-            return packed(message)
+            return pack_frame(message)
 
         yield Peer(link, send, heard, lambda: None)
         link.close()
@@ -187,7 +187,7 @@ def can_slcan(monkeypatch: pytest.MonkeyPatch) -> Iterator[Peer]:
     ends.callback(os.close, master)
 
     def send(data: bytes) -> None:
-        for message in unpacked(data):
+        for message in unpack_frames(data):
             payload = bytes(message.data).hex().upper()
             _whole(master, f"t{message.arbitration_id:03X}{len(message.data)}{payload}\r".encode())
 

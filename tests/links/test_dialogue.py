@@ -19,9 +19,8 @@ import pytest
 
 from tacpipe.errors import DeviceError
 from tacpipe.links import dialogue as dialogue_of
-from tacpipe.links.dialogue import hold
-from tacpipe.links.link import Link
-from tacpipe.links.opened import Arrived
+from tacpipe.links.dialogue import run_dialogue
+from tacpipe.links.link import Arrived, Link
 from tacpipe.recording import rig
 from tacpipe.sensors.sensor import Ask, Dialogue
 from tests.links import peers
@@ -102,7 +101,7 @@ def test_replies_reach_the_sensor_and_the_stream_behind_them_is_kept(device: tup
 
     talk(b"version?", [b"1.2\nserial 7\nfra", b"me"])
     talk(b"start", [b"frame2"])
-    kept = hold(link, dialogue(), "probe")
+    kept = run_dialogue(link, dialogue(), "probe")
 
     assert heard == [b"1.2\n", b"serial 7\n"]
     assert b"".join(data for _, data in until_all_came(link, kept, 11)) == b"frameframe2"
@@ -135,7 +134,7 @@ def test_samples_before_and_after_a_reply_among_them_are_kept_with_their_arrival
     link.read = noted  # type: ignore[method-assign]
     talk(b"tare", [b"sample1 sam", b"ple2 <do", b"ne>sample3 <ok>sample4 ", b"sample5 "])
     wanted = b"sample1 sample2 sample3 sample4 sample5 "
-    kept = until_all_came(link, hold(link, dialogue(), "probe"), len(wanted))
+    kept = until_all_came(link, run_dialogue(link, dialogue(), "probe"), len(wanted))
 
     assert heard == [b"<done>", b"<ok>", b""]
     assert b"".join(data for _, data in kept) == wanted
@@ -171,7 +170,7 @@ def test_no_sample_is_lost_while_a_device_that_streams_is_opened_and_tared(
                     talk(ask.send, [b"".join([*before, *(replies if ask.until is not None else []), *streamed()])])
                     reply = yield ask
 
-    kept = hold(link, dialogue(), "probe")
+    kept = run_dialogue(link, dialogue(), "probe")
     kept = until_all_came(link, kept, len(b"".join(written)))
 
     assert len(written) > 5
@@ -187,7 +186,7 @@ def test_packets_before_and_after_a_reply_are_no_replies() -> None:
             told = yield Ask(b"hello", lambda data: len(data) if data.startswith(b"reply") else 0)
             assert told == b"reply 1"
 
-        kept = hold(peer.link, dialogue(), "probe")
+        kept = run_dialogue(peer.link, dialogue(), "probe")
         if len(kept) < 2:  # what is behind the reply may come late
             kept += peer.came(6)
 
@@ -203,7 +202,7 @@ def test_a_control_connection_carries_the_dialogue_and_data_wait() -> None:
             yield Ask(b"connect")
             assert control.heard(7) == b"connect"
 
-        assert hold(peer.link, dialogue(), "probe") == []
+        assert run_dialogue(peer.link, dialogue(), "probe") == []
         assert peer.came(8)[0][1] == b"datagram"
 
 
@@ -212,7 +211,7 @@ def test_silence_is_told_with_what_was_awaited(device: tuple[Link, Talk]) -> Non
         yield Ask(b"?", ends_with_newline, timeout_s=0.1, what="the version")
 
     with pytest.raises(DeviceError, match=r"0\.1 s"):
-        hold(device[0], dialogue(), "pps")
+        run_dialogue(device[0], dialogue(), "pps")
 
 
 def test_what_came_instead_of_a_reply_is_told(device: tuple[Link, Talk]) -> None:
@@ -224,7 +223,7 @@ def test_what_came_instead_of_a_reply_is_told(device: tuple[Link, Talk]) -> None
 
     talk(b"?", [b"\xaa\x55\x00"])
     with pytest.raises(DeviceError, match=r"3 bytes.*55 00"):
-        hold(link, dialogue(), "pps")
+        run_dialogue(link, dialogue(), "pps")
 
 
 class Waiting:
@@ -250,7 +249,7 @@ def test_a_reply_that_waited_while_this_process_was_held_up_is_read(monkeypatch:
     times_s = iter([0.0])
     monkeypatch.setattr(dialogue_of, "time", SimpleNamespace(monotonic=lambda: next(times_s, 5.0)))
     link: Any = Waiting()
-    assert hold(link, dialogue(), "probe") == []
+    assert run_dialogue(link, dialogue(), "probe") == []
     assert heard == [b"1.2\n"]
 
 
@@ -265,4 +264,4 @@ def test_a_reply_that_means_no_ends_the_dialogue(device: tuple[Link, Talk]) -> N
 
     talk(b"start", [b"no"])
     with pytest.raises(DeviceError, match=r"The device says n"):
-        hold(link, dialogue(), "pps")
+        run_dialogue(link, dialogue(), "pps")

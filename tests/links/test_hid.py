@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from tacpipe.errors import DeviceError, UsageError
-from tacpipe.links import hid, ports, report_descriptor
+from tacpipe.links import hid, ports
 from tacpipe.sensors.rawhid import RawHid
 
 HERE = Path(__file__).parent
@@ -132,23 +132,23 @@ TEENSY = [interface(1, 0xFFC9), interface(0, 0xFFAB)]
 def test_of_the_interfaces_of_one_device_the_right_one_is_taken(
     place: str, usage_page: int | None, path: bytes
 ) -> None:
-    assert hid.chosen(place, TEENSY, usage_page, "probe")["path"] == path
+    assert hid.choose_interface(place, TEENSY, usage_page, "probe")["path"] == path
 
 
 def test_of_a_teensy_s_interfaces_raw_hid_takes_the_one_of_its_usage_page() -> None:
     keyboard_first = [interface(0, 0x0001), interface(1, 0xFFAB)]
 
-    assert hid.chosen("16c0:0486", keyboard_first, RAW.usage_page, "probe")["path"] == b"/dev/hidraw1"
+    assert hid.choose_interface("16c0:0486", keyboard_first, RAW.usage_page, "probe")["path"] == b"/dev/hidraw1"
 
 
 def test_two_devices_of_one_kind_must_be_told_apart() -> None:
     two = [*TEENSY, interface(0, 0xFFAB, "2", "/dev/hidraw4")]
 
     with pytest.raises(DeviceError, match=r"2 devices.*16c0:0486.*hid:16c0:0486\?serial=1"):
-        hid.chosen("16c0:0486", two, 0xFFAB, "probe")
-    assert hid.chosen("16c0:0486?serial=2", two, 0xFFAB, "probe")["path"] == b"/dev/hidraw4"
+        hid.choose_interface("16c0:0486", two, 0xFFAB, "probe")
+    assert hid.choose_interface("16c0:0486?serial=2", two, 0xFFAB, "probe")["path"] == b"/dev/hidraw4"
     with pytest.raises(UsageError, match="usage_page"):
-        hid.chosen("16c0:0486?number=2", two, 0xFFAB, "probe")
+        hid.choose_interface("16c0:0486?number=2", two, 0xFFAB, "probe")
 
 
 def test_a_missing_device_lists_those_that_are_there(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -156,7 +156,7 @@ def test_a_missing_device_lists_those_that_are_there(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(ports, "hid_ports", lambda: [there])
 
     with pytest.raises(DeviceError, match=r"HID.*16c0:0486; there is hid:/dev/hidraw3 \(256f:c635"):
-        hid.chosen("16c0:0486", [], None, "probe")
+        hid.choose_interface("16c0:0486", [], None, "probe")
 
 
 def test_a_device_without_the_right_to_it_tells_the_rule_to_write(
@@ -191,8 +191,8 @@ def test_another_package_in_the_place_of_hidapi_is_told(monkeypatch: pytest.Monk
 def test_numbered_reports_are_told_from_others_by_the_descriptor() -> None:
     # a mouse of three axes as report 1 (6 bytes) and buttons as report 3 (32 bits), after HID 1.11, appendix E
     spoken = "0501 0908 a101 8501 1600fe 26ff01 7510 9503 8102 8503 7501 9520 8102 c0"
-    reports = report_descriptor.parse(bytes.fromhex(spoken))
+    reports = hid.parse_report_descriptor(bytes.fromhex(spoken))
 
-    assert reports == report_descriptor.Reports(1, {1: 48, 3: 32})
-    assert (reports.numbered, reports.most) == (True, 7)
-    assert report_descriptor.parse(b"").most == 64
+    assert reports == hid.Reports(1, {1: 48, 3: 32})
+    assert (reports.numbered, reports.longest) == (True, 7)
+    assert hid.parse_report_descriptor(b"").longest == 64

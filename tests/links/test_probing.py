@@ -85,7 +85,7 @@ def test_a_device_that_streams_is_found_at_its_rate_of_baud_without_a_word_to_it
 
     first = report.findings[0]
     assert (first.name, dict(first.candidate.options)) == ("flexitac", {"rows": 16, "columns": 16})
-    assert (report.baud, report.asked, report.certain) == (2_000_000, False, True)
+    assert (report.baud, report.requested, report.certain) == (2_000_000, False, True)
     assert heard == []
     assert len(steps) >= 2 and all("listening at" in step for step in steps)
 
@@ -97,7 +97,7 @@ def test_a_silent_device_is_asked_as_its_driver_does_and_told_to_stop() -> None:
         time.sleep(0.05)
 
     first = report.findings[0]
-    assert (first.name, dict(first.candidate.options), report.asked) == ("optoforce", {"axes": 3}, True)
+    assert (first.name, dict(first.candidate.options), report.requested) == ("optoforce", {"axes": 3}, True)
     assert b"".join(heard).endswith(bytes.fromhex("aa 00 32 03 00 04 00 00 e3"))  # speed 0: stop
 
 

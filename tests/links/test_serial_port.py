@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from tacpipe.errors import DeviceError
-from tacpipe.links import holders, serial_port
+from tacpipe.links import ports, serial_port
 from tacpipe.sensors.sensor import Line, Sensor
 from tests.links.peers import Quiet, made
 
@@ -143,7 +143,7 @@ def test_what_the_system_answers_becomes_a_sentence(
     def refuse(*_: object) -> int:
         raise OSError(number, os.strerror(number))
 
-    monkeypatch.setattr(holders, "of_file", lambda _: [])
+    monkeypatch.setattr(ports, "holders_of_file", lambda _: [])
     monkeypatch.setattr("serial.serialposix.os.open", refuse)
 
     with pytest.raises(DeviceError, match=told):
@@ -167,7 +167,7 @@ def test_a_file_is_no_serial_port(tmp_path: Path) -> None:
 def test_a_device_that_takes_no_byte_is_lost_after_a_while(
     terminal: tuple[int, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("tacpipe.links.opened.WRITE_S", 0.2)
+    monkeypatch.setattr("tacpipe.links.link.WRITE_S", 0.2)
     sensor: Sensor = Quiet()
     link = made(f"serial:{terminal[1]}", sensor)
     with pytest.raises(DeviceError, match=r"0\.2 s"):

@@ -103,7 +103,7 @@ def test_a_listening_link_answers_whoever_spoke_last() -> None:
 
 
 def test_a_port_that_is_taken_names_its_holder(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tacpipe.links.holders.os.getpid", lambda: -1)  # so that this process is another
+    monkeypatch.setattr("tacpipe.links.ports.os.getpid", lambda: -1)  # so that this process is another
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("0.0.0.0", 0))
         port = other.getsockname()[1]
@@ -129,13 +129,15 @@ def test_stamps_survive_a_wall_clock_that_is_set(monkeypatch: pytest.MonkeyPatch
         monkeypatch.setattr(f"tacpipe.links.arrival.time.{name}", lambda name=name: clocks[name])
 
     arrivals.look()
-    assert arrivals.of(clocks["time_ns"] - 3_000) == 999_999_997_000
-    assert arrivals.of(clocks["time_ns"] + 10) == 1_000_000_000_000  # from the future: now
+    assert arrivals.to_monotonic(clocks["time_ns"] - 3_000) == 999_999_997_000
+    assert arrivals.to_monotonic(clocks["time_ns"] + 10) == 1_000_000_000_000  # from the future: now
     clocks["time_ns"] += 2 * OLDEST_NS  # the clock is set forward while a datagram waits
     clocks["monotonic_ns"] += 500
     arrivals.look()
-    assert arrivals.of(5_000_000_000_000) == 1_000_000_000_500
-    assert arrivals.of(clocks["time_ns"] - 1_000) == 1_000_000_000_501  # never back, and after what it came after
+    assert arrivals.to_monotonic(5_000_000_000_000) == 1_000_000_000_500
+    assert (
+        arrivals.to_monotonic(clocks["time_ns"] - 1_000) == 1_000_000_000_501
+    )  # never back, and after what it came after
 
 
 class Clocks:
@@ -201,7 +203,7 @@ def test_stamps_are_as_far_apart_as_the_kernel_s_and_equal_only_where_those_are(
                 clocks.now_ns += apart_ns
                 moments.append(clocks.now_ns)
             arrivals.look()
-            told += [arrivals.of(t_ns + WALL_NS) for t_ns in moments]
+            told += [arrivals.to_monotonic(t_ns + WALL_NS) for t_ns in moments]
             true += moments
 
     assert [later > earlier for earlier, later in itertools.pairwise(told)] == [

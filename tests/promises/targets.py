@@ -34,7 +34,7 @@ from tacpipe.codecs.pca import fit
 from tacpipe.datasets import manifest
 from tacpipe.io.hashing import digest
 from tacpipe.io.parquet import from_parquet, to_parquet
-from tacpipe.links import report_descriptor
+from tacpipe.links import hid
 from tacpipe.plugins import given_params, registry
 from tacpipe.plugins.stage import Source
 from tacpipe.recording import header, rig, spool, spool_blocks, spooled
@@ -72,7 +72,7 @@ def targets() -> dict[str, Target]:
         Target("pcd", lambda data: pcd.parsed(NAMED, data), _pcds),
         Target("ply", lambda data: ply.parsed(NAMED, data), _plys),
         Target("depth-frame", lambda data: DepthFrame.of_bytes(data).points(), _frames),
-        Target("report-descriptor", report_descriptor.parse, _descriptors),
+        Target("report-descriptor", hid.parse_report_descriptor, _descriptors),
         Target("codec", _codec, lambda: _parts(_codec_files())),
     ]
     of = functools.partial

@@ -25,7 +25,7 @@ LIMITS = {
     "tacpipe.recording.station": ("MUTE_S", "TARE_S", "REPLY_S", "STOP_S"),
     "tacpipe.recording.pace": ("STALL_NS",),
     "tacpipe.links.network": ("CONNECT_S",),
-    "tacpipe.links.opened": ("WRITE_S",),
+    "tacpipe.links.link": ("WRITE_S",),
 }
 
 

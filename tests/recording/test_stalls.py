@@ -168,7 +168,7 @@ def test_a_device_that_takes_its_time_is_no_stall() -> None:
 
 
 def test_a_datagram_says_whether_the_kernel_stamped_it() -> None:
-    link = udp.UdpLink("x", udp.bound("127.0.0.1", 0, "x"), prompt=True)
+    link = udp.UdpLink("x", udp.bind_port("127.0.0.1", 0, "x"), prompt=True)
     try:
         link._arrival([])
         assert not link.kernel_stamped

@@ -44,7 +44,7 @@ class Reader:
         self.framer = self.sensor.framer()
         self.runs: list[Any] = []
         self.losses: list[Any] = []
-        self.take(dialogue.hold(self.link, self.sensor.opening(self.link.local), name))
+        self.take(dialogue.run_dialogue(self.link, self.sensor.opening(self.link.local), name))
 
     def take(self, chunks: list[tuple[int, bytes]]) -> None:
         for _, chunk in chunks:
