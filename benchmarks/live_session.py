@@ -27,7 +27,6 @@ import numpy as np
 import tacpipe
 from tacpipe.live.preparation import free_ports
 from tacpipe.recording import rig as rigs
-from tacpipe.recording import rig_text
 from tacpipe.simulation import pick_and_move
 from tacpipe.simulation.emulation.emulator import Emulator
 from tacpipe.simulation.emulation.world import World
@@ -73,7 +72,7 @@ def run(arguments: argparse.Namespace, folder: Path) -> tuple[dict[str, Any], di
     sys.setswitchinterval(SWITCH_S)
     memory: dict[str, list[tuple[float, float]]] = {"recorder": [], "model": []}
     with Emulator(rigs.read(RIG), SEED, folder=folder / "emulated", world=world) as emulator:
-        (folder / "emulated" / "rig.toml").write_text(rig_text.of(emulator.rig))
+        (folder / "emulated" / "rig.toml").write_text(rigs.to_toml(emulator.rig))
         gc.collect()
         gc.disable()  # a collection of the emulator's memory stops what a real rig would not stop
         ended = threading.Event()

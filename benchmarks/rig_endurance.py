@@ -25,7 +25,6 @@ import pyarrow as pa
 import tacpipe
 from tacpipe.cli.emulate import SWITCH_S
 from tacpipe.recording import rig as rig_of
-from tacpipe.recording import rig_text
 from tacpipe.simulation.emulation.emulator import Emulator
 from tacpipe.simulation.emulation.ledger import Ledger
 from tacpipe.testing import matching
@@ -94,7 +93,7 @@ def main() -> None:
         folder = Path(name)
         with Emulator(rig_of.read(chosen.rig), folder=folder / "emulated") as emulator:
             rig = folder / "rig.toml"
-            rig.write_text(rig_text.of(emulator.rig))
+            rig.write_text(rig_of.to_toml(emulator.rig))
             seconds = 60 * chosen.minutes
             words = ["acquire", str(rig), "-o", str(folder / "rec"), "--duration", str(seconds), "--quiet"]
             looks, sealed = watched([str(BIN / "tacpipe"), *words], seconds, folder / "store")

@@ -94,7 +94,7 @@ def add(program: typer.Typer, summary: str) -> None:
         if found is None or output is None or recover:
             _report(output, sealed, began_s, as_json=as_json)
             raise typer.Exit(FAILED if left else DONE)
-        plan = trials_of.Plan(
+        plan = trials_of.RecordingPlan(
             output,
             checked_name(name),
             duration,
@@ -119,9 +119,9 @@ def add(program: typer.Typer, summary: str) -> None:
 def _record(rig: Rig, store: Store, plan: Any, *, quiet: bool) -> tuple[list[Recorded], list[str]]:
     from tacpipe.datasets import directory
     from tacpipe.io.termination import EndRequest
-    from tacpipe.recording import appending, completing, trials, triggers
-    from tacpipe.recording.recorder import Recorder
-    from tacpipe.recording.view import View
+    from tacpipe.recording import appending, trials, triggers
+    from tacpipe.recording.recorder import Recorder, complete_rig
+    from tacpipe.recording.watch import View
 
     for value, what, known in ((plan.start, "--start", triggers.STARTS), (plan.stop, "--stop", triggers.STOPS)):
         if value not in known:
@@ -134,7 +134,7 @@ def _record(rig: Rig, store: Store, plan: Any, *, quiet: bool) -> tuple[list[Rec
     store.prepare()
     directory.check_output(store, plan.output)
     appending.refuse_taken(plan.output, plan.names)
-    recorder = Recorder(completing.completed(rig))
+    recorder = Recorder(complete_rig(rig))
     with EndRequest() as ended, recorder.open(), View(recorder.watches, quiet=quiet).open() as view:
         recorder.await_first(ended)
         recorded, lost = trials.run(recorder, store, plan, view, ended)
@@ -145,11 +145,11 @@ def _record(rig: Rig, store: Store, plan: Any, *, quiet: bool) -> tuple[list[Rec
 
 def _recovered(store: Store, output: Path | None, *, quiet: bool) -> tuple[list[Recorded], int]:
     """Seal what earlier processes of this user left behind; return that, and how many spools stay as they are."""
-    from tacpipe.recording import recovery
+    from tacpipe.recording import trials
 
     sealed, left = list[Any](), 0
-    for found in recovery.recovered(store, output):
-        if isinstance(found, recovery.Stayed):
+    for found in trials.recover_spools(store, output):
+        if isinstance(found, trials.Unsealed):
             terminal.note(f"tacpipe: {found.line()}")
             left += 1
             continue
@@ -161,9 +161,9 @@ def _recovered(store: Store, output: Path | None, *, quiet: bool) -> tuple[list[
 
 def _report_others(store: Store) -> None:
     """Print whose the spools are that another user recorded, in a store that is shared."""
-    from tacpipe.recording import recovery
+    from tacpipe.recording import trials
 
-    for folder, owner in recovery.of_others(store).items():
+    for folder, owner in trials.spools_of_others(store).items():
         terminal.note(f"The spool {folder} belongs to {owner}, who alone can seal it.")
 
 
@@ -172,11 +172,11 @@ def _dry_run(rig: Rig, *, as_json: bool) -> str:
     from dataclasses import asdict
 
     from tacpipe.io.termination import EndRequest
-    from tacpipe.recording import clock, completing
-    from tacpipe.recording.recorder import Recorder
-    from tacpipe.recording.view import line
+    from tacpipe.recording import clock
+    from tacpipe.recording.recorder import Recorder, complete_rig
+    from tacpipe.recording.watch import describe_figures
 
-    rig = completing.completed(rig)
+    rig = complete_rig(rig)
     recorder = Recorder(rig)
     with EndRequest() as ended, recorder.open():
         recorder.await_first(ended)
@@ -189,16 +189,16 @@ def _dry_run(rig: Rig, *, as_json: bool) -> str:
     for name, found in figures.items():
         wanted_hz = rig.streams[name].sensor.rate_hz
         off = wanted_hz and abs(found.rate_hz / wanted_hz - 1) > RATE_OFF
-        lines.append(line(name, found) + (f"; {wanted_hz:g} Hz were expected" if off else ""))
+        lines.append(describe_figures(name, found) + (f"; {wanted_hz:g} Hz were expected" if off else ""))
     return "\n".join(lines)
 
 
 def checked_name(name: str | None) -> str:
     """Return the name of a recording, the time now without one. Raises `UsageError` for one that names no file."""
-    from tacpipe.recording import header
+    from tacpipe.recording import spool_folders
 
     found = name or time.strftime("%Y%m%d-%H%M%S", time.gmtime())
-    if not NAME.fullmatch(found) or not header.is_name(found):
+    if not NAME.fullmatch(found) or not spool_folders.is_name(found):
         raise UsageError(f"--name {found!r} names no file; take letters, digits, _, - and dots, no dot in front.")
     return found
 

@@ -38,7 +38,7 @@ def emulate(
     from tacpipe.datasets import replacing
     from tacpipe.io.files import readable_errors, write_whole
     from tacpipe.io.termination import EndRequest
-    from tacpipe.recording import rig_text
+    from tacpipe.recording import rig as rig_files
     from tacpipe.recording.rig import read
     from tacpipe.simulation.emulation import byte_faults
     from tacpipe.simulation.emulation.emulator import Emulator
@@ -48,7 +48,7 @@ def emulate(
     sys.setswitchinterval(SWITCH_S)
     with EndRequest() as ended, readable_errors(output):
         with Emulator(asked, seed, wrong, output) as emulator:
-            write_whole(str(path), rig_text.of(emulator.rig).encode(), f"{path}.draft")
+            write_whole(str(path), rig_files.to_toml(emulator.rig).encode(), f"{path}.draft")
             terminal.result(path)
             for name, stream in emulator.rig.streams.items():
                 terminal.note(f"{name}: {stream.kind} at {stream.address}")

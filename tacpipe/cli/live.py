@@ -134,14 +134,14 @@ def _run(
     from tacpipe.live import session
     from tacpipe.recording import appending, trials
     from tacpipe.recording.recorder import Recorder
-    from tacpipe.recording.view import View
+    from tacpipe.recording.watch import View
     from tacpipe.store import location
 
     store = location.locate(*([] if output is None else [output]))
-    plan: trials_of.Plan | None = None
+    plan: trials_of.RecordingPlan | None = None
     if output is not None:
         attributes = {**acquire.attributes(labels, None), **prepared.attributes}
-        plan = trials.Plan(output, acquire.checked_name(name), duration_s, attributes=attributes)
+        plan = trials.RecordingPlan(output, acquire.checked_name(name), duration_s, attributes=attributes)
         store.prepare()
         directory.check_output(store, output)
         appending.refuse_taken(output, plan.names)
@@ -152,7 +152,7 @@ def _run(
         EndRequest() as is_over,
         session.run_model(recorder, prepared.options, is_over) as supervisor,
         recorder.open(),
-        View(recorder.watches, quiet=quiet, more=lambda: _lines(supervisor)).open() as view,
+        View(recorder.watches, quiet=quiet, footer=lambda: _lines(supervisor)).open() as view,
     ):
         recorder.await_first(is_over)
         if plan is not None and supervisor.alarms.get("levels"):

@@ -153,7 +153,7 @@ def _recordings_text(value: dict[str, Any], full: bool) -> list[str]:
         lines.append(f"{counted(unread, 'streams')} too long to read here: `tacpipe show DATASET RECORDING`, or --full")
     lines += ["", *_labels(value["attributes"], full)]
     lines += [f"excluded: {line}" for line in printable.grouped_failures(value["excluded"])]
-    lines += ending.lines(value["attributes"], value["recordings"])
+    lines += ending.describe_incomplete(value["attributes"], value["recordings"])
     lines += [f"left out: {line}" for line in printable.grouped_failures(value["skipped"])]
     lines += model_overview.files_text(value["files"], full=full) if value["files"] else []
     lines.append(

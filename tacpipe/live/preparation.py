@@ -17,7 +17,7 @@ from tacpipe.live.settings import SessionOptions, Settings, parse_option
 from tacpipe.live.task import LiveTask
 from tacpipe.plugins import fields
 from tacpipe.printable import plain
-from tacpipe.recording import completing, rig_text
+from tacpipe.recording import recorder
 from tacpipe.recording import rig as rigs
 from tacpipe.recording.rig import Rig, Stream
 
@@ -70,7 +70,7 @@ def prepare(rig: Rig, rig_file: str, options: Mapping[str, Any]) -> PreparedSess
             publishing.check(address)
     plan = model.live.plan(model.dataset, rig, settings)
     streams = {name: {"task": model.task, "output": name, **options} for name, options in plan.streams.items()}
-    complete_rig = add_streams(completing.completed(plan.rig), streams)
+    complete_rig = add_streams(recorder.complete_rig(plan.rig), streams)
     settings = with_absolute_paths(replace(settings, task=plan.settings))
     session = SessionOptions(model.task, complete_rig.text, tuple(plan.rig.streams), tuple(streams), settings)
     return PreparedSession(complete_rig, session, {"live_model": model.dataset.digest, **plan.attributes})
@@ -113,12 +113,12 @@ def add_streams(rig: Rig, streams: Mapping[str, Mapping[str, Any]]) -> Rig:
         )
     added = {
         name: Stream(
-            name, "live", rigs.make("live", options, "live"), Address("udp", f"127.0.0.1:{port}"), dict(options)
+            name, "live", rigs.build_sensor("live", options, "live"), Address("udp", f"127.0.0.1:{port}"), dict(options)
         )
         for (name, options), port in zip(streams.items(), free_ports(len(streams)), strict=True)
     }
     extended = replace(rig, streams={**rig.streams, **added})
-    return replace(extended, text=rig_text.of(extended))
+    return replace(extended, text=rigs.to_toml(extended))
 
 
 def free_ports(count: int) -> list[int]:

@@ -33,9 +33,9 @@ def block(stream: int | None, content: Chunks | Note) -> bytes:
     """Return one block as bytes; ``stream`` is the number of its stream, None for a note on all of them."""
     if isinstance(content, Chunks):
         body = content.t_ns.astype("<i8").tobytes() + content.size.astype("<u4").tobytes() + content.data
-        return spool_blocks.of(CHUNKS, 0 if stream is None else stream, len(content.size), body)
+        return spool_blocks.pack_block(CHUNKS, 0 if stream is None else stream, len(content.size), body)
     note = json.dumps({"t_ns": content.t_ns, "what": content.what, "detail": content.detail}).encode()
-    return spool_blocks.of(NOTE, WHOLE if stream is None else stream, 0, note)
+    return spool_blocks.pack_block(NOTE, WHOLE if stream is None else stream, 0, note)
 
 
 class Blocks:
@@ -60,7 +60,7 @@ class Blocks:
             if stop > len(self._text):
                 break
             stream = "" if number == WHOLE else self._streams[number]
-            content = spool_blocks.content(kind, stream, count, bytes(self._text[place + HEAD.size : stop]))
+            content = spool_blocks.unpack_block(kind, stream, count, bytes(self._text[place + HEAD.size : stop]))
             place = stop
             if content is not None:
                 yield stream, content

@@ -1,1 +1,1 @@
-"""From a rig file to recordings: the streams of a rig, a spool that outlasts a crash, and what is sealed of it."""
+"""Record a rig: read its streams, spool their bytes so that they survive a crash, and seal them as a dataset."""

@@ -1,11 +1,11 @@
-"""A sealed recording put into the store and appended to its dataset, looked at once more before success is reported."""
+"""Store a sealed recording, read it back, and append it to its dataset."""
 
 from __future__ import annotations
 
 import functools
 import shutil
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 VERSION = 1
-BYTES = "bytes"  # and under this one its spool, where a driver could not read all of it
-RIG = "rig.toml"  # under this name the rig file goes along with a recording
+BYTES = "bytes"  # name of the attached spool, where a driver could not decode all bytes
+RIG = "rig.toml"  # name of the attached rig file
 
 
 class NothingError(TacpipeError):
@@ -45,9 +45,9 @@ def append(store: Store, output: Path, spooled: Spooled, rig: Rig, sealed: Mappi
     gave anything (`TacpipeError` if they gave no sample), and `DamagedError` if what was written is not what is read.
     """
     began_s = time.perf_counter()
-    streams = {name: one.batches for name, one in sealed.items() if one.rows}
+    streams = {name: stream.batches for name, stream in sealed.items() if stream.rows}
     if not streams:
-        _refuse(spooled, sealed)
+        _raise_empty(spooled, sealed)
     events = events_table(sealed, spooled)
     if events.num_rows:
         streams[EVENTS] = events.to_reader
@@ -55,54 +55,54 @@ def append(store: Store, output: Path, spooled: Spooled, rig: Rig, sealed: Mappi
     text = vars(store.put(rig.text.encode(), durable=True))
     entry: Entry = {"attributes": _attributes(spooled, rig, sealed), "shards": shards}
     files = {RIG: text}
-    if any(one.undecoded for one in sealed.values()):  # what no driver could read today, a better one may
+    if any(stream.undecoded for stream in sealed.values()):  # a later driver may decode them
         with (spooled.folder / "bytes").open("rb") as spool:
             copied = functools.partial(shutil.copyfileobj, spool)
             files[BYTES] = vars(store.put_written(copied, durable=True))
     result = {"recordings": {"": entry}, "files": files}
     identity = keys.identity(ACQUIRE, VERSION, {"rig": text["digest"]}, {"spool": spooled.folder.name})
-    made = {**provenance.of(round(time.perf_counter() - began_s, 4)), "irreplaceable": True}
-    store.commit(identity, result, made, durable=True)
-    output, named = output.absolute(), f"rig-{text['digest'][:8]}.toml"
-    names: list[str] = []  # of the recording
+    provenance_entry = {**provenance.of(round(time.perf_counter() - began_s, 4)), "irreplaceable": True}
+    store.commit(identity, result, provenance_entry, durable=True)
+    output, rig_name = output.absolute(), f"rig-{text['digest'][:8]}.toml"
+    names: list[str] = []  # the name of the recording, last
 
     def appended() -> directory.Change:
         before = existing(output)
-        there = {} if before is None else before.recordings
-        known = next((name for name, other in there.items() if other["shards"] == shards), None)
-        if before is not None and known is not None:  # a crash came between this and the spool's end
-            names.append(known)
-            return directory.Change(before, may_lack=_others(before, known, named))
-        name = _free(spooled.header["recording"], there)
+        recordings = {} if before is None else before.recordings
+        existing_name = next((name for name, entry in recordings.items() if entry["shards"] == shards), None)
+        if before is not None and existing_name is not None:  # a crash came after an earlier append
+            names.append(existing_name)
+            return directory.Change(before, may_lack=_other_paths(before, existing_name, rig_name))
+        name = _free_name(spooled.header["recording"], recordings)
         now = before or Manifest(ACQUIRE, VERSION)
         now = now.with_recordings({name: Item(entry, None, {RIG: text["digest"]})})
-        now = replace(now, files=dict(sorted({**now.files, named: text}.items())))
+        now = replace(now, files=dict(sorted({**now.files, rig_name: text}.items())))
         try:
             manifest_of.check_pages(now, fresh=True)
             now.content  # noqa: B018  (what JSON cannot hold is refused here)
-        except (ValueError, TypeError, KeyError) as error:  # what every reader would refuse is never published
+        except (ValueError, TypeError, KeyError) as error:  # never publish what every reader would refuse
             raise TacpipeError(
                 f"Recording {plain(name)} cannot be added to {output}: {plain(str(error), 200)}."
             ) from error
         names.append(name)
-        return directory.Change(now, may_lack=_others(now, name, named))
+        return directory.Change(now, may_lack=_other_paths(now, name, rig_name))
 
     directory.change(store, output, appended)
     return names[-1]
 
 
-def _others(manifest: Manifest, name: str, rig: str) -> set[str]:
-    """Return the paths of all recordings and rig files but these."""
+def _other_paths(manifest: Manifest, name: str, rig: str) -> set[str]:
+    """Return the paths of all recordings and rig files except these."""
     return {path for path, _ in manifest.objects() if not path.startswith(f"{name}/") and path != rig}
 
 
-def _refuse(spooled: Spooled, sealed: Mapping[str, Sealed]) -> NoReturn:
-    """Report that there is no recording; what holds no byte at all is removed."""
-    received = sum(one.received for one in sealed.values())  # what was read and never written is gone
+def _raise_empty(spooled: Spooled, sealed: Mapping[str, Sealed]) -> NoReturn:
+    """Raise the error for a spool without samples, and remove a spool without bytes."""
+    received = sum(stream.received for stream in sealed.values())
     if not received and not spooled.damage:
         spooled.remove()
         raise NothingError(f"No stream gave a single byte ({', '.join(sealed)}), so there is no recording.")
-    spoiled = sum(one.bytes for one in spooled.damage)
+    spoiled = sum(damage.bytes for damage in spooled.damage)
     raise TacpipeError(
         f"{received:,} bytes came from {', '.join(sealed)} and hold no sample; {spoiled:,} more are spoiled. "
         f"`tacpipe acquire --dry-run` states what each device sends."
@@ -110,44 +110,45 @@ def _refuse(spooled: Spooled, sealed: Mapping[str, Sealed]) -> NoReturn:
 
 
 def existing(output: Path) -> Manifest | None:
-    """Return the manifest of the acquired recordings at ``output``, None if nothing is there yet.
+    """Return the manifest of the acquired recordings at ``output``, or None if there is no dataset yet.
 
-    Raises `UsageError` if another command made what is there.
+    Raises `UsageError` if another command wrote the dataset.
     """
     if not (output / manifest_of.NAME).exists():
         return None
-    found = manifest_of.find(output).manifest
-    if found.stage != ACQUIRE:
+    manifest = manifest_of.find(output).manifest
+    if manifest.stage != ACQUIRE:
         raise UsageError(
-            f"{output} was made by {found.stage}, and acquire appends to acquired recordings alone. Give -o another "
+            f"{output} was made by {manifest.stage}, and acquire appends to acquired recordings alone. Give -o another "
             f"directory; later stages read several datasets as one."
         )
-    return found
+    return manifest
 
 
 def refuse_taken(output: Path, names: Sequence[str]) -> None:
-    """Raise `UsageError` if a recording at ``output`` has one of these names but for case, which some file systems fold.
+    """Raise `UsageError` if a recording at ``output`` has one of these names, in upper or lower case.
 
-    Raises it too if another command made what is there.
+    Some file systems do not distinguish case. Raises it also if another command wrote the dataset.
     """
     before = existing(output)
-    there = {} if before is None else {recording_names.folded(name): name for name in before.recordings}
-    taken = sorted(there[folded] for name in names if (folded := recording_names.folded(name)) in there)
-    if taken:
+    existing_names = {} if before is None else {recording_names.folded(name): name for name in before.recordings}
+    folded_names = [recording_names.folded(name) for name in names]
+    conflicts = sorted(existing_names[folded] for folded in folded_names if folded in existing_names)
+    if conflicts:
         raise UsageError(
-            f"{output} has recordings of these names already: {', '.join(map(plain, taken[:5]))}. Give another --name, in "
-            f"more than upper and lower case, or -o another directory."
+            f"{output} has recordings of these names already: {', '.join(map(plain, conflicts[:5]))}. Give another --name, "
+            f"in more than upper and lower case, or -o another directory."
         )
 
 
-def _free(wanted: str, taken: Mapping[str, Any]) -> str:
-    """Return ``wanted``, with a number behind it if another process took that name since: what is recorded is kept.
+def _free_name(requested: str, existing_names: Iterable[str]) -> str:
+    """Return ``requested``, with a number appended if another process used that name meanwhile.
 
-    Names that differ only in case are one, as on some file systems.
+    Names that differ only in case count as equal, as on some file systems.
     """
-    name, number, folded = wanted, 2, {recording_names.folded(one) for one in taken}
+    name, number, folded = requested, 2, {recording_names.folded(existing) for existing in existing_names}
     while recording_names.folded(name) in folded:
-        name, number = f"{wanted}-{number}", number + 1
+        name, number = f"{requested}-{number}", number + 1
     return name
 
 
@@ -158,40 +159,41 @@ def _shard(store: Store, stream: str, batches: Callable[[], pa.RecordBatchReader
     stored: Object = store.put_written(lambda file: rows.append(parquet.write(batches(), file)), durable=True)
     columns.release()
     for _ in store.blocks(stored.digest, stored.bytes):
-        pass  # each is read back, and all are hashed
-    if not _same(parquet.stored_batches(store.object_path(stored.digest)), batches()):
+        pass  # read every block back, which compares the digest
+    if not _equal_batches(parquet.stored_batches(store.object_path(stored.digest)), batches()):
         raise DamagedError(f"Stream {stream} does not read as it was written: the disk is not to be trusted.")
     return {"digest": stored.digest, "rows": rows[0], "bytes": stored.bytes}
 
 
-def _same(stored: pa.RecordBatchReader, written: pa.RecordBatchReader) -> bool:
-    """Return whether a shard holds the rows of batches to the bit, NaN equal to itself; some rows at a time."""
+def _equal_batches(stored: pa.RecordBatchReader, expected: pa.RecordBatchReader) -> bool:
+    """Return whether a shard has the rows of the expected batches bit by bit, compared in batches."""
     import pyarrow as pa
 
-    if not stored.schema.equals(written.schema):
+    if not stored.schema.equals(expected.schema):
         return False
-    waiting: list[pa.RecordBatch] = []  # of the shard
-    for batch in written:
+    waiting: list[pa.RecordBatch] = []  # batches of the shard
+    for batch in expected:
         count = batch.num_rows
-        while sum(one.num_rows for one in waiting) < count:
-            more = next(stored, None)
-            if more is None:
+        while sum(part.num_rows for part in waiting) < count:
+            next_batch = next(stored, None)
+            if next_batch is None:
                 return False
-            waiting.append(more)
-        there = pa.Table.from_batches(waiting)
-        if not _equal(there.slice(0, count), pa.Table.from_batches([batch])):
+            waiting.append(next_batch)
+        table = pa.Table.from_batches(waiting)
+        if not _equal_tables(table.slice(0, count), pa.Table.from_batches([batch])):
             return False
-        waiting = [one for one in there.slice(count).to_batches() if one.num_rows]
+        waiting = [part for part in table.slice(count).to_batches() if part.num_rows]
     return not waiting and next(stored, None) is None
 
 
-def _equal(ours: pa.Table, theirs: pa.Table) -> bool:
+def _equal_tables(ours: pa.Table, theirs: pa.Table) -> bool:
+    """Return whether two tables are equal bit by bit, so that NaN equals NaN."""
     import pyarrow as pa
 
     for kind, *columns in zip(theirs.schema, ours.columns, theirs.columns, strict=True):
         if pa.types.is_floating(kind.type):
-            one, other = (column.to_numpy().view(f"u{kind.type.bit_width // 8}") for column in columns)
-            if not np.array_equal(one, other):
+            left, right = (column.to_numpy().view(f"u{kind.type.bit_width // 8}") for column in columns)
+            if not np.array_equal(left, right):
                 return False
         elif not columns[0].equals(columns[1]):
             return False
@@ -199,21 +201,22 @@ def _equal(ours: pa.Table, theirs: pa.Table) -> bool:
 
 
 def _attributes(spooled: Spooled, rig: Rig, sealed: Mapping[str, Sealed]) -> dict[str, Attribute]:
-    """Return labels, and for each stream how many samples were lost; what a crash cost where there was one."""
+    """Return the labels and, for each stream, the number of lost samples and the losses of a crash."""
     master = rig.streams[rig.master]
     attributes: dict[str, Attribute] = {"sensor": master.sensor.product or master.kind, "master": rig.master}
     attributes |= {**rig.labels, **spooled.header["attributes"]}
     attributes["ended"] = spooled.ended
     if spooled.header.get("duration_s") is not None:
         attributes["requested_duration_s"] = float(spooled.header["duration_s"])
-    for name, one in sealed.items():
-        attributes[f"{name}_lost"] = one.lost
-        if not one.rows:
+    for name, stream in sealed.items():
+        attributes[f"{name}_lost"] = stream.lost
+        if not stream.rows:
             attributes[f"{name}_missing"] = True
-        if one.undecoded:
-            attributes[f"{name}_undecoded_bytes"] = one.undecoded
-        if one.uncertain:
-            attributes[f"{name}_uncertain_samples"] = one.uncertain
-        if one.crashed[0]:
-            attributes |= {f"{name}_crash_lost_reads": one.crashed[0], f"{name}_crash_lost_bytes": one.crashed[1]}
+        if stream.undecoded:
+            attributes[f"{name}_undecoded_bytes"] = stream.undecoded
+        if stream.uncertain:
+            attributes[f"{name}_uncertain_samples"] = stream.uncertain
+        if stream.crashed[0]:
+            reads, size = stream.crashed
+            attributes |= {f"{name}_crash_lost_reads": reads, f"{name}_crash_lost_bytes": size}
     return attributes

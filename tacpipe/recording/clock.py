@@ -1,4 +1,4 @@
-"""The clock that a recording goes by, and waiting on it; tests put another one in its place."""
+"""Read the clock of a recording, and wait. Tests replace it with a clock of their own."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ def now_s() -> float:
 
 
 def sleep(seconds: float) -> None:
-    """Wait so long."""
+    """Wait for ``seconds``."""
     time.sleep(seconds)
 
 
 def suspended_ns() -> int:
-    """Return for how long the computer was suspended since its start, in ns: the monotonic clock stands still meanwhile."""
-    if not hasattr(time, "CLOCK_BOOTTIME"):  # this system does not state
+    """Return how long the computer was suspended since its start, in ns. The monotonic clock does not count that time."""
+    if not hasattr(time, "CLOCK_BOOTTIME"):  # this system has no such clock
         return 0
     return time.clock_gettime_ns(time.CLOCK_BOOTTIME) - time.monotonic_ns()

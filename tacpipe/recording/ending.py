@@ -1,4 +1,4 @@
-"""How a recording ended, and what `tacpipe show` reports of those that were cut off or whose recorder was held up."""
+"""Name how recordings end, and describe those that were cut off or whose recorder was delayed."""
 
 from __future__ import annotations
 
@@ -16,12 +16,14 @@ MOST = 20  # lines
 UNCERTAIN = "_uncertain_samples"
 
 
-def lines(attributes: Mapping[str, Mapping[str, Any]], recordings: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Return a line for each recording that was cut off, and for each in which arrivals are uncertain.
+def describe_incomplete(
+    attributes: Mapping[str, Mapping[str, Any]], recordings: Mapping[str, Mapping[str, Any]]
+) -> list[str]:
+    """Return one line per recording that was cut off, and one per recording with uncertain arrivals.
 
-    ``attributes`` are those of each recording, ``recordings`` the figures of its streams.
+    ``attributes`` has the attributes of each recording, ``recordings`` the figures of its streams.
     """
-    found = []
+    lines = []
     for name in sorted(attributes):
         values = attributes[name]
         if values.get("ended") in REASONS:
@@ -30,11 +32,11 @@ def lines(attributes: Mapping[str, Mapping[str, Any]], recordings: Mapping[str, 
             requested_s = values.get("requested_duration_s")
             part = f" of {requested_s:g}" if isinstance(requested_s, int | float) else ""
             duration = f", {max(durations_s):.1f}{part} s" if durations_s else ""
-            found.append(f"not completed: {plain(name)}: {REASONS[values['ended']]}{duration}")
+            lines.append(f"not completed: {plain(name)}: {REASONS[values['ended']]}{duration}")
         late = {stream: count for stream, count in values.items() if stream.endswith(UNCERTAIN)}
         if late:
             described = ", ".join(
                 f"{count} samples of {plain(key.removesuffix(UNCERTAIN))}" for key, count in late.items()
             )
-            found.append(f"recorder held up: {plain(name)}: the arrival of {described} is uncertain")
-    return found[:MOST] + ([f"… and {len(found) - MOST} more"] if len(found) > MOST else [])
+            lines.append(f"recorder held up: {plain(name)}: the arrival of {described} is uncertain")
+    return lines[:MOST] + ([f"… and {len(lines) - MOST} more"] if len(lines) > MOST else [])

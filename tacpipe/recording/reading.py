@@ -1,4 +1,4 @@
-"""One stream from the bytes of its link to samples: framed, decoded, counted, with every loss reported and counted once."""
+"""Decode the bytes of one stream to samples: frame, decode and count them, and report every loss once."""
 
 from __future__ import annotations
 
@@ -13,28 +13,26 @@ from tacpipe.sensors.counting import Counted, Counting
 from tacpipe.sensors.framing import Account, Chunks, Loss, Run
 from tacpipe.sensors.sensor import Samples, Sensor
 
-LINK = "link"  # frames that the counter misses and of which no byte came
-DEVICE = "device"  # samples that the device itself passed over
+LINK = "link"  # frames that the counter misses and of which no byte arrived
+DEVICE = "device"  # samples that the device itself skipped
 DUPLICATE, LATE, RESET = "duplicate", "late", "counter_reset"
-SILENT = (
-    "silent"  # of a device that does not count: nothing came for longer than it should, and no burst made up for it
-)
-SILENT_PERIODS, SILENT_NS = 5.0, 50_000_000  # of both the longer one
+SILENT = "silent"  # a device without counter sent nothing for too long, and no burst made up for it
+SILENT_PERIODS, SILENT_NS = 5.0, 50_000_000  # the longer of both is the limit
 
 
 class Event(NamedTuple):
-    """Something that went wrong with a stream: when, why, and how many frames and bytes it cost."""
+    """A fault of a stream: when, why, and how many frames and bytes it cost."""
 
     t_ns: int
     cause: str
-    frames: int = 0  # lost; below 0 for one that was counted as lost and came late
-    bytes: int = 0  # thrown away
+    frames: int = 0  # lost frames; negative for a frame that was counted as lost and came late
+    bytes: int = 0  # discarded bytes
     detail: str = ""
 
 
 @dataclass(frozen=True)
 class Batch:
-    """Samples of one stream in the order of their arrival, and what went wrong meanwhile."""
+    """Samples of one stream in the order of their arrival, and the faults meanwhile."""
 
     t_ns: Times  # (sample,), arrival on the monotonic clock
     values: tuple[AnyArray, ...]  # blocks (sample, channel)
@@ -48,25 +46,25 @@ class Batch:
 
     @property
     def counters(self) -> list[str]:
-        """Names of the counters of samples that are there."""
+        """The names of the counters that the samples have."""
         return [name for name in ("seq", "device_seq") if getattr(self, name) is not None]
 
 
 class Reading:
-    """Turns what a link gave into samples; the same bytes give the same samples, however they are cut."""
+    """Decodes the bytes of a link to samples. The same bytes give the same samples, however they are cut."""
 
     def __init__(self, sensor: Sensor) -> None:
         self.sensor = sensor
-        self.frames = 0  # that carried samples
-        self.lost = 0  # frames, by counter where there is one
+        self.frames = 0  # number of frames with samples
+        self.lost = 0  # number of lost frames, by counter where there is one
         self._framer = sensor.framer()
-        self._before = Account()  # of the framers of links that were lost
+        self._before = Account()  # account of the links before the present one
         self._counting = _counting(sensor, sensor.counter)
         self._device_counting = _counting(sensor, sensor.device_counter)
-        self._unexplained: list[Loss] = []  # losses before a sample that states how many frames they cost
+        self._unexplained: list[Loss] = []  # losses whose cost the counter of a later sample states
         self._last_ns: int | None = None
-        self._device_ns: tuple[int, int] | None = None  # the device's clock as it was sent last, and unrolled
-        self._silence: Event | None = None  # that may still be made up for
+        self._device_ns: tuple[int, int] | None = None  # the device's last clock reading, as sent and unrolled
+        self._silence: Event | None = None  # the last silence, which a burst may still make up for
 
     @property
     def account(self) -> Account:
@@ -77,13 +75,13 @@ class Reading:
         )
 
     def feed(self, chunks: Chunks) -> Batch:
-        """Return the samples that are complete now."""
+        """Return the samples that these bytes complete."""
         return self._batch(*self._framer.feed(chunks))
 
     def broken(self) -> Batch:
-        """Return what was left when the link was lost; what comes next is from a new one."""
+        """Return the last samples of a lost link. The next bytes are those of a new link."""
         batch = self._batch(*self._framer.flush())
-        self._device_ns = None  # a device that was without power begins anew
+        self._device_ns = None  # a device that was without power restarts its clock
         for counting in (self._counting, self._device_counting):
             if counting is not None:
                 counting.reopened()
@@ -92,13 +90,13 @@ class Reading:
         return batch
 
     def finish(self) -> Batch:
-        """Return what is left when nothing more comes."""
+        """Return the last samples and events of the stream."""
         batch = self._batch(*self._framer.flush())
-        left = tuple(_event(loss, loss.frames) for loss in self._unexplained)
-        left += () if self._silence is None else (self._silence,)
-        self.lost += sum(event.frames for event in left)
+        final_events = tuple(_event(loss, loss.frames) for loss in self._unexplained)
+        final_events += () if self._silence is None else (self._silence,)
+        self.lost += sum(event.frames for event in final_events)
         self._unexplained, self._silence = [], None
-        return replace(batch, events=batch.events + left)
+        return replace(batch, events=batch.events + final_events)
 
     def _batch(self, runs: Sequence[Run], losses: Sequence[Loss]) -> Batch:
         decoded = [(run, self.sensor.decode(run.frames)) for run in runs]
@@ -106,17 +104,17 @@ class Reading:
         stamps = [run.t_ns if samples.rows is None else run.t_ns[samples.rows] for run, samples in decoded]
         t_ns = np.concatenate(stamps) if stamps else np.zeros(0, dtype=np.int64)
         self.frames += sum(len(s) if s.rows is None else len(np.unique(s.rows)) for _, s in decoded)
-        every = [samples for _, samples in decoded]
-        seq, device_seq, t_device_ns = (_joined(every, name) for name in ("seq", "device_seq", "t_device_ns"))
+        decoded_samples = [samples for _, samples in decoded]
+        seq, device_seq, t_device_ns = (_joined(decoded_samples, name) for name in ("seq", "device_seq", "t_device_ns"))
         if t_device_ns is not None and self.sensor.device_wrap_ns is not None:
             t_device_ns = self._unrolled(t_device_ns, self.sensor.device_wrap_ns)
         events: list[Event] = []
-        kept = np.ones(len(t_ns), dtype=bool)
+        retained = np.ones(len(t_ns), dtype=bool)
         self._unexplained += losses
         if self._counting is not None:
             if seq is not None:
                 counted = self._counting.feed(seq, t_ns)
-                seq, kept = counted.seq, ~counted.duplicate
+                seq, retained = counted.seq, ~counted.duplicate
                 events += self._explained(counted, t_ns)
                 if self._device_counting is not None and device_seq is not None:
                     skipped = self._device_counting.feed(device_seq, t_ns)
@@ -129,12 +127,14 @@ class Reading:
         self.lost += sum(event.frames for event in events)
         if len(t_ns):
             self._last_ns = int(t_ns[-1])
-        blocks = tuple(np.concatenate(several) for several in zip(*(one.values for one in every), strict=True))
+        blocks = tuple(
+            np.concatenate(parts) for parts in zip(*(samples.values for samples in decoded_samples), strict=True)
+        )
         batch = Batch(t_ns, blocks, seq, device_seq, t_device_ns, tuple(sorted(events)))
-        return batch if kept.all() else _chosen(batch, kept)
+        return batch if retained.all() else _select_rows(batch, retained)
 
     def _unrolled(self, sent_ns: Times, wrap_ns: int) -> Times:
-        """Return device times (sample,) that continue where the clock begins at 0 again; a smaller step back stays one."""
+        """Return device times (sample,) that continue where the clock wraps to 0. A smaller step back stays a step back."""
         last_sent_ns, last_ns = self._device_ns or (int(sent_ns[0]), int(sent_ns[0]))
         steps_ns = np.diff(sent_ns, prepend=last_sent_ns)
         unrolled: Times = last_ns + np.cumsum(np.where(steps_ns < -wrap_ns // 2, steps_ns + wrap_ns, steps_ns))
@@ -142,7 +142,7 @@ class Reading:
         return unrolled
 
     def _explained(self, counted: Counted, t_ns: Times) -> list[Event]:
-        """Return the events of a batch whose samples are counted: each loss costs what the counter states, and no more."""
+        """Return the events of a batch with a counter. Each loss costs as many frames as the counter states."""
         events: list[Event] = []
         odd = np.flatnonzero((counted.missing > 0) | counted.duplicate | counted.late | counted.reset)
         for row in odd.tolist():
@@ -162,14 +162,14 @@ class Reading:
                 self._unexplained.remove(loss)
             if missing:
                 events.append(Event(at_ns, LINK, frames=missing))
-        if len(t_ns):  # a loss after which the counter continued as it should cost no frame
+        if len(t_ns):  # a loss after which the counter continued cost no frame
             last_ns = int(t_ns[-1])
             events += [_event(loss, 0) for loss in self._unexplained if loss.t_ns <= last_ns]
             self._unexplained = [loss for loss in self._unexplained if loss.t_ns > last_ns]
         return events
 
     def _silences(self, t_ns: Times) -> list[Event]:
-        """Return the silences that are over; what comes in a burst behind one was late and is not lost."""
+        """Return the silences that ended. Samples of a burst after a silence were late, not lost."""
         if not self.sensor.awaited or not len(t_ns):
             return []
         period_ns = 1e9 / self.sensor.rate_hz
@@ -178,13 +178,13 @@ class Reading:
         if self._silence is None and not silent.any():
             return []
         events = []
-        for at_ns, step_ns, began in zip(t_ns.tolist(), apart_ns.tolist(), silent.tolist(), strict=True):
-            if self._silence is not None and (began or step_ns > period_ns / 2):
+        for at_ns, step_ns, begins in zip(t_ns.tolist(), apart_ns.tolist(), silent.tolist(), strict=True):
+            if self._silence is not None and (begins or step_ns > period_ns / 2):
                 events.append(self._silence)
                 self._silence = None
             elif self._silence is not None:
                 self._silence = self._silence._replace(frames=max(0, self._silence.frames - 1))
-            if began:
+            if begins:
                 lost = max(0, round(step_ns / period_ns) - 1)
                 self._silence = Event(at_ns, SILENT, lost, detail=f"{step_ns / 1e6:.0f} ms, by the clock")
         return events
@@ -195,8 +195,8 @@ def _counting(sensor: Sensor, modulus: int | None) -> Counting | None:
 
 
 def _joined(samples: Sequence[Samples], name: str) -> Times | None:
-    found = [getattr(one, name) for one in samples]
-    return np.concatenate(found) if found and found[0] is not None else None
+    arrays = [getattr(part, name) for part in samples]
+    return np.concatenate(arrays) if arrays and arrays[0] is not None else None
 
 
 def _event(loss: Loss, frames: int) -> Event:
@@ -204,19 +204,21 @@ def _event(loss: Loss, frames: int) -> Event:
 
 
 def _device_events(skipped: Counted, counted: Counted, t_ns: Times) -> list[Event]:
-    """Return the samples that the device passed over itself: those that its own counter misses beyond lost packets.
+    """Return the events of samples that the device skipped: those that its own counter misses beyond lost packets.
 
-    Where that counter began anew, or jumped beyond what time allows, it states nothing of that.
+    A counter that restarted, or jumped further than the time allows, states no such samples.
     """
     beyond = np.where(skipped.reset, 0, skipped.missing - counted.missing)
-    found = [Event(int(t_ns[row]), DEVICE, frames=int(beyond[row])) for row in np.flatnonzero(beyond > 0)]
-    anew = np.flatnonzero(skipped.reset & ~counted.reset)
-    return found + [Event(int(t_ns[row]), RESET, detail="the device's second counter") for row in anew]
+    events = [Event(int(t_ns[row]), DEVICE, frames=int(beyond[row])) for row in np.flatnonzero(beyond > 0)]
+    restarts = np.flatnonzero(skipped.reset & ~counted.reset)
+    return events + [Event(int(t_ns[row]), RESET, detail="the device's second counter") for row in restarts]
 
 
-def _chosen(batch: Batch, rows: Bools) -> Batch:
-    def of(values: Times | None) -> Times | None:
+def _select_rows(batch: Batch, rows: Bools) -> Batch:
+    def select(values: Times | None) -> Times | None:
         return None if values is None else values[rows]
 
     blocks = tuple(block[rows] for block in batch.values)
-    return Batch(batch.t_ns[rows], blocks, of(batch.seq), of(batch.device_seq), of(batch.t_device_ns), batch.events)
+    return Batch(
+        batch.t_ns[rows], blocks, select(batch.seq), select(batch.device_seq), select(batch.t_device_ns), batch.events
+    )

@@ -1,4 +1,4 @@
-"""The rig file: which streams a rig has, what speaks on each and where, and which of them sets the grid.
+"""Read and write rig files: the streams of a rig, the sensor and the address of each, and the master stream.
 
 master = "xela1"
 
@@ -24,7 +24,7 @@ from typing import Any
 
 from tacpipe.channels.streams import EVENTS
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.io import regular
+from tacpipe.io import regular, toml
 from tacpipe.links import link
 from tacpipe.plugins import params, registry
 from tacpipe.plugins.stage import Attribute
@@ -32,36 +32,36 @@ from tacpipe.printable import excerpt, plain
 from tacpipe.sensors.sensor import Sensor
 
 NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")
-TAKEN = (EVENTS, "truth")  # streams that a recording has next to those of its sensors
+RESERVED = (EVENTS, "truth")  # streams of a recording that no sensor may use
 KEYS = ("name", "sensor", "transport", "options", "emulate")
 
 
 @dataclass(frozen=True)
 class Stream:
-    """One stream of a rig: the sensor, and where it is."""
+    """One stream of a rig: the sensor and its address."""
 
     name: str
     kind: str  # the sensor's registered name
     sensor: Sensor
     address: link.Address
-    options: Mapping[str, Any] = field(default_factory=dict)  # of the sensor, as written
-    emulate: Mapping[str, Any] = field(default_factory=dict)  # what `tacpipe sensors emulate` reads
+    options: Mapping[str, Any] = field(default_factory=dict)  # options of the sensor, as written
+    emulate: Mapping[str, Any] = field(default_factory=dict)  # options of `tacpipe sensors emulate`
 
 
 @dataclass(frozen=True)
 class Rig:
-    """A rig: its streams by name, the master, labels that every recording gets."""
+    """A rig: its streams by name, the master stream, and the labels of every recording."""
 
     streams: Mapping[str, Stream]
     master: str
     labels: Mapping[str, Attribute] = field(default_factory=dict)
     emulate: Mapping[str, Any] = field(default_factory=dict)
-    live: Mapping[str, Any] = field(default_factory=dict)  # what `tacpipe live` is asked for, as written
-    text: str = ""  # the file as it was read, which goes along with what is recorded
+    live: Mapping[str, Any] = field(default_factory=dict)  # options of `tacpipe live`, as written
+    text: str = ""  # the text of the file, which is stored with every recording
 
 
 def read(path: Path) -> Rig:
-    """Return the rig that a file describes. Raises `UsageError` with the place of what is wrong."""
+    """Return the rig that a file describes. Raises `UsageError` with the place of the mistake."""
     try:
         text = regular.content(path).decode()
     except TacpipeError as error:
@@ -73,80 +73,102 @@ def read(path: Path) -> Rig:
     return parse(text, str(path))
 
 
-def parse(text: str, where: str = "rig.toml") -> Rig:
-    """Return the rig of a rig file's text; ``where`` names it in errors.
+def parse(text: str, source: str = "rig.toml") -> Rig:
+    """Return the rig of a rig file's text. ``source`` names it in errors.
 
-    Raises `UsageError` for what is not a TOML, for an unknown key, sensor, option or address, and for a name that is taken.
+    Raises `UsageError` for invalid TOML, an unknown key, sensor, option or address, and a reserved or repeated name.
     """
     try:
-        found = tomllib.loads(text)
+        contents = tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # numbers of thousands of digits, brackets within brackets
-        raise UsageError(f"{where} is not valid TOML: {plain(str(error), 200)}.") from error
-    _known(found, ("master", "labels", "stream", "emulate", "live"), where)
-    tables = found.get("stream")
+        raise UsageError(f"{source} is not valid TOML: {plain(str(error), 200)}.") from error
+    _refuse_unknown(contents, ("master", "labels", "stream", "emulate", "live"), source)
+    tables = contents.get("stream")
     if not isinstance(tables, list) or not tables or not all(isinstance(table, dict) for table in tables):
-        raise UsageError(f"{where} lists no stream; each is a table [[stream]] with name, sensor and transport.")
+        raise UsageError(f"{source} lists no stream; each is a table [[stream]] with name, sensor and transport.")
     streams: dict[str, Stream] = {}
     for number, table in enumerate(tables, start=1):
-        stream = _stream(table, f"{where}, stream {_called(table, number)}")
+        stream = _stream(table, f"{source}, stream {_stream_label(table, number)}")
         if stream.name in streams:
-            raise UsageError(f"{where} has two streams named {stream.name}; names must be unique.")
+            raise UsageError(f"{source} has two streams named {stream.name}; names must be unique.")
         streams[stream.name] = stream
-    master = found.get("master", next(iter(streams)))
+    master = contents.get("master", next(iter(streams)))
     if not isinstance(master, str) or master not in streams:
         raise UsageError(
-            f"{where}: the master is {excerpt(master)}; it must be one of the streams, {', '.join(streams)}."
+            f"{source}: the master is {excerpt(master)}; it must be one of the streams, {', '.join(streams)}."
         )
-    labels = _table(found, "labels", where)
+    labels = _table(contents, "labels", source)
     for name, value in labels.items():
         if not isinstance(value, str | int | float | bool) or (isinstance(value, float) and not math.isfinite(value)):
             described = f"label {plain(name)} is {excerpt(value)}"
-            raise UsageError(f"{where}: {described}; it must be text, a finite number, true or false.")
-    return Rig(streams, master, labels, _table(found, "emulate", where), _table(found, "live", where), text)
+            raise UsageError(f"{source}: {described}; it must be text, a finite number, true or false.")
+    return Rig(streams, master, labels, _table(contents, "emulate", source), _table(contents, "live", source), text)
 
 
-def _stream(table: Mapping[str, Any], where: str) -> Stream:
-    _known(table, KEYS, where)
+def _stream(table: Mapping[str, Any], source: str) -> Stream:
+    _refuse_unknown(table, KEYS, source)
     for key in ("name", "sensor", "transport"):
         if not isinstance(table.get(key), str):
-            raise UsageError(f"{where}: {key} is {excerpt(table.get(key))}; it must be a text.")
+            raise UsageError(f"{source}: {key} is {excerpt(table.get(key))}; it must be a text.")
     name = table["name"]
-    if not NAME.fullmatch(name) or name in TAKEN:
+    if not NAME.fullmatch(name) or name in RESERVED:
         raise UsageError(
-            f"{where}: {excerpt(name)} cannot name a stream; take small letters, digits and _, 64 at most, and "
-            f"neither of {', '.join(TAKEN)}."
+            f"{source}: {excerpt(name)} cannot name a stream; take small letters, digits and _, 64 at most, and "
+            f"neither of {', '.join(RESERVED)}."
         )
-    kind, options, emulate = table["sensor"], _table(table, "options", where), _table(table, "emulate", where)
+    kind, options, emulate = table["sensor"], _table(table, "options", source), _table(table, "emulate", source)
     address = link.parse(table["transport"])
-    sensor = make(kind, options, where)
+    sensor = build_sensor(kind, options, source)
     if address.scheme not in sensor.links:
         raise UsageError(
-            f"{where}: {kind} cannot be reached by {plain(str(address))}; it must be {' or '.join(sensor.links)}, as in "
+            f"{source}: {kind} cannot be reached by {plain(str(address))}; it must be {' or '.join(sensor.links)}, as in "
             f"{' or '.join(link.SCHEMES[scheme] for scheme in sensor.links)}."
         )
     return Stream(name, kind, sensor, address, options, emulate)
 
 
-def _table(found: Mapping[str, Any], key: str, where: str) -> Mapping[str, Any]:
-    value = found.get(key, {})
+def _table(table: Mapping[str, Any], key: str, source: str) -> Mapping[str, Any]:
+    value = table.get(key, {})
     if not isinstance(value, dict):
-        raise UsageError(f"{where}: {key} is {excerpt(value)}; it must be a table, as in {key} = {{ … }}.")
+        raise UsageError(f"{source}: {key} is {excerpt(value)}; it must be a table, as in {key} = {{ … }}.")
     return value
 
 
-def make(kind: str, options: Mapping[str, Any], where: str) -> Sensor:
-    """Return a sensor with these options. Raises `UsageError` for an unknown one or a value of another type."""
-    made: Sensor = params.filled(registry.load_sensor(kind), options, where, "option")
-    return made
+def build_sensor(kind: str, options: Mapping[str, Any], source: str) -> Sensor:
+    """Return a sensor with these options. Raises `UsageError` for an unknown option or a value of a wrong type."""
+    sensor: Sensor = params.filled(registry.load_sensor(kind), options, source, "option")
+    return sensor
 
 
-def _called(table: Mapping[str, Any], number: int) -> str:
-    """Return how a stream is named in errors."""
+def _stream_label(table: Mapping[str, Any], number: int) -> str:
+    """Return the name of a stream for errors."""
     name = table.get("name", number)
     return plain(name) if isinstance(name, str) else excerpt(name)
 
 
-def _known(table: Mapping[str, Any], keys: tuple[str, ...], where: str) -> None:
+def _refuse_unknown(table: Mapping[str, Any], keys: tuple[str, ...], source: str) -> None:
     for key in table:
         if key not in keys:
-            raise UsageError(f"{where}: there is no key {plain(key)}; there are {', '.join(keys)}.")
+            raise UsageError(f"{source}: there is no key {plain(key)}; there are {', '.join(keys)}.")
+
+
+def to_toml(rig: Rig) -> str:
+    """Return the TOML of a rig that differs from its file, as one of the emulator or one that its devices complete."""
+    parts = [f"master = {toml.toml_value(rig.master)}\n"]
+    if rig.labels:
+        parts.append(
+            "[labels]\n"
+            + "".join(f"{toml.toml_key(name)} = {toml.toml_value(value)}\n" for name, value in rig.labels.items())
+        )
+    if rig.live:
+        parts.append(
+            "[live]\n"
+            + "".join(f"{toml.toml_key(name)} = {toml.toml_value(value)}\n" for name, value in rig.live.items())
+        )
+    for stream in rig.streams.values():
+        lines = {"name": stream.name, "sensor": stream.kind, "transport": str(stream.address)}
+        table = "".join(f"{name} = {toml.toml_value(value)}\n" for name, value in lines.items())
+        if stream.options:
+            table += f"options = {toml.toml_value(stream.options)}\n"
+        parts.append("[[stream]]\n" + table)
+    return "\n".join(parts)

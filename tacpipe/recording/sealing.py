@@ -1,70 +1,161 @@
-"""From a spool to a recording: each stream's bytes decoded into a table, what went wrong into another."""
+"""Decode a spool: the samples of each stream as one table, and the faults of all streams as another."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from tacpipe.arrays import Int64s, Times
 from tacpipe.errors import TacpipeError
-from tacpipe.recording.decoded import UNCERTAIN as UNCERTAIN
-from tacpipe.recording.decoded import Decoded, Stamping
 from tacpipe.recording.ending import COMPLETED
+from tacpipe.recording.pace import CAUGHT_UP, STALLED, Stalls
 from tacpipe.recording.reading import SILENT, SILENT_PERIODS, Batch, Event, Reading
 from tacpipe.recording.rig import Rig
 from tacpipe.recording.spool_blocks import Note
 from tacpipe.recording.spooled import Spooled
-from tacpipe.recording.stalls import Stalls
-from tacpipe.recording.station import CAUGHT_UP, LOST, OPENED, OVERRUN, STALLED
+from tacpipe.recording.station import LOST, OPENED, OVERRUN
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Sensor
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from tacpipe.io.spill import Spill
+    from tacpipe.io.spill import Piece, Spill
 
-END_S = 0.5  # by which a stream may end before the others without a word
-UNDECODED = "undecoded"  # bytes at which the driver gave up
-CRASH = "crash"  # what a process had read and not yet written when it ended
-IN_MEMORY = 1 << 24  # bytes of decoded samples, before they are put aside on disk
-MOST_BYTES = 2 << 20  # of a stream's chunks that are decoded in one go
+UNCERTAIN = "t_uncertain_ns"  # column, only where this program was delayed
+PIECE_BYTES = 1 << 22  # size of samples that are moved to disk together
+
+
+@dataclass(frozen=True)
+class Stamping:
+    """Functions from arrivals on the monotonic clock (sample,) to stamps in UTC, and to how late these may be."""
+
+    utc_ns: Callable[[Any], Any]
+    uncertain_ns: Callable[[Times], Int64s]
+
+
+class Decoded:
+    """Samples of one stream in the order of their arrival."""
+
+    def __init__(self, fields: Sequence[pa.Field], spill: Spill) -> None:
+        self.count = 0
+        self.first_ns = self.last_ns = 0  # first and last arrival on the monotonic clock, if there are samples
+        self._fields, self._spill = fields, spill
+        self._device: list[pa.Field] = []  # fields of the device's clock and counters
+        self._waiting: list[pa.Table] = []
+        self._bytes = 0  # size of the waiting tables
+        self._pieces: list[Piece] = []
+
+    def add(self, batch: Batch) -> None:
+        """Add samples. Raises Arrow's error for values that do not fit their columns; then nothing is added."""
+        import pyarrow as pa
+
+        from tacpipe.channels import schema
+
+        if not len(batch):
+            return
+        device = self._device
+        if not self.count:
+            device = schema.device_fields(clock=batch.t_device_ns is not None, counters=batch.counters)
+        clocks = [pa.array(getattr(batch, kind.name), kind.type) for kind in device]
+        values = (block[:, number] for block in batch.values for number in range(block.shape[1]))
+        channels = [pa.array(column, kind.type) for kind, column in zip(self._fields, values, strict=True)]
+        arrays = [pa.array(batch.t_ns, pa.int64()), *clocks, *channels]
+        table = pa.Table.from_arrays(arrays, names=[str(number) for number in range(len(arrays))])
+        if not self.count:
+            self._device, self.first_ns = device, int(batch.t_ns[0])
+        self.count += len(batch)
+        self.last_ns = int(batch.t_ns[-1])
+        self._waiting.append(table)
+        self._bytes += table.nbytes
+
+    def spill_if_large(self) -> None:
+        """Move added samples from memory to disk once they are many. Raises `StorageError` for a full disk."""
+        if self._bytes > PIECE_BYTES:
+            self._spill_waiting()
+
+    def uncertain(self, stamping: Stamping) -> int:
+        """Return the number of samples that may be stamped late."""
+        uncertain_ns = (stamping.uncertain_ns(table.column(0).to_numpy()) for table in self._tables())
+        return sum(int((late_ns != 0).sum()) for late_ns in uncertain_ns)
+
+    def batches(self, stamping: Stamping, *, uncertain: bool) -> pa.RecordBatchReader:
+        """Return the samples with their stamps in batches, with a column of how late these may be if ``uncertain``."""
+        import pyarrow as pa
+
+        from tacpipe.channels import schema
+
+        stamps = [schema.time_field()]
+        if uncertain:
+            stamps.append(pa.field(UNCERTAIN, pa.int64(), metadata={"unit": "ns", "quantity": "time"}))
+        full_schema = pa.schema([*stamps, *self._device, *self._fields])
+
+        def stamped_batches() -> Iterator[pa.RecordBatch]:
+            for piece in self._tables():
+                t_ns = piece.column(0).to_numpy()
+                columns = [pa.array(stamping.utc_ns(t_ns), pa.int64())]
+                if uncertain:
+                    columns.append(pa.array(stamping.uncertain_ns(t_ns), pa.int64()))
+                table = pa.Table.from_arrays([*columns, *piece.columns[1:]], schema=full_schema)
+                yield from table.combine_chunks().to_batches()
+
+        return pa.RecordBatchReader.from_batches(full_schema, stamped_batches())
+
+    def _spill_waiting(self) -> None:
+        import pyarrow as pa
+
+        if self._waiting:
+            self._pieces.append(self._spill.add(pa.concat_tables(self._waiting).combine_chunks()))
+            self._waiting, self._bytes = [], 0
+
+    def _tables(self) -> Iterator[pa.Table]:
+        self._spill_waiting()
+        for piece in self._pieces:
+            yield self._spill.read(piece)
+
+
+END_S = 0.5  # a stream may end this much before the others without an event
+UNDECODED = "undecoded"  # bytes that the driver could not decode
+CRASH = "crash"  # bytes that a process had read and not yet written when it ended
+IN_MEMORY = 1 << 24  # size of decoded samples that are kept in memory
+MOST_BYTES = 2 << 20  # size of chunks that are decoded together
 
 
 @dataclass(frozen=True)
 class Sealed:
-    """One stream of a spool, and what became of the rest of its bytes."""
+    """One stream of a spool, and the account of its bytes."""
 
     rows: int
-    batches: Callable[[], pa.RecordBatchReader]  # the samples, some at a time
-    span_ns: tuple[int, int] | None  # stamps of the first sample and of the last one, where there are any
+    batches: Callable[[], pa.RecordBatchReader]  # returns the samples in batches
+    span_ns: tuple[int, int] | None  # stamps of the first and the last sample, None without samples
     events: list[Event]
-    lost: int  # frames, by counter where there is one
-    received: int = 0  # bytes
-    undecoded: int = 0  # of them, that the driver could not make sense of: its mistake, or another device
-    crashed: tuple[int, int] = (0, 0)  # chunks and bytes that were read and never spooled
-    uncertain: int = 0  # samples that had waited while this program was held up
+    lost: int  # number of lost frames, by counter where there is one
+    received: int = 0  # number of bytes
+    undecoded: int = 0  # number of bytes that the driver could not decode
+    crashed: tuple[int, int] = (0, 0)  # numbers of chunks and bytes that were read and never spooled
+    uncertain: int = 0  # number of samples that waited while this program was delayed
 
     @property
     def table(self) -> pa.Table:
-        """All samples at once."""
+        """All samples as one table."""
         return self.batches().read_all()
 
 
 def seal(spooled: Spooled, rig: Rig) -> dict[str, Sealed]:
-    """Return every stream of a spool."""
+    """Return every stream of a spool by name."""
     from tacpipe.io.spill import Spill
 
-    end_ns = max((one.last_ns for one in spooled.tallied().values()), default=0)
+    end_ns = max((tally.last_ns for tally in spooled.tallied().values()), default=0)
     spill = Spill(IN_MEMORY)
     return {name: stream(spooled, rig, name, end_ns, spill) for name in spooled.streams}
 
 
 def stream(spooled: Spooled, rig: Rig, name: str, end_ns: int = 0, spill: Spill | None = None) -> Sealed:
-    """Return one stream of a spool: ``t_ns`` in UTC, the device's time and counters next to it, and the channels.
+    """Return one stream of a spool with ``t_ns`` in UTC, the device's time and counters, and the channels.
 
-    ``end_ns`` is when the last byte of any stream came: one that fell silent long before states it. Samples are put aside
-    in ``spill``, or in one of its own, for as long as they are asked for.
+    ``end_ns`` is the arrival of the last byte of any stream: a stream that was silent long before gets an event. Samples are
+    moved to ``spill``, or to a new one, for as long as the result is used.
     """
     from tacpipe.io.spill import Spill
 
@@ -95,20 +186,20 @@ def stream(spooled: Spooled, rig: Rig, name: str, end_ns: int = 0, spill: Spill 
 
 @dataclass
 class _Read:
-    """What was read of a stream next to its samples."""
+    """The account of a stream's blocks."""
 
     events: list[Event] = field(default_factory=list)
     chunks: int = 0
     bytes: int = 0
-    undecoded: int = 0  # bytes of them
+    undecoded: int = 0  # bytes
 
 
 def _read(blocks: Iterable[Chunks | Note], sensor: Sensor, decoded: Decoded, stalls: Stalls) -> _Read:
-    """Decode the blocks of a stream: samples go to ``decoded``, what held the program up to ``stalls``."""
-    found, reading = _Read(), Reading(sensor)
+    """Decode the blocks of a stream: add samples to ``decoded``, delays of the program to ``stalls``."""
+    account, reading = _Read(), Reading(sensor)
 
     def add(batch: Batch) -> None:
-        found.events.extend(batch.events)
+        account.events.extend(batch.events)
         decoded.add(batch)
 
     away = False
@@ -119,38 +210,38 @@ def _read(blocks: Iterable[Chunks | Note], sensor: Sensor, decoded: Decoded, sta
                 add(reading.broken())
             if block.what in (STALLED, CAUGHT_UP):
                 stall = stalls.take(block)
-                found.events += [] if stall is None else [stall]
-            elif block.what != OPENED or away:  # that it opened before it was recorded is not an event
-                found.events.append(_event_of(block, sensor))
+                account.events += [] if stall is None else [stall]
+            elif block.what != OPENED or away:  # opening before the recording is not an event
+                account.events.append(_event_of(block, sensor))
             continue
-        found.chunks += len(block.size)
-        found.bytes += len(block.data)
+        account.chunks += len(block.size)
+        account.bytes += len(block.data)
         try:
             add(reading.feed(block))
-        except Exception as error:  # of a driver: the other streams, and what came before and after, are sealed
-            found.undecoded += len(block.data)
-            why = str(error) if isinstance(error, TacpipeError) else f"{type(error).__name__}: {error}"
-            found.events.append(Event(int(block.t_ns[-1]), UNDECODED, bytes=len(block.data), detail=why))
+        except Exception as error:  # a driver's error does not stop the other streams and blocks
+            account.undecoded += len(block.data)
+            reason = str(error) if isinstance(error, TacpipeError) else f"{type(error).__name__}: {error}"
+            account.events.append(Event(int(block.t_ns[-1]), UNDECODED, bytes=len(block.data), detail=reason))
             reading = Reading(sensor)
-        decoded.put_aside()
+        decoded.spill_if_large()
     add(reading.finish())
-    return found
+    return account
 
 
 def _crashed(spooled: Spooled, name: str, chunks: int, size: int) -> tuple[int, int]:
-    """Return how many chunks and bytes of a stream were read beyond those that were spooled."""
+    """Return the numbers of chunks and bytes of a stream that were read and not spooled."""
     tallied = spooled.tallied().get(name)
     return (0, 0) if tallied is None or tallied.chunks <= chunks else (tallied.chunks - chunks, tallied.bytes - size)
 
 
 def _event_of(note: Note, sensor: Sensor) -> Event:
-    """Return the event of a note; packets that this computer dropped are lost, where no counter states it itself."""
+    """Return the event of a note. Packets that this computer dropped count as lost where no counter states them."""
     dropped = int(note.detail) if note.what == OVERRUN and sensor.counter is None else 0
     return Event(note.t_ns, note.what, dropped, detail=note.detail)
 
 
 def _silent_end(sensor: Sensor, last_ns: int, end_ns: int) -> list[Event]:
-    """Return the event of a stream that gave nothing any more well before the end; no counter reports on that."""
+    """Return the event of a stream that fell silent well before the end, which no counter reports."""
     apart_s = (end_ns - last_ns) / 1e9
     if not sensor.awaited or apart_s < max(END_S, SILENT_PERIODS / sensor.rate_hz):
         return []
@@ -160,12 +251,12 @@ def _silent_end(sensor: Sensor, last_ns: int, end_ns: int) -> list[Event]:
 
 
 def _gathered(spooled: Spooled, name: str) -> Iterator[Chunks | Note]:
-    """Yield the blocks of a stream, those of chunks joined so that each is worth decoding."""
+    """Yield the blocks of a stream, with chunks joined to blocks that are large enough to decode."""
     waiting: list[Chunks] = []
     for _, block in spooled.blocks(name):
         if isinstance(block, Chunks):
             waiting.append(block)
-            if sum(len(one.data) for one in waiting) < MOST_BYTES and len(waiting) < 512:
+            if sum(len(chunks.data) for chunks in waiting) < MOST_BYTES and len(waiting) < 512:
                 continue
         if waiting:
             yield Chunks.joined(waiting)
@@ -177,29 +268,29 @@ def _gathered(spooled: Spooled, name: str) -> Iterator[Chunks | Note]:
 
 
 def _cut_off(sealed: Mapping[str, Sealed], spooled: Spooled) -> list[tuple[Event, str]]:
-    """Return the event of a recording that was not completed, with how much of it there is; nothing for one that was."""
-    spans_ns = [one.span_ns for one in sealed.values() if one.span_ns is not None]
+    """Return the event of a recording that was not completed, with its duration, or nothing."""
+    spans_ns = [stream.span_ns for stream in sealed.values() if stream.span_ns is not None]
     if spooled.ended == COMPLETED or not spans_ns:
         return []
     first_ns, last_ns = min(first for first, _ in spans_ns), max(last for _, last in spans_ns)
     requested_s = spooled.header.get("duration_s")
-    of = "no duration was requested" if requested_s is None else f"{requested_s:g} s were requested"
-    return [(Event(last_ns, spooled.ended, detail=f"{(last_ns - first_ns) / 1e9:.1f} s are there; {of}"), "")]
+    request = "no duration was requested" if requested_s is None else f"{requested_s:g} s were requested"
+    return [(Event(last_ns, spooled.ended, detail=f"{(last_ns - first_ns) / 1e9:.1f} s are there; {request}"), "")]
 
 
 def events_table(sealed: Mapping[str, Sealed], spooled: Spooled) -> pa.Table:
-    """Return the table of what went wrong in all streams, in the order of time."""
+    """Return the table of the events of all streams, in the order of time."""
     import pyarrow as pa
 
     from tacpipe.channels import schema
 
-    rows = sorted((event, name) for name, one in sealed.items() for event in one.events)
+    rows = sorted((event, name) for name, stream in sealed.items() for event in stream.events)
     rows += _cut_off(sealed, spooled)
     rows = [
-        (Event(spooled.utc_ns(spooled.header["clock"]["monotonic_ns"]), "spool_damage", bytes=found.bytes), "")
-        for found in spooled.damage
+        (Event(spooled.utc_ns(spooled.header["clock"]["monotonic_ns"]), "spool_damage", bytes=damage.bytes), "")
+        for damage in spooled.damage
     ] + rows
-    whole = {"unit": "1", "quantity": "count"}
+    count = {"unit": "1", "quantity": "count"}
     return pa.Table.from_arrays(
         [
             pa.array([event.t_ns for event, _ in rows], pa.int64()),
@@ -214,7 +305,7 @@ def events_table(sealed: Mapping[str, Sealed], spooled: Spooled) -> pa.Table:
                 schema.time_field(),
                 pa.field("stream", pa.string()),
                 pa.field("cause", pa.string()),
-                pa.field("frames", pa.int64(), metadata=whole),
+                pa.field("frames", pa.int64(), metadata=count),
                 pa.field("bytes", pa.int64(), metadata={"unit": "byte", "quantity": "count"}),
                 pa.field("detail", pa.string()),
             ]

@@ -1,4 +1,4 @@
-"""The blocks of a spool, byte for byte: each with a mark, a check sum, and the chunks of one stream or a note."""
+"""Encode and decode the blocks of a spool: a mark, a check sum, and the chunks of one stream or a note."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from tacpipe.sensors.framing import Chunks
 MARK = b"tacB"
 HEAD = struct.Struct("<4sIBBHII")  # mark, check sum of all that follows, kind, stream, 0, chunks, bytes of the body
 CHUNKS, NOTE = 0, 1  # kinds of blocks
-WHOLE = 255  # in the place of a stream's number: a note on the recording, which has the stream ""
+WHOLE = 255  # stream number of a note on the recording, whose stream is ""
 
 
 @dataclass(frozen=True)
 class Note:
-    """Something that happened to a stream besides its bytes: a link that opened, was lost, was paused."""
+    """An event of a stream, such as a link that opened or was lost. ``what`` names it."""
 
     t_ns: int
     stream: str
@@ -30,14 +30,14 @@ class Note:
     detail: str = ""
 
 
-def of(kind: int, stream: int, count: int, body: bytes) -> bytes:
-    """Return a block that holds ``body``, with ``count`` chunks of the stream of this number."""
-    rest = HEAD.pack(MARK, 0, kind, stream, 0, count, len(body))[8:]
-    return MARK + struct.pack("<I", zlib.crc32(body, zlib.crc32(rest))) + rest + body
+def pack_block(kind: int, stream: int, count: int, body: bytes) -> bytes:
+    """Return a block with ``body``, which has ``count`` chunks of the stream of this number."""
+    covered = HEAD.pack(MARK, 0, kind, stream, 0, count, len(body))[8:]
+    return MARK + struct.pack("<I", zlib.crc32(body, zlib.crc32(covered))) + covered + body
 
 
-def end(content: mmap.mmap, place: int) -> int | None:
-    """Return where the block at ``place`` ends, or None if there is no whole and undamaged one."""
+def find_end(content: mmap.mmap, place: int) -> int | None:
+    """Return where the block at ``place`` ends, or None if no complete and undamaged block starts there."""
     if place + HEAD.size > len(content) or content[place : place + 4] != MARK:
         return None
     _, check, _, _, _, _, size = HEAD.unpack_from(content, place)
@@ -48,8 +48,8 @@ def end(content: mmap.mmap, place: int) -> int | None:
         return stop if zlib.crc32(covered) == check else None
 
 
-def following(handle: int, content: mmap.mmap, place: int) -> int:
-    """Return where after ``place``, where there is no block, one may begin; holes of the file are passed over unread."""
+def find_next(handle: int, content: mmap.mmap, place: int) -> int:
+    """Return the next place after ``place`` where a block may begin. Holes of the file are skipped unread."""
     try:
         data = os.lseek(handle, place, os.SEEK_DATA)
         if data > place:
@@ -58,13 +58,13 @@ def following(handle: int, content: mmap.mmap, place: int) -> int:
     except OSError as error:
         if error.errno == errno.ENXIO:  # nothing follows but a hole
             return len(content)
-        stop = len(content)  # a file system that does not state
-    found = content.find(MARK, place + 1, stop)
-    return stop if found < 0 else found
+        stop = len(content)  # the file system reports no holes
+    mark = content.find(MARK, place + 1, stop)
+    return stop if mark < 0 else mark
 
 
-def content(kind: int, stream: str, count: int, body: bytes) -> Chunks | Note | None:
-    """Return what a block holds, None where its sum is right and it is still none: another program wrote it."""
+def unpack_block(kind: int, stream: str, count: int, body: bytes) -> Chunks | Note | None:
+    """Return the content of a block, or None where its check sum is right but another program wrote it."""
     try:
         if kind == NOTE:
             entry = json.loads(body)

@@ -1,7 +1,7 @@
-"""The folders of spools in a store: whose they are, which of them nobody writes any more, and their removal.
+"""Find the spools of a store, their owners and those without a writer, and remove spools.
 
-A store may be shared, so a spool is its user's alone: others cannot open its folder, and only spools of the user who runs a
-command are sealed or removed by it. No symbolic link is followed.
+A store may be shared. A spool belongs to its user: others cannot open its folder, and a command seals or removes only spools
+of the user who runs it. No symbolic link is followed.
 """
 
 from __future__ import annotations
@@ -9,45 +9,46 @@ from __future__ import annotations
 import contextlib
 import errno
 import fcntl
+import math
 import os
 import pwd
 import re
 import stat
 import tempfile
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
+from tacpipe.datasets import manifest, paths
 from tacpipe.errors import TacpipeError
 from tacpipe.io.files import listed
-from tacpipe.store import layout
+from tacpipe.printable import excerpt
+from tacpipe.store import layout, location
+from tacpipe.store.layout import BESIDE_NAME
+from tacpipe.store.store import Store
 
-FOLDER = layout.SPOOL  # within the store
-YOUNG_S = 60.0  # for which a spool without a header may be one that is being begun
-NAME = re.compile(r"[0-9a-f]{32}")  # of a spool's folder
-FILES = (
-    "header.json",
-    ".header.json",
-    "tally",
-    "bytes",
-)  # as they are removed: without a header it is not sealed again
+FOLDER = layout.SPOOL  # folder of the store
+YOUNG_S = 60.0  # a younger spool without a header may just be starting
+NAME = re.compile(r"[0-9a-f]{32}")  # name of a spool's folder
+FILES = ("header.json", ".header.json", "tally", "bytes")  # order of removal: a spool without header is not sealed
 READ = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC  # a pipe without writers would block for ever
 
 
-def users(place: Path, seen: Iterable[int]) -> frozenset[int]:
-    """Return the user ids that files of this process have in a folder, ``seen`` being those that there are.
+def users(place: Path, existing: Iterable[int]) -> frozenset[int]:
+    """Return the user ids that files of this process have in a folder whose files have the ids ``existing``.
 
-    That is its own; where another was seen, also what the file system, as one of a network, makes of it.
+    A network file system may give files another id than that of the process, so a file is created where ids differ.
     """
-    found = {os.geteuid()}
-    if not found.issuperset(seen):
+    ids = {os.geteuid()}
+    if not ids.issuperset(existing):
         with contextlib.suppress(OSError), tempfile.TemporaryFile(dir=place) as file:
-            found.add(os.fstat(file.fileno()).st_uid)
-    return frozenset(found)
+            ids.add(os.fstat(file.fileno()).st_uid)
+    return frozenset(ids)
 
 
 def user(number: int) -> str:
-    """Return the name of a user, or the number where there is no name."""
+    """Return the name of a user, or the number of a user without name."""
     try:
         return pwd.getpwuid(number).pw_name
     except (KeyError, OverflowError):
@@ -55,7 +56,7 @@ def user(number: int) -> str:
 
 
 def refuse_link(store: Path) -> None:
-    """Raise `TacpipeError` where a store's folder of spools is a symbolic link: what it leads to may be anybody's."""
+    """Raise `TacpipeError` where a store's folder of spools is a symbolic link, which may lead to another user's files."""
     if (store / FOLDER).is_symlink():
         raise TacpipeError(
             f"{store / FOLDER} is a symbolic link. Remove it; to record to another disk, name a store there in "
@@ -66,18 +67,18 @@ def refuse_link(store: Path) -> None:
 def owners(store: Path) -> dict[Path, int]:
     """Return the folders of all spools, and the user id of each. Raises `TacpipeError` as `refuse_link`."""
     refuse_link(store)
-    found = {}
+    owner_ids = {}
     for folder in listed(store / FOLDER):
         with contextlib.suppress(FileNotFoundError):
-            there = folder.lstat()
-            if stat.S_ISDIR(there.st_mode) and NAME.fullmatch(folder.name):
-                found[folder] = there.st_uid
-    return found
+            status = folder.lstat()
+            if stat.S_ISDIR(status.st_mode) and NAME.fullmatch(folder.name):
+                owner_ids[folder] = status.st_uid
+    return owner_ids
 
 
 def abandoned(store: Path) -> list[Path]:
-    """Return the folders of this user's spools that no process writes or seals any more, oldest first."""
-    found = []
+    """Return the folders of this user's spools that no process writes or seals, oldest first."""
+    folders = []
     everybodys = owners(store)
     ids = users(store / FOLDER, everybodys.values())
     for folder in [folder for folder, owner in everybodys.items() if owner in ids]:
@@ -85,22 +86,22 @@ def abandoned(store: Path) -> list[Path]:
             with locked(folder) as ours:
                 age_s = time.time() - (folder / "bytes" if ours else folder).stat().st_mtime
                 if ours and (folder / "header.json").exists():
-                    found.append((-age_s, folder))
-                elif ours and age_s > YOUNG_S:  # its process ended before it recorded, or after it was sealed
+                    folders.append((-age_s, folder))
+                elif ours and age_s > YOUNG_S:  # its process ended before the recording or after sealing
                     remove(folder)
             if not ours and age_s > YOUNG_S:
-                folder.rmdir()  # fails for one that holds anything
+                folder.rmdir()  # fails for a folder that is not empty
         except (FileNotFoundError, NotADirectoryError):
             continue
         except OSError as error:
             if error.errno != errno.ENOTEMPTY:
-                found.append((0.0, folder))  # who tries to seal it states what is wrong with it
-    return [folder for _, folder in sorted(found)]
+                folders.append((0.0, folder))  # sealing it will report the error
+    return [folder for _, folder in sorted(folders)]
 
 
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[bool]:
-    """Hold a spool while in the block; yield False if it is gone, or if a process writes or seals it."""
+    """Lock a spool in the block. Yield False if it is gone, or if a process writes or seals it."""
     try:
         handle = os.open(folder / "bytes", READ)
     except FileNotFoundError:
@@ -118,14 +119,97 @@ def locked(folder: Path) -> Iterator[bool]:
 
 
 def remove(folder: Path) -> None:
-    """Remove a spool: the files that one has, and its folder where it holds no other."""
+    """Remove the files of a spool, and its folder where it has no other file."""
     with contextlib.suppress(FileNotFoundError):
-        there = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+        handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
         try:
             for name in FILES:
                 with contextlib.suppress(FileNotFoundError):
-                    os.unlink(name, dir_fd=there)
+                    os.unlink(name, dir_fd=handle)
         finally:
-            os.close(there)
+            os.close(handle)
     with contextlib.suppress(OSError):
         folder.rmdir()
+
+
+FILE = re.compile(r"rig-[0-9a-f]{8}\.toml")  # rig files next to the recordings
+MOST_NS = 1 << 62  # limit of clock readings
+
+
+def output_path(store: Store, dataset: Path) -> str:
+    """Return the path of a dataset for a header: relative to the store's project, so that both can be moved.
+
+    The path is absolute outside of that project, and where the store is not in a project.
+    """
+    path, project = Path(os.path.abspath(dataset)), _project(store)  # noqa: PTH100  (without following links)
+    return str(path.relative_to(project) if project is not None and path.is_relative_to(project) else path)
+
+
+def destination(header: Mapping[str, Any], store: Store, opened: Path | None) -> Path:
+    """Return the dataset to which a spool is appended.
+
+    It must be the output of this command (``opened``), or lie in the project of the store or of the current folder without
+    a link that leads out of it. Raises `TacpipeError` for any other.
+    """
+    output = header.get("output")
+    if isinstance(output, str) and output and "\0" not in output:
+        for project in _projects(store):
+            path = project / output
+            if opened is not None and path == Path(os.path.abspath(opened)):  # noqa: PTH100
+                return path
+            if _is_in_project(path, project):
+                return path
+    raise TacpipeError(
+        f"It was recorded for {excerpt(output)}, which is neither the -o of this command nor in the project of its store. "
+        f"If that is right, `tacpipe acquire --recover -o` with that path seals it."
+    )
+
+
+def check_header(header: Mapping[str, Any], streams: Iterable[str]) -> None:
+    """Raise `TacpipeError` for a header that no dataset can represent. ``streams`` are those of its rig file."""
+    name, attributes, clock = header.get("recording"), header.get("attributes"), header.get("clock")
+    if not isinstance(name, str) or not is_name(name):
+        raise TacpipeError(f"Its recording is called {excerpt(name)}, and no file can have that name.")
+    if header.get("streams") != list(streams):
+        raise TacpipeError(f"Its streams are {excerpt(header.get('streams'))}, and its rig file has others.")
+    if not isinstance(attributes, dict) or not all(_is_attribute(value) for value in attributes.values()):
+        raise TacpipeError(
+            f"Its attributes are {excerpt(attributes)}; each must be text, a finite number, true or false."
+        )
+    duration_s = header.get("duration_s")  # older spools have none
+    if duration_s is not None and (not _is_attribute(duration_s) or isinstance(duration_s, str)):
+        raise TacpipeError(f"Its duration is {excerpt(duration_s)}; it must be a number of seconds.")
+    readings = [clock.get(key) for key in ("monotonic_ns", "utc_ns")] if isinstance(clock, dict) else [None]
+    if not all(type(reading) is int and abs(reading) < MOST_NS for reading in readings):
+        raise TacpipeError(f"Its clock is {excerpt(clock)}; it must hold monotonic_ns and utc_ns, whole nanoseconds.")
+
+
+def is_name(name: str) -> bool:
+    """Return whether a recording can have this name: a valid folder name that no file of the dataset has.
+
+    >>> [is_name(name) for name in ("press-001", "木", "a/b", "../a", ".a", "manifest.json", "rig-0123abcd.toml")]
+    [True, True, False, False, False, False, False]
+    """
+    return "/" not in name and paths.safe_path(name) and name.lower() != manifest.NAME and not FILE.fullmatch(name)
+
+
+def _is_attribute(value: object) -> bool:
+    return isinstance(value, str | int) or (isinstance(value, float) and math.isfinite(value))
+
+
+def _project(store: Store) -> Path | None:
+    """Return the project that a store belongs to, or None for a store that TACPIPE_STORE names."""
+    root = Path(os.path.abspath(store.root))  # noqa: PTH100
+    return root.parent if root.name == BESIDE_NAME else None
+
+
+def _projects(store: Store) -> list[Path]:
+    """Return the projects that may contain a spool's dataset. Relative paths start at the first."""
+    project, current = _project(store), location.project()
+    return [current] if project is None or project == current else [project, current]
+
+
+def _is_in_project(path: Path, project: Path) -> bool:
+    if not path.is_relative_to(project) or not paths.safe_path(path.relative_to(project).as_posix()):
+        return False
+    return path.resolve().is_relative_to(project.resolve())

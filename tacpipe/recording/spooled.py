@@ -1,4 +1,4 @@
-"""A spool that is read: of a recording that has ended, or whose process has."""
+"""Read the spool of a recording that has ended, or whose process has."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from tacpipe.recording.spool_blocks import Note
 from tacpipe.sensors.framing import Chunks
 from tacpipe.store import layout
 
-KEPT = layout.KEPT  # within the store
-PASSED_BYTES = 1 << 23  # whole pages
-HEADER_BYTES = 16 << 20  # at most
+KEPT = layout.KEPT  # folder of the store
+PASSED_BYTES = 1 << 23  # release mapped memory in such steps, a multiple of the page size
+HEADER_BYTES = 16 << 20  # limit of the header's size
 
 
 @dataclass(frozen=True)
 class Damage:
-    """Bytes of a spool that are not a block: at its end what a crash tore off, elsewhere what a disk did."""
+    """Bytes of a spool that are no block: torn off by a crash at its end, damaged by the disk elsewhere."""
 
     offset: int
     bytes: int
@@ -39,7 +39,7 @@ class Damage:
 
 @dataclass(frozen=True)
 class Tallied:
-    """What a stream had received when the process ended, spooled or not."""
+    """The total that a stream had received when the process ended, spooled or not."""
 
     chunks: int
     bytes: int
@@ -47,7 +47,7 @@ class Tallied:
 
 
 class Spooled:
-    """A spool that is read: of a recording that has ended, or whose process has.
+    """The spool of a recording that has ended, or whose process has.
 
     ``owners`` are the user ids that its files may have; None: any. Raises `TacpipeError` for a spool without a header.
     """
@@ -55,7 +55,7 @@ class Spooled:
     def __init__(self, folder: Path, owners: frozenset[int] | None = None) -> None:
         self.folder, self._owners = folder, owners
         try:
-            with self._opened("header.json") as file:
+            with self._open("header.json") as file:
                 content = file.read(HEADER_BYTES + 1)
             if len(content) > HEADER_BYTES:
                 raise ValueError(f"it has more than {HEADER_BYTES:,} bytes")
@@ -69,53 +69,53 @@ class Spooled:
                 f"Remove the folder."
             ) from error
         self.damage: list[Damage] = []
-        self._notes: list[Note] = []  # on the recording
+        self._notes: list[Note] = []  # notes on the whole recording
 
     @property
     def ended(self) -> str:
-        """How the recording ended, as far as its blocks were read: one whose process did not end it was recovered."""
+        """How the recording ended, by the blocks that were read. Without a note of its end it was recovered."""
         entry = next((note.detail for note in self._notes if note.what == ENDED), "")
         return entry if entry in (COMPLETED, INTERRUPTED) else RECOVERED
 
     def blocks(self, stream: str | None = None) -> Iterator[tuple[str, Chunks | Note]]:
         """Yield the chunks and notes of one stream, or of all, in the order in which they were appended.
 
-        What is not a block is passed over, and noted in ``damage``. Notes on the recording are read along, see `ended`.
+        Bytes that are no block are skipped and noted in ``damage``. Notes on the recording are collected for `ended`.
         """
-        wanted = None if stream is None else self.streams.index(stream)
+        requested = None if stream is None else self.streams.index(stream)
         self.damage, self._notes = [], []
         with contextlib.ExitStack() as opened:
-            file = opened.enter_context(self._opened("bytes"))
+            file = opened.enter_context(self._open("bytes"))
             if not os.fstat(file.fileno()).st_size:
                 return
             content = opened.enter_context(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
             place = passed = 0
             while place < len(content):
-                if place - passed >= PASSED_BYTES:  # what was read need not stay mapped: spools are larger than memory
+                if place - passed >= PASSED_BYTES:  # spools are larger than memory, so release what was read
                     content.madvise(mmap.MADV_DONTNEED, passed, PASSED_BYTES)
                     passed += PASSED_BYTES
-                stop = spool_blocks.end(content, place)
+                stop = spool_blocks.find_end(content, place)
                 if stop is None:
-                    found = spool_blocks.following(file.fileno(), content, place)
-                    self._damaged(place, found - place)
-                    place = found
+                    next_place = spool_blocks.find_next(file.fileno(), content, place)
+                    self._add_damage(place, next_place - place)
+                    place = next_place
                     continue
                 _, _, kind, number, _, count, size = spool_blocks.HEAD.unpack_from(content, place)
-                if (wanted is None or number == wanted) and number < len(self.streams):
+                if (requested is None or number == requested) and number < len(self.streams):
                     body = content[place + spool_blocks.HEAD.size : place + spool_blocks.HEAD.size + size]
-                    entry = spool_blocks.content(kind, self.streams[number], count, body)
+                    entry = spool_blocks.unpack_block(kind, self.streams[number], count, body)
                     if entry is None:
-                        self._damaged(place, stop - place)
+                        self._add_damage(place, stop - place)
                     else:
                         yield self.streams[number], entry
                 elif number == spool_blocks.WHOLE:
-                    entry = spool_blocks.content(
+                    entry = spool_blocks.unpack_block(
                         kind, "", count, content[place + spool_blocks.HEAD.size : place + spool_blocks.HEAD.size + size]
                     )
                     self._notes += [entry] if isinstance(entry, Note) else []
                 place = stop
 
-    def _damaged(self, offset: int, size: int) -> None:
+    def _add_damage(self, offset: int, size: int) -> None:
         last = self.damage[-1] if self.damage else None
         if last is not None and last.offset + last.bytes == offset:
             self.damage[-1] = Damage(last.offset, last.bytes + size)
@@ -123,12 +123,12 @@ class Spooled:
             self.damage.append(Damage(offset, size))
 
     def tallied(self) -> dict[str, Tallied]:
-        """Return what each stream had received in the end."""
+        """Return the total that each stream had received."""
         try:
-            with self._opened("tally") as file:
+            with self._open("tally") as file:
                 content = file.read(len(self.streams) * TALLY.size)
             return {name: Tallied(*TALLY.unpack_from(content, n * TALLY.size)) for n, name in enumerate(self.streams)}
-        except (FileNotFoundError, struct.error):  # one that cannot be read now is not a reason to forget what was lost
+        except (FileNotFoundError, struct.error):  # other errors are raised, so that losses are not forgotten
             return {}
 
     def utc_ns(self, t_ns: Any) -> Any:
@@ -137,23 +137,23 @@ class Spooled:
         return t_ns + (clock["utc_ns"] - clock["monotonic_ns"])
 
     def remove(self) -> None:
-        """Remove the spool, whose content is sealed."""
+        """Remove the spool after its content is sealed."""
         spool_folders.remove(self.folder)
 
     def keep(self) -> Path:
-        """Move the spool, whose content is sealed, to where no command looks for one; return where it lies."""
-        kept = self.folder.parent.parent / KEPT
-        with readable_errors(kept.parent):
-            kept.mkdir(mode=0o777, exist_ok=True)
-            if kept.is_symlink():
-                raise TacpipeError(f"{kept} is a symbolic link. Remove it.")
-            self.folder.rename(kept / self.folder.name)
-            for folder in (kept, self.folder.parent, kept.parent):
+        """Move the sealed spool to a folder where no command looks for spools, and return its new path."""
+        target = self.folder.parent.parent / KEPT
+        with readable_errors(target.parent):
+            target.mkdir(mode=0o777, exist_ok=True)
+            if target.is_symlink():
+                raise TacpipeError(f"{target} is a symbolic link. Remove it.")
+            self.folder.rename(target / self.folder.name)
+            for folder in (target, self.folder.parent, target.parent):
                 sync_folder(str(folder))
-        return kept / self.folder.name
+        return target / self.folder.name
 
-    def _opened(self, name: str) -> io.FileIO:
-        """Return one of its files, opened. Raises `TacpipeError` for one that is not a regular file, or another user's."""
+    def _open(self, name: str) -> io.FileIO:
+        """Open one of its files. Raises `TacpipeError` for a file of another user or one that is not regular."""
         path = self.folder / name
         try:
             file = io.FileIO(path, opener=lambda name, _: os.open(name, spool_folders.READ))
@@ -162,11 +162,11 @@ class Spooled:
                 raise TacpipeError(f"{path} is a symbolic link, and no spool holds one. Remove it.") from None
             raise
         try:
-            found = os.fstat(file.fileno())
-            regular.require(path, found.st_mode)
-            if self._owners is not None and found.st_uid not in self._owners:
+            status = os.fstat(file.fileno())
+            regular.require(path, status.st_mode)
+            if self._owners is not None and status.st_uid not in self._owners:
                 raise TacpipeError(
-                    f"{path} belongs to another user ({spool_folders.user(found.st_uid)}), who alone can seal it."
+                    f"{path} belongs to another user ({spool_folders.user(status.st_uid)}), who alone can seal it."
                 )
         except BaseException:
             file.close()

@@ -1,4 +1,4 @@
-"""One stream at work: its link is opened, read by a thread of its own, and opened anew when it was lost."""
+"""Run one stream: open its link, read it in a thread, and open it again after a loss."""
 
 from __future__ import annotations
 
@@ -6,142 +6,144 @@ import contextlib
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Iterable
+from dataclasses import fields, replace
+from typing import TYPE_CHECKING, Any
 
 from tacpipe.errors import DeviceError, TacpipeError
 from tacpipe.links import dialogue, opening
 from tacpipe.links.dialogue import NoReplyError
 from tacpipe.links.link import Link, LinkLostError, Opened
-from tacpipe.recording import clock, silence_diagnosis
-from tacpipe.recording.pace import WAITED_NS, Pace
+from tacpipe.recording import clock
+from tacpipe.recording.pace import CAUGHT_UP, STALLED, WAITED_NS, Pace
 from tacpipe.recording.rig import Stream
 from tacpipe.recording.spool_blocks import Note
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Sensor
 
+if TYPE_CHECKING:
+    from tacpipe.links.recognition import Candidate
+
 TALKING = ("udp", "tcp+udp")
 OPENED, LOST, OVERRUN = "opened", "lost", "overrun"
-BEGAN, OVER = "began", "over"  # for listeners: what comes between is part of the recording
-FOREIGN = "foreign"  # packets of other senders than the one that counts
+BEGAN, OVER = "began", "over"  # notes for listeners; the blocks between them are part of the recording
+FOREIGN = "foreign"  # packets of other senders
 REFUSED = "refused"  # packets that the sensor does not accept
-LEFT_OUT_S = 1.0  # least time from one note on packets left out to the next
-STALLED, CAUGHT_UP = (
-    "recorder_stalled",
-    "caught_up",
-)  # this program was held up; from here on arrivals are certain again
-READ_S = 0.1  # longest wait of a read, after which the thread looks whether it should end
-AGAIN_S = (0.1, 2.0)  # between two tries to open a lost link: first, and at most
-MUTE_S = 4.0  # after which a device that should send datagrams and does not is asked anew: nothing else states its loss
-TARE_S = 5.0  # in which a device must have tared
-STOP_S = 2.0  # in which a thread must have ended
-REPLY_S = 0.5  # after which a device that is asked for each frame is asked once more
+LEFT_OUT_S = 1.0  # smallest time between two notes on packets that were left out
+READ_S = 0.1  # timeout of a read, after which the thread checks whether it should end
+AGAIN_S = (0.1, 2.0)  # first and longest pause between two tries to open a lost link
+MUTE_S = 4.0  # a datagram device that is silent for so long is opened again: nothing else reports its loss
+TARE_S = 5.0  # limit for taring a device
+STOP_S = 2.0  # limit for ending the thread
+REPLY_S = 0.5  # a device that sends on request is asked again after so long
 
 Tally = Callable[[int, int, int], None]  # chunks, bytes, last arrival
-Listener = Callable[["Chunks | Note"], None]  # is given what came as it comes; it must neither wait nor raise
+Listener = Callable[["Chunks | Note"], None]  # receives blocks as they arrive; it must neither wait nor raise
 
 
 class Station:
-    """A stream whose link is open, or was lost and is tried again until it is back.
+    """A stream whose link is open, or is tried again after a loss until it is back.
 
-    `take` gives what came since; nothing of it is looked at here.
+    `take` returns the blocks since the last call, which are not decoded here.
     """
 
     def __init__(self, stream: Stream) -> None:
         self.stream = stream
-        self.error: TacpipeError | None = None  # why the link is lost, while it is
+        self.error: TacpipeError | None = None  # the reason while the link is lost
         self.listener: Listener | None = None  # called by the thread that reads
         self._tally: Tally | None = None
         self._link: Link | None = None
-        self._came: deque[tuple[int, bytes]] = deque()
+        self._entries: deque[tuple[int, bytes]] = deque()
         self._notes: deque[Note] = deque()
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._run, name=stream.name, daemon=True)
         self._keeping = threading.Lock()
-        self._orders: deque[Callable[[Link], None]] = deque()  # carried out by the thread, between two reads
+        self._orders: deque[Callable[[Link], None]] = deque()  # the thread runs these between two reads
         self._chunks = self._bytes = self._overruns = self._foreign = self._refused = 0
-        self._left_out_s = 0.0  # when packets that were left out were noted last
-        self._empty_ns = 0  # when the link was last known to hold nothing that waits to be read
+        self._left_out_s = 0.0  # time of the last note on packets that were left out
+        self._empty_ns = 0  # when the link was last known to be empty
         self._wait_s = AGAIN_S[0]
 
     def start(self) -> None:
-        """Open the link and begin to read it. Raises `DeviceError` if that fails."""
+        """Open the link and start the reading thread. Raises `DeviceError` if that fails."""
         try:
             self._open()
         except NoReplyError as error:
             heard = [Chunks.of(error.heard)] if error.heard else []
-            raise DeviceError(silence_diagnosis.sentence(self.stream, error.awaited, heard, reply=True)) from error
+            raise DeviceError(explain_silence(self.stream, error.awaited, heard, reply=True)) from error
         self._thread.start()
 
     def take(self) -> list[Chunks | Note]:
-        """Return what came since the last call, bytes and notes in their order."""
+        """Return the bytes and notes since the last call, in their order."""
         with self._keeping:
-            return self._taken()
+            return self._take_blocks()
 
     def begin(self, tally: Tally, early: list[Chunks | Note] | None) -> list[Chunks | Note]:
-        """Return what came since the last call, and state ``tally`` from now on how much came after that.
+        """Return the blocks since the last call, and report the totals of later blocks to ``tally``.
 
-        ``early`` is what came before and is recorded too: it counts, and with it what this returns. None: neither. The
-        listener gets the note `BEGAN`, and behind it all that counts.
+        ``early`` has earlier blocks that are recorded too; they and the returned blocks then count. With None
+        neither counts.
+        The listener gets the note `BEGAN`, followed by all blocks that count.
         """
         with self._keeping:
-            found = self._taken()
-            counted = [] if early is None else [block for block in (*early, *found) if isinstance(block, Chunks)]
+            pending = self._take_blocks()
+            counted = [] if early is None else [block for block in (*early, *pending) if isinstance(block, Chunks)]
             self._chunks = sum(len(block.size) for block in counted)
             self._bytes = sum(len(block.data) for block in counted)
             self._tally = tally
-            self._foreign = (
-                self._link.foreign if self._link is not None else 0
-            )  # what came before is not of this recording
+            self._foreign = 0 if self._link is None else self._link.foreign  # earlier packets are not recorded
             self._refused = 0
-            for block in (Note(clock.now_ns(), self.stream.name, BEGAN), *(() if early is None else (*early, *found))):
+            for block in (
+                Note(clock.now_ns(), self.stream.name, BEGAN),
+                *(() if early is None else (*early, *pending)),
+            ):
                 self._inform(block)
-            return found
+            return pending
 
     def end(self) -> list[Chunks | Note]:
-        """Return what came since the last call, and state no tally any more. The listener gets the note `OVER`."""
+        """Return the blocks since the last call, and stop the tally. The listener gets the note `OVER`."""
         with self._keeping:
             self._tally = None
             self._inform(Note(clock.now_ns(), self.stream.name, OVER))
             self._note_left_out(self._link)
-            return self._taken()
+            return self._take_blocks()
 
     def drained(self, since_ns: int) -> bool:
-        """Return whether all that waited in the link at that moment was read; True while the link is lost."""
+        """Return whether the link was read empty since ``since_ns``. True while the link is lost."""
         return self._link is None or self._empty_ns >= since_ns
 
     def tare(self) -> bool:
-        """Have the device take its present reading for zero; return False if it has no such command.
+        """Have the device take its present reading as zero. Return False if it has no such command.
 
         Raises `DeviceError` if the link is lost or the device does not reply.
         """
         sensor, name = self.stream.sensor, self.stream.name
         if type(sensor).taring is Sensor.taring:
             return False
-        done, failed = threading.Event(), []
+        finished, failed = threading.Event(), []
 
         def order(link: Link) -> None:
             try:
                 self._keep(dialogue.run_dialogue(link, sensor.taring(), name))
             except DeviceError as error:
                 failed.append(error)
-            done.set()
+            finished.set()
 
         self._orders.append(order)
-        if not done.wait(TARE_S):
+        if not finished.wait(TARE_S):
             raise DeviceError(f"Stream {name} could not be tared: its link is lost. Wait until it is back.")
         if failed:
             raise failed[0]
         return True
 
     def stop(self) -> None:
-        """End the thread, state the device to stop, close the link."""
+        """End the thread, send the device its closing request, and close the link."""
         self._ending.set()
         if self._thread.is_alive():
             self._thread.join(timeout=STOP_S)
         link, self._link = self._link, None
         if link is not None:
-            with contextlib.suppress(Exception):  # whatever a device states to its end, the others are to be closed too
+            with contextlib.suppress(Exception):  # an error of one device must not keep the others open
                 answer = self.stream.sensor.closing()
                 if answer:
                     link.write(answer)
@@ -171,7 +173,7 @@ class Station:
                 self._read()
             except TacpipeError as error:
                 self._lose(error)
-            except Exception as error:  # of a driver: stated as a loss, and no other stream suffers
+            except Exception as error:  # a driver's error is reported as a loss, and the other streams continue
                 self._lose(DeviceError(f"Stream {self.stream.name} failed: {type(error).__name__}: {error}"))
 
     def _lose(self, error: TacpipeError) -> None:
@@ -183,7 +185,7 @@ class Station:
             with self._keeping:
                 self._inform(note)
             self._wait_s = AGAIN_S[0]
-            with contextlib.suppress(Exception):  # of a device that is gone; nothing may end this thread
+            with contextlib.suppress(Exception):  # the device is gone, and nothing may end this thread
                 link.close()
         self._ending.wait(self._wait_s)
         self._wait_s = min(2 * self._wait_s, AGAIN_S[1])
@@ -192,18 +194,18 @@ class Station:
         """Read the link until it is lost or the thread is to end."""
         link, sensor = self._link, self.stream.sensor
         assert link is not None
-        asked, answers = sensor.request(), type(sensor).answer is not Sensor.answer
+        request, answers = sensor.request(), type(sensor).answer is not Sensor.answer
         pace = Pace(clock.now_ns(), clock.suspended_ns())
-        if asked:
-            self._ask(link, asked, pace)
+        if request:
+            self._poll(link, request, pace)
             return
         heard_s = time.monotonic()
         while not self._ending.is_set():
-            came = self._paced(link, READ_S, pace)
-            heard_s = self._heard(heard_s, came)
+            packets = self._paced(link, READ_S, pace)
+            heard_s = self._heard(heard_s, packets)
             self._obey(link, pace)
             if answers:
-                for _, chunk in came:
+                for _, chunk in packets:
                     answer = sensor.answer(chunk)
                     if answer:
                         link.write(answer)
@@ -215,29 +217,29 @@ class Station:
                     self._note_left_out(link)
 
     def _paced(self, link: Link, timeout_s: float, pace: Pace) -> list[tuple[int, bytes]]:
-        """Keep and return what came.
+        """Read the link, keep and return the packets.
 
-        Where this program was held up before it is noted, and where what is read no longer waited.
+        Notes mark where this program was delayed, and where the packets no longer had to wait.
         """
         began_ns = clock.now_ns()
-        came = link.read(timeout_s)
+        packets = link.read(timeout_s)
         ended_ns = clock.now_ns()
         stall = pace.read(began_ns, ended_ns, round(timeout_s * 1e9), clock.suspended_ns())
-        at_ns = came[0][0] if came else ended_ns
+        at_ns = packets[0][0] if packets else ended_ns
         if stall is not None:
             late_ns = 0 if link.kernel_stamped else stall.late_ns
             self._notes.append(Note(at_ns, self.stream.name, STALLED, replace(stall, late_ns=late_ns).detail))
         elif pace.caught_up(began_ns, ended_ns):
             self._notes.append(Note(at_ns, self.stream.name, CAUGHT_UP))
-        self._keep(came)
-        if not came or ended_ns - began_ns > WAITED_NS:
+        self._keep(packets)
+        if not packets or ended_ns - began_ns > WAITED_NS:
             self._empty_ns = began_ns
-        return came
+        return packets
 
-    def _heard(self, before_s: float, came: list[tuple[int, bytes]]) -> float:
-        """Return when the device was heard last. Raises `LinkLostError` for one that is mute, where silence alone states."""
+    def _heard(self, before_s: float, packets: list[tuple[int, bytes]]) -> float:
+        """Return when the device was heard last. Raises `LinkLostError` where only silence reports the loss of a device."""
         sensor, address, now_s = self.stream.sensor, self.stream.address, time.monotonic()
-        if came or address.scheme not in TALKING or sensor.listens or not sensor.awaited:
+        if packets or address.scheme not in TALKING or sensor.listens or not sensor.awaited:
             return now_s
         if now_s - before_s > MUTE_S:
             described = (
@@ -246,18 +248,18 @@ class Station:
             raise LinkLostError(described.strip())
         return before_s
 
-    def _ask(self, link: Link, asked: bytes, pace: Pace) -> None:
-        """Read a device that sends a frame when it is asked: at the sensor's rate, never before it replied."""
+    def _poll(self, link: Link, request: bytes, pace: Pace) -> None:
+        """Read a device that sends one frame per request, at the sensor's rate and never before it replied."""
         period_s = 1.0 / self.stream.sensor.rate_hz
         due_s = time.monotonic()
         while not self._ending.is_set():
-            link.write(asked)
+            link.write(request)
             pace.resume(clock.now_ns())
             self._paced(link, REPLY_S, pace)
             self._obey(link, pace)
             due_s = max(due_s + period_s, time.monotonic() - period_s)
             while not self._ending.is_set() and (left_s := due_s - time.monotonic()) > 0:
-                self._paced(link, min(left_s, READ_S), pace)  # the rest of a reply that came in pieces
+                self._paced(link, min(left_s, READ_S), pace)  # remaining parts of a reply
 
     def _obey(self, link: Link, pace: Pace) -> None:
         while self._orders:
@@ -265,7 +267,7 @@ class Station:
             pace.resume(clock.now_ns())
 
     def _note_left_out(self, link: Link | None) -> None:
-        """Note how many packets were left out since the last note. Called with the lock."""
+        """Note how many packets were left out since the last note. The caller has the lock."""
         self._left_out_s = time.monotonic()
         if link is not None and link.foreign > self._foreign:
             described = f"{link.foreign - self._foreign} packets of other senders were left out"
@@ -281,14 +283,14 @@ class Station:
         self._overruns = overruns
 
     def _keep(self, packets: list[tuple[int, bytes]]) -> None:
-        """Keep what came and is recorded, and hand it on."""
+        """Keep the packets that the sensor accepts, count them and pass them on."""
         accepted = [packet for packet in packets if self.stream.sensor.accepts(packet[1])]
         with self._keeping:
             self._refused += len(packets) - len(accepted)
             packets = accepted
             if not packets:
                 return
-            self._came.extend(packets)
+            self._entries.extend(packets)
             if self._tally is not None:
                 self._chunks += len(packets)
                 self._bytes += sum(len(data) for _, data in packets)
@@ -300,17 +302,82 @@ class Station:
         if self.listener is not None:
             self.listener(block)
 
-    def _taken(self) -> list[Chunks | Note]:
-        found: list[Chunks | Note] = []
+    def _take_blocks(self) -> list[Chunks | Note]:
+        blocks: list[Chunks | Note] = []
         while self._notes:
             note = self._notes.popleft()
-            found += [*_chunks(self._came, note.t_ns), note]
-        return found + _chunks(self._came, None)
+            blocks += [*_chunks(self._entries, note.t_ns), note]
+        return blocks + _chunks(self._entries, None)
 
 
-def _chunks(came: deque[tuple[int, bytes]], before_ns: int | None) -> list[Chunks]:
-    """Return what came before a moment, taken from the front of the queue."""
-    taken = []
-    while came and (before_ns is None or came[0][0] < before_ns):
-        taken.append(came.popleft())
-    return [Chunks.of(taken)] if taken else []
+def _chunks(entries: deque[tuple[int, bytes]], before_ns: int | None) -> list[Chunks]:
+    """Take the entries before ``before_ns``, or all, from the front of the queue and return them."""
+    front = []
+    while entries and (before_ns is None or entries[0][0] < before_ns):
+        front.append(entries.popleft())
+    return [Chunks.of(front)] if front else []
+
+
+INVISIBLE_OPTIONS = ("rate_hz", "baud")  # options that do not change the frames
+
+
+def explain_silence(stream: Stream, awaited: str, heard: Iterable[Chunks], *, reply: bool = False) -> str:
+    """Return a sentence with the device, the problem and what to do, for a stream on which ``awaited`` did not come.
+
+    ``heard`` has the bytes that came instead. With ``reply`` a reply was awaited, and frames of the sensor itself are
+    evidence.
+    """
+    joined = Chunks.joined(list(heard))
+    about = f"Stream {stream.name} ({stream.address}): {awaited}"
+    probe = f"`tacpipe sensors probe {stream.address}`"
+    serial = stream.address.scheme == "serial"
+    if not joined.data:
+        rate = f", set to {stream.sensor.baud} baud as we are" if serial else ""
+        end = f"; {probe} tries all rates" if serial else ""
+        described = f"{about}, but nothing came. Check power and cable, and that it is {stream.kind}{rate}{end}."
+        return f"{described} {stream.sensor.exclusive}".strip()
+    about += f", but {len(joined.data):,} bytes came that hold none."
+    recognised = _explain_bytes(stream, joined, reply=reply)
+    if recognised:
+        return f"{about} {recognised}"
+    at = f"is set to another rate than {stream.sensor.baud} baud, or " if serial else ""
+    return f"{about} Either the device {at}speaks another protocol; {probe} tries what is known."
+
+
+def _explain_bytes(stream: Stream, heard: Chunks, *, reply: bool) -> str:
+    """Return a sentence on the sensor that the bytes are of, empty if none is recognised."""
+    from tacpipe.links.recognition import Candidate, recognise
+
+    scheme, expected = stream.address.scheme, Candidate(stream.kind, stream.sensor)
+    if reply and recognise(heard, scheme, [expected]):
+        return (
+            f"They are frames of {expected}, so the device does not hear us or is another model: check the wire that we "
+            f"send on, and the model in the rig file."
+        )
+    findings = recognise(heard, scheme)
+    if not findings:
+        return ""
+    best = findings[0].candidate
+    if best.kind == stream.kind:
+        nearer = recognise(heard, scheme, _nearer(expected, best))
+        best = nearer[0].candidate if nearer else best
+        return f"They are frames of {best}: set that among the options in the rig file."
+    return f"They are frames of {best}: name that in the rig file, or plug in the other device."
+
+
+def _nearer(expected: Candidate, recognised: Candidate) -> list[Candidate]:
+    """Return variants of the rig file's sensor, each with one option of another sensor of the same kind."""
+    from tacpipe.links.recognition import Candidate
+
+    sensor: Any = expected.sensor
+    variants = []
+    for option in fields(sensor):
+        value = getattr(recognised.sensor, option.name)
+        if option.name in INVISIBLE_OPTIONS or value == getattr(sensor, option.name):
+            continue
+        try:
+            variant = replace(sensor, **{option.name: value})
+            variants.append(Candidate(expected.kind, variant, {option.name: value}))
+        except TacpipeError:  # no product has these options together
+            continue
+    return variants

@@ -1,10 +1,10 @@
-"""One recording after another on an open rig: tared, started and stopped as asked, sealed, appended."""
+"""Record one trial after another on an open rig: tare, start, stop, seal and append."""
 
 from __future__ import annotations
 
 import contextlib
 import signal
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -14,7 +14,8 @@ from tacpipe.io import termination
 from tacpipe.io.termination import EndRequest
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import excerpt, plain
-from tacpipe.recording import appending, clock, header, sealing, triggers
+from tacpipe.recording import appending, clock, sealing, spool_folders, triggers
+from tacpipe.recording.appending import NothingError
 from tacpipe.recording.ending import COMPLETED, INTERRUPTED
 from tacpipe.recording.recorder import Recorder
 from tacpipe.recording.rig import Rig
@@ -22,13 +23,13 @@ from tacpipe.recording.spool import ENDED, Spool
 from tacpipe.recording.spool_blocks import Note
 from tacpipe.recording.spool_folders import users
 from tacpipe.recording.spooled import Spooled
-from tacpipe.recording.view import View
+from tacpipe.recording.watch import View
 from tacpipe.store.store import Store
 
 
 @dataclass(frozen=True)
-class Plan:
-    """What is to be recorded, and what starts and stops it."""
+class RecordingPlan:
+    """The recordings to make, and what starts and stops them."""
 
     output: Path
     name: str
@@ -43,42 +44,42 @@ class Plan:
 
     @property
     def requested(self) -> bool:
-        """Whether an end was requested; else the recording lasts until it is interrupted, which completes it."""
+        """True where an end is defined. Otherwise the recording lasts until it is interrupted, which completes it."""
         return self.duration_s is not None or self.stop != "duration"
 
     @property
     def names(self) -> list[str]:
-        """The names of its recordings: that which was given, with the number of the trial where there are several."""
+        """The names of the recordings: the given name, with a trial number if there are several."""
         return [self.name] if self.trials == 1 else [f"{self.name}-{trial + 1:03d}" for trial in range(self.trials)]
 
 
 @dataclass(frozen=True)
 class Recorded:
-    """One recording, as it was appended."""
+    """One recording that was appended."""
 
     name: str
     seconds: float
     rows: dict[str, int]  # stream to samples
     lost: dict[str, int]  # stream to frames
-    ended: str = COMPLETED  # or interrupted, or recovered
-    spool: str = ""  # where its spool is kept
+    ended: str = COMPLETED  # completed, interrupted or recovered
+    spool: str = ""  # path of its retained spool
 
     def line(self) -> str:
-        """Return it in words."""
+        """Return a sentence on it."""
         described = ", ".join(
             f"{name} {rows} samples" + (f" ({self.lost[name]} lost)" if self.lost[name] else "")
             for name, rows in self.rows.items()
         )
-        kept = f"; its spool is kept in {self.spool}" if self.spool else ""
-        return f"{plain(self.name, NAME_BYTES)}: {self.seconds:.1f} s, {described}{kept}"
+        retained = f"; its spool is kept in {self.spool}" if self.spool else ""
+        return f"{plain(self.name, NAME_BYTES)}: {self.seconds:.1f} s, {described}{retained}"
 
 
 def run(
-    recorder: Recorder, store: Store, plan: Plan, view: View, ended: EndRequest
+    recorder: Recorder, store: Store, plan: RecordingPlan, view: View, stopping: EndRequest
 ) -> tuple[list[Recorded], list[str]]:
-    """Record what ``plan`` asks for; ``ended`` cuts it short, and so does a stream that was lost and is not back.
+    """Record the trials of ``plan`` until ``stopping`` is true or a stream is lost.
 
-    Return what was recorded, and a sentence for each stream that was lost.
+    Return the recordings, and a sentence for each lost stream.
     """
     recorded: list[Recorded] = []
     tap = triggers.Tap(recorder.watches) if "tap" in (plan.start, plan.stop) else None
@@ -87,30 +88,36 @@ def run(
             if plan.tare:
                 recorder.tare()
             starts, stops = _triggers(recorder, plan, pressed, tap)
-            _await(recorder, starts, ended, view, f"trial {trial + 1} of {plan.trials}: waiting for {plan.start}")
-            if ended():
+            _await(
+                recorder,
+                starts,
+                stopping,
+                view,
+                f"trial {trial + 1} of {plan.trials}: waiting for {plan.start}",
+            )
+            if stopping():
                 break
-            one, lost = _record(recorder, store, plan, trial, stops, view, ended)
-            recorded.append(one)
-            if lost or ended():
+            recording, lost = _record(recorder, store, plan, trial, stops, view, stopping)
+            recorded.append(recording)
+            if lost or stopping():
                 return recorded, lost
     return recorded, []
 
 
-def _keys(plan: Plan) -> contextlib.AbstractContextManager[triggers.Keys]:
-    """Listen to the keyboard if a key is asked for; else the terminal is left alone, and may be another program's."""
+def _keys(plan: RecordingPlan) -> contextlib.AbstractContextManager[triggers.Keys]:
+    """Listen to the keyboard only if a key starts or stops trials, so that other programs can use the terminal."""
     return triggers.keys() if "key" in (plan.start, plan.stop) else contextlib.nullcontext(lambda *, must=False: False)
 
 
-def _await(recorder: Recorder, starts: triggers.Trigger, ended: EndRequest, view: View, waiting: str) -> None:
-    recorder.run(lambda: ended() or starts(), lambda: view.show(waiting))
+def _await(recorder: Recorder, starts: triggers.Trigger, stopping: EndRequest, view: View, waiting: str) -> None:
+    recorder.run(lambda: stopping() or starts(), lambda: view.show(waiting))
 
 
 def recover(store: Store, folder: Path, opened: Path | None) -> Recorded:
-    """Seal what an abandoned spool holds and append it to the dataset that it was recorded for.
+    """Seal an abandoned spool and append it to its dataset.
 
-    ``opened`` is the dataset that this command was given, None for none. Raises `TacpipeError` with what keeps it from being
-    sealed: it is another user's, it names what no dataset can hold, or a dataset elsewhere. It stays as it is then.
+    ``opened`` is the output of this command, None for none. Raises `TacpipeError`, and leaves the spool unchanged, where it
+    belongs to another user, has an invalid header, or names a dataset elsewhere.
     """
     from tacpipe.recording import rig as rig_of
 
@@ -119,65 +126,69 @@ def recover(store: Store, folder: Path, opened: Path | None) -> Recorded:
     if not isinstance(described, str):
         raise TacpipeError(f"Its rig file is {excerpt(described)}; it must be a text.")
     rig = rig_of.parse(described, f"The rig file in {folder}")
-    header.check(spooled.header, rig.streams)
-    return _sealed(store, header.destination(spooled.header, store, opened), spooled, rig)
+    spool_folders.check_header(spooled.header, rig.streams)
+    return _seal(store, spool_folders.destination(spooled.header, store, opened), spooled, rig)
 
 
 def _record(
-    recorder: Recorder, store: Store, plan: Plan, trial: int, stops: triggers.Trigger, view: View, ended: EndRequest
+    recorder: Recorder,
+    store: Store,
+    plan: RecordingPlan,
+    trial: int,
+    stops: triggers.Trigger,
+    view: View,
+    stopping: EndRequest,
 ) -> tuple[Recorded, list[str]]:
     name = plan.names[trial]
     attributes = {**plan.attributes, **({"trial": trial + 1} if plan.trials > 1 else {})}
-    described = {"output": header.output(store, plan.output), "recording": name, "attributes": attributes}
-    wanted = {"duration_s": plan.duration_s, "keep": plan.keep_spool}
-    spool = Spool(store.root, {**described, **wanted, "rig": recorder.rig.text}, list(recorder.stations))
+    described = {"output": spool_folders.output_path(store, plan.output), "recording": name, "attributes": attributes}
+    requested = {"duration_s": plan.duration_s, "keep": plan.keep_spool}
+    spool = Spool(store.root, {**described, **requested, "rig": recorder.rig.text}, list(recorder.stations))
     began_s = clock.now_s()
-    how = COMPLETED
+    ending = COMPLETED
 
     def over() -> bool:
-        nonlocal how
+        nonlocal ending
         if plan.duration_s is not None and clock.now_s() - began_s >= plan.duration_s:
             return True
-        if ended() and (plan.requested or ended.number == signal.SIGHUP):
-            how = INTERRUPTED
-        return ended() or stops()
+        if stopping() and (plan.requested or stopping.number == signal.SIGHUP):
+            ending = INTERRUPTED
+        return stopping() or stops()
 
-    kept = f"What was recorded is kept in {spool.folder}; `tacpipe acquire --recover` seals it"
-    with (
-        termination.reporting(f"tacpipe: interrupted. {kept}."),
-        contextlib.closing(spool),
-    ):  # nobody else may recover it
+    advice = f"What was recorded is kept in {spool.folder}; `tacpipe acquire --recover` seals it"
+    # The spool stays locked until it is sealed, so that no other process recovers it.
+    with termination.reporting(f"tacpipe: interrupted. {advice}."), contextlib.closing(spool):
         with recorder.recording(spool, preroll=plan.start != "now"):
             recorder.run(over, lambda: view.show(f"recording {name}, {clock.now_s() - began_s:.0f} s"))
-            spool.note(Note(clock.now_ns(), "", ENDED, how))
-        lost = recorder.lost()  # now: while it is sealed nobody looks at what comes
+            spool.note(Note(clock.now_ns(), "", ENDED, ending))
+        lost = recorder.lost()  # before sealing, during which nothing is read
         view.show(f"sealing {name}")
         try:
-            return _sealed(store, plan.output, Spooled(spool.folder), recorder.rig), lost
+            return _seal(store, plan.output, Spooled(spool.folder), recorder.rig), lost
         except TacpipeError as error:
-            raise type(error)(f"{error} {kept} once that is fixed.") from error
+            raise type(error)(f"{error} {advice} once that is fixed.") from error
         except Exception as error:
-            error.add_note(f"{kept}.")
+            error.add_note(f"{advice}.")
             raise
 
 
-def _sealed(store: Store, output: Path, spooled: Spooled, rig: Rig) -> Recorded:
+def _seal(store: Store, output: Path, spooled: Spooled, rig: Rig) -> Recorded:
     sealed = sealing.seal(spooled, rig)
     with store.at_work():
         name = appending.append(store, output, spooled, rig, sealed)
-    kept = str(spooled.keep()) if spooled.header.get("keep") is True else ""
+    retained = str(spooled.keep()) if spooled.header.get("keep") is True else ""
     spooled.remove()
-    rows = {stream: one.rows for stream, one in sealed.items()}
-    spans_ns = [one.span_ns for one in sealed.values() if one.span_ns is not None]
+    rows = {name: stream.rows for name, stream in sealed.items()}
+    spans_ns = [stream.span_ns for stream in sealed.values() if stream.span_ns is not None]
     first, last = min(first for first, _ in spans_ns), max(last for _, last in spans_ns)
-    lost = {stream: one.lost for stream, one in sealed.items()}
-    return Recorded(name, (last - first) / 1e9, rows, lost, spooled.ended, kept)
+    lost = {name: stream.lost for name, stream in sealed.items()}
+    return Recorded(name, (last - first) / 1e9, rows, lost, spooled.ended, retained)
 
 
 def _triggers(
-    recorder: Recorder, plan: Plan, pressed: triggers.Keys, tap: triggers.Tap | None
+    recorder: Recorder, plan: RecordingPlan, pressed: triggers.Keys, tap: triggers.Tap | None
 ) -> tuple[triggers.Trigger, triggers.Trigger]:
-    """Return what starts the next trial, and what stops it next to its duration."""
+    """Return the trigger that starts the next trial, and the one that stops it besides its duration."""
     contact = None
     if "contact" in (plan.start, plan.stop):
         contact = triggers.Contact(recorder.watches, plan.contact_count)
@@ -187,5 +198,50 @@ def _triggers(
         starts["contact"], stops["contact"] = contact.touched, contact.released
     if tap is not None:
         starts["tap"], stops["tap"] = (lambda: tap.received("start")), (lambda: tap.received("stop"))
-        stops["duration"] = lambda: tap.received("start") and False  # one that comes meanwhile begins no other trial
+        stops["duration"] = lambda: tap.received("start") and False  # a start during a trial does not begin another
     return starts[plan.start], stops[plan.stop]
+
+
+MOST_WORDS = 300  # characters of an unexpected error
+
+
+@dataclass(frozen=True)
+class Unsealed:
+    """A spool that could not be sealed."""
+
+    folder: Path
+    reason: str
+
+    def line(self) -> str:
+        """Return a sentence on it."""
+        return f"The spool {self.folder} stays as it is. {self.reason}"
+
+
+def recover_spools(store: Store, output: Path | None) -> Iterator[Recorded | Unsealed]:
+    """Seal the spools that no process uses and yield the result of each. Spools without a sample are skipped.
+
+    A spool that cannot be sealed stays and does not stop the others. ``output`` is the dataset of the command.
+    """
+    for folder in spool_folders.abandoned(store.root):
+        try:
+            with spool_folders.locked(folder) as ours:
+                if not ours:
+                    continue
+                recorded = recover(store, folder, output)
+        except NothingError:
+            continue  # it ended before its first sample
+        except TacpipeError as error:
+            yield Unsealed(folder, str(error))
+        except Exception as error:  # a damaged spool or another version's driver may raise anything
+            yield Unsealed(folder, plain(f"{type(error).__name__}: {error}", MOST_WORDS))
+        else:
+            yield recorded
+
+
+def spools_of_others(store: Store) -> dict[Path, str]:
+    """Return the spools of other users in a shared store, with the user of each."""
+    with contextlib.suppress(OSError):  # a failed disk was reported already
+        owners = spool_folders.owners(store.root)
+        ours = spool_folders.users(store.root / spool_folders.FOLDER, owners.values())
+        return {folder: spool_folders.user(owner) for folder, owner in owners.items() if owner not in ours}
+    return {}

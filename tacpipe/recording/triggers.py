@@ -1,4 +1,4 @@
-"""What starts and stops a trial: nothing, time, a key, a touch, or a word from one of the lab's own programs."""
+"""Start and stop trials by a key, a touch, or a message of one of the lab's own programs."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from tacpipe.recording import clock
 from tacpipe.recording.watch import Watch, tactile_channels
 
 STARTS, STOPS = ("now", "key", "contact", "tap"), ("duration", "key", "contact", "tap")
-RELEASE_S = 0.5  # without touch, after which a contact is over
-TAP = "tap"  # the kind of the stream that hears the lab's own programs
+RELEASE_S = 0.5  # a contact ends after so long without touch
+TAP = "tap"  # kind of the stream that receives messages of the lab's own programs
 
 Trigger = Callable[[], bool]
 
@@ -27,19 +27,22 @@ class Keys(Protocol):
     """Detects whether a key was pressed."""
 
     def __call__(self, *, must: bool = False) -> bool:
-        """Return whether it was since the last call. With ``must``, raises `UsageError` where none can be any more."""
+        """Return whether a key was pressed since the last call.
+
+        With ``must``, raises `UsageError` where no key can be pressed any more.
+        """
 
 
 @contextlib.contextmanager
 def keys() -> Iterator[Keys]:
-    """Yield what states whether Enter or the space bar was pressed."""
+    """Yield a function that detects whether Enter or the space bar was pressed."""
     try:
         source = sys.stdin.fileno()
-    except (AttributeError, OSError, ValueError):  # there is none, or it is closed
+    except (AttributeError, OSError, ValueError):  # standard input is missing or closed
         source = -1
     settings = None
-    waiting, ended = b"", source < 0
-    with contextlib.suppress(Exception):  # no terminal: lines of standard input represent keys
+    waiting, closed = b"", source < 0
+    with contextlib.suppress(Exception):  # without a terminal, lines of standard input are keys
         import termios
         import tty
 
@@ -47,47 +50,47 @@ def keys() -> Iterator[Keys]:
         tty.setcbreak(source)
 
     def pressed(*, must: bool = False) -> bool:
-        nonlocal waiting, ended
-        if not ended and select.select([source], [], [], 0)[0]:
+        nonlocal waiting, closed
+        if not closed and select.select([source], [], [], 0)[0]:
             read = b""
-            with contextlib.suppress(OSError):  # of a terminal that was closed: no key can be pressed any more
-                read = os.read(source, 4096)  # not through sys.stdin, which keeps what select does not see
-            waiting, ended = waiting + read, not read
-        taken, found = _pressed(waiting, lines=settings is None)
-        waiting = waiting[taken:]
-        if must and ended and not found:
+            with contextlib.suppress(OSError):  # the terminal was closed, so no key can be pressed
+                read = os.read(source, 4096)  # sys.stdin would buffer bytes that select does not see
+            waiting, closed = waiting + read, not read
+        count, is_pressed = _find_key(waiting, lines=settings is None)
+        waiting = waiting[count:]
+        if must and closed and not is_pressed:
             raise UsageError(
                 "No key can be pressed: standard input is closed or at its end. Run it in a terminal, or start by time, "
                 "contact or tap."
             )
-        return found
+        return is_pressed
 
     try:
         yield pressed
     finally:
         if settings is not None:
-            with contextlib.suppress(termios.error):  # of a terminal that was closed
+            with contextlib.suppress(termios.error):  # the terminal was closed
                 termios.tcsetattr(source, termios.TCSADRAIN, settings)
 
 
-def _pressed(typed: bytes, *, lines: bool) -> tuple[int, bool]:
-    """Return how many bytes of what was typed are dealt with, and whether one of them is a key that counts.
+def _find_key(typed: bytes, *, lines: bool) -> tuple[int, bool]:
+    """Return how many typed bytes are processed, and whether one of them is Enter or the space bar.
 
-    >>> _pressed(b"ab  ", lines=False), _pressed(b"go", lines=True), _pressed(b"go\\n\\n", lines=True)
+    >>> _find_key(b"ab  ", lines=False), _find_key(b"go", lines=True), _find_key(b"go\\n\\n", lines=True)
     ((3, True), (0, False), (3, True))
     """
-    found = [place for place in (typed.find(key) for key in ((b"\n",) if lines else (b"\n", b" "))) if place >= 0]
-    if found:
-        return min(found) + 1, True
+    places = [place for place in (typed.find(key) for key in ((b"\n",) if lines else (b"\n", b" "))) if place >= 0]
+    if places:
+        return min(places) + 1, True
     return (0 if lines else len(typed)), False
 
 
 class Contact:
-    """Detects from the tactile channels of all streams whether something is touched."""
+    """Detects a contact by the tactile channels of all streams."""
 
     def __init__(self, watches: Mapping[str, Watch], threshold: float) -> None:
-        found = {name: [place for place, _ in tactile_channels(watch.stream)] for name, watch in watches.items()}
-        self._channels = {name: np.array(places) for name, places in found.items() if places}
+        tactile = {name: [place for place, _ in tactile_channels(watch.stream)] for name, watch in watches.items()}
+        self._channels = {name: np.array(places) for name, places in tactile.items() if places}
         if not self._channels:
             raise UsageError(
                 "No stream of this rig has tactile channels, so no contact can be seen. Start and stop by key, time or tap."
@@ -96,12 +99,12 @@ class Contact:
         self._touched_s: float | None = None
 
     def touched(self) -> bool:
-        """Return whether a tactile channel is further from rest than the threshold."""
+        """Return whether a tactile channel differs from rest by more than the threshold."""
         for name, places in self._channels.items():
             watch = self._watches[name]
-            if watch.newest is None or watch.rest is None:
+            if watch.newest is None or watch.rest_level is None:
                 continue
-            if np.abs(watch.newest[places] - watch.rest[places]).max() > self._threshold:
+            if np.abs(watch.newest[places] - watch.rest_level[places]).max() > self._threshold:
                 self._touched_s = clock.now_s()
                 return True
         return False
@@ -113,7 +116,7 @@ class Contact:
 
 
 class Tap:
-    """Detects from what the lab's own programs state whether a trial begins or ends."""
+    """Detects by messages of the lab's own programs whether a trial begins or ends."""
 
     def __init__(self, watches: Mapping[str, Watch]) -> None:
         self._watches = [watch for watch in watches.values() if watch.stream.kind == TAP]
@@ -125,7 +128,7 @@ class Tap:
         self._since_ns = [clock.now_ns() for _ in self._watches]
 
     def received(self, word: str) -> bool:
-        """Return whether ``{"event": word}`` came since this was made; what came up to it, or at all, is dealt with."""
+        """Return whether a new ``{"event": word}`` came. Messages up to it, or all if there is none, are then processed."""
         for number, watch in enumerate(self._watches):
             for chunk in watch.heard:
                 for t_ns, packet in zip(chunk.t_ns.tolist(), chunk.packets(), strict=True):

@@ -1,56 +1,60 @@
-"""What can be determined of a stream while it comes: rate, losses, jitter, latency, the newest values."""
+"""Follow the streams of a rig: rate, losses, jitter, latency, the newest values."""
 
 from __future__ import annotations
 
+import contextlib
+import sys
 from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from tacpipe import printable
 from tacpipe.arrays import Floats, Int64s
 from tacpipe.errors import TacpipeError
+from tacpipe.io import progress, terminal
+from tacpipe.recording import clock
 from tacpipe.recording.reading import Batch, Reading
 from tacpipe.recording.rig import Stream
 from tacpipe.recording.spool_blocks import Note
 from tacpipe.recording.station import LOST
 from tacpipe.sensors.framing import Chunks
 
-SPAN_NS = 2_000_000_000  # over which rate and jitter are given
-REST_S = 0.5  # over which the level of a tactile channel at rest is taken
+SPAN_NS = 2_000_000_000  # time over which rate and jitter are computed
+REST_S = 0.5  # time over which the rest level of a tactile channel is averaged
 
 
 @dataclass(frozen=True)
 class Figures:
-    """What a stream does now."""
+    """The present figures of a stream."""
 
     rate_hz: float
     jitter_ms: float  # standard deviation of the time between arrivals
-    latency_ms: (
-        float | None
-    )  # median of how much later samples came than the fastest, by the device's clock; None: has none
-    samples: int  # in all
-    lost: int  # in all
-    bytes_lost: int  # in all
+    latency_ms: float | None  # median delay behind the fastest sample, by the device's clock; None without clock
+    samples: int  # total
+    lost: int  # total
+    bytes_lost: int  # total
 
 
 class Watch:
-    """Follows one stream; what it sees is not kept."""
+    """Follows one stream and keeps only its newest samples."""
 
     def __init__(self, stream: Stream) -> None:
         self.stream = stream
         self.samples = 0
-        self.error = ""  # what its driver could not make of what came
+        self.error = ""  # the last error of its driver
         self.newest: Floats | None = None  # (channel,)
-        self.heard: deque[Chunks] = deque(maxlen=64)  # the last chunks, to state what speaks where no frame is found
+        self.heard: deque[Chunks] = deque(maxlen=64)  # the last chunks, to recognise the device where no frame is found
         self.last_ns: int | None = None  # arrival of the newest sample
         self._reading = Reading(stream.sensor)
         self._recent: deque[tuple[Int64s, Int64s | None]] = deque()
-        self._rest: list[Floats] = []
-        self.rest: Floats | None = None  # (channel,), once it is known
+        self._rest_samples: list[Floats] = []
+        self.rest_level: Floats | None = None  # (channel,), once it is measured
 
     def feed(self, blocks: list[Chunks | Note]) -> None:
-        """Take what came. What a driver raises is kept in ``error``: nothing that is looked at may end a recording."""
+        """Decode blocks. A driver's error is kept in ``error``, because a watch must not end a recording."""
         for block in blocks:
             if isinstance(block, Chunks):
                 self.heard.append(block)
@@ -64,7 +68,7 @@ class Watch:
                 self._reading = Reading(self.stream.sensor)
 
     def figures(self, now_ns: int) -> Figures:
-        """Return what the stream does at this moment of the monotonic clock."""
+        """Return the figures at ``now_ns`` of the monotonic clock."""
         self._forget(now_ns)
         t_ns = np.concatenate([stamps for stamps, _ in self._recent] or [np.zeros(0, dtype=np.int64)])
         steps_ns = np.diff(t_ns)
@@ -79,8 +83,8 @@ class Watch:
         return Figures(rate_hz, jitter_ms, latency_ms, self.samples, lost, self._reading.account.lost)
 
     def tare(self) -> None:
-        """Take the level of the next samples for rest."""
-        self._rest, self.rest = [], None
+        """Measure the rest level again, from the next samples."""
+        self._rest_samples, self.rest_level = [], None
 
     def _look(self, batch: Batch) -> None:
         if not len(batch):
@@ -91,11 +95,11 @@ class Watch:
         self._forget(self.last_ns)
         numbers = [block[-1].astype(np.float64) for block in batch.values if block.dtype.kind in "iufb"]
         self.newest = np.concatenate(numbers) if numbers else None
-        if self.rest is None and self.newest is not None:
-            self._rest.append(self.newest)
+        if self.rest_level is None and self.newest is not None:
+            self._rest_samples.append(self.newest)
             enough = REST_S * (self.stream.sensor.rate_hz or 1.0)
-            if len(self._rest) >= min(10.0, max(1.0, enough)):
-                self.rest = np.mean(self._rest, axis=0)
+            if len(self._rest_samples) >= min(10.0, max(1.0, enough)):
+                self.rest_level = np.mean(self._rest_samples, axis=0)
 
     def _forget(self, now_ns: int) -> None:
         while self._recent and self._recent[0][0][-1] < now_ns - SPAN_NS:
@@ -103,7 +107,7 @@ class Watch:
 
 
 def tactile_channels(stream: Stream) -> list[tuple[int, Any]]:
-    """Return position among the numeric channels, and field, of each tactile channel of a stream."""
+    """Return the position among the numeric channels and the field of each tactile channel of a stream."""
     import pyarrow as pa
 
     numeric = [
@@ -112,3 +116,94 @@ def tactile_channels(stream: Stream) -> list[tuple[int, Any]]:
         if pa.types.is_integer(kind.type) or pa.types.is_floating(kind.type) or pa.types.is_boolean(kind.type)
     ]
     return [(place, kind) for place, kind in enumerate(numeric) if (kind.metadata or {}).get(b"quantity") == b"tactile"]
+
+
+FRAMES_HZ = 8.0  # refresh rate on a terminal
+LINE_S = 5.0  # pause between two plain lines
+SHADES = ("grey15", "dark_blue", "blue", "dark_cyan", "green", "yellow", "orange1", "red")
+COLUMNS = 16  # largest number of columns of the heat map
+
+
+class View:
+    """Shows the watches of a rig. `show` may be called at any rate."""
+
+    def __init__(
+        self, watches: Mapping[str, Watch], *, quiet: bool = False, footer: Callable[[], Sequence[str]] = lambda: ()
+    ) -> None:
+        self._watches, self._quiet = watches, quiet
+        self._footer = footer  # returns lines to show below the streams
+        self._live: Any = None
+        self._shown_s = clock.now_s()
+        self._tactile = {
+            name: [place for place, _ in tactile_channels(watch.stream)] for name, watch in watches.items()
+        }
+        self._largest = dict.fromkeys(watches, 1.0)
+
+    @contextlib.contextmanager
+    def open(self) -> Iterator[View]:
+        """Show the view on the terminal in the block, where there is a terminal."""
+        if self._quiet or not progress.is_visible():
+            yield self
+            return
+        from rich.console import Console
+        from rich.live import Live
+
+        with Live(console=Console(file=sys.stderr), refresh_per_second=FRAMES_HZ, transient=True) as self._live:
+            yield self
+        self._live = None
+
+    def show(self, state: str) -> None:
+        """Show the figures of the streams, and ``state``: what the rig is doing."""
+        now_s = clock.now_s()
+        if self._quiet or now_s - self._shown_s < (1 / FRAMES_HZ if self._live else LINE_S):
+            return
+        self._shown_s = now_s
+        figures = {name: watch.figures(clock.now_ns()) for name, watch in self._watches.items()}
+        if self._live is not None:
+            self._live.update(self._picture(state, figures))
+        else:
+            described = "; ".join(describe_figures(name, values) for name, values in figures.items())
+            terminal.note(f"{state}: {described}")
+            for footer_line in self._footer():
+                terminal.note(footer_line)
+
+    def _picture(self, state: str, figures: Mapping[str, Figures]) -> Any:
+        from rich.console import Group
+        from rich.table import Table
+        from rich.text import Text
+
+        table = Table(
+            "stream", "Hz", "jitter ms", "latency ms", "samples", "lost", "bytes lost", title=printable.shown(state)
+        )
+        for name, values in figures.items():
+            latency = "" if values.latency_ms is None else f"{values.latency_ms:.2f}"
+            row = (f"{values.rate_hz:.1f}", f"{values.jitter_ms:.2f}", latency, str(values.samples))
+            table.add_row(name, *row, str(values.lost), str(values.bytes_lost), style="red" if values.lost else None)
+        maps = [Text.assemble(name + "\n", *self._heat(name)) for name in figures if self._tactile[name]]
+        return Group(table, *(Text(printable.shown(footer_line)) for footer_line in self._footer()), *maps)
+
+    def _heat(self, name: str) -> list[Any]:
+        """Return the tactile channels of a stream as coloured cells, by how far each is from rest."""
+        watch, places = self._watches[name], self._tactile[name]
+        if watch.newest is None or watch.rest_level is None:
+            return []
+        away = np.abs(watch.newest[places] - watch.rest_level[places])
+        self._largest[name] = max(self._largest[name], float(away.max()))
+        shade = np.minimum(away / self._largest[name] * len(SHADES), len(SHADES) - 1).astype(int)
+        cells: list[Any] = []
+        for number, level in enumerate(shade.tolist()):
+            cells.append(("  ", f"on {SHADES[level]}"))
+            if (number + 1) % COLUMNS == 0:
+                cells.append("\n")
+        return cells
+
+
+def describe_figures(name: str, figures: Figures) -> str:
+    """Return the figures of a stream as one line.
+
+    >>> describe_figures("xela1", Figures(50.02, 0.41, None, 120, 1, 0))
+    'xela1 50.0 Hz, jitter 0.4 ms, 120 samples, 1 lost'
+    """
+    latency = "" if figures.latency_ms is None else f", latency {figures.latency_ms:.1f} ms"
+    counts = f"{figures.samples} samples, {figures.lost} lost"
+    return f"{name} {figures.rate_hz:.1f} Hz, jitter {figures.jitter_ms:.1f} ms{latency}, {counts}"

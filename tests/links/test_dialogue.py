@@ -148,7 +148,7 @@ def test_no_sample_is_lost_while_a_device_that_streams_is_opened_and_tared(
     kind: str, device: tuple[Link, Talk]
 ) -> None:
     link, talk = device
-    sensor = rig.make(kind, {}, "stream")
+    sensor = rig.build_sensor(kind, {}, "stream")
     sent = iter(pieces(sensor, sensor.encode(samples(kind, sensor, 40, seed=4))))
     end = sensor.device()
     end.streaming = True  # an earlier session left it so

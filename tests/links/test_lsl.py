@@ -22,7 +22,7 @@ from tacpipe.errors import DeviceError, TacpipeError, UsageError
 from tacpipe.links.link import Link, LinkLostError, parse
 from tacpipe.links.opening import open_link
 from tacpipe.links.recognition import recognise
-from tacpipe.recording import completing, rig
+from tacpipe.recording import recorder, rig
 from tacpipe.recording.reading import Reading
 from tacpipe.recording.spool_blocks import Note
 from tacpipe.recording.station import Station
@@ -72,7 +72,7 @@ def ended(process: subprocess.Popen[str]) -> int:
 
 
 def made(options: dict[str, Any] | None = None) -> lsl.Lsl:
-    sensor = rig.make("lsl", options or {}, "test")
+    sensor = rig.build_sensor("lsl", options or {}, "test")
     assert isinstance(sensor, lsl.Lsl)
     return sensor
 
@@ -137,7 +137,7 @@ def test_a_rig_without_channels_takes_those_that_the_outlet_describes() -> None:
     name = unique()
     text = f'[[stream]]\nname = "wrist"\nsensor = "lsl"\ntransport = "lsl:?source_id={name}-1"\n'
     with outlet("force", name):
-        found = completing.completed(rig.parse(text))
+        found = recorder.complete_rig(rig.parse(text))
     assert found.streams["wrist"].sensor == made(FORCE)
     assert rig.parse(found.text).streams["wrist"].sensor == made(FORCE)
 
@@ -147,7 +147,7 @@ def test_an_outlet_that_ended_is_opened_anew_when_it_is_back() -> None:
     name = unique()
     text = f'[[stream]]\nname = "wrist"\nsensor = "lsl"\ntransport = "lsl:{name}"\n'
     with outlet("force", name) as process:
-        station = Station(completing.completed(rig.parse(text)).streams["wrist"])
+        station = Station(recorder.complete_rig(rig.parse(text)).streams["wrist"])
         station.start()
         blocks: list[Any] = []
         _taken(station, blocks, lambda: _samples(blocks) > 20)

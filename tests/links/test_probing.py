@@ -35,12 +35,12 @@ def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def flexitac() -> tuple[Sensor, list[bytes]]:
-    sensor = rig.make("flexitac", {"rows": 16, "columns": 16, "baud": 2_000_000}, "test")
+    sensor = rig.build_sensor("flexitac", {"rows": 16, "columns": 16, "baud": 2_000_000}, "test")
     return sensor, [bytes(frame) for frame in sensor.encode(Samples((RNG.integers(0, 40, (200, 256), np.uint8),)))]
 
 
 def optoforce() -> tuple[Sensor, list[bytes]]:
-    sensor = rig.make("optoforce", {"axes": 3}, "test")
+    sensor = rig.build_sensor("optoforce", {"axes": 3}, "test")
     counts = RNG.integers(-900, 900, (200, 3), np.int16)
     samples = Samples((np.zeros((200, 1), np.uint16), counts), seq=np.arange(200))
     return sensor, [bytes(frame) for frame in sensor.encode(samples)]
@@ -134,7 +134,7 @@ def test_the_command_prints_what_speaks_and_the_lines_for_the_rig_file(lab: Lab)
     assert lines[0].startswith(f"serial:{path} speaks flexitac (rows = 16, columns = 16): ")
     assert lines[0].endswith("at 2,000,000 baud.")
     parsed = rig.parse("\n".join(lines[lines.index("[[stream]]") :]))
-    assert parsed.streams["flexitac"].sensor == rig.make("flexitac", {"rows": 16, "columns": 16}, "test")
+    assert parsed.streams["flexitac"].sensor == rig.build_sensor("flexitac", {"rows": 16, "columns": 16}, "test")
     assert listed["ports"][0]["findings"][0]["sensor"] == "flexitac"
     assert listed["ports"][0]["certain"] is True
 
@@ -148,7 +148,7 @@ def test_the_command_exits_with_5_where_nothing_is_recognised(lab: Lab) -> None:
 
 @pytest.mark.rig
 def test_datagrams_are_recognised_too(lab: Lab) -> None:
-    sensor = rig.make("ati-netft", {}, "test")
+    sensor = rig.build_sensor("ati-netft", {}, "test")
     frames = sensor.encode(_some(sensor))
     with (
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free,

@@ -34,7 +34,7 @@ def stream(sensor: Sensor, samples: Samples) -> Chunks:
 
 
 def rigged(kind: str, options: Mapping[str, Any]) -> Sensor:
-    return rig.make(kind, options, "test")
+    return rig.build_sensor(kind, options, "test")
 
 
 def optoforce(axes: int) -> Chunks:

@@ -16,7 +16,7 @@ ROW_NS = 10**12
 
 
 def decoder_and_packets(sensor: str) -> tuple[Decoder, list[bytes]]:
-    of = rigs.make(sensor, {}, "stream")
+    of = rigs.build_sensor(sensor, {}, "stream")
     samples = made.samples(sensor, of, 4, 1)
     return Decoder(of), made.pieces(of, of.encode(samples))
 

@@ -31,7 +31,7 @@ class Session:
     """An engine with one skin, and the frames that it sends."""
 
     def __init__(self, count: int = 200) -> None:
-        self.sensor: Sensor = rigs.make("xela", {"rate_hz": 50}, "skin")
+        self.sensor: Sensor = rigs.build_sensor("xela", {"rate_hz": 50}, "skin")
         axes = tuple(dict.fromkeys(("skin", name[-1]) for name in CHANNELS))
         alarms = Alarms(axes, {"load": tuple(LEVEL for _ in axes), "slip": (LEVEL,)}, floors=(1.0,))
         self.engine = ForecastEngine({"skin": self.sensor}, Persistence, lambda _: alarms, settle_ns=SETTLE_NS)

@@ -88,7 +88,7 @@ class Session:
     """An engine with a BioTac, whose frames arrive as those of a simulated trial."""
 
     def __init__(self, model: Any, kind: int = 1, table: Any = None, **changed: Any) -> None:
-        self.sensor = rigs_of.make("biotac", {}, "finger")
+        self.sensor = rigs_of.build_sensor("biotac", {}, "finger")
         self.engine = opened(model, {"finger": self.sensor}, **changed)
         self.table = trial(kind) if table is None else table
         names = [field.name for field in self.sensor.fields()]
@@ -301,7 +301,9 @@ def test_what_was_lost_makes_this_recording_unknown_and_not_the_next(models: dic
 
 
 def test_rows_of_the_sessions_stream_hold_what_was_published() -> None:
-    sensor = rigs_of.make("live", {"task": "material", "output": "material", "channels": ["cork", "felt"]}, "live")
+    sensor = rigs_of.build_sensor(
+        "live", {"task": "material", "output": "material", "channels": ["cork", "felt"]}, "live"
+    )
     assert isinstance(sensor, Live)
     assert [field.name for field in sensor.fields()] == [*SLIDE_COLUMNS, "probability_cork", "probability_felt"]
     for probabilities in (None, np.array([0.25, 0.75], np.float32)):
@@ -318,8 +320,8 @@ def test_rows_of_the_sessions_stream_hold_what_was_published() -> None:
 
 def test_a_rig_that_the_model_cannot_read_is_refused_by_what_is_missing(models: dict[str, Opened]) -> None:
     model: Any = models["statistics"]
-    biotac, range_finder = (rigs_of.make(kind, {}, kind) for kind in ("biotac", "tfmini"))
-    two = rigs_of.make("biotac", {"fingers": 2}, "biotac")
+    biotac, range_finder = (rigs_of.build_sensor(kind, {}, kind) for kind in ("biotac", "tfmini"))
+    two = rigs_of.build_sensor("biotac", {"fingers": 2}, "biotac")
     for sensors, changed, named in (
         ({"range": range_finder}, {}, "tactile"),
         ({"a": biotac, "b": biotac}, {}, "2 streams"),
@@ -339,7 +341,7 @@ def test_a_model_of_several_sensors_needs_the_name_of_the_rigs(tmp_path: Path) -
     model: Any = Opened(
         material_training.train(fitting("train.material", KINDS["statistics"]), parts[0], parts[1], tmp_path, None)
     )
-    sensors = {"finger": rigs_of.make("biotac", {}, "finger")}
+    sensors = {"finger": rigs_of.build_sensor("biotac", {}, "finger")}
     with pytest.raises(UsageError, match="--sensor"):
         opened(model, sensors)
     assert opened(model, sensors, sensor="biotac").describe("m").frames == FRAMES

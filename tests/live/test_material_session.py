@@ -8,7 +8,6 @@ import pytest
 import tacpipe
 from tacpipe.metrics import calibration
 from tacpipe.recording import rig as rig_of
-from tacpipe.recording import rig_text
 from tacpipe.simulation.emulation.emulator import Emulator
 from tests.conftest import Lab
 from tests.live.sessions import commanded, ended, subscriber
@@ -31,7 +30,7 @@ def test_the_last_answer_of_a_session_is_what_predict_gives_its_recording(lab: L
         Emulator(asked, 5, folder=lab.folder / "emulated", patient=True) as emulator,
         subscriber() as (port, messages),
     ):
-        (lab.folder / "rig.toml").write_text(rig_text.of(emulator.rig))
+        (lab.folder / "rig.toml").write_text(rig_of.to_toml(emulator.rig))
         words = f"live rig.toml --model models/m -o rec --json --publish udp:127.0.0.1:{port}"
         process = commanded(lab, words)
         live.awaited(lambda: sum(one.get("seen") == 1.0 for one in messages) > 5 or process.poll() is not None)

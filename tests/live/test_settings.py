@@ -13,7 +13,6 @@ from tacpipe.cli import live as command
 from tacpipe.errors import UsageError
 from tacpipe.live.settings import SessionOptions, Settings, keys, task_settings
 from tacpipe.recording import rig as rigs
-from tacpipe.recording import rig_text
 from tacpipe.tasks.forward.live import plans
 from tacpipe.tasks.forward.live.task import ForwardSettings
 from tests.conftest import Lab
@@ -131,7 +130,7 @@ def test_the_table_stays_in_the_text_of_a_rig_and_recorders_do_not_look_at_it() 
     text = STREAM + '[live]\nmodel = "models/f"\npublish = ["udp:127.0.0.1:9000"]\nsettle_ms = 3\n'
     rig = rigs.parse(text)
     assert rig.live == {"model": "models/f", "publish": ["udp:127.0.0.1:9000"], "settle_ms": 3}
-    assert rigs.parse(rig_text.of(rig)).live == rig.live
+    assert rigs.parse(rigs.to_toml(rig)).live == rig.live
     assert rigs.parse(STREAM + '[live]\nanything = "else"\n').live  # `tacpipe acquire` records such a rig
     with pytest.raises(UsageError, match="live is 3; it must be a table"):
         rigs.parse("live = 3\n" + STREAM)

@@ -39,7 +39,7 @@ def moving(count: int, step_ms: float = 4.0) -> tuple[Any, Any]:
 
 @pytest.mark.parametrize("kind", ARMS)
 def test_the_set_points_of_an_arm_are_read_as_pose_and_velocities(kind: str) -> None:
-    sensor: Sensor = rigs_of.make(kind, ARMS[kind], "robot")
+    sensor: Sensor = rigs_of.build_sensor(kind, ARMS[kind], "robot")
     samples = made.samples(kind, sensor, 40, 3)
     t_ns, poses = moving(40)
     names = [field.name for field in sensor.fields()]
@@ -70,7 +70,7 @@ def test_the_set_points_of_an_arm_are_read_as_pose_and_velocities(kind: str) -> 
 
 def test_a_stream_without_set_points_is_refused_with_the_option_that_records_them() -> None:
     with pytest.raises(UsageError, match="target_TCP_pose"):
-        Targets("robot", likely_schema(rigs_of.make("ur-rtde", {}, "robot")))
+        Targets("robot", likely_schema(rigs_of.build_sensor("ur-rtde", {}, "robot")))
 
 
 @pytest.fixture(scope="module")

@@ -66,7 +66,7 @@ class Session:
     """An engine with one stream of requests."""
 
     def __init__(self, files: Files, rank: str = "contact", folder: Path | None = None) -> None:
-        self.sensor = rigs_of.make("grasps", {} if folder is None else {"folder": str(folder)}, "requests")
+        self.sensor = rigs_of.build_sensor("grasps", {} if folder is None else {"folder": str(folder)}, "requests")
         self.engine = TouchEngine({"requests": self.sensor}, Predictor.load(files), touch_ranking.criterion(rank))
         self.t_ns = 0
         self.engine.take("", Note(0, "", wire.BEGIN, str(OFFSET_NS)))
@@ -208,7 +208,7 @@ def test_what_is_no_request_is_no_frame(change: dict[str, Any]) -> None:
 
 
 def live() -> Live:
-    found = rigs_of.make("live", {"task": "touch", "output": "touch", "channels": list(COLUMNS)}, "live")
+    found = rigs_of.build_sensor("live", {"task": "touch", "output": "touch", "channels": list(COLUMNS)}, "live")
     assert isinstance(found, Live)
     return found
 
@@ -225,7 +225,7 @@ def test_the_sessions_stream_has_a_row_a_candidate(models: dict[str, Files]) -> 
 
 
 def test_a_rig_without_requests_and_a_criterion_that_cannot_be_are_refused(models: dict[str, Files]) -> None:
-    sensors = {"range": rigs_of.make("tfmini", {}, "range")}
+    sensors = {"range": rigs_of.build_sensor("tfmini", {}, "range")}
     with pytest.raises(TacpipeError, match="sensor grasps"):
         TouchEngine(sensors, Predictor.load(models["tree-ensemble"]), touch_ranking.criterion("contact"))
     with pytest.raises(TacpipeError, match="both fingers"):

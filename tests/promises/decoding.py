@@ -22,7 +22,7 @@ CUT = b"\xa5cut\x5a"  # between the packets of a link that gives packets
 @functools.cache
 def sensor(case: str) -> Sensor:
     """Return the sensor of a case."""
-    return rig.make(*CASES[case], case)
+    return rig.build_sensor(*CASES[case], case)
 
 
 @functools.cache

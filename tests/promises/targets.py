@@ -37,7 +37,7 @@ from tacpipe.io.parquet import from_parquet, to_parquet
 from tacpipe.links import hid
 from tacpipe.plugins import given_params, registry
 from tacpipe.plugins.stage import Source
-from tacpipe.recording import header, rig, spool, spool_blocks, spooled
+from tacpipe.recording import rig, spool, spool_blocks, spool_folders, spooled
 from tacpipe.sensors.framing import Chunks
 from tests.conftest import Lab, Ran
 from tests.formats import grasp_files, slide_files, xdf_writer, xela_files
@@ -157,7 +157,7 @@ def _spool(data: bytes) -> object:
         if isinstance(block, Chunks):
             assert sum(map(len, block.packets())) == len(block.data)
     assert sum(damage.bytes for damage in found.damage) <= len(data) + len(_spools()[0])
-    header.check(found.header, ["a", "b"])
+    spool_folders.check_header(found.header, ["a", "b"])
     return found.tallied()
 
 

@@ -25,7 +25,6 @@ from typing import Any
 import tacpipe
 from tacpipe.cli.emulate import SWITCH_S
 from tacpipe.recording import rig as rig_of
-from tacpipe.recording import rig_text
 from tacpipe.simulation.emulation.emulator import Emulator
 from tacpipe.testing import matching
 
@@ -49,7 +48,7 @@ class Cost:
 def emulated(folder: Path) -> Iterator[Emulator]:
     """Serve the rig of the first paper, its rig file with addresses in ``folder``."""
     with Emulator(rig_of.read(RIG), folder=folder / "emulated", patient=True) as emulator:
-        (folder / "rig.toml").write_text(rig_text.of(emulator.rig))
+        (folder / "rig.toml").write_text(rig_of.to_toml(emulator.rig))
         yield emulator
 
 

@@ -15,7 +15,6 @@ import numpy as np
 
 import tacpipe
 from tacpipe.recording import rig as rig_of
-from tacpipe.recording import rig_text
 from tacpipe.simulation.emulation.byte_faults import Faults
 from tacpipe.simulation.emulation.emulator import Emulator
 from tacpipe.testing.matching import STAMPS
@@ -43,7 +42,7 @@ def served(folder: Path, *streams: str, faults: Faults | None = None, head: str 
     """Serve a rig of these streams, its rig file with the addresses that were made in ``folder``."""
     asked = rig_of.parse(head + "".join(streams))
     with Emulator(asked, faults=faults, folder=folder / "emulated", patient=True) as emulator:
-        (folder / "rig.toml").write_text(rig_text.of(emulator.rig))
+        (folder / "rig.toml").write_text(rig_of.to_toml(emulator.rig))
         yield emulator
 
 

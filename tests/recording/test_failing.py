@@ -185,7 +185,7 @@ def test_what_is_recorded_before_a_trigger_arrived_within_half_a_second(
     late = chunks(
         range(3000), sent, now_ns - 3000 * PERIOD_NS
     )  # three seconds in one block, as while a trial is sealed
-    recorder._watched("a", [late])
+    recorder._watch("a", [late])
     spool = Spool(tmp_path, {"rig": RIG}, ["a", "b"])
     with recorder.recording(spool, preroll=True):
         pass

@@ -139,7 +139,7 @@ def test_the_same_bytes_give_the_same_samples_however_they_are_cut(sizes: list[i
 def test_a_device_s_clock_goes_on_where_it_begins_at_zero_again() -> None:
     numbers = ({"name": "t", "type": "u32"}, {"name": "force", "type": "i16", "unit": "N", "quantity": "force"})
     options = {"marker": "AA 55", "rate_hz": 1000, "clock": {"number": "t", "unit": "us"}, "numbers": numbers}
-    rig = rig_of.make("generic", options, "test")
+    rig = rig_of.build_sensor("generic", options, "test")
     taken_us = np.arange(2**32 - 50_000, 2**32 + 50_000, 1000)
     values = (np.arange(len(taken_us), dtype=np.int16)[:, None],)
     sent = rig.encode(Samples(values, t_device_ns=taken_us % 2**32 * 1000))

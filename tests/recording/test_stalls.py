@@ -13,7 +13,7 @@ from tacpipe.io.columns import Columns
 from tacpipe.io.parquet import to_parquet
 from tacpipe.links import udp
 from tacpipe.plugins import registry
-from tacpipe.recording import clock, sealing, station
+from tacpipe.recording import clock, pace, sealing
 from tacpipe.recording import rig as rig_of
 from tacpipe.recording.pace import CATCH_UP_NS, STALL_NS, Pace
 from tacpipe.recording.rig import Rig
@@ -93,7 +93,7 @@ def recorded(folder: Path, device: Device, rig: Rig = RIG) -> Sealed:
 
 def stalls(found: Sealed) -> list[tuple[int, str]]:
     """Return time and detail of each stall in ms after the start."""
-    return [((event.t_ns - START_NS) // MS, event.detail) for event in found.events if event.cause == station.STALLED]
+    return [((event.t_ns - START_NS) // MS, event.detail) for event in found.events if event.cause == pace.STALLED]
 
 
 def test_a_recorder_that_is_never_held_up_says_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

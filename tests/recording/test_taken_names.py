@@ -25,4 +25,4 @@ def test_a_name_that_a_recording_has_but_for_case_is_refused_and_numbered_where_
     with pytest.raises(UsageError, match=f"names already: {there}"):
         appending.refuse_taken(Path("rec"), ["bowl", name])
     appending.refuse_taken(Path("rec"), ["bowl", f"{name}-2"])
-    assert appending._free(name, before.recordings) == f"{name}-2"
+    assert appending._free_name(name, before.recordings) == f"{name}-2"

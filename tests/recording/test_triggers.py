@@ -115,7 +115,7 @@ def test_a_touch_begins_a_trial_and_its_end_ends_it(lab: Lab, monkeypatch: pytes
 
     class Seen(triggers.Contact):
         def touched(self) -> bool:
-            if all(watch.rest is not None for watch in self._watches.values()):
+            if all(watch.rest_level is not None for watch in self._watches.values()):
                 pad.rested.set()
             return super().touched()
 

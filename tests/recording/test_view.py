@@ -12,10 +12,9 @@ from rich.console import Console
 from tacpipe.io import progress
 from tacpipe.links.link import Address
 from tacpipe.recording import clock, rig
-from tacpipe.recording import view as view_of
+from tacpipe.recording import watch as view_of
 from tacpipe.recording.rig import Stream
-from tacpipe.recording.view import View
-from tacpipe.recording.watch import Watch
+from tacpipe.recording.watch import View, Watch
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.optoforce import OptoForce
 from tests.recording.test_reading import frames
@@ -36,7 +35,7 @@ def force(monkeypatch: pytest.MonkeyPatch) -> Watch:
 
 def pad(touched: int | None = None) -> Watch:
     """Return a pad that was at rest for a second, then had a taxel pressed."""
-    sensor = rig.make("generic", {"rate_hz": 100, "packets": True, "numbers": [NUMBERS]}, "here")
+    sensor = rig.build_sensor("generic", {"rate_hz": 100, "packets": True, "numbers": [NUMBERS]}, "here")
     watch = Watch(Stream("pad", "generic", sensor, Address("udp", ":4000")))
     rest = np.full(TAXELS, 100, "<u2")
     for tick in range(20):

@@ -86,7 +86,7 @@ class Sent:
 
 def sent(case: str, count: int, seed: int = 0) -> Sent:
     kind, options = CASES[case]
-    sensor = rig.make(kind, options, case)
+    sensor = rig.build_sensor(kind, options, case)
     samples = made.samples(kind, sensor, count, seed)
     frames = sensor.encode(samples)
     rows = made.rows(understood(sensor, frames))
@@ -106,16 +106,16 @@ def understood(sensor: Sensor, frames: Frames) -> Samples:
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_sensor_needs_no_option_or_says_which(kind: str) -> None:
     if kind not in made.OPTIONS:
-        assert isinstance(rig.make(kind, {}, "rig.toml"), Sensor)
+        assert isinstance(rig.build_sensor(kind, {}, "rig.toml"), Sensor)
         return
     with pytest.raises(UsageError) as error:
-        rig.make(kind, {}, "rig.toml")
+        rig.build_sensor(kind, {}, "rig.toml")
     assert any(option in str(error.value) for option in made.OPTIONS[kind])
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_fields_have_names_of_their_own_units_and_quantities(case: str) -> None:
-    fields = rig.make(*CASES[case], case).fields()
+    fields = rig.build_sensor(*CASES[case], case).fields()
     names = [field.name for field in fields]
     assert len(set(names)) == len(names) > 0
     assert all(name == name.lower() and name.replace("_", "").isalnum() for name in names)
@@ -219,7 +219,7 @@ def test_the_same_chunks_give_the_same_samples_however_they_are_batched(case: st
 
 @pytest.mark.parametrize("case", CASES)
 def test_the_device_answers_what_the_host_says_and_then_gives_frames(case: str) -> None:
-    sensor = rig.make(*CASES[case], case)
+    sensor = rig.build_sensor(*CASES[case], case)
     device = sensor.device()
 
     described.hold(sensor.opening({"port": 50_000}), device)

@@ -60,7 +60,7 @@ TYPES = ("u8", "i8", "u16", "i16", "u24", "i24", "u32", "i32", "u64", "i64", "f3
 
 
 def board(**options: Any) -> Generic:
-    made = rig.make("generic", {"rate_hz": 100, "marker": "AA", **options}, "rig")
+    made = rig.build_sensor("generic", {"rate_hz": 100, "marker": "AA", **options}, "rig")
     assert isinstance(made, Generic)
     return made
 
@@ -93,7 +93,7 @@ def test_a_description_of_a_daq_reads_what_its_driver_reads(seed: int, sizes: li
     rng = np.random.default_rng(seed)
     status = rng.integers(0, 1 << 16, (20, 1), dtype=np.uint16)
     axes = rng.integers(-(1 << 15), 1 << 15, (20, 3), dtype=np.int16)
-    driver, described = OptoForce(axes=3), rig.make("generic", DAQ, "rig")
+    driver, described = OptoForce(axes=3), rig.build_sensor("generic", DAQ, "rig")
     samples = Samples((status, axes), seq=np.arange(65_530, 65_550) % (1 << 16))
     data = bytearray(stream(driver.encode(samples)))
     assert stream(described.encode(samples)) == data
@@ -318,4 +318,4 @@ def test_what_cannot_be_is_refused_with_a_sentence(options: Mapping[str, object]
 
 def test_rate_and_numbers_must_be_given() -> None:
     with pytest.raises(UsageError, match="rate_hz"):
-        rig.make("generic", {}, "rig")
+        rig.build_sensor("generic", {}, "rig")

@@ -31,7 +31,7 @@ ARDUINO = """count,millis,taxel1,taxel2,tilt
 
 
 def lines(**options: Any) -> Lines:
-    made = rig.make("lines", {"rate_hz": 100, **options}, "test")
+    made = rig.build_sensor("lines", {"rate_hz": 100, **options}, "test")
     assert isinstance(made, Lines)
     return made
 

@@ -19,7 +19,7 @@ from tacpipe.errors import DeviceError, UsageError
 from tacpipe.links import dialogue
 from tacpipe.links.link import Link, LinkLostError
 from tacpipe.links.opening import open_link
-from tacpipe.recording import rig, rig_text
+from tacpipe.recording import rig
 from tacpipe.recording.rig import Rig
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Samples, Sensor
@@ -91,7 +91,7 @@ HOST = """
 import sys
 from pathlib import Path
 from tacpipe.links.opening import open_link
-from tacpipe.recording import rig, rig_text
+from tacpipe.recording import rig
 stream = rig.read(Path(sys.argv[1])).streams["rawhid"]
 link = open_link(stream.address, stream.sensor, "rawhid")
 found = []
@@ -304,7 +304,7 @@ def test_the_truth_of_two_runs_is_the_same() -> None:
 
 def test_the_rig_file_with_the_made_addresses_is_read_back() -> None:
     with Emulator(FIRST_PAPER) as emulator:
-        found = rig.parse(rig_text.of(emulator.rig))
+        found = rig.parse(rig.to_toml(emulator.rig))
         assert found.streams["proximity"].address == emulator.rig.streams["proximity"].address
     assert {name: stream.sensor for name, stream in found.streams.items()} == {
         name: stream.sensor for name, stream in FIRST_PAPER.streams.items()
@@ -328,7 +328,7 @@ def test_a_camera_cannot_be_emulated() -> None:
 def test_hid_boards_are_read_by_hidapi(tmp_path: Path) -> None:
     asked = Rig({name: ALL_SENSORS.streams[name] for name in HID}, HID[0])
     with Emulator(asked, folder=tmp_path) as emulator:
-        (tmp_path / "rig.toml").write_text(rig_text.of(emulator.rig))
+        (tmp_path / "rig.toml").write_text(rig.to_toml(emulator.rig))
         done = subprocess.run(
             ["umockdev-wrapper", sys.executable, "-c", HOST, str(tmp_path / "rig.toml")],
             env={**os.environ, "UMOCKDEV_DIR": (tmp_path / "hid" / "root").read_text().strip()},

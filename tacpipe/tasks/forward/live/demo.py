@@ -22,7 +22,6 @@ from tacpipe.errors import TacpipeError
 from tacpipe.io import terminal
 from tacpipe.live.preparation import free_ports
 from tacpipe.recording import rig as rigs
-from tacpipe.recording import rig_text
 from tacpipe.sensors import plan as plans
 from tacpipe.simulation import pick_and_move
 from tacpipe.simulation.emulation.emulator import Emulator
@@ -170,7 +169,7 @@ def run(output: Path, rig_file: Path, seconds: float = LIVE_S) -> Path:
     (port,) = free_ports(1)
     sys.setswitchinterval(SWITCH_S)
     with Emulator(rigs.read(rig_file), SEED, folder=output / "emulated", world=world) as emulator:
-        (output / "emulated" / "rig.toml").write_text(rig_text.of(emulator.rig))
+        (output / "emulated" / "rig.toml").write_text(rigs.to_toml(emulator.rig))
         is_over = threading.Event()
         planner = threading.Thread(target=send_plans, args=(emulator, port, is_over), daemon=True)
         planner.start()

@@ -54,7 +54,7 @@ def with_plan(rig: Rig, plan: str, sender: str = "") -> Rig:
         )
     if scheme == "udp":
         place = _guarded(place, sender)
-    stream = Stream(PLAN, "plan", rigs.make("plan", {}, "--plan"), Address(scheme, place))
+    stream = Stream(PLAN, "plan", rigs.build_sensor("plan", {}, "--plan"), Address(scheme, place))
     return replace(rig, streams={**rig.streams, PLAN: stream})
 
 
