@@ -64,8 +64,8 @@ class Outcome:
 def outcome(name: str, seconds: float, faults: Faults) -> Outcome:
     """Return what became of ``seconds`` of a stream of the rig of all sensors."""
     emulator = Emulator(rig_of.read(RIG), seed=1, faults=faults)
-    stream = emulator.asked.streams[name]
-    its_pace, rate_hz = pace(emulator.asked, name), stream.sensor.rate_hz or UNPACED_HZ
+    stream = emulator.rig_file.streams[name]
+    its_pace, rate_hz = pace(emulator.rig_file, name), stream.sensor.rate_hz or UNPACED_HZ
     source = emulator.source(name, its_pace, rate_hz)
     packets = stream.address.scheme in serving.PACKETS
     plan = Plan(source, its_pace, faults, [1], packets=packets)
@@ -75,7 +75,7 @@ def outcome(name: str, seconds: float, faults: Faults) -> Outcome:
     harmed: Counter[str] = Counter()
     away = False
     while plan.until_ns < seconds * 1e9:
-        for item in plan.more():
+        for item in plan.next_items():
             if item.number < 0 and item.cause in (byte_faults.UNPLUG, byte_faults.REPLUG):
                 away = item.cause == byte_faults.UNPLUG
                 harmed[item.cause] += 1

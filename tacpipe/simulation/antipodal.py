@@ -13,13 +13,13 @@ from tacpipe.arrays import Bools, Floats
 from tacpipe.clouds.grasp import Grasp
 from tacpipe.simulation.depth_camera import Placed
 
-OPENING_M = (0.02, 0.12)  # between the fingers
+OPENING_M = (0.02, 0.12)  # distance between the fingers
 CONE_RAD = np.deg2rad(15.0)  # largest angle between closing and a normal
 MARGIN_M = 0.004  # least way from a contact to an edge
-DIRECTIONS = 36  # of the lines that are looked at
+DIRECTIONS = 36  # number of lines that are tried
 LEAN_RAD = np.deg2rad(4.0)  # standard deviation of their angle to the table
-PITCH_RAD = np.deg2rad(20.0)  # by which the approach may lean from the vertical, about the closing axis
-FAR_M = 0.2  # from where fingers come
+PITCH_RAD = np.deg2rad(20.0)  # largest angle of the approach to the vertical, about the closing axis
+FAR_M = 0.2  # distance from which the fingers approach
 
 
 def grasped(
@@ -30,17 +30,17 @@ def grasped(
     ``shift`` is the largest fraction of half the cloud's length by which the point is shifted; ``central`` takes the
     body's origin instead. Finger 1, the one at ``g1``, comes from the camera's left, as on the published rig.
     """
-    through = placed.origin_m if central else _within(placed, _shifted(seen_m, shift, rng))
+    through = placed.origin_m if central else _inside(placed, _shifted(seen_m, shift, rng))
     if through is None:
         return None
     ways = _level(up, rng)
-    one, two = (through - FAR_M * side * ways for side in (1, -1))
-    first = one + placed.hit(one, ways)[:, None] * ways
-    second = two - placed.hit(two, -ways)[:, None] * ways
-    kept = np.flatnonzero(_suitable(placed, first, second))
-    if not len(kept):
+    start, stop = (through - FAR_M * side * ways for side in (1, -1))
+    first = start + placed.hit(start, ways)[:, None] * ways
+    second = stop - placed.hit(stop, -ways)[:, None] * ways
+    suitable = np.flatnonzero(_suitable(placed, first, second))
+    if not len(suitable):
         return None
-    chosen = int(rng.choice(kept))
+    chosen = int(rng.choice(suitable))
     closing, pitch = ways[chosen], rng.uniform(-PITCH_RAD, PITCH_RAD)
     down = -up + (up @ closing) * closing
     down /= np.linalg.norm(down)
@@ -57,7 +57,7 @@ def _shifted(seen_m: Floats, shift: float, rng: np.random.Generator) -> Floats:
     return np.asarray(seen_m[np.argmin(((seen_m - target) ** 2).sum(axis=1))])
 
 
-def _within(placed: Placed, seen_m: Floats) -> Floats | None:
+def _inside(placed: Placed, seen_m: Floats) -> Floats | None:
     """Return the point halfway through the body along the camera's ray to ``seen_m`` (xyz), metres, None if it misses."""
     ray = seen_m / np.linalg.norm(seen_m)
     near = float(placed.hit(np.zeros((1, 3)), ray[None])[0])
@@ -86,9 +86,9 @@ def _suitable(placed: Placed, first_m: Floats, second_m: Floats) -> Bools:
         gap = second_m - first_m
         opening = np.linalg.norm(gap, axis=1)
         closing = gap / opening[:, None]
-    kept = np.isfinite(opening) & (opening >= OPENING_M[0]) & (opening <= OPENING_M[1])
+    suitable = np.isfinite(opening) & (opening >= OPENING_M[0]) & (opening <= OPENING_M[1])
     for at_m, sign in ((first_m, -1), (second_m, 1)):
-        rows = np.flatnonzero(kept)
+        rows = np.flatnonzero(suitable)
         along = sign * (placed.normal(at_m[rows]) * closing[rows]).sum(axis=1)
-        kept[rows] &= (along >= np.cos(CONE_RAD)) & (placed.shape.margin_m(placed.inward(at_m[rows])) >= MARGIN_M)
-    return np.asarray(kept)
+        suitable[rows] &= (along >= np.cos(CONE_RAD)) & (placed.shape.margin_m(placed.inward(at_m[rows])) >= MARGIN_M)
+    return np.asarray(suitable)

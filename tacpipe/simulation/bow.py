@@ -14,7 +14,7 @@ from tacpipe.arrays import Floats
 from tacpipe.simulation.primitives import DOWN_Z, Rest
 
 CLOSE_M = 1e-8  # distance at which a ray has met the surface
-STEPS = 200  # after which a ray that grazes has missed
+STEPS = 200  # a grazing ray has missed after so many steps
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Bow:
         unit = direction / length[:, None]
         nearest = -(origin_m * unit).sum(axis=1)
         chord2 = self.bound_m**2 - (origin_m**2).sum(axis=1) + nearest**2
-        found = np.full(len(unit), np.inf)
+        distance = np.full(len(unit), np.inf)
         leaves = nearest + np.sqrt(np.maximum(chord2, 0))
         going = np.flatnonzero((chord2 > 0) & (leaves > 0))
         chord = np.sqrt(chord2[going])
@@ -59,13 +59,13 @@ class Bow:
         for _ in range(STEPS):
             gap = self.distance_m(origin_m[going] + way[:, None] * unit[going])
             met = gap < CLOSE_M
-            found[going[met]] = way[met]
+            distance[going[met]] = way[met]
             way = way + gap
-            kept = ~met & (way < until)
-            going, way, until = going[kept], way[kept], until[kept]
+            active = ~met & (way < until)
+            going, way, until = going[active], way[active], until[active]
             if not len(going):
                 break
-        return np.asarray(found / length)
+        return np.asarray(distance / length)
 
     def normal(self, at_m: Floats) -> Floats:
         """Return the direction from the arc to each point (point, xyz)."""
@@ -75,14 +75,14 @@ class Bow:
     def bending(self, at_m: Floats) -> Floats:
         """Return one over the tube's radius around the tube, cos / distance from the axis along it (point, xyz, xyz)."""
         normal = self.normal(at_m)
-        found = (np.eye(3) - normal[:, :, None] * normal[:, None, :]) / self.tube_m
-        seen = at_m + self.shift_m
-        off = np.hypot(seen[:, 0], seen[:, 1])
-        on = np.flatnonzero(np.abs(np.arctan2(seen[:, 1], seen[:, 0])) <= self.half_rad)
-        along = np.column_stack([-seen[on, 1], seen[on, 0], np.zeros(len(on))]) / off[on, None]
+        curvature = (np.eye(3) - normal[:, :, None] * normal[:, None, :]) / self.tube_m
+        relative_m = at_m + self.shift_m
+        off = np.hypot(relative_m[:, 0], relative_m[:, 1])
+        on = np.flatnonzero(np.abs(np.arctan2(relative_m[:, 1], relative_m[:, 0])) <= self.half_rad)
+        along = np.column_stack([-relative_m[on, 1], relative_m[on, 0], np.zeros(len(on))]) / off[on, None]
         lengthwise = (off[on] - self.arc_m) / self.tube_m / off[on]
-        found[on] += (lengthwise - 1 / self.tube_m)[:, None, None] * along[:, :, None] * along[:, None, :]
-        return np.asarray(found)
+        curvature[on] += (lengthwise - 1 / self.tube_m)[:, None, None] * along[:, :, None] * along[:, None, :]
+        return np.asarray(curvature)
 
     def margin_m(self, at_m: Floats) -> Floats:
         """Return inf (point,): there are no edges."""
@@ -94,7 +94,7 @@ class Bow:
 
     def _from_arc(self, at_m: Floats) -> Floats:
         """Return the vectors from the nearest point of the arc (point, xyz)."""
-        seen = at_m + self.shift_m
-        angle = np.clip(np.arctan2(seen[:, 1], seen[:, 0]), -self.half_rad, self.half_rad)
+        relative_m = at_m + self.shift_m
+        angle = np.clip(np.arctan2(relative_m[:, 1], relative_m[:, 0]), -self.half_rad, self.half_rad)
         arc = self.arc_m * np.column_stack([np.cos(angle), np.sin(angle), np.zeros(len(angle))])
-        return np.asarray(seen - arc)
+        return np.asarray(relative_m - arc)

@@ -56,16 +56,18 @@ def camera(rng: np.random.Generator, height_m: tuple[float, float], tilt_rad: fl
     return up, float(rng.uniform(*height_m))
 
 
-def put(shape: Shape, rest: Rest, yaw_rad: float, at_m: tuple[float, float], up: Floats, height_m: float) -> Placed:
-    """Return a body lying on the table as ``rest`` states, turned by ``yaw_rad`` about the vertical.
+def place_shape(
+    shape: Shape, pose: Rest, yaw_rad: float, at_m: tuple[float, float], up: Floats, height_m: float
+) -> Placed:
+    """Return a body lying on the table as ``pose`` states, turned by ``yaw_rad`` about the vertical.
 
     ``at_m`` is where the camera sees its origin: x and y on the optical axis' plane at ``height_m``, metres.
     """
     ray = np.array([*at_m, height_m]) / height_m
     ground = ray * height_m * up[2] / (ray @ up)
-    own, seen = _basis(rest.up), _basis(up)
+    basis, target_basis = _basis(pose.up), _basis(up)
     turn = np.array([[np.cos(yaw_rad), -np.sin(yaw_rad), 0], [np.sin(yaw_rad), np.cos(yaw_rad), 0], [0, 0, 1.0]])
-    return Placed(shape, seen @ turn @ own.T, ground + rest.height_m * up)
+    return Placed(shape, target_basis @ turn @ basis.T, ground + pose.height_m * up)
 
 
 def rays(rows: range, columns: range) -> Floats:
@@ -81,11 +83,11 @@ def window(placed: Placed) -> tuple[range, range]:
     x, y, z = placed.origin_m
     reach = placed.shape.bound_m / (z - placed.shape.bound_m) * FOCAL * 1.1
 
-    def within(centre: float, size: int) -> range:
+    def clip_range(centre: float, size: int) -> range:
         middle = centre * FOCAL + size / 2
         return range(max(0, int(middle - reach)), min(size, int(middle + reach) + 2))
 
-    return within(y / z, HEIGHT), within(x / z, WIDTH)
+    return clip_range(y / z, HEIGHT), clip_range(x / z, WIDTH)
 
 
 def depths(placed: Placed) -> tuple[Floats, Floats]:
@@ -104,13 +106,13 @@ def measured(direction: Floats, depth_m: Floats, noise_scale: float, rng: np.ran
 
 def painted(own_m: Floats, rng: np.random.Generator) -> Bytes:
     """Return colours (point, rgb) of points in a body's own frame: a random colour, random waves of others, and noise."""
-    found = np.tile(rng.uniform(50, 205, 3), (len(own_m), 1))
+    colours = np.tile(rng.uniform(50, 205, 3), (len(own_m), 1))
     for _ in range(RIPPLES):
         along = rng.normal(size=3)
         along *= 2 * np.pi / rng.uniform(*WAVE_M) / np.linalg.norm(along)
-        found += np.outer(np.sin(own_m @ along + rng.uniform(0, 2 * np.pi)), rng.normal(0, 20, 3))
-    found += rng.normal(0, COLOUR_NOISE, found.shape)
-    return np.rint(found).clip(0, 255).astype(np.uint8)
+        colours += np.outer(np.sin(own_m @ along + rng.uniform(0, 2 * np.pi)), rng.normal(0, 20, 3))
+    colours += rng.normal(0, COLOUR_NOISE, colours.shape)
+    return np.rint(colours).clip(0, 255).astype(np.uint8)
 
 
 def _basis(third: Floats) -> Floats:

@@ -1,4 +1,4 @@
-"""What goes wrong between a sensor and its log: samples lost, frames held, stamps late, a device's clock that is off."""
+"""Simulate faults between a sensor and its log: samples lost, frames repeated, stamps late, a device's clock that is off."""
 
 from __future__ import annotations
 

@@ -19,9 +19,9 @@ from tacpipe.channels import places, schema
 PLACES_M = places.BIOTAC_M  # (electrode, axis); x along the finger to its tip, z from the pad into the finger
 ALONG_M = PLACES_M[:, 0]  # (electrode,), xi: by which an electrode measures the surface earlier
 APERTURE_M = 0.0006
-CENTRE_M = 0.001 * np.array([-1.0, 0.0, -5.08])  # where the finger touches
+CENTRE_M = 0.001 * np.array([-1.0, 0.0, -5.08])  # position of the contact on the finger
 REACH_M = 0.005  # standard deviation of the Gaussian by which electrodes measure what is there
-GAIN_COUNT_N = (45.0, 3.0)  # of an electrode at the centre, and of all besides
+GAIN_COUNT_N = (45.0, 3.0)  # gain of an electrode at the centre, and gain of all electrodes
 LEAN = 0.4  # fraction of the force, times friction, that shows more or less at 5 mm before or behind the centre
 PRESSURE_COUNT_N = 28.0  # PDC
 TRIGGER_COUNT = 40  # PDC above which the slide starts
@@ -30,16 +30,16 @@ NOISE_COUNT, PRESSURE_NOISE_COUNT, VIBRATION_NOISE_COUNT = 0.75, 1.0, 3.0
 DRIFT_COUNT = 0.3  # random walk of an electrode, counts after one second
 RATE_HZ = 100.0
 VIBRATION_RATE_HZ = RATE_HZ * schema.VIBRATIONS
-REST_COUNT = (2500.0, 3500.0)  # of an electrode that touches nothing
-TARE_ROWS = 10  # at the start, whose mean is taken off
+REST_COUNT = (2500.0, 3500.0)  # counts of an electrode without touch
+TARE_ROWS = 10  # time at the start whose mean is subtracted
 WARMTH_COUNT, WARMING_S = 120.0, 6.0  # TAC: the finger is warmer than the material
 
 
 def gains() -> Floats:
     """Return the counts that one newton at the centre gives on each electrode (electrode,)."""
     distance2 = ((PLACES_M - CENTRE_M) ** 2).sum(axis=1)
-    near, besides = GAIN_COUNT_N
-    gain: Floats = near * np.exp(-distance2 / (2 * REACH_M**2)) + besides
+    near, uniform = GAIN_COUNT_N
+    gain: Floats = near * np.exp(-distance2 / (2 * REACH_M**2)) + uniform
     return gain
 
 
@@ -54,8 +54,8 @@ def read(signal: Floats, noise_scale: float, rng: np.random.Generator) -> Counts
     """Return electrodes (time, electrode) as they are logged: with rest, noise and drift, rounded, tared and absolute."""
     steps = rng.normal(0, DRIFT_COUNT / np.sqrt(RATE_HZ), signal.shape)
     noise = rng.normal(0, NOISE_COUNT, signal.shape) + np.cumsum(steps, axis=0)
-    rest = rng.uniform(*REST_COUNT, signal.shape[1])
-    return tared(np.rint(rest + signal + noise_scale * noise))
+    rest_counts = rng.uniform(*REST_COUNT, signal.shape[1])
+    return tared(np.rint(rest_counts + signal + noise_scale * noise))
 
 
 def pressure(force_n: Floats, noise_count: Floats) -> Counts:
@@ -85,5 +85,5 @@ def tared(counts: Floats) -> Counts:
 
 def counted(counts: Floats) -> Counts:
     """Return the absolute values of tared counts, rounded, within 16 bits."""
-    whole: Counts = np.rint(np.abs(counts)).clip(0, 65_535).astype(np.uint16)
-    return whole
+    rounded: Counts = np.rint(np.abs(counts)).clip(0, 65_535).astype(np.uint16)
+    return rounded

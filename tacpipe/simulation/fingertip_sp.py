@@ -15,20 +15,27 @@ import numpy as np
 from tacpipe.arrays import Counts, Floats, Times
 from tacpipe.channels import biotac_sp
 
-CHANNELS = biotac_sp.ELECTRODES + 1  # of a finger by which touch is measured: the electrodes, then the fluid's pressure
-GAIN_COUNT = 2600.0  # by which an electrode falls under a contact that squeezes all fluid out
+CHANNELS = (
+    biotac_sp.ELECTRODES + 1
+)  # channels of a finger that measure touch: the electrodes, then the fluid's pressure
+GAIN_COUNT = 2600.0  # decrease of an electrode under a contact that squeezes out all fluid
 FLUID_M = 0.0006  # indentation at which 1 - 1/e of that is reached
 BREADTH = 1.1  # sigma of the pressed region over the contact's radius
 BULGE = 0.35  # fraction of what pressed electrodes fall by that the others rise by
-REST_COUNT = (2400.0, 3480.0)  # of an electrode
-NOISE_COUNT = (3.5, 6.4)  # of an electrode, standard deviation
+REST_COUNT = (2400.0, 3480.0)  # noise of an electrode
+NOISE_COUNT = (3.5, 6.4)  # standard deviation of an electrode
 PRESSURE_NOISE_COUNT = (0.05, 0.25)
 PRESSURE_COUNT = (1676.0, 2779.0)  # untouched, by finger
 PRESSURE_COUNT_N = 140.0  # slope
-FULL_COUNT = {"electrode": (100, 3800), "pdc": (0, 4095)}  # between which readings lie
+FULL_COUNT = {"electrode": (100, 3800), "pdc": (0, 4095)}  # bounds of the readings
 DRIFT_DAYS = (2.0, 3.0, 5.0)  # periods in which a reading drifts
 DAY_NS = 86_400_000_000_000
-OTHERS_COUNT = {"pac0": (2037, 2049), "pac1": (2037, 2049), "tac": (2152, 2051), "tdc": (2620, 2449)}  # by finger
+OTHERS_COUNT = {
+    "pac0": (2037, 2049),
+    "pac1": (2037, 2049),
+    "tac": (2152, 2051),
+    "tdc": (2620, 2449),
+}  # values by finger
 OTHERS_NOISE_COUNT = {"pac0": 8.0, "pac1": 8.0, "tac": 10.0, "tdc": 6.0}
 VIBRATION_COUNT_S_N = 3.0  # PAC, by the rate at which the force changes
 
@@ -45,14 +52,14 @@ class Sensors:
 def sensors(rng: np.random.Generator) -> Sensors:
     """Return two sensors as ``rng`` draws them."""
     fingers, electrodes = len(biotac_sp.FINGERS), biotac_sp.ELECTRODES
-    rest = np.column_stack([rng.uniform(*REST_COUNT, (fingers, electrodes)), PRESSURE_COUNT])
+    rest_counts = np.column_stack([rng.uniform(*REST_COUNT, (fingers, electrodes)), PRESSURE_COUNT])
     noise = np.column_stack(
         [
             rng.uniform(*NOISE_COUNT, (fingers, electrodes)),
             rng.uniform(*PRESSURE_NOISE_COUNT, fingers),
         ]
     )
-    return Sensors(rest, noise, rng.uniform(0, 2 * np.pi, (len(DRIFT_DAYS), *rest.shape)))
+    return Sensors(rest_counts, noise, rng.uniform(0, 2 * np.pi, (len(DRIFT_DAYS), *rest_counts.shape)))
 
 
 def pressed(contact_m: Floats, skin_m: Floats, centre_m: Floats) -> Floats:
@@ -65,14 +72,14 @@ def pressed(contact_m: Floats, skin_m: Floats, centre_m: Floats) -> Floats:
     sigma2 = np.maximum(BREADTH * contact_m, 1e-9) ** 2
     near = np.exp(-way2 / (2 * sigma2[..., None]))
     fall = GAIN_COUNT * (1 - np.exp(-skin_m / FLUID_M))[..., None] * near
-    aside = (1 - near) / (1 - near).sum(axis=-1, keepdims=True)
-    return np.asarray(BULGE * fall.sum(axis=-1, keepdims=True) * aside - fall)
+    distribution = (1 - near) / (1 - near).sum(axis=-1, keepdims=True)
+    return np.asarray(BULGE * fall.sum(axis=-1, keepdims=True) * distribution - fall)
 
 
-def signal(made: Sensors, force_n: Floats, contact_m: Floats, skin_m: Floats, centre_m: Floats) -> Floats:
+def signal(hand: Sensors, force_n: Floats, contact_m: Floats, skin_m: Floats, centre_m: Floats) -> Floats:
     """Return what both sensors show without noise and drift (..., finger, channel), counts."""
     pressure = PRESSURE_COUNT_N * force_n[..., None]
-    return np.asarray(made.rest + np.concatenate([pressed(contact_m, skin_m, centre_m), pressure], axis=-1))
+    return np.asarray(hand.rest + np.concatenate([pressed(contact_m, skin_m, centre_m), pressure], axis=-1))
 
 
 def drift(phases_rad: Floats, rate_count_day: float, t_ns: int | Times = 0) -> Floats:
@@ -97,18 +104,18 @@ def rows(counts: Counts, speed_n_s: Floats, noise_scale: float, rng: np.random.G
 
     ``speed_n_s`` is how fast the force changes (time, finger): it shows on the quick readings of the pressure.
     """
-    found = []
+    blocks = []
     for field in biotac_sp.fields():
         name, channel = field.name.split("_")
         finger = biotac_sp.FINGERS.index(name)
         if channel == "pdc":
-            found.append(counts[:, finger, -1].astype(np.float64))
+            blocks.append(counts[:, finger, -1].astype(np.float64))
         elif channel.startswith("electrode"):
-            found.append(counts[:, finger, int(channel.removeprefix("electrode")) - 1].astype(np.float64))
+            blocks.append(counts[:, finger, int(channel.removeprefix("electrode")) - 1].astype(np.float64))
         else:
             level = OTHERS_COUNT[channel][finger] + noise_scale * rng.normal(
                 0, OTHERS_NOISE_COUNT[channel], len(counts)
             )
             shake = VIBRATION_COUNT_S_N * speed_n_s[:, finger] if channel.startswith("pac") else 0.0
-            found.append(np.rint(level + shake).clip(0, 4095))
-    return found
+            blocks.append(np.rint(level + shake).clip(0, 4095))
+    return blocks

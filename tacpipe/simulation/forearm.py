@@ -16,15 +16,15 @@ from tacpipe.channels import places, schema
 
 TAXELS = schema.TRIANGLES * schema.TRIANGLE_TAXELS
 APERTURE_M = 0.0018
-SIGMA_M = 0.0085  # of the Gaussian by which the patch presses
-GAIN_COUNT_N = 170.0  # of a taxel at the centre of the patch
-LEAN = 0.3  # as of the fingertip, one sigma before or behind the centre
+SIGMA_M = 0.0085  # standard deviation of the patch's Gaussian pressure
+GAIN_COUNT_N = 170.0  # gain of a taxel at the centre of the patch
+LEAN = 0.3  # value one sigma before or after the centre, as for the fingertip
 NOISE_COUNT = 2.25  # three times the fingertip's
 DEAD_COUNT = 6.0  # readings below are zero, those above less by it
 DRIFT_COUNT = 0.9  # random walk, counts after one second
 LARGEST_COUNT = 255.0
 RATE_HZ, FRAMES = 50.0, 75
-START_M = ((-0.018, -0.010), (-0.003, 0.003))  # of the patch's centre along the strip and across it
+START_M = ((-0.018, -0.010), (-0.003, 0.003))  # start of the patch's centre along and across the strip
 ROLL_M = ((0.012, 0.022), (-0.003, 0.003))  # its way during a slide
 
 

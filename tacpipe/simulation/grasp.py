@@ -20,12 +20,12 @@ from tacpipe.channels import biotac_sp, schema
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins.stage import Attribute, RecordingOutput
 from tacpipe.simulation import fingertip_sp, grasp_truth, pinch, pinch_course, tabletop
-from tacpipe.simulation.grasp_scene import Readings, Rig, Scene, families, perform, read_sensors, sensors, thing
+from tacpipe.simulation.grasp_scene import Readings, Rig, Scene, draw_thing, families, perform, read_sensors, sensors
 
 START_NS = 1_620_000_000_000_000_000  # UTC stamp of the first grasp
-GRASP_NS = 180_000_000_000  # from one grasp of a session to the next
+GRASP_NS = 180_000_000_000  # time between two grasps of a session
 SESSION = 20  # grasps
-READ_NS = 5_000_000_000  # from the plan to the reading
+READ_NS = 5_000_000_000  # time between the plan and the reading
 NOISE, BOUND = 4, 5  # streams of random numbers
 
 
@@ -38,23 +38,23 @@ def simulate_trial(seed: int, index: int, rig: Rig) -> RecordingOutput:
     _check(rig)
     scene = perform(seed, index, rig)
     t_ns = stamp_ns(index, rig)
-    made = sensors(seed)
-    readings = read_sensors(made, scene, t_ns, rig)
+    hand = sensors(seed)
+    readings = read_sensors(hand, scene, t_ns, rig)
     rng = np.random.default_rng([seed, NOISE, index])
     streams = {"grasp": scene.grasp.table(t_ns)}
     moments_ns: dict[str, int] = {}
     if rig.raw:
         course = pinch_course.course(t_ns, rng)
-        other = thing(seed, index + 1 + int(rng.integers(1_000)), rig)
-        view = tabletop.view(scene.placed, other.shape, scene.up, scene.camera_m, rig.noise_scale, rng)
+        neighbour = draw_thing(seed, index + 1 + int(rng.integers(1_000)), rig)
+        view = tabletop.view(scene.placed, neighbour.shape, scene.up, scene.camera_m, rig.noise_scale, rng)
         streams |= tabletop.tables(view)
-        streams["biotac_sp"] = _readings_over_time(made, scene, readings, course, rig, rng)
+        streams["biotac_sp"] = _readings_over_time(hand, scene, readings, course, rig, rng)
         moments_ns = course.moments_ns
     else:
         streams["cloud"] = scene.cloud.table()
-        still = np.zeros((1, len(biotac_sp.FINGERS)))
-        streams["reading"] = _logged(np.array([t_ns + READ_NS]), made, readings.shown[None], still, rig, rng)
-    bound = grasp_truth.bound(made, scene, rig, np.random.default_rng([seed, BOUND, index]))
+        no_drift = np.zeros((1, len(biotac_sp.FINGERS)))
+        streams["reading"] = _logged(np.array([t_ns + READ_NS]), hand, readings.signal[None], no_drift, rig, rng)
+    bound = grasp_truth.bound(hand, scene, rig, np.random.default_rng([seed, BOUND, index]))
     streams["truth"] = grasp_truth.table(t_ns, scene, readings, bound, moments_ns)
     return RecordingOutput(streams, _attributes(scene, session(index, rig)))
 
@@ -80,7 +80,7 @@ def _number(index: int, rig: Rig) -> int:
 
 
 def _readings_over_time(
-    made: fingertip_sp.Sensors,
+    hand: fingertip_sp.Sensors,
     scene: Scene,
     readings: Readings,
     course: pinch_course.Course,
@@ -91,21 +91,21 @@ def _readings_over_time(
     force = course.fraction[:, None] * readings.touch.force_n  # (time, finger)
     contact, skin = pinch.pressed(scene.situation, force)
     centre = np.broadcast_to(readings.touch.centre_m, (len(force), *readings.touch.centre_m.shape[1:]))
-    shown = fingertip_sp.signal(made, force, contact, skin, centre) + readings.drift
+    counts = fingertip_sp.signal(hand, force, contact, skin, centre) + readings.drift
     speed = np.gradient(force, course.t_ns / 1e9, axis=0)
-    return _logged(course.t_ns, made, shown, speed, rig, rng)
+    return _logged(course.t_ns, hand, counts, speed, rig, rng)
 
 
 def _logged(
     t_ns: Times,
-    made: fingertip_sp.Sensors,
-    shown: Floats,
+    hand: fingertip_sp.Sensors,
+    signal: Floats,
     speed_n_s: Floats,
     rig: Rig,
     rng: np.random.Generator,
 ) -> pa.Table:
     """Return a stream of readings of what sensors show (time, finger, channel), with noise."""
-    counts = fingertip_sp.counted(shown + rig.noise_scale * made.noise * rng.normal(size=shown.shape))
+    counts = fingertip_sp.counted(signal + rig.noise_scale * hand.noise * rng.normal(size=signal.shape))
     return schema.stream(t_ns, fingertip_sp.rows(counts, speed_n_s, rig.noise_scale, rng), biotac_sp.fields())
 
 
@@ -113,9 +113,9 @@ def _attributes(scene: Scene, session: int) -> dict[str, Attribute]:
     return {
         "sensor": "biotac-sp",
         "simulated": True,
-        "object": scene.of.name,
-        "family": scene.of.family,
-        "session": f"{scene.of.name}-s{session:02d}",
+        "object": scene.thing.name,
+        "family": scene.thing.family,
+        "session": f"{scene.thing.name}-s{session:02d}",
     }
 
 

@@ -20,16 +20,16 @@ from tacpipe.simulation.household import Thing
 from tacpipe.simulation.primitives import Ellipsoid
 
 CAMERA_M = (0.9, 1.2)  # height above the table
-TILT_RAD = np.deg2rad(8.0)  # at most, of the camera
-SEEN_AT_M, SPREAD_M = (-0.05, -0.15), 0.03  # where objects lie in the camera's view: mean and standard deviation
-LEAST_POINTS = 800  # of a cloud, as the fewest of the published ones
+TILT_RAD = np.deg2rad(8.0)  # largest tilt of the camera
+SEEN_AT_M, SPREAD_M = (-0.05, -0.15), 0.03  # mean and standard deviation of object positions in the camera's view
+LEAST_POINTS = 800  # smallest size of a cloud, as in the published set
 TRIES = 100  # poses until one is seen and grasped
 SENSORS, THINGS, TRIAL = 1, 2, 3  # streams of random numbers
 
 
 @dataclass(frozen=True)
 class Rig:
-    """Which objects are grasped, and how well the sensors state; the fields are those of the stage's params.
+    """The objects and the quality of the sensors. The fields are those of the stage's params.
 
     Controls: ``spheres`` makes all objects alike but for their size, ``one_pose`` leaves the cloud only the object to
     state, ``effort_spread=0`` makes the force one of the geometry alone.
@@ -49,12 +49,12 @@ class Rig:
 
 @dataclass(frozen=True)
 class Scene:
-    """What truly happens in a trial."""
+    """The true course of a trial."""
 
-    of: Thing
+    thing: Thing
     placed: Placed
     up: Floats  # the table's normal in the camera's frame (xyz)
-    camera_m: float  # from the camera to the table along the optical axis
+    camera_m: float  # distance from the camera to the table along the optical axis
     cloud: Cloud
     grasp: Grasp
     situation: pinch.Situation
@@ -63,34 +63,34 @@ class Scene:
 
 @dataclass(frozen=True)
 class Readings:
-    """What both sensors measure at contact: truth, and what they show of it without noise (finger, channel), counts."""
+    """The readings of both sensors at contact: the true touch, and the counts (finger, channel) without noise."""
 
     touch: pinch.Touch
     drift: Floats
-    shown: Floats
+    signal: Floats
 
 
 def families(rig: Rig) -> tuple[str, ...]:
     """Return the families that a rig grasps, raising `TacpipeError` for an unknown one."""
-    found = household.FAMILIES if rig.families == "all" else tuple(name.strip() for name in rig.families.split(","))
-    unknown = [name for name in found if name not in household.FAMILIES]
+    names = household.FAMILIES if rig.families == "all" else tuple(name.strip() for name in rig.families.split(","))
+    unknown = [name for name in names if name not in household.FAMILIES]
     if unknown:
         raise TacpipeError(
             f"There is no family {unknown[0]!r}; known are {', '.join(household.FAMILIES)}, or all for all of them."
         )
-    return ("sphere",) if rig.spheres else found
+    return ("sphere",) if rig.spheres else names
 
 
-def thing(seed: int, index: int, rig: Rig = Rig()) -> Thing:
+def draw_thing(seed: int, index: int, rig: Rig = Rig()) -> Thing:
     """Return what trial ``index`` grasps: the same object whichever others there are, but for spheres of all sizes."""
     if rig.spheres:
         stiffness = "rigid" if rig.stiffness == "mixed" else rig.stiffness
-        drawn = household.thing(np.random.default_rng([seed, THINGS]), "sphere", 1, stiffness)
+        drawn = household.draw_thing(np.random.default_rng([seed, THINGS]), "sphere", 1, stiffness)
         return replace(drawn, name="spheres", shape=Ellipsoid(np.full(3, household.REFERENCE_M)))
     names = families(rig)
     number, kind = divmod(index % (len(names) * rig.objects), len(names))
     rng = np.random.default_rng([seed, THINGS, household.FAMILIES.index(names[kind]), number])
-    return household.thing(rng, names[kind], number + 1, rig.stiffness)
+    return household.draw_thing(rng, names[kind], number + 1, rig.stiffness)
 
 
 def sensors(seed: int) -> fingertip_sp.Sensors:
@@ -100,15 +100,15 @@ def sensors(seed: int) -> fingertip_sp.Sensors:
 
 def perform(seed: int, index: int, rig: Rig = Rig()) -> Scene:
     """Return what truly happens in trial ``index``; raises `TacpipeError` if in `TRIES` poses nothing could be grasped."""
-    of = thing(seed, index, rig)
+    thing = draw_thing(seed, index, rig)
     rng = np.random.default_rng([seed, TRIAL, index])
-    rests = of.shape.rests()
+    rests = thing.shape.rests()
     scale = float(rng.uniform(*household.SPHERES_M)) / household.REFERENCE_M if rig.spheres else 1.0
     for _ in range(TRIES):
         up, height_m = depth_camera.camera(rng, CAMERA_M, TILT_RAD)
-        rest = rests[0 if rig.one_pose else int(rng.integers(len(rests)))]
+        pose = rests[0 if rig.one_pose else int(rng.integers(len(rests)))]
         at_m = (float(rng.normal(SEEN_AT_M[0], SPREAD_M)), float(rng.normal(SEEN_AT_M[1], SPREAD_M)))
-        placed = depth_camera.put(of.shape, rest, float(rng.uniform(0, 2 * np.pi)), at_m, up, height_m)
+        placed = depth_camera.place_shape(thing.shape, pose, float(rng.uniform(0, 2 * np.pi)), at_m, up, height_m)
         direction, depth_m = depth_camera.depths(placed)
         if len(depth_m) < LEAST_POINTS:
             continue
@@ -117,26 +117,26 @@ def perform(seed: int, index: int, rig: Rig = Rig()) -> Scene:
         if grasp is None:
             continue
         colours = depth_camera.painted(placed.inward(direction * depth_m[:, None]), rng)
-        situation = pinch.situation(placed, grasp, of.compliance_1_pa)
+        situation = pinch.situation(placed, grasp, thing.compliance_1_pa)
         hidden = pinch.unseen(rng, 1, rig.effort_spread)
-        scene = Scene(of, placed, up, height_m, Cloud(points, colours), grasp, situation, hidden)
+        scene = Scene(thing, placed, up, height_m, Cloud(points, colours), grasp, situation, hidden)
         return scene if scale == 1 else _scaled(scene, scale)
-    raise TacpipeError(f"The object {of.name} could not be seen and grasped in {TRIES} poses; take another seed.")
+    raise TacpipeError(f"The object {thing.name} could not be seen and grasped in {TRIES} poses; take another seed.")
 
 
-def read_sensors(made: fingertip_sp.Sensors, scene: Scene, t_ns: int, rig: Rig = Rig()) -> Readings:
+def read_sensors(hand: fingertip_sp.Sensors, scene: Scene, t_ns: int, rig: Rig = Rig()) -> Readings:
     """Return what both sensors measure of a scene at ``t_ns``; where the camera is does not matter."""
     touch = pinch.touch(scene.situation, scene.hidden)
-    off = fingertip_sp.drift(made.phases_rad, rig.drift_count_day, t_ns)
-    shown = fingertip_sp.signal(made, touch.force_n, touch.contact_m, touch.skin_m, touch.centre_m)[0]
-    return Readings(touch, off, shown + off)
+    off = fingertip_sp.drift(hand.phases_rad, rig.drift_count_day, t_ns)
+    signal = fingertip_sp.signal(hand, touch.force_n, touch.contact_m, touch.skin_m, touch.centre_m)[0]
+    return Readings(touch, off, signal + off)
 
 
 def _scaled(scene: Scene, scale: float) -> Scene:
     """Return a scene with all lengths times ``scale``: the camera sees the same, only nearer and smaller or the reverse."""
-    of = replace(scene.of, shape=Ellipsoid(np.full(3, household.REFERENCE_M * scale)))
-    placed = Placed(of.shape, scene.placed.rotation, scene.placed.origin_m * scale)
+    thing = replace(scene.thing, shape=Ellipsoid(np.full(3, household.REFERENCE_M * scale)))
+    placed = Placed(thing.shape, scene.placed.rotation, scene.placed.origin_m * scale)
     grasp = Grasp(scene.grasp.g1_m * scale, scene.grasp.g2_m * scale, scene.grasp.wrist)
     cloud = Cloud((scene.cloud.points_m * scale).astype(np.float32), scene.cloud.colours)
-    situation = pinch.situation(placed, grasp, of.compliance_1_pa)
-    return replace(scene, of=of, placed=placed, cloud=cloud, grasp=grasp, situation=situation)
+    situation = pinch.situation(placed, grasp, thing.compliance_1_pa)
+    return replace(scene, thing=thing, placed=placed, cloud=cloud, grasp=grasp, situation=situation)

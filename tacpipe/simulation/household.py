@@ -12,11 +12,11 @@ from tacpipe.simulation.primitives import Box, Ellipsoid, Frustum, Shape
 
 FAMILIES = ("box", "cylinder", "sphere", "ellipsoid", "cone", "bow")
 MODULI_PA = {"rigid": np.inf, "elastic": 50_000.0, "foam": 15_000.0}
-SHARES = (0.6, 0.2, 0.2)  # of the objects, in the order of MODULI_PA
+SHARES = (0.6, 0.2, 0.2)  # shares of the objects, in the order of MODULI_PA
 TAPER, NARROW = (
     (0.08, 0.22),
     0.4,
-)  # of cones: slope, within what friction holds, and least fraction of the radius at the top
+)  # slope of cones within friction, and smallest fraction of the radius at the top
 REFERENCE_M = 0.04  # radius of the sphere that represents spheres of all sizes
 SPHERES_M = (0.012, 0.058)  # radii of those
 
@@ -36,7 +36,7 @@ class Thing:
         return 1 / MODULI_PA[self.stiffness]
 
 
-def thing(rng: np.random.Generator, family: str, number: int, stiffness: str = "mixed") -> Thing:
+def draw_thing(rng: np.random.Generator, family: str, number: int, stiffness: str = "mixed") -> Thing:
     """Return an object of a family as ``rng`` draws it, named by the family and its ``number``, as in "cone-03".
 
     ``stiffness`` is one of `MODULI_PA`, or mixed. Raises `TacpipeError` for an unknown family or stiffness.

@@ -31,19 +31,19 @@ import numpy as np
 from tacpipe.arrays import Bools, Floats
 
 GRAVITY_M_S2 = 9.81
-UPWARDS_M_S2 = np.array([0.0, 0.0, GRAVITY_M_S2])  # what the table or the hand does to an object at rest
+UPWARDS_M_S2 = np.array([0.0, 0.0, GRAVITY_M_S2])  # acceleration that the table or the hand gives an object at rest
 STIFFNESS_N_M = 2e4
 KINETIC = 0.8  # mu_k / mu_s
 DROP_M = 0.025
 TABLE_M = 0.001  # rise over which the table hands the object's weight over to the fingers
 PATCH_M = 0.008  # R, radius of the patch that twists
-BLOCK_ROWS = 1 << 14  # that are plain numbers at once: these take ten times the memory of an array
+BLOCK_ROWS = 1 << 14  # rows that are plain numbers at once, in ten times the memory of an array
 GYRATION_M = 0.06  # radius of gyration of a small bottle
 
 
 @dataclass(frozen=True)
 class Grasp:
-    """What the fingers hold, and how."""
+    """The object in the grasp, and the parameters of the grasp."""
 
     mass_kg: float
     friction: float  # mu_s
@@ -69,7 +69,7 @@ class Grasp:
 
 @dataclass(frozen=True)
 class Contact:
-    """What the fingers do to the object, and what it does between them; in the frame of the hand."""
+    """The motion of the fingers and of the object between them, in the frame of the hand."""
 
     force_n: Floats  # (time, axis) on the object, of both fingers together
     normal_n: Floats  # (time, finger)
@@ -102,14 +102,14 @@ def carry(grasp: Grasp, acceleration_m_s2: Floats, rise_m: Floats | None = None,
     table, and the object begins in stick under its load.
     """
     moves = _slide(grasp, acceleration_m_s2, rise_m, 1 / rate_hz)  # (time, 7)
-    held = moves[:, 6] < 2
-    along = acceleration_m_s2[:, 1] * grasp.mass_kg * (grasp.grip_n > 0) * held
+    is_held = moves[:, 6] < 2
+    along = acceleration_m_s2[:, 1] * grasp.mass_kg * (grasp.grip_n > 0) * is_held
     force = np.column_stack([moves[:, 0], along, moves[:, 1]])
-    pressed = (grasp.grip_n > 0) * held
+    pressed = (grasp.grip_n > 0) * is_held
     normal = np.column_stack([grasp.grip_n + along / 2, grasp.grip_n - along / 2]) * pressed[:, None]
-    torque, rotation = _twist(grasp, force, held, 1 / rate_hz)
+    torque, rotation = _twist(grasp, force, is_held, 1 / rate_hz)
     return Contact(
-        force, np.maximum(normal, 0.0), moves[:, 2:4], moves[:, 4:6], moves[:, 6] == 1, ~held, torque, rotation
+        force, np.maximum(normal, 0.0), moves[:, 2:4], moves[:, 4:6], moves[:, 6] == 1, ~is_held, torque, rotation
     )
 
 
@@ -144,7 +144,7 @@ def _slide(grasp: Grasp, acceleration_m_s2: Floats, rise_m: Floats | None, step_
     ex = -(mass * float(acceleration_m_s2[first, 0])) / STIFFNESS_N_M  # deflection of the spring
     ez = -(mass * (float(acceleration_m_s2[first, 2]) + GRAVITY_M_S2)) * borne / STIFFNESS_N_M
     slipping = False
-    found: list[tuple[float, ...]] = []  # of rows that `moves` does not hold yet
+    pending: list[tuple[float, ...]] = []  # rows that `moves` does not have yet
     last = first  # row before which it does
     for rise, pull_x, pull_z, limit in _plain(mass, acceleration_m_s2, limits, rises, first):
         borne = min(max((rise + sz) / TABLE_M, 0.0), 1.0)
@@ -167,13 +167,13 @@ def _slide(grasp: Grasp, acceleration_m_s2: Floats, rise_m: Floats | None, step_
                 sx, sz = sx + step_s * vx, sz + step_s * vz
                 if sx * sx + sz * sz > DROP_M**2:
                     break
-        found.append((fx, fz, sx, sz, vx if slipping else 0.0, vz if slipping else 0.0, float(slipping)))
-        if len(found) == BLOCK_ROWS:
-            moves[last : last + len(found)] = found
-            last += len(found)
-            found.clear()
-    moves[last : last + len(found)] = found
-    last += len(found)
+        pending.append((fx, fz, sx, sz, vx if slipping else 0.0, vz if slipping else 0.0, float(slipping)))
+        if len(pending) == BLOCK_ROWS:
+            moves[last : last + len(pending)] = pending
+            last += len(pending)
+            pending.clear()
+    moves[last : last + len(pending)] = pending
+    last += len(pending)
     if last < rows:
         moves[last:, 2:6] = _fall(acceleration_m_s2[last:], rises[last:], (sx, sz), (vx, vz), step_s)
         moves[last:, 6] = 2
@@ -185,10 +185,10 @@ def _plain(
 ) -> Iterator[tuple[float, float, float, float]]:
     """Yield rise, pull along x and z and friction limit of each row from ``first``, as plain numbers."""
     for begin in range(first, len(rises_m), BLOCK_ROWS):
-        some = slice(begin, begin + BLOCK_ROWS)
-        pull_x = (mass_kg * acceleration_m_s2[some, 0]).tolist()
-        pull_z = (mass_kg * (acceleration_m_s2[some, 2] + GRAVITY_M_S2)).tolist()
-        yield from zip(rises_m[some].tolist(), pull_x, pull_z, limits_n[some].tolist(), strict=True)
+        block = slice(begin, begin + BLOCK_ROWS)
+        pull_x = (mass_kg * acceleration_m_s2[block, 0]).tolist()
+        pull_z = (mass_kg * (acceleration_m_s2[block, 2] + GRAVITY_M_S2)).tolist()
+        yield from zip(rises_m[block].tolist(), pull_x, pull_z, limits_n[block].tolist(), strict=True)
 
 
 def _fall(
@@ -211,7 +211,7 @@ def _fall(
     return np.column_stack([displacement, velocity])
 
 
-def _twist(grasp: Grasp, force_n: Floats, held: Bools, step_s: float) -> tuple[Floats, Floats]:
+def _twist(grasp: Grasp, force_n: Floats, is_held: Bools, step_s: float) -> tuple[Floats, Floats]:
     """Return torque about y and rotation of the object against the fingers (time,).
 
     The centre of mass hangs ``lever_m`` next to the grasp at angle 0 and swings down as the object turns; friction holds
@@ -225,7 +225,7 @@ def _twist(grasp: Grasp, force_n: Floats, held: Bools, step_s: float) -> tuple[F
     limits = (2 * (2 / 3) * grasp.friction * grasp.grip_n * PATCH_M).tolist()
     force_x, force_z = force_n[:, 0].tolist(), force_n[:, 2].tolist()
     angle = speed = 0.0
-    for row in range(int(held.sum())):
+    for row in range(int(is_held.sum())):
         demand = grasp.lever_m * (force_z[row] * math.cos(angle) - force_x[row] * math.sin(angle))
         limit, torque = limits[row], demand
         if speed or abs(demand) > limit:
@@ -237,5 +237,5 @@ def _twist(grasp: Grasp, force_n: Floats, held: Bools, step_s: float) -> tuple[F
                 speed = 0.0
             angle += step_s * speed
         torques[row], angles[row] = torque, angle
-    angles[int(held.sum()) :] = angle
+    angles[int(is_held.sum()) :] = angle
     return torques, angles

@@ -39,21 +39,21 @@ RESERVE = (
 )
 OPEN_M, GRASPED_M = 0.070, 0.040  # finger width
 APPROACH_S, RAMP_S, PAUSE_S = (0.6, 1.2), 0.4, (0.2, 0.5)
-BLOCK_ROWS = 1 << 16  # of a stream that are made at once
-KEPT_BYTES = 1 << 24  # of streams in memory, before they are put aside on disk
+BLOCK_ROWS = 1 << 16  # rows of a stream that are computed at once
+KEPT_BYTES = 1 << 24  # size of streams that are kept in memory
 LOSS_S, SLIDE_S = 0.02, 0.04  # over which a grip gives way, and for which the load must then be too much
 
 
 @dataclass(frozen=True)
 class Rig:
-    """What is done to the bottle, and how the streams are logged; the fields are those of the stage's params.
+    """The handling of the bottle and the logging of the streams. The fields are those of the stage's params.
 
     To study one thing at a time: ``friction_scale=4`` never slips, ``effort=1.15`` slips because of the plan alone,
     ``effort=0.9, grip_loss_probability=1, grip_loss=0.3`` because of the grip alone, and ``still`` keeps the load constant.
     """
 
     duration_s: float = 12.0
-    protocol: str = "mixed"  # of trajectory.PROTOCOLS, or each with the same chance
+    protocol: str = "mixed"  # name of trajectory.PROTOCOLS, or mixed for equal chances
     effort: float = 0.0  # largest load that the plan makes over the friction limit; 0: grip and friction are random
     friction_scale: float = 1.0
     grip_loss_probability: float = 0.0
@@ -73,7 +73,7 @@ class Rig:
 
 @dataclass(frozen=True)
 class Scene:
-    """What truly happens in a trial, before anything is logged; arrays are (time, …) at 1 kHz."""
+    """The true course of a trial before logging; arrays are (time, …) at 1 kHz."""
 
     protocol: str
     path: trajectory.Trajectory
@@ -94,7 +94,7 @@ def simulate_trial(seed: int, index: int, rig: Rig = Rig()) -> RecordingOutput:
     start_ns = START_NS + index * TRIAL_NS
     streams: dict[str, pa.Table | pa.RecordBatchReader] = {}
     spill = Spill(KEPT_BYTES)
-    known: dict[str, Attribute] = {}
+    labels: dict[str, Attribute] = {}
     duration_ns = int(scene.path.t_ns[-1])
     devices = {
         "xela1": (rig.tactile_rate_hz, rig.tactile_jitter_ms, rig.clock_offset_ms),
@@ -110,22 +110,22 @@ def simulate_trial(seed: int, index: int, rig: Rig = Rig()) -> RecordingOutput:
         arrived_ns = faults.arrivals(samples.true_ns, delay_ms * 1e6, rng)
         measured, fields = _measured(name, scene, samples.true_ns, rig, rng)
 
-        def made(some: slice) -> pa.Table:
-            clocks = [start_ns + faults.device_stamps(samples.true_ns[some], clock), samples.seq[some]]  # noqa: B023
-            columns = [*clocks, *measured(some).T]  # noqa: B023
-            return schema.stream(start_ns + arrived_ns[some], columns, [*_clock_fields(), *fields])  # noqa: B023
+        def build_rows(block: slice) -> pa.Table:
+            clocks = [start_ns + faults.device_stamps(samples.true_ns[block], clock), samples.seq[block]]  # noqa: B023
+            columns = [*clocks, *measured(block).T]  # noqa: B023
+            return schema.stream(start_ns + arrived_ns[block], columns, [*_clock_fields(), *fields])  # noqa: B023
 
-        streams[name] = _in_blocks(len(samples.seq), made, spill)
-        known |= {f"gt_{name}_clock_offset_ns": clock.offset_ns, f"gt_{name}_clock_skew": clock.skew}
+        streams[name] = _in_blocks(len(samples.seq), build_rows, spill)
+        labels |= {f"gt_{name}_clock_offset_ns": clock.offset_ns, f"gt_{name}_clock_skew": clock.skew}
     streams["truth"] = _in_blocks(len(scene.path.t_ns), _truth(scene, start_ns), spill)
-    return RecordingOutput(streams, _attributes(scene, index, start_ns, rig) | known)
+    return RecordingOutput(streams, _attributes(scene, index, start_ns, rig) | labels)
 
 
-def _in_blocks(rows: int, made: Callable[[slice], pa.Table], spill: Spill) -> pa.Table | pa.RecordBatchReader:
+def _in_blocks(rows: int, build_rows: Callable[[slice], pa.Table], spill: Spill) -> pa.Table | pa.RecordBatchReader:
     """Return a stream of so many rows, of which some are made at a time and put aside."""
-    gathered = Gathered(spill, made(slice(0, 0)))
+    gathered = Gathered(spill, build_rows(slice(0, 0)))
     for first in range(0, rows, BLOCK_ROWS):
-        gathered.add(made(slice(first, first + BLOCK_ROWS)))
+        gathered.add(build_rows(slice(first, first + BLOCK_ROWS)))
     return gathered.rows()
 
 
@@ -136,7 +136,7 @@ def perform(seed: int, index: int, rig: Rig = Rig()) -> Scene:
     chance = trajectory.PROTOCOLS[int(rng.integers(len(trajectory.PROTOCOLS)))]
     protocol = chance if rig.protocol == "mixed" else rig.protocol
     if rig.still:
-        path = trajectory.still(rig.duration_s)
+        path = trajectory.rest(rig.duration_s)
         closing, squeeze = np.ones(len(path.t_ns)), np.ones(len(path.t_ns))
     else:
         path = trajectory.trajectory(protocol, rig.duration_s, approach_s + RAMP_S + pause_s, rng)
@@ -167,16 +167,16 @@ def touch(scene: Scene, finger: int, true_ns: Times, *, creep: float = taxels.CR
     at = interpolation(scene, true_ns)
     displacement, torque = at(contact.displacement_m), at(contact.torque_nm)
     pressures = [
-        at(contact.normal_n[:, j])[:, None] * taxels.fractions(one, displacement, torque)
-        for j, one in enumerate(scene.skins)
+        at(contact.normal_n[:, j])[:, None] * taxels.fractions(skin, displacement, torque)
+        for j, skin in enumerate(scene.skins)
     ]
     friction = scene.grasp.friction * np.where(contact.slip[rows], mechanics.KINETIC, 1.0)
     pulled = taxels.shear(friction[:, None] * np.hstack(pressures), at(contact.force_n[:, ::2]))
     late = at(taxels.lagged(contact.normal_n[:, finger], trajectory.RATE_HZ))
     fraction = taxels.fractions(scene.skins[finger], displacement, torque)
     pressed = (1 - creep) * pressures[finger] + creep * late[:, None] * fraction
-    own = slice(finger * schema.TAXELS, (finger + 1) * schema.TAXELS)
-    return np.concatenate([pulled[:, own] + taxels.bulge(pressed), pressed[:, :, None]], axis=2)
+    columns = slice(finger * schema.TAXELS, (finger + 1) * schema.TAXELS)
+    return np.concatenate([pulled[:, columns] + taxels.bulge(pressed), pressed[:, :, None]], axis=2)
 
 
 def _measured(
@@ -184,7 +184,7 @@ def _measured(
 ) -> tuple[Callable[[slice], AnyArray], list[Any]]:
     """Return what a device logs of some of the samples taken at ``true_ns`` (time, channel), and its fields."""
     if name == "robot":
-        return lambda some: arm(scene, true_ns[some]), [
+        return lambda block: arm(scene, true_ns[block]), [
             schema.float_field("finger_m", "m", "finger_width"),
             *schema.pose_fields(),
         ]
@@ -193,11 +193,11 @@ def _measured(
         field = pa.field("distance", pa.int16(), metadata={"unit": "count", "quantity": "proximity"})
         return proximity.readings(up_m, rig.noise_scale, rng)[:, None].__getitem__, [field]
     finger = ("xela1", "xela2").index(name)
-    one = scene.skins[finger]
+    skin = scene.skins[finger]
     force = touch(scene, finger, true_ns, creep=0.0 if rig.still else taxels.CREEP)
     drift_scale = 0.0 if rig.still else rig.noise_scale
     errors = taxels.errors(true_ns / 1e9, rig.noise_scale, drift_scale, rng)
-    counts = taxels.digitised(one.base_count + taxels.signal(one, force) + errors)
+    counts = taxels.digitised(skin.base_count + taxels.signal(skin, force) + errors)
     return faults.hold(counts, rig.hold_probability, rng)[0].__getitem__, schema.uskin_fields()
 
 
@@ -224,11 +224,11 @@ def _loss_row(load_n: Floats, grasp: mechanics.Grasp, rise_m: Floats, loss: floa
     will do.
     """
     aloft = rise_m >= rise_m.max() / 2
-    given, until = round(LOSS_S * trajectory.RATE_HZ), round((LOSS_S + SLIDE_S) * trajectory.RATE_HZ)
+    start, until = round(LOSS_S * trajectory.RATE_HZ), round((LOSS_S + SLIDE_S) * trajectory.RATE_HZ)
     short = np.cumsum(np.append(0, load_n <= (1 - loss) * grasp.limit_n))  # rows before each in which friction holds
     sliding = aloft.copy()
     sliding[-until:] = False
-    sliding[:-until] &= short[until:-1] == short[given : given - until - 1]
+    sliding[:-until] &= short[until:-1] == short[start : start - until - 1]
     return int(rng.choice(np.flatnonzero(sliding if sliding.any() else aloft)))
 
 
@@ -240,8 +240,8 @@ def interpolation(scene: Scene, true_ns: Times) -> Any:
 
     def at(values: Floats) -> Floats:
         weight = fraction if values.ndim == 1 else fraction[:, None]
-        found: Floats = values[rows - 1] * (1 - weight) + values[rows] * weight
-        return found
+        interpolated: Floats = values[rows - 1] * (1 - weight) + values[rows] * weight
+        return interpolated
 
     return at
 
@@ -263,27 +263,27 @@ def _truth(scene: Scene, start_ns: int) -> Callable[[slice], pa.Table]:
     """Return a function that returns some rows of the stream ``truth`` at 1 kHz."""
     contact, acceleration_m_s2 = scene.contact, scene.path.acceleration_m_s2
 
-    def made(some: slice) -> pa.Table:
+    def build_rows(block: slice) -> pa.Table:
         columns: list[tuple[Any, Any]] = [
-            (schema.float_field(f"gt_finger{j + 1}_normal_n", "N", "force"), contact.normal_n[some, j]) for j in (0, 1)
+            (schema.float_field(f"gt_finger{j + 1}_normal_n", "N", "force"), contact.normal_n[block, j]) for j in (0, 1)
         ]
-        columns += _vector("gt_force_{}_n", "N", "force", contact.force_n[some])
-        columns += _vector("gt_acceleration_{}_m_s2", "m/s^2", "acceleration", acceleration_m_s2[some])
-        moved, speed = contact.displacement_m[some], contact.velocity_m_s[some]
+        columns += _vector("gt_force_{}_n", "N", "force", contact.force_n[block])
+        columns += _vector("gt_acceleration_{}_m_s2", "m/s^2", "acceleration", acceleration_m_s2[block])
+        moved, speed = contact.displacement_m[block], contact.velocity_m_s[block]
         columns += _vector("gt_displacement_{}_m", "m", "position", moved, "xz")
         columns.append((schema.float_field("gt_displacement_m", "m", "position"), np.linalg.norm(moved, axis=1)))
         columns += _vector("gt_velocity_{}_m_s", "m/s", "velocity", speed, "xz")
         columns.append((schema.float_field("gt_velocity_m_s", "m/s", "velocity"), np.linalg.norm(speed, axis=1)))
-        columns.append((schema.float_field("gt_torque_y_nm", "N m", "torque"), contact.torque_nm[some]))
-        columns.append((schema.float_field("gt_rotation_y_rad", "rad", "angle"), contact.rotation_rad[some]))
+        columns.append((schema.float_field("gt_torque_y_nm", "N m", "torque"), contact.torque_nm[block]))
+        columns.append((schema.float_field("gt_rotation_y_rad", "rad", "angle"), contact.rotation_rad[block]))
         mass = np.full(len(moved), scene.grasp.mass_kg)
         columns.append((schema.float_field("gt_mass_kg", "kg", "mass"), mass))
-        columns.append((schema.label_field("gt_slip"), contact.slip[some]))
-        columns.append((schema.label_field("gt_dropped"), contact.dropped[some]))
+        columns.append((schema.label_field("gt_slip"), contact.slip[block]))
+        columns.append((schema.label_field("gt_dropped"), contact.dropped[block]))
         fields, values = zip(*columns, strict=True)
-        return schema.stream(start_ns + scene.path.t_ns[some], values, fields)
+        return schema.stream(start_ns + scene.path.t_ns[block], values, fields)
 
-    return made
+    return build_rows
 
 
 def _vector(name: str, unit: str, quantity: str, values: Floats, axes: Sequence[str] = schema.AXES) -> list[Any]:
@@ -315,6 +315,6 @@ def _attributes(scene: Scene, index: int, start_ns: int, rig: Rig) -> dict[str, 
 
 def _ease(progress: Floats) -> Floats:
     """Return a smooth ramp from 0 to 1 as ``progress`` goes from 0 to 1."""
-    held = np.clip(progress, 0.0, 1.0)
-    eased: Floats = held**2 * (3 - 2 * held)
+    clipped = np.clip(progress, 0.0, 1.0)
+    eased: Floats = clipped**2 * (3 - 2 * clipped)
     return eased

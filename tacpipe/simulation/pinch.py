@@ -21,33 +21,33 @@ from tacpipe.simulation.primitives import principal_curvatures
 
 TIP_M = 0.0067  # radius of a fingertip, an assumption
 SKIN_PA = 1.0e6  # modulus of its skin, an assumption
-FORCE_N = ((3.2, 1.3), (2.6, 1.0))  # that the joints hold at the least and at the widest opening, by finger
+FORCE_N = ((3.2, 1.3), (2.6, 1.0))  # force of the joints at the smallest and the widest opening, by finger
 OPENING_M = (0.02, 0.12)
-SQUEEZE_M = (0.008, 0.012)  # by which fingers close beyond touch
+SQUEEZE_M = (0.008, 0.012)  # distance that fingers close beyond the touch
 COMMON = 0.8  # fraction of the logarithm of the effort that both fingers have in common
 CENTRE_M = (
     (0.0038, 0.0),
     (-0.0013, 0.0),
 )  # along and around the finger, where a level contact is, but for the thumb's side
-SIDE_M = (0.003, 0.005)  # by which the thumb touches with its side
-BEND_RAD = 0.3  # by which the last joint is bent at the least opening, and stretched at the widest
+SIDE_M = (0.003, 0.005)  # offset of the thumb's contact to its side
+BEND_RAD = 0.3  # angle of the last joint at the smallest opening; it is straight at the widest
 SHIFT_M, TILT_RAD = 0.002, np.deg2rad(5.0)  # largest errors of a fingertip's pose
 
 
 @dataclass(frozen=True)
 class Situation:
-    """What geometry reports on a grasp; fingers are middle finger and thumb, axes along and around the finger."""
+    """The geometry of a grasp. Fingers are middle finger and thumb, axes are along and around the finger."""
 
     opening_m: float
     curvatures_1_m: Floats  # (finger, 2), principal ones of the object at the contact
     bending_1_m: Floats  # (finger, axis), its normal curvatures along the axes of the pad
     lean_rad: Floats  # (finger, axis), of the normal from the pad's own
-    compliance_1_pa: float  # of the object
+    compliance_1_pa: float  # compliance of the object
 
 
 @dataclass(frozen=True)
 class Unseen:
-    """What nobody sees of grasps, drawn any number of times."""
+    """The unobserved values of grasps, drawn any number of times."""
 
     effort: Floats  # (draw, finger), by which the torque limit is multiplied
     squeeze_m: Floats  # (draw,)
@@ -58,7 +58,7 @@ class Unseen:
 
 @dataclass(frozen=True)
 class Touch:
-    """What comes of both: force, the contact's radius, by how much the skin gives way, and where the contact is."""
+    """The resulting touch: force, radius of the contact, deformation of the skin, and position of the contact."""
 
     force_n: Floats  # (draw, finger)
     contact_m: Floats  # (draw, finger)
@@ -83,9 +83,9 @@ def situation(placed: Placed, grasp: Grasp, compliance_1_pa: float) -> Situation
 
 def unseen(rng: np.random.Generator, draws: int, effort_spread: float) -> Unseen:
     """Return ``draws`` draws of what nobody sees; ``effort_spread`` is the standard deviation of the effort's logarithm."""
-    common, own = rng.normal(size=(draws, 1)), rng.normal(size=(draws, 2))
+    common, individual = rng.normal(size=(draws, 1)), rng.normal(size=(draws, 2))
     return Unseen(
-        np.exp(effort_spread * (np.sqrt(COMMON) * common + np.sqrt(1 - COMMON) * own)),
+        np.exp(effort_spread * (np.sqrt(COMMON) * common + np.sqrt(1 - COMMON) * individual)),
         rng.uniform(*SQUEEZE_M, draws),
         rng.uniform(-SHIFT_M, SHIFT_M, (draws, 2, 2)),
         rng.uniform(-TILT_RAD, TILT_RAD, (draws, 2, 2)),
@@ -99,35 +99,35 @@ def limits_n(opening_m: float) -> Floats:
     return np.array([narrow + fraction * (wide - narrow) for narrow, wide in FORCE_N])
 
 
-def touch(of: Situation, hidden: Unseen) -> Touch:
+def touch(situation: Situation, hidden: Unseen) -> Touch:
     """Return what comes of a situation and each draw of what nobody sees."""
-    force = hidden.effort * limits_n(of.opening_m)
-    if of.compliance_1_pa:
-        resisted = 2 / of.compliance_1_pa * TIP_M * hidden.squeeze_m
+    force = hidden.effort * limits_n(situation.opening_m)
+    if situation.compliance_1_pa:
+        resisted = 2 / situation.compliance_1_pa * TIP_M * hidden.squeeze_m
         force = np.minimum(force, resisted[:, None])
-    return Touch(force, *pressed(of, force), centre(of, hidden))
+    return Touch(force, *pressed(situation, force), centre(situation, hidden))
 
 
-def pressed(of: Situation, force_n: Floats) -> tuple[Floats, Floats]:
+def pressed(situation: Situation, force_n: Floats) -> tuple[Floats, Floats]:
     """Return the contact's radius and by how much the skin gives way, metres, under forces (..., finger).
 
     Of the whole indentation the skin takes the share E* / E_skin: both bodies give way in proportion to compliance.
     """
-    radius = hertz.effective_radius_m(TIP_M, of.curvatures_1_m)
-    modulus = hertz.effective_modulus_pa(SKIN_PA, of.compliance_1_pa)
+    radius = hertz.effective_radius_m(TIP_M, situation.curvatures_1_m)
+    modulus = hertz.effective_modulus_pa(SKIN_PA, situation.compliance_1_pa)
     contact = hertz.contact_radius_m(force_n, radius, modulus)
     return contact, hertz.indentation_m(contact, radius) * modulus / SKIN_PA
 
 
-def centre(of: Situation, hidden: Unseen) -> Floats:
+def centre(situation: Situation, hidden: Unseen) -> Floats:
     """Return the middle of the contact on the unrolled core (draw, finger, axis), metres.
 
     A round tip touches where its normal is the object's. Tips that are shifted by e over a surface of curvature k roll
     to where the normal leans by e k / (1 + k R).
     """
-    fraction = (of.opening_m - OPENING_M[0]) / (OPENING_M[1] - OPENING_M[0])
-    lean = of.lean_rad + np.array([BEND_RAD * (2 * fraction - 1), 0.0]) + hidden.tilt_rad
-    lean = lean + hidden.shift_m * of.bending_1_m / (1 + of.bending_1_m * TIP_M)
+    fraction = (situation.opening_m - OPENING_M[0]) / (OPENING_M[1] - OPENING_M[0])
+    lean = situation.lean_rad + np.array([BEND_RAD * (2 * fraction - 1), 0.0]) + hidden.tilt_rad
+    lean = lean + hidden.shift_m * situation.bending_1_m / (1 + situation.bending_1_m * TIP_M)
     at = np.array(CENTRE_M) + TIP_M * lean
     at[:, 1, 1] += hidden.side_m
     return np.asarray(at)

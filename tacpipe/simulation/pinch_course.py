@@ -9,7 +9,7 @@ import numpy as np
 from tacpipe.arrays import Floats, Times
 from tacpipe.simulation import faults
 
-RATE_HZ = 100.0  # of readings
+RATE_HZ = 100.0  # rate of readings
 FREE_S, CLOSING_S, HELD_S, RELEASE_S, AFTER_S = (0.8, 1.4), (0.3, 0.6), (0.8, 1.4), 0.2, 0.5
 JITTER_NS = 100_000.0  # mean and standard deviation of a reading's way to the host
 
@@ -33,6 +33,6 @@ def course(start_ns: int, rng: np.random.Generator) -> Course:
     moments = zip(("contact", "hold", "release"), knots_s, strict=False)
     return Course(
         start_ns + faults.arrivals(true_ns, JITTER_NS, rng),
-        fraction**2 * (3 - 2 * fraction),  # without a jerk
+        fraction**2 * (3 - 2 * fraction),  # smooth start and stop
         {name: start_ns + round(1e9 * float(at_s)) for name, at_s in moments},
     )

@@ -58,8 +58,8 @@ def principal_curvatures(bending: Floats, normal: Floats) -> Floats:
     first = np.cross(normal, helper)
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     tangents = np.stack([first, np.cross(normal, first)], axis=2)  # (point, xyz, tangent)
-    found: Floats = np.linalg.eigvalsh(np.swapaxes(tangents, 1, 2) @ bending @ tangents)
-    return found
+    curvatures: Floats = np.linalg.eigvalsh(np.swapaxes(tangents, 1, 2) @ bending @ tangents)
+    return curvatures
 
 
 @dataclass(frozen=True)
@@ -78,8 +78,8 @@ class Box:
         with np.errstate(divide="ignore", invalid="ignore"):
             walls = np.stack([(side * self.half_m - origin_m) / direction for side in (-1, 1)])
         entered = np.nanmax(walls.min(axis=0), axis=1)
-        left = np.nanmin(walls.max(axis=0), axis=1)
-        return np.where((entered <= left) & (entered > 0), entered, np.inf)
+        exit = np.nanmin(walls.max(axis=0), axis=1)
+        return np.where((entered <= exit) & (entered > 0), entered, np.inf)
 
     def normal(self, at_m: Floats) -> Floats:
         """Return the normal of the face that each point lies on (point, xyz)."""
@@ -96,11 +96,11 @@ class Box:
 
     def rests(self) -> list[Rest]:
         """Return each axis up that is not too tall for the shorter edge under it."""
-        found = []
+        poses = []
         for axis, half in enumerate(self.half_m):
             if half <= STABLE * np.delete(self.half_m, axis).min():
-                found.append(Rest(np.eye(3)[axis], float(half)))
-        return found
+                poses.append(Rest(np.eye(3)[axis], float(half)))
+        return poses
 
 
 @dataclass(frozen=True)
@@ -150,7 +150,7 @@ class Frustum:
 
     @property
     def slope(self) -> float:
-        """By how much the radius grows with height."""
+        """The growth of the radius per height."""
         return (self.top_m - self.bottom_m) / (2 * self.half_m)
 
     @property
@@ -173,13 +173,13 @@ class Frustum:
         side = _first_root(square, linear, constant)
         with np.errstate(invalid="ignore"):
             side[~(np.abs(origin_m[:, 2] + side * direction[:, 2]) <= self.half_m)] = np.inf
-        found = side
+        distance = side
         for height, radius_m in ((-self.half_m, self.bottom_m), (self.half_m, self.top_m)):
             with np.errstate(divide="ignore", invalid="ignore"):
                 way = (height - origin_m[:, 2]) / direction[:, 2]
                 off = np.hypot(*(origin_m[:, :2] + way[:, None] * direction[:, :2]).T)
-            found = np.where((off <= radius_m) & (way > 0) & (way < found), way, found)
-        return found
+            distance = np.where((off <= radius_m) & (way > 0) & (way < distance), way, distance)
+        return distance
 
     def normal(self, at_m: Floats) -> Floats:
         """Return the normal of the side or of the end that each point lies on (point, xyz)."""
@@ -192,12 +192,12 @@ class Frustum:
     def bending(self, at_m: Floats) -> Floats:
         """Return cos(half angle) / radius about the axis on the side (point, xyz, xyz), zeros on the ends."""
         on = np.flatnonzero(self._on_side(at_m))
-        found = np.zeros((len(at_m), 3, 3))
+        bending = np.zeros((len(at_m), 3, 3))
         off = np.hypot(at_m[on, 0], at_m[on, 1])
         about = np.column_stack([-at_m[on, 1], at_m[on, 0], np.zeros(len(on))]) / off[:, None]
         curvature = 1 / (off * np.hypot(1, self.slope))
-        found[on] = curvature[:, None, None] * about[:, :, None] * about[:, None, :]
-        return found
+        bending[on] = curvature[:, None, None] * about[:, :, None] * about[:, None, :]
+        return bending
 
     def margin_m(self, at_m: Floats) -> Floats:
         """Return the way to the nearest rim (point,), metres."""
@@ -230,6 +230,6 @@ def _first_root(square: Floats, linear: Floats, constant: Floats) -> Floats:
     with np.errstate(divide="ignore", invalid="ignore"):
         root = np.sqrt(linear**2 - square * constant)
         q = -linear - np.where(linear < 0, -root, root)  # the sum that loses no digits
-        both = np.stack([q / square, constant / q])
-    both[~(both > 0)] = np.inf
-    return np.asarray(both.min(axis=0))
+        roots = np.stack([q / square, constant / q])
+    roots[~(roots > 0)] = np.inf
+    return np.asarray(roots.min(axis=0))

@@ -13,7 +13,7 @@ from tacpipe.arrays import Floats
 
 RATE_HZ = 400.0
 REST_COUNT = 740.0
-COUNT_MM = 8.0  # by which the reading falls for each millimetre of slip downwards
+COUNT_MM = 8.0  # decrease of the reading per millimetre of downward slip
 NOISE_COUNT = 0.8
 FLOOR_COUNT = 544.0  # reached at 24.5 mm
 

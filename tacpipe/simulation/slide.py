@@ -35,16 +35,16 @@ SPECTRA = ("shared", "independent")
 START_NS = 1_581_000_000_000_000_000  # UTC stamp of the first trial's start
 TRIAL_NS = 60_000_000_000
 FORCE_SPREAD = 0.05  # standard deviation of a trial's force, as a fraction of it
-HOVER_S = (0.2, 0.4)  # before the finger touches
+HOVER_S = (0.2, 0.4)  # time before the finger touches
 APPROACH_M_S = 0.0005
 SLIDE_S, SHORT_SLIDE_S, SHORT_MATERIAL = 8.0, 6.0, 1  # one published material was recorded for less time
 RAMP_S = 0.3  # over which speed and force settle
 STOP_S, LIFT_S, AFTER_S = 0.1, 0.1, 0.3
-SPEED_SPREAD = 0.01  # of the arm: standard deviation from trial to trial, and half of it within one
+SPEED_SPREAD = 0.01  # standard deviation of the arm's speed between trials; half as much within a trial
 WANDER, MOST_WANDER = 0.07, 0.3  # share by which the forearm's speed varies: standard deviation, and at most
 WANDER_S = (0.8, 2.0)  # periods of that
 SESSION_GAIN, SESSION_N = 0.08, 0.07  # standard deviation between sessions: gain, and offset of each channel in newton
-DRIFT_N, DRIFT_TRIALS = 0.04, 50  # by which an offset moves, over so many trials of a session
+DRIFT_N, DRIFT_TRIALS = 0.04, 50  # drift of an offset, over so many trials of a session
 TRIAL_N = 0.10  # standard deviation of each channel's offset from trial to trial
 ARM_HZ = 150.0
 ARM_GAP = 0.12  # fraction of the arm's readings after which the link is silent
@@ -56,7 +56,7 @@ MATERIAL, SESSION, TRIAL, NOISE = 1, 2, 3, 4  # streams of random numbers
 
 @dataclass(frozen=True)
 class Rig:
-    """Which materials are slid over, and how well the sensors state; the fields are those of the stage's params.
+    """The materials and the quality of the sensors. The fields are those of the stage's params.
 
     Controls: with ``identical_materials`` nothing but the session distinguishes one class from another, with
     ``session_scale=0`` nothing but the material does, and with ``spectra="independent"`` the sensors have nothing in
@@ -79,43 +79,43 @@ class Rig:
 
 @dataclass(frozen=True)
 class Place:
-    """Where a trial stands in the plan of the rig; all but ``number`` count from 1, except that material 0 is any."""
+    """The place of a trial in the plan of the rig; all but ``number`` count from 1, except that material 0 is any."""
 
     sensor: str
     material: int
     session: int
-    number: int  # of the trial among those of its sensor and material, from 0
+    number: int  # index of the trial among those of its sensor and material, from 0
 
 
 @dataclass(frozen=True)
 class Scene:
-    """What truly happens in a trial when the sensor takes its samples; arrays are (time,) unless stated otherwise."""
+    """The true course of a trial at the sensor's samples; arrays are (time,) unless stated otherwise."""
 
     place: Place
-    of: texture.Material
+    material: texture.Material
     surface: texture.Waves
     true_ns: Times  # since the start of the trial
-    position_m: Floats  # of the slide
+    position_m: Floats  # position along the slide
     speed_m_s: Floats
     force_n: Floats
     contact: Floats  # 0: nothing is touched, 1: pressed as in the slide
     phase: NDArray[np.int8]  # -1 before the slide, 0 in it, 1 after
     patch_m: Floats  # (time, axis): centre of what is pressed, along the skin and across it
-    pressure_count: Counts  # of the finger's fluid, as it is logged; empty for RoboSkin
+    pressure_count: Counts  # pressure of the finger's fluid as logged, empty for RoboSkin
 
 
 def place(index: int, rig: Rig) -> Place:
     """Return what trial ``index`` is a trial of."""
-    number, within = divmod(index, len(SENSORS) * rig.materials)
+    number, position = divmod(index, len(SENSORS) * rig.materials)
     session = number % rig.sessions + 1
-    return Place(SENSORS[within % len(SENSORS)], within // len(SENSORS) + 1, session, number)
+    return Place(SENSORS[position % len(SENSORS)], position // len(SENSORS) + 1, session, number)
 
 
 def material(seed: int, sensor: str, number: int, rig: Rig = Rig()) -> texture.Material:
     """Return material ``number`` as ``sensor`` measures it: the same for both sensors where they share their spectra."""
     source = SENSORS.index(sensor) if rig.spectra == "independent" else 0
-    known = 0 if rig.identical_materials else number
-    return texture.material(np.random.default_rng([seed, MATERIAL, source, known]))
+    index = 0 if rig.identical_materials else number
+    return texture.material(np.random.default_rng([seed, MATERIAL, source, index]))
 
 
 def simulate_trial(seed: int, index: int, rig: Rig = Rig()) -> RecordingOutput:
@@ -137,22 +137,22 @@ def simulate_trial(seed: int, index: int, rig: Rig = Rig()) -> RecordingOutput:
             streams |= _arm(scene, start_ns, rig, rng)
     else:
         taxels = forearm.read(signal, rig.noise_scale, rng)
-        made = f"from a nominal rate of {forearm.RATE_HZ:g} Hz"
-        streams["roboskin"] = schema.stream(start_ns + scene.true_ns, taxels.T, schema.roboskin_fields(), made)
+        note = f"from a nominal rate of {forearm.RATE_HZ:g} Hz"
+        streams["roboskin"] = schema.stream(start_ns + scene.true_ns, taxels.T, schema.roboskin_fields(), note)
     streams["truth"] = _truth(scene, start_ns)
     return RecordingOutput(streams, _attributes(scene.place))
 
 
 def perform(seed: int, index: int, rig: Rig = Rig()) -> Scene:
     """Return what truly happens in trial ``index``."""
-    which = place(index, rig)
+    slot = place(index, rig)
     rng = np.random.default_rng([seed, TRIAL, index])
-    of = material(seed, which.sensor, which.material, rig)
-    surface = texture.track(of, rng)
+    surface_material = material(seed, slot.sensor, slot.material, rig)
+    surface = texture.track(surface_material, rng)
     force_n = rig.force_n * (1 + FORCE_SPREAD * float(rng.normal()))
-    if which.sensor == "biotac":
-        return _drawn(which, of, surface, force_n, rig, rng)
-    return _rolled(which, of, surface, force_n, rig, rng)
+    if slot.sensor == "biotac":
+        return _drawn(slot, surface_material, surface, force_n, rig, rng)
+    return _rolled(slot, surface_material, surface, force_n, rig, rng)
 
 
 def response(seed: int, index: int, scene: Scene, rig: Rig = Rig()) -> Floats:
@@ -160,16 +160,16 @@ def response(seed: int, index: int, scene: Scene, rig: Rig = Rig()) -> Floats:
     gain, lean, along_m, aperture_m = sensitivity(scene)
     contact_n = texture.contact_force(scene.surface, scene.position_m[:, None] + along_m, aperture_m)
     factor, offset_n = nuisance(seed, index, gain.shape[1], rig)
-    pressed_n = scene.force_n[:, None] * (1 + scene.of.friction * lean)
-    found: Floats = factor * gain * (pressed_n + scene.contact[:, None] * (contact_n + offset_n))
-    return found
+    pressed_n = scene.force_n[:, None] * (1 + scene.material.friction * lean)
+    counts: Floats = factor * gain * (pressed_n + scene.contact[:, None] * (contact_n + offset_n))
+    return counts
 
 
 def sensitivity(scene: Scene) -> tuple[Floats, Floats, Floats, float]:
     """Return counts per newton (time, channel), d (time, channel), xi (channel,) in metres, and the aperture's sigma."""
     if scene.place.sensor == "biotac":
         shape = (len(scene.true_ns), schema.ELECTRODES)
-        gain, lean = (np.broadcast_to(known, shape) for known in (fingertip.gains(), fingertip.leans()))
+        gain, lean = (np.broadcast_to(values, shape) for values in (fingertip.gains(), fingertip.leans()))
         return gain, lean, fingertip.ALONG_M, fingertip.APERTURE_M
     gain = forearm.GAIN_COUNT_N * forearm.fractions(scene.patch_m)
     return gain, forearm.leans(scene.patch_m), forearm.ALONG_M, forearm.APERTURE_M
@@ -177,23 +177,28 @@ def sensitivity(scene: Scene) -> tuple[Floats, Floats, Floats, float]:
 
 def nuisance(seed: int, index: int, number: int, rig: Rig = Rig()) -> tuple[float, Floats]:
     """Return the gain of a trial's session and the offset of each of ``number`` channels in that trial, N (channel,)."""
-    which = place(index, rig)
-    rng = np.random.default_rng([seed, SESSION, SENSORS.index(which.sensor), which.material, which.session])
+    slot = place(index, rig)
+    rng = np.random.default_rng([seed, SESSION, SENSORS.index(slot.sensor), slot.material, slot.session])
     factor = float(np.exp(rig.session_scale * SESSION_GAIN * rng.normal()))
     offset, drift = rng.normal(0, 1, (2, number))
-    late = which.number // rig.sessions / DRIFT_TRIALS
-    own = np.random.default_rng([seed, SESSION, index]).normal(0, 1, number)
-    return factor, rig.session_scale * (SESSION_N * offset + DRIFT_N * late * drift) + rig.noise_scale * TRIAL_N * own
+    late = slot.number // rig.sessions / DRIFT_TRIALS
+    noise = np.random.default_rng([seed, SESSION, index]).normal(0, 1, number)
+    return factor, rig.session_scale * (SESSION_N * offset + DRIFT_N * late * drift) + rig.noise_scale * TRIAL_N * noise
 
 
 def _drawn(
-    which: Place, of: texture.Material, surface: texture.Waves, force_n: float, rig: Rig, rng: np.random.Generator
+    slot: Place,
+    surface_material: texture.Material,
+    surface: texture.Waves,
+    force_n: float,
+    rig: Rig,
+    rng: np.random.Generator,
 ) -> Scene:
     """Return a slide of the BioTac, which starts with the first sample whose pressure is above the trigger."""
     rate_hz = fingertip.RATE_HZ
     touch_s, phase_s = rng.uniform(*HOVER_S), rng.random() / rate_hz
-    loading_n_s = of.stiffness_n_m * APPROACH_M_S
-    short = which.material == SHORT_MATERIAL and not rig.identical_materials
+    loading_n_s = surface_material.stiffness_n_m * APPROACH_M_S
+    short = slot.material == SHORT_MATERIAL and not rig.identical_materials
     lasts_s = SHORT_SLIDE_S if short else SLIDE_S
     longest_s = touch_s + 2 * fingertip.TRIGGER_COUNT / fingertip.PRESSURE_COUNT_N / loading_n_s
     at_s = phase_s + np.arange(round((longest_s + lasts_s + AFTER_S) * rate_hz)) / rate_hz
@@ -209,8 +214,8 @@ def _drawn(
     pressed_n = np.where(since_s < 0, coming_n[:rows], sliding_n * lifting)
     phase = np.where(since_s < 0, -1, np.where(np.arange(rows) < first + round(lasts_s * rate_hz), 0, 1))
     return Scene(
-        which,
-        of,
+        slot,
+        surface_material,
         surface,
         np.rint(at_s * 1e9).astype(np.int64),
         position_m,
@@ -224,7 +229,12 @@ def _drawn(
 
 
 def _rolled(
-    which: Place, of: texture.Material, surface: texture.Waves, force_n: float, rig: Rig, rng: np.random.Generator
+    slot: Place,
+    surface_material: texture.Material,
+    surface: texture.Waves,
+    force_n: float,
+    rig: Rig,
+    rng: np.random.Generator,
 ) -> Scene:
     """Return a slide of RoboSkin: in contact from first to last frame, at a speed that wanders."""
     at_s = np.arange(forearm.FRAMES) / forearm.RATE_HZ
@@ -235,8 +245,8 @@ def _rolled(
     way = rig.roboskin_speed_m_s * (at_s - variation / turn * (np.cos(turn * at_s + phase) - np.cos(phase)))
     start_m, roll_m = (np.array([rng.uniform(*axis) for axis in axes]) for axes in (forearm.START_M, forearm.ROLL_M))
     return Scene(
-        which,
-        of,
+        slot,
+        surface_material,
         surface,
         np.rint(at_s * 1e9).astype(np.int64),
         way,
@@ -267,7 +277,7 @@ def _finger(scene: Scene, signal: Floats, rig: Rig, rng: np.random.Generator) ->
     pac = np.zeros((len(signal), schema.VIBRATIONS), np.uint16)
     if rig.pac:
         rows = np.arange(pac.size) / schema.VIBRATIONS
-        at, contact = (np.interp(rows, np.arange(len(signal)), known) for known in (scene.position_m, scene.contact))
+        at, contact = (np.interp(rows, np.arange(len(signal)), values) for values in (scene.position_m, scene.contact))
         pac = fingertip.vibration(
             contact * texture.contact_force(scene.surface, at, fingertip.APERTURE_M), rig.noise_scale, rng
         )
@@ -279,22 +289,24 @@ def _arm(scene: Scene, start_ns: int, rig: Rig, rng: np.random.Generator) -> dic
 
     The arm slides along -x, and z is up. Nobody estimates angular velocity: it is NaN, as in the published recordings.
     """
-    taken = faults.samples(int(scene.true_ns[-1]), ARM_HZ, 0.0, rng).true_ns
-    silent = rng.random(len(taken)) < ARM_GAP
-    until_ns = np.maximum.accumulate(np.where(silent, taken + rng.exponential(ARM_GAP_S * 1e9, len(taken)), 0))
-    taken = taken[np.append(True, taken[1:] > until_ns[:-1])]
-    arrived_ns = start_ns + faults.arrivals(taken, rig.jitter_ms * 1e6, rng)
-    speed, force = (np.interp(taken, scene.true_ns, known) for known in (scene.speed_m_s, scene.force_n))
-    phase = np.interp(taken, scene.true_ns, scene.phase)
-    still = np.zeros(len(taken))
+    sample_ns = faults.samples(int(scene.true_ns[-1]), ARM_HZ, 0.0, rng).true_ns
+    silent = rng.random(len(sample_ns)) < ARM_GAP
+    until_ns = np.maximum.accumulate(np.where(silent, sample_ns + rng.exponential(ARM_GAP_S * 1e9, len(sample_ns)), 0))
+    sample_ns = sample_ns[np.append(True, sample_ns[1:] > until_ns[:-1])]
+    arrived_ns = start_ns + faults.arrivals(sample_ns, rig.jitter_ms * 1e6, rng)
+    speed, force = (np.interp(sample_ns, scene.true_ns, values) for values in (scene.speed_m_s, scene.force_n))
+    phase = np.interp(sample_ns, scene.true_ns, scene.phase)
+    zeros = np.zeros(len(sample_ns))
     down = np.where(phase < 0, APPROACH_M_S, 0.0)
-    twist = np.column_stack([-speed, still, -down]) + rig.noise_scale * rng.normal(0, SPEED_NOISE_M_S, (len(taken), 3))
-    spikes = np.flatnonzero(rng.random(len(taken)) < SPIKES * (rig.noise_scale > 0))
+    twist = np.column_stack([-speed, zeros, -down]) + rig.noise_scale * rng.normal(
+        0, SPEED_NOISE_M_S, (len(sample_ns), 3)
+    )
+    spikes = np.flatnonzero(rng.random(len(sample_ns)) < SPIKES * (rig.noise_scale > 0))
     twist[spikes, 0] += rng.choice([-SPIKE_M_S, SPIKE_M_S], len(spikes))
-    load = np.column_stack([scene.of.friction * force * (speed > 0), still, force])
+    load = np.column_stack([scene.material.friction * force * (speed > 0), zeros, force])
     load += rig.noise_scale * rng.normal(0, FORCE_NOISE_N, load.shape)
     turned = rig.noise_scale * rng.normal(0, TORQUE_NOISE_NM, load.shape)
-    unknown = np.full((3, len(taken)), np.nan)
+    unknown = np.full((3, len(sample_ns)), np.nan)
     return {
         "twist": schema.stream(arrived_ns, [*twist.T, *unknown], schema.twist_fields()),
         "wrench": schema.stream(arrived_ns, [*load.T, *turned.T], schema.wrench_fields()),
@@ -315,15 +327,15 @@ def _truth(scene: Scene, start_ns: int) -> pa.Table:
     return schema.stream(start_ns + scene.true_ns, columns, fields)
 
 
-def _attributes(which: Place) -> dict[str, Attribute]:
+def _attributes(slot: Place) -> dict[str, Attribute]:
     return {
-        "sensor": which.sensor,
+        "sensor": slot.sensor,
         "simulated": True,
-        "material": which.material,
-        "trial": which.number + 1,
-        "session": f"{which.sensor}-m{which.material:02d}-s{which.session}",
-        "rate_hz": fingertip.RATE_HZ if which.sensor == "biotac" else forearm.RATE_HZ,
-        **({"layout": "time"} if which.sensor == "roboskin" else {}),
+        "material": slot.material,
+        "trial": slot.number + 1,
+        "session": f"{slot.sensor}-m{slot.material:02d}-s{slot.session}",
+        "rate_hz": fingertip.RATE_HZ if slot.sensor == "biotac" else forearm.RATE_HZ,
+        **({"layout": "time"} if slot.sensor == "roboskin" else {}),
     }
 
 

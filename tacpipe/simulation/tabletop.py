@@ -1,4 +1,4 @@
-"""What the camera sees before anything is cut out: a table, the object that is grasped, and another one next to it."""
+"""Render the camera's view before segmentation: a table, the grasped object, and another object next to it."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from tacpipe.simulation.depth_camera import Placed
 from tacpipe.simulation.primitives import Shape
 
 TABLE, OBJECT, CLUTTER = 0, 1, 2
-GAP_M = (0.04, 0.10)  # between the spheres that hold the two bodies
-SIDES = 60  # on which the other one is tried
+GAP_M = (0.04, 0.10)  # gap between the bounding spheres of the two bodies
+SIDES = 60  # number of directions tried for the other body
 HALF_M = (0.45, 0.35)  # half the table's edges along x and y
-EDGE_PX = 10  # by which the other body stays within the image
+EDGE_PX = 10  # margin of the other body to the edge of the image
 
 
 @dataclass(frozen=True)
@@ -31,13 +31,13 @@ class View:
 
 
 def view(
-    placed: Placed, other: Shape, up: Floats, camera_m: float, noise_scale: float, rng: np.random.Generator
+    placed: Placed, neighbour: Shape, up: Floats, camera_m: float, noise_scale: float, rng: np.random.Generator
 ) -> View:
-    """Return the camera's view of a body on the table, with a body ``other`` set down next to it."""
+    """Return the camera's view of a body on the table, with a body ``neighbour`` set down next to it."""
     through = depth_camera.rays(range(depth_camera.HEIGHT), range(depth_camera.WIDTH))
     depth = _table(through, up, camera_m)
     surface = np.full(len(depth), TABLE, np.int8)
-    bodies = [(OBJECT, placed), (CLUTTER, _beside(placed, other, up, camera_m, rng))]
+    bodies = [(OBJECT, placed), (CLUTTER, _place_neighbour(placed, neighbour, up, camera_m, rng))]
     for kind, body in bodies:
         rows, columns = depth_camera.window(body)
         pixels = (np.array(rows)[:, None] * depth_camera.WIDTH + np.array(columns)).ravel()
@@ -49,15 +49,15 @@ def view(
     through, depth, surface = through[met], depth[met], surface[met]
     colours = depth_camera.painted(through * depth[:, None], rng)
     for kind, body in bodies:
-        own = surface == kind
-        colours[own] = depth_camera.painted(body.inward(through[own] * depth[own, None]), rng)
+        visible = surface == kind
+        colours[visible] = depth_camera.painted(body.inward(through[visible] * depth[visible, None]), rng)
     return View(Cloud(depth_camera.measured(through, depth, noise_scale, rng), colours), surface)
 
 
-def tables(seen: View) -> dict[str, pa.Table]:
+def tables(view: View) -> dict[str, pa.Table]:
     """Return the stream ``scene``, and ``scene_truth`` with a row a point: 0 the table, 1 the object, 2 another one."""
-    truth = pa.Table.from_arrays([pa.array(seen.surface)], schema=pa.schema([schema.label_field("gt_surface")]))
-    return {"scene": seen.cloud.table(), "scene_truth": truth}
+    truth = pa.Table.from_arrays([pa.array(view.surface)], schema=pa.schema([schema.label_field("gt_surface")]))
+    return {"scene": view.cloud.table(), "scene_truth": truth}
 
 
 def _table(through: Floats, up: Floats, camera_m: float) -> Floats:
@@ -67,19 +67,21 @@ def _table(through: Floats, up: Floats, camera_m: float) -> Floats:
     return np.where(off.all(axis=1) & (depth > 0), depth, np.inf)
 
 
-def _beside(placed: Placed, other: Shape, up: Floats, camera_m: float, rng: np.random.Generator) -> Placed:
+def _place_neighbour(placed: Placed, neighbour: Shape, up: Floats, camera_m: float, rng: np.random.Generator) -> Placed:
     """Return a body put down next to another, where the camera sees all of it if there is such a place."""
-    rests = other.rests()
-    rest = rests[int(rng.integers(len(rests)))]
+    rests = neighbour.rests()
+    pose = rests[int(rng.integers(len(rests)))]
     centre = placed.origin_m[:2] / placed.origin_m[2] * camera_m
-    found = None
+    best = None
     for _ in range(SIDES):
         angle, gap = rng.uniform(0, 2 * np.pi), rng.uniform(*GAP_M)
-        x, y = centre + (placed.shape.bound_m + other.bound_m + gap) * np.array([np.cos(angle), np.sin(angle)])
-        found = depth_camera.put(other, rest, float(rng.uniform(0, 2 * np.pi)), (float(x), float(y)), up, camera_m)
-        rows, columns = depth_camera.window(found)
-        seen = len(rows) and len(columns)  # it may lie next to the picture
-        if seen and min(rows[0], columns[0]) > EDGE_PX and rows[-1] + EDGE_PX < depth_camera.HEIGHT:
+        x, y = centre + (placed.shape.bound_m + neighbour.bound_m + gap) * np.array([np.cos(angle), np.sin(angle)])
+        best = depth_camera.place_shape(
+            neighbour, pose, float(rng.uniform(0, 2 * np.pi)), (float(x), float(y)), up, camera_m
+        )
+        rows, columns = depth_camera.window(best)
+        visible = len(rows) and len(columns)  # it may lie next to the picture
+        if visible and min(rows[0], columns[0]) > EDGE_PX and rows[-1] + EDGE_PX < depth_camera.HEIGHT:
             break
-    assert found is not None
-    return found
+    assert best is not None
+    return best

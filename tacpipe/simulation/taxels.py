@@ -21,19 +21,19 @@ import numpy as np
 from tacpipe.arrays import Counts, Floats
 from tacpipe.channels import places, schema
 
-PITCH_M = places.USKIN_PITCH_M  # of the taxels
+PITCH_M = places.USKIN_PITCH_M  # pitch of the taxels
 PAD_M = 2 * PITCH_M  # half the width of a pad: the centre of what presses on it stays within
 PLACES_M = places.uskin_m()  # (taxel, axis)
-SIGMA_M = (0.004, 0.006)  # of the Gaussian that shares the pressure
+SIGMA_M = (0.004, 0.006)  # standard deviation of the Gaussian that distributes the pressure
 CENTRE_M = 0.003  # largest distance of its centre from the pad's, along either axis
-TWIST_M_NM = 0.02  # by which a torque shifts it
+TWIST_M_NM = 0.02  # shift of the pressure by a torque
 GAIN_COUNT_N = (1500.0, 1500.0, 3250.0)  # x, y, z; with `BULGE` set for the spread of the published recordings
-OFF_AXIS = 0.05  # of a force that shows on the other axes
+OFF_AXIS = 0.05  # fraction of a force on the other axes
 QUADRATIC_N = 0.03  # q as a fraction of the gain, at one newton
-CROSSTALK = 0.08  # of a taxel's signal that its four neighbours see
+CROSSTALK = 0.08  # fraction of a taxel's signal in its four neighbours
 CREEP, CREEP_S = 0.03, 0.5  # fraction of the pressure that follows late, and how late
-BULGE = 0.4  # of a taxel's pressure that pushes it outwards, for each pitch that it is off the centre
-BASE_COUNT = (16_000.0, 16_500.0, 38_000.0)  # at rest, as the published recordings have it
+BULGE = 0.4  # outward part of a taxel's pressure per pitch of distance from the centre
+BASE_COUNT = (16_000.0, 16_500.0, 38_000.0)  # level at rest in the published recordings
 BASE_SPREAD_COUNT = 300.0
 DRIFT_COUNT = 2.0  # random walk, counts after one second
 NOISE_COUNT = (1.35, 1.15, 3.4)  # x, y, z; standard deviation of second differences / sqrt(6), quiet xela-psc frames
@@ -57,17 +57,17 @@ def skin(rng: np.random.Generator) -> Skin:
     return Skin(centre, float(rng.uniform(*SIGMA_M)), mixing * np.array(GAIN_COUNT_N)[:, None], base)
 
 
-def fractions(one: Skin, displacement_m: Floats, torque_nm: Floats) -> Floats:
+def fractions(skin: Skin, displacement_m: Floats, torque_nm: Floats) -> Floats:
     """Return the fraction of the normal force that each taxel bears (time, taxel); they add up to one.
 
     ``displacement_m`` (time, 2) is that of the object along x and z, ``torque_nm`` (time,) twists it.
     """
-    moved = one.centre_m + displacement_m + np.outer(torque_nm, [TWIST_M_NM, 0.0])
+    moved = skin.centre_m + displacement_m + np.outer(torque_nm, [TWIST_M_NM, 0.0])
     centre = PAD_M * np.tanh(moved / PAD_M)
     distance2 = ((PLACES_M - centre[:, None]) ** 2).sum(axis=2)
-    fraction = np.exp((distance2.min(axis=1, keepdims=True) - distance2) / (2 * one.sigma_m**2))
-    whole: Floats = fraction / fraction.sum(axis=1, keepdims=True)
-    return whole
+    fraction = np.exp((distance2.min(axis=1, keepdims=True) - distance2) / (2 * skin.sigma_m**2))
+    normalised: Floats = fraction / fraction.sum(axis=1, keepdims=True)
+    return normalised
 
 
 def shear(cap_n: Floats, load_n: Floats) -> Floats:
@@ -78,8 +78,10 @@ def shear(cap_n: Floats, load_n: Floats) -> Floats:
     total = np.linalg.norm(load_n, axis=1)
     ordered = np.sort(cap_n, axis=1)
     taxels = cap_n.shape[1]
-    below = np.cumsum(ordered, axis=1) - ordered  # what the taxels of smaller cap bear if they are capped
-    level = (total[:, None] - below) / (taxels - np.arange(taxels))  # of the rest, were this one not capped
+    below = np.cumsum(ordered, axis=1) - ordered  # load of the taxels with a smaller cap, if they are capped
+    level = (total[:, None] - below) / (
+        taxels - np.arange(taxels)
+    )  # level of the remaining taxels if this one is not capped
     fits = level <= ordered  # the first taxel of which this is so is not capped, nor are those behind it
     borne = np.minimum(cap_n, np.take_along_axis(level, fits.argmax(axis=1)[:, None], axis=1))
     full = ~fits.any(axis=1)
@@ -98,17 +100,17 @@ def bulge(pressed_n: Floats) -> Floats:
     return pushed
 
 
-def signal(one: Skin, force_n: Floats) -> Floats:
+def signal(skin: Skin, force_n: Floats) -> Floats:
     """Return the counts above base (time, taxel, axis) that a force on each taxel (time, taxel, axis) gives."""
     bent = force_n + QUADRATIC_N * np.abs(force_n) * force_n
-    counts: Floats = np.einsum("mn,tna->tma", crosstalk(), np.einsum("tna,nba->tnb", bent, one.gain_count_n))
+    counts: Floats = np.einsum("mn,tna->tma", crosstalk(), np.einsum("tna,nba->tnb", bent, skin.gain_count_n))
     return counts
 
 
-def forces(one: Skin, counts: Floats) -> Floats:
+def forces(skin: Skin, counts: Floats) -> Floats:
     """Return the force on each taxel (time, taxel, axis), N, that would give these counts without drift and noise."""
-    above = np.einsum("mn,tna->tma", np.linalg.inv(crosstalk()), counts.reshape(-1, schema.TAXELS, 3) - one.base_count)
-    bent = np.einsum("tna,nba->tnb", above, np.linalg.inv(one.gain_count_n))
+    above = np.einsum("mn,tna->tma", np.linalg.inv(crosstalk()), counts.reshape(-1, schema.TAXELS, 3) - skin.base_count)
+    bent = np.einsum("tna,nba->tnb", above, np.linalg.inv(skin.gain_count_n))
     size = (np.sqrt(1 + 4 * QUADRATIC_N * np.abs(bent)) - 1) / (2 * QUADRATIC_N)
     force: Floats = np.sign(bent) * size
     return force
@@ -117,9 +119,9 @@ def forces(one: Skin, counts: Floats) -> Floats:
 def crosstalk() -> Floats:
     """Return what of each taxel's signal each one sees (taxel, taxel)."""
     row, column = np.divmod(np.arange(schema.TAXELS), 4)
-    apart = np.abs(row[:, None] - row) + np.abs(column[:, None] - column)
-    seen: Floats = np.eye(schema.TAXELS) + CROSSTALK * (apart == 1)
-    return seen
+    distance = np.abs(row[:, None] - row) + np.abs(column[:, None] - column)
+    matrix: Floats = np.eye(schema.TAXELS) + CROSSTALK * (distance == 1)
+    return matrix
 
 
 def lagged(values: Floats, rate_hz: float) -> Floats:
@@ -145,5 +147,5 @@ def errors(at_s: Floats, noise_scale: float, drift_scale: float, rng: np.random.
 
 def digitised(counts: Floats) -> Counts:
     """Return counts (time, taxel, axis) as the device sends them (time, channel): rounded, within 16 bits."""
-    whole: Counts = np.rint(counts).clip(0, 65_535).reshape(len(counts), -1).astype(np.uint16)
-    return whole
+    rounded: Counts = np.rint(counts).clip(0, 65_535).reshape(len(counts), -1).astype(np.uint16)
+    return rounded

@@ -24,27 +24,27 @@ BACKGROUND_M = (
     0.040,
 )  # wavelengths of the background; longer ones would be slope, shorter ones nobody measures
 ROUGHNESS_N = (0.15, 0.35)  # standard deviation of all that a surface adds
-AMPLITUDE = (0.15, 1.0)  # of one grating over that of the others
-EXPONENT = (0.8, 1.8)  # of the background: its power falls with the wave number to this power
+AMPLITUDE = (0.15, 1.0)  # amplitude of one grating relative to the others
+EXPONENT = (0.8, 1.8)  # exponent of the background's power over the wave number
 BACKGROUND = (0.05, 0.25)  # its fraction of the variance
 FRICTION = (0.3, 0.9)
 STIFFNESS_N_M = (1000.0, 4000.0)
 WEAR = 0.2  # standard deviation of the logarithm of a grating's amplitude from trial to trial
-STRETCH = 0.01  # of its wavelength
-WAVES = 64  # that make a background
-GRID_M = 0.00005  # between the places at which a surface is computed; between them it is linear
+STRETCH = 0.01  # relative stretch of the wavelength
+WAVES = 64  # number of waves of a background
+GRID_M = 0.00005  # grid at which a surface is computed, linear in between
 
 
 @dataclass(frozen=True)
 class Material:
-    """What all trials of a material have in common."""
+    """The properties that all trials of a material share."""
 
     wavelength_m: Floats  # (grating,)
     amplitude_n: Floats  # (grating,)
     background_n: float  # standard deviation
     exponent: float
     friction: float  # mu
-    stiffness_n_m: float  # of finger and material together, when one is pressed on the other
+    stiffness_n_m: float  # combined stiffness of finger and material
 
 
 @dataclass(frozen=True)
@@ -71,15 +71,15 @@ def material(rng: np.random.Generator) -> Material:
     )
 
 
-def track(of: Material, rng: np.random.Generator) -> Waves:
+def track(material: Material, rng: np.random.Generator) -> Waves:
     """Return the surface along one trial's way over a material."""
     edges = _edges(WAVES)
     number = rng.uniform(edges[:-1], edges[1:])
     size, phase = rng.rayleigh(1.0, WAVES), rng.uniform(0, 2 * np.pi, GRATINGS + WAVES)
     worn, stretched = rng.normal(0, 1, (2, GRATINGS))
     return Waves(
-        np.concatenate([1 / of.wavelength_m * (1 + STRETCH * stretched), number]),
-        np.concatenate([of.amplitude_n * np.exp(WEAR * worn), size * np.sqrt(_background(of, edges))]),
+        np.concatenate([1 / material.wavelength_m * (1 + STRETCH * stretched), number]),
+        np.concatenate([material.amplitude_n * np.exp(WEAR * worn), size * np.sqrt(_background(material, edges))]),
         phase,
     )
 
@@ -99,21 +99,23 @@ def contact_force(surface: Waves, position_m: Floats, aperture_m: float) -> Floa
     low, high = float(position_m.min()), float(position_m.max())
     grid = low + GRID_M * np.arange(int((high - low) / GRID_M) + 2)
     amplitude = surface.amplitude_n * passed(surface.number_per_m, aperture_m)
-    kept = amplitude > 1e-6 * amplitude.max()
-    angle = np.outer(2 * np.pi * surface.number_per_m[kept], grid) + surface.phase_rad[kept, None]
-    value: Floats = np.interp(position_m.ravel(), grid, amplitude[kept] @ np.cos(angle)).reshape(position_m.shape)
+    significant = amplitude > 1e-6 * amplitude.max()
+    angle = np.outer(2 * np.pi * surface.number_per_m[significant], grid) + surface.phase_rad[significant, None]
+    value: Floats = np.interp(position_m.ravel(), grid, amplitude[significant] @ np.cos(angle)).reshape(
+        position_m.shape
+    )
     return value
 
 
-def spectrum(of: Material, aperture_m: float, parts: int = 400) -> tuple[Floats, Floats]:
+def spectrum(material: Material, aperture_m: float, parts: int = 400) -> tuple[Floats, Floats]:
     """Return wave numbers, per m, and the expected power at each, N^2, of a material measured through an aperture.
 
     The gratings come first, then ``parts`` pieces of the background; both arrays are (grating + part,). The powers add
     up to the variance of what is measured.
     """
     edges = _edges(parts)
-    number = np.concatenate([1 / of.wavelength_m, np.sqrt(edges[:-1] * edges[1:])])
-    power = np.concatenate([of.amplitude_n**2 / 2, _background(of, edges)])
+    number = np.concatenate([1 / material.wavelength_m, np.sqrt(edges[:-1] * edges[1:])])
+    power = np.concatenate([material.amplitude_n**2 / 2, _background(material, edges)])
     return number, power * passed(number, aperture_m) ** 2
 
 
@@ -122,11 +124,11 @@ def _edges(parts: int) -> Floats:
     return np.geomspace(1 / BACKGROUND_M[1], 1 / BACKGROUND_M[0], parts + 1)
 
 
-def _background(of: Material, edges: Floats) -> Floats:
+def _background(material: Material, edges: Floats) -> Floats:
     """Return the power of the background between each two wave numbers (part,), N^2."""
-    if abs(of.exponent - 1) < 1e-9:
+    if abs(material.exponent - 1) < 1e-9:
         area = np.diff(np.log(edges))
     else:
-        area = np.diff(edges ** (1 - of.exponent)) / (1 - of.exponent)
-    power: Floats = of.background_n**2 * area / area.sum()
+        area = np.diff(edges ** (1 - material.exponent)) / (1 - material.exponent)
+    power: Floats = material.background_n**2 * area / area.sum()
     return power

@@ -1,4 +1,4 @@
-"""What can be known of a touch from its geometry: the expected reading, and the error that no model falls below.
+"""Compute the expected reading of a touch from its geometry, and the smallest error that a model can have.
 
 The effort of the hand, the errors of the fingertips' poses, drift and noise of the sensors do not show in a cloud and a
 planned grasp. The mean over them, E[y | geometry], has the least root-mean-square error of all predictions from these.
@@ -18,8 +18,8 @@ DRAWS = 256
 
 
 def readings(
-    of: pinch.Situation,
-    made: fingertip_sp.Sensors,
+    situation: pinch.Situation,
+    hand: fingertip_sp.Sensors,
     rng: np.random.Generator,
     *,
     draws: int = DRAWS,
@@ -31,14 +31,14 @@ def readings(
 
     Channels are the electrodes, then the pressure; times of drift are drawn too.
     """
-    contact = pinch.touch(of, pinch.unseen(rng, draws, effort_spread))
-    shown = fingertip_sp.signal(made, contact.force_n, contact.contact_m, contact.skin_m, contact.centre_m)
-    phases = rng.uniform(0, 2 * np.pi, (draws, *made.phases_rad.shape))
-    off = fingertip_sp.drift(phases, drift_count_day) + noise_scale * made.noise * rng.normal(size=shown.shape)
-    return fingertip_sp.counted(shown + off)
+    contact = pinch.touch(situation, pinch.unseen(rng, draws, effort_spread))
+    counts = fingertip_sp.signal(hand, contact.force_n, contact.contact_m, contact.skin_m, contact.centre_m)
+    phases = rng.uniform(0, 2 * np.pi, (draws, *hand.phases_rad.shape))
+    off = fingertip_sp.drift(phases, drift_count_day) + noise_scale * hand.noise * rng.normal(size=counts.shape)
+    return fingertip_sp.counted(counts + off)
 
 
-def known(possible: Counts) -> tuple[Floats, Floats]:
+def mean_and_variance(possible: Counts) -> tuple[Floats, Floats]:
     """Return mean and variance of readings (draw, finger, channel), each (finger, channel), counts and counts squared."""
     return possible.mean(axis=0), possible.var(axis=0, ddof=1)
 

@@ -20,7 +20,7 @@ import numpy as np
 from tacpipe.arrays import Floats, Int64s, Times
 from tacpipe.errors import TacpipeError
 
-RATE_HZ = 1000  # of a Franka Emika Panda's states
+RATE_HZ = 1000  # rate of a Franka Emika Panda's states
 PROTOCOLS = ("controlled", "kinaesthetic")
 START_M = (0.58, 0.0, 0.18)  # x and z: the published profile generator
 JERK_S = 0.03  # over which the acceleration of a controlled profile changes
@@ -28,10 +28,14 @@ PHASE_S = (0.16, 0.6)  # T of the lift and the leg after it
 JOLT_S = (0.06, 0.6)  # T of further legs: the short ones make the object slip a little and hold again
 SPEED_M_S = 1.0  # largest V; a Panda's hand is rated for 1.7 m/s
 LEG_M = (0.30, 0.15, 0.40)  # longest leg along x, y, z; the published ones are 0.30 m long
-AFTER_LIFT_S = 1.5  # that a trial must leave for the lift and what follows
-BOX_M = ((-0.25, 0.25), (-0.15, 0.15), (0.10, 0.40))  # where a person carries the object, from the start
+AFTER_LIFT_S = 1.5  # time of a trial after the lift, at least
+BOX_M = (
+    (-0.25, 0.25),
+    (-0.15, 0.15),
+    (0.10, 0.40),
+)  # region in which a person carries the object, relative to the start
 PEAK_M_S2 = (1.0, 8.0)  # peak acceleration of a minimum-jerk segment; the larger one is the limit of a leg's too
-REACH = (0.05, 1.0)  # of the way to its random target that a segment goes: short ones are shakes
+REACH = (0.05, 1.0)  # fraction of the way to its random target per segment: short ones are shakes
 SHORTEST_S = 0.12  # segment
 JERK_PEAK = 10 / np.sqrt(3)  # peak acceleration of a minimum-jerk segment of one metre in one second
 OVERLAP = (0.75, 1.15)  # start of the next segment, in lengths of this one
@@ -41,7 +45,7 @@ TREMOR_M = (0.0002, 0.0008)  # amplitude along each axis: up to 0.5 m/s²
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Where the hand is at `RATE_HZ` from 0; arrays are (time,) or (time, axis), in the world."""
+    """The motion of the hand at `RATE_HZ` from 0. Arrays are (time,) or (time, axis), in world coordinates."""
 
     t_ns: Times
     position_m: Floats  # (time, axis)
@@ -82,7 +86,7 @@ def trajectory(protocol: str, duration_s: float, first_s: float, rng: np.random.
     return Trajectory(_stamps(rows), path + START_M, yaw)
 
 
-def still(duration_s: float) -> Trajectory:
+def rest(duration_s: float) -> Trajectory:
     """Return a hand that hovers, lifted, from the first row to the last."""
     rows = round(duration_s * RATE_HZ) + 1
     return Trajectory(_stamps(rows), np.tile(np.add(START_M, (0.0, 0.0, BOX_M[2][0])), (rows, 1)), np.zeros(rows))
@@ -135,7 +139,7 @@ def smooth(acceleration: Floats) -> Floats:
 def _trapezoids(rows: int, first: int, rng: np.random.Generator) -> Floats:
     """Return the commanded acceleration (time, axis): trapezoids of velocity, one after another from row ``first``."""
     acceleration = np.zeros((rows, 3))
-    reach = np.zeros(3)  # where the hand is from its start, m
+    reach = np.zeros(3)  # position of the hand relative to its start, m
     row, leg = first, 0
     while row < rows:
         phase_s = rng.uniform(*PHASE_S) if leg < 2 else np.exp(rng.uniform(*np.log(JOLT_S)))

@@ -19,7 +19,7 @@ from tacpipe.plugins.registry import load
 from tacpipe.plugins.stage import RecordingOutput
 from tacpipe.simulation import depth_camera, household
 from tacpipe.simulation.grasp import session, simulate_trial, stamp_ns
-from tacpipe.simulation.grasp_scene import Rig, Scene, perform, thing
+from tacpipe.simulation.grasp_scene import Rig, Scene, draw_thing, perform
 from tests.simulation.grasp_datasets import SEED
 
 RIG = Rig()
@@ -68,13 +68,13 @@ def test_no_point_is_hidden_by_the_body_itself(index: int) -> None:
 
 def inside(seen: Scene, own_m: np.ndarray) -> np.ndarray:
     """Whether points in the body's own frame are well within it (point,)."""
-    shape: Any = seen.of.shape
+    shape: Any = seen.thing.shape
     x, y, z = own_m.T
-    if seen.of.family == "box":
+    if seen.thing.family == "box":
         return np.asarray((np.abs(own_m) < shape.half_m - 1e-5).all(axis=1))
-    if seen.of.family in ("sphere", "ellipsoid"):
+    if seen.thing.family in ("sphere", "ellipsoid"):
         return np.asarray(((own_m / shape.semi_m) ** 2).sum(axis=1) < 1 - 1e-3)
-    if seen.of.family in ("cylinder", "cone"):
+    if seen.thing.family in ("cylinder", "cone"):
         radius = np.interp(z, [-shape.half_m, shape.half_m], [shape.bottom_m, shape.top_m])
         return np.asarray((np.hypot(x, y) < radius - 1e-5) & (np.abs(z) < shape.half_m - 1e-5))
     return np.asarray(shape.distance_m(own_m) < -1e-5)
@@ -84,7 +84,7 @@ def test_an_independent_ray_caster_sees_the_same_cylinder() -> None:
     o3d = pytest.importorskip("open3d")
     rig = Rig(families="cylinder", noise_scale=0.0)
     seen = scene(1, rig)
-    shape: Any = seen.of.shape
+    shape: Any = seen.thing.shape
     mesh = o3d.geometry.TriangleMesh.create_cylinder(shape.bottom_m, 2 * shape.half_m, resolution=720)
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = seen.placed.rotation, seen.placed.origin_m
@@ -175,11 +175,11 @@ def test_a_trial_follows_from_seed_and_number_whatever_the_number_of_trials() ->
 
 
 def test_objects_take_turns_and_stay_what_they_are_when_others_are_left_out() -> None:
-    names = Counter(thing(SEED, index, RIG).name for index in range(60))
+    names = Counter(draw_thing(SEED, index, RIG).name for index in range(60))
     assert set(names.values()) == {2}
     assert len(names) == 30
-    alone = thing(SEED, 0, Rig(families="cone"))
-    among = thing(SEED, household.FAMILIES.index("cone"), RIG)
+    alone = draw_thing(SEED, 0, Rig(families="cone"))
+    among = draw_thing(SEED, household.FAMILIES.index("cone"), RIG)
     assert (alone.name, alone.shape) == (among.name, among.shape) == ("cone-01", among.shape)
 
 
@@ -242,7 +242,7 @@ def test_with_one_pose_each_object_lies_with_the_same_side_up() -> None:
 def test_colours_tell_nothing_of_the_object(key: str) -> None:
     seen = [scene(index) for index in range(90)]
     means = np.array([one.cloud.colours.mean(axis=0) for one in seen if one.cloud.colours is not None])
-    groups = np.array([getattr(one.of, key) for one in seen])
+    groups = np.array([getattr(one.thing, key) for one in seen])
     within = np.concatenate([means[groups == one] - means[groups == one].mean(axis=0) for one in set(groups)])
     unexplained = (within**2).sum() / (len(means) - len(set(groups)))  # variance within groups, and below of all
     assert unexplained / (means.var(axis=0, ddof=1).sum()) == pytest.approx(1, abs=0.25)

@@ -7,12 +7,12 @@ from tacpipe.simulation import depth_camera, tabletop
 from tests.simulation import solids
 
 
-def test_what_lies_beside_an_object_may_first_be_tried_where_the_camera_does_not_look(
+def test_what_lies_place_neighbour_an_object_may_first_be_tried_where_the_camera_does_not_look(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     up = np.array([0.0, 0.0, -1.0])
     rest = solids.BOX.rests()[0]
-    placed = depth_camera.put(solids.BOX, rest, 0.0, (0.0, 0.0), up, 0.8)
+    placed = depth_camera.place_shape(solids.BOX, rest, 0.0, (0.0, 0.0), up, 0.8)
     real, tried = depth_camera.window, []
 
     def window(found: depth_camera.Placed) -> tuple[range, range]:
@@ -20,7 +20,7 @@ def test_what_lies_beside_an_object_may_first_be_tried_where_the_camera_does_not
         return (range(0), range(0)) if len(tried) == 1 else real(found)
 
     monkeypatch.setattr(depth_camera, "window", window)
-    beside = tabletop._beside(placed, solids.BOX, up, 0.8, np.random.default_rng(0))
+    beside = tabletop._place_neighbour(placed, solids.BOX, up, 0.8, np.random.default_rng(0))
 
     assert len(tried) > 1 and beside is tried[-1]
     apart_m = np.linalg.norm(beside.origin_m - placed.origin_m)

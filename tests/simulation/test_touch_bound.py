@@ -22,7 +22,7 @@ def test_without_drift_and_noise_the_error_of_the_pressure_is_that_of_a_lognorma
     possible = touch_bound.readings(
         of, sensors(SEED), rng, draws=40_000, effort_spread=0.2, noise_scale=0.0, drift_count_day=0.0
     )
-    mean, variance = touch_bound.known(possible)
+    mean, variance = touch_bound.mean_and_variance(possible)
     limit = 140 * pinch.limits_n(of.opening_m)
     expected = np.array([1676, 2779]) + limit * np.exp(0.02)
     np.testing.assert_allclose(mean[:, -1], expected, atol=1.5)
@@ -37,7 +37,7 @@ def test_drift_and_noise_add_their_own_variances() -> None:
     )
     periods = np.array([2.0, 3.0, 5.0])
     expected = (30**2 / 3 * (periods / (2 * np.pi)) ** 2).sum() + 1 / 12  # of three waves, and of rounding
-    np.testing.assert_allclose(touch_bound.known(possible)[1][:, -1], expected, rtol=0.03)
+    np.testing.assert_allclose(touch_bound.mean_and_variance(possible)[1][:, -1], expected, rtol=0.03)
 
 
 @pytest.mark.parametrize("index", [0, 1, 5])
@@ -50,9 +50,9 @@ def test_mean_and_variance_are_those_of_the_same_grasp_made_again_and_again_by_t
         hidden = pinch.unseen(rng, 1, RIG.effort_spread)
         t_ns = stamp_ns(int(rng.integers(200_000)), RIG)
         again = read_sensors(made, replace(scene, hidden=hidden), t_ns, RIG)
-        made_again.append(fingertip_sp.counted(again.shown + made.noise * rng.normal(size=(2, 25))))
-    mean, variance = touch_bound.known(np.array(made_again))
-    found, spread = touch_bound.known(touch_bound.readings(scene.situation, made, rng, draws=3_000))
+        made_again.append(fingertip_sp.counted(again.signal + made.noise * rng.normal(size=(2, 25))))
+    mean, variance = touch_bound.mean_and_variance(np.array(made_again))
+    found, spread = touch_bound.mean_and_variance(touch_bound.readings(scene.situation, made, rng, draws=3_000))
     np.testing.assert_allclose(found, mean, atol=5 * np.sqrt(2 / 3_000) * np.sqrt(variance.max()))
     np.testing.assert_allclose(np.sqrt(spread), np.sqrt(variance), rtol=0.15)
 

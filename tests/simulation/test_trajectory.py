@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tacpipe.errors import TacpipeError
-from tacpipe.simulation.trajectory import JERK_S, RATE_HZ, Trajectory, minimum_jerk, smooth, still, trajectory
+from tacpipe.simulation.trajectory import JERK_S, RATE_HZ, Trajectory, minimum_jerk, rest, smooth, trajectory
 
 
 def path(protocol: str, seed: int, duration_s: float = 20.0) -> Trajectory:
@@ -60,7 +60,7 @@ def test_a_minimum_jerk_movement_starts_and_ends_at_rest_and_peaks_where_theory_
 
 
 def test_a_hand_that_is_still_is_still_and_aloft() -> None:
-    one = still(2.0)
+    one = rest(2.0)
     assert len(one.t_ns) == 2001
     assert not one.acceleration_m_s2.any()
 

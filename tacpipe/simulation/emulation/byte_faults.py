@@ -1,4 +1,4 @@
-"""What harms a stream on its way: bytes that are changed, added or lost, frames that are, moments in which nothing comes.
+"""Harm a stream on its way: change, add or lose bytes and frames, and pause or unplug the device.
 
 `Harm` takes the frames of a stream, with the times at which they are due, and gives what goes out instead. It knows
 nothing of links: whatever it does to a stream is the same for the same seed, however the stream is sent.
@@ -25,12 +25,12 @@ SOUND, NOISE, CUT, FLIP, BURST, DROP, DUPLICATE, REORDER, UNPLUG, REPLUG, OVERRU
 CAUSES = (SOUND, NOISE, CUT, FLIP, BURST, DROP, DUPLICATE, REORDER, UNPLUG, REPLUG, OVERRUN, BAUD, STALL, GONE)
 CHANGED = (CUT, FLIP, BURST)  # faults whose frame goes out with other bytes
 LONGEST_NOISE, LONGEST_BURST = 40, 60  # bytes
-SEPARATION_NS = 1_000  # from a frame to what is put before or behind it
+SEPARATION_NS = 1_000  # time between a frame and an item that is inserted before or after it
 
 
 @dataclass(frozen=True)
 class Faults:
-    """What goes wrong, and how often. Rates are times a second, probabilities are a frame's."""
+    """The faults and their frequencies. Rates are per second, probabilities are per frame."""
 
     noise: float = 0.0  # a second: some bytes between two frames, or a packet of nonsense
     cut: float = 0.0  # a second: a frame of which the beginning or the end is missing
@@ -40,11 +40,11 @@ class Faults:
     duplicate: float = 0.0  # probability: the packet goes out twice; nothing on links of bytes
     reorder: float = 0.0  # probability: the packet goes out behind the next; nothing on links of bytes
     stall: float = 0.0  # a second: nothing comes for a while, and then all of it
-    stall_s: float = 0.2  # for which it stalls
+    stall_s: float = 0.2  # duration of a stall
     unplug: float = 0.0  # a second: the device goes away
-    unplug_s: float = 1.0  # after which it comes back
+    unplug_s: float = 1.0  # duration of a disconnection
     clock_step: float = 0.0  # a second: the device's clock is set
-    clock_step_ms: float = 50.0  # by so much, forward or back
+    clock_step_ms: float = 50.0  # size of a step, forward or back
     wrap_s: float | None = None  # counters go round so long after the start
 
     def __post_init__(self) -> None:
@@ -69,16 +69,16 @@ def parse(text: str) -> Faults:
             values[name.strip()] = float(value)
         except ValueError:
             raise UsageError(f"--faults: {part!r} is not a fault; each reads like noise=0.5, with a number.") from None
-    found: Faults = params.filled(Faults, values, "--faults", "fault")
-    return found
+    faults: Faults = params.filled(Faults, values, "--faults", "fault")
+    return faults
 
 
 class Item(NamedTuple):
-    """What goes out at a moment: a frame or what became of it, noise, or that the device is unplugged or back."""
+    """An item that is sent at a moment: a frame, harmed or not, noise, or the device that is unplugged or comes back."""
 
     due_ns: int
     data: bytes  # empty: nothing goes out
-    number: int  # of the sample, -1: of none
+    number: int  # number of the sample, -1 for none
     cause: str = SOUND
     invisible: bool = False  # harmed, and still takes the protocol's own test for a frame
 
@@ -93,12 +93,12 @@ class Harm:
         rngs = [np.random.default_rng([*seed, 4, number]) for number in range(len(rates))]
         happenings = [Happening(rate, rng) for rate, rng in zip(rates, rngs, strict=True)]
         self._noise, self._cut, self._flip, self._burst, self._stall, self._unplug = happenings
-        self._stalls: list[tuple[int, int]] = []  # from, until; the last few
+        self._stalls: list[tuple[int, int]] = []  # start and end of the last stalls
         self._away: list[tuple[int, int]] = []
-        self._later: list[Item] = []  # what was put off beyond the frames at hand
+        self._later: list[Item] = []  # items delayed beyond the present frames
         self._quiet = faults == Faults(wrap_s=faults.wrap_s)
 
-    def done(self, frames: Sequence[bytes], due_ns: Sequence[int], first: int) -> list[Item]:
+    def apply(self, frames: Sequence[bytes], due_ns: Sequence[int], first: int) -> list[Item]:
         """Return what goes out instead of ``frames``, in order; ``first`` is the number of the first one's sample."""
         items = [Item(due, data, first + row) for row, (data, due) in enumerate(zip(frames, due_ns, strict=True))]
         if self._quiet or not items:
@@ -123,8 +123,8 @@ class Harm:
             items[row] = items[row]._replace(data=bytes(changed), cause=FLIP)
         for at_ns in self._cut.until(until_ns):
             row = _row(items, at_ns)
-            kept = int(self._rng.integers(1, max(2, len(items[row].data))))
-            data = items[row].data[:kept] if self._rng.random() < 0.5 else items[row].data[-kept:]
+            length = int(self._rng.integers(1, max(2, len(items[row].data))))
+            data = items[row].data[:length] if self._rng.random() < 0.5 else items[row].data[-length:]
             items[row] = items[row]._replace(data=data, cause=CUT)
         for at_ns in self._burst.until(until_ns):
             row = _row(items, at_ns)
@@ -135,11 +135,11 @@ class Harm:
         """Replace ``count`` bytes from ``start`` of a frame by random ones, into the frames behind it where they reach."""
         while count > 0 and row < len(items):
             data = items[row].data
-            there = min(count, len(data) - start)
-            if there > 0:
-                random = self._rng.integers(0, 256, there, dtype=np.uint8).tobytes()
-                items[row] = items[row]._replace(data=data[:start] + random + data[start + there :], cause=BURST)
-            row, start, count = row + 1, 0, 0 if self.packets else count - there
+            size = min(count, len(data) - start)
+            if size > 0:
+                random = self._rng.integers(0, 256, size, dtype=np.uint8).tobytes()
+                items[row] = items[row]._replace(data=data[:start] + random + data[start + size :], cause=BURST)
+            row, start, count = row + 1, 0, 0 if self.packets else count - size
 
     def _mark_undetectable(self, items: list[Item], frames: Sequence[bytes]) -> None:
         for row, item in enumerate(items):
@@ -151,8 +151,8 @@ class Harm:
             return items
         lost = self._rng.random(len(items)) < self.faults.drop
         return [
-            item._replace(data=b"", cause=DROP, invisible=False) if gone else item
-            for item, gone in zip(items, lost, strict=True)
+            item._replace(data=b"", cause=DROP, invisible=False) if is_lost else item
+            for item, is_lost in zip(items, lost, strict=True)
         ]
 
     def _move(self, items: list[Item]) -> list[Item]:
@@ -164,11 +164,11 @@ class Harm:
             moved[row + 1] = before._replace(due_ns=after.due_ns, cause=before.cause or REORDER)
         if not faults.duplicate:
             return moved
-        twice = self._rng.random(len(moved)) < faults.duplicate
+        duplicated = self._rng.random(len(moved)) < faults.duplicate
         doubled: list[Item] = []
-        for item, again in zip(moved, twice, strict=True):
+        for item, is_duplicate in zip(moved, duplicated, strict=True):
             doubled.append(item)
-            if again and item.data:
+            if is_duplicate and item.data:
                 doubled.append(item._replace(due_ns=item.due_ns + SEPARATION_NS, cause=DUPLICATE))
         return doubled
 
@@ -191,26 +191,26 @@ class Harm:
                 signs += [Item(at_ns, b"", -1, UNPLUG), Item(back_ns, b"", -1, REPLUG)]
         if not self._away:
             return items
-        kept = [
+        remaining = [
             item._replace(data=b"", cause=UNPLUG, invisible=False)
             if any(start <= item.due_ns < stop for start, stop in self._away)
             else item
             for item in items
         ]
-        return sorted([*kept, *signs], key=lambda item: item.due_ns)
+        return sorted([*remaining, *signs], key=lambda item: item.due_ns)
 
     def _hold_up(self, items: list[Item], until_ns: int) -> list[Item]:
         stall_ns = round(self.faults.stall_s * 1e9)
         self._stalls = self._stalls[-2:] + [(at_ns, at_ns + stall_ns) for at_ns in self._stall.until(until_ns)]
         if not self._stalls:
             return items
-        held = []
+        delayed = []
         for item in items:
             for start, stop in self._stalls:
                 if start <= item.due_ns < stop and item.cause not in (UNPLUG, REPLUG):
                     item = item._replace(due_ns=stop, cause=item.cause or STALL)
-            held.append(item)
-        return held
+            delayed.append(item)
+        return delayed
 
 
 def _row(items: Sequence[Item], at_ns: int) -> int:

@@ -23,8 +23,8 @@ EXTENDED = 1 << 31
 
 def split(piece: bytes) -> list[tuple[int, bytes]]:
     """Return identifier and data of the CAN frames that a sensor's frame is made of; what is cut off at its end is none."""
-    whole = len(piece) - len(piece) % FRAME.size
-    return [(identifier, data[: min(count, 8)]) for identifier, count, data in FRAME.iter_unpack(piece[:whole])]
+    complete = len(piece) - len(piece) % FRAME.size
+    return [(identifier, data[: min(count, 8)]) for identifier, count, data in FRAME.iter_unpack(piece[:complete])]
 
 
 def joined(identifier: int, data: bytes) -> bytes:
@@ -39,7 +39,7 @@ class Member:
 
     def __init__(self, bus: Any, sensor: Sensor) -> None:
         self.bus, self.device = bus, sensor.device()
-        self.wanted = 0
+        self.pending_frames = 0
 
     def send(self, pieces: Sequence[bytes]) -> list[int]:
         """Put the CAN frames of each piece on the bus."""
@@ -114,7 +114,7 @@ class Slcan(Pty):
     def understood(self, data: bytes) -> list[bytes]:
         """Return the CAN frames that the host has the adapter send."""
         *lines, self._pending = (self._pending + data).split(b"\r")
-        return [frame for one in lines if (frame := frame_of(one))]
+        return [frame for line in lines if (frame := frame_of(line))]
 
 
 def line(identifier: int, data: bytes) -> bytes:

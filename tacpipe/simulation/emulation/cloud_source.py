@@ -13,7 +13,7 @@ from tacpipe.simulation import grasp_scene, tabletop
 from tacpipe.simulation.emulation.source import BLOCK_S, Timing
 from tacpipe.simulation.grasp_scene import Rig
 
-EVERY = 16  # of the camera's 300,000 points is kept
+EVERY = 16  # one of so many of the camera's 300,000 points is kept
 
 
 class CloudSource:
@@ -24,7 +24,7 @@ class CloudSource:
         self.rows = max(1, round(timing.rate_hz * BLOCK_S))  # clouds a block
         self._seed = seed[0]
         self._coloured = len(sensor.fields()) > 3
-        self._samples = functools.lru_cache(2)(self._made)
+        self._samples = functools.lru_cache(2)(self._generate)
 
     def block(self, number: int) -> Samples:
         """Return the points of the clouds of block ``number``; ``rows`` reports on which each is."""
@@ -34,16 +34,16 @@ class CloudSource:
         """Return the numbers of a block's clouds, counted from 0 through the stream (cloud,)."""
         return block * self.rows + np.arange(self.rows, dtype=np.int64)
 
-    def _made(self, block: int) -> Samples:
-        points, colours = zip(*(self._seen(int(number)) for number in self.numbers(block)), strict=True)
-        rows = np.repeat(np.arange(self.rows, dtype=np.int64), [len(one) for one in points])
+    def _generate(self, block: int) -> Samples:
+        points, colours = zip(*(self._view(int(number)) for number in self.numbers(block)), strict=True)
+        rows = np.repeat(np.arange(self.rows, dtype=np.int64), [len(cloud) for cloud in points])
         values = (np.concatenate(points), np.concatenate(colours)) if self._coloured else (np.concatenate(points),)
         return Samples(values, rows=rows)
 
-    def _seen(self, number: int) -> tuple[Float32s, Bytes]:
+    def _view(self, number: int) -> tuple[Float32s, Bytes]:
         scene = grasp_scene.perform(self._seed, number)
-        other = grasp_scene.thing(self._seed, number + 1)
+        neighbour = grasp_scene.draw_thing(self._seed, number + 1)
         rng = np.random.default_rng([self._seed, 9, number])
-        cloud = tabletop.view(scene.placed, other.shape, scene.up, scene.camera_m, Rig().noise_scale, rng).cloud
+        cloud = tabletop.view(scene.placed, neighbour.shape, scene.up, scene.camera_m, Rig().noise_scale, rng).cloud
         assert cloud.colours is not None
         return cloud.points_m[::EVERY].astype(np.float32), cloud.colours[::EVERY]

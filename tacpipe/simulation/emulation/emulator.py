@@ -35,10 +35,10 @@ from tacpipe.simulation.emulation.source import Sampled, Source, Timing
 from tacpipe.simulation.emulation.transmission import Plan, Transmission
 from tacpipe.simulation.emulation.world import World
 
-LOOK_NS = 20_000_000  # between looks at what no descriptor states
-FILL_S = 0.1  # between looks whether more must be planned
-LONGEST_S = 0.02  # that a wait lasts at most
-UNPACED_HZ = 2.0  # of sensors that state no rate: clouds that come when they come
+LOOK_NS = 20_000_000  # period of checks for events without a descriptor
+FILL_S = 0.1  # period of checks whether to plan more frames
+LONGEST_S = 0.02  # longest wait
+UNPACED_HZ = 2.0  # rate of sensors that state none, such as clouds
 
 
 class Emulator:
@@ -59,10 +59,10 @@ class Emulator:
         patient: bool = False,
     ) -> None:
         self.patient = patient
-        self.asked, self.seed, self.faults = rig, seed, faults or Faults()
+        self.rig_file, self.seed, self.faults = rig, seed, faults or Faults()
         self.folder = folder or Path()
         self._temporary = folder is None
-        self._held = contextlib.ExitStack()
+        self._resources = contextlib.ExitStack()
         self.world = world or World(seed)
         self.ledger = {name: Ledger(name) for name in rig.streams}
         self._transmissions: dict[str, Transmission] = {}
@@ -75,23 +75,23 @@ class Emulator:
         """The rig as hosts find it; its recordings are marked as simulated."""
         streams = {
             name: replace(stream, address=self._transmissions[name].endpoint.address)
-            for name, stream in self.asked.streams.items()
+            for name, stream in self.rig_file.streams.items()
         }
-        return replace(self.asked, streams=streams, labels={**self.asked.labels, "simulated": True})
+        return replace(self.rig_file, streams=streams, labels={**self.rig_file.labels, "simulated": True})
 
     def __enter__(self) -> Self:
-        paces = {name: pace(self.asked, name) for name in self.asked.streams}
-        with contextlib.ExitStack() as held:
+        paces = {name: pace(self.rig_file, name) for name in self.rig_file.streams}
+        with contextlib.ExitStack() as resources:
             if self._temporary:
-                self.folder = Path(held.enter_context(tempfile.TemporaryDirectory(prefix="tacpipe-")))
+                self.folder = Path(resources.enter_context(tempfile.TemporaryDirectory(prefix="tacpipe-")))
             self.folder.mkdir(parents=True, exist_ok=True)
             endpoints: dict[str, Endpoint] = {}
-            for name, stream in self.asked.streams.items():
+            for name, stream in self.rig_file.streams.items():
                 endpoints[name] = serving.endpoint(stream, self.folder)
-                held.callback(endpoints[name].close)
-            self._held = held.pop_all()
+                resources.callback(endpoints[name].close)
+            self._resources = resources.pop_all()
         self.epoch_ns = time.monotonic_ns()
-        for name, stream in self.asked.streams.items():
+        for name, stream in self.rig_file.streams.items():
             self._transmissions[name] = self._transmission(stream, paces[name], endpoints[name])
         self._threads = [
             threading.Thread(target=self._until_stopped, args=(work,), daemon=True) for work in (self._pace, self._fill)
@@ -106,14 +106,14 @@ class Emulator:
         self._stopped.set()
         for thread in self._threads:
             thread.join()
-        self._held.close()
+        self._resources.close()
         if self._errors and error is None:
             raise self._errors[0]
 
     def _until_stopped(self, work: Callable[[], None]) -> None:
         try:
             work()
-        except BaseException as error:  # of a thread; the ``with`` statement raises it
+        except BaseException as error:  # an error of the thread, which the ``with`` statement raises
             self._errors.append(error)
             self._stopped.set()
 
@@ -139,7 +139,7 @@ class Emulator:
 
     def source(self, name: str, its_pace: Pace, rate_hz: float, start_ns: int = 0) -> Sampled:
         """Return the source of a stream."""
-        seed, sensor = self._seed(name), self.asked.streams[name].sensor
+        seed, sensor = self._seed(name), self.rig_file.streams[name].sensor
         steps = (
             ClockSteps(self.faults.clock_step, self.faults.clock_step_ms, seed) if self.faults.clock_step else no_steps
         )
@@ -165,27 +165,31 @@ class Emulator:
 
     def _pace(self) -> None:
         transmissions = list(self._transmissions.values())
-        owners: dict[int, Transmission] = {}  # of descriptors
+        owners: dict[int, Transmission] = {}  # transmissions by descriptor
         look_ns, changed = 0, True
         while not self._stopped.is_set():
             if changed:
-                owners = {number: one for one in transmissions for number in one.endpoint.descriptors()}
+                owners = {
+                    number: transmission
+                    for transmission in transmissions
+                    for number in transmission.endpoint.descriptors()
+                }
             now_ns = time.monotonic_ns()
-            next_ns = min([one.next_ns for one in transmissions])
+            next_ns = min([transmission.next_ns for transmission in transmissions])
             wait_s = min(LONGEST_S, max(0.0, (next_ns - now_ns) / 1e9))
             ready, _, _ = select.select(owners, [], [], wait_s)
             now_ns = time.monotonic_ns()
             for number in ready:
                 self._hear(owners[number], owners[number].endpoint.ready(number), now_ns)
             changed = bool(ready)
-            for one in transmissions:
-                if one.next_ns <= now_ns:
-                    changed |= one.run(now_ns)
+            for transmission in transmissions:
+                if transmission.next_ns <= now_ns:
+                    changed |= transmission.run(now_ns)
             if now_ns >= look_ns:
                 look_ns, changed = now_ns + LOOK_NS, True
                 self._obey(now_ns)
-                for one in transmissions:
-                    self._hear(one, one.endpoint.look(), now_ns)
+                for transmission in transmissions:
+                    self._hear(transmission, transmission.endpoint.look(), now_ns)
 
     def _hear(self, transmission: Transmission, heard: Iterable[tuple[Peer, bytes]], now_ns: int) -> None:
         for peer, data in heard:
@@ -198,15 +202,15 @@ class Emulator:
 
 
 def stream_of_clouds(sensor: Sensor) -> bool:
-    """Whether a sensor's samples are points of clouds."""
+    """Return whether a sensor's samples are points of clouds."""
     return [field.name for field in sensor.fields()][:3] == ["x_m", "y_m", "z_m"]
 
 
 def pace(rig: Rig, name: str) -> Pace:
     """Return the pace of a stream: what the rig file states under ``emulate``, of the stream over that of the rig."""
-    where = f"stream {name}, emulate"
-    found: Pace = params.filled(Pace, {**rig.emulate, **rig.streams[name].emulate}, where, "key")
-    return found
+    source = f"stream {name}, emulate"
+    stream_pace: Pace = params.filled(Pace, {**rig.emulate, **rig.streams[name].emulate}, source, "key")
+    return stream_pace
 
 
 def clock(its_pace: Pace, seed: list[int]) -> clocks.Clock:

@@ -13,20 +13,20 @@ class Peer(Protocol):
     """A host at the other end, and the device as it is to this host."""
 
     device: Device
-    wanted: int  # frames that the host asked for and did not get yet
+    pending_frames: int  # frames that the host asked for and did not get yet
 
     def send(self, pieces: Sequence[bytes]) -> list[int]:
         """Send frames or replies; return how many bytes of each went out."""
 
     @property
     def fault(self) -> str:
-        """What harms what is sent to this host, of `byte_faults.CAUSES`; empty: nothing."""
+        """The cause, of `byte_faults.CAUSES`, that harms bytes to this host; empty for none."""
 
 
 class Endpoint(Protocol):
     """One stream's end of its link. All is called by the one thread that paces."""
 
-    address: Address  # for the host's rig file
+    address: Address  # address for the host's rig file
 
     @property
     def peers(self) -> Sequence[Peer]:
@@ -51,15 +51,15 @@ class Endpoint(Protocol):
         """End."""
 
 
-def stretched(sizes: Sequence[int], taken: int) -> list[int]:
-    """Return how many bytes of pieces of these sizes are among the first ``taken`` of all.
+def stretched(sizes: Sequence[int], sent: int) -> list[int]:
+    """Return how many bytes of pieces of these sizes are among the first ``sent`` of all.
 
     >>> stretched([4, 4, 4], 6)
     [4, 2, 0]
     """
     parts = []
     for size in sizes:
-        part = min(size, taken)
+        part = min(size, sent)
         parts.append(part)
-        taken -= part
+        sent -= part
     return parts

@@ -18,14 +18,14 @@ class Writer:
     def __init__(self, folder: Path, sensor: Sensor) -> None:
         self.folder, self.device = folder, sensor.device()
         self.suffix = str(getattr(sensor, "suffix", "")) or ".bin"
-        self.wanted = 0
-        self._written = 0
+        self.pending_frames = 0
+        self._count = 0
 
     def send(self, pieces: Sequence[bytes]) -> list[int]:
         """Write a file each; it has another name until it is whole."""
         for piece in pieces:
-            self._written += 1
-            path = self.folder / f"frame{self._written:06d}{self.suffix}"
+            self._count += 1
+            path = self.folder / f"frame{self._count:06d}{self.suffix}"
             draft = path.with_suffix(".part")
             draft.write_bytes(piece)
             draft.rename(path)

@@ -24,7 +24,7 @@ SIX_AXES = (  # six 16-bit axes in report 1, three in report 2, 32 buttons in re
     "0501 0908 a101 a100 8501 16a2fe 265e01 7510 9506 0930 0931 0932 0933 0934 0935 8102 c0 "
     "a100 8502 16a2fe 265e01 7510 9503 0933 0934 0935 8102 c0 a102 8503 0509 1901 2920 1500 2501 7501 9520 8102 c0 c0"
 )
-DESCRIPTORS = {"256f:c635": SIX_AXES}  # of devices that are not a raw HID
+DESCRIPTORS = {"256f:c635": SIX_AXES}  # report descriptors of devices that are not raw HID
 _servers: dict[Path, Server] = {}
 
 
@@ -58,13 +58,13 @@ class Server:
     def line(self) -> bytes:
         """Return the next line that the server states, waiting for it."""
         assert self.process.stdout is not None
-        found = b""
-        while not found.endswith(b"\n"):
+        line = b""
+        while not line.endswith(b"\n"):
             piece = os.read(self.process.stdout.fileno(), 1)
             if not piece:
                 return b""
-            found += piece
-        return found.strip()
+            line += piece
+        return line.strip()
 
     def send(self, command: str) -> None:
         """Give the server a command."""
@@ -79,7 +79,7 @@ class Server:
         *lines, self._pending = (self._pending + data).split(b"\n")
         for line in lines:
             number, _, report = line.decode().partition(" ")
-            self.devices[int(number)].written.append(bytes.fromhex(report))
+            self.devices[int(number)].reports.append(bytes.fromhex(report))
 
     def close(self) -> None:
         """End the server."""
@@ -97,7 +97,7 @@ class Host:
 
     def __init__(self, endpoint: Hid) -> None:
         self.endpoint, self.device = endpoint, endpoint.sensor.device()
-        self.wanted = 0
+        self.pending_frames = 0
 
     def send(self, pieces: Sequence[bytes]) -> list[int]:
         """Send each piece as a report."""
@@ -116,10 +116,10 @@ class Hid:
         self.server = _servers[folder]
         self.number = len(self.server.devices)
         self.server.devices.append(self)
-        self.written: list[bytes] = []
-        named = address.place.partition("?")[0] if ":" in address.place else (*sensor.usb_ids, "16c0:0486")[0]
-        vendor, _, product = named.lower().partition(":")
-        descriptor = bytes.fromhex(DESCRIPTORS.get(named.lower(), RAW)).hex()
+        self.reports: list[bytes] = []
+        usb_id = address.place.partition("?")[0] if ":" in address.place else (*sensor.usb_ids, "16c0:0486")[0]
+        vendor, _, product = usb_id.lower().partition(":")
+        descriptor = bytes.fromhex(DESCRIPTORS.get(usb_id.lower(), RAW)).hex()
         self.server.send(f"add {self.number} {vendor} {product} {descriptor} {type(sensor).__name__}")
         self.server.line()
         self._away = False
@@ -137,8 +137,8 @@ class Hid:
 
     def look(self) -> list[tuple[Host, bytes]]:
         """Return what hosts wrote to this one: reports, behind a number that is 0 where there is none."""
-        written, self.written = self.written, []
-        return [(self.peers[0], report.removeprefix(b"\0")) for report in written if not self._away]
+        reports, self.reports = self.reports, []
+        return [(self.peers[0], report.removeprefix(b"\0")) for report in reports if not self._away]
 
     def unplug(self) -> None:
         """Fall silent."""

@@ -16,7 +16,7 @@ from typing import Any
 
 GET_SIZE, GET_DESCRIPTOR = 0x80044801, 0x90044802  # HIDIOCGRDESCSIZE and HIDIOCGRDESC of <linux/hidraw.h>
 MOST = 4096  # bytes of a descriptor or a report
-LOOK_S = 0.02  # between looks at a device that no host has open
+LOOK_S = 0.02  # period of checks of a device that no host has open
 
 
 def described(number: int, vendor: str, product: str, descriptor: str, name: str) -> str:
@@ -68,15 +68,15 @@ def hear(number: int, board: int) -> None:
             print(number, data.hex(), flush=True)
 
 
-def put(board: int, rest: bytes, report: bytes) -> bytes:
-    """Send a report behind the rest of the one before, or drop it as the kernel does; return what is left to be sent."""
-    data = rest or report
+def append_report(board: int, buffered: bytes, report: bytes) -> bytes:
+    """Send a report behind the buffered of the one before, or drop it as the kernel does; return what is left to be sent."""
+    data = buffered or report
     try:
         data = data[os.write(board, data) :]
-        if not data and rest:
+        if not data and buffered:
             data = report[os.write(board, report) :]
     except BlockingIOError:
-        return rest
+        return buffered
     return data
 
 
@@ -86,8 +86,8 @@ def serve(mock: Any, testbed: Any, loop: Any) -> None:
     rests: dict[str, bytes] = {}
     handlers = []
     for line in sys.stdin:
-        what, number, *words = line.strip().split(maxsplit=5)
-        if what == "add":
+        command, number, *words = line.strip().split(maxsplit=5)
+        if command == "add":
             testbed.add_from_string(described(int(number), *words))
             handlers.append(mock.IoctlBase.new())
             handlers[-1].connect("handle-ioctl", answering(bytes.fromhex(words[2])))
@@ -97,7 +97,7 @@ def serve(mock: Any, testbed: Any, loop: Any) -> None:
             threading.Thread(target=hear, args=(int(number), boards[number]), daemon=True).start()
             print(number, flush=True)
         elif number in boards:
-            rests[number] = put(boards[number], rests.get(number, b""), bytes.fromhex(words[0]))
+            rests[number] = append_report(boards[number], rests.get(number, b""), bytes.fromhex(words[0]))
     loop.quit()
 
 

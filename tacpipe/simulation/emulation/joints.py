@@ -13,12 +13,12 @@ import numpy as np
 from tacpipe.arrays import AnyFloats, Floats, Times
 from tacpipe.signals import kinematics
 
-READY_RAD = (0.0, -np.pi / 4, 0.0, -3 * np.pi / 4, 0.0, np.pi / 2, np.pi / 4)  # of the robot's own examples
+READY_RAD = (0.0, -np.pi / 4, 0.0, -3 * np.pi / 4, 0.0, np.pi / 2, np.pi / 4)  # start pose of the robot's own examples
 LOWEST_RAD = (-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973)  # Franka Emika, Panda documentation
 HIGHEST_RAD = (2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973)
-HAND_M = 0.107 + 0.1034  # from the last joint's frame to between the fingertips, along its axis
-HAND_RAD = -np.pi / 4  # by which the hand is turned against the flange
-WAYPOINT_ROWS = 10  # of 1 ms: angles between are interpolated, which moves the hand by less than 0.1 mm
+HAND_M = 0.107 + 0.1034  # distance of the fingertips from the last joint's frame, along its axis
+HAND_RAD = -np.pi / 4  # angle between the hand and the flange
+WAYPOINT_ROWS = 10  # rows of 1 ms between solved angles; interpolation moves the hand by less than 0.1 mm
 ROUNDS, DAMPING = 40, 1e-3
 
 
@@ -47,12 +47,12 @@ def course(t_ns: Times, position_m: Floats, yaw_rad: Floats) -> Course:
 
 def solved(position_m: Floats, yaw_rad: Floats) -> Floats:
     """Return the angles (time, joint) that bring the hand to ``position_m`` (time, axis) with ``yaw_rad`` (time,)."""
-    wanted = _downwards(yaw_rad)
+    target = _downwards(yaw_rad)
     angle = np.tile(READY_RAD, (len(position_m), 1))
     for _ in range(ROUNDS):
         frames = kinematics.joint_frames(kinematics.PANDA, angle)
         place, turn = hand(frames)
-        off = np.concatenate([position_m - place, _rotation_between(turn, wanted)], axis=1)  # (time, 6)
+        off = np.concatenate([position_m - place, _rotation_between(turn, target)], axis=1)  # (time, 6)
         axes, places = frames[:, :, :3, 2], frames[:, :, :3, 3]
         linear = np.cross(axes, place[:, None] - places)
         jacobian = np.concatenate([linear, axes], axis=2).transpose(0, 2, 1)  # (time, 6, joint)
@@ -89,9 +89,9 @@ def _downwards(yaw_rad: Floats) -> Floats:
     return turn
 
 
-def _rotation_between(turn: Floats, wanted: Floats) -> Floats:
-    """Return for small angles the vector (time, 3) that turns ``turn`` into ``wanted``."""
-    vector: Floats = 0.5 * np.cross(turn, wanted, axis=1).sum(axis=2)
+def _rotation_between(turn: Floats, target: Floats) -> Floats:
+    """Return for small angles the vector (time, 3) that turns ``turn`` into ``target``."""
+    vector: Floats = 0.5 * np.cross(turn, target, axis=1).sum(axis=2)
     return vector
 
 

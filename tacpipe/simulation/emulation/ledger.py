@@ -1,4 +1,4 @@
-"""What an emulated stream sent, and what was harmed on the way: the truth that a recording of it is held against."""
+"""Record the frames that an emulated stream sent and those that were harmed, to compare with a recording."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ CODES = {cause: code for code, cause in enumerate(CAUSES)}
 
 @dataclass(frozen=True)
 class Entry:
-    """What went out, or should have."""
+    """A frame that was sent, or should have been sent."""
 
-    due_ns: int  # on this computer's monotonic clock
+    due_ns: int  # time on this computer's monotonic clock
     sent_ns: int  # likewise; 0: it was not sent
-    number: int  # of the sample in its source, -1: no frame
+    number: int  # number of the sample in its source, -1 for no frame
     size: int  # bytes that went out
     cause: str
     invisible: bool  # harmed, and still takes the protocol's own test for a frame
@@ -64,9 +64,9 @@ class Ledger:
         self._invisible.append(item.invisible)
         self._source.append(len(self.sources) - 1)
 
-    def enter(self, t_ns: int, what: str, more: str = "") -> None:
+    def enter(self, t_ns: int, event: str, detail: str = "") -> None:
         """Enter something that happened: opened, closed, unplug, replug, heard, rate, clock."""
-        self.events.append((t_ns, what, more))
+        self.events.append((t_ns, event, detail))
 
     @property
     def entries(self) -> list[Entry]:
@@ -82,21 +82,21 @@ class Ledger:
 
     def column(self, name: str) -> AnyArray:
         """Return a column (entry,): ``due_ns``, ``sent_ns``, ``number``, ``size``, ``cause`` (code), ..."""
-        kept: array[int] = getattr(self, f"_{name}")
-        return np.array(kept[: len(self)], dtype=np.int64)
+        values: array[int] = getattr(self, f"_{name}")
+        return np.array(values[: len(self)], dtype=np.int64)
 
     @property
     def counts(self) -> dict[str, int]:
         """How many entries there are of each cause; of the sound ones under "sent"."""
         codes = self.column("cause")
-        found = {cause or "sent": int((codes == code).sum()) for code, cause in enumerate(CAUSES)}
-        return {cause: count for cause, count in found.items() if count}
+        counts = {cause or "sent": int((codes == code).sum()) for code, cause in enumerate(CAUSES)}
+        return {cause: count for cause, count in counts.items() if count}
 
     @property
     def whole(self) -> Int64s:
         """The rows of entries that went out as frames should (entry,)."""
         codes = np.array([CODES[cause] for cause in UNHARMED])
-        count = len(self)  # of all columns, though it may grow meanwhile
+        count = len(self)  # common length of all columns, which may grow meanwhile
         size, cause, number = (self.column(name)[:count] for name in ("size", "cause", "number"))
         rows: Int64s = np.flatnonzero((size > 0) & np.isin(cause, codes) & (number >= 0))
         return rows
@@ -130,7 +130,7 @@ class Ledger:
         for part in np.split(np.arange(len(rows)), edges):
             if len(part):
                 source, block = self.sources[sources[part[0]]], int(blocks[part[0]])
-                yield taken(source.block(block), numbers[part] - block * source.rows)
+                yield take_rows(source.block(block), numbers[part] - block * source.rows)
 
     def table(self) -> pa.Table:
         """Return the entries as a table, a row each."""
@@ -150,20 +150,20 @@ class Ledger:
         content = {
             "counts": self.counts,
             "clock": [_clock(source) for source in self.sources],
-            "events": [{"t_ns": t_ns, "what": what, "more": more} for t_ns, what, more in self.events],
+            "events": [{"t_ns": t_ns, "what": event, "more": detail} for t_ns, event, detail in self.events],
             "harmed": {str(row): data.hex() for row, data in self.harmed.items()},
         }
         (folder / f"{self.name}.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
-def taken(samples: Samples, rows: Int64s) -> Samples:
+def take_rows(samples: Samples, rows: Int64s) -> Samples:
     """Return the samples of some frames, in their order."""
     if samples.rows is not None:  # many samples a frame, as the points of a cloud
         parts = [np.flatnonzero(samples.rows == row) for row in rows]
-        own = np.repeat(np.arange(len(rows), dtype=np.int64), [len(part) for part in parts])
-        return Samples(tuple(values[np.concatenate(parts)] for values in samples.values), rows=own)
+        positions = np.repeat(np.arange(len(rows), dtype=np.int64), [len(part) for part in parts])
+        return Samples(tuple(values[np.concatenate(parts)] for values in samples.values), rows=positions)
     seq, t_device_ns, device_seq = (
-        None if one is None else one[rows] for one in (samples.seq, samples.t_device_ns, samples.device_seq)
+        None if column is None else column[rows] for column in (samples.seq, samples.t_device_ns, samples.device_seq)
     )
     return Samples(tuple(values[rows] for values in samples.values), seq, t_device_ns, device_seq)
 

@@ -17,12 +17,12 @@ from tacpipe.errors import UsageError
 class Pace:
     """How a stream's frames come; in a rig file the keys of ``emulate``, for the whole rig or one stream."""
 
-    jitter_ms: float = 0.2  # by which a frame is late on average, exponentially distributed
+    jitter_ms: float = 0.2  # mean delay of a frame, exponentially distributed
     burst_ms: float = 0.0  # frames are collected for so long and sent together, as USB bridges do; 0: each alone
-    skew_ppm: float | None = None  # by which the device's clock, and with it its rate, is fast; None: any within 50
-    offset_ms: float | None = None  # by which its clock is ahead; None: any within 80
-    slides: bool = False  # of a biotac: the slides of `tacpipe simulate material` instead of the rig's grasps
-    finger: int | None = None  # of the gripper that the sensor sits on, 1 or 2; None: the last digit of its name, or 1
+    skew_ppm: float | None = None  # excess rate of the device's clock; None: random within 50
+    offset_ms: float | None = None  # lead of the device's clock; None: random within 80
+    slides: bool = False  # a biotac sends the slides of `tacpipe simulate material` instead of the rig's grasps
+    finger: int | None = None  # finger of the gripper with the sensor, 1 or 2; None: the last digit of its name, or 1
 
     def __post_init__(self) -> None:
         if self.jitter_ms < 0 or self.burst_ms < 0:
@@ -38,5 +38,5 @@ def due_ns(taken_ns: Times, pace: Pace, after_ns: int, rng: np.random.Generator)
     late_ns = np.rint(rng.exponential(pace.jitter_ms * 1e6, len(taken_ns))).astype(np.int64)
     due = np.maximum(np.maximum.accumulate(taken_ns + late_ns), after_ns)
     burst_ns = round(pace.burst_ms * 1e6)
-    together: Times = -(-due // burst_ns) * burst_ns if burst_ns else due
-    return together
+    burst_due_ns: Times = -(-due // burst_ns) * burst_ns if burst_ns else due
+    return burst_due_ns

@@ -1,4 +1,4 @@
-"""What a pad of taxels measures that is not a uSkin: the contact's force, shared out over a grid of any number of taxels."""
+"""Simulate a pad of taxels other than uSkin: the contact force is distributed over a grid of any number of taxels."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 from tacpipe.arrays import Floats, Times
 from tacpipe.simulation.emulation.world import World
 
-WIDTH_M = 0.03  # of a pad, along either axis
-SIGMA_M = 0.005  # of the Gaussian that shares the pressure
+WIDTH_M = 0.03  # width of a pad along both axes
+SIGMA_M = 0.005  # standard deviation of the Gaussian that distributes the pressure
 
 
 def places(taxels: int) -> Floats:

@@ -1,4 +1,4 @@
-"""What a perfect link would have given: samples that were encoded and decoded again, with nothing lost between."""
+"""Return the samples of a perfect link: encoded and decoded again without a loss."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from tacpipe.sensors.sensor import Frames, Samples, Sensor
 def decoded(sensor: Sensor, frames: Frames) -> Samples:
     """Return the samples of what `Sensor.encode` gave; ``rows`` reports on which frame each is."""
     parts = list(_alike(frames)) if isinstance(frames, list) and isinstance(sensor.framer(), ByteFramer) else [frames]
-    found = []
+    decoded_parts = []
     for part in parts:
         samples = sensor.decode(part)
-        own = np.arange(len(samples), dtype=np.int64) if samples.rows is None else samples.rows
-        found.append(replace(samples, rows=own, t_device_ns=samples.t_device_ns))
-    return joined(found, [len(part) for part in parts])
+        rows = np.arange(len(samples), dtype=np.int64) if samples.rows is None else samples.rows
+        decoded_parts.append(replace(samples, rows=rows, t_device_ns=samples.t_device_ns))
+    return joined(decoded_parts, [len(part) for part in parts])
 
 
 def joined(parts: Sequence[Samples], frames: Sequence[int] | None = None) -> Samples:
@@ -30,13 +30,13 @@ def joined(parts: Sequence[Samples], frames: Sequence[int] | None = None) -> Sam
     values = tuple(np.concatenate(blocks) for blocks in zip(*(part.values for part in parts), strict=True))
     starts = np.cumsum([0, *counts])
     rows = [part.rows + start for part, start in zip(parts, starts, strict=False) if part.rows is not None]
-    seq, t_device_ns, device_seq = (_together(parts, name) for name in ("seq", "t_device_ns", "device_seq"))
+    seq, t_device_ns, device_seq = (_joined_column(parts, name) for name in ("seq", "t_device_ns", "device_seq"))
     return Samples(values, seq, t_device_ns, device_seq, np.concatenate(rows) if rows else None)
 
 
-def _together(parts: Sequence[Samples], name: str) -> Int64s | None:
-    kept = [one for part in parts if (one := getattr(part, name)) is not None]
-    return np.concatenate(kept) if kept else None
+def _joined_column(parts: Sequence[Samples], name: str) -> Int64s | None:
+    columns = [column for part in parts if (column := getattr(part, name)) is not None]
+    return np.concatenate(columns) if columns else None
 
 
 def _alike(frames: Sequence[bytes]) -> Iterator[Any]:

@@ -1,4 +1,4 @@
-"""What happens now and then, at random moments of a mean rate: a Poisson process, asked in the order of time."""
+"""Draw events of a Poisson process with a mean rate, in the order of time."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ class Happening:
 
     def until(self, t_ns: int) -> list[int]:
         """Return the moments before ``t_ns`` that were not asked for yet."""
-        found = []
+        events = []
         while self._next_ns < t_ns:
-            found.append(int(self._next_ns))
+            events.append(int(self._next_ns))
             self._next_ns = self._step(self._next_ns)
-        return found
+        return events

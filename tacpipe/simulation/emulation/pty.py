@@ -32,11 +32,11 @@ class Port:
     def __init__(self, endpoint: Pty) -> None:
         self.endpoint = endpoint
         self.device = endpoint.sensor.device()
-        self.wanted = 0
+        self.pending_frames = 0
 
     @property
     def fault(self) -> str:
-        """Whether the host listened at another speed when it was written to last."""
+        """True where the host used another speed at the last write."""
         return byte_faults.BAUD if self.endpoint.garbling else byte_faults.SOUND
 
     def send(self, pieces: Sequence[bytes]) -> list[int]:
@@ -52,7 +52,7 @@ class Pty:
         self.address = Address("serial", str(link))
         self.peers: list[Port] = []
         self._master = -1
-        self._baud = 0  # that the host has set
+        self._baud = 0  # speed that the host has set
         self.garbling = False
         self.replug()
 
@@ -68,7 +68,7 @@ class Pty:
         tty.setraw(slave)
         os.set_blocking(self._master, False)
         name = os.ttyname(slave)
-        os.close(slave)  # from now on the master states whether anybody has it open
+        os.close(slave)  # the master then reports whether a host has it open
         draft.unlink(missing_ok=True)
         draft.symlink_to(name)
         draft.replace(self.link)
@@ -115,7 +115,7 @@ class Pty:
         return [(self._port, b"")]
 
     def wrong_baud(self) -> bool:
-        """Whether the host has set another speed than the device's."""
+        """Return whether the host has set another speed than the device's."""
         self._baud = _speed(self._master) if self._master >= 0 else 0
         return bool(self._baud) and self._baud != getattr(self.sensor, "baud", self._baud)
 
@@ -125,10 +125,10 @@ class Pty:
         self.garbling = self.wrong_baud()
         if self.garbling:
             on_the_line = [uart.garbled(piece, self.sensor.baud, self._baud) for piece in on_the_line]
-        taken = 0
+        count = 0
         with contextlib.suppress(BlockingIOError):
-            taken = os.write(self._master, b"".join(on_the_line))
-        sizes = stretched([len(piece) for piece in on_the_line], taken)
+            count = os.write(self._master, b"".join(on_the_line))
+        sizes = stretched([len(piece) for piece in on_the_line], count)
         return [
             len(piece) if size == len(sent) else min(size, len(piece) - 1)
             for piece, sent, size in zip(pieces, on_the_line, sizes, strict=True)

@@ -1,4 +1,4 @@
-"""What the world gives for each quantity that a field may hold, in SI units.
+"""Compute each quantity that a field may have from the simulated world, in SI units.
 
 `tacpipe.simulation.emulation.scales` turns it into what a device sends.
 """
@@ -21,11 +21,11 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 
-CLEARANCE_M = 0.12  # from the wrist's proximity sensor down to the object, as long as it does not slip
+CLEARANCE_M = 0.12  # distance from the wrist's proximity sensor to the object without slip
 WARMING_C, WARM_C, WARMING_NS = 4.0, 31.0, 600_000_000_000  # a device warms up by so much, towards so much, that slowly
 STEP_NS = 1_000_000  # over which differences are taken
-STRENGTH = 1200.0  # of what a range finder gets back
-FRICTION = 0.5  # that a sensor of slip states
+STRENGTH = 1200.0  # signal strength of a range finder
+FRICTION = 0.5  # friction that a slip sensor states
 
 
 @dataclass(frozen=True)
@@ -39,24 +39,28 @@ class View:
 
 def look(quantity: str, view: View, fields: Sequence[pa.Field]) -> Floats:
     """Return what fields of one quantity show (time, field), SI; zeros for one that the world does not know."""
-    known = QUANTITIES.get(quantity) if not of(fields[0], "taxel") or quantity not in ("force", "torque") else _tactile
-    return known(view, fields) if known else np.zeros((len(view.t_ns), len(fields)))
+    function = (
+        QUANTITIES.get(quantity)
+        if not metadata_of(fields[0], "taxel") or quantity not in ("force", "torque")
+        else _tactile
+    )
+    return function(view, fields) if function else np.zeros((len(view.t_ns), len(fields)))
 
 
-def of(field: pa.Field, key: str) -> str | None:
+def metadata_of(field: pa.Field, key: str) -> str | None:
     """Return what a field's metadata states under ``key``; None where it is silent."""
-    found = (field.metadata or {}).get(key.encode())
-    return None if found is None else found.decode()
+    value = (field.metadata or {}).get(key.encode())
+    return None if value is None else value.decode()
 
 
 def axis_of(field: pa.Field) -> str | None:
     """Return the axis or component that a field's metadata names."""
-    return of(field, "axis") or of(field, "component")
+    return metadata_of(field, "axis") or metadata_of(field, "component")
 
 
-def _vector(values: Floats, fields: Sequence[pa.Field], names: Sequence[str], alone: int) -> Floats:
-    """Return the columns of ``values`` (time, component) that fields name, ``alone`` for those that name none."""
-    return values[:, [names.index(name) if (name := axis_of(field)) in names else alone for field in fields]]
+def _vector(values: Floats, fields: Sequence[pa.Field], names: Sequence[str], axis: int) -> Floats:
+    """Return the columns of ``values`` (time, component) that fields name, ``axis`` for those that name none."""
+    return values[:, [names.index(name) if (name := axis_of(field)) in names else axis for field in fields]]
 
 
 def _tactile(view: View, fields: Sequence[pa.Field]) -> Floats:
@@ -64,8 +68,8 @@ def _tactile(view: View, fields: Sequence[pa.Field]) -> Floats:
     places = [_place(field) for field in fields]
     pads = list(dict.fromkeys(pad for pad, _ in places))
     values = np.zeros((len(view.t_ns), len(fields)))
-    for number, one in enumerate(pads):
-        rows = [row for row, (pad, _) in enumerate(places) if pad == one]
+    for number, pad_name in enumerate(pads):
+        rows = [row for row, (pad, _) in enumerate(places) if pad == pad_name]
         taxels = list(dict.fromkeys(places[row][1] for row in rows))
         force = pad_of_taxels.pressed(view.world, (view.finger + number) % 2, view.t_ns, len(taxels))
         columns = [taxels.index(places[row][1]) for row in rows]
@@ -76,7 +80,9 @@ def _tactile(view: View, fields: Sequence[pa.Field]) -> Floats:
 
 def _place(field: pa.Field) -> tuple[str, str]:
     """Return which pad a field is of, and which taxel of it."""
-    layout = {key: of(field, key) or "" for key in ("sensor", "finger", "module", "triangle", "taxel", "electrode")}
+    layout = {
+        key: metadata_of(field, key) or "" for key in ("sensor", "finger", "module", "triangle", "taxel", "electrode")
+    }
     taxel = layout.pop("taxel") or layout.pop("electrode") or field.name
     return " ".join(layout.values()), taxel
 

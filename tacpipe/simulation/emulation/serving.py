@@ -1,4 +1,4 @@
-"""Which end of a link a stream of the rig file gets, and the address under which hosts find it."""
+"""Serve the streams of a rig file: choose the end of each link and its address for hosts."""
 
 from __future__ import annotations
 

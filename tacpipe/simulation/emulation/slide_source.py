@@ -1,4 +1,4 @@
-"""What an emulated BioTac sends that is drawn over one material after another: the trials of `tacpipe simulate material`.
+"""Emulate a BioTac that slides over one material after another: the trials of `tacpipe simulate material`.
 
 Trials follow one another, those of each material in turn, as the simulated rig makes them.
 """
@@ -32,8 +32,8 @@ class SlideSource:
         self.rows = max(1, round(timing.rate_hz * BLOCK_S))
         self._seed, self._rig = seed, rig or Rig(arm_every=0)
         self._fields = [field.name for field in BioTac().fields()]
-        self._ends = [0]  # of each trial, in samples from the start
-        self._trial = functools.lru_cache(KEPT)(self._made)
+        self._ends = [0]  # end of each trial in samples from the start
+        self._trial = functools.lru_cache(KEPT)(self._generate)
 
     def numbers(self, block: int) -> Int64s:
         """Return the numbers of a block's samples, counted from 0 through the stream (sample,)."""
@@ -50,7 +50,7 @@ class SlideSource:
         device_ns = faults.device_stamps(self.timing.taken_ns(numbers), self.timing.clock)
         return Samples((readings,), numbers % (self.sensor.counter or 1), device_ns)
 
-    def _made(self, number: int) -> Ints:
+    def _generate(self, number: int) -> Ints:
         """Return the readings of a trial (sample, 44)."""
         table = simulate_trial(self._seed, len(SENSORS) * number, self._rig).streams[SENSORS[0]]
         return np.column_stack([table.column(name).to_numpy() for name in self._fields]).astype(np.uint16)

@@ -30,7 +30,7 @@ Columns = dict[int, AnyArray]  # number of the field to its values (time,)
 
 BLOCK_S = 0.5
 KEPT = 3  # blocks that are kept in case they are asked for once more
-PARTS = {"report": (1, 2)}  # what fields go through that name the part of a state that a frame states
+PARTS = {"report": (1, 2)}  # values of fields that name the part of a state in a frame
 UNCOUNTED = 1 << 32  # modulus of a counter that nobody looks at
 USKIN = 48  # channels of a 4x4
 
@@ -40,15 +40,17 @@ class Timing:
     """When an emulated sensor takes its samples, and what its clock and its counters state."""
 
     rate_hz: float
-    start_ns: int = 0  # of the first sample, in the world's time
+    start_ns: int = 0  # time of the first sample in the world
     clock: faults.Clock = field(default_factory=faults.Clock)  # its oscillator paces its samples too
-    steps: Callable[[Times], Times] = no_steps  # by how much the clock was set until then, ns (time,)
+    steps: Callable[[Times], Times] = no_steps  # returns the total of clock steps so far, ns (time,)
     wrap_s: float | None = None  # counters go round so long after the start; None: they begin anywhere
 
     def taken_ns(self, number: Int64s) -> Times:
         """Return when samples ``number`` (sample,) are taken, in the world's time."""
-        taken: Times = self.start_ns + np.rint(number * (1e9 / self.rate_hz / (1 + self.clock.skew))).astype(np.int64)
-        return taken
+        sample_ns: Times = self.start_ns + np.rint(number * (1e9 / self.rate_hz / (1 + self.clock.skew))).astype(
+            np.int64
+        )
+        return sample_ns
 
     def first_after(self, t_ns: int) -> int:
         """Return the number of the first sample that is taken after ``t_ns``."""
@@ -56,7 +58,7 @@ class Timing:
 
 
 class Sampled(Protocol):
-    """What an emulated sensor sends, a block of frames at a time."""
+    """Generates the frames of an emulated sensor, one block at a time."""
 
     sensor: Sensor
     timing: Timing
@@ -81,8 +83,8 @@ class Source:
         self._seed = list(seed)
         self._groups = _grouped(self.fields)
         self._widths = _widths(sensor, self.fields)
-        self._drift: list[Floats] = [np.zeros((USKIN // 3, 3))]  # of a uSkin at the start of each block
-        self._samples = functools.lru_cache(KEPT)(self._made)
+        self._drift: list[Floats] = [np.zeros((USKIN // 3, 3))]  # drift of a uSkin at the start of each block
+        self._samples = functools.lru_cache(KEPT)(self._generate)
         rng = np.random.default_rng([*seed, 0])
         self._first = [
             _first_count(timing, sensor.step, modulus or UNCOUNTED, rng)
@@ -97,7 +99,7 @@ class Source:
         """Return the numbers of a block's samples, counted from 0 through the stream (sample,)."""
         return block * self.rows + np.arange(self.rows, dtype=np.int64)
 
-    def _made(self, block: int) -> Samples:
+    def _generate(self, block: int) -> Samples:
         numbers = self.numbers(block)
         taken_ns = self.timing.taken_ns(numbers)
         rng = np.random.default_rng([*self._seed, 1, block])
@@ -116,7 +118,7 @@ class Source:
     def _filled(self, group: Sequence[int], view: View, block: int, rng: np.random.Generator) -> Columns:
         """Return the columns of the fields of one quantity."""
         fields = [self.fields[number] for number in group]
-        quantity = quantities.of(fields[0], "quantity") or ""
+        quantity = quantities.metadata_of(fields[0], "quantity") or ""
         if fields[0].name in PARTS:
             parts = np.array(PARTS[fields[0].name], dtype=fields[0].type.to_pandas_dtype())
             return {group[0]: parts[self.numbers(block) % len(parts)]}
@@ -125,9 +127,9 @@ class Source:
         if quantity == "tactile" and _is_uskin(fields):
             counts = self._uskin(view, block, rng)
             return {number: counts[:, row] for row, number in enumerate(group)}
-        if quantity == "proximity" and quantities.of(fields[0], "unit") == "count":
+        if quantity == "proximity" and quantities.metadata_of(fields[0], "unit") == "count":
             up_m = view.world.contact(view.t_ns, lambda scene: scene.contact.displacement_m[:, 1])
-            kinds = [one.type.to_pandas_dtype() for one in fields]
+            kinds = [channel.type.to_pandas_dtype() for channel in fields]
             return {
                 number: proximity.readings(up_m, 1.0, rng).astype(kind)
                 for number, kind in zip(group, kinds, strict=True)
@@ -137,9 +139,9 @@ class Source:
 
     def _uskin(self, view: View, block: int, rng: np.random.Generator) -> Counts:
         """Return the counts of a uSkin (time, channel): as `pick_and_move` logs them, with a drift that continues."""
-        one = view.world.skins[view.finger]
+        skin = view.world.skins[view.finger]
         noise = taxels.errors(view.t_ns / 1e9, 1.0, 0.0, rng)
-        counts = one.base_count + taxels.signal(one, view.world.touch(view.finger, view.t_ns)) + noise
+        counts = skin.base_count + taxels.signal(skin, view.world.touch(view.finger, view.t_ns)) + noise
         digits = taxels.digitised(counts + self._drifted(block))
         return faults.hold(digits, pick_and_move.Rig().hold_probability, rng)[0]
 
@@ -166,9 +168,9 @@ def _first_count(timing: Timing, step: int, modulus: int, rng: np.random.Generat
 def _grouped(fields: Sequence[pa.Field]) -> list[list[int]]:
     """Return the numbers of the fields of each quantity; forces of taxels apart from those of whole sensors."""
     groups: dict[tuple[str | None, bool, str | None], list[int]] = {}
-    for number, one in enumerate(fields):
-        quantity = one.name if one.name in PARTS else quantities.of(one, "quantity")
-        key = quantity, bool(quantities.of(one, "taxel")), quantities.of(one, "unit")
+    for number, channel in enumerate(fields):
+        quantity = channel.name if channel.name in PARTS else quantities.metadata_of(channel, "quantity")
+        key = quantity, bool(quantities.metadata_of(channel, "taxel")), quantities.metadata_of(channel, "unit")
         groups.setdefault(key, []).append(number)
     return list(groups.values())
 
@@ -176,15 +178,15 @@ def _grouped(fields: Sequence[pa.Field]) -> list[list[int]]:
 def _is_uskin(fields: Sequence[pa.Field]) -> bool:
     from tacpipe.channels import schema
 
-    return [one.name for one in fields] == [one.name for one in schema.uskin_fields()]
+    return [channel.name for channel in fields] == [channel.name for channel in schema.uskin_fields()]
 
 
 def _widths(sensor: Sensor, fields: Sequence[pa.Field]) -> list[int]:
     """Return the widths of the blocks of `Samples.values`: neighbours of one type, or those of each output."""
     outputs: Sequence[str] | None = getattr(sensor, "outputs", None)
     if outputs:
-        one = cast("DataclassInstance", sensor)
-        return [len(replace(one, outputs=(name,)).fields()) for name in outputs]  # type: ignore[attr-defined]
+        options = cast("DataclassInstance", sensor)
+        return [len(replace(options, outputs=(name,)).fields()) for name in outputs]  # type: ignore[attr-defined]
     starts = [row for row in range(len(fields)) if not row or fields[row - 1].type != fields[row].type]
     widths: list[int] = np.diff([*starts, len(fields)]).tolist()
     return widths

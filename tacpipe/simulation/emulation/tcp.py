@@ -17,35 +17,35 @@ MOST_READ = 65_536
 class Connection:
     """A host that is connected."""
 
-    def __init__(self, made: socket.socket, sensor: Sensor) -> None:
-        made.setblocking(False)
-        made.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self.socket, self.device = made, sensor.device()
-        self.wanted = 0
+    def __init__(self, connection: socket.socket, sensor: Sensor) -> None:
+        connection.setblocking(False)
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self.socket, self.device = connection, sensor.device()
+        self.pending_frames = 0
         self.fault = byte_faults.SOUND
-        self._rest = b""  # of a piece that was sent in part, and must be sent whole
+        self._unsent = b""  # rest of a piece that was sent in part
 
     def send(self, pieces: Sequence[bytes]) -> list[int]:
         """Send over the connection what it has room for; a piece that was begun is ended before any other."""
-        if self._rest:
-            self._rest = self._rest[self._put(self._rest) :]
-            if self._rest:
+        if self._unsent:
+            self._unsent = self._unsent[self._send_some(self._unsent) :]
+            if self._unsent:
                 return [0] * len(pieces)
         sizes = [len(piece) for piece in pieces]
-        whole = b"".join(pieces)
-        taken = self._put(whole)
-        parts = stretched(sizes, taken)
+        content = b"".join(pieces)
+        sent = self._send_some(content)
+        parts = stretched(sizes, sent)
         for piece, part in zip(pieces, parts, strict=True):
             if 0 < part < len(piece):
-                self._rest = piece[part:]
+                self._unsent = piece[part:]
         return [size if part else 0 for size, part in zip(sizes, parts, strict=True)]
 
-    def _put(self, data: bytes) -> int:
+    def _send_some(self, data: bytes) -> int:
         try:
             return self.socket.send(data)
         except BlockingIOError:
             return 0
-        except OSError:  # which reading states as well
+        except OSError:  # reading reports the same error
             self.fault = byte_faults.GONE
             return 0
 
@@ -66,11 +66,11 @@ class Connection:
 class Registration(Connection):
     """A host that is connected, and named a UDP port to the device to send frames to: replies go over the connection."""
 
-    def __init__(self, made: socket.socket, sensor: Sensor) -> None:
-        super().__init__(made, sensor)
+    def __init__(self, connection: socket.socket, sensor: Sensor) -> None:
+        super().__init__(connection, sensor)
         self._port = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._port.setblocking(False)
-        self.host = made.getpeername()[0]
+        self.host = connection.getpeername()[0]
 
     def close(self) -> None:
         """Close the connection and the port that frames go out by."""
@@ -128,18 +128,18 @@ class Tcp:
 
     def descriptors(self) -> list[int]:
         """Return the server and its connections."""
-        own = [self._server.fileno()] if self._server is not None else []
-        return own + [peer.socket.fileno() for peer in self.peers]
+        listening = [self._server.fileno()] if self._server is not None else []
+        return listening + [peer.socket.fileno() for peer in self.peers]
 
     def ready(self, descriptor: int) -> list[tuple[Connection, bytes]]:
         """Take a connection, or return what a host wrote."""
         if self._server is not None and descriptor == self._server.fileno():
             try:
-                made = self.kind(self._server.accept()[0], self.sensor)
+                peer = self.kind(self._server.accept()[0], self.sensor)
             except OSError:  # it went away before it was taken
                 return []
-            self.peers = [*self.peers, made]
-            return [] if self.scheme == "ws" else [(made, b"")]
+            self.peers = [*self.peers, peer]
+            return [] if self.scheme == "ws" else [(peer, b"")]
         for peer in self.peers:
             if peer.socket.fileno() == descriptor:
                 return self._heard(peer)
@@ -149,7 +149,7 @@ class Tcp:
         data = peer.read()
         if data is None:
             self.leave(peer)
-            self.peers = [other for other in self.peers if other is not peer]
+            self.peers = [existing for existing in self.peers if existing is not peer]
             return []
         return self.understood(peer, data)
 

@@ -18,10 +18,10 @@ from tacpipe.simulation.emulation.pacing import Pace
 from tacpipe.simulation.emulation.source import Sampled
 from tacpipe.simulation.emulation.undetectable_faults import one_by_one
 
-AHEAD_NS = 1_500_000_000  # that frames are planned before they are due
-IDLE_NS = 20_000_000  # between looks at a stream that nobody receives
+AHEAD_NS = 1_500_000_000  # frames are planned so long before they are due
+IDLE_NS = 20_000_000  # period of checks of a stream without a receiver
 MOST_MESSAGES = 1000  # messages of the host that the ledger keeps
-PAUSE_NS = 2_000_000  # between two tries of a patient device
+PAUSE_NS = 2_000_000  # pause between two tries of a patient device
 
 
 class Plan:
@@ -32,13 +32,13 @@ class Plan:
         self._harm = Harm(faults, source.sensor, seed, packets=packets)
         self._rng = np.random.default_rng([*seed, 7])
         self._block = 0
-        self.until_ns = source.timing.start_ns  # that all items before are out
+        self.until_ns = source.timing.start_ns  # time at which all earlier items are sent
 
     def skip(self, t_ns: int) -> None:
         """Begin with the block that holds the first sample after ``t_ns``."""
         self._block = max(self._block, self.source.timing.first_after(t_ns) // self.source.rows)
 
-    def more(self) -> list[Item]:
+    def next_items(self) -> list[Item]:
         """Return the items of the next block."""
         source = self.source
         numbers = source.numbers(self._block)
@@ -46,7 +46,7 @@ class Plan:
         due_ns = pacing.due_ns(source.timing.taken_ns(numbers), self.pace, self.until_ns, self._rng)
         self._block += 1
         self.until_ns = int(due_ns[-1]) + 1
-        return self._harm.done(frames, due_ns.tolist(), int(numbers[0]))
+        return self._harm.apply(frames, due_ns.tolist(), int(numbers[0]))
 
 
 class Transmission:
@@ -57,11 +57,11 @@ class Transmission:
         endpoint: Endpoint,
         sensor: Sensor,
         ledger: Ledger,
-        planned: Callable[[float, int], Plan],  # of a rate and a start, ns from the rig's start
+        planned: Callable[[float, int], Plan],  # returns due times, ns from the rig's start, of a rate and a start
         rate_hz: float,
         epoch_ns: int,
         *,
-        patient: bool = False,  # what a host has no room for waits, and is not lost
+        patient: bool = False,  # bytes wait, and are not lost, where a host has no room
     ) -> None:
         self._patient = patient
         self._late: deque[tuple[Item | None, bytes]] = (
@@ -75,7 +75,7 @@ class Transmission:
         self._lock = threading.Lock()
         self._items: deque[Item] = deque()
         self._latest: Item | None = None  # the last frame that was due, for hosts that ask
-        self._asked = bool(sensor.request())
+        self._on_request = bool(sensor.request())
         self._begin(rate_hz, 0)
 
     def _begin(self, rate_hz: float, start_ns: int) -> None:
@@ -91,7 +91,7 @@ class Transmission:
         with self._lock:
             self._plan.skip(now_ns - AHEAD_NS)
             while self._plan.until_ns < now_ns + AHEAD_NS:
-                self._items.extend(self._plan.more())
+                self._items.extend(self._plan.next_items())
 
     @property
     def next_ns(self) -> int:
@@ -101,7 +101,7 @@ class Transmission:
         if not self._items:
             return self._epoch_ns + self._plan.until_ns
         due_ns = self._epoch_ns + self._items[0].due_ns
-        return due_ns if self._asked or self._receivers() else due_ns + IDLE_NS
+        return due_ns if self._on_request or self._receivers() else due_ns + IDLE_NS
 
     def run(self, now_ns: int) -> bool:
         """Send what is due at ``now_ns`` on the monotonic clock; return whether the device was unplugged or came back."""
@@ -131,7 +131,7 @@ class Transmission:
         self.ledger.enter(now_ns, REPLUG if back else UNPLUG)
 
     def _receivers(self) -> list[Peer]:
-        return [peer for peer in self.endpoint.peers if peer.device.streaming or peer.wanted]
+        return [peer for peer in self.endpoint.peers if peer.device.streaming or peer.pending_frames]
 
     def _send(self, items: Sequence[Item], now_ns: int) -> None:
         if not items:
@@ -149,19 +149,19 @@ class Transmission:
         fault = byte_faults.SOUND
         pieces = [item.data for item in items]
         for peer in self._receivers():
-            part = pieces if peer.device.streaming else pieces[: peer.wanted]
-            taken = self._post(peer, part)
-            peer.wanted = max(0, peer.wanted - len(part)) if not peer.device.streaming else 0
+            part = pieces if peer.device.streaming else pieces[: peer.pending_frames]
+            sent = self._post(peer, part)
+            peer.pending_frames = max(0, peer.pending_frames - len(part)) if not peer.device.streaming else 0
             if sizes is None:
-                sizes, fault = taken, peer.fault
+                sizes, fault = sent, peer.fault
         if sizes is not None:
             self._enter(items[: len(sizes)], sizes, fault, now_ns)
 
     def _post(self, peer: Peer, pieces: Sequence[bytes]) -> list[int]:
         post: Callable[[Sequence[bytes]], list[int]] = getattr(peer, "post", peer.send)
         full = [piece for piece in pieces if piece]
-        taken = iter(post(full) if full else [])
-        return [next(taken) if piece else 0 for piece in pieces]
+        sent = iter(post(full) if full else [])
+        return [next(sent) if piece else 0 for piece in pieces]
 
     def _push(self, now_ns: int) -> None:
         """Send what waits, in order, as far as the host has room for it; what waited for a host that left is forgotten."""
@@ -169,10 +169,10 @@ class Transmission:
         if peer is None or peer is not self._awaited:
             self._late.clear()
         while self._late and peer is not None and not getattr(peer, "full", bool)():
-            item, left = self._late[0]
-            left = left[self._post(peer, [left])[0] :]
-            if left:
-                self._late[0] = (item, left)
+            item, remaining = self._late[0]
+            remaining = remaining[self._post(peer, [remaining])[0] :]
+            if remaining:
+                self._late[0] = (item, remaining)
                 break
             self._late.popleft()
             if item is not None:
@@ -195,7 +195,7 @@ class Transmission:
         elif len(self.ledger.events) < MOST_MESSAGES:
             self.ledger.enter(now_ns, "heard", data.hex())
         replies = [reply for reply in peer.device.hear(data) if reply]
-        if replies and self._late and peer is self._awaited:  # behind the frame that is half sent
+        if replies and self._late and peer is self._awaited:  # after the frame that is half sent
             for reply in reversed(replies):
                 self._late.insert(1, (None, reply))
         elif replies:
@@ -204,17 +204,17 @@ class Transmission:
         if rate_hz and rate_hz != self._rate_hz:
             self.ledger.enter(now_ns, "rate", f"{rate_hz:g}")
             self._begin(rate_hz, now_ns - self._epoch_ns)
-        wanted = peer.device.polled()
-        if wanted:
-            peer.wanted += wanted
+        requested = peer.device.polled()
+        if requested:
+            peer.pending_frames += requested
             self._hand_over(peer, now_ns)
 
     def _hand_over(self, peer: Peer, now_ns: int) -> None:
         """Send the latest frame to a host that asked; more that it asked for follow as they become due."""
-        before, peer.wanted = peer.wanted, 0
+        before, peer.pending_frames = peer.pending_frames, 0
         self.run(now_ns)  # frames that are due are those of others
-        peer.wanted = before
+        peer.pending_frames = before
         if self._latest is not None and peer in self.endpoint.peers:  # it may have been unplugged just now
             sizes = self._post(peer, [self._latest.data])
-            peer.wanted -= 1
+            peer.pending_frames -= 1
             self._enter([self._latest], sizes, peer.fault, now_ns)

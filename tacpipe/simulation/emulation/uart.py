@@ -1,10 +1,10 @@
-"""What a serial port reads that is set to another speed than the device's: the line's bits, sampled at the wrong times."""
+"""Compute the bytes that a serial port receives at another speed than the device sends."""
 
 from __future__ import annotations
 
 import numpy as np
 
-IDLE_BITS = 30  # after the last byte, at which the line rests
+IDLE_BITS = 30  # number of idle bits after the last byte
 
 
 def garbled(data: bytes, sent_baud: int, read_baud: int) -> bytes:
@@ -20,14 +20,14 @@ def garbled(data: bytes, sent_baud: int, read_baud: int) -> bytes:
     bits = np.unpackbits(np.frombuffer(data, np.uint8)[:, None], axis=1, bitorder="little")  # (byte, bit)
     framed = np.hstack([np.zeros((len(bits), 1), np.uint8), bits, np.ones((len(bits), 1), np.uint8)])
     line = np.append(framed.ravel(), np.ones(IDLE_BITS + round(12 * sent_baud / read_baud), np.uint8))
-    width = sent_baud / read_baud  # of a bit as it is read, in bits as they are sent
+    width = sent_baud / read_baud  # length of a received bit in sent bits
     middles = (1.5 + np.arange(8)) * width
     low = np.flatnonzero(line == 0)
-    found, place = [], 0.0
+    received, place = [], 0.0
     while (row := int(np.searchsorted(low, np.floor(place)))) < len(low):
         start = max(place, float(low[row]))
-        found.append(np.packbits(line[np.floor(start + middles).astype(int)], bitorder="little")[0])
+        received.append(np.packbits(line[np.floor(start + middles).astype(int)], bitorder="little")[0])
         place = start + 9.5 * width
         if place >= len(line) - 12 * width:
             break
-    return bytes(found)
+    return bytes(received)

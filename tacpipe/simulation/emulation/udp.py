@@ -24,10 +24,10 @@ class Correspondent:
     def __init__(self, endpoint: Udp, target: tuple[str, int]) -> None:
         self.endpoint, self.target = endpoint, target
         self.device = endpoint.sensor.device()
-        self.wanted = 0
+        self.pending_frames = 0
 
     def full(self) -> bool:
-        """Whether the host has left so much in its queue that the kernel may soon drop what comes."""
+        """Return whether the host's queue is so full that the kernel may soon drop packets."""
         return (waiting(self.target[1]) or 0) > MOST_WAITING
 
     def send(self, pieces: Sequence[bytes]) -> list[int]:

@@ -15,10 +15,10 @@ from tacpipe.simulation.emulation.tcp import Connection, Tcp
 class Client(Connection):
     """A host that is connected, or about to be."""
 
-    def __init__(self, made: socket.socket, sensor: Sensor) -> None:
+    def __init__(self, connection: socket.socket, sensor: Sensor) -> None:
         from websockets.server import ServerProtocol
 
-        super().__init__(made, sensor)
+        super().__init__(connection, sensor)
         self.protocol = ServerProtocol()
         self.open = False
 
@@ -69,7 +69,7 @@ class Websocket(Tcp):
                 heard.append((peer, bytes(event.data)))
             elif event.opcode is Opcode.CLOSE:
                 peer.open = False
-        with contextlib.suppress(OSError):  # of a peer that is gone: the next read states it
+        with contextlib.suppress(OSError):  # the peer is gone, which the next read reports
             for piece in protocol.data_to_send():
                 if piece:
                     peer.socket.send(piece)

@@ -1,4 +1,4 @@
-"""What happens at the emulated rig, for as long as it is wanted: pick-and-move trials, one after another.
+"""Simulate the world of the emulated rig without an end: pick-and-move trials, one after another.
 
 A cycle is a trial of `tacpipe.simulation.pick_and_move` and the way back: the fingers open, the hand returns to where it
 began. So nothing jumps, and the skins stay the same throughout. Cycles are made when they are asked for, and a few are kept.
@@ -17,15 +17,15 @@ from tacpipe.arrays import Floats, Times
 from tacpipe.simulation import mechanics, pick_and_move, trajectory
 from tacpipe.simulation.emulation import joints
 
-TRIAL_S, RETURN_S = 10.5, 1.5  # of a cycle
-RELEASE_S = 0.3  # in which the fingers open, at the beginning of the way back
+TRIAL_S, RETURN_S = 10.5, 1.5  # duration of a cycle
+RELEASE_S = 0.3  # time in which the fingers open, at the start of the way back
 CYCLE_NS = round((TRIAL_S + RETURN_S) * 1e9)
 BASE_M = (
     0.12,
     0.0,
     0.0,
-)  # by which the arm stands nearer than the published rig's, so that it reaches wherever hands go
-CYCLES = 4  # that are kept: streams run ahead of one another by less
+)  # the arm stands this much nearer than the published rig's, so that it reaches all positions of hands
+CYCLES = 4  # number of cycles that are kept: streams run ahead of each other by less
 
 
 @dataclass(frozen=True)
@@ -52,17 +52,19 @@ class World:
     def __init__(self, seed: int = 0, rig: pick_and_move.Rig | None = None) -> None:
         self._seed = seed
         self._rig = replace(rig or pick_and_move.Rig(), duration_s=TRIAL_S)
-        self._cycle = functools.lru_cache(CYCLES)(self._made)
+        self._cycle = functools.lru_cache(CYCLES)(self._generate)
         self.skins = pick_and_move.perform(seed, 0, self._rig).skins
 
     def cycle(self, number: int) -> Cycle:
         """Return cycle ``number``; the same seed gives the same one, whenever it is asked for."""
         return self._cycle(number)
 
-    def _made(self, number: int) -> Cycle:
+    def _generate(self, number: int) -> Cycle:
         scene = replace(pick_and_move.perform(self._seed, number, self._rig), skins=self.skins)
-        whole = with_return(scene)
-        return Cycle(whole, joints.course(whole.path.t_ns, whole.path.position_m, whole.path.yaw_rad))
+        full_scene = with_return(scene)
+        return Cycle(
+            full_scene, joints.course(full_scene.path.t_ns, full_scene.path.position_m, full_scene.path.yaw_rad)
+        )
 
     def at(self, t_ns: Times, look: Callable[[Cycle, Times], Floats]) -> Floats:
         """Return what ``look`` finds of each cycle at times within it, for ``t_ns`` (time,) in order: (time, …)."""
@@ -103,16 +105,16 @@ def with_return(scene: pick_and_move.Scene) -> pick_and_move.Scene:
     """Return a scene that is longer by the way back: its last row is as its first."""
     rows = round(RETURN_S * trajectory.RATE_HZ)
     since_s = np.arange(1, rows + 1) / trajectory.RATE_HZ
-    held = 1 - trajectory.minimum_jerk(np.clip(since_s / RELEASE_S, 0.0, 1.0))  # (time,), of the grip
+    grip = 1 - trajectory.minimum_jerk(np.clip(since_s / RELEASE_S, 0.0, 1.0))  # (time,), of the grip
     away = 1 - trajectory.minimum_jerk(np.clip((since_s - RELEASE_S) / (RETURN_S - RELEASE_S), 0.0, 1.0))
 
-    def fading(values: Floats, fraction: Floats, rest: Any = 0.0) -> Floats:
-        last = values[-1] - rest
-        faded: Floats = np.concatenate([values, rest + np.multiply.outer(fraction, last)])
+    def fading(values: Floats, fraction: Floats, resting: Any = 0.0) -> Floats:
+        last = values[-1] - resting
+        faded: Floats = np.concatenate([values, resting + np.multiply.outer(fraction, last)])
         return faded
 
     path, contact, grasp = scene.path, scene.contact, scene.grasp
-    nothing = np.zeros(rows, dtype=bool)
+    no_slip = np.zeros(rows, dtype=bool)
     step_ns = 1_000_000_000 // trajectory.RATE_HZ
     return replace(
         scene,
@@ -121,16 +123,16 @@ def with_return(scene: pick_and_move.Scene) -> pick_and_move.Scene:
             fading(path.position_m, away, path.position_m[0]) - BASE_M,
             fading(path.yaw_rad, away, path.yaw_rad[0]),
         ),
-        finger_m=fading(scene.finger_m, held, scene.finger_m[0]),
-        grasp=replace(grasp, grip_n=fading(grasp.grip_n, held)),
+        finger_m=fading(scene.finger_m, grip, scene.finger_m[0]),
+        grasp=replace(grasp, grip_n=fading(grasp.grip_n, grip)),
         contact=mechanics.Contact(
-            fading(contact.force_n, held),
-            fading(contact.normal_n, held),
+            fading(contact.force_n, grip),
+            fading(contact.normal_n, grip),
             fading(contact.displacement_m, away),
             fading(contact.velocity_m_s, np.zeros(rows)),
-            np.concatenate([contact.slip, nothing]),
-            np.concatenate([contact.dropped, nothing]),
-            fading(contact.torque_nm, held),
+            np.concatenate([contact.slip, no_slip]),
+            np.concatenate([contact.dropped, no_slip]),
+            fading(contact.torque_nm, grip),
             fading(contact.rotation_rad, away),
         ),
     )

@@ -39,7 +39,7 @@ def planned(
     items: list[Item] = []
     frames: dict[int, bytes] = {}
     for block in range(round(SECONDS * sensor.rate_hz / source.rows)):
-        items += plan.more()
+        items += plan.next_items()
         made = one_by_one(sensor, sensor.encode(source.block(block)))
         frames |= dict(zip(source.numbers(block).tolist(), made, strict=True))
     return items, frames
