@@ -39,10 +39,10 @@ class AnySkin(Sensor):
 
     summary: ClassVar[str] = "AnySkin and ReSkin: magnetic skins, binary or ASCII, of any number of magnetometers."
 
-    magnetometers: int = 5  # on the board
-    mode: Literal["binary", "ascii"] = "binary"  # of the firmware: binary is what the vendor calls burst
+    magnetometers: int = 5  # number of magnetometers on the board
+    mode: Literal["binary", "ascii"] = "binary"  # mode of the firmware: binary is called burst by the vendor
     rate_hz: float = 100.0  # frames a second
-    baud: int = 115_200  # of a port over USB, where any will do
+    baud: int = 115_200  # baud rate of the port; over USB any rate works
 
     def __post_init__(self) -> None:
         options.within("anyskin", "magnetometers", self.magnetometers, 1, 200)
@@ -53,13 +53,13 @@ class AnySkin(Sensor):
         """Return ``taxel01_temperature``, ``taxel01_x``, … of each magnetometer: float32, degrees and microteslas."""
         import pyarrow as pa
 
-        found = []
+        fields = []
         flux = taxels.fields(self.magnetometers, pa.float32(), "uT", axes="xyz")
         for number, name in enumerate(taxels.numbered("taxel", self.magnetometers), start=1):
             metadata = {"unit": "degC", "quantity": "temperature", "taxel": str(number)}
-            found.append(pa.field(f"{name}_temperature", pa.float32(), metadata=metadata))
-            found += flux[3 * number - 3 : 3 * number]
-        return found
+            fields.append(pa.field(f"{name}_temperature", pa.float32(), metadata=metadata))
+            fields += flux[3 * number - 3 : 3 * number]
+        return fields
 
     def framer(self) -> Framer:
         """Return a framer of frames of one size with their end, or of lines with as many numbers."""

@@ -28,7 +28,7 @@ MAGIC = 0x1234
 STOP, START, BIAS = 0, 2, 0x42
 STARTS = (1, START, 3)  # the first of newer boxes; the third buffers only where it is set up so
 RECORD = np.dtype([("rdt_seq", ">u4"), ("ft_seq", ">u4"), ("status", ">u4"), ("counts", ">i4", 6)])
-BIAS_S = 0.1  # for the box to take its present load for zero
+BIAS_S = 0.1  # time that the box needs to take its present load as zero
 
 
 @dataclass(frozen=True)
@@ -132,21 +132,21 @@ class AtiNetFT(Sensor):
 class _Box(Device):
     """The box's side: streams without end, or as many records as it was asked for."""
 
-    wanted = 0
+    requested = 0
 
     def hear(self, data: bytes) -> list[bytes]:
         if len(data) != REQUEST.size:
             return []
         magic, command, count = REQUEST.unpack(data)
         if magic == MAGIC and command in STARTS:
-            self.streaming, self.wanted = count == 0, self.wanted + count
+            self.streaming, self.requested = count == 0, self.requested + count
         elif magic == MAGIC and command == STOP:
-            self.streaming, self.wanted = False, 0
+            self.streaming, self.requested = False, 0
         return []
 
     def polled(self) -> int:
-        wanted, self.wanted = self.wanted, 0
-        return wanted
+        requested, self.requested = self.requested, 0
+        return requested
 
 
 def request(command: int, records: int = 0) -> bytes:

@@ -36,10 +36,10 @@ if TYPE_CHECKING:
 
 MARKER = b"BT"
 HEADER = 5  # marker, fingers, counter
-WORDS = 2 * VIBRATIONS  # of a frame: every second is PAC
+WORDS = 2 * VIBRATIONS  # words per frame, every second of them PAC
 WORD_HZ = 4400
-HIGHEST = 0x0FFF  # of 12 bits
-MOST_FINGERS = 5  # on one adapter
+HIGHEST = 0x0FFF  # largest value of 12 bits
+MOST_FINGERS = 5  # fingers per adapter
 SLOTS = (  # word of the frame that each of `biotac_fields` is: tdc, tac, pdc, pac…, electrodes
     *(2 * VIBRATIONS - 2, 2 * VIBRATIONS - 4, 2 * VIBRATIONS - 6),
     *range(1, WORDS, 2),
@@ -56,7 +56,7 @@ class BioTac(Sensor):
 
     fingers: int = 1  # BioTacs on the bridge, 1 to 5
     rate_hz: float = 100.0  # frames a second: 4400 words by 44
-    baud: int = 921600  # of the bridge
+    baud: int = 921600  # baud rate of the bridge
 
     def __post_init__(self) -> None:
         if not 1 <= self.fingers <= MOST_FINGERS:
@@ -78,8 +78,10 @@ class BioTac(Sensor):
         for finger in range(1, self.fingers + 1):
             for field, slot in zip(biotac_fields(), SLOTS, strict=True):
                 offset = {b"offset_ns": str(round(slot * 1e9 / WORD_HZ)).encode()}
-                named = field.with_metadata({**field.metadata, **offset})
-                fields.append(named if self.fingers == 1 else named.with_name(f"finger{finger}_{field.name}"))
+                with_offset = field.with_metadata({**field.metadata, **offset})
+                fields.append(
+                    with_offset if self.fingers == 1 else with_offset.with_name(f"finger{finger}_{field.name}")
+                )
         return fields
 
     def framer(self) -> Framer:
@@ -128,5 +130,5 @@ def _is_odd(data: Bytes) -> Bools:
 
 def _is_whole(frames: Bytes) -> Bools:
     summed = sum16(frames[:, :-2]) == np.ascontiguousarray(frames[:, -2:]).view("<u2")[:, 0]
-    whole: Bools = summed & _is_odd(frames[:, HEADER:-2]).all(axis=1)
-    return whole
+    is_valid: Bools = summed & _is_odd(frames[:, HEADER:-2]).all(axis=1)
+    return is_valid

@@ -1,4 +1,4 @@
-"""From a stream of bytes to frames: lock on repeated marks, check sums, resynchronize.
+"""Cut a stream of bytes into frames: lock on repeated marks, check sums, resynchronize.
 
 No byte is looked at by itself in Python: as long as all is well, the bytes at hand are one array (frame, byte).
 
@@ -30,14 +30,14 @@ class ByteFramer:
         self.account = Account()
         self._text = Pending()
         self._locked = False
-        self._begun = False  # whether any frame was found yet
-        self._broken_at: int | None = None  # where a frame should have begun that did not; counted from the first byte
-        self._barred = -1  # where the chain that broke could begin once more, which it must not
+        self._has_frames = False  # True after the first frame
+        self._broken_at: int | None = None  # place, from the first byte, where an expected frame did not begin
+        self._barred = -1  # place where the broken chain must not begin again
         self._usual = framing.size or 0  # size of the last good frame
         self._marked: tuple[int, list[tuple[int, bytes]]] = (0, [])  # marks of frames of the last size, see `_marks`
-        self._told = (b"", 0)  # the last header whose size was asked for, and the size
-        self._behind = False  # whether the bytes at hand begin right behind a tail, which was cut off
-        self._ruined: set[int] = set()  # where no chain begins, counted from the first byte: not looked at once more
+        self._last_header = (b"", 0)  # the last header whose size was computed, and the size
+        self._follows_tail = False  # True where the buffered bytes begin right after a tail that was cut off
+        self._ruined: set[int] = set()  # places, from the first byte, where no chain begins
 
     def feed(self, chunks: Chunks) -> tuple[list[Run], list[Loss]]:
         """Take what a link gave; return the frames that are complete now, and what was lost."""
@@ -48,11 +48,11 @@ class ByteFramer:
     def flush(self) -> tuple[list[Run], list[Loss]]:
         """Return what is left when nothing more comes: frames with a sum are good, others lack what confirms them."""
         runs, losses = self._scan(ended=True)
-        left = len(self._text.data)
-        if left:
-            whole = self._locked and bool(self._usual) and left >= self._usual
-            losses.append(self._lose(0, left, UNCONFIRMED if whole else CUT if self._begun else START))
-            self._text.cut(left)
+        remaining = len(self._text.data)
+        if remaining:
+            complete = self._locked and bool(self._usual) and remaining >= self._usual
+            losses.append(self._lose(0, remaining, UNCONFIRMED if complete else CUT if self._has_frames else START))
+            self._text.cut(remaining)
         return runs, losses
 
     def _scan(self, *, ended: bool) -> tuple[list[Run], list[Loss]]:
@@ -61,29 +61,29 @@ class ByteFramer:
         place, size = 0, len(self._text.data)
         while place < size:
             if not self._locked:
-                found, kept = self._search(place, ended=ended)
-                if found is None:
-                    place = self._skip(place, kept, losses) if kept - place > self.framing.most else place
+                start, retained = self._search(place, ended=ended)
+                if start is None:
+                    place = self._skip(place, retained, losses) if retained - place > self.framing.most else place
                     break
-                place = self._skip(place, found, losses)
-                self._locked = self._begun = True
+                place = self._skip(place, start, losses)
+                self._locked = self._has_frames = True
                 self._ruined.clear()
                 self._broken_at = None
             spans, stop, broken = self._chain(place)
-            held = 0 if ended and not broken and self.framing.summed else self.framing.confirm
-            place = self._give(spans, held, runs, place)
+            unconfirmed = 0 if ended and not broken and self.framing.summed else self.framing.confirm
+            place = self._give(spans, unconfirmed, runs, place)
             if not broken:
                 break
             self._locked, self._broken_at, self._barred = False, self._text.base + stop, self._text.base + place
         if place:
             tail = self.framing.tail
-            self._behind = bool(tail) and self._text.data[max(0, place - len(tail)) : place] == tail
+            self._follows_tail = bool(tail) and self._text.data[max(0, place - len(tail)) : place] == tail
         self._text.cut(place)
         return runs, losses
 
-    def _give(self, spans: Sequence[Span], held: int, runs: list[Run], place: int) -> int:
-        """Append the runs of a chain but for its last ``held`` frames; return where those begin."""
-        give = -held
+    def _give(self, spans: Sequence[Span], unconfirmed: int, runs: list[Run], place: int) -> int:
+        """Append the runs of a chain but for its last ``unconfirmed`` frames; return where those begin."""
+        give = -unconfirmed
         for _, _, count in spans:
             give += count
         for start, size, count in spans:
@@ -105,20 +105,20 @@ class ByteFramer:
         And where they end, and whether it is certain that no frame begins there. With ``most``, no more than so many.
         """
         spans: list[Span] = []
-        there = len(self._text.data)
-        left = there if most is None else most
-        while left > 0:
+        size_of_text = len(self._text.data)
+        limit = size_of_text if most is None else most
+        while limit > 0:
             size = self._size(place)
-            if size is None or place + size > there:
+            if size is None or place + size > size_of_text:
                 return spans, place, False
             if size == 0:
                 return spans, place, True
-            count = max(1, min((there - place) // size, MOST_BYTES // size, left))
+            count = max(1, min((size_of_text - place) // size, MOST_BYTES // size, limit))
             run = self._good(place, size, count)
             if run:
                 spans.append((place, size, run))
                 place += run * size
-                left -= run
+                limit -= run
             if run < count and (run == 0 or self._size(place) == size):
                 return spans, place, True
         return spans, place, False
@@ -127,8 +127,8 @@ class ByteFramer:
         """Return the size of the frame that begins at ``place``, 0 if none does, None if too few bytes are there."""
         text, framing = self._text.data, self.framing
         if not text.startswith(framing.marker, place):
-            there = text[place : place + len(framing.marker)]
-            if len(there) == len(framing.marker) or not framing.marker.startswith(there):
+            mark = text[place : place + len(framing.marker)]
+            if len(mark) == len(framing.marker) or not framing.marker.startswith(mark):
                 return 0
         if framing.size is not None:
             return framing.size
@@ -137,19 +137,19 @@ class ByteFramer:
         head = text[place : place + framing.header]
         if len(head) < framing.header:
             return None
-        if head != self._told[0]:
+        if head != self._last_header[0]:
             size = int(framing.sizes(np.frombuffer(head, np.uint8)[None])[0])
-            self._told = head, size if framing.header <= size <= framing.most else 0
-        return self._told[1]
+            self._last_header = head, size if framing.header <= size <= framing.most else 0
+        return self._last_header[1]
 
     def _size_to_tail(self, place: int) -> int | None:
         """Return how many bytes there are up to the next tail: the usual number if that gives a tail as well."""
         text, tail = self._text.data, self.framing.tail
         if self._usual and text[place + self._usual - len(tail) : place + self._usual] == tail:
             return self._usual
-        found = place + len(self.framing.marker) - 1
-        while (found := text.find(tail, found + 1, place + self.framing.most)) >= 0:
-            stop = found + len(tail)
+        tail_at = place + len(self.framing.marker) - 1
+        while (tail_at := text.find(tail, tail_at + 1, place + self.framing.most)) >= 0:
+            stop = tail_at + len(tail)
             frame = np.frombuffer(text, np.uint8, stop - place, place)[None]  # (1, byte)
             if self.framing.check is None or self.framing.check(frame)[0]:
                 return stop - place
@@ -188,7 +188,7 @@ class ByteFramer:
         And the first place at which they still may, once more bytes are there.
         """
         possible: int | None = None
-        there = len(self._text.data)
+        size_of_text = len(self._text.data)
         enough = 1 if ended and self.framing.summed else self.framing.lock
         base = self._text.base
         self._ruined = {start for start in self._ruined if start >= base + place}
@@ -196,14 +196,14 @@ class ByteFramer:
             if base + start in self._ruined:
                 continue
             spans, stop, ruined = self._chain(start, self.framing.lock)
-            count = sum(found for _, _, found in spans)
-            if count >= enough and (count >= self.framing.lock or (stop == there and not ruined)):
+            count = sum(frames for _, _, frames in spans)
+            if count >= enough and (count >= self.framing.lock or (stop == size_of_text and not ruined)):
                 return self._phase(start)
             if ruined:
                 self._ruined.add(base + start)
             elif possible is None:
                 possible = start
-        return None, there if possible is None else possible
+        return None, size_of_text if possible is None else possible
 
     def _phase(self, start: int) -> tuple[int | None, int]:
         """Return of the places within a frame from ``start`` on the one at which marks repeat for longest, as `_search`.
@@ -215,19 +215,19 @@ class ByteFramer:
         if self.framing.summed or size is None:
             return start, start
         places = [start]
-        for other in self._candidates(start + 1):
-            if other >= start + size:
+        for candidate in self._candidates(start + 1):
+            if candidate >= start + size:
                 break
-            places.append(other)
-        there = len(self._text.data)
+            places.append(candidate)
+        size_of_text = len(self._text.data)
         chains = [self._chain(place, AMBIGUOUS) for place in places]
         alive = [place for place, (_, _, ruined) in zip(places, chains, strict=True) if not ruined]
-        whole = [place for place in alive if place + size * self.framing.lock <= there]
-        if len(whole) > 1:
-            return None, max(start, there - AMBIGUOUS * size)
+        complete = [place for place in alive if place + size * self.framing.lock <= size_of_text]
+        if len(complete) > 1:
+            return None, max(start, size_of_text - AMBIGUOUS * size)
         longest = max(range(len(places)), key=lambda number: chains[number][1] - places[number])
-        found = whole[0] if whole else places[longest]
-        return found, found
+        chosen = complete[0] if complete else places[longest]
+        return chosen, chosen
 
     def _candidates(self, place: int) -> Iterable[int]:
         """Yield where a frame may begin: at markers, or behind tails; not where the chain that broke began."""
@@ -235,16 +235,16 @@ class ByteFramer:
         mark = framing.marker or framing.tail
         shift = 0 if framing.marker else len(mark)
         barred = self._barred - self._text.base
-        if shift and self._behind and place == 0 != barred:
+        if shift and self._follows_tail and place == 0 != barred:
             yield 0
-        found = text.find(mark, max(0, place - shift))
-        while found >= 0:
-            if found + shift >= place and found + shift != barred:
-                yield found + shift
-            found = text.find(mark, found + 1)
-        for there in range(len(mark) - 1, 0, -1):  # a mark of which the end is not there yet
-            start = len(text) - there
-            if start >= place and start != barred and text.endswith(mark[:there]):
+        mark_at = text.find(mark, max(0, place - shift))
+        while mark_at >= 0:
+            if mark_at + shift >= place and mark_at + shift != barred:
+                yield mark_at + shift
+            mark_at = text.find(mark, mark_at + 1)
+        for length in range(len(mark) - 1, 0, -1):  # a mark of which the end is not there yet
+            start = len(text) - length
+            if start >= place and start != barred and text.endswith(mark[:length]):
                 yield start
 
     def _skip(self, place: int, start: int, losses: list[Loss]) -> int:
@@ -254,7 +254,7 @@ class ByteFramer:
 
     def _cause(self, place: int, start: int) -> str:
         """Return what became of the bytes from ``place`` to ``start``, between good frames."""
-        if not self._begun:
+        if not self._has_frames:
             return START
         broken = place if self._broken_at is None else max(place, self._broken_at - self._text.base)
         between, usual = start - broken, self._usual

@@ -75,9 +75,9 @@ def _crc(data: Bytes, kind: Kind, polynomial: int, bits: int, start: bytes) -> N
     A CRC is the exclusive or of what its bytes add, each by how many follow it, so that all are looked up at once.
     """
     count = data.shape[1]
-    rest = start[count:]  # of the first value, that no byte has met
-    left = int.from_bytes(rest.ljust(len(start), b"\x00")) if kind is _left else int.from_bytes(rest, "little")
-    crc = np.full(len(data), left, dtype=np.uint32)
+    unused = start[count:]  # bytes of the first value that are combined with no byte
+    remainder = int.from_bytes(unused.ljust(len(start), b"\x00")) if kind is _left else int.from_bytes(unused, "little")
+    crc = np.full(len(data), remainder, dtype=np.uint32)
     if not count:
         return crc
     added = _added(kind, polynomial, bits, 1 << (count - 1).bit_length())  # (bytes that follow, value)
@@ -85,8 +85,8 @@ def _crc(data: Bytes, kind: Kind, polynomial: int, bits: int, start: bytes) -> N
     block = max(1, MOST_LOOKED_UP // count)
     flat = added.ravel()
     for first in range(0, len(data), block):
-        found = flat.take(data[first : first + block] + places)  # (frame, byte)
-        crc[first : first + block] ^= np.bitwise_xor.reduce(found, axis=1)
+        crcs = flat.take(data[first : first + block] + places)  # (frame, byte)
+        crc[first : first + block] ^= np.bitwise_xor.reduce(crcs, axis=1)
     for place, value in enumerate(start[:count]):
         crc ^= added[count - 1 - place, value]
     return crc

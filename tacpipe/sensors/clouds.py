@@ -27,7 +27,7 @@ from tacpipe.sensors.text_framer import TextFramer
 if TYPE_CHECKING:
     import pyarrow as pa
 
-NAMED = Path("a cloud")  # in sentences about what has no file name any more
+NAMED = Path("a cloud")  # name in errors, as the file name is not known any more
 AT_HAND = 4  # clouds that are kept between the framer's look at them and their decoding
 
 
@@ -59,12 +59,12 @@ class Clouds(Sensor):
 
     def decode(self, frames: Sequence[bytes]) -> Samples:
         """Return a row for each point; ``rows`` states of which cloud it is."""
-        found = [self._points(frame) for frame in frames]
-        points = [xyz for xyz, _ in found] or [np.zeros((0, 3), np.float32)]
-        rows = np.repeat(np.arange(len(found)), [len(xyz) for xyz, _ in found]).astype(np.int64)
+        clouds = [self._points(frame) for frame in frames]
+        points = [xyz for xyz, _ in clouds] or [np.zeros((0, 3), np.float32)]
+        rows = np.repeat(np.arange(len(clouds)), [len(xyz) for xyz, _ in clouds]).astype(np.int64)
         values: tuple[Float32s | Bytes, ...] = (np.concatenate(points),)
         if self.colour:
-            values += (np.concatenate([rgb for _, rgb in found if rgb is not None] or [np.zeros((0, 3), np.uint8)]),)
+            values += (np.concatenate([rgb for _, rgb in clouds if rgb is not None] or [np.zeros((0, 3), np.uint8)]),)
         return Samples(values, rows=rows)
 
     def encode(self, samples: Samples) -> list[bytes]:
@@ -78,9 +78,9 @@ class Clouds(Sensor):
     def _points(self, content: bytes) -> tuple[Float32s, Bytes | None]:
         """Return the points that were seen (point, xyz), metres, and their colours (point, rgb)."""
         xyz, colours = _parsed(content)
-        seen = np.isfinite(xyz).all(axis=1)
+        is_finite = np.isfinite(xyz).all(axis=1)
         scale = np.float32(1.0 if content.startswith(MAGIC) else self.unit_m)
-        return xyz[seen] * scale, None if colours is None else colours[seen]
+        return xyz[is_finite] * scale, None if colours is None else colours[is_finite]
 
     def _is_right(self, content: bytes) -> bool:
         try:

@@ -43,8 +43,8 @@ class Contactile(Sensor):
     summary: ClassVar[str] = "Contactile PapillArray sensors behind their controller (PTS v2.0)."
     counter: ClassVar[int | None] = COUNTER
 
-    sensors: int = 2  # on the controller
-    pillars: int = 9  # of each sensor
+    sensors: int = 2  # number of sensors on the controller
+    pillars: int = 9  # number of pillars per sensor
     slip: bool = False  # watch for slip: states and friction of pillars and sensors
     rate_hz: float = 500.0  # 100, 250, 500 or 1000
     baud: int = 115200  # over USB any
@@ -76,18 +76,18 @@ class Contactile(Sensor):
             for name, layout in sensors
             for pillar in range(1, self.pillars + 1)
         ]
-        one, newton = {"unit": "1", "quantity": "status"}, {"unit": "N", "quantity": "force"}
+        status, newton = {"unit": "1", "quantity": "status"}, {"unit": "N", "quantity": "force"}
         friction = {"unit": "1", "quantity": "friction"}
         fields = [
             f for owner in pillars for f in (*_vector(*owner, "force", "N"), *_vector(*owner, "displacement", "mm"))
         ]
         fields += [f for owner in sensors for f in (*_vector(*owner, "force", "N"), *_vector(*owner, "torque", "N mm"))]
         if self.slip:
-            fields += [pa.field(f"{name}_slip", pa.int8(), metadata=one | layout) for name, layout in pillars]
+            fields += [pa.field(f"{name}_slip", pa.int8(), metadata=status | layout) for name, layout in pillars]
             fields += [
                 pa.field(f"{name}_friction", pa.float32(), metadata=friction | layout) for name, layout in pillars
             ]
-            fields += [pa.field(f"{name}_slip", pa.uint8(), metadata=one | layout) for name, layout in sensors]
+            fields += [pa.field(f"{name}_slip", pa.uint8(), metadata=status | layout) for name, layout in sensors]
             for name, layout in sensors:
                 fields.append(pa.field(f"{name}_friction", pa.float32(), metadata=friction | layout))
                 fields.append(pa.field(f"{name}_grip_force_n", pa.float32(), metadata=newton | layout))
@@ -125,7 +125,7 @@ class Contactile(Sensor):
             selected = frames[rows]
             parts.append((rows, self._values(selected, layout), _gathered(selected, layout.places(pts.HUB), 12)[:, 0]))
         if not parts:
-            return self._nothing()
+            return self._empty_samples()
         rows = np.concatenate([part[0] for part in parts])
         order = np.argsort(rows, kind="stable")
         hub = np.concatenate([part[2] for part in parts])[order]
@@ -134,7 +134,7 @@ class Contactile(Sensor):
         t_us = np.ascontiguousarray(hub[:, 4:]).view("<u8")[:, 0].astype(np.int64)
         return Samples(values, seq=seq, t_device_ns=t_us * 1000, rows=rows[order])
 
-    def _nothing(self) -> Samples:
+    def _empty_samples(self) -> Samples:
         none = np.zeros(0, dtype=np.int64)
         layout = pts.parse(pts.template(self.sensors, self.pillars, slip=self.slip))
         return Samples(
@@ -162,7 +162,7 @@ class Contactile(Sensor):
         t_us = (samples.t_device_ns // 1000).astype("<u8")[:, None].view(np.uint8)
         _scatter(frames, layout.places(pts.HUB), np.hstack([counter, t_us])[:, None])
         forces, *slip = samples.values
-        entries = _bytes(forces, 24)  # of all pillars, then of the sensors
+        entries = _bytes(forces, 24)  # bytes of all pillars, then of the sensors
         _scatter(frames, layout.places(pts.PILLARS), entries[:, : -self.sensors])
         _scatter(frames, layout.places(pts.SENSORS), entries[:, -self.sensors :])
         if self.slip:

@@ -1,4 +1,4 @@
-"""What boards have in common whose frames the rig file describes: a counter, a clock, and what starts and stops them."""
+"""Define the options that sensors share whose frames the rig file describes: a counter, a clock, start and stop."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from tacpipe.sensors.sensor import Device, Sensor
 
 
 class Counter(Protocol):
-    """What the rig file states of the counter in a frame."""
+    """The counter in a frame, as the rig file states it."""
 
     @property
     def modulus(self) -> int:
-        """At which it begins anew; 0: as its type."""
+        """The modulus of the counter; 0: that of its type."""
 
     @property
     def step(self) -> int:
-        """By which it grows."""
+        """The increment of the counter."""
 
 
 class DescribedSensor(Sensor):
@@ -33,9 +33,9 @@ class DescribedSensor(Sensor):
 
     @property
     def counter_modulus(self) -> int:
-        """At which the sequence begins anew; 0 where there is none."""
-        found = self._counting()
-        return 0 if found is None else found[0].modulus or found[1]
+        """The modulus of the sequence, 0 where there is none."""
+        counting = self._counting()
+        return 0 if counting is None else counting[0].modulus or counting[1]
 
     @property
     def counter(self) -> int | None:  # type: ignore[override]
@@ -44,9 +44,9 @@ class DescribedSensor(Sensor):
 
     @property
     def step(self) -> int:  # type: ignore[override]
-        """By which ``seq`` grows from a frame to the next."""
-        found = self._counting()
-        return 1 if found is None else found[0].step
+        """The increment of ``seq`` from one frame to the next."""
+        counting = self._counting()
+        return 1 if counting is None else counting[0].step
 
 
 def device_ns(ticks: AnyArray, unit: str) -> Int64s:

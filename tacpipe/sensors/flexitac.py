@@ -35,10 +35,10 @@ class FlexiTac(Sensor):
     )
     line: ClassVar[Line] = Line(settle_s=2.0)  # opening the port resets an Arduino, which takes so long to boot
 
-    rows: int = 12  # of the grid, as in the firmware
-    columns: int = 32  # of the grid, as in the firmware
+    rows: int = 12  # rows of the grid, as in the firmware
+    columns: int = 32  # columns of the grid, as in the firmware
     rate_hz: float = 100.0  # frames a second: about 85 to 105 of 12 x 32
-    baud: int = 2_000_000  # as in the firmware
+    baud: int = 2_000_000  # baud rate of the firmware
 
     def __post_init__(self) -> None:
         options.positive("flexitac", rows=self.rows, columns=self.columns, rate_hz=self.rate_hz, baud=self.baud)

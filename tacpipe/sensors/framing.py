@@ -1,4 +1,4 @@
-"""What frames look like in the bytes of a link, what becomes of bytes that are none, and what cuts the ones from the others.
+"""Define chunks of bytes, the description of frames in them, losses, and the interface of framers.
 
 Every framer accounts for every byte: it ends up in a frame, in a `Loss`, or in what is still pending; `Account` holds the
 sums. `ByteFramer` is for streams of bytes, `LineFramer` for lines of text, `PacketFramer` and `TextFramer` for links that
@@ -25,7 +25,7 @@ MALFORMED = "malformed"  # a packet that is none of this protocol
 
 @dataclass(frozen=True)
 class Chunks:
-    """What a link gave: the bytes as they came, and when. For links of packets each chunk is one."""
+    """The bytes of a link as they arrived, with their arrivals. Each chunk of a link of packets is one packet."""
 
     t_ns: Times  # (chunk,), arrival
     size: Int64s  # (chunk,), bytes
@@ -40,11 +40,11 @@ class Chunks:
         return cls(stamps, sizes, b"".join(data for _, data in pairs))
 
     @classmethod
-    def joined(cls, several: Sequence[Chunks]) -> Chunks:
+    def joined(cls, parts: Sequence[Chunks]) -> Chunks:
         """Return several as one."""
-        stamps = np.concatenate([one.t_ns for one in several]) if several else np.zeros(0, dtype=np.int64)
-        sizes = np.concatenate([one.size for one in several]) if several else np.zeros(0, dtype=np.int64)
-        return cls(stamps, sizes, b"".join(one.data for one in several))
+        stamps = np.concatenate([part.t_ns for part in parts]) if parts else np.zeros(0, dtype=np.int64)
+        sizes = np.concatenate([part.size for part in parts]) if parts else np.zeros(0, dtype=np.int64)
+        return cls(stamps, sizes, b"".join(part.data for part in parts))
 
     def since(self, t_ns: int) -> Chunks:
         """Return the chunks that arrived at a moment or later."""
@@ -90,7 +90,7 @@ class Account:
 
 
 class Framer(Protocol):
-    """What cuts bytes into frames."""
+    """An object that cuts bytes into frames."""
 
     account: Account
 
@@ -105,9 +105,9 @@ class Framer(Protocol):
 class Framing:
     """How frames look in a stream of bytes."""
 
-    marker: bytes = b""  # that each begins with
-    tail: bytes = b""  # that each ends with
-    size: int | None = None  # of the whole frame in bytes, where all have the same
+    marker: bytes = b""  # first bytes of each frame
+    tail: bytes = b""  # last bytes of each frame
+    size: int | None = None  # size of a frame in bytes, where all have the same
     header: int = 0  # bytes from which ``sizes`` states the size, the marker included
     sizes: Callable[[Bytes], Ints] | None = None  # (frame, header) to (frame,), whole sizes
     most: int = 4096  # largest size; a frame that states more of itself is none
@@ -120,5 +120,5 @@ class Framing:
 
     @property
     def summed(self) -> bool:
-        """Whether one frame alone can be known to be one."""
+        """Return whether a single frame can be recognised."""
         return self.check is not None and not self.weak

@@ -34,10 +34,10 @@ LARGEST = 1 << 20  # bytes of a message; more is none
 RATE_HZ = 1000.0  # fixed
 JOINTS = 7
 FLAGS = 41  # kinds of errors
-AFFINE = 1e-3  # by which the last row of a pose may miss (0, 0, 0, 1)
+AFFINE = 1e-3  # tolerance of the last row of a pose to (0, 0, 0, 1)
 
 POSE, INERTIA = 16, 9  # matrices, column after column
-FLOATS = {  # in their order, with how many numbers each has
+FLOATS = {  # names and counts of numbers, in their order
     **dict.fromkeys(("O_T_EE", "O_T_EE_d", "F_T_EE", "EE_T_K", "F_T_NE", "NE_T_EE"), POSE),
     **{"m_ee": 1, "I_ee": INERTIA, "F_x_Cee": 3, "m_load": 1, "I_load": INERTIA, "F_x_Cload": 3},
     **{"elbow": 2, "elbow_d": 2},
@@ -55,7 +55,7 @@ STATE = np.dtype(
     + [("robot_mode", "u1"), ("success_rate", "<f4")]
 )
 MEASURED, AIMED = "O_T_EE", "O_T_EE_d"  # poses
-READ = (MEASURED, "q", "dq", "tau_J", "tau_ext_hat_filtered", "O_F_ext_hat_K", "success_rate")  # of the floats
+READ = (MEASURED, "q", "dq", "tau_J", "tau_ext_hat_filtered", "O_F_ext_hat_K", "success_rate")  # floats that are read
 MODES = ("robot_mode", "motion_mode", "control_mode")
 ERRORS = ("errors", "last_errors")
 
@@ -154,8 +154,8 @@ class Franka(Sensor):
 
     def opening(self, local: Mapping[str, Any]) -> Dialogue:
         """Ask for the state at the port that the link listens on. Raises `DeviceError` if the arm refuses."""
-        asked = CONNECT.pack(CONNECT_COMMAND, 1, CONNECT.size, VERSION, local["port"])
-        reply = yield Ask(asked, whole, what="the arm's reply to a connection (FCI must be activated in Desk)")
+        request = CONNECT.pack(CONNECT_COMMAND, 1, CONNECT.size, VERSION, local["port"])
+        reply = yield Ask(request, whole, what="the arm's reply to a connection (FCI must be activated in Desk)")
         if len(reply) < CONNECTED.size:
             raise DeviceError(
                 f"The arm's reply has {len(reply)} bytes; it should have {CONNECTED.size}. Is this an FCI?"

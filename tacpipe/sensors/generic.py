@@ -47,18 +47,18 @@ class Generic(DescribedSensor):
     links: ClassVar[tuple[str, ...]] = ("serial", "tcp", "udp", "hid")
 
     rate_hz: float  # frames a second
-    numbers: tuple[Number, ...]  # between marker and tail, in their order, without gaps
+    numbers: tuple[Number, ...]  # the numbers between marker and tail, in their order, without gaps
     marker: str = ""  # bytes that each frame begins with, in hexadecimal: "AA 55"
     tail: str = ""  # bytes that each frame ends with, in hexadecimal: "0D 0A"
-    order: Order = "little"  # of the bytes of a number: little or big, the end that comes first
+    order: Order = "little"  # byte order of numbers: little or big, the end that comes first
     sum: Sum | None = None  # how a frame is summed, and which number holds that
-    sequence: Sequence | None = None  # which number counts the frames
-    clock: Clock | None = None  # which number is the device's time
-    length: Length | None = None  # which number states the size of a frame; none: all have the same
+    sequence: Sequence | None = None  # the number that counts the frames
+    clock: Clock | None = None  # the number that is the device's time
+    length: Length | None = None  # the number that states the size of a frame; none: all have the same
     packets: bool = False  # each packet of the link is a frame (udp, hid), which then needs no marker
-    start: str = ""  # what has the board stream, in hexadecimal; none: it streams by itself
-    stop: str = ""  # what ends that, in hexadecimal
-    baud: int = 115_200  # of a serial port
+    start: str = ""  # bytes that start the stream, in hexadecimal; none: the board streams by itself
+    stop: str = ""  # bytes that stop the stream, in hexadecimal
+    baud: int = 115_200  # baud rate of a serial port
 
     def __post_init__(self) -> None:
         options.positive("generic", rate_hz=self.rate_hz, baud=self.baud)
@@ -77,21 +77,21 @@ class Generic(DescribedSensor):
         self._check_roles()
         place = self._places[self.clock.number] if self.clock is not None else None
         if self.clock is not None and place is not None and place.kind.kind in "ui" and place.width < 8:
-            wrap_ns = place.range * layout.UNITS_NS[self.clock.unit]  # as a u32 of microseconds after 71.6 minutes
+            wrap_ns = place.range * layout.UNITS_NS[self.clock.unit]  # a u32 of microseconds wraps after 71.6 minutes
             object.__setattr__(self, "device_wrap_ns", wrap_ns)
 
     def _check_names(self) -> None:
         names = [name for place in self._channels for name, _ in _names(place.number)]
-        if twice := next((name for name in names if names.count(name) > 1), None):
-            raise UsageError(f"generic: two channels are named {twice}; give the numbers other names.")
+        if repeated := next((name for name in names if names.count(name) > 1), None):
+            raise UsageError(f"generic: two channels are named {repeated}; give the numbers other names.")
 
     def _check_roles(self) -> None:
         """Raise `UsageError` unless sum, sequence, clock and length each have a number of their own that can hold it."""
         roles = [role for role in (self.sum, self.sequence, self.clock, self.length) if role is not None]
-        taken = [role.number for role in roles]
-        if twice := next((name for name in taken if taken.count(name) > 1), None):
+        numbers = [role.number for role in roles]
+        if repeated := next((name for name in numbers if numbers.count(name) > 1), None):
             raise UsageError(
-                f"generic: the number {twice} has two roles; each of sum, sequence, clock, length needs its own."
+                f"generic: the number {repeated} has two roles; each of sum, sequence, clock, length needs its own."
             )
         if self.sum is not None:
             layout.summed(self.sum, layout.referred(self._places, "sum", self.sum.number), self.size)
@@ -127,11 +127,11 @@ class Generic(DescribedSensor):
 
     @functools.cached_property
     def _channels(self) -> list[Place]:
-        taken = {role.number for role in (self.sum, self.sequence, self.clock, self.length) if role is not None}
+        roles = {role.number for role in (self.sum, self.sequence, self.clock, self.length) if role is not None}
         return [
             place
             for name, place in self._places.items()
-            if name not in taken and not place.number.skip and place.number.equals is None
+            if name not in roles and not place.number.skip and place.number.equals is None
         ]
 
     def _counting(self) -> tuple[Sequence, int] | None:

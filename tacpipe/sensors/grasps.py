@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 VERSION = 1
-MOST_GRASPS, MOST_POINTS = 1000, 1_000_000  # of a request
+MOST_GRASPS, MOST_POINTS = 1000, 1_000_000  # limits of a request
 LARGEST = 1 << 62
 POINTS = tuple(f"{point}_{axis}_m" for point in ("g1", "g2") for axis in "xyz")
 WRIST = tuple(f"wrist_{row}_{column}" for row in range(3) for column in range(3))
@@ -46,7 +46,7 @@ class Grasps(Sensor):
     listens: ClassVar[bool] = True
     steady: ClassVar[bool] = False
 
-    folder: str = ""  # in which the files of clouds are that requests name; empty: requests must hold their clouds
+    folder: str = ""  # folder of the files of clouds that requests name; empty: requests must contain their clouds
     rate_hz: float = 0.0  # requests a second; 0: they come when they come
 
     def fields(self) -> list[pa.Field]:
@@ -72,12 +72,12 @@ class Grasps(Sensor):
 
     def decode(self, frames: Sequence[bytes]) -> Samples:
         """Return a sample for each grasp of each request; the wrist is NaN where it is not given."""
-        found = [parsed(frame) for frame in frames]
-        rows = [len(one["grasps"]) for one in found]
-        numbers = [[one["request"], place] for one in found for place in range(len(one["grasps"]))]
+        requests = [parsed(frame) for frame in frames]
+        rows = [len(request["grasps"]) for request in requests]
+        numbers = [[one["request"], place] for one in requests for place in range(len(one["grasps"]))]
         places = [
             [*grasp["g1"], *grasp["g2"], *itertools.chain.from_iterable(grasp.get("wrist") or [[math.nan] * 3] * 3)]
-            for one in found
+            for one in requests
             for grasp in one["grasps"]
         ]
         return Samples(
@@ -85,19 +85,19 @@ class Grasps(Sensor):
                 np.array(numbers, dtype=np.int64).reshape(-1, 2),
                 np.array(places, dtype=np.float64).reshape(-1, len(POINTS) + len(WRIST)),
             ),
-            rows=np.repeat(np.arange(len(found)), rows).astype(np.int64),
+            rows=np.repeat(np.arange(len(requests)), rows).astype(np.int64),
         )
 
     def encode(self, samples: Samples) -> list[bytes]:
         """Return a request without a cloud for each run of samples whose grasps are counted from 0."""
         numbers, places = samples.values
-        found: list[dict[str, Any]] = []
+        requests: list[dict[str, Any]] = []
         for (request, grasp), place in zip(numbers.tolist(), places, strict=True):
-            if not grasp or not found:
-                found.append({"version": VERSION, "request": request, "cloud": None, "grasps": []})
+            if not grasp or not requests:
+                requests.append({"version": VERSION, "request": request, "cloud": None, "grasps": []})
             wrist = place[6:].reshape(3, 3).tolist() if np.isfinite(place[6:]).all() else None
-            found[-1]["grasps"].append({"g1": place[:3].tolist(), "g2": place[3:6].tolist(), "wrist": wrist})
-        return [json.dumps(one).encode() for one in found]
+            requests[-1]["grasps"].append({"g1": place[:3].tolist(), "g2": place[3:6].tolist(), "wrist": wrist})
+        return [json.dumps(request).encode() for request in requests]
 
 
 def is_request(text: bytes) -> bool:
@@ -129,10 +129,12 @@ def _is_cloud(cloud: Any) -> bool:
     if cloud is None or isinstance(cloud, str):
         return True
     widths = {len(point) for point in cloud}
-    return 0 < len(cloud) <= MOST_POINTS and widths in ({3}, {6}) and all(_are_numbers(one, len(one)) for one in cloud)
+    return 0 < len(cloud) <= MOST_POINTS and widths in ({3}, {6}) and all(_are_numbers(row, len(row)) for row in cloud)
 
 
 def _are_numbers(row: Any, count: int) -> bool:
     return (
-        type(row) is list and len(row) == count and all(type(one) in (int, float) and math.isfinite(one) for one in row)
+        type(row) is list
+        and len(row) == count
+        and all(type(number) in (int, float) and math.isfinite(number) for number in row)
     )

@@ -42,11 +42,11 @@ class JustFloat(Sensor):
 
     model: Literal["any", "fulai-3.0", "fulai-3.1", "fulai-3.2"] = "any"  # a fulai's hardware version, or any board
     channels: int = 0  # floats in a frame, of any board; 0: as many as names
-    names: tuple[str, ...] = ()  # of the channels, of any board; none: taxel01, taxel02, …
-    unit: str = "1"  # of the channels, of any board
-    quantity: str = "tactile"  # of the channels, of any board
+    names: tuple[str, ...] = ()  # names of the channels of another board; none: taxel01, taxel02, …
+    unit: str = "1"  # unit of the channels of another board
+    quantity: str = "tactile"  # quantity of the channels of another board
     rate_hz: float = 100.0  # frames a second
-    baud: int = 2_000_000  # of the port
+    baud: int = 2_000_000  # baud rate of the port
 
     def __post_init__(self) -> None:
         options.known("justfloat", "model", self.model, ("any", *FULAI))
@@ -73,8 +73,8 @@ class JustFloat(Sensor):
         return FULAI.get(self.model, self.channels or len(self.names))
 
     @functools.cached_property
-    def kept(self) -> Indices:
-        """Which floats of a frame are channels (channel,)."""
+    def channel_places(self) -> Indices:
+        """The positions of channels among the floats of a frame (channel,)."""
         return np.setdiff1d(np.arange(self.floats), RESERVED.get(self.model, ()))
 
     def fields(self) -> list[pa.Field]:
@@ -86,7 +86,7 @@ class JustFloat(Sensor):
             return [pa.field(name, pa.float32(), metadata=metadata) for name in self.names]
         return [
             field.with_metadata({**field.metadata, b"quantity": self.quantity.encode()})
-            for field in taxels.fields(len(self.kept), pa.float32(), self.unit)
+            for field in taxels.fields(len(self.channel_places), pa.float32(), self.unit)
         ]
 
     def framer(self) -> Framer:
@@ -96,12 +96,12 @@ class JustFloat(Sensor):
     def decode(self, frames: Bytes) -> Samples:
         """Return the floats (frame, channel)."""
         floats = _floats(frames)
-        return Samples((floats[:, self.kept] if self.model in RESERVED else floats,))
+        return Samples((floats[:, self.channel_places] if self.model in RESERVED else floats,))
 
     def encode(self, samples: Samples) -> Bytes:
         """Return the frames of these samples, with zeros for what is reserved."""
         floats = np.zeros((len(samples), self.floats), dtype="<f4")
-        floats[:, self.kept] = samples.values[0]
+        floats[:, self.channel_places] = samples.values[0]
         tails = np.broadcast_to(np.frombuffer(TAIL, np.uint8), (len(floats), len(TAIL)))
         return np.hstack([floats.view(np.uint8), tails])
 

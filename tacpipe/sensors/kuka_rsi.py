@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 
-CYCLES_MS = (4, 12)  # of the controller
+CYCLES_MS = (4, 12)  # cycles of the controller
 FRAME, AXES = ("X", "Y", "Z", "A", "B", "C"), tuple(f"A{axis}" for axis in range(1, 7))
 ATTRIBUTES = {
     "RIst": FRAME,
@@ -78,7 +78,7 @@ class KukaRsi(Sensor):
             )
         if not re.fullmatch(r"\w+", self.sen_type):
             raise UsageError(f"kuka-rsi: sen_type is {self.sen_type!r}; it must be the SENTYPE of the configuration.")
-        object.__setattr__(self, "step", self.cycle_ms)  # by which IPOC grows; an option sets it
+        object.__setattr__(self, "step", self.cycle_ms)  # increment of IPOC, which an option sets
 
     @property
     def cycle_ms(self) -> int:
@@ -119,10 +119,10 @@ class KukaRsi(Sensor):
 
     def answer(self, chunk: bytes) -> bytes:
         """Return the reply to a text: its IPOC and no correction; nothing if the controller only sends."""
-        found = None if self.only_send else IPOC.search(chunk)
-        if found is None:
+        match = None if self.only_send else IPOC.search(chunk)
+        if match is None:
             return b""
-        return b'<Sen Type="%b"><IPOC>%b</IPOC></Sen>' % (self.sen_type.encode(), found[1])
+        return b'<Sen Type="%b"><IPOC>%b</IPOC></Sen>' % (self.sen_type.encode(), match[1])
 
     def device(self) -> Device:
         """Return a controller, which sends from the start; it minds no answers."""
@@ -138,23 +138,23 @@ def _numbers(outputs: tuple[str, ...], packet: bytes) -> tuple[float, ...] | Non
         numbers = [ipoc, *(float(text) for name in outputs for text in _texts(root, name))]
     except (ElementTree.ParseError, ValueError):
         return None
-    whole = len(numbers) == 1 + sum(map(_width, outputs)) and 0 <= ipoc < 1 << 32
-    return tuple(numbers) if root.tag == "Rob" and whole and all(map(math.isfinite, numbers)) else None
+    is_valid = len(numbers) == 1 + sum(map(_width, outputs)) and 0 <= ipoc < 1 << 32
+    return tuple(numbers) if root.tag == "Rob" and is_valid and all(map(math.isfinite, numbers)) else None
 
 
 @functools.lru_cache(maxsize=BATCHES_AT_HAND)
 def _table(outputs: tuple[str, ...], packets: tuple[bytes, ...]) -> Floats | None:
     """Return IPOC and the numbers of the outputs (packet, number); None where packets differ in more than their numbers."""
-    known = _pattern(outputs, number_texts.numbered(packets[0])) if packets else None
-    if known is None:
+    layout = _pattern(outputs, number_texts.numbered(packets[0])) if packets else None
+    if layout is None:
         return None
-    pattern, columns = known
-    written = pattern.written(packets)
-    numbers = None if written is None else number_texts.floats(written)
-    if written is None or numbers is None or not np.isfinite(numbers).all():
+    pattern, columns = layout
+    parsed = pattern.written(packets)
+    numbers = None if parsed is None else number_texts.floats(parsed)
+    if parsed is None or numbers is None or not np.isfinite(numbers).all():
         return None
     wide = len(pattern.before)
-    clock = number_texts.wholes(number_texts.taken(written, range(columns[0], len(written), wide)))
+    clock = number_texts.wholes(number_texts.taken(parsed, range(columns[0], len(parsed), wide)))
     if clock is None or clock.min() < 0 or clock.max() >= 1 << 32:
         return None
     table = numbers.reshape(len(packets), wide)[:, columns]
@@ -169,8 +169,8 @@ def _pattern(outputs: tuple[str, ...], text: bytes) -> tuple[number_texts.Patter
     if pattern is None or content is None:
         return None
     columns = np.array(content) - number_texts.FIRST
-    known = (columns >= 0) & (columns < len(pattern.before))
-    return (pattern, columns.astype(np.intp)) if known.all() else None
+    is_number = (columns >= 0) & (columns < len(pattern.before))
+    return (pattern, columns.astype(np.intp)) if is_number.all() else None
 
 
 def _width(name: str) -> int:

@@ -36,14 +36,14 @@ UNITS_NS = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_000_000_000}
 class Number:
     """One number of a frame, or several of a kind."""
 
-    name: str  # of the channel; of several, numbers go behind it: taxel01, taxel02, …
+    name: str  # name of the channel; several get numbers: taxel01, taxel02, …
     type: Type  # u unsigned, i signed, f floating point, and the bits
     count: int = 1  # how many
-    axes: str = ""  # of each, such as "xyz" for three numbers a taxel: taxel01_x, taxel01_y, …
-    unit: str = "1"  # in which it is
-    quantity: str = "tactile"  # what it is, as docs/format.md lists it
-    order: Order | None = None  # of its bytes, where it is not that of the frame
-    equals: int | None = None  # what it always is; such a number is looked at and is not a channel
+    axes: str = ""  # axes of each, such as "xyz" for three numbers per taxel: taxel01_x, taxel01_y, …
+    unit: str = "1"  # unit of the channel
+    quantity: str = "tactile"  # quantity of the channel, one of docs/format.md
+    order: Order | None = None  # byte order, where it differs from that of the frame
+    equals: int | None = None  # constant value; such a number is checked and is not a channel
     skip: bool = False  # it is not a channel
 
 
@@ -59,11 +59,11 @@ class Sum:
 
 @dataclass(frozen=True)
 class Sequence:
-    """What counts the frames."""
+    """The number that counts the frames."""
 
     number: str  # the name of the number that holds it
-    modulus: int = 0  # at which it begins anew; 0: as its type
-    step: int = 1  # by which it grows
+    modulus: int = 0  # modulus of the counter; 0: that of its type
+    step: int = 1  # increment of the counter
 
 
 @dataclass(frozen=True)
@@ -71,12 +71,12 @@ class Clock:
     """The device's time of a frame."""
 
     number: str  # the name of the number that holds it
-    unit: Literal["ns", "us", "ms", "s"]  # of that number
+    unit: Literal["ns", "us", "ms", "s"]  # unit of that number
 
 
 @dataclass(frozen=True)
 class Length:
-    """What states the size of a frame, where a board sends frames of several sizes."""
+    """The number that states the size of a frame, where a board sends frames of several sizes."""
 
     number: str  # the name of the number that holds it
     plus: int = 0  # bytes of the whole frame that it does not count
@@ -84,7 +84,7 @@ class Length:
 
 @dataclass(frozen=True)
 class Place:
-    """Where a number stands in a frame."""
+    """The place of a number in a frame."""
 
     number: Number
     at: int  # first byte
@@ -123,7 +123,7 @@ class Place:
             return data.view(self.kind.newbyteorder(_sign(self.order))).astype(self.kind, copy=False)
         wide = np.zeros(
             (len(data), self.many, 4), dtype=np.uint8
-        )  # in the upper bytes, so that the sign is in its place
+        )  # in the upper bytes, so that the sign bit is at its place
         triples = data.reshape(len(data), self.many, 3)
         wide[:, :, 1:] = triples if self.order == "little" else triples[:, :, ::-1]
         return wide.view(self.kind.newbyteorder("<"))[:, :, 0].astype(self.kind) >> 8
@@ -143,11 +143,11 @@ def places(numbers: Iterable[Number], begin: int, order: Order) -> dict[str, Pla
 
     Raises `UsageError` for a name that is none or is there twice, a count below 1, and a value that the type cannot hold.
     """
-    found: dict[str, Place] = {}
+    by_name: dict[str, Place] = {}
     for number in numbers:
         if not NAME.fullmatch(number.name):
             _refuse(f"{number.name!r} cannot name a number; take small letters, digits and _")
-        if number.name in found:
+        if number.name in by_name:
             _refuse(f"two numbers are named {number.name}; names must be unique")
         if not 1 <= number.count <= 4096:
             _refuse(f"the number {number.name} has count = {number.count}; it must be between 1 and 4096")
@@ -155,26 +155,26 @@ def places(numbers: Iterable[Number], begin: int, order: Order) -> dict[str, Pla
             _refuse(f'the number {number.name} has axes = "{number.axes}"; it must be a letter each, such as "xyz"')
         place = Place(number, begin, number.order or order)
         if number.equals is not None:
-            least = 0 if number.type[0] != "i" else -place.range // 2
+            smallest = 0 if number.type[0] != "i" else -place.range // 2
             if number.type[0] == "f":
                 _refuse(f"the number {number.name} has equals, which only whole numbers can have, and is {number.type}")
-            if not least <= number.equals < least + place.range:
+            if not smallest <= number.equals < smallest + place.range:
                 _refuse(
                     f"the number {number.name} can never be {number.equals}, as equals states: its type is {number.type}"
                 )
-        found[number.name] = place
+        by_name[number.name] = place
         begin = place.stop
-    return found
+    return by_name
 
 
-def referred(known: dict[str, Place], role: str, name: str, types: str = "u") -> Place:
+def referred(places: dict[str, Place], role: str, name: str, types: str = "u") -> Place:
     """Return the place of the number that ``role`` refers to by name.
 
     Raises `UsageError` if there is none, or it is several or not of a kind in ``types``.
     """
-    if name not in known:
-        _refuse(f"{role} refers to the number {name!r}, which is not there; there are {', '.join(known) or 'none'}")
-    place = known[name]
+    if name not in places:
+        _refuse(f"{role} refers to the number {name!r}, which is not there; there are {', '.join(places) or 'none'}")
+    place = places[name]
     if place.many != 1:
         _refuse(f"{role} refers to the number {name}, which is {place.many} numbers; it must be one")
     if place.number.type[0] not in types:

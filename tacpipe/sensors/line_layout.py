@@ -23,21 +23,21 @@ MOST_CELLS = 4096
 class Column:
     """One column of the lines, or several of a kind."""
 
-    name: str  # of the channel; taxel{1..16} and taxel{1..4}_{x,y,z} are several, the last braces counting fastest
+    name: str  # name of the channel; taxel{1..16} and taxel{1..4}_{x,y,z} are several, the last braces count fastest
     type: Type = "f32"  # u unsigned, i signed, f floating point, and the bits
-    unit: str = "1"  # in which it is
-    quantity: str = "tactile"  # what it is, as docs/format.md lists it
+    unit: str = "1"  # unit of the channel
+    quantity: str = "tactile"  # quantity of the channel, one of docs/format.md
     label: str = ""  # text right before each number, as "x:"; with the braces of the name
     skip: bool = False  # it is not a channel, and may hold any text
 
 
 @dataclass(frozen=True)
 class Sequence:
-    """What counts the lines."""
+    """The column that counts the lines."""
 
     column: str  # the name of the column that holds it
-    modulus: int = 0  # at which it begins anew; 0: as its type
-    step: int = 1  # by which it grows
+    modulus: int = 0  # modulus of the counter; 0: that of its type
+    step: int = 1  # increment of the counter
 
 
 @dataclass(frozen=True)
@@ -45,8 +45,8 @@ class Clock:
     """The device's time of a line."""
 
     column: str  # the name of the column that holds it
-    unit: Literal["ns", "us", "ms", "s"]  # of that column
-    modulus: int = 0  # at which it begins anew, in its unit; 0: as its type
+    unit: Literal["ns", "us", "ms", "s"]  # unit of that column
+    modulus: int = 0  # modulus of the clock in its unit; 0: that of its type
 
 
 @dataclass(frozen=True)
@@ -54,10 +54,10 @@ class Sum:
     """The check sum that ends a line."""
 
     kind: Literal["sum8", "lrc", "xor8", "crc8", "sum16", "crc16-modbus", "crc16-ccitt", "crc32"]  # how it is computed
-    mark: str = "*"  # what stands right before it; the last such text of a line
-    digits: Literal["hex", "decimal"] = "hex"  # as what it is written
-    begin: str = ""  # what lines begin with that is not summed: the $ of NMEA 0183
-    mark_summed: bool = False  # whether the mark is summed with what stands before it
+    mark: str = "*"  # text right before it, the last such text of a line
+    digits: Literal["hex", "decimal"] = "hex"  # notation of the check sum
+    begin: str = ""  # start of lines that is not summed: the $ of NMEA 0183
+    mark_summed: bool = False  # True where the mark is summed too
 
     @property
     def width(self) -> int:
@@ -98,18 +98,18 @@ def cells(columns: tuple[Column, ...]) -> tuple[Cell, ...]:
     >>> [cell.name for cell in cells((Column("t", "u32"), Column("taxel{1..2}_{x,y}", "u16")))]
     ['t', 'taxel01_x', 'taxel01_y', 'taxel02_x', 'taxel02_y']
     """
-    found: dict[str, Cell] = {}
+    by_name: dict[str, Cell] = {}
     for column in columns:
         for cell in _expanded(column):
             if not NAME.fullmatch(cell.name):
                 _refuse(f"{cell.name!r} cannot name a column; take small letters, digits and _, as in taxel{{1..16}}")
-            if cell.name in found:
+            if cell.name in by_name:
                 _refuse(f"two columns are named {cell.name}; names must be unique")
-            found[cell.name] = cell
-            options.within("lines", "count of columns", len(found), 1, MOST_CELLS)
-    if not any(not cell.skip for cell in found.values()):
+            by_name[cell.name] = cell
+            options.within("lines", "count of columns", len(by_name), 1, MOST_CELLS)
+    if not any(not cell.skip for cell in by_name.values()):
         _refuse("no column is a channel; list in columns what stands in a line, in its order")
-    return tuple(found.values())
+    return tuple(by_name.values())
 
 
 def _expanded(column: Column) -> Iterator[Cell]:
@@ -117,9 +117,9 @@ def _expanded(column: Column) -> Iterator[Cell]:
     braces = _braces(column.name)
     if _braces(column.label) not in ([], braces):
         _refuse(f"the label {column.label!r} must have the braces of the name {column.name!r}, or none")
-    for values in itertools.product(*(one.values for one in braces)):
+    for values in itertools.product(*(brace.values for brace in braces)):
         pairs = list(zip(braces, values, strict=True))
-        name = _filled(column.name, [value.zfill(one.width) for one, value in pairs])
+        name = _filled(column.name, [value.zfill(brace.width) for brace, value in pairs])
         label = _filled(column.label, list(values))
         metadata = {"unit": column.unit, "quantity": column.quantity, **_places(column.quantity, pairs)}
         yield Cell(name, column.type, label, column.skip, metadata)
@@ -127,7 +127,7 @@ def _expanded(column: Column) -> Iterator[Cell]:
 
 @dataclass(frozen=True)
 class _Braces:
-    """What braces in a pattern count through."""
+    """The values of braces in a pattern."""
 
     values: tuple[str, ...]
     numbered: bool
@@ -140,16 +140,16 @@ class _Braces:
 
 def _braces(pattern: str) -> list[_Braces]:
     """Return the braces of a pattern."""
-    found = []
+    braces = []
     for first, last, words in BRACES.findall(pattern):
         if words:
-            found.append(_Braces(tuple(words.split(",")), numbered=False))
+            braces.append(_Braces(tuple(words.split(",")), numbered=False))
             continue
         if int(first) > int(last):
             _refuse(f"the braces {{{first}..{last}}} count down; write {{{last}..{first}}}")
         options.within("lines", "count of columns", int(last) - int(first) + 1, 1, MOST_CELLS)
-        found.append(_Braces(tuple(map(str, range(int(first), int(last) + 1))), numbered=True))
-    return found
+        braces.append(_Braces(tuple(map(str, range(int(first), int(last) + 1))), numbered=True))
+    return braces
 
 
 def _filled(pattern: str, values: list[str]) -> str:
@@ -160,18 +160,18 @@ def _filled(pattern: str, values: list[str]) -> str:
 
 def _places(quantity: str, pairs: list[tuple[_Braces, str]]) -> dict[str, str]:
     """Return which taxel and axis a cell is: of one range of numbers the taxel, of two also the row and the column."""
-    found, taxel, places = {}, 0, []
+    by_taxel, taxel, places = {}, 0, []
     for braces, value in pairs:
         if braces.numbered:
             places.append(braces.values.index(value))
             taxel = taxel * len(braces.values) + places[-1]
         else:
-            found["axis" if quantity == "tactile" else "component"] = value
+            by_taxel["axis" if quantity == "tactile" else "component"] = value
     if quantity == "tactile" and places:
-        found["taxel"] = str(taxel + 1)
+        by_taxel["taxel"] = str(taxel + 1)
         if len(places) == 2:
-            found |= {"row": str(places[0] + 1), "column": str(places[1] + 1)}
-    return found
+            by_taxel |= {"row": str(places[0] + 1), "column": str(places[1] + 1)}
+    return by_taxel
 
 
 def _refuse(what: str) -> None:

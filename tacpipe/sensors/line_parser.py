@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 WHOLE = re.compile(rb"[+-]?\d{1,20}")
 FLOAT = re.compile(rb"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d{1,3})?")
-WRITTEN = b"0123456789+-.eE"  # what numbers are written with
+WRITTEN = b"0123456789+-.eE"  # characters of numbers
 LETTER = re.compile(rb"[A-Za-z]")
 
 
@@ -70,24 +70,27 @@ class Parser:
         bodies = self._bodies(lines)
         if bodies is None:
             return None
-        found = None if self._labelled else self._at_once(bodies)
-        if found is None:
-            found = self._one_by_one(bodies)
-        if found is None:
+        numbers_at_once = None if self._labelled else self._at_once(bodies)
+        if numbers_at_once is None:
+            numbers_at_once = self._one_by_one(bodies)
+        if numbers_at_once is None:
             return None
-        numbers = {kind: _fitted(values, kind) for kind, values in found.items()}
-        known = {kind: values for kind, values in numbers.items() if values is not None}
-        return Table(known, self.cells) if len(known) == len(numbers) else None
+        numbers = {kind: _fitted(values, kind) for kind, values in numbers_at_once.items()}
+        complete = {kind: values for kind, values in numbers.items() if values is not None}
+        return Table(complete, self.cells) if len(complete) == len(numbers) else None
 
     @cached_property
-    def _wanted(self) -> list[int]:
+    def _requested(self) -> list[int]:
         return [place for place, cell in enumerate(self.cells) if not cell.skip]
 
     @cached_property
     def _of_type(self) -> dict[str, list[int]]:
-        """Which of the wanted cells are of each type."""
-        types = [self.cells[place].type for place in self._wanted]
-        return {kind: [row for row, one in enumerate(types) if one == kind] for kind in dict.fromkeys(types)}
+        """The positions of the requested cells of each type."""
+        types = [self.cells[place].type for place in self._requested]
+        return {
+            kind: [row for row, kind_of_cell in enumerate(types) if kind_of_cell == kind]
+            for kind in dict.fromkeys(types)
+        }
 
     @cached_property
     def _labelled(self) -> bool:
@@ -106,9 +109,9 @@ class Parser:
             lines = summed
         if not (self.prefix or self.suffix):
             return list(lines)
-        least, stop = len(self.prefix) + len(self.suffix), -len(self.suffix) or None
+        smallest, stop = len(self.prefix) + len(self.suffix), -len(self.suffix) or None
         if not all(
-            len(line) >= least and line.startswith(self.prefix) and line.endswith(self.suffix) for line in lines
+            len(line) >= smallest and line.startswith(self.prefix) and line.endswith(self.suffix) for line in lines
         ):
             return None
         return [line[len(self.prefix) : stop] for line in lines]
@@ -118,35 +121,35 @@ class Parser:
         texts = number_texts.cells(lines, len(self.cells), self.separator)
         if texts is None:
             return None
-        if len(self._wanted) < len(self.cells):
-            texts = number_texts.at(texts, _places(len(lines), len(self.cells), self._wanted))
+        if len(self._requested) < len(self.cells):
+            texts = number_texts.at(texts, _places(len(lines), len(self.cells), self._requested))
         absent = None
         if self.missing:
             texts, absent = _without_missing(texts, self.missing)
-        written = number_texts.joined(texts)
-        if written.translate(None, WRITTEN.replace(b".", self.decimal)):
+        joined = number_texts.joined(texts)
+        if joined.translate(None, WRITTEN.replace(b".", self.decimal)):
             return None
         if self.decimal != b".":
-            texts = number_texts.replaced(texts, written.replace(self.decimal, b"."))
-        found = {}
+            texts = number_texts.replaced(texts, joined.replace(self.decimal, b"."))
+        columns = {}
         for kind, mine in self._of_type.items():
             numbers = self._cast(texts, absent, kind, mine, len(lines))
             if numbers is None:
                 return None
-            found[kind] = numbers
-        return found
+            columns[kind] = numbers
+        return columns
 
     def _cast(
         self, texts: pa.Array, absent: Bools | None, kind: str, mine: Sequence[int], count: int
     ) -> AnyArray | None:
         """Return texts (line times cell) as the numbers of one type (line, cell), NaN where ``absent``."""
-        alone = len(mine) == len(self._wanted)
-        chosen = texts if alone else number_texts.at(texts, _places(count, len(self._wanted), mine))
+        is_single_type = len(mine) == len(self._requested)
+        chosen = texts if is_single_type else number_texts.at(texts, _places(count, len(self._requested), mine))
         numbers = number_texts.cast(chosen, _wide(kind))
         if numbers is None:
             return None
         numbers = numbers.reshape(count, len(mine))
-        lacking = None if absent is None else absent.reshape(count, len(self._wanted))[:, mine]
+        lacking = None if absent is None else absent.reshape(count, len(self._requested))[:, mine]
         if lacking is None or not lacking.any():
             return numbers
         return np.where(lacking, np.nan, numbers) if kind[0] == "f" else None
@@ -154,7 +157,7 @@ class Parser:
     def _one_by_one(self, lines: Sequence[bytes]) -> dict[str, AnyArray] | None:
         rows = []
         for line in lines:
-            row = self._row(line, self._wanted)
+            row = self._row(line, self._requested)
             if row is None:
                 return None
             rows.append(row)
@@ -168,30 +171,30 @@ class Parser:
         except OverflowError:
             return None
 
-    def _row(self, line: bytes, wanted: Sequence[int]) -> list[float | int] | None:
+    def _row(self, line: bytes, requested: Sequence[int]) -> list[float | int] | None:
         words = [word.strip(b" \t") for word in line.split(self.separator)] if self.separator else line.split()
         if len(words) != len(self.cells):
             return None
-        found: list[float | int] = []
-        for place in wanted:
+        numbers: list[float | int] = []
+        for place in requested:
             cell, label, word = self.cells[place], self._labels[place], words[place]
             if not word.startswith(label):
                 return None
             word = word[len(label) :].strip(b" \t") if label else word
             if cell.kind.kind == "f" and word in self.missing:
-                found.append(np.nan)
+                numbers.append(np.nan)
             elif cell.kind.kind == "f":
                 if b"." in word and self.decimal != b".":
                     return None
                 word = word.replace(self.decimal, b".")
                 if not FLOAT.fullmatch(word):
                     return None
-                found.append(float(word))
+                numbers.append(float(word))
             elif WHOLE.fullmatch(word):
-                found.append(int(word))
+                numbers.append(int(word))
             else:
                 return None
-        return found
+        return numbers
 
 
 def _without_missing(texts: pa.Array, missing: Sequence[bytes]) -> tuple[pa.Array, Bools | None]:
@@ -199,7 +202,7 @@ def _without_missing(texts: pa.Array, missing: Sequence[bytes]) -> tuple[pa.Arra
     import pyarrow as pa
     import pyarrow.compute as pc
 
-    flags = pc.is_in(texts, value_set=pa.array([one.decode() for one in missing], pa.string()))
+    flags = pc.is_in(texts, value_set=pa.array([text.decode() for text in missing], pa.string()))
     absent = flags.to_numpy(zero_copy_only=False)
     return (pc.if_else(flags, "0", texts), absent) if absent.any() else (texts, None)
 
@@ -219,15 +222,15 @@ def _wide(kind: str) -> np.dtype[np.generic]:
 
 def _fitted(numbers: AnyArray, kind: str) -> AnyArray | None:
     """Return numbers (line, cell) in their type; None where one is beyond it. NaN is a value that is missing."""
-    wanted = dtype(kind)
-    if wanted.kind == "f":
-        beyond = bool((np.abs(numbers) > np.finfo(wanted).max).any())  # infinite too
-    elif wanted.itemsize == 8 or not len(numbers):
+    target = dtype(kind)
+    if target.kind == "f":
+        beyond = bool((np.abs(numbers) > np.finfo(target).max).any())  # infinite too
+    elif target.itemsize == 8 or not len(numbers):
         beyond = False
     else:
-        limits = np.iinfo(wanted)
+        limits = np.iinfo(target)
         beyond = int(numbers.min()) < limits.min or int(numbers.max()) > limits.max
-    return None if beyond else numbers.astype(wanted)
+    return None if beyond else numbers.astype(target)
 
 
 def _without_sum(lines: Sequence[bytes], total: Sum) -> list[bytes] | None:
@@ -238,8 +241,8 @@ def _without_sum(lines: Sequence[bytes], total: Sum) -> list[bytes] | None:
     )
     bodies, declared = [], []
     for line in lines:
-        body, found, written = line.rpartition(mark)
-        if not found or not body.startswith(begin) or not digits.fullmatch(written.strip(b" \t")):
+        body, separator, written = line.rpartition(mark)
+        if not separator or not body.startswith(begin) or not digits.fullmatch(written.strip(b" \t")):
             return None
         bodies.append(body)
         declared.append(int(written, 16 if total.digits == "hex" else 10))
@@ -250,10 +253,10 @@ def _without_sum(lines: Sequence[bytes], total: Sum) -> list[bytes] | None:
 
 def sums(texts: Sequence[bytes], total: Sum) -> AnyArray:
     """Return the sum of each text (text,), those of one length at once."""
-    found = np.zeros(len(texts), dtype=np.int64)
+    totals = np.zeros(len(texts), dtype=np.int64)
     rows = sorted(range(len(texts)), key=lambda row: len(texts[row]))
     for size, group in groupby(rows, key=lambda row: len(texts[row])):
         mine = list(group)
         data = np.frombuffer(b"".join(texts[row] for row in mine), np.uint8).reshape(len(mine), size)
-        found[mine] = layout.SUMS[total.kind][0](data).astype(np.int64)
-    return found
+        totals[mine] = layout.SUMS[total.kind][0](data).astype(np.int64)
+    return totals

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 MOST = 1 << 16  # bytes of a line
-Read = tuple[Int64s | None, Table]  # which lines hold a sample (None: all), and their numbers
+Read = tuple[Int64s | None, Table]  # lines with a sample (None: all), and their numbers
 KEPT = 4  # batches of lines that are read once for the framer and the decoder
 
 
@@ -60,20 +60,20 @@ class Lines(DescribedSensor):
     }
 
     rate_hz: float  # lines a second
-    columns: tuple[Column, ...]  # of a line, in their order
-    separator: str = ","  # between them, one character, which may have spaces around it; a space: spaces or tabs
+    columns: tuple[Column, ...]  # columns of a line, in their order
+    separator: str = ","  # character between columns, which may have spaces around it; a space: spaces or tabs
     decimal: Literal[".", ","] = "."  # mark of a float's decimals
     missing: tuple[str, ...] = ()  # text of a value that is missing: "nan", "" for nothing; it becomes NaN
     prefix: str = ""  # text that each line begins with: "$SKIN,"
     suffix: str = ""  # text that each line ends with, before the sum: "," where one follows the last number too
-    comments: tuple[str, ...] = ()  # what lines begin with that hold no sample: "#"
+    comments: tuple[str, ...] = ()  # start of lines without a sample: "#"
     sum: Sum | None = None  # the check sum at the end
-    sequence: Counter | None = None  # which column counts the lines
-    clock: Clock | None = None  # which column is the device's time
+    sequence: Counter | None = None  # the column that counts the lines
+    clock: Clock | None = None  # the column that is the device's time
     packets: bool = False  # each packet of the link is a line (udp), and needs no end
     start: str = ""  # text that has the board send: "s\n"; none: it sends by itself
     stop: str = ""  # text that ends that
-    baud: int = 115_200  # of a serial port
+    baud: int = 115_200  # baud rate of a serial port
 
     def __post_init__(self) -> None:
         options.positive("lines", rate_hz=self.rate_hz, baud=self.baud)
@@ -123,9 +123,9 @@ class Lines(DescribedSensor):
             _refuse("no column is a channel; list in columns what the board measures")
         if self.clock is not None:
             ticking = self._places[self.clock.column][1]
-            whole = ticking.kind.kind == "u" and ticking.kind.itemsize < 8
-            ticks = self.clock.modulus or (_range(ticking) if whole else 0)
-            wrap_ns = ticks * layout.UNITS_NS[self.clock.unit]  # as a u32 of microseconds after 71.6 minutes
+            is_unsigned = ticking.kind.kind == "u" and ticking.kind.itemsize < 8
+            ticks = self.clock.modulus or (_range(ticking) if is_unsigned else 0)
+            wrap_ns = ticks * layout.UNITS_NS[self.clock.unit]  # a u32 of microseconds wraps after 71.6 minutes
             object.__setattr__(self, "device_wrap_ns", wrap_ns or None)
 
     @functools.cached_property
@@ -138,8 +138,8 @@ class Lines(DescribedSensor):
 
     @functools.cached_property
     def _channels(self) -> list[int]:
-        taken = {role.column for role in (self.sequence, self.clock) if role is not None}
-        return [place for place, cell in enumerate(self._cells) if cell.name not in taken and not cell.skip]
+        roles = {role.column for role in (self.sequence, self.clock) if role is not None}
+        return [place for place, cell in enumerate(self._cells) if cell.name not in roles and not cell.skip]
 
     @functools.cached_property
     def _blocks(self) -> list[list[int]]:
@@ -216,9 +216,9 @@ class Lines(DescribedSensor):
         if self.clock is not None and samples.t_device_ns is not None:
             place, cell = self._places[self.clock.column]
             columns[place] = self._ticks(cell, samples.t_device_ns)
-        written = [self._written(cell, column) for cell, column in zip(self._cells, columns, strict=True)]
+        texts = [self._written(cell, column) for cell, column in zip(self._cells, columns, strict=True)]
         between = self.separator
-        lines = [f"{self.prefix}{between.join(row)}{self.suffix}".encode() for row in zip(*written, strict=True)]
+        lines = [f"{self.prefix}{between.join(row)}{self.suffix}".encode() for row in zip(*texts, strict=True)]
         return lines if self.sum is None else _summed(lines, self.sum)
 
     def _ticks(self, cell: Cell, t_device_ns: AnyArray) -> AnyArray:
@@ -266,9 +266,9 @@ def _read(parser: Parser, lines: tuple[bytes, ...]) -> Read | None:
 def _summed(lines: Sequence[bytes], total: Sum) -> list[bytes]:
     mark, begin = total.mark.encode(), total.begin.encode()
     end = mark if total.mark_summed else b""
-    found = sums([line[len(begin) :] + end for line in lines], total).tolist()
+    totals = sums([line[len(begin) :] + end for line in lines], total).tolist()
     digits = f"%0{2 * total.width}X" if total.digits == "hex" else "%d"
-    return [line + mark + (digits % value).encode() for line, value in zip(lines, found, strict=True)]
+    return [line + mark + (digits % value).encode() for line, value in zip(lines, totals, strict=True)]
 
 
 def _range(cell: Cell) -> int:

@@ -1,4 +1,4 @@
-"""What lines of text state of how they are laid out: the options of the sensor `lines` that fit all that came.
+"""Guess the options of the sensor `lines` that fit all lines of a text.
 
 What cannot be seen in the bytes is guessed: names, units, types, and which column counts or is a clock.
 """
@@ -22,7 +22,7 @@ from tacpipe.sensors.pending import Pending
 FEWEST = 5  # lines that a guess takes
 MOST = 1000  # lines that are looked at
 ALIKE = 0.8  # fraction of the lines that must be alike
-SEPARATORS = ",;\t|: "  # in the order in which they are tried
+SEPARATORS = ",;\t|: "  # separators, in the order in which they are tried
 COMMENTS = ("#", "//", "%", ";")
 NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+")
@@ -33,7 +33,7 @@ NAME = re.compile(r"[a-z][a-z0-9_]*")
 MISSING = ("nan", "NaN", "NAN", "ovf", "inf", "")
 SUMMED = ("xor8", "sum8", "crc8", "lrc", "sum16", "crc16-modbus", "crc16-ccitt", "crc32")
 CLOCKS = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
-OFF = 0.2  # by which a clock may differ from the arrivals of a second or two
+OFF = 0.2  # largest deviation of a clock from the arrivals of a second or two
 STEADY = 0.9  # fraction of the steps of a counter that are alike
 ROUND = 2  # significant digits of a rate
 
@@ -59,15 +59,15 @@ def of(data: Chunks) -> list[Options]:
     if words is None or len(words) < FEWEST:
         return []
     missing = [word for word in MISSING if any(word in row for row in words)]
-    numbers, whole = _numbers(words, decimal, missing)
+    numbers, is_integer = _numbers(words, decimal, missing)
     if numbers is None:
         return []
     names = _names([line.lstrip("#/%; ") for line in lines], separator, labels, len(words[0]), prefix, suffix)
     rate_hz = _rate_hz(t_ns)
-    sequence = _counter(numbers, whole)
-    clock = _clock(numbers, whole, t_ns, sequence)
+    sequence = _counter(numbers, is_integer)
+    clock = _clock(numbers, is_integer, t_ns, sequence)
     options["rate_hz"] = rate_hz
-    options["columns"] = _columns(names, labels, numbers, whole, sequence, clock)
+    options["columns"] = _columns(names, labels, numbers, is_integer, sequence, clock)
     flat = [column["name"] for column in options["columns"]] if names else None
     options |= {} if separator == "," or len(labels) == 1 else {"separator": separator}
     options |= {} if decimal == "." else {"decimal": decimal}
@@ -110,9 +110,9 @@ def _sum(lines: Sequence[str]) -> tuple[Options | None, list[str]]:
         if len(parted) < tail:
             continue
         for digits in ("hex", "decimal"):
-            found = _kind(parted, mark, digits)
-            if found is not None:
-                return found, [line.rpartition(mark)[0] for line in lines if mark in line]
+            kind = _kind(parted, mark, digits)
+            if kind is not None:
+                return kind, [line.rpartition(mark)[0] for line in lines if mark in line]
     return None, list(lines)
 
 
@@ -147,14 +147,14 @@ def _kind(parted: Sequence[tuple[str, str, str]], mark: str, digits: str) -> Opt
 def _cells(lines: Sequence[str]) -> tuple[str, str, str, str, list[list[str]], Int64s] | None:
     """Return prefix, separator, suffix, decimal mark, the cells of the lines that are alike, and which lines these are."""
     prefix = _shared(lines)
-    rest = [line.removeprefix(prefix) for line in lines]
+    bodies = [line.removeprefix(prefix) for line in lines]
     for separator in SEPARATORS:
         decimal = "."
-        if separator != "," and any(DECIMAL_COMMA.search(line) for line in rest):
+        if separator != "," and any(DECIMAL_COMMA.search(line) for line in bodies):
             decimal = ","
-        parted = [line.split(separator) if separator != " " else line.split() for line in rest]
-        width, many = Counter(map(len, parted)).most_common(1)[0]
-        if many < ALIKE * len(lines) or (width == 1 and separator != " "):
+        parted = [line.split(separator) if separator != " " else line.split() for line in bodies]
+        width, count = Counter(map(len, parted)).most_common(1)[0]
+        if count < ALIKE * len(lines) or (width == 1 and separator != " "):
             continue
         rows = [row for row, words in enumerate(parted) if len(words) == width]
         cells = [[word.strip() for word in parted[row]] for row in rows]
@@ -163,27 +163,29 @@ def _cells(lines: Sequence[str]) -> tuple[str, str, str, str, list[list[str]], I
             cells, suffix = [words[:-1] for words in cells], separator
         sound = [row for row, words in enumerate(cells) if _is_row(words, decimal)]
         if len(sound) >= ALIKE * len(lines):
-            kept = np.array(rows)[sound]
-            return prefix, separator, suffix, decimal, [cells[row] for row in sound], kept
+            sound_rows = np.array(rows)[sound]
+            return prefix, separator, suffix, decimal, [cells[row] for row in sound], sound_rows
     return None
 
 
 def _shared(lines: Sequence[str]) -> str:
     """Return the text that nearly all lines begin with and that no number begins with; empty: none."""
-    found = Counter(match[0] for line in lines if (match := LEAD.match(line)))
-    if not found:
+    prefixes = Counter(match[0] for line in lines if (match := LEAD.match(line)))
+    if not prefixes:
         return ""
-    prefix, many = found.most_common(1)[0]
-    if many < ALIKE * len(lines) or prefix.rstrip(" \t").endswith((":", "=")):  # of a label
+    prefix, count = prefixes.most_common(1)[0]
+    if count < ALIKE * len(lines) or prefix.rstrip(" \t").endswith((":", "=")):  # the prefix is a label
         return ""
     return prefix
 
 
 def _is_row(words: Sequence[str], decimal: str) -> bool:
     """Return whether every cell is a number, a missing one, or one behind its label; and one at least a number."""
-    found = [(match[2] if (match := LABELLED.fullmatch(word)) else word) for word in words]
-    numbers = [bool(NUMBER.fullmatch(word.replace(decimal, "."))) for word in found]
-    return any(numbers) and all(one or word in MISSING for one, word in zip(numbers, found, strict=True))
+    words_of_row = [(match[2] if (match := LABELLED.fullmatch(word)) else word) for word in words]
+    numbers = [bool(NUMBER.fullmatch(word.replace(decimal, "."))) for word in words_of_row]
+    return any(numbers) and all(
+        is_number or word in MISSING for is_number, word in zip(numbers, words_of_row, strict=True)
+    )
 
 
 def _labels(cells: Sequence[Sequence[str]]) -> tuple[list[str], list[list[str]] | None]:
@@ -203,8 +205,8 @@ def _numbers(words: Sequence[Sequence[str]], decimal: str, missing: Sequence[str
         numbers = np.array(plain, dtype=np.float64)
     except (ValueError, OverflowError):
         return None, np.zeros(0, dtype=bool)
-    written = [[bool(re.fullmatch(r"[+-]?\d+", word)) for word in row] for row in plain]
-    return numbers, np.asarray(np.array(written).all(axis=0))
+    is_integer = [[bool(re.fullmatch(r"[+-]?\d+", word)) for word in row] for row in plain]
+    return numbers, np.asarray(np.array(is_integer).all(axis=0))
 
 
 def _names(
@@ -233,36 +235,36 @@ def _columns(
     clock: tuple[int, str] | None,
 ) -> list[Options]:
     """Return the columns, those of a kind next to each other as one where nothing names them."""
-    found: list[Options] = []
+    options: list[Options] = []
     taxels = 0
     for place in range(len(whole)):
         role = place == sequence or (clock is not None and place == clock[0])
-        kind = _type(numbers[:, place], whole=bool(whole[place]), role=role)
+        kind = _type(numbers[:, place], is_integer=bool(whole[place]), role=role)
         label = {"label": labels[place]} if labels[place] else {}
         if names is not None:
             unit = {} if role or kind == "f32" else {"unit": "count"}
-            found.append({"name": names[place], "type": kind, **unit, **label})
+            options.append({"name": names[place], "type": kind, **unit, **label})
         elif role:
-            found.append({"name": "count" if place == sequence else "device_time", "type": kind})
+            options.append({"name": "count" if place == sequence else "device_time", "type": kind})
         else:
             taxels += 1
             unit = {} if kind == "f32" else {"unit": "count"}
-            last = found[-1] if found else {}
+            last = options[-1] if options else {}
             if last.get("type") == kind and str(last.get("name", "")).startswith("taxel{"):
                 last["name"] = re.sub(r"\.\.\d+", f"..{taxels}", last["name"])
             else:
-                found.append({"name": f"taxel{{{taxels}..{taxels}}}", "type": kind, **unit})
-    return found
+                options.append({"name": f"taxel{{{taxels}..{taxels}}}", "type": kind, **unit})
+    return options
 
 
-def _type(numbers: Floats, *, whole: bool, role: bool) -> str:
+def _type(numbers: Floats, *, is_integer: bool, role: bool) -> str:
     """Return a type that holds what came and what may come: 32 bits, or 64 where these are needed."""
-    if not whole:
+    if not is_integer:
         return "f64" if role else "f32"
-    most = float(np.abs(numbers).max())
+    largest = float(np.abs(numbers).max())
     if role:
-        return "u32" if most < 1 << 32 else "u64"
-    return "i32" if most < 1 << 31 else "i64"
+        return "u32" if largest < 1 << 32 else "u64"
+    return "i32" if largest < 1 << 31 else "i64"
 
 
 def _rate_hz(t_ns: Times) -> float:
@@ -277,16 +279,16 @@ def _step(numbers: Floats) -> int:
     return int(Counter(np.diff(numbers).astype(np.int64).tolist()).most_common(1)[0][0])
 
 
-def _counter(numbers: Floats, whole: Bools) -> int | None:
+def _counter(numbers: Floats, is_integer: Bools) -> int | None:
     """Return the first column that grows by 1 with nearly every line, or by another number with all; None: none."""
-    for place in np.flatnonzero(whole).tolist():
+    for place in np.flatnonzero(is_integer).tolist():
         steps = np.diff(numbers[:, place])
         if (steps == 1).mean() >= STEADY and numbers[:, place].min() >= 0:
             return int(place)
     return None
 
 
-def _clock(numbers: Floats, whole: Bools, t_ns: Times, sequence: int | None) -> tuple[int, str] | None:
+def _clock(numbers: Floats, is_integer: Bools, t_ns: Times, sequence: int | None) -> tuple[int, str] | None:
     """Return the column that grows as time does, and its unit; None: none, or all came at once."""
     span_ns = float(t_ns[-1] - t_ns[0])
     for place in range(numbers.shape[1]):
@@ -295,8 +297,12 @@ def _clock(numbers: Floats, whole: Bools, t_ns: Times, sequence: int | None) -> 
             continue
         ticks = float(values[-1] - values[0])
         for unit, unit_ns in CLOCKS.items():
-            if (whole[place] or unit in ("s", "ms")) and abs(ticks * unit_ns / span_ns - 1) < OFF and ticks > FEWEST:
+            if (
+                (is_integer[place] or unit in ("s", "ms"))
+                and abs(ticks * unit_ns / span_ns - 1) < OFF
+                and ticks > FEWEST
+            ):
                 return place, unit
-            if not whole[place] and unit == "s" and abs(ticks * unit_ns / span_ns - 1) < OFF:
+            if not is_integer[place] and unit == "s" and abs(ticks * unit_ns / span_ns - 1) < OFF:
                 return place, unit
     return None

@@ -44,8 +44,8 @@ class Lsl(Sensor):
         "channels": "as the outlet states; leave out to take what it states when a recording begins",
     }
 
-    channels: tuple[Channel, ...] = ()  # of the stream, in their order; none: as the outlet states
-    format: Format = "float32"  # of a sample's values, as LSL names it; taken from the outlet with the channels
+    channels: tuple[Channel, ...] = ()  # channels of the stream, in their order; none: as the outlet states
+    format: Format = "float32"  # type of values, as LSL names it; comes from the outlet with the channels
     rate_hz: float = 0.0  # samples a second; 0: they come when they come
 
     def __post_init__(self) -> None:
@@ -61,7 +61,7 @@ class Lsl(Sensor):
 
     @property
     def incomplete(self) -> bool:  # type: ignore[override]
-        """Whether the channels are to be taken from the outlet."""
+        """True where the channels come from the outlet."""
         return not self.channels
 
     @property
@@ -77,13 +77,13 @@ class Lsl(Sensor):
         import pyarrow as pa
 
         kind = pa.string() if self._is_text else pa.from_numpy_dtype(self._dtype.newbyteorder("="))
-        found = []
+        fields = []
         for channel in self.channels:
             unit, quantity = channel.unit or "1", channel.quantity or ("text" if self._is_text else "state")
-            found.append(
+            fields.append(
                 pa.field(channel.name, kind, metadata={**channel.metadata, "unit": unit, "quantity": quantity})
             )
-        return [*found, pa.field(CORRECTION, pa.float64(), metadata={"unit": "s", "quantity": "time"})]
+        return [*fields, pa.field(CORRECTION, pa.float64(), metadata={"unit": "s", "quantity": "time"})]
 
     def framer(self) -> Framer:
         """Return a framer of the link's packets."""
@@ -92,8 +92,8 @@ class Lsl(Sensor):
     def _is_right(self, packet: bytes) -> bool:
         if packet[:1] == DESCRIPTION:
             return _described(packet) is not None
-        found = self._opened(packet)
-        return found is not None and bool((np.abs(found[1]) < lsl.LATEST_S).all())
+        opened = self._opened(packet)
+        return opened is not None and bool((np.abs(opened[1]) < lsl.LATEST_S).all())
 
     def _opened(self, packet: bytes) -> tuple[float, Floats, AnyArray] | None:
         """Return correction, stamps (sample,) in seconds and values (sample, channel); None: no samples of this stream."""
@@ -112,8 +112,8 @@ class Lsl(Sensor):
 
     def decode(self, frames: Sequence[bytes]) -> Samples:
         """Return the samples of packets, several each: channels and corrections, and the stamps as they were sent."""
-        found = [(row, self._opened(frame)) for row, frame in enumerate(frames)]
-        parts = [(row, one) for row, one in found if one is not None]
+        opened = [(row, self._opened(frame)) for row, frame in enumerate(frames)]
+        parts = [(row, packet) for row, packet in opened if packet is not None]
         counts = [len(one[1]) for _, one in parts]
         corrections = np.repeat([one[0] for _, one in parts], counts).astype(np.float64)[:, None]
         kind = object if self._is_text else self._dtype.newbyteorder("=")
@@ -151,18 +151,18 @@ def packet(values: AnyArray, stamps: Floats, correction: float) -> bytes:
 
 def options(data: Chunks) -> list[dict[str, Any]]:
     """Return the options of the stream whose description is among packets; none where none is."""
-    for one in data.packets():
-        found = _described(one) if one[:1] == DESCRIPTION else None
-        if found is not None:
-            channels = [_entry(channel, text=found.is_text) for channel in found.channels]
-            return [{"channels": channels, "format": found.format, "rate_hz": found.rate_hz}]
+    for packet in data.packets():
+        description = _described(packet) if packet[:1] == DESCRIPTION else None
+        if description is not None:
+            channels = [_entry(channel, text=description.is_text) for channel in description.channels]
+            return [{"channels": channels, "format": description.format, "rate_hz": description.rate_hz}]
     return []
 
 
 def _entry(channel: Channel, *, text: bool) -> dict[str, str]:
     """Return a channel as a rig file has it; what is the same for every text is left out."""
-    named = f"{channel.name}_channel" if channel.name in TAKEN else channel.name
-    return {"name": named, **({} if text else channel.metadata)}
+    name = f"{channel.name}_channel" if channel.name in TAKEN else channel.name
+    return {"name": name, **({} if text else channel.metadata)}
 
 
 def _described(data: bytes) -> lsl.Description | None:

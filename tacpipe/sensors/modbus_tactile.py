@@ -29,8 +29,16 @@ REFUSED = 0x80  # bit of the function in a reply that means no
 ADDRESS, SENDING, SENDING_HZ, UNIT, COUNT, ZERO = 0x01, 0x0B, 0x0C, 0x0D, 0x0F, 0x12  # registers
 REFUSALS = {1: "it does not know the function", 2: "it has no such register", 3: "the value is out of its range"}
 BROADCAST, HEADER = 0, 4
-INFOS = {1: b"ST-00-01", 2: b"YF-e0-000001", 3: b"v1.2", 4: b"v1.0.1"}  # of the device that is emulated
-REGISTERS = {ADDRESS: 1, SENDING: 0, SENDING_HZ: 100, UNIT: 1, COUNT: 60, 0x0E: 20, 0x10: 250}  # after power-up
+INFOS = {1: b"ST-00-01", 2: b"YF-e0-000001", 3: b"v1.2", 4: b"v1.0.1"}  # texts of the emulated device
+REGISTERS = {
+    ADDRESS: 1,
+    SENDING: 0,
+    SENDING_HZ: 100,
+    UNIT: 1,
+    COUNT: 60,
+    0x0E: 20,
+    0x10: 250,
+}  # registers after power-up
 
 
 @dataclass(frozen=True)
@@ -39,11 +47,11 @@ class ModbusTactile(Sensor):
 
     summary: ClassVar[str] = "Synria tactile pressure modules on Modbus RTU, asked for each frame."
 
-    address: int = 1  # of the module on its bus, 1 to 247
+    address: int = 1  # address of the module on its bus, 1 to 247
     points: int = 60  # taxels of the module
-    unit: Literal["mN", "count"] = "mN"  # what the module sends: calibrated forces, or counts of its ADC
+    unit: Literal["mN", "count"] = "mN"  # unit that the module sends: calibrated forces, or counts of its ADC
     rate_hz: float = 200.0  # how often it is asked
-    baud: int = 4_000_000  # of the bus
+    baud: int = 4_000_000  # baud rate of the bus
 
     def __post_init__(self) -> None:
         options.within("modbus-tactile", "address", self.address, 1, 247)
@@ -102,13 +110,15 @@ class ModbusTactile(Sensor):
         """Take the present load for zero. Raises `DeviceError` if the module refuses."""
         yield self._writing(ZERO, 1, "that it takes zero anew")
 
-    def _writing(self, register: int, value: int, what: str) -> Ask:
-        return self._asking(WRITE_REGISTER, register.to_bytes(2, "big") + value.to_bytes(2, "big"), 8, what)
+    def _writing(self, register: int, value: int, description: str) -> Ask:
+        return self._asking(WRITE_REGISTER, register.to_bytes(2, "big") + value.to_bytes(2, "big"), 8, description)
 
-    def _asking(self, function: int, data: bytes, size: int, what: str) -> Ask:
+    def _asking(self, function: int, data: bytes, size: int, description: str) -> Ask:
         """Return a request and what finds its reply of ``size`` bytes."""
         return Ask(
-            with_crc(bytes([self.address, function]) + data), until=_reply(self.address, function, size), what=what
+            with_crc(bytes([self.address, function]) + data),
+            until=_reply(self.address, function, size),
+            what=description,
         )
 
     def device(self) -> Device:
@@ -122,7 +132,7 @@ class _Module(Device):
     """The module's side: counts what it is asked for, reads and writes registers, states what it is."""
 
     registers: dict[int, int] = field(default_factory=dict)
-    asked: int = 0
+    requests: int = 0
 
     def hear(self, data: bytes) -> list[bytes]:
         self.heard += data
@@ -147,15 +157,15 @@ class _Module(Device):
     def _answer(self, function: int, data: bytes) -> bytes | None:
         """Return function and data of a reply, or None for taxels, which `polled` counts."""
         if function == PRESSURES:
-            self.asked += 1
+            self.requests += 1
             return None
         register, value = int.from_bytes(data[:2], "big"), int.from_bytes(data[2:4], "big")
         if function == READ_REGISTERS:
-            wanted = range(register, register + value)
-            if any(number not in self.registers for number in wanted):
+            addresses = range(register, register + value)
+            if any(number not in self.registers for number in addresses):
                 return bytes([function | REFUSED, 2])
-            held = b"".join(self.registers[number].to_bytes(2, "big") for number in wanted)
-            return bytes([function, len(held)]) + held
+            content = b"".join(self.registers[number].to_bytes(2, "big") for number in addresses)
+            return bytes([function, len(content)]) + content
         if function == WRITE_REGISTER:
             if register == COUNT:
                 return bytes([function | REFUSED, 2])
@@ -167,8 +177,8 @@ class _Module(Device):
         return bytes([function | REFUSED, 1])
 
     def polled(self) -> int:
-        asked, self.asked = self.asked, 0
-        return asked
+        requests, self.requests = self.requests, 0
+        return requests
 
 
 def with_crc(body: bytes) -> bytes:
@@ -183,18 +193,18 @@ def with_crc(body: bytes) -> bytes:
 def _reply(address: int, function: int, size: int) -> Callable[[bytes], int | tuple[int, int]]:
     """Return what finds a reply of ``size`` bytes, or a refusal of five, which raises `DeviceError`, among what came."""
 
-    def until(came: bytes) -> int | tuple[int, int]:
+    def until(received: bytes) -> int | tuple[int, int]:
         for code, length in ((function, size), (function | REFUSED, 5)):
             head = bytes([address, code])
-            start = came.find(head)
+            start = received.find(head)
             while start >= 0:
-                message = came[start : start + length]
+                message = received[start : start + length]
                 if len(message) == length and with_crc(message[:-2]) == message:
                     if code != function:
-                        why = REFUSALS.get(message[2], f"error {message[2]}")
-                        raise DeviceError(f"The module refused function {function:#04x}: {why}.")
+                        reason = REFUSALS.get(message[2], f"error {message[2]}")
+                        raise DeviceError(f"The module refused function {function:#04x}: {reason}.")
                     return start, start + length
-                start = came.find(head, start + 1)
+                start = received.find(head, start + 1)
         return 0
 
     return until

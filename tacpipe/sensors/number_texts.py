@@ -20,13 +20,13 @@ if TYPE_CHECKING:
 
 
 SPACES = b" \t\r\n"
-BLANKS = b" \t"  # that may stand around a separator
+BLANKS = b" \t"  # characters that may be around a separator
 NEWLINE = 0x0A
-MOST_BYTES = (1 << 31) - 1  # that 32-bit places in a text reach
-NUMBERS = re.compile(rb"(?<=[\">])-?\d+(?:\.\d+)?(?=[\"<])")  # of an XML text, between its marks
-FIRST = 1_000_000  # by which numbers represent themselves, see `numbered`
-ODD = (b"<?", b"<!", b"&", b"'", b"\0")  # in an XML text: other marks than quotes and tags
-APART = b"\0"  # between texts: no XML holds it
+MOST_BYTES = (1 << 31) - 1  # limit of 32-bit places in a text
+NUMBERS = re.compile(rb"(?<=[\">])-?\d+(?:\.\d+)?(?=[\"<])")  # numbers between the marks of an XML text
+FIRST = 1_000_000  # first of the numbers that stand for numbers, see `numbered`
+ODD = (b"<?", b"<!", b"&", b"'", b"\0")  # marks of an XML text other than quotes and tags
+APART = b"\0"  # separator of texts, which no XML contains
 
 
 def of_lines(lines: Sequence[bytes], width: int) -> Floats | None:
@@ -56,7 +56,7 @@ def cells(lines: Sequence[bytes], width: int, separator: bytes = b"") -> pa.Arra
     marks = np.flatnonzero((data == separator[0]) | (data == NEWLINE))
     if len(marks) != len(lines) * width or (data[marks[width - 1 :: width]] != NEWLINE).any():
         return None
-    ends = marks - np.arange(len(marks))  # of cells within the text without its separators
+    ends = marks - np.arange(len(marks))  # ends of cells in the text without separators
     return _texts(text.translate(None, separator + b"\n"), np.concatenate([[0], ends]))
 
 
@@ -66,7 +66,7 @@ def _spaced_cells(text: bytes, count: int, width: int) -> pa.Array | None:
     solid = text.translate(None, SPACES)
     if len(solid) + len(spaces) != len(text):
         return None  # another character below the space
-    ends = spaces - np.arange(len(spaces))  # of cells within ``solid``, and again where spaces follow one another
+    ends = spaces - np.arange(len(spaces))  # ends of cells in ``solid``, repeated where spaces are adjacent
     last = np.flatnonzero(ends != np.concatenate([[0], ends[:-1]]))
     if len(last) != count * width or (data[spaces[last[width - 1 :: width]]] != NEWLINE).any():
         return None
@@ -113,7 +113,7 @@ def numbered(text: bytes) -> bytes:
 
 def pattern(text: bytes) -> Pattern | None:
     """Return the pattern of a text; None where it has no numbers, or parts that need more than a look at its marks."""
-    starts = np.array([found.start() for found in NUMBERS.finditer(text)])
+    starts = np.array([match.start() for match in NUMBERS.finditer(text)])
     if not len(starts) or any(odd in text for odd in ODD):
         return None
     marks = _marks(text)

@@ -1,4 +1,4 @@
-"""What an option of a sensor may be, and the sentence for one that it may not."""
+"""Check the values of sensor options, and raise errors for invalid ones."""
 
 from __future__ import annotations
 
@@ -23,6 +23,6 @@ def within(sensor: str, name: str, value: float, least: float, most: float) -> N
 
 def known(sensor: str, name: str, value: Any, among: Iterable[Any]) -> None:
     """Raise `UsageError` for an option of ``sensor`` that is none of those ``among`` which it must be."""
-    there = list(among)
-    if value not in there:
-        raise UsageError(f"{sensor}: {name} is {value!r}; it must be one of {', '.join(map(str, there))}.")
+    allowed = list(among)
+    if value not in allowed:
+        raise UsageError(f"{sensor}: {name} is {value!r}; it must be one of {', '.join(map(str, allowed))}.")

@@ -40,17 +40,17 @@ class OptoForce(Sensor):
     axes: int = 6  # 3, 6, or 12 of four 3-axis sensors
     rate_hz: float = 1000.0  # 1000, 333, 100, 30 or 10
     filter_hz: float = 15.0  # cut-off of the DAQ's low-pass filter: 500, 150, 50, 15, 5 or 1.5; 0: none
-    baud: int = 1_000_000  # of the DAQ
+    baud: int = 1_000_000  # baud rate of the DAQ
 
     def __post_init__(self) -> None:
-        for name, value, known in (
+        for name, value, allowed in (
             ("axes", self.axes, LENGTHS),
             ("rate_hz", self.rate_hz, SPEEDS),
             ("filter_hz", self.filter_hz, FILTERS),
         ):
-            if value not in known:
+            if value not in allowed:
                 raise UsageError(
-                    f"optoforce: {name} is {value:g}; it must be one of {', '.join(f'{v:g}' for v in known)}."
+                    f"optoforce: {name} is {value:g}; it must be one of {', '.join(f'{v:g}' for v in allowed)}."
                 )
 
     def fields(self) -> list[pa.Field]:

@@ -1,4 +1,4 @@
-"""From the packets of a link to frames: each is one, or none."""
+"""Turn the packets of a link into frames. Each packet is one frame or none."""
 
 from __future__ import annotations
 

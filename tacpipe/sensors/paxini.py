@@ -67,7 +67,7 @@ VARIANTS = {  # product to its points, no two alike, which is how the board's co
 }
 DATA_TYPES = {"both": 3, "resultant": 1, "distributed": 2}
 UNIT = "dN"  # a count is a tenth of a newton
-STALE_S = 0.15  # in which what an earlier session left streaming comes to an end
+STALE_S = 0.15  # time in which the stream of an earlier session ends
 
 
 @dataclass(frozen=True)
@@ -77,12 +77,10 @@ class Paxini(Sensor):
     summary: ClassVar[str] = "Paxini PX-6AX GEN3 tactile modules of a hand, behind their high-speed board."
 
     modules: tuple[str, ...] = ("thumb_tip",)  # slots with a module: thumb_proximal … little_nail, palm1 … palm8
-    variants: tuple[str, ...] = (
-        "DP-S2015-Elite",
-    )  # which product sits in each of these slots, or the one in all of them
+    variants: tuple[str, ...] = ("DP-S2015-Elite",)  # the product in each of these slots, or the one in all of them
     data: Literal["both", "resultant", "distributed"] = "both"  # a module's whole force, that of its points, or both
     rate_hz: float = 91.0  # frames a second, as the board pushes them
-    baud: int = 921_600  # of the board
+    baud: int = 921_600  # baud rate of the board
 
     def __post_init__(self) -> None:
         for module in self.modules:
@@ -115,16 +113,16 @@ class Paxini(Sensor):
         """
         import pyarrow as pa
 
-        found = [pa.field("status", pa.uint8(), metadata={"unit": "1", "quantity": "status"})]
+        fields = [pa.field("status", pa.uint8(), metadata={"unit": "1", "quantity": "status"})]
         for axes, kind in (("xy", pa.int8()), ("z", pa.uint8())):
             for module, count in self.points.items():
                 if self.data != "distributed":
                     for axis in axes:
                         metadata = {"unit": UNIT, "quantity": "force", "module": module, "component": axis}
-                        found.append(pa.field(f"{module}_force_{axis}", kind, metadata=metadata))
+                        fields.append(pa.field(f"{module}_force_{axis}", kind, metadata=metadata))
                 if self.data != "resultant":
-                    found += taxels.fields(count, kind, UNIT, axes=axes, prefix=f"{module}_", module=module)
-        return found
+                    fields += taxels.fields(count, kind, UNIT, axes=axes, prefix=f"{module}_", module=module)
+        return fields
 
     def framer(self) -> Framer:
         """Return a framer of what is pushed for these modules; its sum is of 8 bits."""
@@ -158,15 +156,15 @@ class Paxini(Sensor):
         version = yield _reading(VERSION, 15, "its version")
         active = yield _reading(ACTIVE, 4, "its active modules")
         counts = yield _reading(POINTS, 2 * len(SLOTS), "its point counts")
-        there = _modules(_data(active), _data(counts))
-        if there != self.points:
+        connected = _modules(_data(active), _data(counts))
+        if connected != self.points:
             raise DeviceError(
-                f"The board ({_text(_data(version))}) has {_module_list(there)}; the rig file states "
-                f"{_module_list(self.points)}. Correct modules and variants there: {_suggestion(there)}."
+                f"The board ({_text(_data(version))}) has {_module_list(connected)}; the rig file states "
+                f"{_module_list(self.points)}. Correct modules and variants there: {_suggestion(connected)}."
             )
-        taken = yield _writing(DATA_TYPE, bytes([DATA_TYPES[self.data]]), "what it pushes")
-        if _data(taken)[:1] not in (b"", b"\x00"):
-            raise DeviceError(f'The board cannot push data = "{self.data}": error {_data(taken)[0]}. Choose another.')
+        reply = yield _writing(DATA_TYPE, bytes([DATA_TYPES[self.data]]), "what it pushes")
+        if _data(reply)[:1] not in (b"", b"\x00"):
+            raise DeviceError(f'The board cannot push data = "{self.data}": error {_data(reply)[0]}. Choose another.')
         yield Ask(write(PUSHING, b"\x01"), until=pushed, what="the first frame")
 
     def closing(self) -> bytes:
@@ -200,7 +198,7 @@ class Paxini(Sensor):
 
     @functools.cached_property
     def _places(self) -> tuple[Indices, Indices]:
-        """Where in a frame the numbers along x and y are, and those along z, in the order of the fields."""
+        """Return the places of the numbers along x and y and of those along z, in the order of the fields."""
         signed, unsigned, place = [], [], PUSH_HEADER
         for count in self.points.values():
             if self.data != "distributed":
@@ -215,12 +213,12 @@ class Paxini(Sensor):
         return np.array(signed), np.array(unsigned)
 
 
-def _reading(register: int, length: int, what: str) -> Ask:
-    return Ask(read(register, length), until=_reply(READ_FUNCTION, register), what=what)
+def _reading(register: int, length: int, description: str) -> Ask:
+    return Ask(read(register, length), until=_reply(READ_FUNCTION, register), what=description)
 
 
-def _writing(register: int, data: bytes, what: str) -> Ask:
-    return Ask(write(register, data), until=_reply(WRITE_FUNCTION, register), what=f"that it took {what}")
+def _writing(register: int, data: bytes, description: str) -> Ask:
+    return Ask(write(register, data), until=_reply(WRITE_FUNCTION, register), what=f"that it took {description}")
 
 
 def _reply(function: int, register: int) -> Callable[[bytes], int | tuple[int, int]]:
@@ -229,44 +227,46 @@ def _reply(function: int, register: int) -> Callable[[bytes], int | tuple[int, i
     The reply to a write may lack the data of which it states the length.
     """
 
-    def until(came: bytes) -> int | tuple[int, int]:
+    def until(received: bytes) -> int | tuple[int, int]:
         for code in (function, function | 0x80):
             head = REPLY + bytes([code]) + two(register)
-            start = came.find(head)
+            start = received.find(head)
             while start >= 0:
-                declared = number(came[start + 6 : start + 8]) if len(came) >= start + REPLY_HEADER else 0
+                declared = number(received[start + 6 : start + 8]) if len(received) >= start + REPLY_HEADER else 0
                 for length in (declared, 0) if function != READ_FUNCTION else (declared,):
                     stop = start + REPLY_HEADER + length + 1
-                    if stop <= len(came) and sums(came[start:stop]):
+                    if stop <= len(received) and sums(received[start:stop]):
                         if code != function:
                             raise DeviceError(
                                 f"The board refused function {function:#04x} of register {register:#06x}."
                             )
                         return start, stop
-                start = came.find(head, start + 1)
+                start = received.find(head, start + 1)
         return 0
 
     return until
 
 
-def pushed(came: bytes) -> int | tuple[int, int]:
+def pushed(received: bytes) -> int | tuple[int, int]:
     """Find the reply to the order to push, which is a frame without forces, or else forces, which are not taken.
 
     Raises `DeviceError` if the reply reports on an error.
     """
-    found: int | tuple[int, int] = 0
-    start = came.find(PUSH)
+    reply: int | tuple[int, int] = 0
+    start = received.find(PUSH)
     while start >= 0:
-        length = number(came[start + 3 : start + 5])
+        length = number(received[start + 3 : start + 5])
         stop = start + PUSH_HEADER + length
-        if length and stop <= len(came) and sums(came[start:stop]):
-            if length == 1 and came[start + 5]:
-                raise DeviceError(f"The board does not push its forces: error {came[start + 5]}. Switch it off and on.")
+        if length and stop <= len(received) and sums(received[start:stop]):
+            if length == 1 and received[start + 5]:
+                raise DeviceError(
+                    f"The board does not push its forces: error {received[start + 5]}. Switch it off and on."
+                )
             if length == 1:
                 return start, stop
-            found = (0, 0)
-        start = came.find(PUSH, start + 1)
-    return found
+            reply = (0, 0)
+        start = received.find(PUSH, start + 1)
+    return reply
 
 
 def _data(reply: bytes) -> bytes:

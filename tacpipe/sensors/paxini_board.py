@@ -87,15 +87,15 @@ class Board(Device):
 
     def _answer(self, function: int, register: int, length: int, data: bytes) -> list[bytes]:
         if function == READ_FUNCTION:
-            found = next(
+            content = next(
                 (
-                    held[register - base : register - base + length]
-                    for base, held in self.memory.items()
-                    if base <= register < base + len(held)
+                    memory[register - base : register - base + length]
+                    for base, memory in self.memory.items()
+                    if base <= register < base + len(memory)
                 ),
                 b"",
             )
-            return [message(function, register, found.ljust(length, b"\x00"), REPLY)]
+            return [message(function, register, content.ljust(length, b"\x00"), REPLY)]
         if (function, register) == (WRITE_FUNCTION, PUSHING):
             self.streaming = data == b"\x01"
             return (

@@ -19,7 +19,7 @@ class Pending:
     def __init__(self) -> None:
         self.data = b""
         self.base = 0  # how many bytes were cut off
-        self._ends: list[int] = []  # of chunks, counted from the very first byte
+        self._ends: list[int] = []  # ends of chunks, counted from the first byte of the link
         self._stamps: list[int] = []  # (chunk,), arrival
 
     def append(self, chunks: Chunks) -> None:
@@ -42,9 +42,9 @@ class Pending:
         first = bisect_right(self._ends, self.base + int(places[0]))
         last = bisect_right(self._ends, self.base + int(places[-1]), first)
         if first == last:  # all in one chunk
-            found = np.empty(len(places), dtype=np.int64)
-            found.fill(self._stamps[first])
-            return found
+            arrivals_ns = np.empty(len(places), dtype=np.int64)
+            arrivals_ns.fill(self._stamps[first])
+            return arrivals_ns
         if isinstance(places, range):
             places = np.arange(places.start, places.stop, places.step)
         chunks = np.array(self._ends[first:last]).searchsorted(self.base + places, side="right")
@@ -54,5 +54,5 @@ class Pending:
         """Cut the first ``count`` bytes off."""
         self.data = self.data[count:]
         self.base += count
-        gone = bisect_right(self._ends, self.base)
-        del self._ends[:gone], self._stamps[:gone]
+        removed = bisect_right(self._ends, self.base)
+        del self._ends[:removed], self._stamps[:removed]

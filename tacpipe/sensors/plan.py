@@ -28,12 +28,12 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 VERSION = 1
-MOST_POINTS = 1000  # of a plan
+MOST_POINTS = 1000  # limit of points in a plan
 LARGEST = 1 << 62
-NAME = "plan"  # of the stream of a rig
-MEASURED = "measured"  # in place of an address of plans: the recorded motion is assumed to continue
+NAME = "plan"  # name of the stream in a rig
+MEASURED = "measured"  # replaces an address of plans: the recorded motion is assumed to continue
 POSE = (*(f"position_{axis}_m" for axis in "xyz"), *(f"orientation_{part}" for part in "xyzw"))  # columns
-NUMBERS = len(POSE)  # of a pose
+NUMBERS = len(POSE)  # numbers per pose
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class Plan(Sensor):
 
 def packet(t_ns: Iterable[int], poses: Any) -> bytes:
     """Return the packet of a plan: times in UTC ns (point,), and poses (point, 7)."""
-    points = [[int(at_ns), *(float(one) for one in pose)] for at_ns, pose in zip(t_ns, poses, strict=True)]
+    points = [[int(at_ns), *(float(number) for number in pose)] for at_ns, pose in zip(t_ns, poses, strict=True)]
     return json.dumps({"version": VERSION, "points": points}).encode()
 
 
@@ -101,7 +101,7 @@ def is_plan(text: bytes) -> bool:
             return False
         return all(
             len(point) == 1 + NUMBERS
-            and all(type(one) in (int, float) and math.isfinite(one) for one in point[1:])
+            and all(type(number) in (int, float) and math.isfinite(number) for number in point[1:])
             and any(point[4:])
             for point in points
         )

@@ -33,7 +33,7 @@ HUB, PILLARS, SENSORS, PILLAR_SLIP, SENSOR_SLIP = 1, 3, 4, 5, 6
 KINDS = {PILLARS: 2, SENSORS: 2, PILLAR_SLIP: 1, SENSOR_SLIP: 1}  # number that each entry begins with
 SIZES = {HUB: 12, PILLARS: 24, SENSORS: 24, PILLAR_SLIP: 5, SENSOR_SLIP: 9}  # bytes of values of an entry
 NESTED = (PILLARS, PILLAR_SLIP)  # blocks with a table of pillars in each sensor
-WIDTH = 2  # of the offsets that `template` writes
+WIDTH = 2  # bytes of the offsets that `template` writes
 KEPT = 8  # layouts of one size that are remembered
 
 
@@ -43,7 +43,7 @@ class _NoLayoutError(ValueError):
 
 @dataclass(frozen=True)
 class Layout:
-    """Where the values of a frame stand, counted from its first byte, and the bytes that state it."""
+    """The places of the values in a frame, counted from its first byte, and the bytes that state them."""
 
     entries: dict[int, tuple[tuple[int, ...], ...]]  # block to the places of values: by sensor, and by pillar in it
     fixed: Int64s  # (byte,), places of all bytes that are not values
@@ -56,7 +56,7 @@ class Layout:
 
     @property
     def slips(self) -> bool:
-        """Whether the frame has both blocks of slip."""
+        """True where the frame has both blocks of slip."""
         return PILLAR_SLIP in self.entries and SENSOR_SLIP in self.entries
 
     def places(self, block: int) -> Int64s:
@@ -74,28 +74,28 @@ def layouts(frames: Bytes) -> Iterator[tuple[Int64s, Layout | None]]:
 
     Tables are read once for each layout: frames are compared with those that are known of their size.
     """
-    known = _known(frames.shape[1])
-    left = np.arange(len(frames))
-    for layout in list(known):
-        fits = layout.fits(frames if len(left) == len(frames) else frames[left])
+    by_size = _known(frames.shape[1])
+    remaining = np.arange(len(frames))
+    for layout in list(by_size):
+        fits = layout.fits(frames if len(remaining) == len(frames) else frames[remaining])
         if fits.any():
-            yield left[fits], layout
-            left = left[~fits]
-        if not len(left):
+            yield remaining[fits], layout
+            remaining = remaining[~fits]
+        if not len(remaining):
             return
     wrong = []
-    while len(left):
+    while len(remaining):
         try:
-            layout = parse(frames[left[0]].tobytes())
+            layout = parse(frames[remaining[0]].tobytes())
         except _NoLayoutError:
-            wrong.append(left[0])
-            left = left[1:]
+            wrong.append(remaining[0])
+            remaining = remaining[1:]
             continue
-        known.insert(0, layout)
-        del known[KEPT:]
-        fits = layout.fits(frames[left])
-        yield left[fits], layout
-        left = left[~fits]
+        by_size.insert(0, layout)
+        del by_size[KEPT:]
+        fits = layout.fits(frames[remaining])
+        yield remaining[fits], layout
+        remaining = remaining[~fits]
     if wrong:
         yield np.array(wrong), None
 
@@ -112,13 +112,13 @@ def are_whole(frames: Bytes) -> Bools:
     if frames.shape[1] < start + stop + 3:
         return np.zeros(len(frames), dtype=bool)
     body = frames[:, start:-stop]
-    whole: Bools = sum16(body[:, :-2]) == np.ascontiguousarray(body[:, -2:]).view("<u2")[:, 0]
-    rows = np.flatnonzero(whole)
+    is_valid: Bools = sum16(body[:, :-2]) == np.ascontiguousarray(body[:, -2:]).view("<u2")[:, 0]
+    rows = np.flatnonzero(is_valid)
     if len(rows):
-        for found, layout in layouts(frames if len(rows) == len(frames) else frames[rows]):
+        for rows_of_layout, layout in layouts(frames if len(rows) == len(frames) else frames[rows]):
             if layout is None:
-                whole[rows[found]] = False
-    return whole
+                is_valid[rows[rows_of_layout]] = False
+    return is_valid
 
 
 def parse(frame: bytes) -> Layout:

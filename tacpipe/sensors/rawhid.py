@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 MARKER = b"\xab\xcd"
 SIZE = 64
 READINGS = 12
-BEHIND = len(MARKER) + 2 * READINGS  # where the zeros begin
+BEHIND = len(MARKER) + 2 * READINGS  # place of the first zero
 FASTEST_HZ = 1000.0  # one report in each 1 ms frame of full-speed USB
 
 

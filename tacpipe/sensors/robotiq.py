@@ -29,7 +29,7 @@ START, HEADER = 0x9A, 4
 READ, SYNCHRONOUS, ASYNCHRONOUS, VERSION = 0x61, 0x58, 0x59, 0xE3
 DATA = (READ, SYNCHRONOUS, ASYNCHRONOUS)  # commands of packets that hold data
 ROWS, COLUMNS = 7, 4  # taxels of a fingertip
-KINDS = {  # of fields: the byte's upper half and the numbers behind it
+KINDS = {  # fields: the upper half of the byte, and the numbers after it
     "static": (0x10, ">u2", ROWS * COLUMNS),
     "dynamic": (0x20, ">i2", 1),
     "acceleration": (0x30, ">i2", 3),
@@ -38,25 +38,27 @@ KINDS = {  # of fields: the byte's upper half and the numbers behind it
     "temperature": (0x60, ">i2", 1),
     "timestamp": (0x70, ">u8", 1),
 }
-SIZES = {code: np.dtype(kind).itemsize * count for code, kind, count in KINDS.values()}  # in bytes, after the kind
+SIZES = {
+    code: np.dtype(kind).itemsize * count for code, kind, count in KINDS.values()
+}  # sizes in bytes, after the kind
 PARTS = {code: part for part, (code, _, _) in KINDS.items()}
-TYPES = (np.dtype(">u2"), np.dtype(">i2"), np.dtype(">u8"))  # of the blocks of a sample
+TYPES = (np.dtype(">u2"), np.dtype(">i2"), np.dtype(">u8"))  # types of the blocks of a sample
 SIGNED = ("dynamic", "acceleration", "angular_velocity", "magnetic_field", "temperature")
-KNOWN = np.isin(np.arange(256), (*DATA, VERSION))  # which commands a packet from the device may have
+KNOWN = np.isin(np.arange(256), (*DATA, VERSION))  # commands that a packet from the device may have
 Key = tuple[int, int]  # kind and finger of a field
 Layout = tuple[tuple[Key, int], ...]  # the fields of a frame, with the place of the first number of each
 Columns = tuple[Indices, ...]  # the bytes of a frame that are the numbers of each block
 
 
 class Structure(NamedTuple):
-    """What frames of one size must have in common to have the same fields."""
+    """The bytes that frames of one size must share to have the same fields."""
 
-    places: Indices  # of the command and of the kinds
-    values: Bytes  # in these places
+    places: Indices  # places of the command and of the kinds
+    values: Bytes  # values at these places
     layout: Layout | None  # None: such frames are not made of known fields
 
 
-_latest: dict[int, Structure] = {}  # of each size, the one met last, which is the next one's as a rule
+_latest: dict[int, Structure] = {}  # last structure of each size, which is usually that of the next frame
 
 
 @dataclass(frozen=True)
@@ -66,11 +68,11 @@ class Robotiq(Sensor):
     summary: ClassVar[str] = "Robotiq TSF-85 tactile fingertips, with their motion sensors and clocks."
     usb_ids: ClassVar[tuple[str, ...]] = ("16d0:14cc", "04b4:f232")  # the hub, and the bridge of older units
 
-    fingers: int = 2  # that are plugged in
-    parts: tuple[str, ...] = tuple(KINDS)  # of each finger that a sample must have; a packet that lacks one holds none
-    tick_us: float = 0.0  # of the fingertips' clock in microseconds, where known; 0: it is a channel and no time
+    fingers: int = 2  # number of connected fingers
+    parts: tuple[str, ...] = tuple(KINDS)  # parts of each finger in a sample; a packet that lacks one has no sample
+    tick_us: float = 0.0  # tick of the fingertips' clock in microseconds; 0: unknown, so the clock is a channel
     rate_hz: float = 100.0  # packets a second; the period is a whole number of milliseconds up to 255
-    baud: int = 115_200  # of the port
+    baud: int = 115_200  # baud rate of the port
 
     def __post_init__(self) -> None:
         options.within("robotiq", "fingers", self.fingers, 1, 2)
@@ -98,19 +100,21 @@ class Robotiq(Sensor):
         Side by side by their type: first the taxels of both fingers, uint16, then what is int16, then the clocks, uint64.
         """
         return [
-            made
+            channel
             for parts in (("static",), SIGNED, ("timestamp",))
             for finger in range(1, self.fingers + 1)
             for part in parts
             if part in self.parts
-            for made in _fields(part, finger)
+            for channel in _fields(part, finger)
         ]
 
     def framer(self) -> Framer:
         """Return a framer of packets that are made of known fields, or are a reply."""
-        most = HEADER + 255
+        largest = HEADER + 255
         return ByteFramer(
-            Framing(marker=bytes([START]), header=HEADER, sizes=_sizes, most=most, check=_is_packet, lock=3, confirm=1)
+            Framing(
+                marker=bytes([START]), header=HEADER, sizes=_sizes, most=largest, check=_is_packet, lock=3, confirm=1
+            )
         )
 
     def decode(self, frames: Bytes) -> Samples:
@@ -128,21 +132,21 @@ class Robotiq(Sensor):
         if len(blocks) > 1:
             order = np.concatenate(rows)
             sort = np.argsort(order)
-            values = tuple(np.concatenate(several)[sort] for several in zip(*blocks, strict=True))
+            values = tuple(np.concatenate(parts)[sort] for parts in zip(*blocks, strict=True))
             order = order[sort]
-        every = len(order) == len(frames)
-        return Samples(values, t_device_ns=self._device_ns(values), rows=None if every else order)
+        is_complete = len(order) == len(frames)
+        return Samples(values, t_device_ns=self._device_ns(values), rows=None if is_complete else order)
 
     def encode(self, samples: Samples) -> Bytes:
         """Return packets of these samples, with the fields of ``parts`` in the order of the protocol, finger by finger."""
         blocks = {key: block for keys, block in zip(self._groups.values(), samples.values, strict=True) for key in keys}
-        taken = dict.fromkeys(self._groups, 0)
+        used = dict.fromkeys(self._groups, 0)
         pieces: list[Bytes] = []
         for code, finger in self._keys:
             _, name, count = KINDS[PARTS[code]]
             kind, block = np.dtype(name), blocks[code, finger]
-            numbers = block[:, taken[kind] : taken[kind] + count].astype(kind)
-            taken[kind] += count
+            numbers = block[:, used[kind] : used[kind] + count].astype(kind)
+            used[kind] += count
             pieces.append(np.full((len(samples), 1), code | finger << 2, dtype=np.uint8))
             pieces.append(np.ascontiguousarray(numbers).view(np.uint8))
         body = np.hstack(pieces)
@@ -195,7 +199,7 @@ class Robotiq(Sensor):
 class _Fingertips(Device):
     """The fingertips' side: they state their version, send a packet when asked, or stream with a period."""
 
-    asked: int = 0
+    requests: int = 0
     version: bytes = field(default=b"\x01\x00\x00")
 
     def hear(self, data: bytes) -> list[bytes]:
@@ -211,14 +215,14 @@ class _Fingertips(Device):
                 self.streaming = message[4] > 0
                 self.rate_hz = 1000 / message[4] if message[4] else None
             elif message[2] == READ:
-                self.asked += 1
+                self.requests += 1
             elif message[2] == VERSION:
                 replies.append(command(VERSION, self.version))
         return replies
 
     def polled(self) -> int:
-        asked, self.asked = self.asked, 0
-        return asked
+        requests, self.requests = self.requests, 0
+        return requests
 
 
 def command(code: int, data: bytes = b"") -> bytes:
@@ -263,28 +267,28 @@ def _sizes(heads: Bytes) -> Int64s:
 
 def _structure(frame: bytes) -> Structure:
     """Return what a packet of data or of something else is made of, as far as its fields are known."""
-    found: dict[Key, int] = {}
-    place, seen, known = HEADER, [2], frame[2] in DATA
-    while known and place < len(frame):
-        seen.append(place)
+    fields: dict[Key, int] = {}
+    place, places, is_known_command = HEADER, [2], frame[2] in DATA
+    while is_known_command and place < len(frame):
+        places.append(place)
         code, finger = frame[place] & 0xF0, frame[place] >> 2 & 3
-        known = code in SIZES and finger <= 1 and (code, finger) not in found
-        found[code, finger] = place + 1
+        is_known_command = code in SIZES and finger <= 1 and (code, finger) not in fields
+        fields[code, finger] = place + 1
         place += 1 + SIZES.get(code, 0)
-    whole = known and place == len(frame) and bool(found)
-    values = np.frombuffer(frame, np.uint8)[seen]
-    return Structure(np.array(seen), values, tuple(found.items()) if whole else None)
+    is_valid = is_known_command and place == len(frame) and bool(fields)
+    values = np.frombuffer(frame, np.uint8)[places]
+    return Structure(np.array(places), values, tuple(fields.items()) if is_valid else None)
 
 
 def _alike(frames: Bytes, rows: Indices) -> Iterator[tuple[Indices, Layout | None]]:
     """Yield those ``rows`` of frames of one size that have the same fields, and their layout."""
     size = frames.shape[1]
     while len(rows):
-        some = frames if len(rows) == len(frames) else frames[rows]
+        selected = frames if len(rows) == len(frames) else frames[rows]
         structure = _latest.get(size)
-        if structure is None or (some[0, structure.places] != structure.values).any():
-            structure = _latest[size] = _structure(some[0].tobytes())
-        same = some.take(structure.places, axis=1) == structure.values
+        if structure is None or (selected[0, structure.places] != structure.values).any():
+            structure = _latest[size] = _structure(selected[0].tobytes())
+        same = selected.take(structure.places, axis=1) == structure.values
         if same.all():
             yield rows, structure.layout
             return

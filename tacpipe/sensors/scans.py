@@ -13,9 +13,9 @@ from tacpipe.sensors.framing import MALFORMED, START, Account, Chunks, Loss, Run
 
 TORN = "torn"  # a scan of which CAN frames are missing
 CAN = 13  # bytes of a CAN frame as a link gives it: identifier, length, 8 of data
-DATA = 5  # where the data begins
+DATA = 5  # place of the data
 HEAD, TAIL = 0x40, 0xC0  # first byte of the data, of each triangle's two CAN frames
-TAIL_LENGTHS = (6, 8)  # of the data, without diagnostics and with
+TAIL_LENGTHS = (6, 8)  # lengths of the last data, without and with diagnostics
 
 
 class ScanFramer:
@@ -30,10 +30,10 @@ class ScanFramer:
         self.size = 2 * len(identifiers)  # CAN frames of a scan
         self._identifiers = np.array(identifiers, dtype=np.int64)
         self._pause_ns = pause_ns  # longer between two CAN frames of a scan, and others came between
-        self._data = np.zeros((0, CAN), dtype=np.uint8)  # of a scan that is not whole yet
+        self._data = np.zeros((0, CAN), dtype=np.uint8)  # frames of an incomplete scan
         self._t_ns: Times = np.zeros(0, dtype=np.int64)
-        self._begun = False
-        self._place = self.size  # of the last CAN frame that is decided
+        self._has_scans = False
+        self._place = self.size  # place of the last CAN frame that is assigned
 
     def feed(self, chunks: Chunks) -> tuple[list[Run], list[Loss]]:
         """Return the scans that are whole now, and what is left of torn ones as losses."""
@@ -44,19 +44,19 @@ class ScanFramer:
         bad = places < 0
         losses += [Loss(int(at_ns), MALFORMED, 0, CAN) for at_ns in stamps[bad]]
         starts, torn_at = self._scans(places, stamps)
-        whole = (starts[:, None] + np.arange(self.size)).ravel()
+        rows_of_scans = (starts[:, None] + np.arange(self.size)).ravel()
         keep = len(data) if torn_at is None else torn_at
-        left = np.ones(len(data), dtype=bool)
-        left[whole] = left[bad] = False
-        first = 0 if self._begun else int(starts[0]) if len(starts) else keep
-        losses += self._torn(left[:keep], places[:keep], stamps[:keep], first)
+        unassigned = np.ones(len(data), dtype=bool)
+        unassigned[rows_of_scans] = unassigned[bad] = False
+        first = 0 if self._has_scans else int(starts[0]) if len(starts) else keep
+        losses += self._torn(unassigned[:keep], places[:keep], stamps[:keep], first)
         self._data, self._t_ns = data[keep:], stamps[keep:]
-        self.account.framed += len(whole) * CAN
+        self.account.framed += len(rows_of_scans) * CAN
         self.account.lost += sum(loss.bytes for loss in losses)
         if not len(starts):
             return [], losses
-        self._begun = True
-        return [Run(data[whole].reshape(len(starts), -1), stamps[starts + self.size - 1])], losses
+        self._has_scans = True
+        return [Run(data[rows_of_scans].reshape(len(starts), -1), stamps[starts + self.size - 1])], losses
 
     def _can_frames(self, chunks: Chunks) -> tuple[Bytes, Times, list[Loss]]:
         """Return the CAN frames of this board (frame, 13), their arrival, and packets that are not a CAN frames as
@@ -76,8 +76,8 @@ class ScanFramer:
     def _places(self, frames: Bytes) -> Int64s:
         """Return the place of each CAN frame in a scan (frame,), -1 where it is none of a scan."""
         tail = frames[:, DATA] == TAIL
-        whole = np.where(tail, np.isin(frames[:, 4], TAIL_LENGTHS), frames[:, 4] == 8)
-        good = whole & (tail | (frames[:, DATA] == HEAD))
+        is_complete = np.where(tail, np.isin(frames[:, 4], TAIL_LENGTHS), frames[:, 4] == 8)
+        good = is_complete & (tail | (frames[:, DATA] == HEAD))
         places = 2 * np.searchsorted(self._identifiers, _identifier(frames)) + tail
         return np.where(good, places, -1)
 
@@ -93,17 +93,17 @@ class ScanFramer:
         open_at = int(starts[-1]) if starts[-1] + length[-1] == len(places) and length[-1] < self.size else None
         return starts[length >= self.size], open_at
 
-    def _torn(self, left: Bools, places: Int64s, t_ns: Times, first: int) -> list[Loss]:
+    def _torn(self, unassigned: Bools, places: Int64s, t_ns: Times, first: int) -> list[Loss]:
         """Return a loss for each stretch of CAN frames that belong to no whole scan, and count the scans they are of.
 
         Those before ``first`` are what was left of a scan when recording began.
         """
-        known = places >= 0
+        is_placed = places >= 0
         new = np.zeros(len(places), dtype=bool)
-        new[known] = np.diff(places[known], prepend=self._place) <= 0
-        if known.any():
-            self._place = int(places[known][-1])
-        rows = np.flatnonzero(left)
+        new[is_placed] = np.diff(places[is_placed], prepend=self._place) <= 0
+        if is_placed.any():
+            self._place = int(places[is_placed][-1])
+        rows = np.flatnonzero(unassigned)
         return [
             Loss(int(t_ns[group[-1]]), START, 0, len(group) * CAN)
             if group[0] < first
@@ -114,8 +114,8 @@ class ScanFramer:
 
     def flush(self) -> tuple[list[Run], list[Loss]]:
         """Return what is left of a scan that is not whole."""
-        left, first = np.ones(len(self._data), dtype=bool), 0 if self._begun else len(self._data)
-        losses = self._torn(left, self._places(self._data), self._t_ns, first)
+        unassigned, first = np.ones(len(self._data), dtype=bool), 0 if self._has_scans else len(self._data)
+        losses = self._torn(unassigned, self._places(self._data), self._t_ns, first)
         self.account.lost += len(self._data) * CAN
         self._data, self._t_ns = self._data[:0], self._t_ns[:0]
         return [], losses

@@ -1,4 +1,4 @@
-"""What a sensor is to tacpipe: bytes in, samples out, the requests it needs, and the device's side of it for the emulator.
+"""Define sensors: decode bytes to samples, state the requests of a device, and emulate the device.
 
 A product is one file with one frozen dataclass, a `Sensor`. Its fields are the options of the rig file, each with a
 comment that is its help. Nothing here does input or output: a link carries the bytes, see `tacpipe.links`.
@@ -21,7 +21,7 @@ Frames = Any  # NDArray[np.uint8] (frame, byte) of frames of one size, or list[b
 
 @dataclass(frozen=True)
 class Samples:
-    """What frames state. ``values`` are blocks (sample, channel), side by side in the order of the sensor's fields."""
+    """The samples of frames. ``values`` are blocks (sample, channel), side by side in the order of the sensor's fields."""
 
     values: tuple[AnyArray, ...]
     seq: Int64s | None = None  # (sample,), the counter as the frame holds it; `Sensor.counter` is its modulus
@@ -35,7 +35,7 @@ class Samples:
 
 @dataclass(frozen=True)
 class Ask:
-    """What is written to a device while a stream is opened or tared, and the reply that is waited for.
+    """A request to a device while a stream is opened or tared, and the awaited reply.
 
     ``until`` is given what came since and returns where the reply is: how many bytes it takes, or (start, stop) where
     samples may come before it, which are then no part of it and are kept; 0 while it is not whole. With (0, 0) the reply is
@@ -47,11 +47,11 @@ class Ask:
     until: Callable[[bytes], int | tuple[int, int]] | None = None
     timeout_s: float = 2.0
     pause_s: float = 0.0
-    what: str = "a reply"  # for the sentence when none comes
+    what: str = "a reply"  # name of the reply in errors
 
-    def found(self, came: bytes) -> tuple[int, int] | None:
+    def found(self, received: bytes) -> tuple[int, int] | None:
         """Return where the reply is in what came since, (start, stop), None while it is not whole or none is awaited."""
-        end = self.until(came) if self.until is not None and came else 0
+        end = self.until(received) if self.until is not None and received else 0
         return end if isinstance(end, tuple) else (0, end) if end else None
 
 
@@ -64,7 +64,7 @@ class Line:
 
     dtr: bool | None = None
     rts: bool | None = None
-    settle_s: float = 0.0  # of silence and boot text after opening, which is thrown away
+    settle_s: float = 0.0  # time of silence and boot text after opening, which is discarded
 
 
 @dataclass
@@ -88,29 +88,29 @@ class Sensor:
     """A product. Subclasses are frozen dataclasses, registered under the entry-point group ``tacpipe.sensors``."""
 
     summary: ClassVar[str] = ""  # one sentence: what it is
-    product: ClassVar[str] = ""  # what recordings name it in their attribute ``sensor``; empty: the registered name
+    product: ClassVar[str] = ""  # name in the attribute ``sensor`` of recordings; empty: the registered name
     links: ClassVar[tuple[str, ...]] = ("serial",)  # schemes of addresses it can be reached by
     line: ClassVar[Line] = Line()
     counter: ClassVar[int | None] = None  # modulus of ``seq``; None: the device does not count
     device_counter: ClassVar[int | None] = None  # modulus of ``device_seq``
-    step: ClassVar[int] = 1  # by which ``seq`` grows from a sample to the next
-    device_wrap_ns: ClassVar[int | None] = None  # after which the device's clock begins at 0 again
-    listens: ClassVar[bool] = False  # by UDP the device sends of itself to an address that is set at its end
+    step: ClassVar[int] = 1  # increment of ``seq`` between two samples
+    device_wrap_ns: ClassVar[int | None] = None  # period of the device's clock
+    listens: ClassVar[bool] = False  # True where the device sends by UDP to an address that is set at the device
     steady: ClassVar[bool] = True  # it sends at its rate all the time; False: only when something happens
-    exclusive: ClassVar[str] = ""  # what else cannot use the device meanwhile; a sentence, empty: nothing
+    exclusive: ClassVar[str] = ""  # sentence on programs that cannot use the device meanwhile; empty: none
     usb_ids: ClassVar[tuple[str, ...]] = ()  # "16d0:14cc": vendor and product, where the product has its own
-    usage_page: ClassVar[int | None] = None  # of the HID interface that samples come by, where a device has several
+    usage_page: ClassVar[int | None] = None  # usage page of the HID interface with samples, where a device has several
     described: ClassVar[bool] = False  # its frames are what the rig file states, so that those of any board may fit
-    guesses: ClassVar[Mapping[str, str]] = {}  # what a probe's guess of each of its options rests on
+    guesses: ClassVar[Mapping[str, str]] = {}  # evidence for a probe's guess of each option
 
     incomplete: ClassVar[bool] = False  # options are missing that the device itself states when it is opened
 
     rate_hz: float  # samples a second; 0: none is known
-    baud: int  # of a serial port
+    baud: int  # baud rate of a serial port
 
     @property
     def awaited(self) -> bool:
-        """Whether samples should come all the time, so that silence states that something is wrong."""
+        """True where samples come continuously, so that silence is a fault."""
         return self.steady and self.rate_hz > 0
 
     def fields(self) -> list[pa.Field]:

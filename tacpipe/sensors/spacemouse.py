@@ -133,10 +133,10 @@ def merged(reports: Sequence[bytes], state: Bytes) -> Bytes:
     number = padded[:, 0]
     frames = np.vstack([state, np.zeros((len(reports), FRAME), dtype=np.uint8)])
     frames[1:, 0] = number
-    both = (number == TRANSLATION) & (sizes == LONGEST)
+    is_both = (number == TRANSLATION) & (sizes == LONGEST)
     _carry(frames[:, 1:], PARTS[TRANSLATION], number == TRANSLATION, padded[:, 1:7])
-    turned = np.where(both[:, None], padded[:, 7:13], padded[:, 1:7])
-    _carry(frames[:, 1:], PARTS[ROTATION], (number == ROTATION) | both, turned)
+    turned = np.where(is_both[:, None], padded[:, 7:13], padded[:, 1:7])
+    _carry(frames[:, 1:], PARTS[ROTATION], (number == ROTATION) | is_both, turned)
     _carry(frames[:, 1:], PARTS[BUTTONS], number == BUTTONS, padded[:, 1:5])
     return frames[1:]
 

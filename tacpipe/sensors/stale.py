@@ -10,7 +10,7 @@ from tacpipe.arrays import Bytes, Int64s
 from tacpipe.sensors.framing import Account, Chunks, Framer, Loss, Run
 
 STALE = "stale"  # a frame that the device kept from its last session
-SETTLE_NS = 500_000_000  # from the first frame on in which the jump is awaited: a kept queue comes at once
+SETTLE_NS = 500_000_000  # time after the first frame in which the jump is awaited: a stale queue arrives at once
 Counters = Callable[[Bytes], Int64s]
 
 
@@ -23,7 +23,7 @@ class FreshFramer:
     def __init__(self, framer: Framer, counters: Counters, modulus: int, most: int) -> None:
         self._framer, self._counters, self._modulus, self._most = framer, counters, modulus, most
         self._held: list[Run] | None = []
-        self.account: Account = framer.account  # what is held back is pending
+        self.account: Account = framer.account  # delayed frames are pending
 
     def feed(self, chunks: Chunks) -> tuple[list[Run], list[Loss]]:
         """Return the frames that are known to be of this session, and what was lost."""
@@ -61,11 +61,11 @@ class FreshFramer:
         half = self._modulus // 2
         steps = (np.diff(counters[t_ns - t_ns[0] < SETTLE_NS]) + half) % self._modulus - half
         jumps = np.flatnonzero((steps < 0) | (steps > self._most))
-        left = int(jumps[-1]) + 1 if len(jumps) else 0  # frames to drop
+        dropped = int(jumps[-1]) + 1 if len(jumps) else 0  # frames to drop
         stale, fresh = [], []
         for run in held:
-            count = min(left, len(run.t_ns))
-            left -= count
+            count = min(dropped, len(run.t_ns))
+            dropped -= count
             if count:
                 stale.append(Run(run.frames[:count], run.t_ns[:count]))
             if count < len(run.t_ns):

@@ -31,7 +31,7 @@ Record = Mapping[str, Any]
 
 ENTRY = re.compile(r"(?P<path>\w+(\.\w+)*)(:(?P<unit>[^:]+))?")  # a key, of a part as in pose.x or q.0, with its unit
 TAKEN = ("t_ns", "t_device_ns", "seq", "device_seq", "event", "json")
-LARGEST = 1 << 62  # of counters and times
+LARGEST = 1 << 62  # limit of counters and times
 
 
 @dataclass(frozen=True)
@@ -139,19 +139,19 @@ class Tap(Sensor):
             return False
         if self.grasp:
             return "grasp" not in record or _is_grasp(record["grasp"], turned=self.grasp == "wrist")
-        found = [_at(record, _path(entry)) for entry in self.numbers]
-        return all(value is None or isinstance(value, float) or _is_whole(value) for value in found)
+        values = [_at(record, _path(entry)) for entry in self.numbers]
+        return all(value is None or isinstance(value, float) or _is_whole(value) for value in values)
 
     def _numbers(self, records: Sequence[Record]) -> Floats:
         """Return the numbers (sample, channel) of records, NaN where there is none."""
-        found = np.full((len(records), len(self.numbers)), np.nan)
+        numbers = np.full((len(records), len(self.numbers)), np.nan)
         for column, entry in enumerate(self.numbers):
             path = _path(entry)
             for row, record in enumerate(records):
                 value = _at(record, path)
                 if value is not None:
-                    found[row, column] = value
-        return found
+                    numbers[row, column] = value
+        return numbers
 
     def _grasps(self, records: Sequence[Record]) -> Floats:
         """Return points and wrist (sample, channel) of records, in the order of the columns."""

@@ -25,12 +25,14 @@ def fields(count: int, kind: pa.DataType, unit: str, axes: str = "", prefix: str
     """
     import pyarrow as pa
 
-    found = []
+    fields_of_taxels = []
     for number, name in enumerate(numbered("taxel", count), start=1):
         metadata = {"unit": unit, "quantity": "tactile", **layout, "taxel": str(number)}
-        found += [pa.field(f"{prefix}{name}_{axis}", kind, metadata={**metadata, "axis": axis}) for axis in axes]
-        found += [] if axes else [pa.field(f"{prefix}{name}", kind, metadata=metadata)]
-    return found
+        fields_of_taxels += [
+            pa.field(f"{prefix}{name}_{axis}", kind, metadata={**metadata, "axis": axis}) for axis in axes
+        ]
+        fields_of_taxels += [] if axes else [pa.field(f"{prefix}{name}", kind, metadata=metadata)]
+    return fields_of_taxels
 
 
 def grid(rows: int, columns: int, kind: pa.DataType, unit: str, prefix: str = "", **layout: str) -> list[pa.Field]:

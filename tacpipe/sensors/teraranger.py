@@ -29,7 +29,7 @@ MARKER = b"\x54"
 SIZE = 4
 BINARY = bytes.fromhex("00 11 02 4C")  # frames as here, rather than text
 START, STOP = bytes.fromhex("00 52 02 01 DF"), bytes.fromhex("00 52 02 00 D8")
-FASTEST_HZ = 240.0  # of the Evo 60m
+FASTEST_HZ = 240.0  # largest rate of the Evo 60m
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class TeraRanger(Sensor):
 
     summary: ClassVar[str] = "Terabee TeraRanger Evo distance sensors over USB or a UART, binary mode."
 
-    rate_hz: float = FASTEST_HZ  # as the sensor runs in its range mode, up to 240
+    rate_hz: float = FASTEST_HZ  # rate in the sensor's range mode, up to 240
     baud: int = 115200  # over USB any
 
     def __post_init__(self) -> None:

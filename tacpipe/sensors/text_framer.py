@@ -1,4 +1,4 @@
-"""From texts to frames: packets that are a text each, and streams of lines.
+"""Turn texts into frames: packets of one text each, and streams of lines.
 
 What states a frame of text from another text is its content, which takes a look at each. A sensor that can look at many at
 once, and faster so, states as ``every`` whether all of them are frames; a text that is none is then found half by half.
@@ -38,8 +38,8 @@ class TextFramer:
             Loss(t_ns, MALFORMED, 1, size)
             for t_ns, size in zip(chunks.t_ns[~good].tolist(), chunks.size[~good].tolist(), strict=True)
         ]
-        kept = _kept(packets, good)
-        return ([Run(kept, chunks.t_ns[good])] if kept else []), losses
+        accepted = _select(packets, good)
+        return ([Run(accepted, chunks.t_ns[good])] if accepted else []), losses
 
     def flush(self) -> tuple[list[Run], list[Loss]]:
         """Return nothing: a packet is whole or it is none."""
@@ -53,7 +53,7 @@ class LineFramer:
         self.check, self.every, self.most = check, every, most
         self.account = Account()
         self._text = Pending()
-        self._begun = False
+        self._has_lines = False
 
     def feed(self, chunks: Chunks) -> tuple[list[Run], list[Loss]]:
         """Return the lines that are complete now, and those that are not frames as losses."""
@@ -67,20 +67,20 @@ class LineFramer:
         sizes = np.fromiter(map(len, lines), np.int64, len(lines)) + 1
         arrival = self._text.arrivals(sizes.cumsum() - 1)
         losses = []
-        if not self._begun:  # the first line of all began before the recording did
+        if not self._has_lines:  # the first line of all began before the recording did
             losses = [Loss(int(arrival[0]), START, 0, int(sizes[0]))]
             lines, sizes, arrival = lines[1:], sizes[1:], arrival[1:]
         lines = [line.strip() for line in lines]
         good = _good(lines, self.check, self.every)
         bad = np.flatnonzero(~good).tolist()
         losses += [Loss(int(arrival[row]), GARBLED, 1, int(sizes[row])) for row in bad]
-        self._begun = True
-        kept = _kept(lines, good)
+        self._has_lines = True
+        accepted = _select(lines, good)
         lost = sum(loss.bytes for loss in losses)
         self.account.framed += stop - lost
         self.account.lost += lost
         self._text.cut(stop)
-        return ([Run(kept, arrival[good])] if kept else []), losses
+        return ([Run(accepted, arrival[good])] if accepted else []), losses
 
     def flush(self) -> tuple[list[Run], list[Loss]]:
         """Return what is left of a line that has no end."""
@@ -92,7 +92,7 @@ class LineFramer:
         last_ns = self._text.arrival(count - 1)
         self.account.lost += count
         self._text.cut(count)
-        return [Loss(last_ns, CUT if self._begun else START, int(self._begun), count)]
+        return [Loss(last_ns, CUT if self._has_lines else START, int(self._has_lines), count)]
 
 
 def _good(texts: Sequence[bytes], check: Check, every: CheckOfAll | None) -> Bools:
@@ -105,5 +105,5 @@ def _good(texts: Sequence[bytes], check: Check, every: CheckOfAll | None) -> Boo
     return np.concatenate([_good(texts[:half], check, every), _good(texts[half:], check, every)])
 
 
-def _kept(texts: list[bytes], good: Bools) -> list[bytes]:
+def _select(texts: list[bytes], good: Bools) -> list[bytes]:
     return texts if good.all() else [text for text, fine in zip(texts, good.tolist(), strict=True) if fine]

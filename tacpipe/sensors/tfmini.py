@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 MARKER = b"\x59\x59"
 SIZE = 9
-BITS = 10 * SIZE  # of a frame on the line, start and stop bits included
+BITS = 10 * SIZE  # bits of a frame on the line, with start and stop bits
 VERSION, RATE, UNIT, ENABLE, SAVE = 0x01, 0x03, 0x05, 0x07, 0x11  # numbers of commands
 UNITS = {"cm": 1, "mm": 6}
 MODELS = ("original", "s", "plus")
@@ -51,11 +51,11 @@ class TfMini(Sensor):
 
     summary: ClassVar[str] = "Benewake TFmini, TFmini-S and TFmini Plus distance sensors over a UART."
 
-    model: Literal["original", "s", "plus"] = "plus"  # which of the three; S and Plus can be determined rate and unit
-    unit: Literal["cm", "mm"] = "cm"  # of the distance
+    model: Literal["original", "s", "plus"] = "plus"  # model; rate and unit of S and Plus can be set
+    unit: Literal["cm", "mm"] = "cm"  # unit of the distance
     rate_hz: float = 100.0  # 1000 divided by a whole number; the original's is 100
     save: bool = True  # keep rate and unit in the sensor's flash, as the manual asks for
-    baud: int = 115200  # as the sensor is set
+    baud: int = 115200  # baud rate of the sensor
 
     def __post_init__(self) -> None:
         if self.model not in MODELS or self.unit not in UNITS:
@@ -111,9 +111,9 @@ class TfMini(Sensor):
 
     def encode(self, samples: Samples) -> Bytes:
         """Return the frames of these samples."""
-        words, *rest = samples.values
+        words, *others = samples.values
         marker = np.broadcast_to(np.frombuffer(MARKER, np.uint8), (len(words), 2))
-        body = np.hstack([marker, np.ascontiguousarray(words, "<u2").view(np.uint8), *rest])
+        body = np.hstack([marker, np.ascontiguousarray(words, "<u2").view(np.uint8), *others])
         return np.hstack([body, sum8(body)[:, None]])
 
     def opening(self, local: Mapping[str, Any]) -> Dialogue:

@@ -75,11 +75,11 @@ def type_of(output: str) -> str | None:
     >>> type_of("actual_q"), type_of("output_int_register_24"), type_of("q")
     ('VECTOR6D', 'INT32', None)
     """
-    found = REGISTER.fullmatch(output)
-    if found is None:
+    match = REGISTER.fullmatch(output)
+    if match is None:
         return TYPES.get(output)
-    kind, known = REGISTERS[found[1]]
-    return kind if int(found[2]) in known else None
+    kind, count = REGISTERS[match[1]]
+    return kind if int(match[2]) in count else None
 
 
 def fields_of(output: str) -> list[pa.Field]:

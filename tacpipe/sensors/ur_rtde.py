@@ -54,9 +54,11 @@ class UrRtde(Sensor):
     def __post_init__(self) -> None:
         unknown = [name for name in self.outputs if type_of(name) is None or name == STAMP]
         if unknown or not self.outputs or len(set(self.outputs)) < len(self.outputs):
-            named = f"{unknown[0]} among its outputs" if unknown else f"the outputs {', '.join(self.outputs) or 'none'}"
+            described = (
+                f"{unknown[0]} among its outputs" if unknown else f"the outputs {', '.join(self.outputs) or 'none'}"
+            )
             raise UsageError(
-                f"ur-rtde has {named}; name each output of the RTDE guide once, as actual_q or output_int_register_24. "
+                f"ur-rtde has {described}; name each output of the RTDE guide once, as actual_q or output_int_register_24. "
                 f"The time comes by itself."
             )
         if not 1 <= self.rate_hz <= 500:
@@ -96,8 +98,8 @@ class UrRtde(Sensor):
         """Return the samples of data packages, with the controller's time; other packages hold none."""
         dtype = self.package
         rows = np.flatnonzero(frames[:, 2] == DATA) if frames.shape[1] == dtype.itemsize else np.zeros(0, np.int64)
-        found = np.ascontiguousarray(frames[rows][:, : dtype.itemsize])
-        packages = found.view(dtype)[:, 0] if len(rows) else np.zeros(0, dtype)
+        records = np.ascontiguousarray(frames[rows][:, : dtype.itemsize])
+        packages = records.view(dtype)[:, 0] if len(rows) else np.zeros(0, dtype)
         return Samples(
             tuple(_native(packages[name], name) for name in self.outputs),
             t_device_ns=np.rint(packages[STAMP] * 1e9).astype(np.int64),
@@ -152,7 +154,7 @@ class _Controller(Device):
 
     def __init__(self, sensor: UrRtde) -> None:
         super().__init__(streaming=False)
-        self.known = (STAMP, *sensor.outputs)
+        self.outputs = (STAMP, *sensor.outputs)
 
     def hear(self, data: bytes) -> list[bytes]:
         self.heard += data
@@ -175,8 +177,8 @@ class _Controller(Device):
     def _recipe(self, package: bytes) -> bytes:
         names = tuple(package[8:].decode("latin-1").removesuffix(",").split(","))  # ur_rtde ends its list with a comma
         self.rate_hz = float(struct.unpack(">d", package[:8])[0])
-        kinds = ",".join(str(type_of(name)) if name in self.known else "NOT_FOUND" for name in names)
-        return packed(OUTPUTS, bytes([names == self.known]) + kinds.encode())
+        kinds = ",".join(str(type_of(name)) if name in self.outputs else "NOT_FOUND" for name in names)
+        return packed(OUTPUTS, bytes([names == self.outputs]) + kinds.encode())
 
 
 def packed(kind: int, payload: bytes = b"") -> bytes:

@@ -17,8 +17,8 @@ GRIDS = {
     512: (16, 32),
     1024: (32, 32),
 }  # taxels to rows and columns of boards that are known
-LEAST_TAXELS = 64  # of a board that is not known: many others mark their frames with the same two bytes
-LEAST_DEGC, MOST_DEGC = -40.0, 85.0  # that the magnetometers of an AnySkin work at
+LEAST_TAXELS = 64  # smallest unknown board: many others mark their frames with the same two bytes
+LEAST_DEGC, MOST_DEGC = -40.0, 85.0  # operating range of the magnetometers of an AnySkin
 MOST_TRIED = 3  # distances between marks, the commonest first
 
 
@@ -43,10 +43,10 @@ def distances(data: bytes, mark: bytes) -> list[int]:
     >>> distances(b"ab__ab__ab_ab__", b"ab")
     [4, 3]
     """
-    places, found = [], data.find(mark)
-    while found >= 0:
-        places.append(found)
-        found = data.find(mark, found + 1)
+    places, mark_at = [], data.find(mark)
+    while mark_at >= 0:
+        places.append(mark_at)
+        mark_at = data.find(mark, mark_at + 1)
     counted = Counter(after - before for before, after in itertools.pairwise(places))
     return [distance for distance, _ in counted.most_common(MOST_TRIED)]
 

@@ -35,10 +35,10 @@ if TYPE_CHECKING:
 MARKER = b"\xaa\xaa\xaa"
 HEADER = 6  # marker, number, size
 FRAME, START, STOP, TARE, MATRIX = 0x00, 0x21, 0x22, 0x23, 0x30
-TICK_NS = 10_000  # of the sensor's clock
-CELLS_AT = HEADER + 5  # behind time and flags
+TICK_NS = 10_000  # tick of the sensor's clock
+CELLS_AT = HEADER + 5  # place of the cells, after time and flags
 RUN_LENGTH = 0x01  # flag
-LONGEST_RUN, HIGHEST = 15, 0x0FFF  # what 4 and 12 bits hold
+LONGEST_RUN, HIGHEST = 15, 0x0FFF  # limits of 4 and 12 bits
 
 
 @dataclass(frozen=True)
@@ -48,8 +48,8 @@ class WeissWts(Sensor):
     summary: ClassVar[str] = "Weiss Robotics WTS tactile sensors over USB."
     device_wrap_ns: ClassVar[int | None] = TICK_NS << 32  # 11.9 hours
 
-    rows: int = 14  # of the matrix; that of a WTS 0614 is 14 by 6
-    columns: int = 6  # of the matrix
+    rows: int = 14  # rows of the matrix, which is 14 by 6 in a WTS 0614
+    columns: int = 6  # columns of the matrix
     compress: bool = True  # ask for run-length coded frames
     rate_hz: float = 100.0  # frames a second: 1000 divided by whole milliseconds
     baud: int = 115200  # over USB any
@@ -82,15 +82,15 @@ class WeissWts(Sensor):
 
     def framer(self) -> Framer:
         """Return a framer of messages with their sum; those that are frames must have all cells of the matrix."""
-        most = max(CELLS_AT + 2 * self.cells + 2, 256)
-        return ByteFramer(Framing(marker=MARKER, header=HEADER, sizes=_sizes, most=most, check=self._is_whole))
+        largest = max(CELLS_AT + 2 * self.cells + 2, 256)
+        return ByteFramer(Framing(marker=MARKER, header=HEADER, sizes=_sizes, most=largest, check=self._is_whole))
 
     def _is_whole(self, frames: Bytes) -> Bools:
-        whole: Bools = crc16_wts(frames[:, :-2]) == np.ascontiguousarray(frames[:, -2:]).view("<u2")[:, 0]
-        rows = np.flatnonzero(whole & (frames[:, 3] == FRAME))
+        is_valid: Bools = crc16_wts(frames[:, :-2]) == np.ascontiguousarray(frames[:, -2:]).view("<u2")[:, 0]
+        rows = np.flatnonzero(is_valid & (frames[:, 3] == FRAME))
         if len(rows):
-            whole[rows] = self._cell_counts(frames[rows]) == self.cells
-        return whole
+            is_valid[rows] = self._cell_counts(frames[rows]) == self.cells
+        return is_valid
 
     def _cell_counts(self, frames: Bytes) -> Int64s:
         """Return how many cells each frame has; -1 where it is too short for any."""
@@ -140,8 +140,8 @@ class WeissWts(Sensor):
         Raises `DeviceError` where the sensor has another matrix, or states no.
         """
         yield Ask(message(STOP), until=_reply(STOP, refusable=True), what="the reply to stop")
-        found = yield Ask(message(MATRIX), until=_reply(MATRIX), what="the matrix information")
-        payload = found[HEADER:-2]
+        reply = yield Ask(message(MATRIX), until=_reply(MATRIX), what="the matrix information")
+        payload = reply[HEADER:-2]
         columns, rows = (int.from_bytes(payload[start : start + 2], "little") for start in (2, 4))
         if (rows, columns) != (self.rows, self.columns):
             raise DeviceError(

@@ -48,9 +48,9 @@ class Xela(Sensor):
     counter: ClassVar[int | None] = 1 << 53  # the server's count has no end; JSON numbers are exact up to here
 
     sensor: int = 1  # number of the sensor at the server
-    taxels: int = 16  # of the sensor: 16 of a 4x4, 24 of a 4x6, 30 of a curved fingertip
+    taxels: int = 16  # number of taxels: 16 of a 4x4, 24 of a 4x6, 30 of a curved fingertip
     forces: bool = False  # keep calibrated forces next to the counts; needs the server's calibration
-    rate_hz: float = 100.0  # that the server is set to
+    rate_hz: float = 100.0  # rate of the server
 
     def __post_init__(self) -> None:
         if self.sensor < 1 or not 1 <= self.taxels <= 99:
@@ -168,11 +168,11 @@ def _of_digits(data: str) -> bytes:
 def _counts(texts: Sequence[str], width: int) -> Counts:
     """Return the counts (sample, channel) of lists of hexadecimal numbers; at once where all have four digits."""
     joined = ",".join(texts)
-    if len(joined) == len(texts) * width * (DIGITS + 1) - 1:  # as long as it can be
-        found = np.frombuffer(_of_digits(joined), dtype=">u2").astype(np.uint16)
+    if len(joined) == len(texts) * width * (DIGITS + 1) - 1:  # the largest possible length
+        counts = np.frombuffer(_of_digits(joined), dtype=">u2").astype(np.uint16)
     else:
-        found = np.array([int(count, 16) for count in joined.split(",") if count], dtype=np.uint16)
-    return found.reshape(len(texts), width)
+        counts = np.array([int(count, 16) for count in joined.split(",") if count], dtype=np.uint16)
+    return counts.reshape(len(texts), width)
 
 
 def _text(
