@@ -24,7 +24,7 @@ BLANKS = b" \t"  # characters that may be around a separator
 NEWLINE = 0x0A
 MOST_BYTES = (1 << 31) - 1  # limit of 32-bit places in a text
 NUMBERS = re.compile(rb"(?<=[\">])-?\d+(?:\.\d+)?(?=[\"<])")  # numbers between the marks of an XML text
-FIRST = 1_000_000  # first of the numbers that stand for numbers, see `numbered`
+FIRST = 1_000_000  # first identifier of a stored text
 ODD = (b"<?", b"<!", b"&", b"'", b"\0")  # marks of an XML text other than quotes and tags
 APART = b"\0"  # separator of texts, which no XML contains
 

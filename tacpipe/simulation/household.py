@@ -12,7 +12,7 @@ from tacpipe.simulation.primitives import Box, Ellipsoid, Frustum, Shape
 
 FAMILIES = ("box", "cylinder", "sphere", "ellipsoid", "cone", "bow")
 MODULI_PA = {"rigid": np.inf, "elastic": 50_000.0, "foam": 15_000.0}
-SHARES = (0.6, 0.2, 0.2)  # shares of the objects, in the order of MODULI_PA
+SHARES = (0.6, 0.2, 0.2)  # fraction of the objects per entry of MODULI_PA
 TAPER, NARROW = (
     (0.08, 0.22),
     0.4,

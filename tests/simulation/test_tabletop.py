@@ -7,7 +7,7 @@ from tacpipe.simulation import depth_camera, tabletop
 from tests.simulation import solids
 
 
-def test_what_lies_place_neighbour_an_object_may_first_be_tried_where_the_camera_does_not_look(
+def test_what_lies_beside_an_object_may_first_be_tried_where_the_camera_does_not_look(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     up = np.array([0.0, 0.0, -1.0])
