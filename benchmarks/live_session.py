@@ -79,7 +79,14 @@ def run(arguments: argparse.Namespace, folder: Path) -> tuple[dict[str, Any], di
         planner = threading.Thread(target=send_plans, args=(emulator, port, ended), daemon=True)
         planner.start()
         words = ["live", str(folder / "emulated" / "rig.toml"), "--model", str(arguments.model), "--quiet", "--json"]
-        words += ["--plan", f"udp:127.0.0.1:{port}", "-o", str(folder / "live"), "--duration", f"{arguments.seconds:g}"]
+        words += [
+            "--plan",
+            f"udp:127.0.0.1:{port}",
+            "-o",
+            str(folder / "live"),
+            "--duration-s",
+            f"{arguments.seconds:g}",
+        ]
         words += ["--settle-ms", f"{arguments.settle_ms:g}"]
         words += ["--realtime"] * arguments.realtime
         words += [word for address in arguments.publish for word in ("--publish", address)]

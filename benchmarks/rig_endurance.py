@@ -95,7 +95,7 @@ def main() -> None:
             rig = folder / "rig.toml"
             rig.write_text(rig_of.to_toml(emulator.rig))
             seconds = 60 * chosen.minutes
-            words = ["acquire", str(rig), "-o", str(folder / "rec"), "--duration", str(seconds), "--quiet"]
+            words = ["acquire", str(rig), "-o", str(folder / "rec"), "--duration-s", str(seconds), "--quiet"]
             looks, sealed = watched([str(BIN / "tacpipe"), *words], seconds, folder / "store")
         os.environ["TACPIPE_STORE"] = str(folder / "store")
         recordings = tacpipe.open(folder / "rec")

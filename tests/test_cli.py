@@ -100,3 +100,22 @@ def test_a_label_is_kept_in_the_manifest_and_numbers_are_numbers(lab: Lab) -> No
     assert (attributes["force_n"], attributes["wet"], attributes["note"]) == (1.5, True, "rough side")
     lab.run("label data/r trial-002 --set wet=null")
     assert "wet" not in parse(Path("data/r/manifest.json").read_bytes(), "r").recordings["trial-002"]["attributes"]
+
+
+def test_an_option_with_its_earlier_name_still_works_and_no_help_shows_it(lab: Lab) -> None:
+    lab.run("simulate toy --trials 2 -o data/recordings --jobs 1")
+    lab.run("label data/recordings trial-000 --set material=foam")
+    lab.run("label data/recordings trial-001 --set=material=cork")
+    labels = lab.manifest("data/recordings").labels
+    listed = lab.run("store list --store .tacpipe --json").out
+
+    assert labels == {"trial-000": {"material": "foam"}, "trial-001": {"material": "cork"}}
+    assert listed == lab.run("store list --remote .tacpipe --json").out
+    assert "--duration-s must be above 0" in lab.call("live no-rig.toml --duration 0").err
+    for command, old in (
+        ("acquire", "--duration"),
+        ("live", "--duration"),
+        ("label", "--set"),
+        ("store list", "--store"),
+    ):
+        assert f"{old} " not in lab.run(f"{command} --help").out

@@ -324,7 +324,7 @@ def test_a_second_clone_with_the_same_caches_gets_the_results_without_running_a_
 @pytest.mark.dvc
 @NEEDS_DVC
 def test_labels_set_by_hand_survive_the_next_repro(toy: Project) -> None:
-    toy.run("tacpipe label data/recordings trial-002 --set material=foam")
+    toy.run("tacpipe label data/recordings trial-002 --label material=foam")
     told = toy.run("dvc repro")
 
     assert "Running stage 'scaled'" in told

@@ -110,7 +110,7 @@ LACK = {  # and for each that does need one, with that extra
     "split data/segments --scheme random --seed 7 -o {o} --executor slurm": "slurm",
     "show data/synced trial-000 --plot {o}.png": "learn",
     "view data/synced --save {o}.rrd": "view",
-    "live ws.toml --model models/forward --publish ws:127.0.0.1:1 --duration 1": "learn",
+    "live ws.toml --model models/forward --publish ws:127.0.0.1:1 --duration-s 1": "learn",
     "demo -o {o}": "learn",
     "demo -o {o} --rig serial.toml": "learn",
     "acquire serial.toml -o {o}": "devices",
@@ -124,8 +124,8 @@ LACK = {  # and for each that does need one, with that extra
     "sensors probe": "devices",
     "sensors probe /dev/null": "devices",
     "sensors probe hid:16c0:0486": "devices",
-    "sensors emulate ws.toml -o {o} --duration 1": "devices",
-    "sensors emulate can.toml -o {o} --duration 1": "devices",
+    "sensors emulate ws.toml -o {o} --duration-s 1": "devices",
+    "sensors emulate can.toml -o {o} --duration-s 1": "devices",
 }
 PATIENCE_S = 300.0  # that no command takes unless it hangs
 HEADER = "ply\nformat ascii 1.0\nelement vertex {0}\nproperty float x\nproperty float y\nproperty float z\nend_header\n"

@@ -104,7 +104,7 @@ def test_a_row_may_name_the_label_called_as_the_key_column(toys: Lab) -> None:
         ("a.csv", "mass,m\n1,2\n", "", 2, ("--key", "mass, m")),
         ("a.csv", "recording,m\ntrial-000,1\n", "--key name", 2, ("name", "recording, m")),
         ("a.csv", "recording,m\n", "", 2, ("a.csv", "no row")),
-        ("a.csv", "recording,m\ntrial-000,1\n", "--set m=3", 2, ("--set",)),
+        ("a.csv", "recording,m\ntrial-000,1\n", "--label m=3", 2, ("--label",)),
         ("a.yaml", "trial-000: {m: [1, 2]}\n", "", 1, ("trial-000", "m is [1, 2]")),
         ("a.yaml", "- 3\n", "", 1, ("entry 0",)),
         ("a.yaml", "trial-000: {m: .nan}\n", "", 1, ("m is nan",)),
@@ -123,7 +123,7 @@ def test_a_mistake_is_one_sentence_and_no_label_is_changed(
     assert labels(toys) == before
 
 
-@pytest.mark.parametrize("arguments", ["", "--key x", "trial-000 --dry-run --set a=1"])
+@pytest.mark.parametrize("arguments", ["", "--key x", "trial-000 --dry-run --label a=1"])
 def test_without_a_table_recordings_must_be_named_and_its_options_are_refused(toys: Lab, arguments: str) -> None:
     ran = toys.call(f"label data/r {arguments}")
     assert ran.code == 2 and "--from" in ran.err

@@ -62,7 +62,7 @@ def test_a_label_reads_and_writes_no_shard(many: Lab, read: Callable[[], int]) -
     before = inodes(many.folder / "data/r")
     assert len(before) == MANY * STREAMS
     read()
-    many.run("label data/r trial-003 --set material=foam")
+    many.run("label data/r trial-003 --label material=foam")
     shards = {digest for _, digest in many.manifest("data/r").objects()}
     assert read() <= 3  # manifests
     assert inodes(many.folder / "data/r") == before
@@ -74,7 +74,7 @@ def test_a_shard_that_is_gone_when_a_label_is_set_is_brought_back_by_link(many: 
     shard = many.folder / "data/r/trial-000/left.parquet"
     content = shard.read_bytes()
     shard.unlink()
-    many.run("label data/r trial-003 --set material=foam")
+    many.run("label data/r trial-003 --label material=foam")
     many.run("store link data/r")
     assert shard.read_bytes() == content
 
@@ -82,11 +82,11 @@ def test_a_shard_that_is_gone_when_a_label_is_set_is_brought_back_by_link(many: 
 @pytest.mark.parametrize(("trials", "named"), [(3, "it has trial-000, trial-001, trial-002."), (7, "and 2 more.")])
 def test_a_recording_that_is_not_there_is_refused_with_those_that_are(lab: Lab, trials: int, named: str) -> None:
     lab.run(f"simulate toy --trials {trials} -o data/r --jobs 1")
-    failed = lab.call("label data/r nobody --set a=b")
+    failed = lab.call("label data/r nobody --label a=b")
     assert failed.code == 2 and "nobody" in failed.err and failed.err.rstrip().endswith(named)
 
 
 def test_a_label_of_several_lines_is_refused_on_one(lab: Lab) -> None:
     lab.run("simulate toy --trials 1 -o data/r --jobs 1")
-    failed = lab.call("label data/r trial-000 --set 'a\nb=c'")
+    failed = lab.call("label data/r trial-000 --label 'a\nb=c'")
     assert failed.code == 2 and failed.err.count("\n") == 1 and "a\\nb=c" in failed.err

@@ -36,7 +36,7 @@ WRITE = (
     "simulate toy -o data/r --check",
     "simulate toy -o data/r --recompute-and-compare",
     "scale data/r -o data/new",
-    "label data/r trial-000 --set material=foam",
+    "label data/r trial-000 --label material=foam",
     "show data/s",
     "explain data/s",
     "acquire rig.toml -o data/rec --recover",
@@ -190,7 +190,7 @@ def test_a_store_that_is_itself_a_link_to_another_disk_works(
     made.store.root.rename(disk)
     made.store.root.symlink_to(disk)
     made.run("scale data/r -o data/t --factor 9")
-    made.run("label data/r trial-000 --set material=foam")
+    made.run("label data/r trial-000 --label material=foam")
     age(made)
     for command in ("store verify", "store repair", "store gc --recordings --grace-days 0", "store push remote data/t"):
         made.run(command)

@@ -322,7 +322,7 @@ def test_a_dataset_in_pages_is_pushed_pulled_and_checked_out(
     assert all(recording.table("left").num_rows == 3 for recording in opened)
     shutil.rmtree(other / "data/r")
     manifest._parsed.clear()
-    lab.run(f"store checkout {hashing.bytes_digest(content['data/s'])} --store {remote} -o data/s")
+    lab.run(f"store checkout {hashing.bytes_digest(content['data/s'])} --remote {remote} -o data/s")
     assert (other / "data/s/manifest.json").read_bytes() == content["data/s"]
     lab.run("store verify")
 

@@ -250,7 +250,7 @@ def test_a_manifest_edited_by_hand_is_refused(lab: Lab) -> None:
     lab.run("simulate toy -o data/r")
     path = Path("data/r/manifest.json")
     path.write_text(path.read_text().replace('"material": "cork"', '"material": "foam"'))
-    for command in ("scale data/r -o data/s", "show data/r", "explain data/r", "label data/r trial-000 --set a=1"):
+    for command in ("scale data/r -o data/s", "show data/r", "explain data/r", "label data/r trial-000 --label a=1"):
         failed = lab.call(command)
         assert failed.code == 4 and "edited by hand" in failed.err, command
     path.write_text("{")

@@ -126,7 +126,7 @@ def collect(lab: Lab, store: Path, options: str = "") -> None:
 
 def snapshots(lab: Lab) -> list[tuple[str, str, str]]:
     """Return project, path and state of all that was pushed, newest first where a project pushed."""
-    listed = json.loads(lab.run(f"store list --store {lab.folder}/remote --json").out)["manifests"]
+    listed = json.loads(lab.run(f"store list --remote {lab.folder}/remote --json").out)["manifests"]
     return [(one["project"], one["path"], one["state"]) for one in listed]
 
 
@@ -185,7 +185,7 @@ def test_a_push_onto_what_somebody_else_pushed_since_is_refused_and_erases_nothi
     two.run("store push ../remote data/r")
     shutil.copytree(two.folder / "one", two.folder / "rig", ignore=shutil.ignore_patterns("leases"))
     enter(two, "rig", monkeypatch)
-    two.run("label data/r trial-000 --set material=foam")
+    two.run("label data/r trial-000 --label material=foam")
     two.run("store push ../remote data/r")
     enter(two, "one", monkeypatch)
     two.run("label data/r trial-001 --set material=cork")
@@ -195,10 +195,10 @@ def test_a_push_onto_what_somebody_else_pushed_since_is_refused_and_erases_nothi
     two.run("store push ../remote data/r --replace")
     collect(two, two.folder / "remote", "--recordings")
     assert len(snapshots(two)) == 3
-    digests = [one["manifest"] for one in json.loads(two.run("store list --store ../remote --json").out)["manifests"]]
+    digests = [one["manifest"] for one in json.loads(two.run("store list --remote ../remote --json").out)["manifests"]]
     labelled = set()
     for digest in digests:
-        two.run(f"store checkout {digest} --store ../remote -o back/{digest}")
+        two.run(f"store checkout {digest} --remote ../remote -o back/{digest}")
         labelled.add(json.dumps(dict(two.manifest(f"one/back/{digest}").labels)))
     assert len(labelled) == 3, "each snapshot came back with its own labels"
 
@@ -229,11 +229,11 @@ def test_what_was_pushed_earlier_is_kept_by_the_stated_rule(two: Lab, monkeypatc
     assert [path for _, path, _ in snapshots(two)].count("data/r") == 1 + HISTORY
     newest, middle, oldest = (
         one["manifest"]
-        for one in json.loads(two.run("store list --store ../remote --json").out)["manifests"]
+        for one in json.loads(two.run("store list --remote ../remote --json").out)["manifests"]
         if one["path"] == "data/i"
     )
     collect(two, two.folder / "remote", f"--recordings --forget {newest} --forget {oldest[:12]}")
-    left = json.loads(two.run("store list --store ../remote --json").out)["manifests"]
+    left = json.loads(two.run("store list --remote ../remote --json").out)["manifests"]
     assert [(one["manifest"], one["state"]) for one in left if one["path"] == "data/i"] == [(middle, "pushed here")]
     collect(two, two.folder / "remote", "--recordings --forget one:data/i --forget data/r")
     assert snapshots(two) == [] and not list((two.folder / "remote/objects").glob("*/*"))
@@ -247,7 +247,7 @@ def test_a_second_computer_joins_a_project_by_its_name(two: Lab, monkeypatch: py
     two.run("store pull ../remote data/r")
     failed = two.call("store push ../remote data/r --project three")
     assert failed.code == 2 and "no project is called three" in failed.err and "one (" in failed.err
-    two.run("label data/r trial-000 --set material=foam")
+    two.run("label data/r trial-000 --label material=foam")
     two.run("store push ../remote data/r --project one")
     two.run("store push ../remote data/r")
     assert snapshots(two) == [("one", "data/r", "pushed here"), ("one", "data/r", "pushed earlier")]
@@ -267,7 +267,7 @@ def test_a_store_elsewhere_serves_projects_without_a_mark_and_no_dataset_is_a_do
         lab.run(f"store push {remote} data/r data/s")
     monkeypatch.chdir(folder / "a/data/r")
     lab.run(f"store push {remote} .")
-    listed = json.loads(lab.run(f"store list --store {remote} --json").out)["manifests"]
+    listed = json.loads(lab.run(f"store list --remote {remote} --json").out)["manifests"]
     names = sorted(f"{one['project']}:{one['path']}" for one in listed)
     assert names == ["a:data/r", "a:data/s", "b:data/r", "b:data/s", "data:r"]
 
@@ -328,7 +328,7 @@ def test_what_was_pushed_before_projects_is_pulled_and_succeeded_by_whoever_has_
         two.run(f"store pull ../remote {wanted if name == 'one' else 'two:data/r'}")
         assert Path("data/r/manifest.json").read_bytes() == (two.folder / name / "data/r/manifest.json").read_bytes()
     enter(two, "one", monkeypatch)
-    two.run("label data/r trial-000 --set material=foam")
+    two.run("label data/r trial-000 --label material=foam")
     two.run("store push ../remote data/r")
     assert sorted(snapshots(two)) == [
         ("one", "data/r", "pushed earlier"),
@@ -415,7 +415,7 @@ def test_a_push_that_another_one_writes_over_where_nothing_locks_says_so_and_its
 ) -> None:
     lab.run("simulate toy -o data/r --trials 1 --rows 3")
     lab.run("store push remote data/r")
-    lab.run("label data/r trial-000 --set material=foam")
+    lab.run("label data/r trial-000 --label material=foam")
     remote = Store(lab.folder / "remote")
     (before,) = remote.roots.all()
     other, honest = "ab" * 32, Roots.push

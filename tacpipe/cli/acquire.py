@@ -30,7 +30,7 @@ def add(program: typer.Typer, summary: str) -> None:
 
     @program.command(
         "acquire",
-        help=f"{summary}\n\nExample: tacpipe acquire rig.toml -o data/recordings --duration 30 --label material=cork",
+        help=f"{summary}\n\nExample: tacpipe acquire rig.toml -o data/recordings --duration-s 30 --label material=cork",
     )
     def acquire(
         rig: Annotated[
@@ -41,7 +41,8 @@ def add(program: typer.Typer, summary: str) -> None:
             typer.Option("-o", "--output", help="Dataset to append to."),
         ] = None,
         duration: Annotated[
-            float | None, typer.Option(help="Duration of a recording, s; without it until Ctrl-C or --stop.")
+            float | None,
+            typer.Option("--duration-s", help="Duration of a recording, s; without it until Ctrl-C or --stop."),
         ] = None,
         trials: Annotated[int, typer.Option(help="Number of recordings, one after another.")] = 1,
         label: Annotated[list[str] | None, typer.Option(help="Label of every recording, as name=value.")] = None,
@@ -50,7 +51,7 @@ def add(program: typer.Typer, summary: str) -> None:
             str | None, typer.Option(help="Name of the recording; the time of its start by default.")
         ] = None,
         start: Annotated[str, typer.Option(help="Start of a trial: now, key, contact or tap.")] = "now",
-        stop: Annotated[str, typer.Option(help="End of a trial in addition to --duration: key, contact or tap.")] = (
+        stop: Annotated[str, typer.Option(help="End of a trial in addition to --duration-s: key, contact or tap.")] = (
             "duration"
         ),
         contact_count: Annotated[
@@ -128,9 +129,9 @@ def _record(rig: Rig, store: Store, plan: Any, *, quiet: bool) -> tuple[list[Rec
             raise UsageError(f"There is no {what} {value}; it must be one of {', '.join(known)}.")
     checked_name(plan.name)
     if plan.trials < 1 or (plan.duration_s is not None and plan.duration_s <= 0):
-        raise UsageError("--trials and --duration must be above 0.")
+        raise UsageError("--trials and --duration-s must be above 0.")
     if plan.trials > 1 and plan.stop == "duration" and plan.duration_s is None:
-        raise UsageError("--trials needs --duration or --stop, or the first trial never ends.")
+        raise UsageError("--trials needs --duration-s or --stop, or the first trial never ends.")
     store.prepare()
     directory.check_output(store, plan.output)
     appending.refuse_taken(plan.output, plan.names)
@@ -207,11 +208,8 @@ def attributes(labels: list[str], note: str | None) -> dict[str, Attribute]:
     """Return the attributes of a recording that labels and a note give. Raises `UsageError` for labels that are none."""
     from tacpipe.datasets import labels as labels_of
 
-    try:
-        found = labels_of.parse(labels, None, include=False) if labels else {}
-    except UsageError as error:
-        raise UsageError(str(error).replace("--set", "--label")) from error
-    return {**found, **({"note": note} if note else {})}
+    parsed = labels_of.parse(labels, None, include=False) if labels else {}
+    return {**parsed, **({"note": note} if note else {})}
 
 
 def _report(

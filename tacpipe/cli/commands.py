@@ -41,14 +41,16 @@ def _label(program: typer.Typer) -> None:
         help=SUMMARIES["label"]
         + "\n\nLabels are set on the recordings that are named, or on each by a table with --from: "
         "CSV, TSV, Parquet, JSON or YAML with a row a recording. An empty cell changes nothing.\n\n"
-        "Example: tacpipe label data/recordings trial-003 --set material=foam",
+        "Example: tacpipe label data/recordings trial-003 --label material=foam",
     )
     def label(
         dataset: Annotated[Path, typer.Argument(help="The recordings.")],
         names: Annotated[
             list[str] | None, typer.Argument(help="Names of recordings; * and ? match any letters.")
         ] = None,
-        set_: Annotated[list[str] | None, typer.Option("--set", help="Label as name=value; null removes it.")] = None,
+        label: Annotated[
+            list[str] | None, typer.Option("--label", help="Label as name=value; null removes it.")
+        ] = None,
         exclude: Annotated[
             str | None, typer.Option("--exclude", help="Leave out of all stages, for this reason.")
         ] = None,
@@ -68,12 +70,12 @@ def _label(program: typer.Typer) -> None:
         from tacpipe.datasets import labels
 
         if from_ is not None:
-            labels_from.refuse_others(names, set_, exclude, include)
+            labels_from.refuse_others(names, label, exclude, include)
             labels_from.run(dataset, from_, key, dry_run=dry_run, as_json=as_json)
             return
         labels_from.refuse_alone(names, key, dry_run)
         assert names is not None
-        wanted = labels.parse(set_ or [], exclude, include=include)
+        wanted = labels.parse(label or [], exclude, include=include)
         changed = labels.change(dataset, names, wanted)
         value = {
             "schema_version": 1,

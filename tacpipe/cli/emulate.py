@@ -30,7 +30,9 @@ def emulate(
     output: Annotated[
         Path, typer.Option("-o", "--output", help="Folder for rig.toml, pseudo-terminals and the ledger.")
     ],
-    duration: Annotated[float | None, typer.Option("--duration", help="Duration, s; without it, until Ctrl-C.")] = None,
+    duration: Annotated[
+        float | None, typer.Option("--duration-s", help="Duration, s; without it, until Ctrl-C.")
+    ] = None,
     faults: Annotated[str, typer.Option("--faults", help="Faults to add: noise=0.5,cut=0.2,flip=1,drop=0.001 …")] = "",
     seed: Annotated[int, typer.Option("--seed", help="Random seed of the simulated world and of the faults.")] = 0,
 ) -> None:

@@ -32,6 +32,8 @@ COMMON = (
     "json_",
     "help",
 )
+# Earlier names of options. They still work, and no help shows them.
+OLD_NAMES = {"--duration": "--duration-s", "--set": "--label", "--store": "--remote"}
 EXAMPLE = "Example: "  # Starts a paragraph with a command line, which is printed without line breaks.
 BRIEF_LINES = 40  # Lines that ``-h`` prints at most.
 TYPES = {"integer": "INTEGER", "int": "INTEGER", "float": "NUMBER", "path": "PATH", "file": "PATH"}
@@ -50,6 +52,16 @@ class Command(TyperCommand):
     """A command whose help shows its options in panels: the one an option names, else that of `PANELS`."""
 
     brief = False  # Whether to show the common options only.
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse a command line, in which options may have the names of `OLD_NAMES` where the command has none of them."""
+        options = {name for param in self.params for name in (*param.opts, *param.secondary_opts)}
+        renamed = {old: new for old, new in OLD_NAMES.items() if new in options and old not in options}
+        end = args.index("--") if "--" in args else len(args)
+        words = [word.partition("=") for word in args[:end]]
+        return super().parse_args(
+            ctx, ["".join((renamed.get(name, name), *value)) for name, *value in words] + args[end:]
+        )
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
         """Return what follows the command's name: arguments, required options, and a word for the others."""

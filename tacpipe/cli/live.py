@@ -49,7 +49,7 @@ def add(program: typer.Typer, summary: str) -> None:
         rig: Annotated[Path, typer.Argument(help="Rig file, as of `tacpipe acquire`.")],
         output: Annotated[Path | None, typer.Option("-o", "--output", help="Dataset to append recordings to.")] = None,
         duration: Annotated[
-            float | None, typer.Option(help="Duration of the session, s; without it until Ctrl-C.")
+            float | None, typer.Option("--duration-s", help="Duration of the session, s; without it until Ctrl-C.")
         ] = None,
         label: Annotated[list[str] | None, typer.Option(help="Label of the recording, as name=value.")] = None,
         name: Annotated[
@@ -63,7 +63,7 @@ def add(program: typer.Typer, summary: str) -> None:
         from tacpipe.recording import rig as rigs
 
         if duration is not None and duration <= 0:
-            raise UsageError("--duration must be above 0.")
+            raise UsageError("--duration-s must be above 0.")
         texts = {key: tuple(value) if isinstance(value, list) else value for key, value in options.items()}
         session = preparation.prepare(rigs.read(rig), str(rig), texts)
         _run(session, output, name, duration, label or [], quiet=quiet, as_json=as_json)

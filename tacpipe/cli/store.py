@@ -28,7 +28,7 @@ Remote = Annotated[
     str, typer.Argument(metavar="STORE", help="The other store: a directory, or s3://BUCKET/FOLDER, gs://…, az://…")
 ]
 OtherStore = Annotated[
-    str | None, typer.Option("--store", metavar="STORE", help="Store to read instead of the project's own.")
+    str | None, typer.Option("--remote", metavar="STORE", help="Other store to read, a directory or an address.")
 ]
 AtRemote = Annotated[
     str | None, typer.Option("--remote", metavar="STORE", help="Other store to work on, a directory or an address.")

@@ -26,7 +26,7 @@ def parse(sets: Sequence[str], exclude: str | None, *, include: bool) -> dict[st
     for text in sets:
         name, equals, value = text.partition("=")
         if not equals or not name.isidentifier():
-            raise UsageError(f"--set {plain(text)} should read name=value, as in --set material=foam.")
+            raise UsageError(f"--label {plain(text)} should read name=value, as in --label material=foam.")
         labels[name] = of_text(value) if value else ""
     if exclude is not None and include:
         raise UsageError("--exclude and --include contradict each other; give one.")
@@ -35,7 +35,7 @@ def parse(sets: Sequence[str], exclude: str | None, *, include: bool) -> dict[st
     if include:
         labels["excluded"] = None
     if not labels:
-        raise UsageError("Nothing to change: give --set name=value, --exclude REASON or --include.")
+        raise UsageError("Nothing to change: give --label name=value, --exclude REASON or --include.")
     return labels
 
 

@@ -127,7 +127,7 @@ def refuse_newer(there: AnyStore, before: Root, seen: Collection[str], name: str
     written = time.strftime("%Y-%m-%d %H:%M", time.localtime(before.get("written_s", 0)))
     raise UsageError(
         f"{there.place} holds another {name} than this project has had here: {manifest[:12]}, pushed on {written}. `tacpipe "
-        f"store checkout {manifest[:12]} --store {there.place} -o DIRECTORY` brings it; --replace pushes all the same, and "
+        f"store checkout {manifest[:12]} --remote {there.place} -o DIRECTORY` brings it; --replace pushes all the same, and "
         f"keeps it as an earlier snapshot."
     )
 

@@ -125,7 +125,7 @@ def pull(remote: Path | str, paths: Sequence[Path], *, ancestors: bool = False, 
         if occupant is not None and occupant.content != manifest.content and not replace:
             raise UsageError(
                 f"{found.directory} holds another dataset than {name}. --replace writes {name} there, and what is there now "
-                f"stays in the store; `tacpipe store checkout {name} --store {remote} -o DIRECTORY` writes it elsewhere."
+                f"stays in the store; `tacpipe store checkout {name} --remote {remote} -o DIRECTORY` writes it elsewhere."
             )
         with local_store.at_work([found.digest]):
             bring(there, local_store, found, done, ancestors=ancestors)
@@ -239,7 +239,7 @@ def _wanted(path: Path, there: AnyStore) -> tuple[manifest_of.Found, str]:
         if not paths.safe_path(root["path"]):
             raise UsageError(
                 f"{plain(root['path'])} is not a path within a project. `tacpipe store checkout {root['manifest'][:12]} "
-                f"--store {there.place} -o DIRECTORY` writes it elsewhere."
+                f"--remote {there.place} -o DIRECTORY` writes it elsewhere."
             )
         directory = folder / root["path"]
     content = there.read(root["manifest"], regular.JSON_BYTES)

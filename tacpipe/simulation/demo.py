@@ -22,7 +22,7 @@ def rig(output: Path) -> list[list[str]]:
     from tacpipe.tasks.forward import demo
 
     recordings = str(output / "recordings")
-    live = ["--trials", str(LIVE_TRIALS), "--duration", str(LIVE_S / LIVE_TRIALS)]
+    live = ["--trials", str(LIVE_TRIALS), "--duration-s", str(LIVE_S / LIVE_TRIALS)]
     return [
         ["acquire", str(output / EMULATED / "rig.toml"), "-o", recordings, *live],
         ["show", recordings],

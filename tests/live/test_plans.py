@@ -144,7 +144,7 @@ def test_a_rig_without_a_stream_that_the_model_needs_or_with_another_layout_ends
     other = live.stream("xela2", "optoforce", "serial:/dev/ttyS9", "{ rate_hz = 333 }")
     for streams, named in (((SKINS[0], ARM), "xela2"), ((SKINS[0], other, ARM), "xela2"), (SKINS, "robot")):
         (trained.folder / "rig.toml").write_text("".join(streams))
-        process = started(trained, "--duration 1")
+        process = started(trained, "--duration-s 1")
         _, err = process.communicate()
         assert process.returncode == 2 and named in err and "Traceback" not in err
         assert not (trained.folder / "rec").exists()

@@ -29,7 +29,7 @@ def patience(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_what_is_published_is_recorded_to_the_bit_and_predicted_from_what_was_recorded(lab: Lab) -> None:
     with live.served(lab.folder, SKIN, live.WRENCH), subscriber() as (port, messages):
-        options = f"-o rec --duration 2 --json --quantiles 90,10 --publish udp:127.0.0.1:{port}"
+        options = f"-o rec --duration-s 2 --json --quantiles 90,10 --publish udp:127.0.0.1:{port}"
         printed = ended(started(lab, options))
     shard = live.only(lab.folder)
     table = shard.table("forecast")
@@ -70,7 +70,7 @@ def test_a_model_process_that_dies_is_started_anew_and_no_sample_is_lost(lab: La
 
 def test_a_model_that_is_too_slow_costs_forecasts_which_are_counted_and_no_sample(lab: Lab) -> None:
     with live.served(lab.folder, SKIN, live.WRENCH):
-        printed = ended(started(lab, "-o rec --duration 3 --json", "slow:0.2"))
+        printed = ended(started(lab, "-o rec --duration-s 3 --json", "slow:0.2"))
     shard = live.only(lab.folder)
     assert printed["live"]["skipped"] > printed["live"]["forecasts"] > 0
     assert whole(shard, "skin") and whole(shard, "wrench")
@@ -95,7 +95,7 @@ def test_a_stream_that_goes_away_makes_alarms_unknown_until_it_is_back(lab: Lab)
 @pytest.mark.parametrize("stream", [live.WRENCH, live.stream("skin", "tfmini", "serial:/dev/ttyUSB3")])
 def test_a_rig_without_what_the_model_reads_is_refused_in_one_sentence(lab: Lab, stream: str) -> None:
     Path(lab.folder / "rig.toml").write_text(f"{live.RANGE}{stream}")
-    process = started(lab, "-o rec --duration 1")
+    process = started(lab, "-o rec --duration-s 1")
     _, err = process.communicate()
     assert process.returncode == 2 and "skin" in err and len(without_created_store(err).strip().splitlines()) == 1
     assert not (lab.folder / "rec").exists()

@@ -33,7 +33,7 @@ STEPS = {  # mark that is set once the command has returned, and the command
     "pushed": "store push remote data/recordings",
     "appended": "ingest numbers more -o data/recordings --jobs 1",
 }
-ACQUIRE = "acquire rig.toml -o data/acquired --duration 2 --name one --quiet"
+ACQUIRE = "acquire rig.toml -o data/acquired --duration-s 2 --name one --quiet"
 RECOVER = "acquire --recover -o data/acquired --quiet"
 FIRST, MORE = ("a", "b", "c"), ("d",)
 libc = ctypes.CDLL(None, use_errno=True)

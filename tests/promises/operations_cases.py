@@ -116,7 +116,7 @@ TOYS = (
     Case("ingest.numbers", NUMBERS, sources=_numbers, durable=True),
     *(Case(name, TOY[n], TOY[:n]) for n, name in enumerate(("simulate.toy", "scale", "halves", "centre", "total"))),
     Case("named", "named data/r -o data/n", TOY[:1]),
-    Case("label", "label data/r trial-000 --set material=foam", TOY[:1], outputs=("data/r",), durable=True),
+    Case("label", "label data/r trial-000 --label material=foam", TOY[:1], outputs=("data/r",), durable=True),
     Case("store status", "store status", TOY[:2]),
     Case("store verify", "store verify", TOY[:2]),
     Case("store repair", "store repair", TOY[:2], spoil=_damage, sound=False),

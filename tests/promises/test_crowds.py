@@ -116,7 +116,7 @@ def test_killed_processes_leave_no_lock_that_anybody_waits_for(scene: Scene, siz
         assert kills.ended(running) in (0, -signal.SIGKILL)
     assert list(scene.project.glob(".tacpipe/leases/*")), "none of them held a lease"
     (scene.project / "gate").touch()
-    for words in (*commands, "label data/r trial-000 --set material=foam", "store gc", "store repair"):
+    for words in (*commands, "label data/r trial-000 --label material=foam", "store gc", "store repair"):
         at_once = scene.start(words, TACPIPE_LOCK_TIMEOUT_S="0")
         assert kills.ended(at_once) == 0, at_once.out.read_text()
     kills.aged(scene.project)
@@ -148,7 +148,7 @@ def test_who_waits_for_a_stopped_process_is_told_whom_and_gives_up(scene: Scene)
 
 @pytest.mark.long
 @pytest.mark.parametrize("times", [3, pytest.param(20, marks=pytest.mark.faults)])
-@pytest.mark.parametrize("words", ["scale data/r -o data/s", "label data/r trial-000 --set material=foam"])
+@pytest.mark.parametrize("words", ["scale data/r -o data/s", "label data/r trial-000 --label material=foam"])
 def test_garbage_that_is_collected_beside_a_stopped_process_is_not_what_it_needs(
     scene: Scene, words: str, times: int
 ) -> None:
@@ -229,7 +229,7 @@ def shared(scene: Scene) -> Iterator[Scene]:
     commands = [
         "simulate toy --trials 2 -o data/r",
         "scale data/r -o data/s",
-        "label data/r trial-000 --set a=1",
+        "label data/r trial-000 --label a=1",
         "store gc",
     ]
     probe = [sys.executable, "-c", PROBE, *commands]
@@ -267,7 +267,7 @@ def test_two_users_of_a_group_share_a_store(shared: Scene, size: int) -> None:
     told = done(*(f"scale data/r --factor 9 --json --quiet --jobs 1 -o data/s{n}" for n in range(size)), first=1)
     assert sum(json.loads(one)["ran"] for one in told) == 12  # each wrote over what was the other's
     for first in (0, 1):
-        done(f"label data/r trial-000 --set material=foam{first}", first=first)
+        done(f"label data/r trial-000 --label material=foam{first}", first=first)
         kills.aged(shared.project)
         done("store gc", first=first)
     tidy(Store(shared.project / ".tacpipe"))

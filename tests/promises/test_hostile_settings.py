@@ -58,7 +58,7 @@ def a_rig(name: str = "xela1", sensor: str = "xela", transport: str = "ws:127.0.
 )
 def test_an_address_that_is_a_command_or_of_no_known_kind_is_refused(lab: Lab, command: str, scheme: str) -> None:
     (lab.folder / "rig.toml").write_text(a_rig(transport=f"{scheme}{command}"))
-    refused(lab, "acquire rig.toml -o data --duration 1")
+    refused(lab, "acquire rig.toml -o data --duration-s 1")
 
 
 @pytest.mark.parametrize("command", some(COMMANDS[:-1], 0))
@@ -79,7 +79,7 @@ def test_a_command_behind_a_known_scheme_is_a_place_that_is_not_there(
     lab: Lab, command: str, scheme: str, sensor: str, options: str
 ) -> None:
     (lab.folder / "rig.toml").write_text(a_rig("one", sensor, f"{scheme}:{command}", options))
-    refused(lab, "acquire rig.toml -o data --duration 1")
+    refused(lab, "acquire rig.toml -o data --duration-s 1")
 
 
 @pytest.mark.parametrize("name", some([*PATHS, *COMMANDS], 3))
@@ -87,7 +87,7 @@ def test_a_stream_cannot_be_named_so_that_it_lies_elsewhere(lab: Lab, name: str)
     if name == "A":
         name = "Xela"
     (lab.folder / "rig.toml").write_text(a_rig(name, more="options = { sensor = 1 }\n"))
-    refused(lab, "acquire rig.toml -o data --duration 1")
+    refused(lab, "acquire rig.toml -o data --duration-s 1")
 
 
 @pytest.mark.parametrize(
@@ -97,7 +97,7 @@ def test_a_recording_cannot_be_named_so_that_it_lies_elsewhere(lab: Lab, name: s
     import shlex
 
     (lab.folder / "rig.toml").write_text(a_rig(more="options = { sensor = 1 }\n"))
-    refused(lab, f"acquire rig.toml -o data --duration 1 --name {shlex.quote(name)}")
+    refused(lab, f"acquire rig.toml -o data --duration-s 1 --name {shlex.quote(name)}")
 
 
 RIGS = {
@@ -120,7 +120,7 @@ RIGS = {
 @pytest.mark.parametrize("case", RIGS)
 def test_a_rig_file_that_no_person_wrote_is_refused_with_a_sentence(lab: Lab, case: str) -> None:
     (lab.folder / "rig.toml").write_bytes(RIGS[case].encode("utf-8", "surrogateescape"))
-    refused(lab, "acquire rig.toml -o data --duration 1")
+    refused(lab, "acquire rig.toml -o data --duration-s 1")
 
 
 @pytest.mark.parametrize("kind", ["folder", "pipe", "endless", "empty"])

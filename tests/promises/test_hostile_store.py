@@ -177,7 +177,7 @@ def test_a_root_that_was_made_up_is_listed_or_refused_with_a_sentence(
     (file,) = remote.root.glob("roots/*")
     root = {key: value for key, value in json.loads(file.read_text()).items() if key != "check"} | changed
     file.write_text(json.dumps({**root, "check": digest(root)}))
-    for command in ("store list --store {}", "store pull {} data/r", "store checkout abcdef --store {} -o x"):
+    for command in ("store list --remote {}", "store pull {} data/r", "store checkout abcdef --remote {} -o x"):
         ran = lab.call(command.format(remote.root))
         assert ran.code in (DONE, USAGE, DAMAGED) and (is_sentence(ran.err) if ran.code else True), ran
         assert "\x1b" not in ran.out + ran.err

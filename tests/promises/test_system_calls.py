@@ -60,7 +60,7 @@ class Case:
 CASES = {
     "ingest": Case("ingest numbers src -o data/recordings --jobs 1", emptied),
     "a stage": Case("scale data/recordings -o data/tripled --factor 3 --jobs 1"),
-    "label": Case("label data/recordings b --set material=cork"),
+    "label": Case("label data/recordings b --label material=cork"),
     "push": Case("store push remote data/recordings data/scaled"),
     "pull": Case("store pull remote data/recordings", pushed),
     "gc": Case("store gc --grace-days 0", unlisted),

@@ -63,7 +63,7 @@ def kill(
     environment = {**os.environ, "TACPIPE_STORE": str(folder / "store"), "PYTHONPATH": path}
     output = folder / "rec"
     before = set(names(output))
-    words = ["acquire", str(folder / "rig.toml"), "-o", str(output), "--duration", str(duration_s), "--quiet"]
+    words = ["acquire", str(folder / "rig.toml"), "-o", str(output), "--duration-s", str(duration_s), "--quiet"]
     recorder = [sys.executable, "-m", "tests.recording.patient", *words]
     process = subprocess.Popen(recorder, env=environment, stdout=subprocess.DEVNULL)
     while begun and not any(file.stat().st_size for file in (folder / "store/spool").glob("*/bytes")):

@@ -37,7 +37,7 @@ def rig(lab: Lab, served: Emulator) -> Emulator:
 @pytest.mark.rig
 def test_the_rig_of_the_first_paper_is_recorded_sample_by_sample(lab: Lab) -> None:
     with live.served(lab.folder, killing.RIG.read_text()) as emulator:
-        lab.run("acquire rig.toml -o rec --duration 1")
+        lab.run("acquire rig.toml -o rec --duration-s 1")
         shard = live.only(lab.folder)
 
         assert sorted(shard.streams) == ["proximity", "robot", "xela1", "xela2"]  # and no events
@@ -48,7 +48,7 @@ def test_the_rig_of_the_first_paper_is_recorded_sample_by_sample(lab: Lab) -> No
 
 
 def test_no_sample_arrives_before_it_was_sent_or_out_of_order(lab: Lab, rig: Emulator) -> None:
-    lab.run("acquire rig.toml -o rec --duration 1")
+    lab.run("acquire rig.toml -o rec --duration-s 1")
     shard = live.only(lab.folder)
     to_utc_ns = time.time_ns() - time.monotonic_ns()
     for name, ledger in rig.ledger.items():
@@ -63,7 +63,7 @@ def test_no_sample_arrives_before_it_was_sent_or_out_of_order(lab: Lab, rig: Emu
 
 def test_trials_are_numbered_tared_and_labelled(lab: Lab, rig: Emulator) -> None:
     heard = len(rig.ledger["force"].events)
-    lab.run("acquire rig.toml -o rec --duration 0.4 --trials 3 --name press --label material=cork --note 'worn pad'")
+    lab.run("acquire rig.toml -o rec --duration-s 0.4 --trials 3 --name press --label material=cork --note 'worn pad'")
     shards = live.shards(lab.folder)
 
     assert list(shards) == ["press-001", "press-002", "press-003"]
@@ -79,18 +79,18 @@ def test_trials_are_numbered_tared_and_labelled(lab: Lab, rig: Emulator) -> None
 
 def test_devices_are_not_tared_where_the_operator_says_no(lab: Lab, rig: Emulator) -> None:
     heard = len(rig.ledger["force"].events)
-    lab.run("acquire rig.toml -o rec --duration 0.3 --trials 2 --no-tare")
+    lab.run("acquire rig.toml -o rec --duration-s 0.3 --trials 2 --no-tare")
 
     assert not [more for _, what, more in rig.ledger["force"].events[heard:] if what == "heard" and more[12:14] == "ff"]
 
 
 def test_a_name_that_a_recording_has_already_is_refused_before_anything_is_recorded(lab: Lab, rig: Emulator) -> None:
-    lab.run("acquire rig.toml -o rec --duration 0.3 --name same")
-    lab.run("acquire rig.toml -o rec --duration 0.3 --name press --trials 2")
+    lab.run("acquire rig.toml -o rec --duration-s 0.3 --name same")
+    lab.run("acquire rig.toml -o rec --duration-s 0.3 --name press --trials 2")
     before = lab.manifest("rec")
-    single = lab.call("acquire rig.toml -o rec --duration 0.3 --name same")
-    several = lab.call("acquire rig.toml -o rec --duration 0.3 --name press --trials 3")
-    folded = lab.call("acquire rig.toml -o rec --duration 0.3 --name Same")  # one to a file system without case
+    single = lab.call("acquire rig.toml -o rec --duration-s 0.3 --name same")
+    several = lab.call("acquire rig.toml -o rec --duration-s 0.3 --name press --trials 3")
+    folded = lab.call("acquire rig.toml -o rec --duration-s 0.3 --name Same")  # one to a file system without case
 
     assert (single.code, several.code, folded.code) == (2, 2, 2)
     assert "names already: same." in folded.err
@@ -103,13 +103,13 @@ def test_a_name_that_was_taken_while_it_was_recorded_gets_a_number_and_loses_not
 ) -> None:
     monkeypatch.setattr("tacpipe.recording.appending.refuse_taken", lambda output, names: None)
     for name in ("same", "Same"):
-        lab.run(f"acquire rig.toml -o rec --duration 0.3 --name {name}")
+        lab.run(f"acquire rig.toml -o rec --duration-s 0.3 --name {name}")
 
     assert sorted(live.shards(lab.folder)) == ["Same-2", "same"]
 
 
 def test_the_rig_file_goes_along(lab: Lab, rig: Emulator) -> None:
-    lab.run("acquire rig.toml -o rec --duration 0.3 --name one")
+    lab.run("acquire rig.toml -o rec --duration-s 0.3 --name one")
     source = lab.manifest("rec").sources["one"]["rig.toml"]
 
     assert lab.store.read(source).decode() == (lab.folder / "rig.toml").read_text()
@@ -117,13 +117,13 @@ def test_the_rig_file_goes_along(lab: Lab, rig: Emulator) -> None:
 
 
 def test_quiet_prints_where_it_is_and_no_more(lab: Lab, rig: Emulator) -> None:
-    ran = lab.run("acquire rig.toml -o rec --duration 0.3 --quiet")
+    ran = lab.run("acquire rig.toml -o rec --duration-s 0.3 --quiet")
 
     assert (ran.out, ran.err) == ("rec\n", "")
 
 
 def test_json_tells_what_was_recorded(lab: Lab, rig: Emulator) -> None:
-    told = json.loads(lab.run("acquire rig.toml -o rec --duration 0.5 --name one --json").out)
+    told = json.loads(lab.run("acquire rig.toml -o rec --duration-s 0.5 --name one --json").out)
     rows = {name: live.only(lab.folder).table(name).num_rows for name in rig.rig.streams}
 
     assert told["schema_version"] == 1 and told["output"] == "rec" and told["rows"] == sum(rows.values())
@@ -148,7 +148,7 @@ def test_a_dry_run_opens_every_stream_and_writes_nothing(
 def test_a_dataset_of_another_stage_is_refused_before_a_device_is_opened(lab: Lab) -> None:
     lab.run("simulate toy -o made")
     (lab.folder / "rig.toml").write_text(live.stream("force", "optoforce", "serial:/dev/there-is-none"))
-    refused = lab.call("acquire rig.toml -o made --duration 1")
+    refused = lab.call("acquire rig.toml -o made --duration-s 1")
 
     assert refused.code == 2 and "made was made by simulate.toy" in refused.err and "there-is-none" not in refused.err
 
@@ -159,8 +159,8 @@ def test_a_dataset_of_another_stage_is_refused_before_a_device_is_opened(lab: La
         ("", "Missing option -o. Give the dataset of recordings to append to, as -o data/recordings."),
         ("-o rec --start bell", "There is no --start bell; it must be one of now, key, contact, tap."),
         ("-o rec --stop bell", "There is no --stop bell; it must be one of duration, key, contact, tap."),
-        ("-o rec --trials 0", "--trials and --duration must be above 0."),
-        ("-o rec --trials 2", "--trials needs --duration or --stop, or the first trial never ends."),
+        ("-o rec --trials 0", "--trials and --duration-s must be above 0."),
+        ("-o rec --trials 2", "--trials needs --duration-s or --stop, or the first trial never ends."),
         (
             "-o rec --name ../out",
             "--name '../out' names no file; take letters, digits, _, - and dots, no dot in front.",
@@ -188,7 +188,7 @@ def test_two_recordings_at_once_are_both_appended(lab: Lab, rig: Emulator) -> No
         options = "{ axes = 3, rate_hz = 333 }" if name == "force" else "{}"
         (lab.folder / f"{name}.toml").write_text(live.stream(name, stream.kind, str(stream.address), options))
     both = [
-        live.started(lab.folder, f"--duration 1 --name {name} --quiet", f"{name}.toml") for name in ("force", "range")
+        live.started(lab.folder, f"--duration-s 1 --name {name} --quiet", f"{name}.toml") for name in ("force", "range")
     ]
     told = [one.communicate()[1] for one in both]
 
@@ -202,10 +202,10 @@ def test_two_recordings_at_once_are_both_appended(lab: Lab, rig: Emulator) -> No
 def test_help_ends_with_an_example(tmp_path: Path) -> None:
     shown = " ".join(tacpipe(tmp_path, "acquire --help").stdout.split("Arguments:")[0].split())
 
-    assert shown.endswith("Example: tacpipe acquire rig.toml -o data/recordings --duration 30 --label material=cork")
+    assert shown.endswith("Example: tacpipe acquire rig.toml -o data/recordings --duration-s 30 --label material=cork")
 
 
 def test_recording_imports_no_torch(lab: Lab, rig: Emulator) -> None:
-    found = imported(lab.folder, "acquire rig.toml -o rec --duration 0.3 --quiet")
+    found = imported(lab.folder, "acquire rig.toml -o rec --duration-s 0.3 --quiet")
 
     assert "numpy" in found and found & {"torch", "sklearn", "open3d", "scipy", "matplotlib"} == set()

@@ -22,7 +22,7 @@ def acquired(lab: Lab) -> Iterator[Lab]:
     """A lab with two recordings, acquired one after the other, whose rig is still served."""
     with live.served(lab.folder, live.FORCE, live.SKIN):
         for name in ("one", "two"):
-            lab.run(f"acquire rig.toml -o rec --duration 0.4 --name {name} --label material=cork")
+            lab.run(f"acquire rig.toml -o rec --duration-s 0.4 --name {name} --label material=cork")
         yield lab
 
 
@@ -98,7 +98,7 @@ def test_damage_to_a_recording_is_told_with_what_brings_it_back(acquired: Lab) -
 
 def test_another_recording_can_be_appended_to_a_dataset_with_a_damaged_one(acquired: Lab) -> None:
     damage(acquired)
-    acquired.call("acquire rig.toml -o rec --duration 0.3 --name three")
+    acquired.call("acquire rig.toml -o rec --duration-s 0.3 --name three")
 
     assert "three" in acquired.manifest("rec").recordings and not live.spools(acquired.folder)
 
@@ -120,7 +120,7 @@ def test_an_acquired_dataset_is_pushed_and_pulled(acquired: Lab, monkeypatch: py
 
 def test_labels_are_changed_afterwards_and_stay_when_more_is_recorded(acquired: Lab) -> None:
     acquired.run("label rec one --set material=foam --exclude 'the pad fell off'")
-    acquired.run("acquire rig.toml -o rec --duration 0.3 --name three")
+    acquired.run("acquire rig.toml -o rec --duration-s 0.3 --name three")
     found = acquired.manifest("rec").recordings
 
     assert [found[name]["attributes"].get("material") for name in ("one", "two", "three")] == ["foam", "cork", None]

@@ -166,7 +166,7 @@ def test_a_disk_that_is_slow_to_sync_costs_no_number(lab: Lab, device: Counting)
 
 
 def test_a_recorder_that_was_killed_leaves_every_number_up_to_then(lab: Lab, device: Counting) -> None:
-    recorder = Recorder(lab, device, "--duration 1000")
+    recorder = Recorder(lab, device, "--duration-s 1000")
     device.sends(200)
     recorder.ends(signal.SIGKILL, -signal.SIGKILL)
     lab.run("acquire --recover")
@@ -178,7 +178,7 @@ def test_a_recorder_that_was_killed_leaves_every_number_up_to_then(lab: Lab, dev
 
 
 def test_a_recorder_whose_terminal_was_closed_has_every_number_up_to_then(lab: Lab, device: Counting) -> None:
-    recorder = Recorder(lab, device, "--duration 1000")
+    recorder = Recorder(lab, device, "--duration-s 1000")
     device.sends(200)
     recorder.ends(signal.SIGHUP)
 

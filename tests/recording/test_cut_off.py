@@ -50,7 +50,7 @@ def after_crash(lab: Lab) -> None:
 
 
 def test_a_recording_that_lasted_as_long_as_asked_is_completed(lab: Lab, script: Script) -> None:
-    lab.run("acquire rig.toml -o rec --duration 3 --name one")
+    lab.run("acquire rig.toml -o rec --duration-s 3 --name one")
 
     assert described(lab) == ("completed", 3.0, [])
     assert "not completed" not in lab.run("show rec").out
@@ -59,8 +59,8 @@ def test_a_recording_that_lasted_as_long_as_asked_is_completed(lab: Lab, script:
 @pytest.mark.parametrize(
     ("options", "number", "ended"),
     [
-        ("--duration 10", signal.SIGINT, "interrupted"),
-        ("--duration 10", signal.SIGTERM, "interrupted"),
+        ("--duration-s 10", signal.SIGINT, "interrupted"),
+        ("--duration-s 10", signal.SIGTERM, "interrupted"),
         ("--stop tap --start now", signal.SIGINT, "interrupted"),
         ("", signal.SIGINT, "completed"),  # nothing else ends it
         ("", signal.SIGTERM, "completed"),
@@ -89,7 +89,7 @@ def test_a_recording_that_a_signal_cut_short_is_interrupted(
 
 def test_a_recording_that_a_loss_of_power_cut_short_is_recovered(lab: Lab, script: Script) -> None:
     crash_at(lab, script, 5.0)
-    lab.run("acquire rig.toml -o rec --duration 10 --name one")
+    lab.run("acquire rig.toml -o rec --duration-s 10 --name one")
     after_crash(lab)
     lab.run("acquire --recover")
     lasts_s = (len(counts(live.only(lab.folder))) - 1) / RATE_HZ
@@ -108,14 +108,14 @@ def test_a_recording_that_ended_and_was_sealed_by_another_process_is_whole_and_s
 
     with monkeypatch.context() as patch:
         patch.setattr(appending, "append", fail)
-        assert lab.call("acquire rig.toml -o rec --duration 3 --name one").code == 1
+        assert lab.call("acquire rig.toml -o rec --duration-s 3 --name one").code == 1
     lab.run("acquire --recover")
 
     assert described(lab) == ("completed", 3.0, [])
 
 
 def test_what_a_label_says_of_the_end_of_a_recording_counts_for_nothing(lab: Lab, script: Script) -> None:
-    lab.run("acquire rig.toml -o rec --duration 3 --name one --label ended=never")
+    lab.run("acquire rig.toml -o rec --duration-s 3 --name one --label ended=never")
 
     assert described(lab)[0] == "completed"
 
@@ -160,7 +160,7 @@ def kept(lab: Lab, err: str) -> Path:
 @pytest.mark.parametrize("crashed", [False, True])
 def test_a_spool_is_kept_where_asked_for_and_no_collection_removes_it(lab: Lab, script: Script, crashed: bool) -> None:
     crash_at(lab, script, 2.5)
-    ran = lab.run("acquire rig.toml -o rec --duration 3 --name one --keep-spool")
+    ran = lab.run("acquire rig.toml -o rec --duration-s 3 --name one --keep-spool")
     if crashed:
         after_crash(lab)
         ran = lab.run("acquire --recover")
@@ -178,6 +178,6 @@ def test_a_spool_is_kept_where_asked_for_and_no_collection_removes_it(lab: Lab, 
 
 
 def test_a_spool_is_not_kept_unasked(lab: Lab, script: Script) -> None:
-    lab.run("acquire rig.toml -o rec --duration 1 --name one")
+    lab.run("acquire rig.toml -o rec --duration-s 1 --name one")
 
     assert not (lab.store.root / "kept-spools").exists() and not live.spools(lab.folder)

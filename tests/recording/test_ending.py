@@ -98,7 +98,7 @@ def test_a_terminal_that_is_closed_ends_a_recording_and_it_is_sealed(lab: Lab, r
 
 
 def test_a_signal_ends_the_trials_that_are_left(lab: Lab, rig: Emulator) -> None:
-    process = live.started(lab.folder, "--name press --trials 50 --duration 0.5")
+    process = live.started(lab.folder, "--name press --trials 50 --duration-s 0.5")
     live.awaited(lambda: (lab.folder / "rec/manifest.json").exists())
     process.send_signal(signal.SIGINT)
     _, err = process.communicate()
@@ -109,7 +109,7 @@ def test_a_signal_ends_the_trials_that_are_left(lab: Lab, rig: Emulator) -> None
 
 
 def test_a_signal_before_the_first_trial_records_nothing(lab: Lab, rig: Emulator) -> None:
-    process = live.started(lab.folder, "--start contact --contact-count 1e9 --duration 1")
+    process = live.started(lab.folder, "--start contact --contact-count 1e9 --duration-s 1")
     live.awaited(lambda: len(rig.ledger["skin"]))
     process.send_signal(signal.SIGINT)
     _, err = process.communicate()
@@ -122,14 +122,14 @@ def test_a_terminal_that_closes_and_its_shell_are_one_request_however_far_apart(
     lab: Lab, rig: Emulator, while_sealing: Interrupt
 ) -> None:
     while_sealing(3, number=signal.SIGHUP)
-    lab.run("acquire rig.toml -o rec --duration 0.5")
+    lab.run("acquire rig.toml -o rec --duration-s 0.5")
 
     live.place(live.recorded(live.only(lab.folder), "force"), live.sent(rig, "force"))
 
 
 def test_one_signal_while_sealing_changes_nothing(lab: Lab, rig: Emulator, while_sealing: Interrupt) -> None:
     while_sealing(1)
-    lab.run("acquire rig.toml -o rec --duration 0.5")
+    lab.run("acquire rig.toml -o rec --duration-s 0.5")
 
     live.place(live.recorded(live.only(lab.folder), "force"), live.sent(rig, "force"))
 
@@ -139,7 +139,7 @@ def test_two_signals_at_once_are_one_wish(
 ) -> None:
     monkeypatch.setattr("tacpipe.io.termination.TWICE_S", 1000.0)  # however slow the computer is between the two
     while_sealing(2, 0)  # as of `timeout`, which signals a process and then its group
-    lab.run("acquire rig.toml -o rec --duration 0.5")
+    lab.run("acquire rig.toml -o rec --duration-s 0.5")
 
     live.place(live.recorded(live.only(lab.folder), "force"), live.sent(rig, "force"))
 
@@ -170,7 +170,7 @@ def test_a_second_signal_while_sealing_leaves_the_spool_and_it_is_recovered(
     lab: Lab, rig: Emulator, while_sealing: Interrupt
 ) -> None:
     while_sealing(2)
-    ended = lab.call("acquire rig.toml -o rec --duration 0.5 --name one")
+    ended = lab.call("acquire rig.toml -o rec --duration-s 0.5 --name one")
     (spool,) = live.spools(lab.folder)
 
     assert ended.code == 130 and not (lab.folder / "rec").exists()

@@ -30,7 +30,7 @@ def test_a_datagram_with_a_false_count_is_a_reset_and_costs_nothing(
     records[100]["seq"] = false
     script.send("program", [json.dumps(record).encode() for record in records], 100)
     (lab.folder / "rig.toml").write_text(COUNTED)
-    lab.run("acquire rig.toml -o rec --duration 3")
+    lab.run("acquire rig.toml -o rec --duration-s 3")
     shard = live.only(lab.folder)
     table = shard.table("program")
 

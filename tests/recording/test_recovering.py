@@ -120,7 +120,7 @@ def test_recovering_twice_does_nothing_the_second_time(lab: Lab) -> None:
 
 def test_the_next_recording_recovers_first(lab: Lab, rig: Emulator) -> None:
     spooled(lab, "before")
-    ran = lab.run("acquire rig.toml -o rec --duration 0.3 --name after")
+    ran = lab.run("acquire rig.toml -o rec --duration-s 0.3 --name after")
 
     assert without_created_store(ran.err).splitlines()[0] == "recovered before: 0.1 s, force 100 samples"
     assert list(live.shards(lab.folder)) == ["after", "before"]
@@ -160,7 +160,7 @@ def test_a_spool_with_half_a_header_keeps_nobody_from_recording(
     header = json.loads((stays / "header.json").read_text())
     del header["clock"]
     (stays / "header.json").write_text(json.dumps(header))
-    ran = lab.run("acquire rig.toml -o rec --duration 0.3 --name new")
+    ran = lab.run("acquire rig.toml -o rec --duration-s 0.3 --name new")
 
     assert f"The spool {stays} stays as it is. Its clock is None" in ran.err
     assert list(live.shards(lab.folder)) == ["new"] and stays.exists()
@@ -197,7 +197,7 @@ def test_a_spool_that_is_being_sealed_is_left_to_the_process_that_does_it(
         return real(store, *more)
 
     monkeypatch.setattr(appending, "append", append)
-    lab.run("acquire rig.toml -o rec --duration 0.3")
+    lab.run("acquire rig.toml -o rec --duration-s 0.3")
 
     ((there, abandoned),) = seen
     assert len(there) == 1 and abandoned == []
@@ -249,7 +249,7 @@ def test_a_disk_that_is_full_while_it_seals_keeps_the_spool_and_it_is_recovered(
 
     with monkeypatch.context() as patch:
         patch.setattr(os, "write", full)
-        ended = lab.call("acquire rig.toml -o rec --duration 1 --name one")
+        ended = lab.call("acquire rig.toml -o rec --duration-s 1 --name one")
     (folder,) = live.spools(lab.folder)
 
     assert ended.code == 1 and not (lab.folder / "rec").exists()

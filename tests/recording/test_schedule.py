@@ -93,7 +93,7 @@ def test_frames_that_never_come_are_lost_in_a_dry_run(lab: Lab, script: Script) 
 
 
 def test_trials_last_as_long_as_asked_and_are_tared(lab: Lab, script: Script) -> None:
-    lab.run("acquire rig.toml -o rec --duration 0.5 --trials 3 --name press")
+    lab.run("acquire rig.toml -o rec --duration-s 0.5 --trials 3 --name press")
     shards = live.shards(lab.folder)
 
     assert list(shards) == ["press-001", "press-002", "press-003"] and len(script.tared) == 3
@@ -105,7 +105,7 @@ def test_trials_last_as_long_as_asked_and_are_tared(lab: Lab, script: Script) ->
 
 def test_a_stream_that_gives_nothing_is_awaited_for_three_seconds(lab: Lab, script: Script) -> None:
     script.sent.clear()
-    refused = lab.call("acquire rig.toml -o rec --duration 1")
+    refused = lab.call("acquire rig.toml -o rec --duration-s 1")
 
     assert refused.code == 5 and 3.0 <= script.t_s < 3.1
     assert "a frame of optoforce was awaited for 3 s, but nothing came." in refused.err
@@ -117,7 +117,7 @@ def test_a_stream_that_was_silent_for_two_seconds_at_the_end_is_lost(
     lab: Lab, script: Script, silent_s: float, code: int
 ) -> None:
     script.sent["force"] = script.sent["force"][: round(RATE_HZ * (4 - silent_s))]
-    ran = lab.call("acquire rig.toml -o rec --duration 4")
+    ran = lab.call("acquire rig.toml -o rec --duration-s 4")
 
     assert ran.code == code
     assert bool(re.search(r"nothing came for 2\.[12] s, though it is open\.", ran.err)) == (code == 5)
@@ -175,7 +175,7 @@ def test_a_program_begins_and_ends_trials_and_a_start_meanwhile_begins_no_other(
 
 
 def test_lines_about_a_recording_come_every_five_seconds(lab: Lab, script: Script) -> None:
-    created, *err = lab.run("acquire rig.toml -o rec --duration 12 --name one").err.splitlines()
+    created, *err = lab.run("acquire rig.toml -o rec --duration-s 12 --name one").err.splitlines()
 
     assert "created the store" in created
     assert [line.split(":")[0] for line in err] == ["recording one, 5 s", "recording one, 10 s", "one"]
@@ -190,7 +190,7 @@ def test_a_long_sealing_is_no_silence_of_the_devices(lab: Lab, script: Script, m
         return seal(*given)
 
     monkeypatch.setattr(sealing, "seal", slowly)
-    lab.run("acquire rig.toml -o rec --duration 1 --quiet")
+    lab.run("acquire rig.toml -o rec --duration-s 1 --quiet")
 
 
 def test_a_terminal_that_closes_ends_a_recording_which_is_sealed_though_nothing_can_be_printed(
@@ -203,7 +203,7 @@ def test_a_terminal_that_closes_ends_a_recording_which_is_sealed_though_nothing_
     before = signal.signal(signal.SIGHUP, lambda *_: None)  # that it would end this process too is another matter
     script.happens.append((6.0, hang_up))
     try:
-        lab.run("acquire rig.toml -o rec --duration 15 --name one")
+        lab.run("acquire rig.toml -o rec --duration-s 15 --name one")
     finally:
         signal.signal(signal.SIGHUP, before)
     found = counts(live.only(lab.folder))
@@ -216,7 +216,7 @@ def test_lines_that_cannot_be_printed_end_no_recording(
     lab: Lab, script: Script, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sys, "stderr", Closed())
-    lab.run("acquire rig.toml -o rec --duration 12 --name one")  # a line every five seconds
+    lab.run("acquire rig.toml -o rec --duration-s 12 --name one")  # a line every five seconds
 
     assert counts(live.only(lab.folder))[-1] >= 12 * RATE_HZ - 1
 
@@ -231,7 +231,7 @@ def test_a_crash_costs_what_came_since_the_last_tick(lab: Lab, script: Script) -
 
     for at_s in np.linspace(1.0, 3.0, 11):
         script.happens.append((float(at_s), look))
-    lab.run("acquire rig.toml -o rec --duration 4")
+    lab.run("acquire rig.toml -o rec --duration-s 4")
     began = counts(live.only(lab.folder))[0]
 
     assert len(seen) == 11

@@ -51,7 +51,7 @@ def silent() -> Iterator[str]:
 def refused(lab: Lab, *streams: str) -> list[str]:
     """Return the sentences of a recording that does not begin, one a stream; fails if anything was written."""
     (lab.folder / "rig.toml").write_text("".join(streams))
-    ran = lab.call("acquire rig.toml -o rec --duration 1")
+    ran = lab.call("acquire rig.toml -o rec --duration-s 1")
     assert ran.code == 5, ran.err
     assert not ran.out and not (lab.folder / "rec").exists()
     assert not list((lab.folder / ".tacpipe/spool").glob("*"))

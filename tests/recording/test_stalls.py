@@ -224,7 +224,7 @@ def test_a_disk_that_is_slow_at_the_end_is_no_silence_of_the_device(
     lab: Lab, script: Script, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     slow_to_finish(script, monkeypatch)
-    lab.run("acquire rig.toml -o rec --duration 4")
+    lab.run("acquire rig.toml -o rec --duration-s 4")
 
     assert counts(live.only(lab.folder))[-1] >= 4 * RATE_HZ - 1
 
@@ -239,7 +239,7 @@ def test_a_recorder_that_was_stopped_at_the_end_blames_no_device(
     script.drained_s = at_s + stopped_s + fetched_s
     script.sent["force"] = [(t_s if t_s < at_s else max(t_s, script.drained_s), data) for t_s, data in read]
     script.happens.append((at_s, lambda: setattr(script, "t_ns", script.t_ns + round(stopped_s * 1e9))))
-    lab.run("acquire rig.toml -o rec --duration 4")
+    lab.run("acquire rig.toml -o rec --duration-s 4")
 
     assert counts(live.only(lab.folder))[-1] >= (at_s + stopped_s) * RATE_HZ - 1  # what had waited is fetched
 
@@ -250,7 +250,7 @@ def test_a_recorder_that_is_stopped_at_the_start_awaits_the_first_sample_as_long
     script.sent["force"] = [(t_s + 7.0, data) for t_s, data in script.sent["force"]]
     script.happens.append((1.0, lambda: setattr(script, "t_ns", script.t_ns + 5 * S)))
 
-    assert lab.call("acquire rig.toml -o rec --duration 1").code == 0
+    assert lab.call("acquire rig.toml -o rec --duration-s 1").code == 0
 
 
 def test_a_device_that_is_silent_is_blamed_though_the_disk_is_slow_too(
@@ -258,7 +258,7 @@ def test_a_device_that_is_silent_is_blamed_though_the_disk_is_slow_too(
 ) -> None:
     script.sent["force"] = script.sent["force"][: RATE_HZ * 2]
     slow_to_finish(script, monkeypatch)
-    ran = lab.call("acquire rig.toml -o rec --duration 5")
+    ran = lab.call("acquire rig.toml -o rec --duration-s 5")
 
     assert ran.code == 5 and "nothing came for 3." in ran.err
 

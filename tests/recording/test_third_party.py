@@ -15,7 +15,7 @@ def test_a_third_party_s_sensor_is_listed_emulated_and_recorded(lab: Lab) -> Non
     assert "A board of a third party." in lab.run("sensors list").out
 
     with served(lab.folder, PULSE) as emulator:
-        lab.run("acquire rig.toml -o rec --duration 1 --quiet")
+        lab.run("acquire rig.toml -o rec --duration-s 1 --quiet")
 
     (shard,) = shards(lab.folder).values()
     found = recorded(shard, "pulse")

@@ -133,7 +133,7 @@ def test_a_touch_begins_a_trial_and_its_end_ends_it(lab: Lab, monkeypatch: pytes
 
 
 def test_a_rig_without_taxels_cannot_wait_for_a_touch(lab: Lab, rig: Emulator) -> None:
-    refused = lab.call("acquire rig.toml -o rec --start contact --duration 1")
+    refused = lab.call("acquire rig.toml -o rec --start contact --duration-s 1")
 
     assert refused.code == 2 and "No stream of this rig has tactile channels" in refused.err
     assert not live.spools(lab.folder)

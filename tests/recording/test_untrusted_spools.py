@@ -143,7 +143,7 @@ def test_a_spool_that_is_none_stays_and_keeps_nobody_from_recording(
     folder = spooled(lab, "old")
     change(folder)
     files = sorted(folder.iterdir())
-    ran = lab.run("acquire rig.toml -o rec --duration 1 --name new")
+    ran = lab.run("acquire rig.toml -o rec --duration-s 1 --name new")
 
     assert f"The spool {folder} stays as it is. " in ran.err
     assert sorted(folder.iterdir()) == files
@@ -191,7 +191,7 @@ def test_a_folder_of_spools_that_is_a_link_is_not_followed(lab: Lab, script: Scr
         os.utime(path, (LONG_AGO_S, LONG_AGO_S))
     folder.parent.rename(elsewhere / "spool")
     (lab.store.root / "spool").symlink_to(elsewhere / "spool")
-    ran = lab.call("acquire rig.toml -o rec --duration 1")
+    ran = lab.call("acquire rig.toml -o rec --duration-s 1")
 
     assert ran.code == 2 and f"{lab.store.root / 'spool'} is a symbolic link" in ran.err
     assert (elsewhere / "spool" / folder.name / "bytes").exists() and (elsewhere / "spool" / empty.name).exists()
@@ -215,7 +215,7 @@ def test_a_project_that_was_moved_seals_its_spools_where_it_is_now(
         shutil.copytree(lab.folder, moved)
 
     script.happens.append((2.0, crash))
-    lab.run("acquire rig.toml -o data/rec --duration 3 --name one")
+    lab.run("acquire rig.toml -o data/rec --duration-s 3 --name one")
     monkeypatch.chdir(moved)
     lab.run("acquire --recover")
 
@@ -225,4 +225,4 @@ def test_a_project_that_was_moved_seals_its_spools_where_it_is_now(
 
 @pytest.mark.parametrize("name", ["manifest.json", "rig-0123abcd.toml"])
 def test_a_recording_cannot_take_the_name_of_a_file_of_its_dataset(lab: Lab, script: Script, name: str) -> None:
-    assert lab.call(f"acquire rig.toml -o rec --duration 1 --name {name}").code == 2
+    assert lab.call(f"acquire rig.toml -o rec --duration-s 1 --name {name}").code == 2

@@ -526,7 +526,7 @@ def test_a_label_is_kept_here_where_there_is_no_link_and_goes_there_with_the_nex
     run = linked.computers.lab.run
     run(SIMULATE)
     run("store push s3://lab/elsewhere data/r")  # a project has its identity from now on
-    ran = linked.under(since(1, "refused"), "label data/r trial-000 --set material=foam")
+    ran = linked.under(since(1, "refused"), "label data/r trial-000 --label material=foam")
     assert ran.code == 0 and linked.computers.address in ran.err
     assert "foam" in run("show data/r --json").out
     (root,) = RemoteStore(there.files).roots.all()

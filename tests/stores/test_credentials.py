@@ -75,8 +75,8 @@ def test_no_credential_is_printed_or_written_by_any_command_of_a_store(
 ) -> None:
     lab.run("simulate toy -o data/r --trials 1 --rows 3")
     place = places.bucket("s3://lab/store")
-    commands = ["push {} data/r", "push {} data/r --verify", "list --store {}", "verify --remote {}", "gc --remote {}"]
-    commands += ["checkout data/r --store {} -o back", "pull {} data/r"]
+    commands = ["push {} data/r", "push {} data/r --verify", "list --remote {}", "verify --remote {}", "gc --remote {}"]
+    commands += ["checkout data/r --remote {} -o back", "pull {} data/r"]
     printed = [lab.run(f"store {command.format(place.address)}") for command in commands]
     printed += [lab.call(f"store push s3://{KEY}:{SECRET}@lab/store data/r")]
     monkeypatch.setenv("AWS_ENDPOINT_URL", "https://127.0.0.1:1")

@@ -41,7 +41,7 @@ def shard(lab: Lab, trial: str = "trial-003", path: str = "data/s") -> str:
 
 def listed(lab: Lab, place: Place) -> list[dict[str, Any]]:
     """Return what was pushed, as `store list` prints it."""
-    found: list[dict[str, Any]] = json.loads(lab.run(f"store list --store {place.address} --json").out)["manifests"]
+    found: list[dict[str, Any]] = json.loads(lab.run(f"store list --remote {place.address} --json").out)["manifests"]
     return found
 
 
@@ -160,7 +160,7 @@ def two_clones(lab: Lab, pushed: Place, monkeypatch: pytest.MonkeyPatch) -> tupl
         folder = lab.folder.with_name(f"{lab.folder.name}-{name}")
         shutil.copytree(lab.folder, folder, ignore=shutil.ignore_patterns("leases", "remote"))
         monkeypatch.chdir(folder)
-        lab.run(f"label data/r trial-000 --set material={name}")
+        lab.run(f"label data/r trial-000 --label material={name}")
         folders.append(folder)
     return folders[0], folders[1]
 
@@ -180,7 +180,7 @@ def test_a_push_onto_what_another_computer_pushed_since_is_refused_and_both_stay
     states = [one["state"] for one in listed(lab, pushed) if one["path"] == "data/r"]
     assert states == ["pushed here", "pushed earlier", "pushed earlier"]
     for number, one in enumerate(one["manifest"] for one in listed(lab, pushed) if one["path"] == "data/r"):
-        lab.run(f"store checkout {one} --store {pushed.address} -o back/{number}")
+        lab.run(f"store checkout {one} --remote {pushed.address} -o back/{number}")
 
 
 def test_of_two_pushes_of_a_name_that_both_looked_before_either_wrote_one_is_refused(

@@ -162,14 +162,14 @@ def test_a_push_of_the_same_name_at_any_step_of_a_push_is_never_written_over_in_
 ) -> None:
     base = Stepping({})
     push(monkeypatch, base, "data/r")
-    lab.run("label data/r trial-000 --set material=foam")
+    lab.run("label data/r trial-000 --label material=foam")
     one = manifest(lab, "data/r")
     before = (lab.folder / "data/r/manifest.json").read_bytes()
 
     others: list[str] = []
 
     def other() -> None:
-        lab.run("label data/r trial-000 --set material=cork")
+        lab.run("label data/r trial-000 --label material=cork")
         push(monkeypatch, files, "data/r", replace=True)
         others.append(manifest(lab, "data/r"))
 

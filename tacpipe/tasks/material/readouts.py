@@ -154,7 +154,7 @@ def _samplings(speeds: str, known: BySensor) -> dict[str, Sampling]:
         if some.layout.rate_hz <= 0:
             raise TacpipeError(
                 f"{some.names[0]} has no rate, and the length of a wave needs one; set it with "
-                f"`tacpipe label RECORDINGS {some.names[0]} --set rate_hz=100`, or what it is."
+                f"`tacpipe label RECORDINGS {some.names[0]} --label rate_hz=100`, or what it is."
             )
         speed_m_s = float(np.median(recorded)) if len(recorded) else given[name]
         found[name] = Sampling(some.layout.frames, some.layout.rate_hz, speed_m_s)

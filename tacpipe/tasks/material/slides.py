@@ -213,8 +213,8 @@ def _require_label(shard: Recording, key: str) -> None:
     if shard.attributes.get(key) is None:
         raise TacpipeError(
             f"Recording {shard.name} of the sensor {shard.attributes.get('sensor')} has no label {key} to learn from; set "
-            f"it with `tacpipe label RECORDINGS {shard.name} --set {key}=…` or `tacpipe label RECORDINGS --from TABLE`, or "
-            f"exclude it."
+            f"it with `tacpipe label RECORDINGS {shard.name} --label {key}=…` or `tacpipe label RECORDINGS --from TABLE`, "
+            f"or exclude it."
         )
 
 

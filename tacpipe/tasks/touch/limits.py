@@ -99,7 +99,7 @@ def limits(
         found = f"{counts[few]} of {few or 'no named object'}" if counts else "none"
         raise TacpipeError(
             f"There are too few grasps: {found}. Limits need {FOLDS} or more of each object, one for each fold; label "
-            f"objects with `tacpipe label RECORDINGS NAME --set object=…`, or leave some out with --exclude."
+            f"objects with `tacpipe label RECORDINGS NAME --label object=…`, or leave some out with --exclude."
         )
     coloured = all(one.colours is not None for one in grasps.clouds)
     rows, _ = geometry.table(grasps.clouds, grasps.grasps, coloured=coloured)

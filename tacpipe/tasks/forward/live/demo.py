@@ -176,7 +176,7 @@ def run(output: Path, rig_file: Path, seconds: float = LIVE_S) -> Path:
         try:
             _tacpipe(
                 *("live", str(output / "emulated" / "rig.toml"), "--model", str(output / "model")),
-                *("--plan", f"udp:127.0.0.1:{port}", "-o", str(output / "live"), "--duration", f"{seconds:g}"),
+                *("--plan", f"udp:127.0.0.1:{port}", "-o", str(output / "live"), "--duration-s", f"{seconds:g}"),
                 *("--alarms-per-hour", f"{PER_HOUR:g}", "--alarms-on", str(output / "setting")),
             )
         finally:
