@@ -36,7 +36,7 @@ from tacpipe.training.scaling import Affine
 
 TASK = "material"
 CHOSEN = ".chosen"  # ends the name of what a readout was chosen by, which may be NaN
-MOST_FRAMES = 100_000  # of a slide
+MOST_FRAMES = 100_000  # longest slide
 NEEDED = {
     **dict.fromkeys(("classes", "quantities"), list),
     **dict.fromkeys(("sensors", "params", "trained_on"), dict),
@@ -47,7 +47,10 @@ ESTIMATORS, SHUFFLED_ESTIMATORS = "model.skops", "baselines.skops"
 ROCKET, STATISTICS, SPECTRA = "minirocket", "statistics", "spectra"
 UNKNOWN_ANSWER = "unknown"
 MEAN_LEVEL, PERMUTED_LABELS = "mean_level", "permuted_labels"
-LEVEL_VIEWS: dict[str, View] = {"level_only": "level", "level_removed": "level_removed"}  # of statistics
+LEVEL_VIEWS: dict[str, View] = {
+    "level_only": "level",
+    "level_removed": "level_removed",
+}  # baselines of the architecture statistics
 
 Config = dict[str, Any]
 ReadoutModel = MinirocketClassifier | StatisticsClassifier
@@ -72,7 +75,7 @@ class NetworkReader:
 
     @property
     def any_length(self) -> bool:
-        """Whether slides of fewer frames than those of training are read too."""
+        """True if the network reads slides of fewer frames than in training, too."""
         return bool(getattr(self.network, "ANY_LENGTH", False))
 
     def read(self, frames: Float32s) -> ReaderOutput:
@@ -83,9 +86,9 @@ class NetworkReader:
         with torch.no_grad():
             for first in range(0, len(frames), CHUNK):
                 scaled = torch.from_numpy(self.scaling.apply(frames[first : first + CHUNK])).to(device)
-                found = self.network(scaled.transpose(0, 1).contiguous(), decode=False)
-                scores.append(found.scores.cpu().numpy())
-                latents.append(found.latents.cpu().numpy())
+                output = self.network(scaled.transpose(0, 1).contiguous(), decode=False)
+                scores.append(output.scores.cpu().numpy())
+                latents.append(output.latents.cpu().numpy())
         return ReaderOutput(np.concatenate(scores), np.concatenate(latents))
 
     def scores_of(self, latents: Float32s) -> Float32s:
@@ -106,7 +109,7 @@ class ReadoutReader:
 
     @property
     def any_length(self) -> bool:
-        """Whether slides of fewer frames than those of training are read too: by statistics over time."""
+        """True if slides of fewer frames than in training are read, too: by statistics over time."""
         return isinstance(self.fitted, StatisticsClassifier)
 
     def read(self, frames: Float32s) -> ReaderOutput:
@@ -123,12 +126,12 @@ class SpectraReader:
     speed_m_s: float
     transfer: Transfer
     classes: tuple[int, ...]
-    any_length: ClassVar[bool] = False  # which wave lengths it distinguishes depends on the way
+    any_length: ClassVar[bool] = False  # the distance slid decides the wave lengths that it distinguishes
 
     def read(self, frames: Float32s) -> ReaderOutput:
         """Return log-likelihoods and, as latents, spectra of slides (slide, time, channel) in device counts."""
-        found = self.bands.log_power(frames, self.rate_hz, self.speed_m_s).astype(np.float32)
-        return ReaderOutput(spread(self.transfer.known.scores(found), self.transfer.classes, self.classes), found)
+        spectra = self.bands.log_power(frames, self.rate_hz, self.speed_m_s).astype(np.float32)
+        return ReaderOutput(spread(self.transfer.known.scores(spectra), self.transfer.classes, self.classes), spectra)
 
     def expected(self, latents: Float32s) -> Float32s:
         """Return the scores (slide, class) of spectra by the classes that other sensors alone learned."""
@@ -141,7 +144,7 @@ class EstimatorReader:
 
     fitted: Fitted
     classes: tuple[int, ...]
-    any_length: ClassVar[bool] = False  # what it reads is of a fixed size
+    any_length: ClassVar[bool] = False  # its features have a fixed size
 
     def read(self, frames: Float32s) -> ReaderOutput:
         """Return the estimator's scores of slides (slide, time, channel) in device counts."""
@@ -157,7 +160,7 @@ class Classifier:
     def __init__(self, files: Mapping[str, bytes], chain: Chain | None = None) -> None:
         self.chain = chain  # the stages that it was trained behind; None: unknown
         config = model_files.tree(files, CONFIG, NEEDED)
-        self.config: Config = config  # as it is stored
+        self.config: Config = config  # config.json
         self.params: Params = params_of.read(Params, config["params"], f"{CONFIG}, params")
         self.architecture: str = config["architecture"]
         self.classes: tuple[int, ...] = tuple(config["classes"])
@@ -166,13 +169,15 @@ class Classifier:
         self.layouts = {name: Layout.from_json(name, layout) for name, layout in config["sensors"].items()}
         if isinstance(self.params, Estimator):
             fitted = self._estimators(files[ESTIMATORS], ESTIMATORS, self.params)
-            self.readers: dict[str, Reader] = {name: EstimatorReader(one, self.classes) for name, one in fitted.items()}
+            self.readers: dict[str, Reader] = {
+                name: EstimatorReader(estimator, self.classes) for name, estimator in fitted.items()
+            }
         else:
             self.readers = self._readers(files[WEIGHTS], WEIGHTS)
         self.last = self._readers(files[LAST], LAST) if LAST in files else {}
         self.baselines = self._baselines(files) if BASELINES in files else {}
-        # of a model that `tacpipe calibrate` made, by sensor
-        self.known = known.unpacked(files[known.FILE], self.layouts) if known.FILE in files else {}
+        # By sensor; empty unless `tacpipe calibrate` wrote the model
+        self.calibrations = known.unpacked(files[known.FILE], self.layouts) if known.FILE in files else {}
 
     @classmethod
     def load(cls, files: Mapping[str, bytes], chain: Chain | None = None) -> Self:
@@ -187,12 +192,14 @@ class Classifier:
             )
         task = model_files.tree(files, CONFIG).get("task")
         if task != TASK:
-            found = plain(str(task))
-            raise TacpipeError(f"This model is of the task {found}, not {TASK}. Give one of `tacpipe train material`.")
+            task_name = plain(str(task))
+            raise TacpipeError(
+                f"This model is of the task {task_name}, not {TASK}. Give one of `tacpipe train material`."
+            )
         with model_files.validated("the model"):
-            made = cls(files, chain)
-            made._try()
-        return made
+            classifier = cls(files, chain)
+            classifier._try()
+        return classifier
 
     def _try(self) -> None:
         """Read a slide of noise of each sensor, and raise where a part does not fit another."""
@@ -206,8 +213,8 @@ class Classifier:
             noise = np.random.default_rng(0).normal(size=(2, layout.frames, len(layout.channels))).astype(np.float32)
             if self.baselines:
                 self.baselines[MEAN_LEVEL][name].scores(noise)
-            found = [reader[name].read(noise).scores for reader in (self.readers, self.last) if reader]
-            shapes = [scores.shape for scores in found if not np.isnan(scores).any()] or [(0, 0)]
+            scores_by_reader = [reader[name].read(noise).scores for reader in (self.readers, self.last) if reader]
+            shapes = [scores.shape for scores in scores_by_reader if not np.isnan(scores).any()] or [(0, 0)]
             if any(shape != (len(noise), len(self.classes)) for shape in shapes):
                 raise ValueError(f"slides of {name} get scores of {shapes}, not of {len(self.classes)} classes")
 
@@ -223,8 +230,10 @@ class Classifier:
 
     def probabilities_of(self, scores: Float32s, sensor: str) -> Float32s:
         """Return the probabilities (slide, class) that scores (slide, class) of slides of a sensor state."""
-        found = self.known[sensor].probabilities(scores) if self.known else calibration.probabilities(scores)
-        return found.astype(np.float32)
+        probabilities = (
+            self.calibrations[sensor].probabilities(scores) if self.calibrations else calibration.probabilities(scores)
+        )
+        return probabilities.astype(np.float32)
 
     def answers(self, slides: Float32s | Floats, sensor: str = "") -> list[str]:
         """Return the name of the class of each slide, or ``unknown``, of a model that `tacpipe calibrate` made.
@@ -237,18 +246,22 @@ class Classifier:
 
     def answered(self, scores: Float32s, frames: Float32s, sensor: str) -> list[str]:
         """Return the answers for slides (slide, time, channel) of a sensor, whose scores (slide, class) are known."""
-        if not self.known:
+        if not self.calibrations:
             raise UsageError(
                 "The model has no calibrated probabilities and no answer unknown. Run `tacpipe calibrate MODEL DATASET "
                 "--split SPLIT -o CALIBRATED` and give that one."
             )
-        refused, names = self.unlike(scores, frames, sensor), self.naming.named(self.named(scores))
+        refused, names = self.is_unknown(scores, frames, sensor), self.naming.names_for(self.best_classes(scores))
         return [UNKNOWN_ANSWER if no else str(name) for no, name in zip(refused, names, strict=True)]
 
-    def unlike(self, scores: Float32s, frames: Float32s, sensor: str) -> Bools:
-        """Return which slides are like no class (slide,), as `answered` takes them; none of an uncalibrated model."""
-        found = self.known.get(sensor)
-        return np.zeros(len(scores), dtype=bool) if found is None else found.score(scores, frames) < found.threshold
+    def is_unknown(self, scores: Float32s, frames: Float32s, sensor: str) -> Bools:
+        """Return which slides are like no class (slide,), by the threshold of their sensor; none without a calibration."""
+        sensor_calibration = self.calibrations.get(sensor)
+        return (
+            np.zeros(len(scores), dtype=bool)
+            if sensor_calibration is None
+            else sensor_calibration.score(scores, frames) < sensor_calibration.threshold
+        )
 
     def _sensor(self, sensor: str) -> str:
         """Return the sensor of slides: the one that is named, or the only one."""
@@ -263,9 +276,9 @@ class Classifier:
         layout = self.layout(self._sensor(sensor))
         frames = np.asarray(slides, np.float32)
         frames = frames[None] if frames.ndim == 2 else frames
-        wanted = (layout.frames, len(layout.channels))
-        if frames.ndim != 3 or frames.shape[1:] != wanted:
-            raise TacpipeError(f"Slides of {layout.sensor} are (slide, {wanted[0]}, {wanted[1]}), not {frames.shape}.")
+        shape = (layout.frames, len(layout.channels))
+        if frames.ndim != 3 or frames.shape[1:] != shape:
+            raise TacpipeError(f"Slides of {layout.sensor} are (slide, {shape[0]}, {shape[1]}), not {frames.shape}.")
         if not np.isfinite(frames).all():
             raise TacpipeError("A slide holds a value that is not finite; it must have a number in every frame.")
         return self.readers[layout.sensor].read(frames).scores
@@ -289,14 +302,14 @@ class Classifier:
         `tacpipe.tasks.material.slides.read` refuses.
         """
         only = tuple(self.layouts) if self.params.sensors else ()
-        there = {shard.attributes.get("sensor") for shard in recordings.recordings.values()}
-        only = tuple(name for name in only if name in there) or only
-        found = slides_of.read(
+        present_sensors = {shard.attributes.get("sensor") for shard in recordings.recordings.values()}
+        only = tuple(name for name in only if name in present_sensors) or only
+        by_sensor = slides_of.read(
             recordings, only=only, quantities=self.quantities, naming=self.naming, labelled=labelled, advance=advance
         )
-        for one in found.values():
-            self.check(one)
-        return found
+        for slides in by_sensor.values():
+            self.check(slides)
+        return by_sensor
 
     def check(self, slides: Slides) -> None:
         """Raise `TacpipeError` where slides are of another layout than those that the model was trained on."""
@@ -307,10 +320,10 @@ class Classifier:
                 f"Segment it with the same params, or train on slides like it."
             )
 
-    def named(self, scores: Float32s) -> Int64s:
+    def best_classes(self, scores: Float32s) -> Int64s:
         """Return the number of the class of the highest score of each slide (slide,)."""
-        named: Int64s = np.array(self.classes, np.int64)[scores.argmax(axis=1)]
-        return named
+        best: Int64s = np.array(self.classes, np.int64)[scores.argmax(axis=1)]
+        return best
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -353,8 +366,8 @@ class Classifier:
         return readers
 
     def _estimators(self, content: bytes, file: str, params: Estimator) -> dict[str, Fitted]:
-        found = estimators.unpacked(content, file, params)
-        return {name: found[name] for name in self.layouts}
+        fitted = estimators.unpacked(content, file, params)
+        return {name: fitted[name] for name in self.layouts}
 
     def _baselines(self, files: Mapping[str, bytes]) -> dict[str, dict[str, Baseline]]:
         """Return the baselines by name and sensor."""
@@ -367,19 +380,19 @@ class Classifier:
             kinds[PERMUTED_LABELS] = READOUTS.get(self.architecture, Level)
         if self.architecture == STATISTICS:
             kinds |= dict.fromkeys(LEVEL_VIEWS, StatisticsClassifier)
-        found: dict[str, dict[str, Baseline]] = {
+        baselines: dict[str, dict[str, Baseline]] = {
             kind: {name: cls.from_tensors(under(f"{kind}.{name}.", arrays)) for name in self.layouts}
             for kind, cls in kinds.items()
         }
-        return {**found, PERMUTED_LABELS: {**shuffled}} if shuffled else found
+        return {**baselines, PERMUTED_LABELS: {**shuffled}} if shuffled else baselines
 
 
-def spread(scores: Float32s, known: Any, classes: tuple[int, ...]) -> Float32s:
-    """Return scores of the classes ``known`` as columns of all ``classes``, the lowest possible where one is unknown.
+def spread(scores: Float32s, scored_classes: Any, classes: tuple[int, ...]) -> Float32s:
+    """Return scores of ``scored_classes`` as columns of all ``classes``; classes without a score have -inf.
 
     >>> spread(np.array([[1.0, 2.0]], np.float32), [3, 5], (3, 4, 5)).tolist()
     [[1.0, -inf, 2.0]]
     """
-    found = np.full((len(scores), len(classes)), -np.inf, np.float32)
-    found[:, [classes.index(int(one)) for one in known]] = scores
-    return found
+    spread_scores = np.full((len(scores), len(classes)), -np.inf, np.float32)
+    spread_scores[:, [classes.index(int(number)) for number in scored_classes]] = scores
+    return spread_scores

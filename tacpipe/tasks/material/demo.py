@@ -6,7 +6,7 @@ from pathlib import Path
 
 from tacpipe.tasks.task import Demo
 
-MATERIALS, SLIDES = 6, 240  # as many slides of each sensor on each material
+MATERIALS, SLIDES = 6, 240  # slides of each sensor on each material
 
 
 def demo(output: Path) -> Demo:
@@ -14,10 +14,10 @@ def demo(output: Path) -> Demo:
     names = ("touched", "slides", "slides-split", "materials", "materials-results", "joint", "joint-results")
     place = {name: str(output / name) for name in names}
     split = ["--split", place["slides-split"]]
-    many = ["--trials", str(SLIDES), "--materials", str(MATERIALS)]
+    simulation = ["--trials", str(SLIDES), "--materials", str(MATERIALS)]
     paper = ["--preset", "paper", "--epochs", "12", "--align-from", "4"]  # of the paper's 2,000 epochs
     commands = [
-        ["simulate", "material", *many, "-o", place["touched"]],
+        ["simulate", "material", *simulation, "-o", place["touched"]],
         ["segment", "slides", place["touched"], "-o", place["slides"]],
         ["split", place["slides"], "-o", place["slides-split"], "--scheme", "random", "--stratify", "sensor,material"],
         ["train", "material", place["slides"], *split, "-o", place["materials"], "--features", "2000"],

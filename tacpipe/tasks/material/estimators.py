@@ -24,7 +24,7 @@ from tacpipe.printable import listed, plain
 from tacpipe.tasks.material.params import Estimator
 
 SCHEMA = "schema.json"
-WRITTEN = (1980, 1, 1, 0, 0, 0)  # what a zip states of each member
+WRITTEN = (1980, 1, 1, 0, 0, 0)  # modification time of all members of a zip
 TRIED = 2  # slides
 SMALLEST = 1e-12  # probability
 LARGEST = 2**31  # bytes that a file may unpack to
@@ -43,15 +43,15 @@ class Fitted:
 
         Raises `TacpipeError` where features or scores are not what `Estimator` states.
         """
-        made = cls(params.build(params.seed), params.features)
-        made.estimator.fit(made._features(frames), materials)
-        made.scores(frames[:TRIED])
-        return made
+        fitted = cls(params.build(params.seed), params.features)
+        fitted.estimator.fit(fitted._features(frames), materials)
+        fitted.scores(frames[:TRIED])
+        return fitted
 
     @property
     def classes(self) -> tuple[int, ...]:
         """The classes that it scores, in order."""
-        return tuple(int(one) for one in self.estimator.classes_)
+        return tuple(int(number) for number in self.estimator.classes_)
 
     def scores(self, frames: Float32s) -> Float32s:
         """Return the score of each class for slides (slide, time, channel), (slide, class).
@@ -63,7 +63,7 @@ class Fitted:
             found: Floats = np.log(np.clip(self.estimator.predict_proba(read), SMALLEST, None))
         else:
             found = np.asarray(self.estimator.decision_function(read))
-            found = np.stack([-found, found], axis=1) / 2 if found.ndim == 1 else found  # of two classes
+            found = np.stack([-found, found], axis=1) / 2 if found.ndim == 1 else found  # two classes
         if found.shape != (len(frames), len(self.classes)):
             raise TacpipeError(
                 f"{type(self.estimator).__name__} returns scores {found.shape} for {len(frames)} slides and "
@@ -72,13 +72,15 @@ class Fitted:
         return found.astype(np.float32)
 
     def _features(self, frames: Float32s) -> Float32s:
-        found: Float32s = np.asarray(self.features(frames), np.float32)
-        if found.ndim != 2 or len(found) != len(frames) or not np.isfinite(found).all():
-            state = "are not all finite" if found.ndim == 2 and len(found) == len(frames) else f"are {found.shape}"
+        features: Float32s = np.asarray(self.features(frames), np.float32)
+        if features.ndim != 2 or len(features) != len(frames) or not np.isfinite(features).all():
+            state = (
+                "are not all finite" if features.ndim == 2 and len(features) == len(frames) else f"are {features.shape}"
+            )
             raise TacpipeError(
                 f"The features of {len(frames)} slides {state}; features(frames) must return (slide, feature), all finite."
             )
-        return found
+        return features
 
 
 def packed(fitted: Mapping[str, Fitted], params: Estimator) -> bytes:
@@ -87,15 +89,15 @@ def packed(fitted: Mapping[str, Fitted], params: Estimator) -> bytes:
         from skops.io import dumps, get_untrusted_types
         from skops.io.exceptions import UnsupportedTypeException
     try:
-        content = dumps({sensor: one.estimator for sensor, one in fitted.items()})
+        content = dumps({sensor: sensor_estimator.estimator for sensor, sensor_estimator in fitted.items()})
     except UnsupportedTypeException as error:
         raise TacpipeError(
             f"The estimator of {params.architecture} cannot be stored without pickle ({plain(str(error), 200)}). Build it "
             f"of estimators of scikit-learn, with functions of a module and not lambda."
         ) from error
-    if others := _refused(get_untrusted_types(data=content), params):
+    if refused := _refused(get_untrusted_types(data=content), params):
         raise TacpipeError(
-            f"The estimator of {params.architecture} holds {others}, which skops does not validate when it is read. Name "
+            f"The estimator of {params.architecture} holds {refused}, which skops does not validate when it is read. Name "
             f"what you trust in TRUSTED of {type(params).__name__}, or build another estimator."
         )
     return _canonical(content)
@@ -112,16 +114,17 @@ def unpacked(content: bytes, name: str, params: Estimator) -> dict[str, Fitted]:
         with zipfile.ZipFile(io.BytesIO(content)) as file:
             if sum(member.file_size for member in file.infolist()) > LARGEST:
                 raise TacpipeError(f"{name} unpacks to more than {LARGEST >> 30} GiB, so it is not read.")
-        own = get_untrusted_types(data=content)
-        if others := _refused(own, params):
+        untrusted_types = get_untrusted_types(data=content)
+        if refused := _refused(untrusted_types, params):
             raise TacpipeError(
-                f"{name} holds {others}, which the architecture {params.architecture} does not trust. Train the model again."
+                f"{name} holds {refused}, which the architecture {params.architecture} does not trust. Train the "
+                f"model again."
             )
-        found = loads(content, trusted=own)
-        return {sensor: Fitted(estimator, params.features) for sensor, estimator in found.items()}
+        estimators = loads(content, trusted=untrusted_types)
+        return {sensor: Fitted(estimator, params.features) for sensor, estimator in estimators.items()}
     except TacpipeError:
         raise
-    except Exception as error:  # what a damaged file raises on its way is of many types
+    except Exception as error:  # a damaged file raises errors of many types
         raise TacpipeError(
             f"{name} is not a file of skops that can be read ({plain(' '.join(str(error).split()), 200)}). Copy it again "
             f"from whoever made it."
@@ -156,31 +159,31 @@ def _canonical(content: bytes) -> bytes:
     numbers: dict[Any, int] = {}
     described = _renumbered(json.loads(members[SCHEMA]), numbers)
     renamed = {SCHEMA: json.dumps(described, indent=1, sort_keys=True).encode()}
-    renamed |= {_member(member, numbers): own for member, own in members.items() if member != SCHEMA}
-    written = io.BytesIO()
-    with zipfile.ZipFile(written, "w", zipfile.ZIP_DEFLATED) as file:
-        for member, own in sorted(renamed.items()):
+    renamed |= {_member(member, numbers): content for member, content in members.items() if member != SCHEMA}
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as file:
+        for member, content in sorted(renamed.items()):
             about = zipfile.ZipInfo(member, WRITTEN)
             about.compress_type = zipfile.ZIP_DEFLATED
-            file.writestr(about, own)
-    return written.getvalue()
+            file.writestr(about, content)
+    return buffer.getvalue()
 
 
 def _renumbered(node: Any, numbers: dict[Any, int]) -> Any:
     """Return a description whose ``__id__`` are counted from 1 in the order in which they come, and files named by them."""
     if isinstance(node, list):
-        return [_renumbered(one, numbers) for one in node]
+        return [_renumbered(child, numbers) for child in node]
     if not isinstance(node, Mapping):
         return node
-    found: dict[str, Any] = {}
+    renumbered: dict[str, Any] = {}
     for name, value in node.items():
         if name == "__id__":
-            found[name] = numbers.setdefault(value, len(numbers) + 1)
+            renumbered[name] = numbers.setdefault(value, len(numbers) + 1)
         elif name == "file":
-            found[name] = _member(value, numbers)
+            renumbered[name] = _member(value, numbers)
         else:
-            found[name] = _renumbered(value, numbers)
-    return found
+            renumbered[name] = _renumbered(value, numbers)
+    return renumbered
 
 
 def _member(name: str, numbers: dict[Any, int]) -> str:

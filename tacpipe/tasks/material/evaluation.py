@@ -36,17 +36,17 @@ class Evaluated:
     """The slides of one sensor and the predictions for them."""
 
     slides: Slides
-    seen: Bools  # (slide,): the model was trained on it
+    in_training: Bools  # (slide,): the model was trained on it
     output: ReaderOutput
     predicted: dict[str, Int64s]  # predictor -> the material it names (slide,)
-    held: Bools  # (slide,): of a material whose label the sensor did not learn
+    held_out: Bools  # (slide,): its material's label was not learned by this sensor
     zero_shot: tuple[Int64s, Int64s] | None = None  # another sensor's names: of all materials, of held-out ones
     counted: Bools = field(default_factory=lambda: np.zeros(0, bool))  # (slide,)
 
-    def right(self, predictor: str, chosen: Bools) -> Bools:
+    def is_right(self, predictor: str, chosen: Bools) -> Bools:
         """Return which of the chosen slides a predictor named rightly."""
-        found: Bools = (self.predicted[predictor] == self.slides.materials)[chosen]
-        return found
+        is_right: Bools = (self.predicted[predictor] == self.slides.materials)[chosen]
+        return is_right
 
 
 def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
@@ -56,7 +56,7 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
     apart, under ``seen``. Raises `TacpipeError` where slides have no label or are not what the model reads.
     """
     classifier = Classifier.load(model)
-    known = set(classifier.config["trained_on"].values())
+    trained_on = set(classifier.config["trained_on"].values())
     evaluated = {}
     key = classifier.naming.key
     answers = Answers(
@@ -65,10 +65,10 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
     )
     with progress.bar("evaluate", 2 * len(recordings.recordings)) as advance:  # each slide is read, then named
         for sensor, slides in _read(classifier, recordings, advance).items():
-            named = answers.add(slides, np.array([one in known for one in slides.digests], bool))
-            if named.any() or not classifier.known:
-                some = slides.some(named) if classifier.known else slides
-                evaluated[sensor] = _evaluated(classifier, some, known)
+            is_learned = answers.add(slides, np.array([digest in trained_on for digest in slides.digests], bool))
+            if is_learned.any() or not classifier.calibrations:
+                counted = slides.select(is_learned) if classifier.calibrations else slides
+                evaluated[sensor] = _evaluated(classifier, counted, trained_on)
             advance(len(slides), sensor)
     if not evaluated:
         raise TacpipeError(
@@ -82,35 +82,39 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
     if zero:
         tree["zero_shot"] = zero
     rows = [
-        (sensor, one, int(at)) for sensor, one in evaluated.items() for at in np.flatnonzero(one.counted & ~one.seen)
+        (sensor, result, int(at))
+        for sensor, result in evaluated.items()
+        for at in np.flatnonzero(result.counted & ~result.in_training)
     ]
     files = {
         headline.FILE: headline.write(_headlines(evaluated, classifier)),
         "metrics.json": model_files.to_json(tree),
         "confusion.csv": metrics.confusion_csv(
             [sensor for sensor, _, _ in rows],
-            [classifier.naming.named(one.slides.materials[[at]])[0] for _, one, at in rows],
-            [classifier.naming.named(one.predicted[MODEL][[at]])[0] for _, one, at in rows],
+            [classifier.naming.names_for(result.slides.materials[[at]])[0] for _, result, at in rows],
+            [classifier.naming.names_for(result.predicted[MODEL][[at]])[0] for _, result, at in rows],
         ),
         **answers.files(),
         **{name: model[name] for name in (CONFIG, HISTORY) if name in model},
     }
     attributes = {name: shard.attributes for name, shard in recordings.recordings.items()}
-    table = predictions_table(evaluated, classifier, {name: one.get("session") for name, one in attributes.items()})
+    table = predictions_table(
+        evaluated, classifier, {name: shard_attributes.get("session") for name, shard_attributes in attributes.items()}
+    )
     return Result({PREDICTIONS: RecordingOutput(table, origin.together(attributes.values()))}, files)
 
 
 def _read(classifier: Classifier, recordings: Dataset, advance: Callable[..., None]) -> dict[str, Slides]:
     """Return labelled slides; of a calibrated classifier their classes may be others than those that it knows."""
     key = classifier.naming.key
-    every = all(shard.attributes.get(key) is not None for shard in recordings.recordings.values())
-    return classifier.read(recordings, labelled=not (classifier.known and every), advance=advance)
+    all_labelled = all(shard.attributes.get(key) is not None for shard in recordings.recordings.values())
+    return classifier.read(recordings, labelled=not (classifier.calibrations and all_labelled), advance=advance)
 
 
-def _evaluated(classifier: Classifier, slides: Slides, known: set[str]) -> Evaluated:
+def _evaluated(classifier: Classifier, slides: Slides, trained_on: set[str]) -> Evaluated:
     """Return the predictions of all predictors for the slides of one sensor."""
     sensor = slides.layout.sensor
-    foreign = [index for index, one in enumerate(slides.materials) if int(one) not in classifier.classes]
+    foreign = [index for index, material in enumerate(slides.materials) if int(material) not in classifier.classes]
     if foreign:
         raise TacpipeError(
             f"{slides.names[foreign[0]]} is of {classifier.naming.key} "
@@ -118,9 +122,9 @@ def _evaluated(classifier: Classifier, slides: Slides, known: set[str]) -> Evalu
             f"{listed(classifier.names, 20)}. Leave it out."
         )
     output = classifier.readers[sensor].read(slides.frames)
-    predicted = {MODEL: classifier.named(output.scores)}
+    predicted = {MODEL: classifier.best_classes(output.scores)}
     if sensor in classifier.last:
-        predicted[LAST_EPOCH] = classifier.named(classifier.last[sensor].read(slides.frames).scores)
+        predicted[LAST_EPOCH] = classifier.best_classes(classifier.last[sensor].read(slides.frames).scores)
     params = classifier.params
     mapped = isinstance(params, Raec) and bool(params.frozen_sensor)  # all have the frozen sensor's classifier already
     if classifier.config.get("joint") and output.latents is not None and not mapped:
@@ -135,17 +139,17 @@ def _evaluated(classifier: Classifier, slides: Slides, known: set[str]) -> Evalu
     counted = np.ones(len(slides), bool)
     if isinstance(params, Raec | XLSTM) and params.drop_last:
         counted[len(slides) // params.batch * params.batch or len(slides) :] = False  # fewer than one batch count all
-    found = Evaluated(
+    evaluated = Evaluated(
         slides,
-        np.array([digest in known for digest in slides.digests], bool),
+        np.array([digest in trained_on for digest in slides.digests], bool),
         output,
         predicted,
         np.isin(slides.materials, held_out),
         counted=counted,
     )
     if held_out and output.latents is not None:
-        found.zero_shot = _by_another(classifier, sensor, output.latents, held_out)
-    return found
+        evaluated.zero_shot = _by_another(classifier, sensor, output.latents, held_out)
+    return evaluated
 
 
 def _exchanged(classifier: Classifier, sensor: str, latents: Float32s) -> Int64s:
@@ -155,36 +159,49 @@ def _exchanged(classifier: Classifier, sensor: str, latents: Float32s) -> Int64s
     name is then taken back through that permutation.
     """
     scores = _partner_scores(classifier, sensor, latents)
-    named = classifier.named(scores)
-    partners = {int(one): int(other) for one, other in classifier.config.get("partners", {}).items()}
+    materials = classifier.best_classes(scores)
+    partners = {
+        int(first_class): int(partner_class)
+        for first_class, partner_class in classifier.config.get("partners", {}).items()
+    }
     first, partner = next(iter(classifier.layouts)), classifier.partner(sensor)
     if not partners or first not in (sensor, partner):
-        return named
-    back = partners if partner == first else {other: one for one, other in partners.items()}
-    return np.array([back[int(one)] for one in named], np.int64)
+        return materials
+    original = (
+        partners
+        if partner == first
+        else {partner_class: first_class for first_class, partner_class in partners.items()}
+    )
+    return np.array([original[int(material)] for material in materials], np.int64)
 
 
 def _partner_scores(classifier: Classifier, sensor: str, latents: Float32s) -> Float32s:
-    own, reader = classifier.readers[sensor], classifier.readers[classifier.partner(sensor)]
-    if isinstance(own, SpectraReader):
-        return own.expected(latents)
-    assert isinstance(reader, NetworkReader)
-    return reader.scores_of(latents)
+    reader, partner_reader = classifier.readers[sensor], classifier.readers[classifier.partner(sensor)]
+    if isinstance(reader, SpectraReader):
+        return reader.expected(latents)
+    assert isinstance(partner_reader, NetworkReader)
+    return partner_reader.scores_of(latents)
 
 
 def _by_another(classifier: Classifier, sensor: str, latents: Float32s, held_out: list[int]) -> tuple[Int64s, Int64s]:
-    """Return the materials by the classes that other sensors learned: of all materials, and of those held out alone."""
+    """Return the materials that another sensor's classifier names: among all materials, and among those held out."""
     scores = _partner_scores(classifier, sensor, latents)
-    among = np.isin(classifier.classes, held_out)
-    return classifier.named(scores), classifier.named(np.where(among, scores, -np.inf))
+    is_held_out = np.isin(classifier.classes, held_out)
+    return classifier.best_classes(scores), classifier.best_classes(np.where(is_held_out, scores, -np.inf))
 
 
 def _summary(evaluated: Mapping[str, Evaluated], classifier: Classifier, *, seen: bool) -> Tree:
     """Return the metrics on the slides that the model has seen, or on those it has not."""
-    chosen = {sensor: (one.seen == seen) & one.counted & ~one.held for sensor, one in evaluated.items()}
-    predictors = sorted({name for one in evaluated.values() for name in one.predicted})
+    chosen = {
+        sensor: (result.in_training == seen) & result.counted & ~result.held_out for sensor, result in evaluated.items()
+    }
+    predictors = sorted({name for result in evaluated.values() for name in result.predicted})
     right = {
-        name: {sensor: one.right(name, chosen[sensor]) for sensor, one in evaluated.items() if name in one.predicted}
+        name: {
+            sensor: result.is_right(name, chosen[sensor])
+            for sensor, result in evaluated.items()
+            if name in result.predicted
+        }
         for name in predictors
     }
     return metrics.summary(right, len(classifier.classes))
@@ -192,37 +209,37 @@ def _summary(evaluated: Mapping[str, Evaluated], classifier: Classifier, *, seen
 
 def _headlines(evaluated: Mapping[str, Evaluated], classifier: Classifier) -> list[headline.Headline]:
     """Return how the model compares with its baselines on the slides of each sensor that it has not seen."""
-    found = []
-    for sensor, one in evaluated.items():
-        chosen = ~one.seen & one.counted & ~one.held
-        names = np.array(one.slides.names)[chosen]
+    sensor_headlines = []
+    for sensor, result in evaluated.items():
+        chosen = ~result.in_training & result.counted & ~result.held_out
+        names = np.array(result.slides.names)[chosen]
         right = {
             predictor: {
                 (0, str(name)): (int(correct), 1)
-                for name, correct in zip(names, one.right(predictor, chosen), strict=True)
+                for name, correct in zip(names, result.is_right(predictor, chosen), strict=True)
             }
-            for predictor in one.predicted
+            for predictor in result.predicted
         }
-        made = headlines.headline(classifier.config["architecture"], sensor, right, len(classifier.classes))
-        found += [made] if made else []
-    return found
+        sensor_headline = headlines.headline(classifier.config["architecture"], sensor, right, len(classifier.classes))
+        sensor_headlines += [sensor_headline] if sensor_headline else []
+    return sensor_headlines
 
 
 def _zero_shot(evaluated: Mapping[str, Evaluated], classifier: Classifier) -> Tree:
     """Return how well another sensor's classifier names materials whose labels a sensor did not learn."""
-    every, among, chances = {}, {}, {}
-    for sensor, one in evaluated.items():
-        if one.zero_shot is None:
+    correct, correct_among_held_out, chances = {}, {}, {}
+    for sensor, result in evaluated.items():
+        if result.zero_shot is None:
             continue
-        chosen = one.held & ~one.seen
-        every[sensor] = (one.zero_shot[0] == one.slides.materials)[chosen]
-        among[sensor] = (one.zero_shot[1] == one.slides.materials)[chosen]
+        chosen = result.held_out & ~result.in_training
+        correct[sensor] = (result.zero_shot[0] == result.slides.materials)[chosen]
+        correct_among_held_out[sensor] = (result.zero_shot[1] == result.slides.materials)[chosen]
         chances[sensor] = 1 / len(classifier.config["held_out"][sensor])
-    if not every:
+    if not correct:
         return {}
-    tree = metrics.accuracy(every)
-    tree["chance"] = {sensor: 1 / len(classifier.classes) for sensor in every}
-    tree["among_held_out"] = {**metrics.accuracy(among), "chance": chances}
+    tree = metrics.accuracy(correct)
+    tree["chance"] = {sensor: 1 / len(classifier.classes) for sensor in correct}
+    tree["among_held_out"] = {**metrics.accuracy(correct_among_held_out), "chance": chances}
     return tree
 
 
@@ -233,20 +250,24 @@ def predictions_table(
 
     ``sessions`` maps a slide to its session, where one is recorded.
     """
-    named, count = classifier.naming.named, {sensor: len(one.slides) for sensor, one in evaluated.items()}
+    names_for, count = classifier.naming.names_for, {sensor: len(result.slides) for sensor, result in evaluated.items()}
     columns: list[tuple[pa.Field, Any]] = [
-        (pa.field("recording", pa.string()), [name for one in evaluated.values() for name in one.slides.names]),
+        (pa.field("recording", pa.string()), [name for result in evaluated.values() for name in result.slides.names]),
         (pa.field("sensor", pa.string()), [sensor for sensor, number in count.items() for _ in range(number)]),
-        naming.field("material", named(_joined(one.slides.materials for one in evaluated.values())), "label"),
-        (pa.field("seen", pa.bool_()), _joined(one.seen for one in evaluated.values())),
+        naming.field("material", names_for(_joined(result.slides.materials for result in evaluated.values())), "label"),
+        (pa.field("seen", pa.bool_()), _joined(result.in_training for result in evaluated.values())),
     ]
-    held = [(sessions or {}).get(name) for one in evaluated.values() for name in one.slides.names]
-    columns.append((pa.field("session", pa.string()), [None if one is None else str(one) for one in held]))
-    for name in sorted({name for one in evaluated.values() for name in one.predicted}):
-        values = [one.predicted.get(name, np.full(len(one.slides), naming.UNKNOWN)) for one in evaluated.values()]
-        columns.append(naming.field(name, named(_joined(values)), "prediction"))
-    columns += score_columns(classifier, _joined(one.output.scores for one in evaluated.values()))
-    latents = [one.output.latents for one in evaluated.values() if one.output.latents is not None]
+    session_values = [(sessions or {}).get(name) for result in evaluated.values() for name in result.slides.names]
+    columns.append(
+        (pa.field("session", pa.string()), [None if session is None else str(session) for session in session_values])
+    )
+    for name in sorted({name for result in evaluated.values() for name in result.predicted}):
+        values = [
+            result.predicted.get(name, np.full(len(result.slides), naming.UNKNOWN)) for result in evaluated.values()
+        ]
+        columns.append(naming.field(name, names_for(_joined(values)), "prediction"))
+    columns += score_columns(classifier, _joined(result.output.scores for result in evaluated.values()))
+    latents = [result.output.latents for result in evaluated.values() if result.output.latents is not None]
     if latents:
         columns += latent_columns(_joined(latents))
     arrays = [pa.array(values, field.type) for field, values in columns]

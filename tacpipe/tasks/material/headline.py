@@ -32,19 +32,21 @@ def headline(
     ``right`` holds, by predictor, then by seed and slide, how often the slide was classified right and how often at all.
     Guessing among ``classes`` counts as a baseline too.
     """
-    own = _sums(right.get(model, {}))
+    model_sums = _sums(right.get(model, {}))
     baselines = {name: _sums(right[predictor]) for predictor, name in BASELINES.items() if right.get(predictor)}
     if classes:
-        baselines[CHANCE] = {key: np.array([one[1] / classes, one[1]]) for key, one in own.items()}
-    return pairing.headline(TASK, method, MEASURE, own, baselines, part=sensor, runs=runs)
+        baselines[CHANCE] = {
+            key: np.array([slide_sums[1] / classes, slide_sums[1]]) for key, slide_sums in model_sums.items()
+        }
+    return pairing.headline(TASK, method, MEASURE, model_sums, baselines, part=sensor, runs=runs)
 
 
 def _sums(right: Mapping[tuple[Any, str], tuple[int, int]]) -> Sums:
-    return {key: np.array(one, dtype=np.float64) for key, one in right.items()}
+    return {key: np.array(counts, dtype=np.float64) for key, counts in right.items()}
 
 
-def _wrong(found: AnyFloats) -> AnyFloats:
-    return np.where(found[:, 1] > 0, 1 - found[:, 0] / np.maximum(found[:, 1], 1), np.nan)
+def _wrong(sums: AnyFloats) -> AnyFloats:
+    return np.where(sums[:, 1] > 0, 1 - sums[:, 0] / np.maximum(sums[:, 1], 1), np.nan)
 
 
 MEASURE = Measure(
@@ -54,8 +56,8 @@ MEASURE = Measure(
     "points",
     "slides",
     _wrong,
-    lambda one, other: 100 * (other - one),
-    lambda found: (100 * (1 - float(_wrong(found[None])[0])),),
+    lambda wrong, baseline: 100 * (baseline - wrong),
+    lambda sums: (100 * (1 - float(_wrong(sums[None])[0])),),
     lambda wrong: 100 * (1 - wrong),
     "accuracy (%)",
     rises=True,

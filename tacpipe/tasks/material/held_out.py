@@ -11,23 +11,23 @@ from tacpipe.tasks.material.naming import NUMBERS, UNKNOWN, Naming
 
 
 def materials(
-    given: str, classes: Sequence[int], sensors: Iterable[str], naming: Naming = NUMBERS
+    assignments: str, classes: Sequence[int], sensors: Iterable[str], naming: Naming = NUMBERS
 ) -> dict[str, set[int]]:
-    """Return the materials whose labels each sensor does not learn; ``given`` is like ``roboskin=17,18,19,20``.
+    """Return the materials whose labels each sensor does not learn; ``assignments`` is like ``roboskin=17,18,19,20``.
 
     >>> materials("b=3,4", [1, 2, 3, 4], ["a", "b"])
     {'a': set(), 'b': {3, 4}}
     """
-    found: dict[str, set[int]] = {name: set() for name in sensors}
-    for name, numbers in Assignments(str, between=";").items(given).items():
+    by_sensor: dict[str, set[int]] = {name: set() for name in sensors}
+    for name, numbers in Assignments(str, between=";").items(assignments).items():
         try:
-            named = {naming.read(word) for word in CommaList().items(numbers)}
+            sensor_materials = {naming.read(word) for word in CommaList().items(numbers)}
         except ValueError:
-            named = {UNKNOWN}
-        if name not in found or not named <= set(classes):
+            sensor_materials = {UNKNOWN}
+        if name not in by_sensor or not sensor_materials <= set(classes):
             raise UsageError(
-                f"hold_out names {name}={numbers}; the sensors are {', '.join(found)} and the classes "
+                f"hold_out names {name}={numbers}; the sensors are {', '.join(by_sensor)} and the classes "
                 f"{listed(map(naming.name, classes), 20)}."
             )
-        found[name] |= named
-    return found
+        by_sensor[name] |= sensor_materials
+    return by_sensor

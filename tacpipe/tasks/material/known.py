@@ -1,4 +1,4 @@
-"""What makes a classifier's probabilities frequencies, and lets it answer ``unknown``: one bundle a sensor."""
+"""The calibration of each sensor of a classifier: its probabilities, and when it answers ``unknown``."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ DISTANCE = "distance."  # begins the names of the tensors of `ClassDistance`
 
 
 @dataclass(frozen=True)
-class Known:
+class SensorCalibration:
     """The temperature of a sensor's scores, and below which score a slide is of no known class."""
 
     temperature: float
-    rule: Rule  # what the score is
+    rule: Rule  # the kind of score
     threshold: float
     distance: ClassDistance
 
@@ -41,10 +41,10 @@ class Known:
 
         ``scores`` (slide, class) are the classifier's, ``frames`` (slide, time, channel) what it read.
         """
-        return self.each(scores, frames)[self.rule]
+        return self.scores_by_rule(scores, frames)[self.rule]
 
-    def each(self, scores: AnyFloats, frames: Float32s) -> dict[Rule, Floats]:
-        """Return that by each rule: the log odds of the largest probability, and minus half the squared distance to the
+    def scores_by_rule(self, scores: AnyFloats, frames: Float32s) -> dict[Rule, Floats]:
+        """Return `score` by rule: the log odds of the largest probability, and minus half the squared distance to the
         nearest class."""
         return {
             "probability": _log_odds(scores / self.temperature),
@@ -59,7 +59,7 @@ class Known:
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, AnyArray]) -> Self:
         """Return what `to_tensors` described. Raises `ValueError` where it cannot be."""
-        temperature, threshold, rule = (float(one) for one in tensors["numbers"])
+        temperature, threshold, rule = (float(number) for number in tensors["numbers"])
         if temperature <= 0 or not 0 <= int(rule) < len(RULES):
             raise ValueError(f"the temperature is {temperature} and the rule {rule}")
         distance = ClassDistance.from_tensors(under(DISTANCE, tensors))
@@ -67,8 +67,8 @@ class Known:
 
 
 @dataclass(frozen=True)
-class Watched:
-    """Validation slides of a sensor: what they are fitted by."""
+class ValidationSlides:
+    """Validation slides of one sensor, with the scores of the classifier."""
 
     scores: Float32s  # (slide, class), the classifier's
     frames: Float32s  # (slide, time, channel)
@@ -76,57 +76,61 @@ class Watched:
 
 
 def fit(
-    learned: tuple[Float32s, Int64s], watched: Watched, classes: Ints, false_unknown: float
-) -> tuple[Known, dict[Rule, float]]:
-    """Return the bundle of a sensor, and by which measure its rule was chosen.
+    training: tuple[Float32s, Int64s], validation: ValidationSlides, classes: Ints, false_unknown: float
+) -> tuple[SensorCalibration, dict[Rule, float]]:
+    """Return the calibration of a sensor, and the area under the curve of each rule.
 
-    The distance is fitted on ``learned``, frames (slide, time, channel) and classes (slide,) of training slides; all else
-    on ``watched``. The rule is the one that distinguishes validation slides better from themselves with their own class left
-    out of the answers (area under the curve); no slide of an unknown class is needed. The threshold is that of split
+    The distance is fitted on ``training``, frames (slide, time, channel) and classes (slide,) of training slides; all else
+    on ``validation``. The rule is the one that distinguishes validation slides better from themselves with their own class
+    left out of the answers (area under the curve); no slide of an unknown class is needed. The threshold is that of split
     conformal prediction: a new slide of a known class falls below it with a probability of at most ``false_unknown``.
     Raises `TacpipeError` with too few slides for that.
     """
-    count = len(watched.labels)
+    count = len(validation.labels)
     if conformal.most_promised(count) < 1 - false_unknown:
         raise TacpipeError(
             f"{count} validation slides cannot set a threshold that at most {100 * false_unknown:g} % of known slides fall "
             f"below; it takes {int(np.ceil(1 / false_unknown - 1 - 1e-9))} or more. Split with more of them "
             f"(`tacpipe split --val`), or allow more with --false-unknown."
         )
-    temperature = calibration.temperature(watched.scores, watched.labels)
-    made = Known(temperature, "probability", 0.0, ClassDistance.fit(*learned))
-    own = watched.labels[:, None] == np.arange(len(classes))
-    away = made.distance.scores(watched.frames)
-    left_out = np.asarray(classes)[watched.labels][:, None] == made.distance.classes
-    whole = made.each(watched.scores, watched.frames)
-    without: dict[Rule, Floats] = {
-        "probability": _log_odds(np.where(own, -np.inf, watched.scores / temperature)),
-        "distance": np.where(left_out, -np.inf, away).max(axis=1),
+    temperature = calibration.temperature(validation.scores, validation.labels)
+    unset = SensorCalibration(temperature, "probability", 0.0, ClassDistance.fit(*training))
+    is_label = validation.labels[:, None] == np.arange(len(classes))
+    distances = unset.distance.scores(validation.frames)
+    is_left_out = np.asarray(classes)[validation.labels][:, None] == unset.distance.classes
+    scores = unset.scores_by_rule(validation.scores, validation.frames)
+    scores_without_class: dict[Rule, Floats] = {
+        "probability": _log_odds(np.where(is_label, -np.inf, validation.scores / temperature)),
+        "distance": np.where(is_left_out, -np.inf, distances).max(axis=1),
     }
-    areas = {rule: calibration.auroc(whole[rule], without[rule]) for rule in RULES}
-    rule = max(RULES, key=lambda one: areas[one])
-    threshold = -conformal.quantile(-whole[rule], np.arange(count), 1 - false_unknown, promised=True)
-    return Known(temperature, rule, threshold, made.distance), areas
+    areas = {rule: calibration.auroc(scores[rule], scores_without_class[rule]) for rule in RULES}
+    rule = max(RULES, key=lambda candidate: areas[candidate])
+    threshold = -conformal.quantile(-scores[rule], np.arange(count), 1 - false_unknown, promised=True)
+    return SensorCalibration(temperature, rule, threshold, unset.distance), areas
 
 
-def packed(known: Mapping[str, Known]) -> bytes:
-    """Return bundles by sensor as a file."""
-    tensors = {f"{name}.{key}": value for name, one in known.items() for key, value in one.to_tensors().items()}
+def packed(calibrations: Mapping[str, SensorCalibration]) -> bytes:
+    """Return calibrations by sensor as a file."""
+    tensors = {
+        f"{name}.{key}": value
+        for name, sensor_calibration in calibrations.items()
+        for key, value in sensor_calibration.to_tensors().items()
+    }
     return save({name: np.ascontiguousarray(value) for name, value in tensors.items()})
 
 
-def unpacked(content: bytes, sensors: Mapping[str, object]) -> dict[str, Known]:
-    """Return the bundles that `packed` wrote. Raises `TacpipeError` for another file."""
-    found = model_files.arrays(content, FILE)
-    return {name: Known.from_tensors(under(f"{name}.", found)) for name in sensors}
+def unpacked(content: bytes, sensors: Mapping[str, object]) -> dict[str, SensorCalibration]:
+    """Return the calibrations that `packed` wrote. Raises `TacpipeError` for another file."""
+    tensors = model_files.arrays(content, FILE)
+    return {name: SensorCalibration.from_tensors(under(f"{name}.", tensors)) for name in sensors}
 
 
 def _log_odds(scores: AnyFloats) -> Floats:
     """Return the logarithm of p / (1 - p) of the largest probability p of each slide (slide,)."""
     wide = scores.astype(np.float64)
     best = wide.argmax(axis=1)[:, None]
-    others = wide.copy()
-    np.put_along_axis(others, best, -np.inf, axis=1)
-    rest = logsumexp(others, axis=1)
-    found: Floats = np.take_along_axis(wide, best, axis=1)[:, 0] - np.where(np.isfinite(rest), rest, -1e6)
-    return found
+    other_scores = wide.copy()
+    np.put_along_axis(other_scores, best, -np.inf, axis=1)
+    remainder = logsumexp(other_scores, axis=1)
+    log_odds: Floats = np.take_along_axis(wide, best, axis=1)[:, 0] - np.where(np.isfinite(remainder), remainder, -1e6)
+    return log_odds

@@ -17,19 +17,19 @@ from tacpipe.tasks.material.pairs import NONE, Pairs
 from tacpipe.training.loop import Line, precise
 
 Network = RecurrentAutoencoder | RecurrentClassifier
-TEMPERATURE = 0.1  # of contrast: the published one
+TEMPERATURE = 0.1  # the published temperature of the contrastive loss
 CHUNK = 128  # slides that go through a network at once where nothing is learned
 
 
 @dataclass(frozen=True)
 class Weights:
-    """What each loss counts (the paper's section IV: 0.01, 1, 1), and from which epoch on latents are aligned."""
+    """Weights of the losses (the paper's section IV: 0.01, 1, 1), and the first epoch that aligns latents."""
 
     reconstruction: float = 0.01
     classification: float = 1.0
     alignment: float = 1.0  # 0: sensors are learned independently
     align_from: int = 20  # first epoch, from 0, in which the alignment counts
-    # what is aligned: pairs of one row, or each slide with all of its class, in contrast to others
+    # Aligns pairs of one row, or each slide with all of its class, in contrast to others
     alignment_loss: str = "pairs"
 
     def __post_init__(self) -> None:
@@ -90,7 +90,7 @@ class JointWork:
 
     @property
     def joint(self) -> bool:
-        """Whether latents of unlike sensors are aligned."""
+        """True if latents of unlike sensors are aligned."""
         return self.weights.alignment > 0 and len(self.training) > 1
 
     def batches(self, epoch: int) -> list[dict[str, Tensor]]:
@@ -104,7 +104,7 @@ class JointWork:
         for sensor, rows in batch.items():
             chosen = rows[rows != NONE]
             if len(chosen):
-                output[sensor], loss = self._own(sensor, model.get_submodule(sensor), chosen)
+                output[sensor], loss = self._sensor_losses(sensor, model.get_submodule(sensor), chosen)
                 total = total.to(loss.device) + loss
         if self.joint:
             aligned = self._alignment(batch, output)
@@ -114,7 +114,7 @@ class JointWork:
                 total = total + self.weights.alignment * aligned
         return total, max(int((rows != NONE).sum()) for rows in batch.values())
 
-    def _own(self, sensor: str, network: nn.Module, chosen: Tensor) -> tuple[NetworkOutput, Tensor]:
+    def _sensor_losses(self, sensor: str, network: nn.Module, chosen: Tensor) -> tuple[NetworkOutput, Tensor]:
         """Return the output of a network for some slides, and its own losses."""
         slides, weights = self.training[sensor], self.weights
         frames, classes = slides.batch(chosen), slides.classes[chosen]
@@ -138,15 +138,17 @@ class JointWork:
 
     def _alignment(self, batch: Mapping[str, Tensor], output: Mapping[str, NetworkOutput]) -> Tensor | None:
         """Return the mean squared difference of latents in rows that two sensors share, averaged over their pairs."""
-        found = []
-        for one, other in combinations(output, 2):
-            latents, valid = zip(*(self._by_row(batch[name], output[name], name) for name in (one, other)), strict=True)
-            both = valid[0] & valid[1]
-            if both.any():
-                found.append(nn.functional.mse_loss(latents[0][both], latents[1][both]))
-        if not found:
+        pair_losses = []
+        for sensor, partner in combinations(output, 2):
+            latents, valid = zip(
+                *(self._by_row(batch[name], output[name], name) for name in (sensor, partner)), strict=True
+            )
+            in_both = valid[0] & valid[1]
+            if in_both.any():
+                pair_losses.append(nn.functional.mse_loss(latents[0][in_both], latents[1][in_both]))
+        if not pair_losses:
             return None
-        mean = torch.stack(found).mean()
+        mean = torch.stack(pair_losses).mean()
         self._sums.add("alignment", mean, 1)
         return mean
 
@@ -159,18 +161,28 @@ class JointWork:
         """
         first = next(iter(batch))
         classes = torch.where(batch[first] != NONE, self.training[first].classes.cpu()[batch[first]], NONE)
-        found = []
-        for one, other in permutations(output, 2):
-            (from_, valid), (to, known) = (self._by_row(batch[name], output[name], name) for name in (one, other))
-            here, there = (classes != NONE).to(valid.device) & valid, (classes != NONE).to(known.device) & known
-            same = classes.to(valid.device)[here][:, None] == classes.to(valid.device)[there]  # (slide, other slide)
+        losses = []
+        for sensor, partner in permutations(output, 2):
+            (from_, valid), (to, partner_valid) = (
+                self._by_row(batch[name], output[name], name) for name in (sensor, partner)
+            )
+            has_class, partner_has_class = (
+                (classes != NONE).to(valid.device) & valid,
+                (classes != NONE).to(partner_valid.device) & partner_valid,
+            )
+            same = (
+                classes.to(valid.device)[has_class][:, None] == classes.to(valid.device)[partner_has_class]
+            )  # (slide, other slide)
             in_pairs = same.any(dim=1)
             if in_pairs.any():
-                cosines = nn.functional.normalize(from_[here], dim=1) @ nn.functional.normalize(to[there], dim=1).t()
+                cosines = (
+                    nn.functional.normalize(from_[has_class], dim=1)
+                    @ nn.functional.normalize(to[partner_has_class], dim=1).t()
+                )
                 shares = nn.functional.log_softmax(cosines / TEMPERATURE, dim=1)[in_pairs]
                 counted = same[in_pairs]
-                found.append(-((shares * counted).sum(dim=1) / counted.sum(dim=1)).mean())
-        return torch.stack(found).mean() if found else None
+                losses.append(-((shares * counted).sum(dim=1) / counted.sum(dim=1)).mean())
+        return torch.stack(losses).mean() if losses else None
 
     def _by_row(self, rows: Tensor, output: NetworkOutput, sensor: str) -> tuple[Tensor, Tensor]:
         """Return latents (row, latent), and which rows hold a slide with a label."""
@@ -189,8 +201,9 @@ class JointWork:
         weights = self.weights
         return {
             "val_loss": sum(
-                weights.classification * one["classification"] + weights.reconstruction * one.get("reconstruction", 0.0)
-                for one in evaluated.values()
+                weights.classification * measures["classification"]
+                + weights.reconstruction * measures.get("reconstruction", 0.0)
+                for measures in evaluated.values()
             ),
             "alignment": self._sums.mean("alignment"),
             "train": {
@@ -207,23 +220,27 @@ class JointWork:
             labelled = labelled[
                 : len(labelled) // self.pairs.batch * self.pairs.batch or None
             ]  # fewer than one count all
-        right = loss = again = 0.0
+        right = loss = reconstruction = 0.0
         for first in range(0, len(labelled), CHUNK):
-            some = labelled[first : first + CHUNK]
-            frames, classes = slides.batch(some), slides.classes[some]
+            batch = labelled[first : first + CHUNK]
+            frames, classes = slides.batch(batch), slides.classes[batch]
             output: NetworkOutput = network(frames)
             right += float((output.scores.argmax(dim=1) == classes).sum())
             loss += float(nn.functional.cross_entropy(output.scores, classes, reduction="sum"))
             if output.frames is not None:
-                again += float(nn.functional.mse_loss(output.frames, frames)) * len(some)
+                reconstruction += float(nn.functional.mse_loss(output.frames, frames)) * len(batch)
         count = len(labelled) or math.nan
-        found = {"accuracy": right / count, "classification": loss / count}
-        return found if isinstance(network, RecurrentClassifier) else {**found, "reconstruction": again / count}
+        measures = {"accuracy": right / count, "classification": loss / count}
+        return (
+            measures
+            if isinstance(network, RecurrentClassifier)
+            else {**measures, "reconstruction": reconstruction / count}
+        )
 
     def ranks(self, line: Mapping[str, Any]) -> dict[str, tuple[float, ...]]:
         """Return the error rate on validation slides, of equals the later epoch being better."""
-        wrong = {sensor: 1 - one["accuracy"] for sensor, one in line["val"].items()}
+        wrong = {sensor: 1 - measures["accuracy"] for sensor, measures in line["val"].items()}
         later = -line["epoch"]
         if self.joint:
             return {"": (sum(wrong.values()) / len(wrong), later)}
-        return {f"{sensor}.": (one, later) for sensor, one in wrong.items()}
+        return {f"{sensor}.": (rate, later) for sensor, rate in wrong.items()}

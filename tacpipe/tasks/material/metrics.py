@@ -49,19 +49,19 @@ def summary(right: Mapping[str, Mapping[str, Bools]], classes: int) -> Tree:
     ``skill`` is the fraction of the mean level's wrong names that the model gets right; ``mcnemar`` the exact probability
     of so unequal disagreements if both were as good.
     """
-    found: Tree = {name: accuracy(by_sensor) for name, by_sensor in right.items()}
-    counts = {sensor: len(one) for sensor, one in right[MODEL].items()}
-    found["chance"] = chance(counts, classes)
-    found["counts"] = {"slides": counts}
+    tree: Tree = {name: accuracy(by_sensor) for name, by_sensor in right.items()}
+    counts = {sensor: len(is_right) for sensor, is_right in right[MODEL].items()}
+    tree["chance"] = chance(counts, classes)
+    tree["counts"] = {"slides": counts}
     if MEAN_LEVEL in right:
-        found["skill"], found["mcnemar"] = {}, {"model_vs_mean_level": {}}
+        tree["skill"], tree["mcnemar"] = {}, {"model_vs_mean_level": {}}
         for sensor, model in right[MODEL].items():
             level = right[MEAN_LEVEL][sensor]
             if len(model) and not level.all():
-                found["skill"][sensor] = float(1 - (~model).mean() / (~level).mean())
+                tree["skill"][sensor] = float(1 - (~model).mean() / (~level).mean())
             if len(model):
-                found["mcnemar"]["model_vs_mean_level"][sensor] = mcnemar(model, level)
-    return found
+                tree["mcnemar"]["model_vs_mean_level"][sensor] = mcnemar(model, level)
+    return tree
 
 
 def confusion_csv(sensors: Sequence[str], materials: Sequence[Any], predicted: Sequence[Any]) -> bytes:

@@ -1,4 +1,4 @@
-"""What `tacpipe.load` returns for a model of the task ``material``: it predicts for recordings and for arrays."""
+"""The loaded model of the task ``material``, which predicts for recordings and for arrays."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class MaterialModel(Classifier):
 
     def predict(
         self,
-        given: Dataset | Recording | Float32s | NDArray[np.float64],
+        slides: Dataset | Recording | Float32s | NDArray[np.float64],
         /,
         sensor: str = "",
         *,
@@ -50,9 +50,9 @@ class MaterialModel(Classifier):
         text where labels are. Raises `TacpipeError` for another shape than the model was trained on, and for values
         that are not finite.
         """
-        if isinstance(given, Dataset | Recording):
-            return prediction.predictions(self, opened(given, self.chain), probabilities=probabilities)
-        return self.naming.named(self.named(self.scores(given, sensor)))
+        if isinstance(slides, Dataset | Recording):
+            return prediction.predictions(self, opened(slides, self.chain), probabilities=probabilities)
+        return self.naming.names_for(self.best_classes(self.scores(slides, sensor)))
 
     def frames(self, recording: Recording) -> tuple[Float32s, str]:
         """Return the slide of a recording in device counts, float32 (time, channel), and its sensor, for `predict`.

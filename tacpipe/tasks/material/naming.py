@@ -1,4 +1,4 @@
-"""Which number of a class each label is: whole numbers are their own, any other labels are numbered in order."""
+"""The number of the class of each label: whole numbers stay, any other labels are numbered in order."""
 
 from __future__ import annotations
 
@@ -29,16 +29,16 @@ class Naming:
     names: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, key: str, labels: Iterable[Attribute]) -> Naming:
+    def from_labels(cls, key: str, labels: Iterable[Attribute]) -> Naming:
         """Return the naming of these labels: whole numbers from 0 stay, any other labels are sorted and numbered as text.
 
-        >>> Naming.of("material", [3, 1]).names, Naming.of("object", ["cup", None, "can"]).names
+        >>> Naming.from_labels("material", [3, 1]).names, Naming.from_labels("object", ["cup", None, "can"]).names
         ((), ('can', 'cup'))
         """
-        known = [label for label in labels if label is not None]
-        if all(_is_number(label) for label in known):
+        present = [label for label in labels if label is not None]
+        if all(_is_number(label) for label in present):
             return cls(key)
-        return cls(key, tuple(sorted({text(label) for label in known})))
+        return cls(key, tuple(sorted({text(label) for label in present})))
 
     def number(self, label: Attribute) -> int:
         """Return the number of a label, `UNKNOWN` for none. Raises `TacpipeError` for one that has no number."""
@@ -64,11 +64,11 @@ class Naming:
         """
         return self.names[number] if self.names else str(number)
 
-    def named(self, numbers: Int64s) -> NDArray[Any]:
+    def names_for(self, numbers: Int64s) -> NDArray[Any]:
         """Return the names of classes (slide,): text, or the numbers where these are the names."""
         if not self.names:
             return numbers
-        return np.array([self.names[one] if one >= 0 else "" for one in numbers.tolist()], dtype=np.str_)
+        return np.array([self.names[number] if number >= 0 else "" for number in numbers.tolist()], dtype=np.str_)
 
     def to_json(self) -> dict[str, Any]:
         """Return what a model's configuration holds of it: nothing of whole numbers under the usual key."""
@@ -80,7 +80,7 @@ class Naming:
         return cls(str(config.get("label", KEY)), tuple(map(str, config.get("names", ()))))
 
 
-NUMBERS = Naming()  # of whole numbers, under the usual key
+NUMBERS = Naming()  # whole numbers, under the usual key
 
 
 def text(label: Attribute) -> str:
@@ -99,7 +99,7 @@ def field(name: str, values: AnyArray, quantity: str) -> tuple[pa.Field, list[An
     about = {"quantity": quantity}
     if values.dtype.kind in "iu":
         return pa.field(name, pa.int32(), metadata=about), values.tolist()
-    return pa.field(name, pa.string(), metadata=about), [one or None for one in values.tolist()]
+    return pa.field(name, pa.string(), metadata=about), [name or None for name in values.tolist()]
 
 
 def _is_number(label: Attribute) -> bool:

@@ -47,17 +47,17 @@ MAPPED_RECONSTRUCTION = 0.05  # weight of a network that is aligned to a frozen 
 def train(
     params: NetworkParams,
     config: Config,
-    known: BySensor,
-    watched: BySensor,
+    training_slides: BySensor,
+    validation_slides: BySensor,
     workspace: Path,
     init: Mapping[str, bytes] | None,
 ) -> dict[str, bytes]:
-    """Return the files of networks, one a sensor, trained on ``known`` slides and chosen on those ``watched``.
+    """Return the files of networks, one per sensor, trained on ``training_slides`` and chosen on ``validation_slides``.
 
     ``config`` is completed. Raises `TacpipeError` where a sensor has no slide to choose by or, learned jointly, lacks
     materials, and `UsageError` for a model to begin with that does not fit.
     """
-    missing = sorted(set(known) - set(watched))
+    missing = sorted(set(training_slides) - set(validation_slides))
     if missing:
         raise TacpipeError(
             f"No recording of {missing[0]} has the role val, and a network is chosen by its validation slides. "
@@ -65,42 +65,51 @@ def train(
         )
     device = devices.kind()
     start = Classifier.load(init) if init else None
-    joint = isinstance(params, Raec) and params.joint and len(known) > 1
+    joint = isinstance(params, Raec) and params.joint and len(training_slides) > 1
     mapped_to = frozen(params)
     if joint:
-        _same_materials(known, Naming.from_json(config))
-    kinds = headers.chosen(params.headers, {name: len(some.layout.channels) for name, some in known.items()})
-    shapes = {name: _shape(params, some, kinds[name], len(config["classes"])) for name, some in known.items()}
-    scalings = {name: Affine.fit(some.frames, params.scaling) for name, some in known.items()}
-    held = held_out.materials(params.hold_out, config["classes"], known, Naming.from_json(config))
+        _same_materials(training_slides, Naming.from_json(config))
+    kinds = headers.chosen(
+        params.headers, {name: len(sensor_slides.layout.channels) for name, sensor_slides in training_slides.items()}
+    )
+    shapes = {
+        name: _shape(params, sensor_slides, kinds[name], len(config["classes"]))
+        for name, sensor_slides in training_slides.items()
+    }
+    scalings = {
+        name: Affine.fit(sensor_slides.frames, params.scaling) for name, sensor_slides in training_slides.items()
+    }
+    held_out_materials = held_out.materials(
+        params.hold_out, config["classes"], training_slides, Naming.from_json(config)
+    )
     if start:
-        _same_space(start, mapped_to, config, known)
+        _same_space(start, mapped_to, config, training_slides)
         shapes[mapped_to] = Shape(**start.config["shapes"][mapped_to])
         scalings[mapped_to] = _reader(start, mapped_to).scaling
         config["trained_on"] = seen(config["trained_on"], start.config["trained_on"])
-    learned, chosen_on = (
+    training, validation = (
         {
-            name: _scaled(params, config, some, scalings[name], held, device, place)
-            for place, (name, some) in enumerate(part.items())
+            name: _scaled(params, config, sensor_slides, scalings[name], held_out_materials, device, place)
+            for place, (name, sensor_slides) in enumerate(part.items())
         }
-        for part in (known, watched)
+        for part in (training_slides, validation_slides)
     )
     partners = _partners(params, len(config["classes"]))
-    config |= _described(config["classes"], shapes, scalings, held, partners, joint=joint)
-    pairs = _pairs(params, learned, partners)
-    work = JointWork(learned, chosen_on, pairs, _weights(params, joint), mapped_to, params.drop_last)
+    config |= _described(config["classes"], shapes, scalings, held_out_materials, partners, joint=joint)
+    pairs = _pairs(params, training, partners)
+    work = JointWork(training, validation, pairs, _weights(params, joint), mapped_to, params.drop_last)
 
     def build() -> nn.Module:
-        made = _built(params, shapes, start, mapped_to).to(device)
-        for name, network in made.items():
-            networks.check(network, params, learned[name].frames, shapes[name].classes)
-        return made
+        built = _built(params, shapes, start, mapped_to).to(device)
+        for name, network in built.items():
+            networks.check(network, params, training[name].frames, shapes[name].classes)
+        return built
 
     trained = loop.train(build, work, loop.Schedule.of(params, params.seed), workspace)
     config["validation"] = _validation(trained.history, work.joint)
     files = _files(trained, config, params)
     if params.baselines:
-        files[BASELINES] = _network_baselines(Classifier.load(files), known, params)
+        files[BASELINES] = _network_baselines(Classifier.load(files), training_slides, params)
     return files
 
 
@@ -120,23 +129,26 @@ def _described(
     classes: Sequence[int],
     shapes: Mapping[str, Shape],
     scalings: Mapping[str, Affine],
-    held: Mapping[str, set[int]],
+    held_out_materials: Mapping[str, set[int]],
     partners: Mapping[int, int] | None,
     *,
     joint: bool,
 ) -> dict[str, Any]:
-    """Return what the description of a model states of networks."""
-    found: dict[str, Any] = {
+    """Return the part of a model's configuration that describes its networks."""
+    description: dict[str, Any] = {
         "shapes": {name: dataclasses.asdict(shape) for name, shape in shapes.items()},
         "scaling": {
-            name: {key: value.tolist() for key, value in one.to_tensors().items()} for name, one in scalings.items()
+            name: {key: value.tolist() for key, value in scaling.to_tensors().items()}
+            for name, scaling in scalings.items()
         },
         "joint": joint,
-        "held_out": {name: sorted(materials) for name, materials in held.items()},
+        "held_out": {name: sorted(materials) for name, materials in held_out_materials.items()},
     }
     if partners is not None:
-        found["partners"] = {str(classes[one]): classes[other] for one, other in sorted(partners.items())}
-    return found
+        description["partners"] = {
+            str(classes[number]): classes[partner] for number, partner in sorted(partners.items())
+        }
+    return description
 
 
 def _files(trained: loop.Trained, config: Config, params: NetworkParams) -> dict[str, bytes]:
@@ -150,7 +162,7 @@ def _files(trained: loop.Trained, config: Config, params: NetworkParams) -> dict
 
 def _pairs(params: NetworkParams, slides: Mapping[str, ScaledSlides], partners: Mapping[int, int] | None) -> Pairs:
     return Pairs(
-        {name: some.classes.cpu() for name, some in slides.items()},
+        {name: scaled.classes.cpu() for name, scaled in slides.items()},
         params.batch,
         pairing=params.pairing if isinstance(params, Raec) else Pairs.pairing,
         shuffle=params.shuffle,
@@ -162,8 +174,8 @@ def _pairs(params: NetworkParams, slides: Mapping[str, ScaledSlides], partners: 
     )
 
 
-def _shape(params: NetworkParams, some: Slides, header: str, classes: int) -> Shape:
-    shape = Shape(channels=len(some.layout.channels), classes=classes, header=header, hidden=params.hidden)
+def _shape(params: NetworkParams, slides: Slides, header: str, classes: int) -> Shape:
+    shape = Shape(channels=len(slides.layout.channels), classes=classes, header=header, hidden=params.hidden)
     if isinstance(params, XLSTM):
         return dataclasses.replace(shape, dropout=params.dropout)
     if not isinstance(params, Raec):
@@ -176,44 +188,50 @@ def _shape(params: NetworkParams, some: Slides, header: str, classes: int) -> Sh
 def _scaled(
     params: NetworkParams,
     config: Config,
-    some: Slides,
+    slides: Slides,
     scaled: Affine,
-    held: Mapping[str, set[int]],
+    held_out_materials: Mapping[str, set[int]],
     device: str,
     place: int,
 ) -> ScaledSlides:
     """Return slides as networks read them; what is held out or not among the training slides' classes has no label."""
-    name = some.layout.sensor
-    numbers = {material: number for number, material in enumerate(config["classes"]) if material not in held[name]}
-    materials = readouts.permuted(params, some.materials, place)
+    name = slides.layout.sensor
+    numbers = {
+        material: number
+        for number, material in enumerate(config["classes"])
+        if material not in held_out_materials[name]
+    }
+    materials = readouts.permuted(params, slides.materials, place)
     classes = torch.tensor([numbers.get(int(material), NONE) for material in materials])
     if not (classes != NONE).any():
         raise TacpipeError(f"hold_out leaves {name} no material to learn; leave at least one.")
-    return ScaledSlides(torch.from_numpy(scaled.apply(some.frames)).to(device), classes.to(device))
+    return ScaledSlides(torch.from_numpy(scaled.apply(slides.frames)).to(device), classes.to(device))
 
 
-def _same_materials(known: BySensor, naming: Naming) -> None:
+def _same_materials(training_slides: BySensor, naming: Naming) -> None:
     """Refuse joint learning where a sensor lacks a material that another has."""
-    materials = {name: {int(one) for one in some.materials} for name, some in known.items()}
-    every = set().union(*materials.values())
-    for name, own in materials.items():
-        if own != every:
-            lacking = ", ".join(map(naming.name, sorted(every - own)))
+    materials = {
+        name: {int(material) for material in sensor_slides.materials} for name, sensor_slides in training_slides.items()
+    }
+    all_materials = set().union(*materials.values())
+    for name, sensor_materials in materials.items():
+        if sensor_materials != all_materials:
+            lacking = ", ".join(map(naming.name, sorted(all_materials - sensor_materials)))
             raise TacpipeError(
                 f"{name} has no training slide of {naming.key} {lacking}, which other sensors have, so they cannot be "
                 f"learned jointly. Exclude those slides, record the material, or train with --no-joint."
             )
 
 
-def _same_space(start: Classifier, known: str, config: Config, slides: BySensor) -> None:
+def _same_space(start: Classifier, frozen_sensor: str, config: Config, slides: BySensor) -> None:
     """Refuse a model of --init that does not know the sensor or the same materials."""
-    if known not in slides:
-        raise UsageError(f"frozen_sensor is {known}; the recordings are of {', '.join(slides)}.")
+    if frozen_sensor not in slides:
+        raise UsageError(f"frozen_sensor is {frozen_sensor}; the recordings are of {', '.join(slides)}.")
     if start.architecture != RAEC:
         raise TacpipeError(
             f"The model of --init is of the architecture {start.architecture}; its space must be of {RAEC}."
         )
-    start.check(slides[known])
+    start.check(slides[frozen_sensor])
     if list(start.classes) != config["classes"] or start.naming != Naming.from_json(config):
         raise TacpipeError(
             f"The model of --init names {listed(map(start.naming.name, start.classes))} and the recordings have "
@@ -242,40 +260,40 @@ def _weights(params: NetworkParams, joint: bool) -> Weights:
 
 def _built(params: NetworkParams, shapes: Mapping[str, Shape], start: Classifier | None, frozen: str) -> nn.ModuleDict:
     """Return the networks by sensor; that of ``frozen`` is taken over and frozen, with its classifier in all others."""
-    built = nn.ModuleDict({name: cast(nn.Module, networks.build(params, one)) for name, one in shapes.items()})
+    built = nn.ModuleDict({name: cast(nn.Module, networks.build(params, shape)) for name, shape in shapes.items()})
     if start:
-        known = _reader(start, frozen).network
+        frozen_network = _reader(start, frozen).network
         for name, network in built.items():
             if name == frozen:
-                network.load_state_dict(known.state_dict())
+                network.load_state_dict(frozen_network.state_dict())
                 network.requires_grad_(False)
             else:
-                network.get_submodule("classifier").load_state_dict(known.classifier.state_dict())
+                network.get_submodule("classifier").load_state_dict(frozen_network.classifier.state_dict())
                 network.get_submodule("classifier").requires_grad_(False)
     return built
 
 
 def _validation(history: Sequence[loop.Line], joint: bool) -> dict[str, Any]:
-    """Return the epoch that each sensor's weights are of, and its accuracy there."""
+    """Return the epoch that each sensor's weights come from, and the accuracy at that epoch."""
 
     def chosen(sensor: str) -> loop.Line:
-        of = list(history[0]["val"]) if joint else [sensor]
-        return max(history, key=lambda line: (sum(line["val"][one]["accuracy"] for one in of), line["epoch"]))
+        sensors = list(history[0]["val"]) if joint else [sensor]
+        return max(history, key=lambda line: (sum(line["val"][name]["accuracy"] for name in sensors), line["epoch"]))
 
-    found = {sensor: chosen(sensor) for sensor in history[0]["val"]}
+    best_lines = {sensor: chosen(sensor) for sensor in history[0]["val"]}
     return {
-        "epoch": {sensor: line["epoch"] for sensor, line in found.items()},
-        "accuracy": {sensor: line["val"][sensor]["accuracy"] for sensor, line in found.items()},
+        "epoch": {sensor: line["epoch"] for sensor, line in best_lines.items()},
+        "accuracy": {sensor: line["val"][sensor]["accuracy"] for sensor, line in best_lines.items()},
     }
 
 
-def _network_baselines(trained: Classifier, known: BySensor, params: Params) -> bytes:
+def _network_baselines(trained: Classifier, training_slides: BySensor, params: Params) -> bytes:
     """Return the mean-level baseline, and a readout of the networks' own latents fitted to shuffled labels."""
-    found: dict[str, np.ndarray] = {}
-    for place, (name, some) in enumerate(known.items()):
-        latents = trained.readers[name].read(some.frames).latents
+    arrays: dict[str, np.ndarray] = {}
+    for place, (name, slides) in enumerate(training_slides.items()):
+        latents = trained.readers[name].read(slides.frames).latents
         assert latents is not None
-        shuffled = np.random.default_rng([params.seed, 3, place]).permutation(some.materials)
-        found |= readouts.stored(MEAN_LEVEL, name, Level.fit(some.frames, some.materials))
-        found |= readouts.stored(PERMUTED_LABELS, name, Level.fit(latents[:, None], shuffled))
-    return readouts.packed(found)
+        shuffled = np.random.default_rng([params.seed, 3, place]).permutation(slides.materials)
+        arrays |= readouts.stored(MEAN_LEVEL, name, Level.fit(slides.frames, slides.materials))
+        arrays |= readouts.stored(PERMUTED_LABELS, name, Level.fit(latents[:, None], shuffled))
+    return readouts.packed(arrays)

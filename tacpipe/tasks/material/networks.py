@@ -22,24 +22,24 @@ def build(params: Material, shape: Shape) -> Network:
 
     Raises `TacpipeError` where they build something else.
     """
-    made = params.build(shape) if isinstance(params, NetworkParams) else None
-    if not isinstance(made, nn.Module):
+    network = params.build(shape) if isinstance(params, NetworkParams) else None
+    if not isinstance(network, nn.Module):
         raise TacpipeError(
-            f"The architecture {params.architecture} built {type(made).__name__}; it must build a torch.nn.Module."
+            f"The architecture {params.architecture} built {type(network).__name__}; it must build a torch.nn.Module."
         )
-    return cast(Network, made if hasattr(made, "classify") else PlainClassifier(made))
+    return cast(Network, network if hasattr(network, "classify") else PlainClassifier(network))
 
 
 @torch.no_grad()
 def check(network: nn.Module, params: NetworkParams, slides: Tensor, classes: int) -> None:
     """Raise `TacpipeError` where a network returns something else than scores for ``slides`` (slide, time, channel)."""
     training = network.training
-    found = network.eval()(slides[:TRIED].transpose(0, 1).contiguous(), decode=False)
+    output = network.eval()(slides[:TRIED].transpose(0, 1).contiguous(), decode=False)
     network.train(training)
-    scores, wanted = getattr(found, "scores", None), (len(slides[:TRIED]), classes)
-    if not isinstance(scores, Tensor) or tuple(scores.shape) != wanted:
+    scores, shape = getattr(output, "scores", None), (len(slides[:TRIED]), classes)
+    if not isinstance(scores, Tensor) or tuple(scores.shape) != shape:
         returned = str(tuple(scores.shape)) if isinstance(scores, Tensor) else type(scores).__name__
         raise TacpipeError(
-            f"The network of the architecture {params.architecture} returns {returned} for {wanted[0]} slides; it must "
-            f"return scores (slide, class), here {wanted}."
+            f"The network of the architecture {params.architecture} returns {returned} for {shape[0]} slides; it must "
+            f"return scores (slide, class), here {shape}."
         )

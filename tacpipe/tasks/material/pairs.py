@@ -1,4 +1,4 @@
-"""Which slides of unlike sensors are learned from together: batches whose rows hold the same material.
+"""Batches of slides of unlike sensors that are learned from together: each row holds one material.
 
 No slide of one sensor belongs to one of another; all that a pair shares is its material. So the latents are drawn
 together by labels, and a pairing of *other* materials serves as the control: see `permuted_classes`.
@@ -30,9 +30,9 @@ class Pairs:
     shuffle: bool = True  # other batches every epoch; without, pairs are fixed as well
     drop_last: bool = False  # leave out the batch that is not full
     subsample_sensor: str = ""  # sensor that learns from a part of the batches alone
-    subsample_percent: int = 100  # of the batches
+    subsample_percent: int = 100  # percentage of the batches
     partners: Mapping[int, int] | None = None  # class of the first sensor -> class of the others, of permuted pairs
-    seed: int = 0  # of what is drawn once
+    seed: int = 0  # seed of the pairs and orders that are drawn once
 
     def __post_init__(self) -> None:
         """Refuse options that do not fit."""
@@ -63,39 +63,39 @@ class Pairs:
         batches = [rows[:, first : first + size] for first in range(0, rows.shape[1], size)]
         if (self.drop_last or self.subsample_sensor) and batches and batches[-1].shape[1] < size:
             batches.pop()
-        found = []
+        slide_batches = []
         for number, batch in enumerate(batches):
-            of = dict(zip(self.classes, batch.clone(), strict=True))
+            slides_by_sensor = dict(zip(self.classes, batch.clone(), strict=True))
             if self.subsample_sensor and not visited(number, self.subsample_percent):
-                of[self.subsample_sensor][:] = NONE
-            if any((one != NONE).any() for one in of.values()):
-                found.append(of)
-        return found
+                slides_by_sensor[self.subsample_sensor][:] = NONE
+            if any((slide_rows != NONE).any() for slide_rows in slides_by_sensor.values()):
+                slide_batches.append(slides_by_sensor)
+        return slide_batches
 
     def _rows(self) -> Tensor:
         """Return the slide of each sensor in every row (sensor, row), in the order of the epoch."""
-        once = torch.Generator().manual_seed(self.seed)
-        pairs = None if self.pairing != "fixed" and self.shuffle else once
+        seeded = torch.Generator().manual_seed(self.seed)
+        pairs = None if self.pairing != "fixed" and self.shuffle else seeded
         rows = self._paired(pairs)
-        order = torch.randperm(rows.shape[1], generator=None if self.shuffle else once)
+        order = torch.randperm(rows.shape[1], generator=None if self.shuffle else seeded)
         return rows[:, order]
 
     def _paired(self, generator: torch.Generator | None) -> Tensor:
         """Return rows (sensor, row) of one class each, those without label at the end, alone in their rows."""
         blocks = []
         first = next(iter(self.classes.values()))
-        known = sorted({int(c) for classes in self.classes.values() for c in set(classes.tolist()) if c != NONE})
-        for wanted in known:
+        all_classes = sorted({int(c) for classes in self.classes.values() for c in set(classes.tolist()) if c != NONE})
+        for number in all_classes:
             members = []
             for classes in self.classes.values():
-                own = wanted if classes is first or self.partners is None else self.partners[wanted]
-                at = (classes == own).nonzero()[:, 0]
+                sensor_class = number if classes is first or self.partners is None else self.partners[number]
+                at = (classes == sensor_class).nonzero()[:, 0]
                 members.append(at[torch.randperm(len(at), generator=generator)])
             blocks.append(_side_by_side(members))
         for place, classes in enumerate(self.classes.values()):
-            alone = (classes == NONE).nonzero()[:, 0]
-            block = torch.full((len(self.classes), len(alone)), NONE)
-            block[place] = alone
+            unlabelled = (classes == NONE).nonzero()[:, 0]
+            block = torch.full((len(self.classes), len(unlabelled)), NONE)
+            block[place] = unlabelled
             blocks.append(block)
         return torch.cat(blocks, dim=1)
 
@@ -122,13 +122,13 @@ def permuted_classes(classes: Sequence[int], seed: int) -> dict[int, int]:
     if len(classes) < 2:
         raise TacpipeError(f"{len(classes)} material cannot be paired with another one; permuted needs two or more.")
     order = np.random.default_rng([seed, 1]).permutation(np.array(sorted(classes)))
-    return {int(one): int(other) for one, other in zip(order, np.roll(order, 1), strict=True)}
+    return {int(number): int(partner) for number, partner in zip(order, np.roll(order, 1), strict=True)}
 
 
 def _side_by_side(members: Sequence[Tensor]) -> Tensor:
     """Return what may be of unlike lengths as rows of one tensor, NONE at the end of the shorter."""
     longest = max(map(len, members))
     block = torch.full((len(members), longest), NONE)
-    for row, found in zip(block, members, strict=True):
-        row[: len(found)] = found
+    for row, indices in zip(block, members, strict=True):
+        row[: len(indices)] = indices
     return block

@@ -43,7 +43,7 @@ HeldOut = Annotated[str, Assignments(Annotated[str, CommaList(least=1)], between
 
 @dataclass(frozen=True)
 class Material:
-    """What every classifier of materials reads and learns."""
+    """Params that every classifier of materials has."""
 
     ARCHITECTURES: ClassVar[str] = "material"  # the task, as entry points name it
     architecture: str = "minirocket"
@@ -81,7 +81,7 @@ class Minirocket(Material):
 
     # classifier: minirocket, random convolutions and a linear readout
     architecture: Literal["minirocket"] = "minirocket"
-    features: Annotated[int, Range(84)] = 10_000  # of each sensor
+    features: Annotated[int, Range(84)] = 10_000  # features of each sensor
     use_validation: bool = True  # learn from validation slides too: nothing is chosen by them
     PRESETS: ClassVar[Presets] = {"quick": {"features": 1_000}}
 
@@ -139,7 +139,7 @@ class Estimator(Material, ABC):
 
 @dataclass(frozen=True)
 class Network(Material, ABC):
-    """What networks that classify slides have in common; an architecture extends it."""
+    """Params that networks for slides have in common; an architecture extends it."""
 
     hold_out: HeldOut = ""  # materials whose labels a sensor does not learn, as roboskin=17,18,19,20
     # sensor that learns from a part of the batches alone; needs --no-shuffle
@@ -150,19 +150,19 @@ class Network(Material, ABC):
     # for such a grid, else none
     headers: Annotated[str, Assignments(Literal["none", "mlp", "cnn"])] = ""
     hidden: PositiveInt = 90  # units of each LSTM
-    # of the input: none; standard: mean 0 and deviation 1 of each channel; spread: one deviation for all channels,
+    # scaling of the input: none; standard: mean 0 and deviation 1 of each channel; spread: one deviation for all channels,
     # zero stays zero; log: spread of log(1 + x)
     scaling: Literal["none", "standard", "spread", "log"] = "none"
     epochs: PositiveInt = 300  # maximum number of passes over the training slides
     batch: PositiveInt = 32  # slides of each sensor per step of the optimiser
-    learning_rate: PositiveFloat = 5e-4  # of Adam
+    learning_rate: PositiveFloat = 5e-4  # learning rate of Adam
     cycle: bool = False  # raise and lower the learning rate once over all epochs
     patience: NonNegativeInt = 0  # epochs without a better validation accuracy after which training ends; 0: all epochs
     shuffle: bool = True  # other batches every epoch
     drop_last: bool = False  # leave out the batch that is not full, in evaluation too, as the published code does
     # weights to keep: best, of the highest validation accuracy; last, of the last epoch
     select: Literal["best", "last"] = "best"
-    # of products in training; bfloat16 takes half the memory and rounds to 3 digits, weights stay in float32
+    # precision of products in training; bfloat16 takes half the memory and rounds to 3 digits, weights stay in float32
     precision: Precision = added("float32")
 
     @abstractmethod
@@ -203,7 +203,7 @@ class Raec(Network):
     # raec: the paper's recurrent autoencoder
     architecture: Literal["raec"] = "raec"
     joint: bool = True  # align the latents of unlike sensors on slides of the same material
-    # with --init: sensor of that model whose network is frozen; the latents of the others are aligned to its own
+    # sensor of the --init model whose network is frozen; the latents of the others are aligned to its own
     frozen_sensor: Annotated[str, StoredAs("known")] = ""
     # pairs of joint learning: random; fixed: drawn once; permuted: of other materials, a negative control
     pairing: Literal["random", "fixed", "permuted"] = "random"
@@ -213,9 +213,9 @@ class Raec(Network):
     latents: PositiveInt = 40  # numbers that a slide is encoded to
     # how a cnn is undone: nearest; last, with the last frame's indices, as published
     unpool: Literal["nearest", "last"] = "nearest"
-    reconstruction_weight: NonNegativeFloat = 0.01  # of the squared error of reconstructed slides
-    classification_weight: NonNegativeFloat = 1.0  # of the negative log-likelihood of classes
-    alignment_weight: NonNegativeFloat = 1.0  # of the alignment loss between sensors
+    reconstruction_weight: NonNegativeFloat = 0.01  # weight of the squared error of reconstructed slides
+    classification_weight: NonNegativeFloat = 1.0  # weight of the negative log-likelihood of classes
+    alignment_weight: NonNegativeFloat = 1.0  # weight of the alignment loss between sensors
     align_from: NonNegativeInt = 20  # first epoch, from 0, in which latents are aligned
     # fraction of latents left out of each training step; 0 as in the published code, 0.2 in the paper's text
     dropout: Dropout = 0.0
@@ -269,4 +269,4 @@ class XLSTM(Network):
         return RecurrentClassifier(shape)
 
 
-Params = Material  # of any architecture
+Params = Material  # params of any architecture

@@ -27,8 +27,8 @@ def predict(
     where the recordings are not what the model reads.
     ``probabilities`` adds, of a calibrated model, a ``probability_…`` of each class and the ``answer``: a name or unknown.
     """
-    found = predictions(Classifier.load(model), recordings, probabilities=probabilities)
-    return Result({PREDICTIONS: RecordingOutput(found)})
+    table = predictions(Classifier.load(model), recordings, probabilities=probabilities)
+    return Result({PREDICTIONS: RecordingOutput(table)})
 
 
 def predictions(classifier: Classifier, recordings: Dataset, *, probabilities: bool = False) -> pa.Table:
@@ -44,27 +44,30 @@ def predictions(classifier: Classifier, recordings: Dataset, *, probabilities: b
         outputs.append(classifier.readers[sensor].read(slides.frames))
         if probabilities:
             answers += classifier.answered(outputs[-1].scores, slides.frames, sensor)
-            likely.append(classifier.known[sensor].probabilities(outputs[-1].scores))
-    scores = np.concatenate([one.scores for one in outputs])
+            likely.append(classifier.calibrations[sensor].probabilities(outputs[-1].scores))
+    scores = np.concatenate([output.scores for output in outputs])
     columns: list[tuple[pa.Field, Any]] = [
         (pa.field("recording", pa.string()), names),
         (pa.field("sensor", pa.string()), sensors),
-        naming.field("material", classifier.naming.named(classifier.named(scores)), "prediction"),
+        naming.field("material", classifier.naming.names_for(classifier.best_classes(scores)), "prediction"),
         *score_columns(classifier, scores),
     ]
     if probabilities:
         columns += probability_columns(classifier, np.concatenate(likely))
         columns.append((pa.field("answer", pa.string(), metadata={"quantity": "prediction"}), answers))
-    latents = [one.latents for one in outputs if one.latents is not None]
+    latents = [output.latents for output in outputs if output.latents is not None]
     if latents:
         columns += latent_columns(np.concatenate(latents))
     arrays = [pa.array(values, field.type) for field, values in columns]
     return pa.Table.from_arrays(arrays, schema=pa.schema([field for field, _ in columns]))
 
 
-def probability_columns(classifier: Classifier, found: Float32s) -> list[tuple[pa.Field, Any]]:
+def probability_columns(classifier: Classifier, probabilities: Float32s) -> list[tuple[pa.Field, Any]]:
     """Return a column of calibrated probabilities a material."""
     return [
-        (pa.field(f"probability_{name.zfill(2)}", pa.float32(), metadata={"quantity": "probability"}), found[:, number])
+        (
+            pa.field(f"probability_{name.zfill(2)}", pa.float32(), metadata={"quantity": "probability"}),
+            probabilities[:, number],
+        )
         for number, name in enumerate(classifier.names)
     ]

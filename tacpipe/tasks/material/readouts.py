@@ -1,4 +1,4 @@
-"""What is fitted at once, without epochs: convolutional features or spectra and a readout of them, and estimators."""
+"""Fit models that need no epochs: convolutional features or spectra with a readout, and estimators."""
 
 from __future__ import annotations
 
@@ -37,12 +37,14 @@ from tacpipe.tasks.material.slides import BySensor, Slides
 Arrays = dict[str, np.ndarray]
 
 
-def rockets(params: Minirocket, config: Config, known: BySensor, watched: BySensor) -> dict[str, bytes]:
+def rockets(
+    params: Minirocket, config: Config, training_slides: BySensor, validation_slides: BySensor
+) -> dict[str, bytes]:
     """Return the files of a model of patterns and a readout, of each sensor alone."""
     tensors: Arrays = {}
     baselines: Arrays = {}
-    for place, (name, some) in enumerate(known.items()):
-        frames, materials = _labelled(params, some, watched.get(name), place)
+    for place, (name, slides) in enumerate(training_slides.items()):
+        frames, materials = _labelled(params, slides, validation_slides.get(name), place)
         strong = MinirocketClassifier.fit(frames, materials, seed=params.seed, features=params.features)
         tensors |= {f"{name}.{key}": value for key, value in strong.to_tensors().items()}
         if params.baselines:
@@ -52,13 +54,15 @@ def rockets(params: Minirocket, config: Config, known: BySensor, watched: BySens
     return _files(config, tensors, baselines)
 
 
-def estimators(params: Estimator, config: Config, known: BySensor, watched: BySensor) -> dict[str, bytes]:
+def estimators(
+    params: Estimator, config: Config, training_slides: BySensor, validation_slides: BySensor
+) -> dict[str, bytes]:
     """Return the files of estimators of scikit-learn, of each sensor alone."""
     fitted: dict[str, Fitted] = {}
     shuffled: dict[str, Fitted] = {}
     levels: Arrays = {}
-    for place, (name, some) in enumerate(known.items()):
-        frames, materials = _labelled(params, some, watched.get(name), place)
+    for place, (name, slides) in enumerate(training_slides.items()):
+        frames, materials = _labelled(params, slides, validation_slides.get(name), place)
         fitted[name] = Fitted.fit(params, frames, materials)
         if params.baselines:
             permutation = np.random.default_rng([params.seed, 3, place]).permutation(materials)
@@ -70,15 +74,17 @@ def estimators(params: Estimator, config: Config, known: BySensor, watched: BySe
     return files
 
 
-def statistics(params: Statistics, config: Config, known: BySensor, watched: BySensor) -> dict[str, bytes]:
+def statistics(
+    params: Statistics, config: Config, training_slides: BySensor, validation_slides: BySensor
+) -> dict[str, bytes]:
     """Return the files of a model of statistics and a readout, of each sensor alone.
 
     Its baselines are those of all models and the same readout of the level alone and of slides without their level.
     """
     tensors: Arrays = {}
     baselines: Arrays = {}
-    for place, (name, some) in enumerate(known.items()):
-        frames, materials = _labelled(params, some, watched.get(name), place)
+    for place, (name, slides) in enumerate(training_slides.items()):
+        frames, materials = _labelled(params, slides, validation_slides.get(name), place)
         fitted = StatisticsClassifier.fit(frames, materials)
         tensors |= {f"{name}.{key}": value for key, value in fitted.to_tensors().items()}
         if params.baselines:
@@ -91,21 +97,25 @@ def statistics(params: Statistics, config: Config, known: BySensor, watched: ByS
 
 
 def spectra(
-    params: Spectra, config: Config, known: BySensor, watched: BySensor, held: Mapping[str, Iterable[int]]
+    params: Spectra,
+    config: Config,
+    training_slides: BySensor,
+    validation_slides: BySensor,
+    held_out: Mapping[str, Iterable[int]],
 ) -> dict[str, bytes]:
     """Return the files of a model of spectra over spatial frequency, by which sensors learn materials from one another.
 
-    ``held`` are the materials whose labels a sensor does not learn; nothing that is fitted for it sees their slides. Raises
-    `TacpipeError` where a sensor's speed or rate is not known, where sensors share too few materials, and where no
+    ``held_out`` are the materials whose labels a sensor does not learn; nothing that is fitted for it sees their slides.
+    Raises `TacpipeError` where a sensor's speed or rate is not known, where sensors share too few materials, and where no
     sensor learns a material.
     """
-    sampled = _samplings(params.speeds, known)
+    sampled = _samplings(params.speeds, training_slides)
     bands = Bands.common(list(sampled.values()))
     labelled: dict[str, transfer.Labelled] = {}
     baselines: Arrays = {}
-    for place, (name, some) in enumerate(known.items()):
-        frames, materials = _labelled(params, some, watched.get(name), place)
-        free = ~np.isin(materials, list(held[name]))
+    for place, (name, slides) in enumerate(training_slides.items()):
+        frames, materials = _labelled(params, slides, validation_slides.get(name), place)
+        free = ~np.isin(materials, list(held_out[name]))
         frames, materials = frames[free], materials[free]
         labelled[name] = transfer.Labelled(
             bands.log_power(frames, sampled[name].rate_hz, sampled[name].speed_m_s), materials
@@ -114,8 +124,8 @@ def spectra(
             shuffled = np.random.default_rng([params.seed, 3, place]).permutation(materials)
             baselines |= stored(MEAN_LEVEL, name, Level.fit(frames, materials))
             baselines |= stored(PERMUTED_LABELS, name, Level.fit(labelled[name].features[:, None], shuffled))
-    named = {name: {int(one) for one in some.labels} for name, some in labelled.items()}
-    missing = sorted(set(config["classes"]) - set().union(*named.values()))
+    learned = {name: {int(number) for number in sensor_labels.labels} for name, sensor_labels in labelled.items()}
+    missing = sorted(set(config["classes"]) - set().union(*learned.values()))
     if missing:
         raise UsageError(
             f"hold_out leaves no sensor that learns {Naming.from_json(config).name(missing[0])}; leave at least one."
@@ -124,51 +134,56 @@ def spectra(
         "spectra": {
             "way_m": bands.way_m,
             "edges_per_m": bands.edges_per_m.tolist(),
-            "speed_m_s": {name: one.speed_m_s for name, one in sampled.items()},
+            "speed_m_s": {name: sampling.speed_m_s for name, sampling in sampled.items()},
         },
-        "held_out": {name: sorted(set(config["classes"]) - own) for name, own in named.items()},
+        "held_out": {
+            name: sorted(set(config["classes"]) - learned_materials) for name, learned_materials in learned.items()
+        },
     }
     tensors = {
         f"{name}.{key}": value
-        for name, own in labelled.items()
-        for key, value in Transfer.fit(own, [labelled[other] for other in labelled if other != name])
+        for name, training_spectra in labelled.items()
+        for key, value in Transfer.fit(training_spectra, [labelled[other] for other in labelled if other != name])
         .to_tensors()
         .items()
     }
     return _files(config, tensors, baselines)
 
 
-def _samplings(speeds: str, known: BySensor) -> dict[str, Sampling]:
+def _samplings(speeds: str, training_slides: BySensor) -> dict[str, Sampling]:
     """Return the sampling of each sensor's slides, at the median of the speeds that are recorded.
 
     ``speeds``, like ``biotac=0.025,roboskin=0.05``, is of sensors whose slides have none.
     """
-    given = Assignments(float).items(speeds)
-    found = {}
-    for name, some in known.items():
-        recorded = some.speeds_m_s[some.speeds_m_s > 0]
-        if not len(recorded) and name not in given:
+    stated_speeds = Assignments(float).items(speeds)
+    samplings = {}
+    for name, slides in training_slides.items():
+        recorded = slides.speeds_m_s[slides.speeds_m_s > 0]
+        if not len(recorded) and name not in stated_speeds:
             raise UsageError(
                 f"The slides of {name} have no speed, and speeds is {speeds!r}; add {name}=0.05, or what it is."
             )
-        if some.layout.rate_hz <= 0:
+        if slides.layout.rate_hz <= 0:
             raise TacpipeError(
-                f"{some.names[0]} has no rate, and the length of a wave needs one; set it with "
-                f"`tacpipe label RECORDINGS {some.names[0]} --label rate_hz=100`, or what it is."
+                f"{slides.names[0]} has no rate, and the length of a wave needs one; set it with "
+                f"`tacpipe label RECORDINGS {slides.names[0]} --label rate_hz=100`, or what it is."
             )
-        speed_m_s = float(np.median(recorded)) if len(recorded) else given[name]
-        found[name] = Sampling(some.layout.frames, some.layout.rate_hz, speed_m_s)
-    return found
+        speed_m_s = float(np.median(recorded)) if len(recorded) else stated_speeds[name]
+        samplings[name] = Sampling(slides.layout.frames, slides.layout.rate_hz, speed_m_s)
+    return samplings
 
 
 def _labelled(
-    params: Minirocket | Statistics | Spectra | Estimator, some: Slides, watched: Slides | None, place: int
+    params: Minirocket | Statistics | Spectra | Estimator,
+    training_slides: Slides,
+    validation_slides: Slides | None,
+    place: int,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the frames and materials to learn from: those of validation too, where params ask for it."""
-    frames, materials = some.frames, permuted(params, some.materials, place)
-    if params.use_validation and watched is not None and params.labels == "true":
-        frames = np.concatenate([frames, watched.frames])
-        materials = np.concatenate([materials, watched.materials])
+    frames, materials = training_slides.frames, permuted(params, training_slides.materials, place)
+    if params.use_validation and validation_slides is not None and params.labels == "true":
+        frames = np.concatenate([frames, validation_slides.frames])
+        materials = np.concatenate([materials, validation_slides.materials])
     return frames, materials
 
 

@@ -1,4 +1,4 @@
-"""What recordings must hold for the task ``material``."""
+"""The streams and labels that recordings must have for the task ``material``."""
 
 from __future__ import annotations
 

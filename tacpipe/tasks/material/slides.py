@@ -21,12 +21,12 @@ if TYPE_CHECKING:
 
 STREAM = "slide"
 TACTILE = "tactile"
-NEAR = 0.02  # of a rate, by which two slides of a sensor may differ
+NEAR = 0.02  # largest difference between the rates of a sensor's slides, as a fraction of the rate
 
 
 @dataclass(frozen=True)
 class Layout:
-    """What a sensor's slides look like: which channels, how many frames, how many a second, and how they are arranged."""
+    """The layout of a sensor's slides: their channels, frames, frames per second and arrangement."""
 
     sensor: str
     channels: tuple[str, ...]
@@ -36,14 +36,14 @@ class Layout:
 
     def alike(self, other: Layout) -> bool:
         """Return whether slides of both can be read as one: the rate may differ a little, as stamps do, or be unknown."""
-        apart = abs(self.rate_hz - other.rate_hz)
-        near = 0.0 in (self.rate_hz, other.rate_hz) or apart <= NEAR * max(self.rate_hz, other.rate_hz)
+        difference_hz = abs(self.rate_hz - other.rate_hz)
+        near = 0.0 in (self.rate_hz, other.rate_hz) or difference_hz <= NEAR * max(self.rate_hz, other.rate_hz)
         return near and dataclasses.replace(other, rate_hz=self.rate_hz) == self
 
     def to_json(self) -> dict[str, Any]:
         """Return what `from_json` reads."""
-        named = {"frames": self.frames, "rate_hz": self.rate_hz, "layout": self.layout}
-        return {"channels": list(self.channels), **named}
+        layout = {"frames": self.frames, "rate_hz": self.rate_hz, "layout": self.layout}
+        return {"channels": list(self.channels), **layout}
 
     @classmethod
     def from_json(cls, sensor: str, stored: dict[str, Any]) -> Layout:
@@ -66,7 +66,7 @@ class Slides:
         """Return how many slides there are."""
         return len(self.names)
 
-    def some(self, chosen: Bools) -> Slides:
+    def select(self, chosen: Bools) -> Slides:
         """Return the slides that a mask (slide,) chooses."""
         at = np.flatnonzero(chosen)
         return Slides(
@@ -100,8 +100,8 @@ def read(
     Raises `TacpipeError` where a recording names no sensor, holds no channel or a value that is not finite, and where
     slides of one sensor differ in channels, frames or rate.
     """
-    found: dict[str, list[tuple[Recording, Layout, Float32s]]] = {}
-    there: set[str] = set()
+    by_sensor: dict[str, list[tuple[Recording, Layout, Float32s]]] = {}
+    present_sensors: set[str] = set()
     for shard in recordings.recordings.values() if labelled else ():  # labels are checked before any frame is read
         if not only or shard.attributes.get("sensor") in only:
             _require_label(shard, naming.key)
@@ -112,26 +112,26 @@ def read(
                 f"Recording {name} has no label sensor; set it with `tacpipe label RECORDINGS {name} "
                 f"--set sensor=biotac`, or what it is."
             )
-        there.add(sensor)
+        present_sensors.add(sensor)
         if not only or sensor in only:
-            found.setdefault(sensor, []).append((shard, *frames(shard, sensor, quantities)))
+            by_sensor.setdefault(sensor, []).append((shard, *frames(shard, sensor, quantities)))
         if advance is not None:
             advance(note=name)
-    missing = sorted(set(only) - set(found))
+    missing = sorted(set(only) - set(by_sensor))
     if missing:
-        known = ", ".join(sorted(there)) or "none"
-        raise TacpipeError(f"No recording is of the sensor {missing[0]}; there are {known}. Give others.")
-    return {sensor: _bundle(several, naming, labelled) for sensor, several in sorted(found.items())}
+        listed_sensors = ", ".join(sorted(present_sensors)) or "none"
+        raise TacpipeError(f"No recording is of the sensor {missing[0]}; there are {listed_sensors}. Give others.")
+    return {sensor: _bundle(sensor_slides, naming, labelled) for sensor, sensor_slides in sorted(by_sensor.items())}
 
 
 def absent_quantities(recordings: Dataset, quantities: Sequence[str]) -> list[str]:
     """Return those of the quantities that no sensor has, by the first recording of each."""
     first = {shard.attributes.get("sensor"): shard for _, shard in sorted(recordings.recordings.items(), reverse=True)}
-    there: set[str] = set()
+    present_quantities: set[str] = set()
     for shard in first.values():
         schema = shard.table(STREAM if STREAM in shard.streams else "").schema
-        there |= {(field.metadata or {}).get(b"quantity", b"").decode() for field in schema}
-    return [quantity for quantity in quantities if quantity not in there]
+        present_quantities |= {(field.metadata or {}).get(b"quantity", b"").decode() for field in schema}
+    return [quantity for quantity in quantities if quantity not in present_quantities]
 
 
 def frames(shard: Recording, sensor: str, quantities: Sequence[str]) -> tuple[Layout, Float32s]:
@@ -142,8 +142,8 @@ def frames(shard: Recording, sensor: str, quantities: Sequence[str]) -> tuple[La
             f"Run `tacpipe segment slides` first."
         )
     table = shard.table(STREAM if STREAM in shard.streams else "")
-    wanted = {quantity.encode() for quantity in quantities}
-    channels = [field.name for field in table.schema if (field.metadata or {}).get(b"quantity") in wanted]
+    quantity_bytes = {quantity.encode() for quantity in quantities}
+    channels = [field.name for field in table.schema if (field.metadata or {}).get(b"quantity") in quantity_bytes]
     if not channels:
         raise absent(shard.name, " or ".join(quantities), table.schema)
     values = _columns(table, channels)
@@ -172,40 +172,40 @@ def _columns(table: pa.Table, channels: Sequence[str]) -> Float32s:
     return values
 
 
-def _bundle(several: Sequence[tuple[Recording, Layout, Float32s]], naming: Naming, labelled: bool) -> Slides:
+def _bundle(sensor_slides: Sequence[tuple[Recording, Layout, Float32s]], naming: Naming, labelled: bool) -> Slides:
     """Return the slides of one sensor, alike in layout."""
-    first, layout, _ = several[0]
-    for shard, other, _ in several:
-        if not layout.alike(other):
+    first, layout, _ = sensor_slides[0]
+    for shard, compared, _ in sensor_slides:
+        if not layout.alike(compared):
             raise TacpipeError(
-                f"{shard.name} {difference(layout, other)} as {first.name}; slides of a sensor are alike. `tacpipe segment "
-                f"slides` keeps as many frames of each (--frames, and --trigger load without static pressure)."
+                f"{shard.name} {difference(layout, compared)} as {first.name}; slides of a sensor are alike. `tacpipe "
+                f"segment slides` keeps as many frames of each (--frames, and --trigger load without static pressure)."
             )
     return Slides(
         layout,
-        tuple(shard.name for shard, _, _ in several),
-        np.stack([values for _, _, values in several]),
-        np.array([_material(shard, naming, labelled) for shard, _, _ in several], np.int64),
-        tuple(shard.digest for shard, _, _ in several),
-        np.array([shard.attributes.get("speed_m_s") or np.nan for shard, _, _ in several], np.float64),
+        tuple(shard.name for shard, _, _ in sensor_slides),
+        np.stack([values for _, _, values in sensor_slides]),
+        np.array([_material(shard, naming, labelled) for shard, _, _ in sensor_slides], np.int64),
+        tuple(shard.digest for shard, _, _ in sensor_slides),
+        np.array([shard.attributes.get("speed_m_s") or np.nan for shard, _, _ in sensor_slides], np.float64),
     )
 
 
-def difference(wanted: Layout, found: Layout) -> str:
+def difference(expected: Layout, layout: Layout) -> str:
     """Return in words how one layout differs from another.
 
     >>> difference(Layout("a", ("x",), 400, 100.0), Layout("a", ("x",), 75, 100.0))
     'has 75 frames, not 400'
     """
-    if found.channels != wanted.channels:
-        odd = [name for name in found.channels if name not in wanted.channels]
-        more = f", among them {odd[0]}" if odd else ""
-        return f"has {len(found.channels)} channels{more}, not the same {len(wanted.channels)}"
-    if found.frames != wanted.frames:
-        return f"has {found.frames} frames, not {wanted.frames}"
-    if found.layout != wanted.layout:
-        return f"has the layout {found.layout}, not {wanted.layout}"
-    return f"has {found.rate_hz:g} frames a second, not {wanted.rate_hz:g}"
+    if layout.channels != expected.channels:
+        odd = [name for name in layout.channels if name not in expected.channels]
+        detail = f", among them {odd[0]}" if odd else ""
+        return f"has {len(layout.channels)} channels{detail}, not the same {len(expected.channels)}"
+    if layout.frames != expected.frames:
+        return f"has {layout.frames} frames, not {expected.frames}"
+    if layout.layout != expected.layout:
+        return f"has the layout {layout.layout}, not {expected.layout}"
+    return f"has {layout.rate_hz:g} frames a second, not {expected.rate_hz:g}"
 
 
 def _require_label(shard: Recording, key: str) -> None:
@@ -231,10 +231,10 @@ def _material(shard: Recording, naming: Naming, labelled: bool) -> int:
         ) from error
 
 
-def quantities(given: str) -> tuple[str, ...]:
-    """Return the quantities that ``given`` names, with commas between.
+def quantities(text: str) -> tuple[str, ...]:
+    """Return the quantities that ``text`` names, with commas between.
 
     >>> quantities("tactile, vibration")
     ('tactile', 'vibration')
     """
-    return tuple(part.strip() for part in given.split(",") if part.strip())
+    return tuple(part.strip() for part in text.split(",") if part.strip())

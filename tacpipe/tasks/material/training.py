@@ -96,7 +96,7 @@ def train(
 def _naming(key: str, *parts: Dataset | None) -> Naming:
     """Return the naming of the labels ``key`` of all recordings to learn from or to choose by."""
     every = [shard for part in parts if part is not None for shard in part.recordings.values()]
-    return Naming.of(key, (shard.attributes.get(key) for shard in every))
+    return Naming.from_labels(key, (shard.attributes.get(key) for shard in every))
 
 
 def _check(params: Params, init: Mapping[str, bytes] | None) -> None:

@@ -24,7 +24,7 @@ Tree = dict[str, Any]
 
 @dataclass
 class Answers:
-    """What a calibrated classifier answers of slides, by sensor; empty where it is not calibrated."""
+    """The answers of a calibrated classifier for slides, by sensor; empty if it is not calibrated."""
 
     classifier: Classifier
     labels: Mapping[str, str] = field(default_factory=dict)  # recording to its label as text
@@ -32,55 +32,58 @@ class Answers:
     unknown: Tree = field(default_factory=dict)
     rows: list[tuple[Any, ...]] = field(default_factory=list)
 
-    def add(self, slides: Slides, seen: Bools) -> Bools:
+    def add(self, slides: Slides, in_training: Bools) -> Bools:
         """Measure slides of one sensor, of known classes and of others, and return which are of known ones (slide,).
 
-        Slides that were ``seen`` (slide,) in training or validation do not count.
+        Slides that were ``in_training`` (slide,) in training or validation do not count.
         """
         classifier, sensor = self.classifier, slides.layout.sensor
-        known = np.isin(slides.materials, classifier.classes)
-        if not classifier.known:
-            return known
+        is_known = np.isin(slides.materials, classifier.classes)
+        if not classifier.calibrations:
+            return is_known
         scores = classifier.readers[sensor].read(slides.frames).scores
-        self._measure(sensor, slides, scores, known, ~seen)
-        return known
+        self._measure(sensor, slides, scores, is_known, ~in_training)
+        return is_known
 
-    def _measure(self, sensor: str, slides: Slides, scores: Float32s, known: Bools, fresh: Bools) -> None:
-        bundle = self.classifier.known[sensor]
-        held = self.classifier.config.get("held_out", {}).get(sensor, [])
-        own = known & fresh & ~np.isin(slides.materials, held)
-        other = ~known & fresh
-        right = self.classifier.named(scores) == slides.materials
-        each = bundle.each(scores, slides.frames)
-        score = each[bundle.rule]
-        if own.any():
-            labels = np.searchsorted(self.classifier.classes, slides.materials[own])
-            self.calibration[sensor] = {"n": int(own.sum()), "temperature": bundle.temperature}
-            for name, one in (("before", 1.0), ("after", bundle.temperature)):
-                found = calibration.probabilities(scores[own], one)
-                confidence, correct = found.max(axis=1), right[own]
+    def _measure(self, sensor: str, slides: Slides, scores: Float32s, is_known: Bools, fresh: Bools) -> None:
+        sensor_calibration = self.classifier.calibrations[sensor]
+        held_out = self.classifier.config.get("held_out", {}).get(sensor, [])
+        learned = is_known & fresh & ~np.isin(slides.materials, held_out)
+        unknown = ~is_known & fresh
+        right = self.classifier.best_classes(scores) == slides.materials
+        scores_by_rule = sensor_calibration.scores_by_rule(scores, slides.frames)
+        score = scores_by_rule[sensor_calibration.rule]
+        if learned.any():
+            labels = np.searchsorted(self.classifier.classes, slides.materials[learned])
+            self.calibration[sensor] = {"n": int(learned.sum()), "temperature": sensor_calibration.temperature}
+            for name, divisor in (("before", 1.0), ("after", sensor_calibration.temperature)):
+                probabilities = calibration.probabilities(scores[learned], divisor)
+                confidence, correct = probabilities.max(axis=1), right[learned]
                 self.calibration[sensor][name] = {
                     "calibration_error": calibration.calibration_error(confidence, correct),
-                    "log_loss": calibration.log_loss(found, labels),
+                    "log_loss": calibration.log_loss(probabilities, labels),
                     "confidence": float(confidence.mean()),
                     "reliability": calibration.reliability(confidence, correct),
                 }
-        if own.any() or other.any():
-            refused = score < bundle.threshold
-            tree: Tree = {"rule": bundle.rule, "threshold": bundle.threshold}
+        if learned.any() or unknown.any():
+            refused = score < sensor_calibration.threshold
+            tree: Tree = {"rule": sensor_calibration.rule, "threshold": sensor_calibration.threshold}
             labels = np.array([self.labels.get(name, "") for name in slides.names])
-            tree |= _rate("false_unknown", refused[own])
-            tree |= _rate("false_known", ~refused[other], labels[other])
-            if own.any() and other.any():
-                tree["auroc"] = {rule: calibration.auroc(one[own], one[other]) for rule, one in each.items()}
-            if (own & ~refused).any():
-                tree["accuracy_of_answers"] = float(right[own & ~refused].mean())
+            tree |= _rate("false_unknown", refused[learned])
+            tree |= _rate("false_known", ~refused[unknown], labels[unknown])
+            if learned.any() and unknown.any():
+                tree["auroc"] = {
+                    rule: calibration.auroc(rule_scores[learned], rule_scores[unknown])
+                    for rule, rule_scores in scores_by_rule.items()
+                }
+            if (learned & ~refused).any():
+                tree["accuracy_of_answers"] = float(right[learned & ~refused].mean())
             self.unknown[sensor] = tree
-        names = self.classifier.naming.named(self.classifier.named(scores))
-        best = bundle.probabilities(scores).max(axis=1)
+        names = self.classifier.naming.names_for(self.classifier.best_classes(scores))
+        best = sensor_calibration.probabilities(scores).max(axis=1)
         for at, name in enumerate(slides.names):
-            answer = UNKNOWN_ANSWER if score[at] < bundle.threshold else str(names[at])
-            flags = [str(bool(flag)).lower() for flag in (known[at], not fresh[at])]
+            answer = UNKNOWN_ANSWER if score[at] < sensor_calibration.threshold else str(names[at])
+            flags = [str(bool(flag)).lower() for flag in (is_known[at], not fresh[at])]
             self.rows.append(
                 (
                     name,
@@ -95,13 +98,13 @@ class Answers:
             )
 
     def trees(self) -> Tree:
-        """Return what ``metrics.json`` holds more: ``calibration`` and ``unknown`` by sensor."""
-        found = {"calibration": self.calibration, "unknown": self.unknown}
-        return {name: one for name, one in found.items() if one}
+        """Return the parts ``calibration`` and ``unknown`` of ``metrics.json``, by sensor."""
+        parts = {"calibration": self.calibration, "unknown": self.unknown}
+        return {name: by_sensor for name, by_sensor in parts.items() if by_sensor}
 
     def files(self) -> dict[str, bytes]:
         """Return ``answers.csv``: a row a slide: class named, its probability, score of known, answer, label."""
-        if not self.classifier.known:
+        if not self.classifier.calibrations:
             return {}
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")

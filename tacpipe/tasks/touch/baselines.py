@@ -20,7 +20,7 @@ NEAREST = 3  # training grasps whose mean is predicted
 class Baselines:
     """The readings of the training grasps, from which baselines predict."""
 
-    readings: Mapping[str, Floats]  # by target (grasp, value), device counts
+    readings: Mapping[str, Floats]  # target -> (grasp, value), device counts
     objects: tuple[str, ...]
     t_ns: Times  # (grasp,)
 
@@ -44,12 +44,12 @@ class Baselines:
         """
         names = np.array(self.objects)
         same = [(names == name) & (names != "") for name in grasps.objects]  # (grasp)(training grasp,)
-        among = [mask if mask.any() else np.ones_like(mask) for mask in same]
+        reference_masks = [mask if mask.any() else np.ones_like(mask) for mask in same]
         nearest = [np.argsort(np.abs(self.t_ns - t_ns), kind="stable")[:NEAREST] for t_ns in grasps.t_ns]
         return {
             CONSTANT: {name: np.tile(values.mean(axis=0), (len(grasps), 1)) for name, values in self.readings.items()},
             OBJECT_MEAN: {
-                name: np.array([values[mask].mean(axis=0) for mask in among]).reshape(len(grasps), -1)
+                name: np.array([values[mask].mean(axis=0) for mask in reference_masks]).reshape(len(grasps), -1)
                 for name, values in self.readings.items()
             },
             NEAREST_IN_TIME: {
@@ -64,8 +64,8 @@ class Baselines:
             np.concatenate([values[name] for name in self.readings], axis=1)
             for values in (self.readings, grasps.readings)
         )
-        known = {row.tobytes() for row in np.asarray(before, np.float64)}
-        return np.array([row.tobytes() in known for row in np.asarray(now, np.float64)], bool)
+        training_rows = {row.tobytes() for row in np.asarray(before, np.float64)}
+        return np.array([row.tobytes() in training_rows for row in np.asarray(now, np.float64)], bool)
 
     def tensors(self) -> dict[str, NDArray[np.generic]]:
         """Return what `from_tensors` reads, but for the objects' names."""

@@ -19,33 +19,39 @@ if TYPE_CHECKING:
     from tacpipe.tasks.calibrated import Asked
 
 
-def calibrate(model: Mapping[str, bytes], asked: Asked, training: Dataset, validation: Dataset) -> dict[str, bytes]:
+def calibrate(model: Mapping[str, bytes], request: Asked, training: Dataset, validation: Dataset) -> dict[str, bytes]:
     """Return the files of a model with quantiles, which hold on validation grasps as often as their levels state.
 
     Raises `TacpipeError` where the model learned from these validation grasps, and where there are none.
     """
-    check_levels(asked.quantiles)
+    check_levels(request.quantiles)
     predictor = Predictor.load(model)
-    known, watched = grasps_of.read(training), grasps_of.read(validation)
-    if not len(watched):
+    training_grasps, validation_grasps = grasps_of.read(training), grasps_of.read(validation)
+    if not len(validation_grasps):
         raise TacpipeError(
             "No grasp has the role val to calibrate on. Make a split with some: `tacpipe split --val 0.2`."
         )
-    learned = set(predictor.config["trained_on"].values())
-    if predictor.config["counts"]["val"] == 0 and any(digest in learned for digest in watched.digests):
+    seen_digests = set(predictor.config["trained_on"].values())
+    if predictor.config["counts"]["val"] == 0 and any(digest in seen_digests for digest in validation_grasps.digests):
         raise UsageError(
             "The model learned from these validation grasps too, so that they state nothing of its errors. Train it with "
             "--no-use-validation."
         )
-    levels = np.array(asked.quantiles) / 100
-    predicted = predictor.predict_grasps(watched)
-    made = ReadingQuantiles.fit(levels, known, watched, predicted, promised=asked.promise)
+    levels = np.array(request.quantiles) / 100
+    predicted = predictor.predict_grasps(validation_grasps)
+    reading_quantiles = ReadingQuantiles.fit(
+        levels, training_grasps, validation_grasps, predicted, promised=request.promise
+    )
     trained_on = {**predictor.config["trained_on"]}
-    trained_on |= {name: one for name, one in zip(watched.names, watched.digests, strict=True) if one not in learned}
-    stated = {
-        "levels": list(asked.quantiles),
-        "method": "promised" if asked.promise else "pooled",
-        "grasps": len(watched),
+    trained_on |= {
+        name: recording_digest
+        for name, recording_digest in zip(validation_grasps.names, validation_grasps.digests, strict=True)
+        if recording_digest not in seen_digests
     }
-    config = {**predictor.config, "quantiles": stated, "trained_on": trained_on}
-    return {**model, CONFIG: model_files.to_json(config), FILE: made.to_bytes()}
+    description = {
+        "levels": list(request.quantiles),
+        "method": "promised" if request.promise else "pooled",
+        "grasps": len(validation_grasps),
+    }
+    config = {**predictor.config, "quantiles": description, "trained_on": trained_on}
+    return {**model, CONFIG: model_files.to_json(config), FILE: reading_quantiles.to_bytes()}

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from tacpipe.tasks.task import Demo
 
-OBJECTS, GRASPS = 1, 90  # of each of six families; and as many grasps of each object
+OBJECTS, GRASPS = 1, 90  # objects of each of six families, grasps of each object
 
 
 def demo(output: Path) -> Demo:
@@ -14,10 +14,10 @@ def demo(output: Path) -> Demo:
     names = ("pinched", "grasps", "grasps-split", "touch", "touch-results", "pointnet", "pointnet-results")
     place = {name: str(output / name) for name in names}
     split = ["--split", place["grasps-split"]]
-    many = ["--trials", str(GRASPS), "--objects", str(OBJECTS)]
-    paper = ["--preset", "paper", "--epochs", "4", "--points", "128"]  # of the paper's 250 epochs and 750 points
+    simulation = ["--trials", str(GRASPS), "--objects", str(OBJECTS)]
+    paper = ["--preset", "paper", "--epochs", "4", "--points", "128"]  # the paper has 250 epochs and 750 points
     commands = [
-        ["simulate", "touch", *many, "-o", place["pinched"]],
+        ["simulate", "touch", *simulation, "-o", place["pinched"]],
         ["segment", "grasps", place["pinched"], "-o", place["grasps"]],
         ["split", place["grasps"], "-o", place["grasps-split"], "--scheme", "random", "--stratify", "object"],
         ["train", "touch", place["grasps"], *split, "-o", place["touch"], "--preset", "quick"],

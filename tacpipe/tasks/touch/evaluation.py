@@ -64,85 +64,91 @@ def _evaluated(
             "The model was trained without baselines, and cannot be evaluated. Train it with --baselines."
         )
     predicted = {TRUE: grasps.readings, MODEL: predictor.predict_grasps(grasps), **predictor.baselines.predict(grasps)}
-    predicted = {name: {target: one[target] for target in predictor.targets} for name, one in predicted.items()}
+    predicted = {
+        name: {target: readings[target] for target in predictor.targets} for name, readings in predicted.items()
+    }
     advance(len(grasps))
-    streams = {name: readings_table(one) for name, one in predicted.items()}
+    streams = {name: readings_table(readings) for name, readings in predicted.items()}
     del predicted[TRUE]
     trained = set(predictor.config["trained_on"].values())
-    seen = np.array([digest in trained for digest in grasps.digests], bool) | predictor.baselines.same_reading(grasps)
-    known = np.array([name in predictor.config["objects"] for name in grasps.objects], bool)
-    tree = _measures(grasps, predicted, ~seen, known)
-    for name, mask in (("known", known & ~seen), ("novel", ~known & ~seen), ("seen", seen)):
+    in_training = np.array([digest in trained for digest in grasps.digests], bool) | predictor.baselines.same_reading(
+        grasps
+    )
+    is_known = np.array([name in predictor.config["objects"] for name in grasps.objects], bool)
+    tree = _measures(grasps, predicted, ~in_training, is_known)
+    for name, mask in (("known", is_known & ~in_training), ("novel", ~is_known & ~in_training), ("seen", in_training)):
         if mask.any():
-            tree[name] = _measures(grasps, predicted, mask, known)
-    if stated := _quantiles(predictor, grasps, predicted, seen, known):
-        tree["quantiles"] = stated
+            tree[name] = _measures(grasps, predicted, mask, is_known)
+    if quantile_tree := _quantiles(predictor, grasps, predicted, in_training, is_known):
+        tree["quantiles"] = quantile_tree
     files = {
-        headline.FILE: headline.write(_headlines(predictor, grasps, predicted, seen, known)),
+        headline.FILE: headline.write(_headlines(predictor, grasps, predicted, in_training, is_known)),
         "metrics.json": (json.dumps(tree, indent=1, sort_keys=True, allow_nan=False) + "\n").encode(),
         "by_object.csv": _by_object_csv(tree),
         **{name: model[name] for name in (CONFIG, HISTORY) if name in model},
     }
     if predictor.quantiles is not None:
-        files[COVERAGE] = quantiles.coverage(predictor.quantiles, grasps, predicted, ~seen, known)
-    streams[GRASPS] = _about(grasps, seen, known)
+        files[COVERAGE] = quantiles.coverage(predictor.quantiles, grasps, predicted, ~in_training, is_known)
+    streams[GRASPS] = _about(grasps, in_training, is_known)
     attributes = origin.together(shard.attributes for shard in recordings.recordings.values())
     return Result({PREDICTIONS: RecordingOutput(streams, attributes)}, files)
 
 
 def _quantiles(
-    predictor: Predictor, grasps: Grasps, predicted: Mapping[str, Readings], seen: Bools, known: Bools
+    predictor: Predictor, grasps: Grasps, predicted: Mapping[str, Readings], in_training: Bools, is_known: Bools
 ) -> Tree:
     """Return the measures of a calibrated model's quantiles, of known objects and of novel ones; empty for others."""
     if predictor.quantiles is None:
         return {}
-    parts = {"known": known & ~seen, "novel": ~known & ~seen}
+    parts = {"known": is_known & ~in_training, "novel": ~is_known & ~in_training}
     clusters = {"known": grasps.names, "novel": grasps.objects}
     trees = {
         name: quantiles.tree(predictor.quantiles, grasps, predicted, mask, clusters[name])
         for name, mask in parts.items()
     }
-    return {**predictor.config["quantiles"], **{name: one for name, one in trees.items() if one}}
+    return {**predictor.config["quantiles"], **{name: measures for name, measures in trees.items() if measures}}
 
 
 def _headlines(
-    predictor: Predictor, grasps: Grasps, predicted: Mapping[str, Readings], seen: Bools, known: Bools
+    predictor: Predictor, grasps: Grasps, predicted: Mapping[str, Readings], in_training: Bools, is_known: Bools
 ) -> list[headline.Headline]:
     """Return how the model compares with its baselines on each target, on known objects and on novel ones."""
-    objects = {name: of or "unnamed" for name, of in zip(grasps.names, grasps.objects, strict=True)}
-    found = []
+    objects = {name: object_name or "unnamed" for name, object_name in zip(grasps.names, grasps.objects, strict=True)}
+    target_headlines = []
     for part in (True, False):
-        rows = np.flatnonzero((known == part) & ~seen)
+        rows = np.flatnonzero((is_known == part) & ~in_training)
         for target in predictor.targets:
             true = biotac_sp.normalised(target, grasps.readings[target])
             errors = {}
-            for name, one in predicted.items():
-                squared = regression.squared_sums(true, biotac_sp.normalised(target, one[target]))
+            for name, readings in predicted.items():
+                squared = regression.squared_sums(true, biotac_sp.normalised(target, readings[target]))
                 errors[name] = {(0, grasps.names[at]): (float(squared[at]), true.shape[1]) for at in rows}
             model = errors.pop(MODEL)
             low, high = biotac_sp.RANGES[target]
-            made = headlines.headline(
+            target_headline = headlines.headline(
                 predictor.config["architecture"], target, high - low, model, errors, part, objects
             )
-            found += [made] if made else []
-    return found
+            target_headlines += [target_headline] if target_headline else []
+    return target_headlines
 
 
-def _measures(grasps: Grasps, predicted: Mapping[str, Readings], mask: Bools, known: Bools) -> Tree:
+def _measures(grasps: Grasps, predicted: Mapping[str, Readings], mask: Bools, is_known: Bools) -> Tree:
     """Return the measures of every predictor on some grasps, over all of them and by object.
 
-    Where an object among them is not ``known``, intervals are over objects: what the next one will be like is the question.
+    Intervals are over objects where one of them is not known, else over grasps (``is_known`` (grasp,)).
     """
     if not mask.any():
         return {"counts": {"grasps": 0}}
     names, objects = np.array(grasps.names), np.array(grasps.objects)
-    clusters = objects if (mask & ~known).any() else names
+    clusters = objects if (mask & ~is_known).any() else names
     tree: Tree = {"counts": {"grasps": int(mask.sum()), "objects": len(set(objects[mask]))}}
-    for name, one in predicted.items():
-        tree[name] = _tree(grasps, one, predicted[CONSTANT], mask, clusters)
+    for name, readings in predicted.items():
+        tree[name] = _tree(grasps, readings, predicted[CONSTANT], mask, clusters)
         tree[name]["by_object"] = {
-            other or "unnamed": _tree(grasps, one, predicted[CONSTANT], mask & (objects == other), names)
-            for other in sorted(set(objects[mask]))
+            object_name or "unnamed": _tree(
+                grasps, readings, predicted[CONSTANT], mask & (objects == object_name), names
+            )
+            for object_name in sorted(set(objects[mask]))
         }
     readings, model = (metrics.chosen(one, mask) for one in (grasps.readings, predicted[MODEL]))
     tree[MODEL]["by_electrode"] = metrics.by_electrode(readings, model)
@@ -150,8 +156,8 @@ def _measures(grasps: Grasps, predicted: Mapping[str, Readings], mask: Bools, kn
 
 
 def _tree(grasps: Grasps, predicted: Readings, constant: Readings, mask: Bools, clusters: AnyArray) -> Tree:
-    readings, one, mean = (metrics.chosen(values, mask) for values in (grasps.readings, predicted, constant))
-    return metrics.tree(readings, one, mean, clusters[mask].tolist())
+    readings, model, mean = (metrics.chosen(values, mask) for values in (grasps.readings, predicted, constant))
+    return metrics.tree(readings, model, mean, clusters[mask].tolist())
 
 
 def _by_object_csv(tree: Tree) -> bytes:
@@ -160,15 +166,15 @@ def _by_object_csv(tree: Tree) -> bytes:
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["object", "predictor", "target", "n", "rmse", "rmse_counts", "r2", "skill"])
     for predictor in (MODEL, CONSTANT, OBJECT_MEAN, NEAREST_IN_TIME):
-        for name, one in tree.get(predictor, {}).get("by_object", {}).items():
-            for target in one["rmse"]:
-                values = [one[measure][target] for measure in ("rmse", "rmse_counts", "r2", "skill")]
+        for name, measures in tree.get(predictor, {}).get("by_object", {}).items():
+            for target in measures["rmse"]:
+                values = [measures[measure][target] for measure in ("rmse", "rmse_counts", "r2", "skill")]
                 rounded = ["" if value is None else f"{value:.6g}" for value in values]
-                writer.writerow([name, predictor, target, one["n"], *rounded])
+                writer.writerow([name, predictor, target, measures["n"], *rounded])
     return text.getvalue().encode()
 
 
-def _about(grasps: Grasps, seen: Bools, known: Bools) -> pa.Table:
+def _about(grasps: Grasps, in_training: Bools, is_known: Bools) -> pa.Table:
     """Return a row a grasp: which recording, object and session, when, and whether the model knows it or its object."""
     return pa.table(
         {
@@ -176,16 +182,16 @@ def _about(grasps: Grasps, seen: Bools, known: Bools) -> pa.Table:
             "object": pa.array(grasps.objects, pa.string()),
             "session": pa.array(grasps.sessions, pa.string()),
             "t_ns": pa.array(grasps.t_ns, pa.int64()),
-            "seen": pa.array(seen, pa.bool_()),
-            "known": pa.array(known, pa.bool_()),
+            "seen": pa.array(in_training, pa.bool_()),
+            "known": pa.array(is_known, pa.bool_()),
         }
     )
 
 
 def simulated(recordings: Dataset) -> dict[str, bool]:
     """Return the attribute that marks what simulated recordings led to; none where all are real."""
-    found = any(bool(shard.attributes.get("simulated")) for shard in recordings.recordings.values())
-    return {"simulated": True} if found else {}
+    is_simulated = any(bool(shard.attributes.get("simulated")) for shard in recordings.recordings.values())
+    return {"simulated": True} if is_simulated else {}
 
 
 def readings_table(predicted: Readings, bands: Mapping[int, Readings] | None = None) -> pa.Table:

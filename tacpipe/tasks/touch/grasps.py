@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 STREAMS = ("cloud", "grasp")
 READING = "reading"
 FEWEST = 3  # points of a cloud; fewer have neither surface nor main axis
-FARTHEST_M = 0.1  # of a grasp point, maybe on a hidden side, from its cloud: beyond it they are not of one object
+FARTHEST_M = 0.1  # largest distance of a grasp point, maybe on a hidden side, from the cloud of its object
 
 
 @dataclass(frozen=True)
@@ -35,24 +35,24 @@ class Grasps:
     t_ns: Times  # (grasp,)
     clouds: tuple[Cloud, ...]
     grasps: tuple[Grasp, ...]
-    readings: Mapping[str, Floats]  # by target (grasp, value), device counts; empty without readings
-    digests: tuple[str, ...]  # of the recordings
+    readings: Mapping[str, Floats]  # target -> (grasp, value), device counts; empty without readings
+    digests: tuple[str, ...]  # digests of the recordings
 
     def __len__(self) -> int:
         """Return how many grasps there are."""
         return len(self.names)
 
-    def joined(self, others: Grasps) -> Grasps:
+    def joined(self, appended: Grasps) -> Grasps:
         """Return these grasps and then the others."""
         return Grasps(
-            self.names + others.names,
-            self.objects + others.objects,
-            self.sessions + others.sessions,
-            np.concatenate([self.t_ns, others.t_ns]),
-            self.clouds + others.clouds,
-            self.grasps + others.grasps,
-            {target: np.concatenate([values, others.readings[target]]) for target, values in self.readings.items()},
-            self.digests + others.digests,
+            self.names + appended.names,
+            self.objects + appended.objects,
+            self.sessions + appended.sessions,
+            np.concatenate([self.t_ns, appended.t_ns]),
+            self.clouds + appended.clouds,
+            self.grasps + appended.grasps,
+            {target: np.concatenate([values, appended.readings[target]]) for target, values in self.readings.items()},
+            self.digests + appended.digests,
         )
 
 
@@ -133,15 +133,15 @@ def _reading(shard: Recording) -> dict[str, Floats]:
             f"Recording {shard.name} has {table.num_rows} readings; a grasp has one. `tacpipe segment grasps` picks the one "
             f"at contact out of a stream."
         )
-    found = {}
+    readings = {}
     for target in biotac_sp.TARGETS:
         columns = biotac_sp.columns(target)
         try:
             require_columns(table, columns)
         except TacpipeError as error:
             raise TacpipeError(f"Recording {shard.name}: {error}") from None
-        found[target] = np.array([table.column(name)[0].as_py() for name in columns], np.float64)  # null becomes NaN
-        if not np.isfinite(found[target]).all():
-            column = columns[int(np.argmin(np.isfinite(found[target])))]
+        readings[target] = np.array([table.column(name)[0].as_py() for name in columns], np.float64)  # null becomes NaN
+        if not np.isfinite(readings[target]).all():
+            column = columns[int(np.argmin(np.isfinite(readings[target])))]
             raise TacpipeError(f"Recording {shard.name} has no finite reading in the column {column}. Leave it out.")
-    return found
+    return readings

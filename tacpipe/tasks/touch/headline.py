@@ -20,7 +20,7 @@ TARGETS = {
     "e_th": "electrodes thumb",
     "e_mf": "electrodes middle finger",
 }
-BASELINES = {  # what tables call the predictors that every result has
+BASELINES = {  # names in tables of the predictors that every result has
     "constant": "constant",
     "object_mean": "mean of the object",
     "nearest_in_time": "mean of the nearest in time",
@@ -33,7 +33,7 @@ def headline(
     range_counts: float,
     model: Mapping[tuple[Any, str], tuple[float, int]],
     baselines: Mapping[str, Mapping[tuple[Any, str], tuple[float, int]]],
-    known: bool | None,
+    known_objects: bool | None,
     objects: Mapping[str, str],
     runs: int = 1,
 ) -> Headline | None:
@@ -42,16 +42,16 @@ def headline(
     Errors are, by seed and grasp, the sum of squares as fractions of the target's range, which is ``range_counts`` wide, and
     the number of values that were summed. Grasps are drawn anew where objects are known, else ``objects`` (by grasp).
     """
-    drawn = None if known else objects
-    compared = {BASELINES.get(name, name.replace("_", " ")): _sums(one) for name, one in baselines.items() if one}
-    made = measure(range_counts, "grasps" if known else "objects")
+    drawn = None if known_objects else objects
+    compared = {BASELINES.get(name, name.replace("_", " ")): _sums(sums) for name, sums in baselines.items() if sums}
+    target_measure = measure(range_counts, "grasps" if known_objects else "objects")
     return pairing.headline(
         TASK,
         method,
-        made,
+        target_measure,
         _sums(model),
         compared,
-        part=PARTS[known],
+        part=PARTS[known_objects],
         target=TARGETS[target],
         clusters=drawn,
         runs=runs,
@@ -65,14 +65,14 @@ def _sums(errors: Mapping[tuple[Any, str], tuple[float, int]]) -> Sums:
 def measure(range_counts: float, cluster: str) -> Measure:
     """Return how sums of squares and numbers of values become errors on a target whose range is ``range_counts`` wide."""
 
-    def rmse(found: AnyFloats) -> AnyFloats:
-        return np.sqrt(np.where(found[:, 1] > 0, found[:, 0] / np.maximum(found[:, 1], 1), np.nan))
+    def rmse(sums: AnyFloats) -> AnyFloats:
+        return np.sqrt(np.where(sums[:, 1] > 0, sums[:, 0] / np.maximum(sums[:, 1], 1), np.nan))
 
-    def gain(one: AnyFloats, other: AnyFloats) -> AnyFloats:
-        return np.where(other > 0, 1 - one / np.where(other > 0, other, 1), np.nan)
+    def gain(error: AnyFloats, baseline: AnyFloats) -> AnyFloats:
+        return np.where(baseline > 0, 1 - error / np.where(baseline > 0, baseline, 1), np.nan)
 
-    def values(found: AnyFloats) -> tuple[float, ...]:
-        share = float(rmse(found[None])[0])
+    def values(sums: AnyFloats) -> tuple[float, ...]:
+        share = float(rmse(sums[None])[0])
         return share, share * range_counts
 
     columns = ("RMSE", "RMSE (counts)")

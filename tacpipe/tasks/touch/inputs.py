@@ -1,4 +1,4 @@
-"""What a PointNet reads of a grasp: points drawn from its cloud, and numbers of the grasp."""
+"""The inputs of a PointNet: points drawn from the cloud of a grasp, and numbers of the grasp."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ WRISTS = ("given", "estimated")
 
 @dataclass(frozen=True)
 class Inputs:
-    """Which of the letter's six modes is read, how many points are drawn, and how they are scaled and turned."""
+    """Options of the inputs: one of the letter's six modes, how many points are drawn, their scale and rotation."""
 
     mode: str
     points: int
@@ -40,10 +40,10 @@ class Inputs:
 
     def __post_init__(self) -> None:
         """Refuse what cannot be."""
-        for name, known in (("mode", MODES), ("normalisation", NORMALISATIONS), ("wrist", WRISTS)):
-            if getattr(self, name) not in known:
-                what = "inputs" if name == "mode" else name
-                raise TacpipeError(f"{what} is {getattr(self, name)!r}; it must be one of {', '.join(known)}.")
+        for name, choices in (("mode", MODES), ("normalisation", NORMALISATIONS), ("wrist", WRISTS)):
+            if getattr(self, name) not in choices:
+                label = "inputs" if name == "mode" else name
+                raise TacpipeError(f"{label} is {getattr(self, name)!r}; it must be one of {', '.join(choices)}.")
         if self.points < 1:
             raise TacpipeError(f"points is {self.points}; it must be 1 or more.")
         if not 0 <= self.rotation_deg <= 180:
@@ -51,7 +51,7 @@ class Inputs:
 
     @property
     def coloured(self) -> bool:
-        """Whether colours are read."""
+        """True if colours are read."""
         return self.mode.startswith("rgb")
 
     @property
@@ -61,7 +61,7 @@ class Inputs:
 
     @property
     def posed(self) -> bool:
-        """Whether the wrist's rotation is read."""
+        """True if the wrist's rotation is read."""
         return self.mode.endswith("pose")
 
     @property
@@ -100,11 +100,11 @@ class Sources:
         rngs = [np.random.default_rng([visit, zlib.crc32(self.clouds[index].points_m.tobytes())]) for index in indices]
         return self._arrays(list(zip(indices, rngs, strict=True)), 0.0)
 
-    def _arrays(self, wanted: Sequence[tuple[int, np.random.Generator]], largest_deg: float) -> Arrays:
+    def _arrays(self, draws: Sequence[tuple[int, np.random.Generator]], largest_deg: float) -> Arrays:
         inputs = self.inputs
-        points = np.empty((len(wanted), inputs.points, inputs.channels), np.float32)
-        numbers = np.empty((len(wanted), inputs.grasp_numbers), np.float32)
-        for row, (index, rng) in enumerate(wanted):
+        points = np.empty((len(draws), inputs.points, inputs.channels), np.float32)
+        numbers = np.empty((len(draws), inputs.grasp_numbers), np.float32)
+        for row, (index, rng) in enumerate(draws):
             cloud, grasp, extent = self.clouds[index], self.grasps[index], self.extents[index]
             rotation = random_rotation(rng, largest_deg)
             wrist = self.wrists[index]

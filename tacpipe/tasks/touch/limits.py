@@ -1,4 +1,4 @@
-"""What limits the prediction of touch on some grasps: their repeatability, their number, and what the grasp does not state.
+"""Measure the limits of predicting touch on some grasps: repeatability, number of grasps, information of the grasp.
 
 The forests here are those of the architecture ``trees``, with leaves of a fixed size; they are trained and tested by
 cross-validation within known objects, and their skill is 1 - RMSE / RMSE of the constant of all training grasps.
@@ -39,19 +39,19 @@ Skills = dict[str, Estimate]  # target to skill
 class Point:
     """A point of a learning curve."""
 
-    grasps: int  # of each object that were trained on, at most
+    grasps: int  # most grasps of one object that were trained on
     trained: float  # grasps trained on, mean over folds
     skill: Skills
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What was measured on grasps."""
+    """Limits that were measured on grasps."""
 
     counts: Mapping[str, int]  # grasps by object
     near: Sequence[tuple[float, float, Mapping[str, repeatability.Repeatability]]]  # bounds in mm
     curve: Sequence[Point]
-    other_finger: Skills  # of forests that also read what the other finger measured
+    other_finger: Skills  # skills of forests that also read the other finger's reading
     draws: int
     trees: int
 
@@ -66,14 +66,15 @@ class Limits:
                 {
                     "low_mm": low,
                     "high_mm": None if math.isinf(high) else high,
-                    "pairs": max((one.pairs for one in by.values()), default=0),
-                    "likeness": {name: _numbers(one.likeness) for name, one in by.items()},
-                    "pair_skill": {name: _numbers(estimates.pair_skill) for name, estimates in by.items()},
+                    "pairs": max((estimates.pairs for estimates in by_target.values()), default=0),
+                    "likeness": {name: _numbers(estimates.likeness) for name, estimates in by_target.items()},
+                    "pair_skill": {name: _numbers(estimates.pair_skill) for name, estimates in by_target.items()},
                 }
-                for low, high, by in self.near
+                for low, high, by_target in self.near
             ],
             "learning_curve": [
-                {"grasps": one.grasps, "trained": one.trained, "skill": _by_target(one.skill)} for one in self.curve
+                {"grasps": point.grasps, "trained": point.trained, "skill": _by_target(point.skill)}
+                for point in self.curve
             ],
             "other_finger": _by_target(self.other_finger),
         }
@@ -94,19 +95,19 @@ def limits(
     `TacpipeError` where an object has fewer than five grasps, one for each fold, or where grasps have no object.
     """
     counts = {name: grasps.objects.count(name) for name in sorted(set(grasps.objects))}
-    few = min(counts, key=lambda name: counts[name], default="")
-    if not counts or "" in counts or counts[few] < FOLDS:
-        found = f"{counts[few]} of {few or 'no named object'}" if counts else "none"
+    rarest = min(counts, key=lambda name: counts[name], default="")
+    if not counts or "" in counts or counts[rarest] < FOLDS:
+        shortage = f"{counts[rarest]} of {rarest or 'no named object'}" if counts else "none"
         raise TacpipeError(
-            f"There are too few grasps: {found}. Limits need {FOLDS} or more of each object, one for each fold; label "
+            f"There are too few grasps: {shortage}. Limits need {FOLDS} or more of each object, one for each fold; label "
             f"objects with `tacpipe label RECORDINGS NAME --label object=…`, or leave some out with --exclude."
         )
-    coloured = all(one.colours is not None for one in grasps.clouds)
+    coloured = all(cloud.colours is not None for cloud in grasps.clouds)
     rows, _ = geometry.table(grasps.clouds, grasps.grasps, coloured=coloured)
-    contacts_m = np.array([[one.g1_m, one.g2_m] for one in grasps.grasps])  # (grasp, finger, axis)
+    contacts_m = np.array([[grasp.g1_m, grasp.g2_m] for grasp in grasps.grasps])  # (grasp, finger, axis)
     trial = _Trial(grasps, rows, draws, trees, seed, advance or (lambda *_, **__: None))
-    most = max(counts.values()) * (FOLDS - 1) // FOLDS
-    curve = [trial.point(size) for size in sorted({min(size, most) for size in sizes})]
+    largest_size = max(counts.values()) * (FOLDS - 1) // FOLDS
+    curve = [trial.point(size) for size in sorted({min(size, largest_size) for size in sizes})]
     near = repeatability.table(grasps.readings, contacts_m, grasps.objects)
     return Limits(counts, near, curve, trial.other_finger(), draws, trees)
 
@@ -136,7 +137,9 @@ class _Trial:
         """Return the skill of forests that also read what the other finger measured, on all training grasps."""
         readings = self.grasps.readings
         rows = {
-            name: np.concatenate([self.rows, *(readings[one] for one in OTHER[name] if one in readings)], axis=1)
+            name: np.concatenate(
+                [self.rows, *(readings[target] for target in OTHER[name] if target in readings)], axis=1
+            )
             for name in readings
         }
         return self._skills(len(self.grasps), rows, "other finger")[0]
@@ -149,23 +152,23 @@ class _Trial:
             rng = np.random.default_rng([self.seed, draw])
             folds = stratified(self.grasps.objects, rng)
             for fold in range(FOLDS):
-                among, tested = np.flatnonzero(folds != fold), np.flatnonzero(folds == fold)
-                chosen = drawn(among, self.grasps.objects, size, rng)
+                trained_on, tested = np.flatnonzero(folds != fold), np.flatnonzero(folds == fold)
+                chosen = drawn(trained_on, self.grasps.objects, size, rng)
                 trained.append(len(chosen))
                 for name, values in readings.items():
                     leaf = max(1, min(LEAF, len(chosen) // 4))
                     forest = Forest.fitted(
                         rows[name][chosen], values[chosen], trees=self.trees, leaf=leaf, seed=self.seed + draw
                     )
-                    constant = np.tile(values[among].mean(axis=0), (len(tested), 1))
+                    constant = np.tile(values[trained_on].mean(axis=0), (len(tested), 1))
                     for at, predicted in enumerate((forest.predict(rows[name][tested]), constant)):
                         squared[name][at, tested] += regression.squared_sums(values[tested], predicted)
                 self.advance(note=note)
         clusters = np.arange(len(self.grasps))
-        found = {
+        skills = {
             name: regression.skill_interval(model, constant, clusters) for name, (model, constant) in squared.items()
         }
-        return found, float(np.mean(trained))
+        return skills, float(np.mean(trained))
 
 
 def stratified(objects: Sequence[str], rng: np.random.Generator) -> Int64s:
@@ -173,19 +176,19 @@ def stratified(objects: Sequence[str], rng: np.random.Generator) -> Int64s:
     names = np.asarray(objects)
     folds = np.zeros(len(names), np.int64)
     for name in sorted(set(objects)):
-        own = rng.permutation(np.flatnonzero(names == name))
-        folds[own] = np.arange(len(own)) % FOLDS
+        members = rng.permutation(np.flatnonzero(names == name))
+        folds[members] = np.arange(len(members)) % FOLDS
     return folds
 
 
-def drawn(among: Indices, objects: Sequence[str], size: int, rng: np.random.Generator) -> Indices:
-    """Return those of the grasps ``among`` (grasp,) that train: ``size`` of each object, or all that it has."""
-    names = np.asarray(objects)[among]
-    return np.concatenate([rng.permutation(among[names == name])[:size] for name in sorted(set(names))])
+def drawn(candidates: Indices, objects: Sequence[str], size: int, rng: np.random.Generator) -> Indices:
+    """Return those of the grasps ``candidates`` (grasp,) that train: ``size`` of each object, or all that it has."""
+    names = np.asarray(objects)[candidates]
+    return np.concatenate([rng.permutation(candidates[names == name])[:size] for name in sorted(set(names))])
 
 
 def _by_target(skills: Skills) -> Tree:
-    return {name: _numbers(one) for name, one in skills.items()}
+    return {name: _numbers(estimate) for name, estimate in skills.items()}
 
 
 def _numbers(estimate: Estimate) -> Tree:

@@ -1,4 +1,4 @@
-"""What a network of touch learns: values of a grasp from points drawn anew at each visit."""
+"""The training of a network of touch: it learns the values of a grasp from points that are drawn at each visit."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SEEDS = 2**62
 
 
 class Drawn(Protocol):
-    """Where points are drawn from: `inputs.Sources` or `patches.PatchSources`."""
+    """A source of drawn points: `inputs.Sources` or `patches.PatchSources`."""
 
     def draw(self, indices: Sequence[int], rng: np.random.Generator) -> Arrays:
         """Return points and the grasps' numbers, drawn anew."""
@@ -67,11 +67,11 @@ class TouchWork:
         """Return indices of all training grasps, shuffled; a single one that is left over joins the batch before it."""
         shuffled = torch.randperm(len(self.training))
         sizes = [self.batch] * (len(shuffled) // self.batch)
-        rest = len(shuffled) % self.batch
-        if rest == 1 and sizes:
+        remainder = len(shuffled) % self.batch
+        if remainder == 1 and sizes:
             sizes[-1] += 1
-        elif rest:
-            sizes.append(rest)
+        elif remainder:
+            sizes.append(remainder)
         return list(torch.split(shuffled, sizes))
 
     def loss(self, model: nn.Module, batch: Tensor, epoch: int) -> tuple[Tensor, int]:
@@ -82,31 +82,31 @@ class TouchWork:
 
     def watch(self, model: nn.Module) -> dict[str, Any]:
         """Return the loss over all watched grasps, always with the same points."""
-        found = predictions(model, self.watched.sources, len(self.watched), draws=1)
+        predicted = predictions(model, self.watched.sources, len(self.watched), draws=1)
         values = self.watched.values
-        return {"val_loss": float(self._loss(torch.from_numpy(found).to(values), values))}
+        return {"val_loss": float(self._loss(torch.from_numpy(predicted).to(values), values))}
 
     def ranks(self, line: dict[str, Any]) -> dict[str, tuple[float]]:
         """Return the loss of what is watched."""
         return {"": (float(line["val_loss"]),)}
 
-    def _loss(self, found: Tensor, values: Tensor) -> Tensor:
-        if found.shape != values.shape:
+    def _loss(self, predicted: Tensor, values: Tensor) -> Tensor:
+        if predicted.shape != values.shape:
             raise TacpipeError(
-                f"The network returns {tuple(found.shape)} for {len(values)} grasps; it must return (cloud, value), here "
-                f"{tuple(values.shape)}."
+                f"The network returns {tuple(predicted.shape)} for {len(values)} grasps; it must return (cloud, value), "
+                f"here {tuple(values.shape)}."
             )
-        squared = (found - values) ** 2
+        squared = (predicted - values) ** 2
         if self.loss_name == "rmse":
             return torch.sqrt(squared.mean() + SMALLEST)
         return (squared * self.weights).mean()
 
 
 def output(model: nn.Module, arrays: Arrays) -> Tensor:
-    """Return what a network makes of points and numbers (grasp, value), on the device of its weights."""
+    """Return the output of a network for points and numbers (grasp, value), on the device of its weights."""
     device = next(model.parameters()).device
-    found: Tensor = model(*(torch.from_numpy(array).to(device) for array in arrays))
-    return found
+    values: Tensor = model(*(torch.from_numpy(array).to(device) for array in arrays))
+    return values
 
 
 def predictions(model: nn.Module, sources: Drawn, count: int, draws: int) -> Float32s:

@@ -31,7 +31,7 @@ class Member(Protocol):
 
     @property
     def targets(self) -> tuple[str, ...]:
-        """What it predicts."""
+        """Names of the targets that it predicts."""
 
     def predict(self, grasps: Grasps) -> Floats:
         """Return the values of its targets side by side (grasp, value), device counts."""
@@ -54,8 +54,8 @@ class ForestMember:
         rows, names = geometry.table(grasps.clouds, grasps.grasps, coloured=self.coloured, placed=self.placed)
         if names != self.features:
             raise TacpipeError("The model was trained on other features than this version computes. Train it again.")
-        found = averaged((group, forest.predict(rows)) for group, forest in self.forests)
-        return np.concatenate([found[target] for target in self.targets], axis=1)
+        by_target = averaged((group, forest.predict(rows)) for group, forest in self.forests)
+        return np.concatenate([by_target[target] for target in self.targets], axis=1)
 
 
 @dataclass(frozen=True)
@@ -69,10 +69,10 @@ class NetworkMember:
 
     def predict(self, grasps: Grasps) -> Floats:
         """Return the values of its targets (grasp, value), device counts, averaged over the params' ``draws``."""
-        found = predictions(self.network, sources(self.params, grasps), len(grasps), self.params.draws)
-        if found.shape != (wanted := (len(grasps), len(self.scale.offset))):
-            raise TacpipeError(f"The network returns {found.shape}; it must return (cloud, value), here {wanted}.")
-        return np.asarray(self.scale.restore(found), np.float64)
+        values = predictions(self.network, sources(self.params, grasps), len(grasps), self.params.draws)
+        if values.shape != (shape := (len(grasps), len(self.scale.offset))):
+            raise TacpipeError(f"The network returns {values.shape}; it must return (cloud, value), here {shape}.")
+        return np.asarray(self.scale.restore(values), np.float64)
 
 
 def parted(values: Floats, targets: Sequence[str]) -> dict[str, Floats]:
@@ -81,13 +81,13 @@ def parted(values: Floats, targets: Sequence[str]) -> dict[str, Floats]:
     return dict(zip(targets, np.split(values, ends, axis=1), strict=True))
 
 
-def averaged(several: Iterable[tuple[Sequence[str], Floats]]) -> dict[str, Floats]:
+def averaged(predictions: Iterable[tuple[Sequence[str], Floats]]) -> dict[str, Floats]:
     """Return by target (grasp, value) the mean of several predictions, each its targets' values side by side."""
-    found: dict[str, list[Floats]] = {}
-    for targets, values in several:
-        for target, own in parted(values, targets).items():
-            found.setdefault(target, []).append(own)
-    return {target: np.mean(values, axis=0) for target, values in found.items()}
+    by_target: dict[str, list[Floats]] = {}
+    for targets, values in predictions:
+        for target, target_values in parted(values, targets).items():
+            by_target.setdefault(target, []).append(target_values)
+    return {target: np.mean(values, axis=0) for target, values in by_target.items()}
 
 
 def units(values: Floats, targets: Sequence[str]) -> Floats:
@@ -102,12 +102,12 @@ def network(params: NetworkParams, targets: Sequence[str]) -> nn.Module:
     """Return an untrained network for params and targets. Raises `TacpipeError` where params build something else."""
     values = sum(biotac_sp.width(target) for target in targets)
     read = inputs(params) if isinstance(params, params_of.Pointnet) else patches(params)
-    made = params.build(Shape(read.channels, read.grasp_numbers, values))
-    if not isinstance(made, nn.Module):
+    built = params.build(Shape(read.channels, read.grasp_numbers, values))
+    if not isinstance(built, nn.Module):
         raise TacpipeError(
-            f"The architecture {params.architecture} built {type(made).__name__}; it must build a torch.nn.Module."
+            f"The architecture {params.architecture} built {type(built).__name__}; it must build a torch.nn.Module."
         )
-    return made
+    return built
 
 
 def checked(params: NetworkParams) -> None:

@@ -1,4 +1,4 @@
-"""What `tacpipe.load` returns for a model of the task ``touch``: it predicts for recordings, and for a cloud and a grasp."""
+"""The loaded model of the task ``touch``, which predicts for recordings, or for a cloud and a grasp."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class TouchModel(Predictor):
     def predict(self, cloud: Cloud, grasp: Grasp, /) -> Touch: ...
 
     def predict(
-        self, given: Dataset | Recording | Cloud, grasp: Grasp | None = None, /, *, quantiles: Sequence[int] = ()
+        self, recordings: Dataset | Recording | Cloud, grasp: Grasp | None = None, /, *, quantiles: Sequence[int] = ()
     ) -> pa.Table | Touch:
         """Return predicted readings: of a dataset or one of its recordings as a table, of one cloud as `Touch`.
 
@@ -41,13 +41,13 @@ class TouchModel(Predictor):
         **A cloud and a grasp**, in metres and one frame, give the touch of this grasp. Raises `TacpipeError` where the grasp
         lies far from the cloud, and where either lacks what the model reads.
         """
-        if isinstance(given, Cloud):
+        if isinstance(recordings, Cloud):
             if grasp is None:
                 raise UsageError(
                     "A cloud needs a grasp: the place where the fingers close. Give predict(cloud, grasp)."
                 )
-            return self.predict_all(given, [grasp])[0]
-        return prediction.predictions(self, opened(given, self.chain), sorted(set(quantiles)))
+            return self.predict_all(recordings, [grasp])[0]
+        return prediction.predictions(self, opened(recordings, self.chain), sorted(set(quantiles)))
 
 
 def grasp_values(model: TouchModel, cloud: Cloud, grasp: Grasp) -> dict[str, float]:

@@ -38,7 +38,7 @@ Targets = Annotated[str, CommaList(Literal["pdc_th", "pdc_mf", "e_th", "e_mf"], 
 
 @dataclass(frozen=True)
 class Touch:
-    """What every model of the task ``touch`` predicts and learns from."""
+    """Params that every model of the task ``touch`` has."""
 
     ARCHITECTURES: ClassVar[str] = "touch"  # the task, as entry points name it
     architecture: str = "tree-ensemble"
@@ -80,9 +80,9 @@ class Trees(Touch):
     architecture: Annotated[
         Literal["tree-ensemble", "trees"], StoredAs("architecture", {"tree-ensemble": "strong"})
     ] = "tree-ensemble"
-    inputs: Literal["rgb", "xyz"] = "rgb"  # what is read of a cloud: places and colours, or places alone
+    inputs: Literal["rgb", "xyz"] = "rgb"  # columns of a cloud: places and colours, or only places
     place: bool = False  # read where the grasp is before the camera too, not its shape alone
-    trees: PositiveInt = 300  # of each target's forest
+    trees: PositiveInt = 300  # trees of each target's forest
     leaf: NonNegativeInt = 0  # fewest training grasps of a leaf; 0: chosen of 2, 4 and 8 by out-of-bag error
     # shrink predictions for objects not trained on towards the constant, as far as errs least on training objects left out
     shrink_novel: bool = added(False)
@@ -91,24 +91,24 @@ class Trees(Touch):
 
 @dataclass(frozen=True)
 class PointNetwork(Touch, ABC):
-    """What networks that read points have in common."""
+    """Params that networks that read points have in common."""
 
     # one network for all targets; else one each, as in the paper
     multi_target: Annotated[bool, StoredAs("together")] = True
     networks: PositiveInt = 3  # networks of other initial weights, whose mean is the prediction
     points: Draws = 128  # drawn of each cloud, or of each patch, anew at each visit
-    draws: Draws = 4  # of points, over which a prediction is averaged
+    draws: Draws = 4  # draws of points over which a prediction is averaged
     # balanced: squared error in which all targets count the same; rmse of normalised values, the paper's
     loss: Literal["balanced", "rmse"] = "balanced"
     epochs: PositiveInt = 40  # passes over the training grasps
     batch: Annotated[int, Range(2)] = 16  # grasps per step of the optimiser, which normalises them by their own spread
-    learning_rate: PositiveFloat = 2e-3  # of Adam; the peak if it goes through a cycle
+    learning_rate: PositiveFloat = 2e-3  # learning rate of Adam; the peak if it goes through a cycle
     cycle: bool = True  # raise and lower the learning rate once over all epochs
     weight_decay: NonNegativeFloat = 0.0  # fraction of each weight that is added to its gradient
     patience: NonNegativeInt = 0  # epochs without a lower validation loss after which training ends; 0: all epochs
     # weights to keep: last, of the last epoch; best, of the lowest validation loss
     select: Literal["last", "best"] = "last"
-    # of products in training; bfloat16 takes half the memory and rounds to 3 digits, weights stay in float32
+    # precision of products in training; bfloat16 takes half the memory and rounds to 3 digits, weights stay in float32
     precision: Precision = added("float32")
 
     @abstractmethod
@@ -136,7 +136,7 @@ class Patches(PointNetwork):
 
     # patches: networks that read points about both contacts
     architecture: Literal["patches"] = "patches"
-    inputs: Literal["rgb", "xyz"] = "rgb"  # what is read of a point: place and colour, or place alone
+    inputs: Literal["rgb", "xyz"] = "rgb"  # columns of a point: place and colour, or only place
     place: bool = False  # read where the grasp is before the camera too, not its shape alone
     backbone: Literal["points", "edges"] = "points"  # points: each alone; edges: each with its nearest ones
     radius_mm: Annotated[PositiveFloat, Unit("mm")] = 20.0  # radius of the patch about a contact
@@ -164,9 +164,9 @@ class Pointnet(PointNetwork):
 
     # pointnet: the paper's network
     architecture: Literal["pointnet"] = "pointnet"
-    # what is read: place (xyz) or place and colour (rgb) of points, with contact points (cont) and wrist (pose)
+    # inputs: place (xyz) or place and colour (rgb) of points, with contact points (cont) and wrist (pose)
     inputs: Literal["xyz", "rgb", "xyzcont", "rgbcont", "xyzpose", "rgbpose"] = "rgbcont"
-    # of a cloud; minmax of each axis; wrist's axes
+    # normalisation of a cloud; minmax of each axis; wrist's axes
     normalisation: Literal["none", "sphere", "minmax", "wrist"] = "none"
     # largest random rotation about each axis in training
     rotation_deg: Annotated[float, Range(0, 180), Unit("degrees")] = 0.0
@@ -198,4 +198,4 @@ class Pointnet(PointNetwork):
         return PointNet(shape.channels, shape.numbers, shape.values, head=HEADS[self.head], transform=self.transform)
 
 
-Params = Touch  # of any architecture
+Params = Touch  # params of any architecture

@@ -1,4 +1,4 @@
-"""What a patch network reads of a grasp: points about both contacts and of the whole object, in the axes of the grasp."""
+"""The inputs of a patch network: points about both contacts and of the whole object, in the axes of the grasp."""
 
 from __future__ import annotations
 
@@ -55,8 +55,8 @@ class PatchSources:
     ) -> None:
         """Take clouds and grasps; raises `TacpipeError` where colours are to be read and a cloud has none."""
         self.patches = patches
-        self.clouds: list[Float32s] = []  # of (point, channel)
-        self.near: list[list[Indices]] = []  # of points about g1 and about g2
+        self.clouds: list[Float32s] = []  # (point, channel) each
+        self.near: list[list[Indices]] = []  # indices of points near g1 and near g2
         if patches.coloured:
             require_colours(names, clouds)
         for cloud, grasp in zip(clouds, grasps, strict=True):
@@ -77,14 +77,14 @@ class PatchSources:
         rngs = [np.random.default_rng([visit, zlib.crc32(self.clouds[index].tobytes())]) for index in indices]
         return self._arrays(list(zip(indices, rngs, strict=True)))
 
-    def _arrays(self, wanted: Sequence[tuple[int, np.random.Generator]]) -> Arrays:
+    def _arrays(self, draws: Sequence[tuple[int, np.random.Generator]]) -> Arrays:
         count = self.patches.points
-        found = np.empty((len(wanted), PLACES, count, self.patches.channels), np.float32)
-        for row, (index, rng) in enumerate(wanted):
+        points = np.empty((len(draws), PLACES, count, self.patches.channels), np.float32)
+        for row, (index, rng) in enumerate(draws):
             cloud = self.clouds[index]
-            for place, among in enumerate((*self.near[index], np.arange(len(cloud)))):
-                found[row, place] = cloud[among[_chosen(len(among), count, rng)]]
-        return found, self.numbers[[index for index, _ in wanted]]
+            for place, indices in enumerate((*self.near[index], np.arange(len(cloud)))):
+                points[row, place] = cloud[indices[_chosen(len(indices), count, rng)]]
+        return points, self.numbers[[index for index, _ in draws]]
 
 
 def require_colours(names: Sequence[str], clouds: Sequence[Cloud]) -> None:

@@ -27,8 +27,8 @@ def predict(
     there are no recordings or they are not what the model reads. ``quantiles`` (percent), of a calibrated model, add columns
     such as ``e_mf_07_q90``.
     """
-    found = predictions(Predictor.load(model), recordings, quantiles)
-    return Result({PREDICTIONS: RecordingOutput(found, simulated(recordings))})
+    table = predictions(Predictor.load(model), recordings, quantiles)
+    return Result({PREDICTIONS: RecordingOutput(table, simulated(recordings))})
 
 
 def predictions(predictor: Predictor, recordings: Dataset, quantiles: Sequence[int] = ()) -> pa.Table:
@@ -40,10 +40,10 @@ def predictions(predictor: Predictor, recordings: Dataset, quantiles: Sequence[i
     predicted = predictor.predict_grasps(grasps)
     bands = {}
     if quantiles and predictor.quantiles is not None:
-        found = predictor.quantiles.quantiles(predicted)
+        quantile_readings = predictor.quantiles.quantiles(predicted)
         bands = {
-            one: {target: values[..., level] for target, values in found.items()}
-            for one, level in zip(quantiles, at, strict=True)
+            percent: {target: values[..., level] for target, values in quantile_readings.items()}
+            for percent, level in zip(quantiles, at, strict=True)
         }
     table = readings_table(predicted, bands)
     return table.add_column(0, pa.field("recording", pa.string()), pa.array(grasps.names, pa.string()))

@@ -62,12 +62,12 @@ class Predictor:
     """A loaded model of touch; `model` adds what reads recordings."""
 
     params: Params
-    config: Config  # as it is stored
+    config: Config  # config.json
     members: Sequence[members.Member]
     baselines: Baselines | None
     chain: Chain | None = None  # the stages that it was trained behind; None: unknown
-    shrinkage: Shrinkage | None = None  # of predictions for objects that it was not trained on
-    quantiles: ReadingQuantiles | None = None  # of a model that `tacpipe calibrate` made
+    shrinkage: Shrinkage | None = None  # shrinks predictions for objects that it was not trained on
+    quantiles: ReadingQuantiles | None = None  # None unless `tacpipe calibrate` wrote the model
 
     @classmethod
     def load(cls, files: Mapping[str, bytes], chain: Chain | None = None) -> Self:
@@ -81,7 +81,7 @@ class Predictor:
         tensors = model_files.tensors(files[WEIGHTS], WEIGHTS)
         device = devices.kind()
         with model_files.validated("the model"):
-            found = [
+            loaded_members = [
                 _member(params, about, under(f"{number}.", tensors), device)
                 for number, about in enumerate(config["members"])
             ]
@@ -90,27 +90,29 @@ class Predictor:
                 stored = model_files.arrays(files[BASELINES], BASELINES, but="")
                 baselines = Baselines.from_tensors(stored, tuple(config["learned_objects"]))
                 baselines.check()
-            if not config["targets"] or {*config["targets"]} != {target for one in found for target in one.targets}:
+            if not config["targets"] or {*config["targets"]} != {
+                target for one in loaded_members for target in one.targets
+            }:
                 raise ValueError(f"its members do not predict {excerpt(config['targets'])}")
             shrunk = {name: value.numpy() for name, value in under(SHRINKAGE, tensors).items()}
             shrinkage = Shrinkage.from_tensors(shrunk, config["targets"]) if shrunk else None
             quantiles = ReadingQuantiles.load(files[QUANTILES], config["targets"]) if QUANTILES in files else None
-        return cls(params, config, found, baselines, chain, shrinkage, quantiles)
+        return cls(params, config, loaded_members, baselines, chain, shrinkage, quantiles)
 
     @cached_property
     def targets(self) -> tuple[str, ...]:
-        """What the model predicts."""
+        """Names of the targets that the model predicts."""
         return tuple(self.config["targets"])
 
     def predict_grasps(self, grasps: Grasps) -> dict[str, Floats]:
         """Return the predicted reading by target (grasp, value), device counts: the mean of the members.
 
-        With a shrinkage, those of grasps without an object that the model was trained on are shrunk.
+        A shrinkage applies to grasps of objects that the model was not trained on.
 
         Raises `TacpipeError` where a grasp lacks what the model reads: colours, points, the wrist.
         """
-        found = members.averaged((member.targets, member.predict(grasps)) for member in self.members)
-        predicted = {target: found[target] for target in self.targets}
+        by_target = members.averaged((member.targets, member.predict(grasps)) for member in self.members)
+        predicted = {target: by_target[target] for target in self.targets}
         if self.shrinkage is None:
             return predicted
         return self.shrinkage.apply(
@@ -129,15 +131,20 @@ class Predictor:
         if not count:
             return []
         names = tuple(f"Grasp {number}" for number in range(count)) if count > 1 else ("The grasp",)
-        nothing = ("",) * count
+        unnamed = ("",) * count
         bundle = Grasps(
-            names, nothing, nothing, np.zeros(count, np.int64), (cloud,) * count, tuple(grasps), {}, nothing
+            names, unnamed, unnamed, np.zeros(count, np.int64), (cloud,) * count, tuple(grasps), {}, unnamed
         )
-        found = self.predict_grasps(bundle)
-        for target in set(biotac_sp.TARGETS) - set(found):
-            found[target] = np.full((count, biotac_sp.width(target)), np.nan)
+        readings = self.predict_grasps(bundle)
+        for target in set(biotac_sp.TARGETS) - set(readings):
+            readings[target] = np.full((count, biotac_sp.width(target)), np.nan)
         return [
-            Touch(float(found["pdc_th"][at, 0]), float(found["pdc_mf"][at, 0]), found["e_th"][at], found["e_mf"][at])
+            Touch(
+                float(readings["pdc_th"][at, 0]),
+                float(readings["pdc_mf"][at, 0]),
+                readings["e_th"][at],
+                readings["e_mf"][at],
+            )
             for at in range(count)
         ]
 

@@ -31,16 +31,16 @@ FILE = "quantiles.safetensors"
 LEVELS = "levels"
 MEAN = "mean"
 
-Readings = Mapping[str, Floats]  # by target (grasp, value), device counts
-Offsets = Mapping[str, Floats]  # by target (level, value), device counts
+Readings = Mapping[str, Floats]  # target -> (grasp, value), device counts
+Offsets = Mapping[str, Floats]  # target -> (level, value), device counts
 
 
 @dataclass(frozen=True)
 class ReadingQuantiles:
-    """By how much quantiles lie beyond a prediction: of the model, of the constant and of the object's mean."""
+    """Offsets of quantiles from a prediction: of the model, of the constant and of the object's mean."""
 
     levels: Floats  # (level,), fractions in ascending order
-    offsets: Mapping[str, Offsets]  # by predictor
+    offsets: Mapping[str, Offsets]  # predictor -> offsets
 
     @property
     def percents(self) -> tuple[int, ...]:
@@ -61,33 +61,36 @@ class ReadingQuantiles:
         Those of the constant and of the object's mean, the baselines, are empirical ones of ``training``. Raises
         `TacpipeError` with too few calibration grasps to promise the levels.
         """
-        own, constant, objects = {}, {}, {}
+        model_offsets, constant_offsets, object_offsets = {}, {}, {}
         for target, values in predicted.items():
-            known = training.readings[target]
-            unit = np.maximum(known.std(axis=0), 1.0)  # a count
+            training_values = training.readings[target]
+            unit = np.maximum(training_values.std(axis=0), 1.0)  # a count
             errors = (calibration.readings[target] - values) / unit
-            own[target] = _quantiles(errors, levels, promised)[:, None] * unit
-            constant[target] = np.quantile(known - known.mean(axis=0), levels, axis=0)
-            objects[target] = np.quantile(_about_objects(known, training.objects), levels, axis=0)
-        return cls(levels, {MODEL: own, CONSTANT: constant, OBJECT_MEAN: objects})
+            model_offsets[target] = _quantiles(errors, levels, promised)[:, None] * unit
+            constant_offsets[target] = np.quantile(training_values - training_values.mean(axis=0), levels, axis=0)
+            object_offsets[target] = np.quantile(_about_objects(training_values, training.objects), levels, axis=0)
+        return cls(levels, {MODEL: model_offsets, CONSTANT: constant_offsets, OBJECT_MEAN: object_offsets})
 
     def to_bytes(self) -> bytes:
         """Return a file that `load` reads."""
         tensors: dict[str, AnyArray] = {LEVELS: self.levels}
         for predictor, offsets in self.offsets.items():
-            tensors |= {f"{predictor}.{target}": np.ascontiguousarray(one) for target, one in offsets.items()}
+            tensors |= {
+                f"{predictor}.{target}": np.ascontiguousarray(target_offsets)
+                for target, target_offsets in offsets.items()
+            }
         return save(tensors)
 
     @classmethod
     def load(cls, content: bytes, targets: Sequence[str]) -> Self:
         """Return what `to_bytes` wrote. Raises `TacpipeError` for another file, `ValueError` where shapes do not fit."""
-        found = model_files.arrays(content, FILE)
-        offsets = {name: dict(under(f"{name}.", found)) for name in (MODEL, CONSTANT, OBJECT_MEAN)}
-        for each in offsets.values():
-            shapes = {target: each[target].shape for target in targets}
-            if shapes != {target: (len(found[LEVELS]), biotac_sp.width(target)) for target in targets}:
+        tensors = model_files.arrays(content, FILE)
+        offsets = {name: dict(under(f"{name}.", tensors)) for name in (MODEL, CONSTANT, OBJECT_MEAN)}
+        for by_target in offsets.values():
+            shapes = {target: by_target[target].shape for target in targets}
+            if shapes != {target: (len(tensors[LEVELS]), biotac_sp.width(target)) for target in targets}:
                 raise ValueError(f"the quantiles are of {shapes}")
-        return cls(found[LEVELS], offsets)
+        return cls(tensors[LEVELS], offsets)
 
 
 def tree(
@@ -100,30 +103,30 @@ def tree(
     """
     if not mask.any():
         return {}
-    found: dict[str, Any] = {}
+    measures: dict[str, Any] = {}
     names = np.asarray(clusters)[mask]
     for predictor in (MODEL, CONSTANT, OBJECT_MEAN):
         for target in predicted[MODEL]:
-            own, still = (
+            sums, constant_sums = (
                 _sums(fitted, grasps, predicted, (name, target), mask, names) for name in (predictor, CONSTANT)
             )
-            for measure, values in quantiles.tree(own, fitted.percents, still).items():
+            for measure, values in quantiles.tree(sums, fitted.percents, constant_sums).items():
                 if MEAN in values:
-                    found.setdefault(predictor, {}).setdefault(measure, {})[target] = values[MEAN]
-    return {"n": int(mask.sum()), **found}
+                    measures.setdefault(predictor, {}).setdefault(measure, {})[target] = values[MEAN]
+    return {"n": int(mask.sum()), **measures}
 
 
 def coverage(
-    fitted: ReadingQuantiles, grasps: Grasps, predicted: Mapping[str, Readings], mask: Bools, known: Bools
+    fitted: ReadingQuantiles, grasps: Grasps, predicted: Mapping[str, Readings], mask: Bools, is_known: Bools
 ) -> bytes:
     """Return ``coverage.parquet``: of grasps that a mask (grasp,) chooses a row a predictor and value.
 
     It states whether the true value lies in the band from the lowest to the highest quantile, how wide that is and the
-    pinball loss, both in device counts; ``known`` (grasp,) is whether the model knows the object.
+    pinball loss, both in device counts; ``is_known`` (grasp,) is whether the model knows the object.
     """
     import pyarrow as pa
 
-    names, objects = (np.asarray(one)[mask] for one in (grasps.names, grasps.objects))
+    names, objects = (np.asarray(labels)[mask] for labels in (grasps.names, grasps.objects))
     parts = []
     for predictor in (MODEL, CONSTANT, OBJECT_MEAN):
         for target, values in predicted[predictor].items():
@@ -137,7 +140,7 @@ def coverage(
                     {
                         "recording": np.repeat(names, count),
                         "object": np.repeat(objects, count),
-                        "known": np.repeat(known[mask], count),
+                        "known": np.repeat(is_known[mask], count),
                         "predictor": [predictor] * truth.size,
                         "target": [target] * truth.size,
                         "value": np.tile(np.arange(1, count + 1, dtype=np.int32), len(truth)),
@@ -163,8 +166,8 @@ def _sums(
     bands = fitted.quantiles({target: predicted[predictor][target][mask]}, predictor)[target]
     truth = grasps.readings[target][mask]
     return [
-        Sums.of(truth[some].reshape(-1, 1), bands[some].reshape(-1, 1, bands.shape[2]), fitted.levels)
-        for some in (clusters == name for name in sorted(set(clusters.tolist())))
+        Sums.of(truth[in_cluster].reshape(-1, 1), bands[in_cluster].reshape(-1, 1, bands.shape[2]), fitted.levels)
+        for in_cluster in (clusters == name for name in sorted(set(clusters.tolist())))
     ]
 
 
@@ -172,12 +175,12 @@ def _quantiles(errors: Floats, levels: Floats, promised: bool) -> Floats:
     """Return the quantile (level,) of errors (grasp, value), each grasp weighing the same."""
     groups = np.repeat(np.arange(len(errors)), errors.shape[1])
     flat, middle = errors.ravel(), len(levels) // 2
-    found = np.zeros(len(levels))
+    offsets = np.zeros(len(levels))
     for at, level in enumerate(levels):
         if not promised or at == middle:
-            found[at] = conformal.quantile(flat, groups, float(level))
+            offsets[at] = conformal.quantile(flat, groups, float(level))
     if promised:
-        away = np.abs(flat - found[middle])
+        away = np.abs(flat - offsets[middle])
         for low in range(middle):
             level = float(levels[-1 - low] - levels[low])
             far = conformal.quantile(away, groups, level, promised=True)
@@ -187,15 +190,15 @@ def _quantiles(errors: Floats, levels: Floats, promised: bool) -> Floats:
                     f"{100 * conformal.most_promised(len(errors)):.0f} % at most, not {100 * level:.0f} %. Split with more "
                     f"of them (`tacpipe split --val`), give quantiles nearer to 50, or leave out --promise."
                 )
-            found[low], found[-1 - low] = found[middle] - far, found[middle] + far
-    return found
+            offsets[low], offsets[-1 - low] = offsets[middle] - far, offsets[middle] + far
+    return offsets
 
 
 def _about_objects(values: Floats, objects: Sequence[str]) -> Floats:
     """Return readings (grasp, value) less the mean of the grasps of the same object."""
-    found = np.empty_like(values)
+    deviations = np.empty_like(values)
     names = np.array(objects)
     for name in set(objects):
         same: Bools = names == name
-        found[same] = values[same] - values[same].mean(axis=0)
-    return found
+        deviations[same] = values[same] - values[same].mean(axis=0)
+    return deviations

@@ -21,7 +21,7 @@ import numpy as np
 from tacpipe.arrays import Floats, Indices
 from tacpipe.metrics.intervals import Estimate
 
-EDGES_MM = (0.0, 6.0, 10.0, 20.0, 40.0, math.inf)  # of the classes of distance
+EDGES_MM = (0.0, 6.0, 10.0, 20.0, 40.0, math.inf)  # edges of the classes of distance
 RESAMPLES = 500
 NOTHING = Estimate(math.nan, math.nan, math.nan)
 
@@ -47,7 +47,7 @@ class Pairs:
 
 @dataclass(frozen=True)
 class Repeatability:
-    """What pairs of one class of distance show of one target."""
+    """Repeatability of one target, from pairs of one class of distance."""
 
     pairs: int
     likeness: (
@@ -71,20 +71,20 @@ def repeatability(
     squared = np.square(values[first] - values[second]).sum(axis=1)  # (pair,)
     kind = np.unique(np.asarray(objects), return_inverse=True)[1]
 
-    def found(weight: Floats) -> tuple[float, float]:
-        within, total = variances(values, kind, weight)
+    def estimates(weight: Floats) -> tuple[float, float]:
+        variance_within, total = variances(values, kind, weight)
         counts = weight[first] * weight[second]
-        expected = float((counts * within[kind[first]]).sum())
+        expected = float((counts * variance_within[kind[first]]).sum())
         if expected <= 0 or total <= 0:
             return math.nan, math.nan
         ratio = float((counts * squared).sum()) / 2 / expected
-        return 1 - ratio, 1 - math.sqrt(ratio * float(np.average(within[kind], weights=weight)) / total)
+        return 1 - ratio, 1 - math.sqrt(ratio * float(np.average(variance_within[kind], weights=weight)) / total)
 
     rng, count = np.random.default_rng(seed), len(values)
     drawn = [np.bincount(rng.integers(0, count, count), minlength=count).astype(np.float64) for _ in range(RESAMPLES)]
-    resampled = np.array([found(weight) for weight in drawn])  # (resample, likeness or pair skill)
+    resampled = np.array([estimates(weight) for weight in drawn])  # (resample, likeness or pair skill)
     resampled = resampled[np.isfinite(resampled).all(axis=1)]
-    means = found(np.ones(count))
+    means = estimates(np.ones(count))
     if not len(resampled):
         return Repeatability(len(first), *(Estimate(mean, math.nan, math.nan) for mean in means))
     low, high = np.quantile(resampled, (0.025, 0.975), axis=0)
@@ -102,10 +102,12 @@ def variances(values: Floats, kind: Indices, weight: Floats) -> tuple[Floats, fl
     sums = np.zeros((objects, values.shape[1]))
     np.add.at(sums, kind, weight[:, None] * values)
     means = sums / np.maximum(counts, 1)[:, None]
-    apart = weight * np.square(values - means[kind]).sum(axis=1)
-    within = np.where(counts > 1, np.bincount(kind, apart, objects) / np.maximum(counts - 1, 1), 0.0)
+    squared_deviations = weight * np.square(values - means[kind]).sum(axis=1)
+    variance_within = np.where(
+        counts > 1, np.bincount(kind, squared_deviations, objects) / np.maximum(counts - 1, 1), 0.0
+    )
     centre = np.average(values, axis=0, weights=weight)
-    return within, float(np.average(np.square(values - centre).sum(axis=1), weights=weight))
+    return variance_within, float(np.average(np.square(values - centre).sum(axis=1), weights=weight))
 
 
 def table(

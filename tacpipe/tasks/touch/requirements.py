@@ -1,4 +1,4 @@
-"""What recordings must hold for the task ``touch``."""
+"""The streams and labels that recordings must have for the task ``touch``."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-COVERAGE = "coverage.parquet"  # of a calibrated model: each value of each grasp and the band that was predicted for it
+COVERAGE = "coverage.parquet"  # each value of each grasp, with the band that a calibrated model predicted
 PREDICTIONS = "predictions"  # the recording; each name below is a stream of it, with the same grasps as rows
 GRASPS, TRUE, MODEL = "grasps", "true", "model"
 CONSTANT, OBJECT_MEAN, NEAREST_IN_TIME = "constant", "object_mean", "nearest_in_time"  # the baselines

@@ -22,29 +22,29 @@ FEWEST = 3  # objects; with two, a model of one is asked about the other
 class Shrinkage:
     """How predictions for novel objects are shrunk, by target."""
 
-    kept: Mapping[str, float]  # of what is predicted beyond the constant, 0 to 1
+    factor: Mapping[str, float]  # multiplies the difference between prediction and constant, 0 to 1
     constant: Mapping[str, Floats]  # (value,), device counts
 
     def apply(self, predicted: Mapping[str, Floats], novel: Bools) -> dict[str, Floats]:
         """Return predictions (grasp, value) by target, those of the ``novel`` grasps (grasp,) shrunk."""
-        found = {}
+        shrunk = {}
         for name, values in predicted.items():
             constant = self.constant[name]
-            found[name] = np.where(novel[:, None], constant + self.kept[name] * (values - constant), values)
-        return found
+            shrunk[name] = np.where(novel[:, None], constant + self.factor[name] * (values - constant), values)
+        return shrunk
 
     def tensors(self) -> dict[str, AnyArray]:
         """Return what `from_tensors` reads."""
-        kept = {f"kept.{name}": np.array([value]) for name, value in self.kept.items()}
-        return {**kept, **{f"constant.{name}": values for name, values in self.constant.items()}}
+        factors = {f"kept.{name}": np.array([value]) for name, value in self.factor.items()}
+        return {**factors, **{f"constant.{name}": values for name, values in self.constant.items()}}
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, AnyArray], targets: Sequence[str]) -> Shrinkage:
         """Return what `tensors` wrote. Raises `ValueError` for a fraction outside 0 to 1."""
-        kept = {name: float(tensors[f"kept.{name}"][0]) for name in targets}
-        if not all(0 <= value <= 1 for value in kept.values()):
-            raise ValueError(f"predictions of novel objects keep {kept}, not 0 to 1")
-        return cls(kept, {name: tensors[f"constant.{name}"].astype(np.float64) for name in targets})
+        factor = {name: float(tensors[f"kept.{name}"][0]) for name in targets}
+        if not all(0 <= value <= 1 for value in factor.values()):
+            raise ValueError(f"predictions of novel objects keep {factor}, not 0 to 1")
+        return cls(factor, {name: tensors[f"constant.{name}"].astype(np.float64) for name in targets})
 
 
 def fit(
@@ -59,20 +59,23 @@ def fit(
     three objects.
     """
     names = np.asarray(objects)
-    each = sorted(set(objects) - {""})
-    if len(each) < FEWEST:
+    object_names = sorted(set(objects) - {""})
+    if len(object_names) < FEWEST:
         raise UsageError(
-            f"shrink_novel is set and training grasps are of {len(each)} objects; it needs {FEWEST} or more, which are left "
-            f"out one by one. Label objects, or leave out --shrink-novel."
+            f"shrink_novel is set and training grasps are of {len(object_names)} objects; it needs {FEWEST} or more, which "
+            f"are left out one by one. Label objects, or leave out --shrink-novel."
         )
-    products = {name: [0.0, 0.0] for name in readings}  # of prediction and truth, of the prediction with itself
-    for name in each:
-        known = names != name
-        predicted = predict(known)
+    products = {name: [0.0, 0.0] for name in readings}  # prediction times truth, prediction squared
+    for name in object_names:
+        in_training = names != name
+        predicted = predict(in_training)
         for target, values in readings.items():
-            constant = values[known].mean(axis=0)
+            constant = values[in_training].mean(axis=0)
             beyond = predicted[target] - constant
-            products[target][0] += float((beyond * (values[~known] - constant)).sum())
+            products[target][0] += float((beyond * (values[~in_training] - constant)).sum())
             products[target][1] += float(np.square(beyond).sum())
-    kept = {name: float(np.clip(one / other, 0, 1)) if other > 0 else 0.0 for name, (one, other) in products.items()}
-    return Shrinkage(kept, {name: values.mean(axis=0) for name, values in readings.items()})
+    factor = {
+        name: float(np.clip(product / square, 0, 1)) if square > 0 else 0.0
+        for name, (product, square) in products.items()
+    }
+    return Shrinkage(factor, {name: values.mean(axis=0) for name, values in readings.items()})

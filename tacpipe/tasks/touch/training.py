@@ -133,7 +133,7 @@ def _grow(params: Trees, config: Config, tensors: dict[str, Tensor], known: Gras
             return members.averaged((group, forest.predict(rows[~among])) for group, forest in found)
 
         shrunk = shrinkage.fit(readings, known.objects, predict)
-        config["kept_of_novel"] = dict(shrunk.kept)
+        config["kept_of_novel"] = dict(shrunk.factor)
         tensors.update({f"{SHRINKAGE}{name}": torch.from_numpy(one) for name, one in shrunk.tensors().items()})
 
 

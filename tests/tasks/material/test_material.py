@@ -208,7 +208,7 @@ def test_swapped_names_go_through_the_permutation_that_sensors_were_aligned_by(t
     latents = np.array([rows[f"z{number:02d}"] for number in range(1, 7)], np.float32).T
     for sensor, partner in (("biotac", "roboskin"), ("roboskin", "biotac")):
         at = [i for i, one in enumerate(rows["sensor"]) if one == sensor]
-        named = found.named(found.readers[partner].scores_of(latents[at]))  # type: ignore[union-attr]
+        named = found.best_classes(found.readers[partner].scores_of(latents[at]))  # type: ignore[union-attr]
         back = {other: one for one, other in partners.items()} if sensor == "biotac" else partners
         assert [rows["swapped"][i] for i in at] == [back[int(one)] for one in named]
 

@@ -36,16 +36,16 @@ def numbered(first: int, count: int) -> Any:
     ("label", "number"), [("foam", 1), (True, 2), (None, UNKNOWN)], ids=["text", "true", "nothing"]
 )
 def test_any_label_is_a_class_and_none_is_unknown(label: Any, number: int) -> None:
-    naming = Naming.of("grit", [True, "foam", "a", None])
+    naming = Naming.from_labels("grit", [True, "foam", "a", None])
     assert naming.names == ("a", "foam", "true")
     assert naming.number(label) == number
-    assert naming.named(np.array([number])).tolist() == [naming.names[number] if number >= 0 else ""]
+    assert naming.names_for(np.array([number])).tolist() == [naming.names[number] if number >= 0 else ""]
 
 
 def test_whole_numbers_stay_their_own_names_and_are_written_as_before() -> None:
-    naming = Naming.of("material", [20, 3])
+    naming = Naming.from_labels("material", [20, 3])
     assert (naming.number(20), naming.name(20), naming.to_json()) == (20, "20", {})
-    assert Naming.of("material", [0.5, -1, 3]).names == ("-1", "0.5", "3")
+    assert Naming.from_labels("material", [0.5, -1, 3]).names == ("-1", "0.5", "3")
 
 
 def test_a_label_that_no_model_knows_is_refused_with_those_that_it_does() -> None:

@@ -32,7 +32,7 @@ def beyond(truth: Floats, fraction: float) -> Callable[[Bools], Mapping[str, Flo
 def test_what_is_kept_is_what_makes_the_predictions_for_left_out_objects_right(fraction: float, kept: float) -> None:
     truth = np.random.default_rng(0).normal(size=(30, 1))
     found = shrinkage.fit({"pdc_th": truth}, OBJECTS, beyond(truth, fraction))
-    assert found.kept["pdc_th"] == pytest.approx(kept)
+    assert found.factor["pdc_th"] == pytest.approx(kept)
     np.testing.assert_allclose(found.constant["pdc_th"], truth.mean(axis=0))
 
 
@@ -59,13 +59,13 @@ def test_grasps_of_novel_objects_alone_are_shrunk(tmp_path: Path) -> None:
     )
     assert plain.shrinkage is None
     assert shrunk.shrinkage is not None
-    assert dict(shrunk.shrinkage.kept) == shrunk.config["kept_of_novel"]
+    assert dict(shrunk.shrinkage.factor) == shrunk.config["kept_of_novel"]
     known, novel = grasps(20, 3), grasps(20, 3, object="shoe")
     for target in ("pdc_th", "e_mf"):
         np.testing.assert_array_equal(shrunk.predict_grasps(known)[target], plain.predict_grasps(known)[target])
         constant = shrunk.shrinkage.constant[target]
         assert constant.shape == (biotac_sp.width(target),)
-        wanted = constant + shrunk.shrinkage.kept[target] * (plain.predict_grasps(novel)[target] - constant)
+        wanted = constant + shrunk.shrinkage.factor[target] * (plain.predict_grasps(novel)[target] - constant)
         np.testing.assert_allclose(shrunk.predict_grasps(novel)[target], wanted)
 
 

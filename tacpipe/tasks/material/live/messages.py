@@ -113,7 +113,7 @@ class MaterialMessage(messages.Message):
 
     @property
     def ended(self) -> bool:
-        """True where the slide is over."""
+        """True if the slide is over."""
         return self.state in (ENDED, FINAL)
 
     @property

@@ -77,8 +77,8 @@ class Answer:
 
     scores: Float32s | None  # (class,); None: no material is named, for a cause
     rows: int = 0  # rows of the slide so far
-    seen: float = 0.0  # fraction of the rows that the model reads
-    ended: bool = False  # nothing came of the slide for `ENDED_NS`
+    fraction: float = 0.0  # rows so far, as a fraction of those that the model reads
+    is_over: bool = False  # nothing came of the slide for `ENDED_NS`
     cause: str = ""
     probabilities: Float32s | None = field(default=None)  # (class,)
 
@@ -87,7 +87,7 @@ class SlideSoFar:
     """Names the material of the slide in what has come of a recording."""
 
     def __init__(
-        self, classifier: Classifier, params: Any, sensor: str, least_seen: float, rate_hz: float | None = None
+        self, classifier: Classifier, params: Any, sensor: str, least_fraction: float, rate_hz: float | None = None
     ) -> None:
         """Take the params of `segment slides`, and which fraction of a slide is enough. Raises for an unknown sensor.
 
@@ -98,7 +98,7 @@ class SlideSoFar:
         self._attributes = {"sensor": sensor} | ({"rate_hz": rate_hz} if rate_hz else {})
         self._layout, self._reader = classifier.layout(sensor), classifier.readers[sensor]
         self._stage = registry.load(SLIDES)
-        self._least = least_seen
+        self._least_fraction = least_fraction
 
     @property
     def frames(self) -> int:
@@ -129,13 +129,13 @@ class SlideSoFar:
         answer = Answer(None, rows, min(1.0, len(frames) / self.frames), is_over)
         if layout.channels != self._layout.channels or len(frames) > self.frames:
             return replace(answer, cause=f"the slide {difference(self._layout, layout)} as the model was trained on")
-        if len(frames) < self.frames and not (self.any_length and answer.seen >= self._least):
-            enough = f"{self._least:.0%} of {self.frames}" if self.any_length else str(self.frames)
+        if len(frames) < self.frames and not (self.any_length and answer.fraction >= self._least_fraction):
+            enough = f"{self._least_fraction:.0%} of {self.frames}" if self.any_length else str(self.frames)
             return replace(answer, cause=f"{len(frames)} rows of the slide have come, and {enough} are needed")
         if not lacks and not self._layout.alike(layout):
             return replace(answer, cause=f"the slide {difference(self._layout, layout)} as the model was trained on")
         scores = self._reader.read(frames[None]).scores
-        if self._classifier.unlike(scores, frames[None], self._sensor)[0]:
+        if self._classifier.is_unknown(scores, frames[None], self._sensor)[0]:
             return replace(answer, scores=scores[0], cause=UNLIKE)
         return replace(
             answer, scores=scores[0], probabilities=self._classifier.probabilities_of(scores, self._sensor)[0]
@@ -183,11 +183,11 @@ class Parting:
     def __init__(self, slide: SlideSoFar, finger: str, pause_ns: int) -> None:
         """Take what a slide is, the stream of the finger, and how long a pause is."""
         self._slide, self._finger, self._pause_ns = slide, finger, pause_ns
-        self._looked = 0  # moments of this part so far
+        self._moments = 0  # number of moments of this part so far
 
     def begin(self) -> None:
         """Begin another part."""
-        self._looked = 0
+        self._moments = 0
 
     def end_ns(self, tables: Tables, until_ns: int) -> int | None:
         """Return the moment at which the slide of this part is over, None where it is not by ``until_ns``.
@@ -197,8 +197,8 @@ class Parting:
         if self._finger not in tables:
             return None
         first_ns = int(tables[self._finger].column("t_ns")[0].as_py())
-        while (at_ns := first_ns + (self._looked + 1) * MOMENT_NS) <= until_ns:
-            self._looked += 1
+        while (at_ns := first_ns + (self._moments + 1) * MOMENT_NS) <= until_ns:
+            self._moments += 1
             if self._slide.is_over(up_to(tables, at_ns), self._finger, self._pause_ns):
                 return at_ns
         return None

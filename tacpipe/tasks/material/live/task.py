@@ -46,7 +46,7 @@ class MaterialLive(LiveTask):
         """Return the streams of materials and latencies."""
         from tacpipe.datasets import model_files
 
-        own_settings = _own(settings)
+        own_settings = _material_settings(settings)
         config = model_files.tree(model.files, model_files.CONFIG, {"classes": list})
         names = config.get("names") or {number: number for number in config["classes"]}
         materials = [str(names[number]) for number in config["classes"]]
@@ -65,7 +65,7 @@ class MaterialLive(LiveTask):
         from tacpipe.tasks.material.live.engine import MaterialEngine, find_finger
         from tacpipe.tasks.material.live.slide import SlideSoFar, slide_params
 
-        own_settings = _own(settings)
+        own_settings = _material_settings(settings)
         classifier = Classifier.load(model.files)
         params = slide_params(model.source.chain)
         trained = tuple(classifier.layouts)
@@ -83,7 +83,9 @@ class MaterialLive(LiveTask):
                 f"stream but {finger}. Add the arm, or train on `segment slides --trigger load`, whose slides end when "
                 f"nothing is touched."
             )
-        has_probabilities = classifier.known or isinstance(classifier.readers[sensor], NetworkReader | SpectraReader)
+        has_probabilities = classifier.calibrations or isinstance(
+            classifier.readers[sensor], NetworkReader | SpectraReader
+        )
         about = MaterialDescription(
             classifier.names,
             sensor,
@@ -110,7 +112,7 @@ class MaterialLive(LiveTask):
         return replay.predict(model, recordings)
 
 
-def _own(settings: Settings) -> MaterialSettings:
+def _material_settings(settings: Settings) -> MaterialSettings:
     assert isinstance(settings.task, MaterialSettings)
     return settings.task
 

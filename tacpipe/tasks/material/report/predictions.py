@@ -49,7 +49,7 @@ class Predictions:
 
     def named(self, materials: Int64s) -> NDArray[Any]:
         """Return the names of materials (slide,): text, or the numbers where these are the names."""
-        return self.naming.named(materials)
+        return self.naming.names_for(materials)
 
     @property
     def one_session_each(self) -> bool:

@@ -43,7 +43,7 @@ class TouchEngine(Engine):
             )
         self._predictor, self._criterion = predictor, criterion
         self._framers = {name: sensor.framer() for name, sensor in self.requests.items()}
-        self._begun: set[str] = set()
+        self._recorded_streams: set[str] = set()
         self._waiting: deque[tuple[int, str, bytes]] = deque()  # arrival, stream, request
         self._clouds: dict[str, Cloud] = {}  # the last one of each stream
 
@@ -57,7 +57,7 @@ class TouchEngine(Engine):
 
     def begin_recording(self, offset_ns: int) -> None:
         """Await the streams of requests."""
-        self._begun = set()
+        self._recorded_streams = set()
 
     def end_recording(self) -> None:
         """Drop the requests that wait."""
@@ -66,11 +66,11 @@ class TouchEngine(Engine):
 
     def begin_stream(self, stream: str) -> None:
         """Answer requests of a stream from now on."""
-        self._begun.add(stream)
+        self._recorded_streams.add(stream)
 
     def take_chunks(self, stream: str, chunks: Chunks) -> None:
         """Keep the requests of a stream; of more than `WAITING` the oldest are dropped."""
-        if stream not in self.requests or stream not in self._begun or not self.running:
+        if stream not in self.requests or stream not in self._recorded_streams or not self.running:
             return
         runs, _ = self._framers[stream].feed(chunks)
         for run in runs:
