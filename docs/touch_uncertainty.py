@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import tacpipe
 from tacpipe.io.parquet import from_parquet
 from tacpipe.plugins import given_params, registry
-from tacpipe.tasks.calibrated import Asked
+from tacpipe.tasks.calibrated import CalibrationRequest
 from tacpipe.tasks.touch import calibration as touch_calibration
 from tacpipe.tasks.touch import evaluation as touch_evaluation
 from tacpipe.tasks.touch import headline as headlines
@@ -39,7 +39,7 @@ SPLITS: Mapping[str, Mapping[str, Any]] = {  # calibrated on 56 grasps, on 60 wh
     "novel": {"scheme": "leave-one-out", "by": "object", "val": 0.25, "stratify": "object"},
 }
 PLACE, DRAWS = ".cache/touch-uncertainty", 2
-ASKED = Asked((10, 50, 90), promise=False, false_unknown=0.05, seed=0)
+ASKED = CalibrationRequest((10, 50, 90), promise=False, false_unknown=0.05, seed=0)
 
 
 def main(data: Path, folder: Path, draws: int) -> None:

@@ -23,7 +23,7 @@ import numpy as np
 
 import tacpipe
 from tacpipe.plugins import given_params, registry
-from tacpipe.tasks.calibrated import Asked
+from tacpipe.tasks.calibrated import CalibrationRequest
 from tacpipe.tasks.material import calibration as material_calibration
 from tacpipe.tasks.material import evaluation as material_evaluation
 from tacpipe.tasks.material import training as material_training
@@ -32,7 +32,7 @@ ARCHITECTURES = ("statistics",)  # the distance depends on the slides only, the 
 FOLDS = 5
 PLACE, DRAWS = ".cache/unknown-materials", 2
 COUNTED = ("false_unknown", "false_known")
-ASKED = Asked((10, 50, 90), promise=False, false_unknown=0.05, seed=0)
+ASKED = CalibrationRequest((10, 50, 90), promise=False, false_unknown=0.05, seed=0)
 
 
 @dataclass

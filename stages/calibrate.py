@@ -44,13 +44,15 @@ def calibrate(params: Params, model: Model, train: Dataset, val: Dataset | None,
     from tacpipe.datasets import model_files
     from tacpipe.errors import UsageError
     from tacpipe.plugins.stage import Result
-    from tacpipe.tasks.calibrated import Asked
+    from tacpipe.tasks.calibrated import CalibrationRequest
 
     task = model_files.task(model.files)
     task_calibration = task.calibration
     if task_calibration is None:
         raise UsageError(f"Models of the task {task.name} cannot be calibrated. Give a model of another task.")
-    asked = Asked(tuple(LEVELS.items(params.quantiles)), params.promise, params.false_unknown, params.seed)
+    request = CalibrationRequest(
+        tuple(LEVELS.items(params.quantiles)), params.promise, params.false_unknown, params.seed
+    )
     files = {name: model.files[name] for name in model.files}
     recordings = calibration if calibration is not None and calibration.recordings else val
     if recordings is None or not recordings.recordings:
@@ -58,4 +60,4 @@ def calibrate(params: Params, model: Model, train: Dataset, val: Dataset | None,
             "No recording has the role calibration or val. Make a split with some: `tacpipe split --calibration 0.15`."
         )
     with model_files.validated("the model"):
-        return Result(files=task_calibration.calibrate(files, asked, train, recordings))
+        return Result(files=task_calibration.calibrate(files, request, train, recordings))

@@ -27,7 +27,7 @@ from typing import Any, Literal
 
 from tacpipe.plugins.constraints import PositiveInt
 from tacpipe.tasks.forward.params import Forward
-from tacpipe.tasks.material.params import Estimator, Network
+from tacpipe.tasks.material.params import Estimator, Material, Network
 from tacpipe.tasks.touch.params import Patches
 
 
@@ -140,6 +140,25 @@ class Flat(Patches):
 
 
 @dataclass(frozen=True)
+class Unfinished(Material):
+    """A classifier that nothing fits."""
+
+    architecture: Literal["unfinished"] = "unfinished"
+
+
+@dataclass(frozen=True)
+class Majority(Material):
+    """Names the most frequent material of each sensor."""
+
+    architecture: Literal["majority"] = "majority"
+
+    def fit(self, slides):
+        """Return the most frequent material of the training slides by sensor."""
+        materials = {sensor: some.materials.tolist() for sensor, some in slides.training.items()}
+        return {f"{sensor}.txt": str(max(set(names), key=names.count)).encode() for sensor, names in materials.items()}
+
+
+@dataclass(frozen=True)
 class Double(Forward):
     """A name that the library has."""
 
@@ -161,6 +180,8 @@ material.scores = lab_architectures:Scores
 material.nearest = lab_architectures:Nearest
 material.forest = lab_architectures:Forest
 material.trusting = lab_architectures:Trusting
+material.majority = lab_architectures:Majority
+material.unfinished = lab_architectures:Unfinished
 touch.flat = lab_architectures:Flat
 """
 
@@ -251,6 +272,12 @@ def test_a_model_without_its_package_names_architecture_package_and_version(pack
         where = ("config.json",) if read is params_of.read else ()
         with pytest.raises(TacpipeError, match=r"'plain' comes from the package lab-architectures 1\.0"):
             read(of, stored, *where)
+
+
+def test_an_architecture_without_a_way_to_learn_is_no_choice_and_the_reason_names_the_method(package: Path) -> None:
+    assert "unfinished" not in params_of.fields(registry.load("train.material"))["architecture"].__args__
+    with pytest.raises(TacpipeError, match="must be a class with the methods fit"):
+        built("material", architecture="unfinished")
 
 
 @pytest.mark.parametrize(
@@ -374,6 +401,17 @@ def test_plain_networks_of_material_and_touch_are_called_as_they_promise(package
     read = members.patches(flat)
     found = network(torch.zeros(2, 3, 7, read.channels), torch.zeros(2, read.grasp_numbers))
     assert found.shape == (2, 1)
+
+
+def test_an_architecture_that_extends_none_of_the_two_is_trained_by_its_own_fit(package: Path, tmp_path: Path) -> None:
+    from tacpipe.tasks.material import training
+    from tests.tasks.material import textures
+
+    params = built("material", architecture="majority", baselines=False)
+    recordings = textures.dataset(
+        *(textures.slide("biotac", material, trial) for material, trial in [(1, 0), (3, 0), (3, 1), (4, 0)])
+    )
+    assert training.train(params, recordings, None, tmp_path) == {"biotac.txt": b"3"}
 
 
 def test_a_codec_that_is_not_installed_is_named_with_its_package() -> None:

@@ -164,6 +164,15 @@ def test_the_demo_runs_the_part_of_every_task_and_one_page_of_their_results(lab:
     assert lab.run("--help").out.index("  simulate ") < lab.run("--help").out.index("  export ")
 
 
+def test_the_demo_on_a_rig_trains_on_the_recordings_of_the_rig_and_shows_what_it_evaluated() -> None:
+    from tacpipe.simulation import demo
+
+    commands = demo.rig(Path("out"))
+    assert commands[0][0] == "acquire" and commands[2][:2] == ["synchronize", "out/recordings"]
+    evaluated = [words[-1] for words in commands if words[0] == "evaluate"]
+    assert commands[-1][:2] == ["report", "out/results"] and evaluated == ["out/results"]
+
+
 def test_a_plug_in_states_the_order_and_the_lines_of_its_commands(
     lab: Lab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

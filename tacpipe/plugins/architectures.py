@@ -10,6 +10,8 @@ classes are the kinds of params of the task's stage (`tacpipe.plugins.params`).
 - The name and version of another package are part of the params as they are stored (``plugin``), and so of every key: a
   model is trained again with another version. tacpipe's own architectures change with the version of the stage.
 - One that cannot be loaded is left out of the choices; who asks for it gets the reason.
+- The shared loop of the task trains what ``build`` returns. An architecture that is trained otherwise has a method ``fit``
+  of its own, so no task asks which architecture it trains.
 - What ``build`` gets and what its result must do is described by the task: `tacpipe.tasks.forward.params.Forward`,
   `tacpipe.tasks.material.params.Estimator` and `Network`, `tacpipe.tasks.touch.params.Patches` and `Pointnet`.
 """
@@ -19,7 +21,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
-import inspect
 import warnings
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -65,8 +66,8 @@ def load(base: Kind, name: str) -> Kind:
     }
     if all(misfits.values()):
         misfits[f"a dataclass whose {TAG} is a Literal with {name}"] = name in fields_of.choices(found, TAG)
-        builds = callable(getattr(found, "build", None)) or registry.brought_by(registry.MODELS, f"{of}.{name}") is None
-        misfits["a class with a method build(shape)"] = builds and not inspect.isabstract(found)
+        missing = sorted(getattr(found, "__abstractmethods__", ()))
+        misfits[f"a class with the methods {', '.join(missing)}"] = not missing
     for wanted, fits in misfits.items():
         if not fits:
             raise TacpipeError(f"{target}, registered as the architecture {name} of {of}, must be {wanted}.")

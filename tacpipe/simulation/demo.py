@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from tacpipe.plugins import registry
+
+if TYPE_CHECKING:
+    from tacpipe.tasks.task import Demo
 
 LIVE_S, LIVE_TRIALS = 30, 6  # of the emulated rig
 EMULATED = "emulated"  # the folder of the emulated rig's own rig file
@@ -12,23 +16,26 @@ EMULATED = "emulated"  # the folder of the emulated rig's own rig file
 
 def commands(output: Path) -> list[list[str]]:
     """Return the commands of each task's demo without the leading ``tacpipe``, and the page of all results."""
-    demos = [demo for name in registry.tasks() if (demo := registry.load_task(name).demo(output)) is not None]
+    demos = _demos(output)
     given = [*(name for demo in demos for name in demo.results), *(name for demo in demos for name in demo.others)]
     return [*(words for demo in demos for words in demo.commands), ["report", *given, "-o", str(page(output))]]
 
 
 def rig(output: Path) -> list[list[str]]:
     """Return the commands after the emulated rig is up: 30 s recorded live, then the chain to a forecast."""
-    from tacpipe.tasks.forward import demo
-
     recordings = str(output / "recordings")
     live = ["--trials", str(LIVE_TRIALS), "--duration-s", str(LIVE_S / LIVE_TRIALS)]
     return [
         ["acquire", str(output / EMULATED / "rig.toml"), "-o", recordings, *live],
         ["show", recordings],
-        *demo.chain(output),
+        *(words for demo in _demos(output) for words in demo.recorded),
         ["report", str(output / "results"), "-o", str(page(output))],
     ]
+
+
+def _demos(output: Path) -> list[Demo]:
+    """Return the parts of all tasks that have one."""
+    return [demo for name in registry.tasks() if (demo := registry.load_task(name).demo(output)) is not None]
 
 
 def page(output: Path) -> Path:

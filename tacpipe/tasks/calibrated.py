@@ -11,7 +11,7 @@ from tacpipe.errors import TacpipeError
 
 
 @dataclass(frozen=True)
-class Asked:
+class CalibrationRequest:
     """How a trained model is to state its uncertainty."""
 
     quantiles: tuple[int, ...]  # percent, ascending

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from tacpipe.live.task import LiveTask
     from tacpipe.plugins.requirements import Requirements
     from tacpipe.plugins.stage import AnyStage, Result
-    from tacpipe.tasks.calibrated import Asked
+    from tacpipe.tasks.calibrated import CalibrationRequest
     from tacpipe.tasks.opened import Chain
 
 Files = Mapping[str, bytes]  # the files of a model by name
@@ -57,7 +57,7 @@ class Calibration:
     states: Literal["quantiles", "probabilities"]  # what a calibrated model states, by its name in `PredictionRequest`
     # Returns the files of a model, which are given, with those that state its uncertainty, measured on recordings with the
     # role train and with the role val.
-    calibrate: Callable[[Files, Asked, Dataset, Dataset], dict[str, bytes]]
+    calibrate: Callable[[Files, CalibrationRequest, Dataset, Dataset], dict[str, bytes]]
 
 
 class Demo(NamedTuple):
@@ -66,6 +66,8 @@ class Demo(NamedTuple):
     commands: list[list[str]]  # in their order, each without the leading ``tacpipe``
     results: list[str]  # paths of results that the page shows
     others: Sequence[str] = ()  # paths of datasets that the page uses, which are not results
+    # commands from ``recordings`` below the output, which an emulated rig wrote, to ``results``; empty without such a part
+    recorded: Sequence[list[str]] = ()
 
 
 class Task(ABC):

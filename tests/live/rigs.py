@@ -13,7 +13,7 @@ from tacpipe.channels import schema
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
 from tacpipe.plugins.stage import RecordingOutput
-from tacpipe.tasks.calibrated import Asked
+from tacpipe.tasks.calibrated import CalibrationRequest
 from tacpipe.tasks.forward import calibration as forward_calibration
 from tacpipe.tasks.forward import training as forward_training
 from tacpipe.tasks.forward.live.chain import Chain, Forecast
@@ -22,7 +22,7 @@ from tests.fake_recordings import FakeRecording, FakeShard, dataset
 
 T0 = 1_700_000_000_000_000_000
 MS = 1_000_000
-ASKED = Asked((5, 10, 50, 90, 95), promise=False, false_unknown=0.05, seed=0)  # of a calibration
+ASKED = CalibrationRequest((5, 10, 50, 90, 95), promise=False, false_unknown=0.05, seed=0)  # of a calibration
 # Four epochs of small batches: with fewer steps the weight of the forecast is 0, and every forecast is persistence.
 SMALL = {"architecture": "gru", "hidden": 8, "epochs": 4, "batch": 16, "context": 4, "horizon": 3}
 Made = tuple[Mapping[str, bytes], Sequence[Mapping[str, Any]]]

@@ -23,7 +23,7 @@ from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.live import Live
 from tacpipe.sensors.sensor import Samples
 from tacpipe.simulation.slide import Rig, simulate_trial
-from tacpipe.tasks.calibrated import Asked
+from tacpipe.tasks.calibrated import CalibrationRequest
 from tacpipe.tasks.material import calibration as material_calibration
 from tacpipe.tasks.material import known, prediction
 from tacpipe.tasks.material import training as material_training
@@ -171,7 +171,7 @@ def test_a_calibrated_model_names_what_predict_answers_or_states_that_the_slide_
 ) -> None:
     learned, watched = (slides(RIG, indices(RIG, ["biotac"], some), frames=FRAMES) for some in (TRAINED, range(4, 8)))
     files = material_calibration.calibrate(
-        models["statistics"].files, Asked((10, 50, 90), False, 0.1, 0), learned, watched
+        models["statistics"].files, CalibrationRequest((10, 50, 90), False, 0.1, 0), learned, watched
     )
     fitted = known.unpacked(files[known.FILE], {"biotac": None})
     for moved, cause in ((-1e9, ""), (1e9, UNLIKE)):

@@ -12,6 +12,7 @@ from tacpipe.errors import UsageError
 from tacpipe.io import progress
 from tacpipe.metrics import conformal
 from tacpipe.metrics.quantiles import check_levels
+from tacpipe.tasks import trained_on
 from tacpipe.tasks.forward import tracks
 from tacpipe.tasks.forward.evaluation import check_rate
 from tacpipe.tasks.forward.forecaster import CONFIG, Forecaster
@@ -21,34 +22,38 @@ from tacpipe.tasks.forward.uncertainty import FILE, Errors, Uncertainty, fewer
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
-    from tacpipe.tasks.calibrated import Asked
+    from tacpipe.tasks.calibrated import CalibrationRequest
 
 FITTED = 5000  # windows that quantiles are fitted on, evenly spread over training recordings
 CORRECTED = 400  # windows of each calibration recording
 
 
-def calibrate(model: Mapping[str, bytes], asked: Asked, training: Dataset, calibration: Dataset) -> dict[str, bytes]:
+def calibrate(
+    model: Mapping[str, bytes], request: CalibrationRequest, training: Dataset, calibration: Dataset
+) -> dict[str, bytes]:
     """Return the files of a model with quantiles of its error, fitted on training and corrected on calibration recordings.
 
     Raises `UsageError` where the model was trained or stopped by a calibration recording, and `TacpipeError` where the
     recordings are not what the model reads or hold no window, and for too few of them.
     """
-    check_levels(asked.quantiles)
+    check_levels(request.quantiles)
     forecaster = Forecaster.load(model)
     _check_unused(forecaster, calibration)
     training_errors = errors_of(forecaster, training, max(1, FITTED // max(1, len(training.recordings))))
     errors = errors_of(forecaster, calibration, CORRECTED)
-    levels = np.array(asked.quantiles) / 100
-    uncertainty = Uncertainty.fit(levels, training_errors, errors, promised=asked.promise, seed=asked.seed)
+    levels = np.array(request.quantiles) / 100
+    uncertainty = Uncertainty.fit(levels, training_errors, errors, promised=request.promise, seed=request.seed)
     count = len(np.unique(errors.recordings))
     config = dict(forecaster.config)
     config["quantiles"] = {
-        "levels": list(asked.quantiles),
-        "method": "promised" if asked.promise else "pooled",
+        "levels": list(request.quantiles),
+        "method": "promised" if request.promise else "pooled",
         "recordings": {"fitted": len(np.unique(training_errors.recordings)), "corrected": count},
         "most_promised": conformal.most_promised(count),
     }
-    config["trained_on"] = _seen(config["trained_on"], training, calibration)
+    config["trained_on"] = trained_on.add_calibration(
+        config["trained_on"], trained_on.of_datasets(training, calibration)
+    )
     return {
         **model,
         CONFIG: model_files.to_json(config),
@@ -91,11 +96,3 @@ def errors_of(forecaster: Forecaster, recordings: Dataset, most: int) -> Errors:
         beginning = f"The {len(recordings.recordings)} recordings hold"
         raise tracks.no_window(beginning, recordings, forecaster.context, forecaster.horizon)
     return Errors(*map(np.concatenate, zip(*parts, strict=True)))
-
-
-def _seen(before: Mapping[str, str], *parts: Dataset) -> dict[str, str]:
-    """Return the digests of all recordings that the model has seen by name, those that it is calibrated on included."""
-    known = set(before.values())
-    new = {shard.name: shard.digest for part in parts for shard in part.recordings.values()}
-    added = {name: digest for name, digest in new.items() if digest not in known}
-    return {**before, **{f"{name} of calibration" if name in before else name: one for name, one in added.items()}}

@@ -22,7 +22,7 @@ def demo(output: Path) -> Demo:
         ["train", "forward", place["latents"], *split, "-o", place["paper-model"], *paper],
         ["evaluate", place["paper-model"], place["latents"], *split, "-o", place["paper-results"]],
     ]
-    return Demo(commands, [place["results"], place["paper-results"]])
+    return Demo(commands, [place["results"], place["paper-results"]], recorded=chain(output))
 
 
 def chain(output: Path) -> list[list[str]]:

@@ -28,6 +28,7 @@ from tacpipe.models.ensemble import Shrunk, persistence_weights
 from tacpipe.models.linear import Baselines
 from tacpipe.models.windows import Windows, motion
 from tacpipe.plugins import params as params_of
+from tacpipe.tasks import trained_on
 from tacpipe.tasks.forward import networks, tracks, units
 from tacpipe.tasks.forward.alarms import Loads
 from tacpipe.tasks.forward.forecaster import (
@@ -46,7 +47,6 @@ from tacpipe.tasks.forward.params import Change, Params
 from tacpipe.tasks.forward.predictors import predicted
 from tacpipe.tasks.forward.rows import Rows, acted, rows
 from tacpipe.tasks.forward.tracks import Track
-from tacpipe.tasks.seen import seen
 from tacpipe.training import devices, loop, scaling
 
 if TYPE_CHECKING:
@@ -116,7 +116,9 @@ def train(
         "scaling": _scaling(parts[0], aside),
         "largest_level": max(largest_level(one.tactile[some]) for one, some in _usable(parts[0], aside)),
         "validation": {"loss": best["val_loss"], "epoch": best["epoch"]},
-        "trained_on": _trained_on((training, validation), start),
+        "trained_on": trained_on.add_earlier(
+            trained_on.of_datasets(training, validation), start.config["trained_on"] if start else {}
+        ),
         "objects": sorted({one.object for one in parts[0] if one.object is not None}),
         "counts": {
             name: {"recordings": len(part), "windows": len(one.starts)}
@@ -128,10 +130,10 @@ def train(
         linear = Baselines.fit(_linear(known), _linear(watched))
         config["baselines"] = linear.chosen
         files[BASELINES] = save_arrays({name: np.ascontiguousarray(one) for name, one in linear.to_tensors().items()})
-    files |= {WEIGHTS: save_tensors(weights), CONFIG: _json(config)}
+    files |= {WEIGHTS: save_tensors(weights), CONFIG: model_files.to_json(config)}
     if params.baselines:
         config["anticipation"] = _alarms(Forecaster.load(files), parts[1])
-    return {**files, CONFIG: _json(config), HISTORY: trained.history_lines}
+    return {**files, CONFIG: model_files.to_json(config), HISTORY: trained.history_lines}
 
 
 def _built(params: Params, codec: codecs.Codec, known: Rows, start: Forecaster | None, device: str) -> nn.Module:
@@ -217,10 +219,6 @@ def _alarms(forecaster: Forecaster, part: Sequence[Track]) -> dict[str, Any]:
             loads.add(some)
             del some  # before the next one is made
     return loads.calibrated()
-
-
-def _json(config: Config) -> bytes:
-    return model_files.to_json(config)
 
 
 def check_codec(model: Mapping[str, bytes], recordings: Mapping[str, bytes]) -> None:
@@ -312,12 +310,6 @@ def _described(codec: codecs.Codec) -> dict[str, Any]:
 def _reference(quaternions: Iterable[AnyFloats]) -> AnyFloats:
     """Return the first usable quaternion of the training recordings (4,): the sign that all are given."""
     return next((one[0].astype(np.float64) for one in quaternions if len(one)), np.array([0.0, 0.0, 0.0, 1.0]))
-
-
-def _trained_on(parts: Sequence[Dataset], start: Forecaster | None) -> dict[str, str]:
-    """Return the digests of all recordings that the model has seen by name, those of the one it began with included."""
-    digests = {shard.name: shard.digest for part in parts for shard in part.recordings.values()}
-    return seen(digests, start.config["trained_on"] if start else {})
 
 
 def _resolved(params: Params, codec: codecs.Codec, start: Forecaster | None) -> Params:

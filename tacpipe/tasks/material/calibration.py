@@ -7,20 +7,22 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.metrics import calibration
 from tacpipe.tasks.material import known as known_of
 from tacpipe.tasks.material.classifier import CONFIG, Classifier
 from tacpipe.tasks.material.known import FILE, SensorCalibration, ValidationSlides
-from tacpipe.tasks.material.readouts import config_file
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
-    from tacpipe.tasks.calibrated import Asked
+    from tacpipe.tasks.calibrated import CalibrationRequest
     from tacpipe.tasks.material.slides import BySensor, Slides
 
 
-def calibrate(model: Mapping[str, bytes], request: Asked, training: Dataset, validation: Dataset) -> dict[str, bytes]:
+def calibrate(
+    model: Mapping[str, bytes], request: CalibrationRequest, training: Dataset, validation: Dataset
+) -> dict[str, bytes]:
     """Return the files of a classifier whose probabilities are calibrated on validation slides, with a threshold of unknown.
 
     Raises `TacpipeError` where the model learned from these validation slides, where a sensor has none, and for too few.
@@ -53,7 +55,7 @@ def calibrate(model: Mapping[str, bytes], request: Asked, training: Dataset, val
             "calibration_error": _errors(scores, labels, calibrations[sensor].temperature),
         }
     config = {**classifier.config, "known": about}
-    return {**model, CONFIG: config_file(config), FILE: known_of.packed(calibrations)}
+    return {**model, CONFIG: model_files.to_json(config), FILE: known_of.packed(calibrations)}
 
 
 def _errors(scores: Any, labels: Any, temperature: float) -> dict[str, float]:

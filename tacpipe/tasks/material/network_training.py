@@ -12,11 +12,13 @@ import torch
 from safetensors.torch import save as save_tensors
 from torch import nn
 
+from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.models import headers
 from tacpipe.models.level import Level
 from tacpipe.models.recurrent_autoencoder import Shape
 from tacpipe.printable import listed
+from tacpipe.tasks import trained_on
 from tacpipe.tasks.material import held_out, networks, readouts
 from tacpipe.tasks.material.classifier import (
     BASELINES,
@@ -29,19 +31,16 @@ from tacpipe.tasks.material.classifier import (
     Config,
     NetworkReader,
 )
-from tacpipe.tasks.material.losses import JointWork, ScaledSlides, Weights
+from tacpipe.tasks.material.losses import JointWork, ScaledSlides
 from tacpipe.tasks.material.naming import Naming
 from tacpipe.tasks.material.pairs import NONE, Pairs, permuted_classes
-from tacpipe.tasks.material.params import XLSTM, Params, Raec
 from tacpipe.tasks.material.params import Network as NetworkParams
+from tacpipe.tasks.material.params import Params, aligning_architectures
 from tacpipe.tasks.material.slides import BySensor, Slides
-from tacpipe.tasks.seen import seen
 from tacpipe.training import devices, loop
 from tacpipe.training.scaling import Affine
 
 HISTORY = "history.jsonl"
-RAEC = "raec"
-MAPPED_RECONSTRUCTION = 0.05  # weight of a network that is aligned to a frozen one: that of the published script
 
 
 def train(
@@ -65,15 +64,15 @@ def train(
         )
     device = devices.kind()
     start = Classifier.load(init) if init else None
-    joint = isinstance(params, Raec) and params.joint and len(training_slides) > 1
-    mapped_to = frozen(params)
+    joint = params.learns_jointly and len(training_slides) > 1
+    mapped_to = params.aligned_sensor
     if joint:
         _same_materials(training_slides, Naming.from_json(config))
     kinds = headers.chosen(
         params.headers, {name: len(sensor_slides.layout.channels) for name, sensor_slides in training_slides.items()}
     )
     shapes = {
-        name: _shape(params, sensor_slides, kinds[name], len(config["classes"]))
+        name: params.shape(len(sensor_slides.layout.channels), kinds[name], len(config["classes"]))
         for name, sensor_slides in training_slides.items()
     }
     scalings = {
@@ -86,7 +85,7 @@ def train(
         _same_space(start, mapped_to, config, training_slides)
         shapes[mapped_to] = Shape(**start.config["shapes"][mapped_to])
         scalings[mapped_to] = _reader(start, mapped_to).scaling
-        config["trained_on"] = seen(config["trained_on"], start.config["trained_on"])
+        config["trained_on"] = trained_on.add_earlier(config["trained_on"], start.config["trained_on"])
     training, validation = (
         {
             name: _scaled(params, config, sensor_slides, scalings[name], held_out_materials, device, place)
@@ -97,7 +96,7 @@ def train(
     partners = _partners(params, len(config["classes"]))
     config |= _described(config["classes"], shapes, scalings, held_out_materials, partners, joint=joint)
     pairs = _pairs(params, training, partners)
-    work = JointWork(training, validation, pairs, _weights(params, joint), mapped_to, params.drop_last)
+    work = JointWork(training, validation, pairs, params.loss_weights(joint=joint), mapped_to, params.drop_last)
 
     def build() -> nn.Module:
         built = _built(params, shapes, start, mapped_to).to(device)
@@ -113,14 +112,9 @@ def train(
     return files
 
 
-def frozen(params: Params) -> str:
-    """Return the sensor whose network is frozen; the empty text where none is."""
-    return params.frozen_sensor if isinstance(params, Raec) else ""
-
-
 def _partners(params: NetworkParams, classes: int) -> dict[int, int] | None:
     """Return the class that each is paired with across sensors, where that is another one."""
-    if isinstance(params, Raec) and params.pairing == "permuted":
+    if params.pairing_method == "permuted":
         return permuted_classes(range(classes), params.seed)
     return None
 
@@ -154,7 +148,7 @@ def _described(
 def _files(trained: loop.Trained, config: Config, params: NetworkParams) -> dict[str, bytes]:
     """Return the files of trained networks: the weights that were selected, and the last ones next to them."""
     best, last = (trained.weights, trained.last) if params.select == "best" else (trained.last, trained.weights)
-    files = {CONFIG: readouts.config_file(config), WEIGHTS: save_tensors(best), HISTORY: trained.history_lines}
+    files = {CONFIG: model_files.to_json(config), WEIGHTS: save_tensors(best), HISTORY: trained.history_lines}
     if params.select == "best":
         files[LAST] = save_tensors(last)
     return files
@@ -164,24 +158,13 @@ def _pairs(params: NetworkParams, slides: Mapping[str, ScaledSlides], partners: 
     return Pairs(
         {name: scaled.classes.cpu() for name, scaled in slides.items()},
         params.batch,
-        pairing=params.pairing if isinstance(params, Raec) else Pairs.pairing,
+        pairing=params.pairing_method,
         shuffle=params.shuffle,
         drop_last=params.drop_last,
         subsample_sensor=params.subsample_sensor,
         subsample_percent=params.subsample_percent,
         partners=partners,
         seed=params.seed,
-    )
-
-
-def _shape(params: NetworkParams, slides: Slides, header: str, classes: int) -> Shape:
-    shape = Shape(channels=len(slides.layout.channels), classes=classes, header=header, hidden=params.hidden)
-    if isinstance(params, XLSTM):
-        return dataclasses.replace(shape, dropout=params.dropout)
-    if not isinstance(params, Raec):
-        return shape
-    return dataclasses.replace(
-        shape, decoder=params.decoder, latents=params.latents, unpool=params.unpool, dropout=params.dropout
     )
 
 
@@ -227,9 +210,10 @@ def _same_space(start: Classifier, frozen_sensor: str, config: Config, slides: B
     """Refuse a model of --init that does not know the sensor or the same materials."""
     if frozen_sensor not in slides:
         raise UsageError(f"frozen_sensor is {frozen_sensor}; the recordings are of {', '.join(slides)}.")
-    if start.architecture != RAEC:
+    if not start.params.ALIGNS_SENSORS:
         raise TacpipeError(
-            f"The model of --init is of the architecture {start.architecture}; its space must be of {RAEC}."
+            f"The model of --init is of the architecture {start.architecture}; its space must be of "
+            f"{' or '.join(aligning_architectures())}."
         )
     start.check(slides[frozen_sensor])
     if list(start.classes) != config["classes"] or start.naming != Naming.from_json(config):
@@ -244,18 +228,6 @@ def _reader(start: Classifier, sensor: str) -> NetworkReader:
     reader = start.readers[sensor]
     assert isinstance(reader, NetworkReader)
     return reader
-
-
-def _weights(params: NetworkParams, joint: bool) -> Weights:
-    if not isinstance(params, Raec):
-        return Weights(alignment=0.0)
-    return Weights(
-        reconstruction=MAPPED_RECONSTRUCTION if params.frozen_sensor else params.reconstruction_weight,
-        classification=params.classification_weight,
-        alignment=params.alignment_weight if joint else 0.0,
-        align_from=params.align_from,
-        alignment_loss=params.alignment_loss,
-    )
 
 
 def _built(params: NetworkParams, shapes: Mapping[str, Shape], start: Classifier | None, frozen: str) -> nn.ModuleDict:

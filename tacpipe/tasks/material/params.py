@@ -5,12 +5,14 @@ Classes of other packages extend `Estimator` or `Network`, whose methods state w
 
 from __future__ import annotations
 
+import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from tacpipe.errors import UsageError
+from tacpipe.plugins import architectures, fields
 from tacpipe.plugins.constraints import (
     Assignments,
     CommaList,
@@ -31,6 +33,8 @@ if TYPE_CHECKING:
 
     from tacpipe.arrays import Float32s
     from tacpipe.models.recurrent_autoencoder import Shape
+    from tacpipe.tasks.material.losses import Weights
+    from tacpipe.tasks.material.training import TrainingSlides
 
 KEY = "material"  # the label that names classes, unless params name another
 Presets = Mapping[str, Mapping[str, object]]
@@ -38,14 +42,17 @@ Panels = Mapping[str, Sequence[str]]
 Dropout = Annotated[float, Range(0, below=1)]
 # the paper's text; its code has no header for BioTac, and a dropout that PyTorch ignores in an LSTM of one layer
 _PAPER_TEXT: Mapping[str, object] = {"epochs": 2000, "dropout": 0.2, "headers": "other=mlp"}
+_ALIGNED_RECONSTRUCTION = 0.05  # weight in networks that are aligned to a frozen one: that of the published script
 HeldOut = Annotated[str, Assignments(Annotated[str, CommaList(least=1)], between=";")]
 
 
 @dataclass(frozen=True)
-class Material:
+class Material(ABC):
     """Params that every classifier of materials has."""
 
     ARCHITECTURES: ClassVar[str] = "material"  # the task, as entry points name it
+    QUANTITIES: ClassVar[tuple[str, ...]] = ("tactile",)  # read where the param ``quantities`` is empty
+    ALIGNS_SENSORS: ClassVar[bool] = False  # whether networks can be aligned to the frozen one of the model of --init
     architecture: str = "minirocket"
     sensors: Names = ""  # sensors to learn for; empty for all
     # quantities to read; empty: tactile, and for minirocket and statistics also vibration (22 readings a frame)
@@ -74,6 +81,18 @@ class Material:
         ),
     }
 
+    @property
+    def aligned_sensor(self) -> str:
+        """The sensor of the model of ``--init`` whose network stays frozen; empty where none does."""
+        return ""
+
+    @abstractmethod
+    def fit(self, slides: TrainingSlides) -> dict[str, bytes]:
+        """Return the files of a model that learned from ``slides``: ``config.json`` and what the classifier reads.
+
+        `Estimator` and `Network` implement it for the estimators and networks that an architecture builds.
+        """
+
 
 @dataclass(frozen=True)
 class Minirocket(Material):
@@ -81,9 +100,14 @@ class Minirocket(Material):
 
     # classifier: minirocket, random convolutions and a linear readout
     architecture: Literal["minirocket"] = "minirocket"
+    QUANTITIES: ClassVar[tuple[str, ...]] = ("tactile", "vibration")
     features: Annotated[int, Range(84)] = 10_000  # features of each sensor
     use_validation: bool = True  # learn from validation slides too: nothing is chosen by them
     PRESETS: ClassVar[Presets] = {"quick": {"features": 1_000}}
+
+    def fit(self, slides: TrainingSlides) -> dict[str, bytes]:
+        """Return the files of random convolutions and a readout for each sensor."""
+        return slides.fit_rockets(self)
 
 
 @dataclass(frozen=True)
@@ -92,7 +116,12 @@ class Statistics(Material):
 
     # statistics: statistics of each channel and a linear readout, for few slides
     architecture: Literal["statistics"] = "statistics"
+    QUANTITIES: ClassVar[tuple[str, ...]] = ("tactile", "vibration")
     use_validation: bool = True  # learn from validation slides too: nothing is chosen by them
+
+    def fit(self, slides: TrainingSlides) -> dict[str, bytes]:
+        """Return the files of statistics and a readout for each sensor."""
+        return slides.fit_statistics(self)
 
 
 @dataclass(frozen=True)
@@ -105,6 +134,10 @@ class Spectra(Material):
     hold_out: HeldOut = ""  # materials whose labels a sensor does not learn, as roboskin=17,18,19,20
     # metres a second of slides whose recordings have no speed
     speeds: Annotated[str, Assignments(PositiveFloat)] = "biotac=0.025,roboskin=0.05"
+
+    def fit(self, slides: TrainingSlides) -> dict[str, bytes]:
+        """Return the files of spectra, by which sensors learn materials from one another."""
+        return slides.fit_spectra(self)
 
 
 @dataclass(frozen=True)
@@ -122,6 +155,10 @@ class Estimator(Material, ABC):
         """
         flat: Float32s = frames.reshape(len(frames), -1)
         return flat
+
+    def fit(self, slides: TrainingSlides) -> dict[str, bytes]:
+        """Return the files of one fitted estimator per sensor."""
+        return slides.fit_estimators(self)
 
     @abstractmethod
     def build(self, seed: int) -> Any:
@@ -165,6 +202,32 @@ class Network(Material, ABC):
     # precision of products in training; bfloat16 takes half the memory and rounds to 3 digits, weights stay in float32
     precision: Precision = added("float32")
 
+    def fit(self, slides: TrainingSlides) -> dict[str, bytes]:
+        """Return the files of one network per sensor, trained by the shared loop."""
+        return slides.train_networks(self)
+
+    @property
+    def learns_jointly(self) -> bool:
+        """Whether the latents of unlike sensors are aligned."""
+        return False
+
+    @property
+    def pairing_method(self) -> Literal["random", "fixed", "permuted"]:
+        """How slides of unlike sensors are paired."""
+        return "random"
+
+    def shape(self, channels: int, header: str, classes: int) -> Shape:
+        """Return the sizes of a sensor's network."""
+        from tacpipe.models.recurrent_autoencoder import Shape
+
+        return Shape(channels=channels, classes=classes, header=header, hidden=self.hidden)
+
+    def loss_weights(self, *, joint: bool) -> Weights:
+        """Return the weights of the terms of the loss; ``joint`` states whether several sensors learn."""
+        from tacpipe.tasks.material.losses import Weights
+
+        return Weights(alignment=0.0)
+
     @abstractmethod
     def build(self, shape: Shape) -> nn.Module:
         """Return a sensor's network, of random weights (`tacpipe.models.recurrent_autoencoder.Shape`).
@@ -202,6 +265,7 @@ class Raec(Network):
 
     # raec: the paper's recurrent autoencoder
     architecture: Literal["raec"] = "raec"
+    ALIGNS_SENSORS: ClassVar[bool] = True
     joint: bool = True  # align the latents of unlike sensors on slides of the same material
     # sensor of the --init model whose network is frozen; the latents of the others are aligned to its own
     frozen_sensor: Annotated[str, StoredAs("known")] = ""
@@ -233,6 +297,43 @@ class Raec(Network):
         "quick": {"epochs": 30},
     }
 
+    @property
+    def aligned_sensor(self) -> str:
+        """The sensor of the model of ``--init`` whose network stays frozen; empty where none does."""
+        return self.frozen_sensor
+
+    @property
+    def learns_jointly(self) -> bool:
+        """Whether the latents of unlike sensors are aligned."""
+        return self.joint
+
+    @property
+    def pairing_method(self) -> Literal["random", "fixed", "permuted"]:
+        """How slides of unlike sensors are paired."""
+        return self.pairing
+
+    def shape(self, channels: int, header: str, classes: int) -> Shape:
+        """Return the sizes of a sensor's network."""
+        return dataclasses.replace(
+            super().shape(channels, header, classes),
+            decoder=self.decoder,
+            latents=self.latents,
+            unpool=self.unpool,
+            dropout=self.dropout,
+        )
+
+    def loss_weights(self, *, joint: bool) -> Weights:
+        """Return the weights of the terms of the loss; ``joint`` states whether several sensors learn."""
+        from tacpipe.tasks.material.losses import Weights
+
+        return Weights(
+            reconstruction=_ALIGNED_RECONSTRUCTION if self.frozen_sensor else self.reconstruction_weight,
+            classification=self.classification_weight,
+            alignment=self.alignment_weight if joint else 0.0,
+            align_from=self.align_from,
+            alignment_loss=self.alignment_loss,
+        )
+
     def build(self, shape: Shape) -> nn.Module:
         """Return the paper's autoencoder with a classifier."""
         from tacpipe.models.recurrent_autoencoder import RecurrentAutoencoder
@@ -262,6 +363,10 @@ class XLSTM(Network):
     dropout: Dropout = added(0.0)  # fraction of the last state left out of each training step; 0.2 in the paper's text
     PRESETS: ClassVar[Presets] = {"paper": _PAPER_TEXT, "quick": {"epochs": 30}}
 
+    def shape(self, channels: int, header: str, classes: int) -> Shape:
+        """Return the sizes of a sensor's network."""
+        return dataclasses.replace(super().shape(channels, header, classes), dropout=self.dropout)
+
     def build(self, shape: Shape) -> nn.Module:
         """Return the paper's recurrent classifier."""
         from tacpipe.models.recurrent_autoencoder import RecurrentClassifier
@@ -270,3 +375,9 @@ class XLSTM(Network):
 
 
 Params = Material  # params of any architecture
+
+
+def aligning_architectures() -> list[str]:
+    """Return the names of the architectures whose networks can be aligned to a frozen one."""
+    able = [kind for kind in architectures.kinds(Material) if kind.ALIGNS_SENSORS]
+    return [name for kind in able for name in fields.choices(kind, architectures.TAG)]

@@ -68,7 +68,7 @@ def estimators(
             permutation = np.random.default_rng([params.seed, 3, place]).permutation(materials)
             levels |= stored(MEAN_LEVEL, name, Level.fit(frames, materials))
             shuffled[name] = Fitted.fit(params, frames, permutation)
-    files = {CONFIG: config_file(config), ESTIMATORS: packed_estimators(fitted, params)}
+    files = {CONFIG: model_files.to_json(config), ESTIMATORS: packed_estimators(fitted, params)}
     if params.baselines:
         files |= {BASELINES: packed(levels), SHUFFLED_ESTIMATORS: packed_estimators(shuffled, params)}
     return files
@@ -204,11 +204,6 @@ def packed(arrays: Mapping[str, np.ndarray]) -> bytes:
     return save({name: np.ascontiguousarray(array) for name, array in arrays.items()})
 
 
-def config_file(config: Config) -> bytes:
-    """Return a config as a file."""
-    return model_files.to_json(config)
-
-
 def _files(config: Config, tensors: Arrays, baselines: Arrays) -> dict[str, bytes]:
-    files = {CONFIG: config_file(config), WEIGHTS: packed(tensors)}
+    files = {CONFIG: model_files.to_json(config), WEIGHTS: packed(tensors)}
     return {**files, BASELINES: packed(baselines)} if baselines else files

@@ -3,26 +3,64 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins.constraints import CommaList
+from tacpipe.tasks import trained_on
 from tacpipe.tasks.material import held_out, network_training, readouts
 from tacpipe.tasks.material import slides as slides_of
-from tacpipe.tasks.material.classifier import ROCKET, STATISTICS, TASK, Config
+from tacpipe.tasks.material.classifier import TASK, Config
 from tacpipe.tasks.material.naming import Naming
-from tacpipe.tasks.material.network_training import RAEC
-from tacpipe.tasks.material.params import Estimator, Minirocket, Params, Raec, Spectra, Statistics
-from tacpipe.tasks.material.params import Network as NetworkParams
+from tacpipe.tasks.material.params import (
+    Estimator,
+    Minirocket,
+    Network,
+    Params,
+    Spectra,
+    Statistics,
+    aligning_architectures,
+)
 from tacpipe.tasks.material.slides import BySensor
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
 
-# that are read where params name none
-QUANTITIES = dict.fromkeys((ROCKET, STATISTICS), (slides_of.TACTILE, "vibration"))
+
+@dataclass(frozen=True)
+class TrainingSlides:
+    """The slides and settings that an architecture's ``fit`` learns from, and the ways to train that the task offers."""
+
+    config: Config  # the model's configuration as far as the data determine it
+    training: BySensor
+    validation: BySensor
+    naming: Naming
+    workspace: Path  # where checkpoints of an interrupted training lie
+    init: Mapping[str, bytes] | None  # the files of the model of ``--init``
+
+    def fit_rockets(self, params: Minirocket) -> dict[str, bytes]:
+        """Return the files of random convolutions and a readout for each sensor."""
+        return readouts.rockets(params, self.config, self.training, self.validation)
+
+    def fit_statistics(self, params: Statistics) -> dict[str, bytes]:
+        """Return the files of statistics and a readout for each sensor."""
+        return readouts.statistics(params, self.config, self.training, self.validation)
+
+    def fit_spectra(self, params: Spectra) -> dict[str, bytes]:
+        """Return the files of spectra, by which sensors learn materials from one another."""
+        excluded = held_out.materials(params.hold_out, self.config["classes"], self.training, self.naming)
+        return readouts.spectra(params, self.config, self.training, self.validation, excluded)
+
+    def fit_estimators(self, params: Estimator) -> dict[str, bytes]:
+        """Return the files of one fitted estimator of scikit-learn per sensor."""
+        return readouts.estimators(params, self.config, self.training, self.validation)
+
+    def train_networks(self, params: Network) -> dict[str, bytes]:
+        """Return the files of one network per sensor, trained by the shared loop."""
+        return network_training.train(params, self.config, self.training, self.validation, self.workspace, self.init)
 
 
 def train(
@@ -40,7 +78,7 @@ def train(
     """
     _check(params, init)
     only = CommaList().items(params.sensors)
-    kinds = slides_of.quantities(params.quantities) or QUANTITIES.get(params.architecture, (slides_of.TACTILE,))
+    kinds = slides_of.quantities(params.quantities) or params.QUANTITIES
     naming = _naming(params.label, training, validation)
     known = slides_of.read(training, only=only, quantities=kinds, naming=naming, labelled=True)
     watched: BySensor = {}
@@ -68,29 +106,11 @@ def train(
             role: {name: len(some) for name, some in part.items()}
             for role, part in (("train", known), ("val", watched))
         },
-        "trained_on": {
-            name: digest
-            for part in (known, watched)
-            for some in part.values()
-            for name, digest in zip(some.names, some.digests, strict=True)
-        },
+        "trained_on": trained_on.merge(
+            *(zip(some.names, some.digests, strict=True) for part in (known, watched) for some in part.values())
+        ),
     }
-    if isinstance(params, Minirocket):
-        return readouts.rockets(params, config, known, watched)
-    if isinstance(params, Statistics):
-        return readouts.statistics(params, config, known, watched)
-    if isinstance(params, Spectra):
-        return readouts.spectra(
-            params, config, known, watched, held_out.materials(params.hold_out, classes, known, naming)
-        )
-    if isinstance(params, Estimator):
-        return readouts.estimators(params, config, known, watched)
-    if isinstance(params, NetworkParams):
-        return network_training.train(params, config, known, watched, workspace, init)
-    raise TacpipeError(
-        f"The params of the architecture {params.architecture} extend neither Estimator nor Network of "
-        f"tacpipe.tasks.material.params, so the task cannot train it."
-    )
+    return params.fit(TrainingSlides(config, known, watched, naming, workspace, init))
 
 
 def _naming(key: str, *parts: Dataset | None) -> Naming:
@@ -101,12 +121,13 @@ def _naming(key: str, *parts: Dataset | None) -> Naming:
 
 def _check(params: Params, init: Mapping[str, bytes] | None) -> None:
     """Refuse a model to begin with where nothing is learned from it, and a frozen sensor without one."""
-    if init is not None and not isinstance(params, Raec):
+    if init is not None and not params.ALIGNS_SENSORS:
+        able = " or ".join(aligning_architectures())
         raise UsageError(
-            f"--init goes with the architecture {RAEC} alone, whose networks can be aligned to that of a frozen sensor, "
-            f"not with {params.architecture}. Leave it out, or choose --architecture {RAEC}."
+            f"--init goes with the architecture {able} only, whose networks can be aligned to that of a frozen sensor, "
+            f"not with {params.architecture}. Leave it out, or choose --architecture {able}."
         )
-    if bool(network_training.frozen(params)) != (init is not None):
+    if bool(params.aligned_sensor) != (init is not None):
         raise UsageError(
             "Alignment to a trained network needs both --frozen-sensor, the sensor that it is of, and --init, the model "
             "that holds it."

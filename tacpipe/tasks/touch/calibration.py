@@ -10,16 +10,19 @@ import numpy as np
 from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.metrics.quantiles import check_levels
+from tacpipe.tasks import trained_on
 from tacpipe.tasks.touch import grasps as grasps_of
 from tacpipe.tasks.touch.predictor import CONFIG, Predictor
 from tacpipe.tasks.touch.quantiles import FILE, ReadingQuantiles
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
-    from tacpipe.tasks.calibrated import Asked
+    from tacpipe.tasks.calibrated import CalibrationRequest
 
 
-def calibrate(model: Mapping[str, bytes], request: Asked, training: Dataset, validation: Dataset) -> dict[str, bytes]:
+def calibrate(
+    model: Mapping[str, bytes], request: CalibrationRequest, training: Dataset, validation: Dataset
+) -> dict[str, bytes]:
     """Return the files of a model with quantiles, which hold on validation grasps as often as their levels state.
 
     Raises `TacpipeError` where the model learned from these validation grasps, and where there are none.
@@ -42,16 +45,15 @@ def calibrate(model: Mapping[str, bytes], request: Asked, training: Dataset, val
     reading_quantiles = ReadingQuantiles.fit(
         levels, training_grasps, validation_grasps, predicted, promised=request.promise
     )
-    trained_on = {**predictor.config["trained_on"]}
-    trained_on |= {
-        name: recording_digest
-        for name, recording_digest in zip(validation_grasps.names, validation_grasps.digests, strict=True)
-        if recording_digest not in seen_digests
-    }
+    calibrated_on = trained_on.merge(zip(validation_grasps.names, validation_grasps.digests, strict=True))
     description = {
         "levels": list(request.quantiles),
         "method": "promised" if request.promise else "pooled",
         "grasps": len(validation_grasps),
     }
-    config = {**predictor.config, "quantiles": description, "trained_on": trained_on}
+    config = {
+        **predictor.config,
+        "quantiles": description,
+        "trained_on": trained_on.add_calibration(predictor.config["trained_on"], calibrated_on),
+    }
     return {**model, CONFIG: model_files.to_json(config), FILE: reading_quantiles.to_bytes()}

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from torch import nn
 
     from tacpipe.models.patches import Shape
+    from tacpipe.tasks.touch.training import FittedModel, TrainingGrasps
 
 Presets = Mapping[str, Mapping[str, object]]
 Panels = Mapping[str, Sequence[str]]
@@ -37,7 +38,7 @@ Targets = Annotated[str, CommaList(Literal["pdc_th", "pdc_mf", "e_th", "e_mf"], 
 
 
 @dataclass(frozen=True)
-class Touch:
+class Touch(ABC):
     """Params that every model of the task ``touch`` has."""
 
     ARCHITECTURES: ClassVar[str] = "touch"  # the task, as entry points name it
@@ -71,6 +72,18 @@ class Touch:
         "Data": ("targets", "use_validation", "run_label"),
     }
 
+    @property
+    def chooses_by_validation(self) -> bool:
+        """Whether validation grasps choose something: a network's epoch, or when its training ends."""
+        return False
+
+    @abstractmethod
+    def fit(self, grasps: TrainingGrasps, model: FittedModel) -> None:
+        """Learn from ``grasps`` and add the members of the model, their tensors and their history to ``model``.
+
+        `Patches` and `Pointnet` implement it for the networks that an architecture builds.
+        """
+
 
 @dataclass(frozen=True)
 class Trees(Touch):
@@ -87,6 +100,10 @@ class Trees(Touch):
     # shrink predictions for objects not trained on towards the constant, as far as errs least on training objects left out
     shrink_novel: bool = added(False)
     PRESETS: ClassVar[Presets] = {"quick": {"trees": 100}}
+
+    def fit(self, grasps: TrainingGrasps, model: FittedModel) -> None:
+        """Add one forest per target and, in a tree-ensemble, one of all targets."""
+        grasps.grow_forests(self, model)
 
 
 @dataclass(frozen=True)
@@ -110,6 +127,11 @@ class PointNetwork(Touch, ABC):
     select: Literal["last", "best"] = "last"
     # precision of products in training; bfloat16 takes half the memory and rounds to 3 digits, weights stay in float32
     precision: Precision = added("float32")
+
+    @property
+    def chooses_by_validation(self) -> bool:
+        """Whether validation grasps choose the epoch of a network, or when its training ends."""
+        return self.select == "best" or bool(self.patience)
 
     @abstractmethod
     def build(self, shape: Shape) -> nn.Module:
@@ -143,6 +165,10 @@ class Patches(PointNetwork):
     hidden: Annotated[int, Range(2)] = 256  # units of the first layer behind the points
     dropout: Dropout = 0.3  # fraction of these left out of each training step
     PRESETS: ClassVar[Presets] = {"quick": {"networks": 1, "epochs": 10, "points": 64}}
+
+    def fit(self, grasps: TrainingGrasps, model: FittedModel) -> None:
+        """Add networks that the shared loop trains: one for all targets or one for each."""
+        grasps.train_networks(self, model)
 
     def build(self, shape: Shape) -> nn.Module:
         """Return the network of patches."""
@@ -190,6 +216,10 @@ class Pointnet(PointNetwork):
         },
         "quick": {"networks": 1, "epochs": 10, "points": 64},
     }
+
+    def fit(self, grasps: TrainingGrasps, model: FittedModel) -> None:
+        """Add networks that the shared loop trains: one for all targets or one for each."""
+        grasps.train_networks(self, model)
 
     def build(self, shape: Shape) -> nn.Module:
         """Return the paper's network."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +23,7 @@ from tacpipe.errors import TacpipeError
 from tacpipe.models.forest import Forest
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins.constraints import CommaList
+from tacpipe.tasks import trained_on
 from tacpipe.tasks.touch import grasps as grasps_of
 from tacpipe.tasks.touch import members, shrinkage
 from tacpipe.tasks.touch.baselines import Baselines
@@ -42,6 +44,39 @@ Config = dict[str, Any]
 LEAVES = (2, 4, 8)  # rows of a leaf that are tried
 
 
+@dataclass(frozen=True)
+class TrainingGrasps:
+    """The grasps that an architecture's ``fit`` learns from, and the ways to train that the task offers."""
+
+    training: Grasps
+    validation: Grasps | None
+    targets: tuple[str, ...]
+    workspace: Path  # where checkpoints of an interrupted training lie
+
+    def grow_forests(self, params: Trees, model: FittedModel) -> None:
+        """Add one forest per target to ``model`` and, in a tree-ensemble, one of all targets."""
+        _grow_forests(params, self, model)
+
+    def train_networks(self, params: NetworkParams, model: FittedModel) -> None:
+        """Add networks to ``model`` that the shared loop trains."""
+        _train_networks(params, self, model)
+
+
+@dataclass(frozen=True)
+class FittedModel:
+    """What an architecture's ``fit`` adds to: the stored parts of a model."""
+
+    config: Config  # holds ``members``, one description for each member
+    tensors: dict[str, Tensor] = field(default_factory=dict)
+    history: list[loop.Line] = field(default_factory=list)
+
+    def add_member(self, described: dict[str, Any], tensors: Mapping[str, Tensor]) -> None:
+        """Add a member of the model: its description, and its tensors by name."""
+        number = len(self.config["members"])
+        self.config["members"].append(described)
+        self.tensors.update({f"{number}.{name}": value.clone().contiguous() for name, value in tensors.items()})
+
+
 def train(
     params: Params,
     training: Dataset,
@@ -59,23 +94,14 @@ def train(
     if not len(known):
         raise TacpipeError("There is no training recording. Make a split with `tacpipe split` that has some.")
     watched = grasps_of.read(validation) if validation is not None and validation.recordings else None
-    if watched is not None and params.use_validation and not _chooses(params):
+    if watched is not None and params.use_validation and not params.chooses_by_validation:
         known, watched = known.joined(watched), None
-    config = _config(params, targets, known, watched)
-    tensors: dict[str, Tensor] = {}
-    history: list[loop.Line] = []
-    if isinstance(params, Trees):
-        _grow(params, config, tensors, known, targets)
-    elif isinstance(params, NetworkParams):
-        _learn(params, config, tensors, history, (known, watched), targets, workspace)
-    else:
-        raise TacpipeError(
-            f"The params of the architecture {params.architecture} extend neither Patches nor Pointnet of "
-            f"tacpipe.tasks.touch.params, so the task cannot train it."
-        )
-    files = {WEIGHTS: save_tensors(tensors)}
-    if history:
-        files[HISTORY] = "".join(json.dumps(line) + "\n" for line in history).encode()
+    model = FittedModel(_config(params, targets, known, watched))
+    params.fit(TrainingGrasps(known, watched, targets, workspace), model)
+    config = model.config
+    files = {WEIGHTS: save_tensors(model.tensors)}
+    if model.history:
+        files[HISTORY] = "".join(json.dumps(line) + "\n" for line in model.history).encode()
     if params.baselines:
         config["learned_objects"] = list(known.objects)
         files[BASELINES] = save_arrays(Baselines.of(known).tensors())
@@ -93,23 +119,20 @@ def _config(params: Params, targets: Sequence[str], known: Grasps, watched: Gras
         "targets": list(targets),
         "objects": sorted(set(known.objects) - {""}),
         "counts": {"train": len(known), "val": len(watched) if watched else 0},
-        "trained_on": dict(zip(known.names, known.digests, strict=True))
-        | (dict(zip(watched.names, watched.digests, strict=True)) if watched else {}),
+        "trained_on": trained_on.merge(
+            *(zip(grasps.names, grasps.digests, strict=True) for grasps in (known, watched) if grasps)
+        ),
         "members": [],
         "parameters": None,
     }
 
 
-def _chooses(params: Params) -> bool:
-    """Return whether something is chosen by validation grasps: a network's epoch, or when its training ends."""
-    return isinstance(params, NetworkParams) and bool(params.select == "best" or params.patience)
-
-
-def _grow(params: Trees, config: Config, tensors: dict[str, Tensor], known: Grasps, targets: Sequence[str]) -> None:
-    """Add a forest a target and, in a tree-ensemble, one that predicts all targets by the same cuts.
+def _grow_forests(params: Trees, grasps: TrainingGrasps, model: FittedModel) -> None:
+    """Add one forest per target to ``model`` and, in a tree-ensemble, one that predicts all targets by the same cuts.
 
     Each has the leaves of the least out-of-bag error.
     """
+    known, targets = grasps.training, grasps.targets
     coloured = members.coloured(params)
     if coloured:
         require_colours(known.names, known.clouds)
@@ -124,7 +147,7 @@ def _grow(params: Trees, config: Config, tensors: dict[str, Tensor], known: Gras
     kept: dict[str, Tensor] = {}
     for number, (_, forest) in enumerate(forests):
         kept |= {f"{number}.{name}": tensor for name, tensor in forest.tensors().items()}
-    _add(config, tensors, about, kept)
+    model.add_member(about, kept)
     if params.shrink_novel:
 
         def predict(among: Bools) -> dict[str, Floats]:
@@ -133,8 +156,8 @@ def _grow(params: Trees, config: Config, tensors: dict[str, Tensor], known: Gras
             return members.averaged((group, forest.predict(rows[~among])) for group, forest in found)
 
         shrunk = shrinkage.fit(readings, known.objects, predict)
-        config["kept_of_novel"] = dict(shrunk.factor)
-        tensors.update({f"{SHRINKAGE}{name}": torch.from_numpy(one) for name, one in shrunk.tensors().items()})
+        model.config["kept_of_novel"] = dict(shrunk.factor)
+        model.tensors.update({f"{SHRINKAGE}{name}": torch.from_numpy(one) for name, one in shrunk.tensors().items()})
 
 
 def _forests(
@@ -161,18 +184,10 @@ def _leaf(rows: Floats, values: Floats, params: Trees) -> int:
     return fitting[int(np.argmin(errors))]
 
 
-def _learn(
-    params: NetworkParams,
-    config: Config,
-    tensors: dict[str, Tensor],
-    history: list[loop.Line],
-    parts: tuple[Grasps, Grasps | None],
-    targets: Sequence[str],
-    workspace: Path,
-) -> None:
-    """Add the networks: one for all targets or one for each, and as many of each as ``networks`` is."""
-    known, watched = parts
-    if watched is None and _chooses(params):
+def _train_networks(params: NetworkParams, grasps: TrainingGrasps, model: FittedModel) -> None:
+    """Add networks to ``model``: one for all targets or one for each, and as many of each as ``networks`` is."""
+    known, watched, targets = grasps.training, grasps.validation, grasps.targets
+    if watched is None and params.chooses_by_validation:
         raise TacpipeError(
             "No recording has the role val, and select best and patience choose a network's epoch by these. Make a split "
             "with some, or train with --select last --patience 0."
@@ -186,7 +201,7 @@ def _learn(
         scale = _scale(known, group, params.loss)
         work = _work(params, scale, (learned, followed), group, device)
         for number in range(params.networks):
-            place = workspace / f"{'-'.join(group)}-{number}"
+            place = grasps.workspace / f"{'-'.join(group)}-{number}"
             schedule = loop.Schedule.of(params, params.seed + 1000 * number)
             build = functools.partial(_built, params, group, device)
             whose = {"target": "all" if params.multi_target else group[0], "network": number}
@@ -207,9 +222,9 @@ def _learn(
             named |= {
                 f"scale.{name}": torch.from_numpy(np.asarray(value)) for name, value in scale.to_tensors().items()
             }
-            _add(config, tensors, about, named)
-            history += [{**line, **whose} for line in trained.history]
-    config["parameters"] = parameters
+            model.add_member(about, named)
+            model.history.extend({**line, **whose} for line in trained.history)
+    model.config["parameters"] = parameters
 
 
 def _work(
@@ -231,12 +246,6 @@ def _weights_learned(params: NetworkParams, targets: Sequence[str]) -> int:
     """Return how many numbers a network learns; the running means of batches are none of them."""
     with torch.device("meta"):  # shapes alone
         return sum(weight.numel() for weight in members.network(params, targets).parameters())
-
-
-def _add(config: Config, tensors: dict[str, Tensor], about: dict[str, Any], named: Mapping[str, Tensor]) -> None:
-    number = len(config["members"])
-    config["members"].append(about)
-    tensors.update({f"{number}.{name}": value.clone().contiguous() for name, value in named.items()})
 
 
 def _side_by_side(some: Grasps, group: Sequence[str]) -> Floats:

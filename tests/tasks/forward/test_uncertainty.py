@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.tasks.calibrated import Asked
+from tacpipe.tasks.calibrated import CalibrationRequest
 from tacpipe.tasks.forward import calibration as forward_calibration
 from tacpipe.tasks.forward import evaluation as forward_evaluation
 from tacpipe.tasks.forward import prediction
@@ -33,7 +33,7 @@ def plain(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
 
 
 def calibrated(files: dict[str, bytes], *, promise: bool = False, count: int = 4) -> dict[str, bytes]:
-    how = Asked(PERCENTS, promise, 0.05, 0)
+    how = CalibrationRequest(PERCENTS, promise, 0.05, 0)
     return forward_calibration.calibrate(files, how, dataset(*TRAINING), dataset(*CALIBRATION[:count]))
 
 
@@ -131,7 +131,9 @@ def test_a_recording_that_trained_or_stopped_the_model_does_not_calibrate_it(
 ) -> None:
     recordings = dataset(*CALIBRATION[:3], motion(seed))
     with pytest.raises(UsageError, match=f"{motion(seed).name}.*tacpipe split --calibration"):
-        forward_calibration.calibrate(plain, Asked(PERCENTS, False, 0.05, 0), dataset(*TRAINING), recordings)
+        forward_calibration.calibrate(
+            plain, CalibrationRequest(PERCENTS, False, 0.05, 0), dataset(*TRAINING), recordings
+        )
 
 
 def test_a_model_without_quantiles_is_evaluated_as_before_and_has_none_to_give(plain: dict[str, bytes]) -> None:
@@ -165,7 +167,7 @@ def test_recordings_of_the_calibration_count_as_seen(model: dict[str, bytes]) ->
 def test_a_model_of_latents_has_quantiles_in_counts(tmp_path: Path) -> None:
     training = compressed(*TRAINING)
     files = trained(tmp_path, training, compressed(motion(10), files=training.files))
-    how = Asked(PERCENTS, False, 0.05, 0)
+    how = CalibrationRequest(PERCENTS, False, 0.05, 0)
     made = forward_calibration.calibrate(files, how, training, compressed(*CALIBRATION, files=training.files))
     tree, _ = evaluated(made, *compressed(TEST, files=training.files).recordings.values(), files=training.files)
     assert 0.5 < tree["quantiles"]["model"]["coverage"]["mean"] <= 1

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from tacpipe.errors import TacpipeError
-from tacpipe.tasks.calibrated import Asked
+from tacpipe.tasks.calibrated import CalibrationRequest
 from tacpipe.tasks.material import calibration as material_calibration
 from tacpipe.tasks.material import prediction as material_prediction
 from tacpipe.tasks.material.model import MaterialModel
@@ -18,7 +18,7 @@ from tests.tasks.material.textures import MATERIALS, dataset, evaluated, slide, 
 
 FOREIGN = 9  # a material that no model here learns
 SENSORS = ("biotac", "roboskin")
-ASKED = Asked((10, 50, 90), False, 0.1, 0)
+ASKED = CalibrationRequest((10, 50, 90), False, 0.1, 0)
 
 
 def others(**attributes: Any) -> Any:
@@ -119,7 +119,7 @@ def test_validation_slides_that_the_model_learned_from_are_refused(tmp_path: Pat
 
 
 def test_too_few_slides_for_the_asked_fraction_are_refused(plain: dict[str, bytes]) -> None:
-    how = Asked((10, 50, 90), False, 0.01, 0)
+    how = CalibrationRequest((10, 50, 90), False, 0.01, 0)
     with pytest.raises(TacpipeError, match=r"20 validation slides cannot set a threshold .* takes 99 or more"):
         material_calibration.calibrate(plain, how, slides(0, 8), slides(20, 5))
 

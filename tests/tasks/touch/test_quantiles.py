@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from tacpipe.errors import TacpipeError
-from tacpipe.tasks.calibrated import Asked
+from tacpipe.tasks.calibrated import CalibrationRequest
 from tacpipe.tasks.touch import calibration as touch_calibration
 from tacpipe.tasks.touch import grasps as grasps_of
 from tacpipe.tasks.touch import prediction as touch_prediction
@@ -20,7 +20,7 @@ from tests.tasks.touch.handmade import dataset, evaluated, recording, recordings
 
 PERCENTS = (10, 50, 90)
 FAST = {"architecture": "trees", "inputs": "xyz"}
-ASKED = Asked(PERCENTS, False, 0.05, 0)
+ASKED = CalibrationRequest(PERCENTS, False, 0.05, 0)
 
 
 @pytest.fixture(scope="module")
@@ -102,6 +102,6 @@ def test_grasps_that_the_model_learned_from_are_refused(tmp_path: Path, watched:
 
 
 def test_too_few_grasps_cannot_promise_the_band(plain: dict[str, bytes]) -> None:
-    how = Asked(PERCENTS, True, 0.05, 0)
+    how = CalibrationRequest(PERCENTS, True, 0.05, 0)
     with pytest.raises(TacpipeError, match="3 calibration grasps can promise a band that holds 75 %"):
         touch_calibration.calibrate(plain, how, recordings(), dataset(*(recording(n) for n in (60, 61, 62))))
