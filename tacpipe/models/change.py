@@ -12,14 +12,14 @@ import torch
 from torch import Tensor, nn
 
 from tacpipe.models import recurrent_layer
-from tacpipe.models.windows import MOTION, Shape, Windows, held, motion
+from tacpipe.models.windows import MOTION, Shape, Windows, motion, repeats
 
 CELLS = ("gru", "lstm", "tcn")
 CLIPPED = 8.0  # standard deviations to which inputs are clipped: a jump of a sensor must not dominate a window
 
 
 class ChangeForecast(nn.Module):
-    """What all of them share: scales fitted on training windows, the loss, and the step from change to touch.
+    """Share scales fitted on training windows, the loss, and the step from change to touch.
 
     ``increments`` means that features are changes from row to row already; then the change itself is predicted.
     """
@@ -74,9 +74,11 @@ class ChangeForecast(nn.Module):
         steps, up = self.arm(windows)
         arm = torch.cat([steps, up.expand(len(steps), -1, -1)], -1)
         past, plan = arm[: windows.context], arm[windows.context :]
-        apart = torch.asinh((windows.touch - windows.touch[-1]) / self.change_scale)
+        change = torch.asinh((windows.touch - windows.touch[-1]) / self.change_scale)
         level = ((windows.touch - self.touch_mean) / self.touch_scale).clamp(-CLIPPED, CLIPPED)
-        return torch.cat([apart, level, held(windows.touch)[..., None], closing(windows)[..., None], past], -1), plan
+        return torch.cat(
+            [change, level, repeats(windows.touch)[..., None], closing(windows)[..., None], past], -1
+        ), plan
 
     def touched(self, change: Tensor, windows: Windows) -> Tensor:
         """Return touch (horizon, window, feature) from scaled change."""
@@ -96,10 +98,10 @@ class PlainForecast(ChangeForecast):
     def forward(self, windows: Windows) -> Tensor:
         """Return the features to come (horizon, window, feature), in their own unit."""
         past, plan = self.inputs(windows)
-        found: Tensor = self.network(past, plan)
+        scaled: Tensor = self.network(past, plan)
         if self.change_only:
-            return self.touched(found, windows)
-        return found * self.touch_scale + self.touch_mean
+            return self.touched(scaled, windows)
+        return scaled * self.touch_scale + self.touch_mean
 
 
 class SequenceForecast(ChangeForecast):
@@ -137,11 +139,11 @@ class SequenceForecast(ChangeForecast):
 
     def _convolved(self, read: Tensor, plan: Tensor) -> Tensor:
         """Return the states of the steps to come, (horizon, window, hidden)."""
-        unknown = plan.new_zeros(*plan.shape[:2], read.shape[-1] - plan.shape[-1])
-        rows = torch.cat([read, torch.cat([unknown, plan], -1)])
-        known = torch.cat([rows.new_ones(len(read)), rows.new_zeros(len(plan))])
-        known = known[:, None, None].expand(-1, rows.shape[1], -1)
-        signal = self.inward(torch.cat([rows, known], -1)).permute(1, 2, 0)  # (window, hidden, row)
+        missing = plan.new_zeros(*plan.shape[:2], read.shape[-1] - plan.shape[-1])
+        rows = torch.cat([read, torch.cat([missing, plan], -1)])
+        is_past = torch.cat([rows.new_ones(len(read)), rows.new_zeros(len(plan))])
+        is_past = is_past[:, None, None].expand(-1, rows.shape[1], -1)
+        signal = self.inward(torch.cat([rows, is_past], -1)).permute(1, 2, 0)  # (window, hidden, row)
         for block in self.blocks:
             signal = block(signal)
         states: Tensor = signal.permute(2, 0, 1)[len(read) :]
@@ -166,9 +168,9 @@ def spread(rows: Tensor) -> Tensor:
     return rows.std(0) if len(rows) > 1 else torch.zeros_like(rows[0])
 
 
-def _scale(found: Tensor) -> Tensor:
-    """Return the spread ``found``, and 1 where nothing moves."""
-    return torch.where(found > 0, found, 1.0)
+def _scale(spread: Tensor) -> Tensor:
+    """Return ``spread``, and 1 where nothing moves."""
+    return torch.where(spread > 0, spread, 1.0)
 
 
 def closing(windows: Windows) -> Tensor:

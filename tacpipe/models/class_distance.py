@@ -69,12 +69,12 @@ class ClassDistance:
         basis = np.linalg.svd(scaled, full_matrices=False)[2][:COMPONENTS].T  # (feature, component)
         classes, index = np.unique(labels, return_inverse=True)
         components = scaled @ basis
-        within, _ = ledoit_wolf(components - _means(components, index)[index], assume_centered=True)
-        variances, axes = np.linalg.eigh(within)
+        covariance, _ = ledoit_wolf(components - _means(components, index)[index], assume_centered=True)
+        variances, axes = np.linalg.eigh(covariance)
         gain = 1 / np.sqrt(np.maximum(variances, STEADY * variances.max() or 1.0))
         means = _means(components @ axes * gain, index)
-        apart = means - means.mean(axis=0)
-        between, directions = np.linalg.eigh(apart.T @ apart / max(1, len(classes) - 1))
+        offsets = means - means.mean(axis=0)
+        between, directions = np.linalg.eigh(offsets.T @ offsets / max(1, len(classes) - 1))
         projection = (standardise[:, None] * (basis @ axes)).astype(np.float32).astype(np.float64)
         return cls(
             classes.astype(np.int32),
@@ -148,9 +148,9 @@ def _means(placed: Floats, labels: Ints) -> Floats:
     return np.stack([placed[labels == label].mean(axis=0) for label in range(labels.max() + 1)])
 
 
-def _log_distances(slides: Floats, others: Floats) -> Floats:
-    """Return the logarithm of the squared distance of each slide (slide, component) to each of ``others`` (slide, other)."""
-    squared = np.stack([np.square(slide - others).sum(axis=1) for slide in slides])
+def _log_distances(slides: Floats, references: Floats) -> Floats:
+    """Return the logarithm of the squared distance of each slide (slide, component) to each reference (slide, reference)."""
+    squared = np.stack([np.square(slide - references).sum(axis=1) for slide in slides])
     distances: Floats = np.log(np.maximum(squared, SMALLEST))
     return distances
 

@@ -15,7 +15,7 @@ from tacpipe.models.taxelwise import TaxelwiseForecast, grid
 from tacpipe.models.windows import POSE, Windows
 
 AUTO, TAXELWISE = "auto", "taxelwise"
-ELSE = "gru"  # what auto is where the taxelwise model cannot read what there is
+ELSE = "gru"  # the meaning of auto where the taxelwise model cannot read the channels
 Layout = Sequence[Mapping[str, str]]
 Loss = Literal["absolute", "huber", "squared"]
 AnyLoss = Literal["auto", "absolute", "huber", "squared"]

@@ -16,7 +16,7 @@ from torch import Tensor
 from tacpipe.arrays import AnyArray, Float32s, Floats, Int32s
 
 FEATURES = 0.4  # fraction of all features that is tried at a cut
-LEAF = -1  # in place of a child where there is none
+LEAF = -1  # the child of a node without children
 
 
 @dataclass(frozen=True)
@@ -38,18 +38,18 @@ class Forest:
 
         forest = ExtraTreesRegressor(trees, min_samples_leaf=leaf, max_features=features, random_state=seed)
         forest.fit(rows.astype(np.float32), values if values.shape[1] > 1 else values[:, 0])
-        found = [tree.tree_ for tree in forest.estimators_]
-        starts = np.cumsum([0, *(tree.node_count for tree in found)])[:-1]
+        grown = [tree.tree_ for tree in forest.estimators_]
+        starts = np.cumsum([0, *(tree.node_count for tree in grown)])[:-1]
         children = [
-            np.where((both := np.column_stack([tree.children_left, tree.children_right])) == LEAF, LEAF, both + start)
-            for tree, start in zip(found, starts, strict=True)
+            np.where((pair := np.column_stack([tree.children_left, tree.children_right])) == LEAF, LEAF, pair + start)
+            for tree, start in zip(grown, starts, strict=True)
         ]
         return cls(
             starts.astype(np.int32),
             np.concatenate(children).astype(np.int32),
-            np.concatenate([np.maximum(tree.feature, 0) for tree in found]).astype(np.int32),
-            np.concatenate([tree.threshold for tree in found]),
-            np.concatenate([tree.value[:, :, 0] for tree in found]).astype(np.float32),
+            np.concatenate([np.maximum(tree.feature, 0) for tree in grown]).astype(np.int32),
+            np.concatenate([tree.threshold for tree in grown]),
+            np.concatenate([tree.value[:, :, 0] for tree in grown]).astype(np.float32),
         )
 
     @staticmethod
@@ -70,11 +70,11 @@ class Forest:
 
     def predict(self, rows: Floats) -> Floats:
         """Return the mean over trees of the leaf that each row (row, feature) falls into, (row, value); of 1 row or more."""
-        given = rows.astype(np.float32)
-        node = np.broadcast_to(self.roots, (len(given), len(self.roots))).copy()  # (row, tree)
-        row = np.arange(len(given))[:, None]
+        features = rows.astype(np.float32)
+        node = np.broadcast_to(self.roots, (len(features), len(self.roots))).copy()  # (row, tree)
+        row = np.arange(len(features))[:, None]
         while True:
-            right = (given[row, self.features[node]] > self.cuts[node]).astype(np.int32)
+            right = (features[row, self.features[node]] > self.cuts[node]).astype(np.int32)
             child = self.children[node, right]
             if (child == LEAF).all():
                 break
@@ -86,10 +86,10 @@ class Forest:
         return replace(self, values=(self.values * unit).astype(np.float32))
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return what `of` reads."""
-        kept: dict[str, AnyArray] = {"roots": self.roots, "children": self.children, "features": self.features}
-        kept |= {"cuts": self.cuts, "values": self.values}
-        return {name: torch.from_numpy(np.ascontiguousarray(array)) for name, array in kept.items()}
+        """Return what `from_tensors` reads."""
+        arrays: dict[str, AnyArray] = {"roots": self.roots, "children": self.children, "features": self.features}
+        arrays |= {"cuts": self.cuts, "values": self.values}
+        return {name: torch.from_numpy(np.ascontiguousarray(array)) for name, array in arrays.items()}
 
     def check(self, features: int, values: int) -> None:
         """Raise `ValueError` unless trees of so many ``features`` predict so many ``values``, and each way down them ends.
@@ -97,8 +97,8 @@ class Forest:
         As they are grown a child stands behind its parent: nodes that lead back to one another would be gone round for ever.
         """
         nodes = len(self.values)
-        own = np.arange(nodes)[:, None]
-        down = (self.children > own) & (self.children < nodes) | (self.children == LEAF)
+        numbers = np.arange(nodes)[:, None]
+        down = (self.children > numbers) & (self.children < nodes) | (self.children == LEAF)
         shapes = {
             "roots": self.roots.ndim == 1 and len(self.roots) > 0,
             "children": self.children.shape == (nodes, 2) and bool(down.all()),
@@ -107,13 +107,13 @@ class Forest:
             "cuts": self.cuts.shape == (nodes,),
             "values": self.values.shape == (nodes, values),
         }
-        whole = all(one.dtype.kind == "i" for one in (self.roots, self.children, self.features))
-        wrong = next((name for name, fine in shapes.items() if not fine), "" if whole else "numbers of nodes")
+        are_integers = all(array.dtype.kind == "i" for array in (self.roots, self.children, self.features))
+        wrong = next((name for name, fine in shapes.items() if not fine), "" if are_integers else "numbers of nodes")
         if wrong or not ((self.roots >= 0) & (self.roots < nodes)).all():
             raise ValueError(f"the {wrong or 'roots'} of a forest of {nodes} nodes are out of range")
 
     @classmethod
-    def of(cls, tensors: Mapping[str, Tensor]) -> Forest:
+    def from_tensors(cls, tensors: Mapping[str, Tensor]) -> Forest:
         """Return the forest that `tensors` wrote."""
         names: Sequence[str] = ("roots", "children", "features", "cuts", "values")
         return cls(*(tensors[name].numpy() for name in names))

@@ -1,4 +1,4 @@
-"""What stands between a sensor's frames and a recurrent network: nothing, a perceptron, or a convolution.
+"""Encode the frames of a sensor for a recurrent network: by nothing, a perceptron, or a convolution.
 
 A header encodes each frame to features and has a mirror that decodes features to a frame. Frames are (time, slide,
 channel); features (time, slide, width).
@@ -54,8 +54,8 @@ class Perceptron(nn.Module):
 
     def decode(self, features: Tensor) -> Tensor:
         """Return the frames."""
-        found: Tensor = self.decoder(features)
-        return found
+        frames: Tensor = self.decoder(features)
+        return frames
 
 
 class Convolution(nn.Module):
@@ -92,8 +92,8 @@ class Convolution(nn.Module):
             self._indices = indices[-slides:]
         else:
             maps = self.pool(maps)
-        found: Tensor = maps.reshape(steps, slides, WIDTH)
-        return found
+        features: Tensor = maps.reshape(steps, slides, WIDTH)
+        return features
 
     def decode(self, features: Tensor) -> Tensor:
         """Return the frames."""
@@ -119,8 +119,8 @@ def build(kind: str, channels: int, unpool: str = "nearest") -> Plain | Perceptr
     raise TacpipeError(f"There is no header {kind!r}; there are none, mlp and cnn.")
 
 
-def chosen(given: str, sensors: Mapping[str, int]) -> dict[str, str]:
-    """Return the header of each sensor; ``given`` is text like ``biotac=none,roboskin=cnn`` and may leave some out.
+def chosen(assignments: str, sensors: Mapping[str, int]) -> dict[str, str]:
+    """Return the header of each sensor; ``assignments`` is text like ``biotac=none,roboskin=cnn`` and may leave some out.
 
     ``sensors`` has the number of channels. A grid of triangles gets a convolution by default, others what ``other``
     states, or none.
@@ -130,12 +130,12 @@ def chosen(given: str, sensors: Mapping[str, int]) -> dict[str, str]:
     >>> chosen("other=mlp", {"biotac": 19, "roboskin": 60})
     {'biotac': 'mlp', 'roboskin': 'cnn'}
     """
-    stated = dict(part.strip().partition("=")[::2] for part in given.split(",") if part.strip())
-    default = stated.pop(OTHER, "none")
-    unknown = sorted(set(stated) - set(sensors))
+    headers = dict(part.strip().partition("=")[::2] for part in assignments.split(",") if part.strip())
+    default = headers.pop(OTHER, "none")
+    unknown = sorted(set(headers) - set(sensors))
     if unknown:
         raise TacpipeError(f"headers names the sensor {unknown[0]}; the recordings have {', '.join(sensors)}.")
     return {
-        name: stated.get(name, "cnn" if channels == GRID[0] * GRID[1] else default)
+        name: headers.get(name, "cnn" if channels == GRID[0] * GRID[1] else default)
         for name, channels in sensors.items()
     }

@@ -20,7 +20,7 @@ from tacpipe.errors import TacpipeError
 
 @dataclass(frozen=True)
 class Level:
-    """What was fitted: scores are bias + (levels - centre) @ weight, log-likelihoods up to what classes share."""
+    """Hold fitted scores: bias + (levels - centre) @ weight, log-likelihoods up to what classes share."""
 
     classes: Int32s  # (class,), sorted
     centre: AnyFloats  # (channel,), in the slides' unit
@@ -55,19 +55,21 @@ class Level:
         moves = gain > 0
         if not moves.any():
             raise TacpipeError("All slides have the same mean levels, so they do not distinguish classes.")
-        found = LinearDiscriminantAnalysis(
+        analysis = LinearDiscriminantAnalysis(
             solver="lsqr", shrinkage="auto", priors=np.full(len(classes), 1 / len(classes))
         )
         with warnings.catch_warnings():
             warnings.simplefilter(
                 "ignore", UserWarning
             )  # a class of one slide adds nothing to the covariance: so be it
-            found.fit((levels - centre)[:, moves] * gain[moves], labels)
-        signs = np.array([-1.0, 1.0]) / 2 if len(classes) == 2 else None  # of two classes only a difference is fitted
+            analysis.fit((levels - centre)[:, moves] * gain[moves], labels)
+        signs = (
+            np.array([-1.0, 1.0]) / 2 if len(classes) == 2 else None
+        )  # scikit-learn fits one difference for two classes
         weight = np.zeros((x.shape[2], len(classes)))
-        coefficients = found.coef_ if signs is None else signs[:, None] * found.coef_
+        coefficients = analysis.coef_ if signs is None else signs[:, None] * analysis.coef_
         weight[moves] = gain[moves, None] * coefficients.T
-        bias = found.intercept_ if signs is None else signs * found.intercept_
+        bias = analysis.intercept_ if signs is None else signs * analysis.intercept_
         parts = (part.astype(np.float32) for part in (centre, weight, bias))
         return cls(classes.astype(np.int32), *parts)
 
@@ -82,8 +84,8 @@ class Level:
 
     def predict(self, x: AnyFloats) -> Int32s:
         """Return the class of the highest score of each slide, (slide,)."""
-        named: Int32s = self.classes[self.scores(x).argmax(axis=1)]
-        return named
+        predicted: Int32s = self.classes[self.scores(x).argmax(axis=1)]
+        return predicted
 
     def to_tensors(self) -> dict[str, AnyArray]:
         """Return all that `from_tensors` needs."""

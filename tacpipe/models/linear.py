@@ -37,7 +37,7 @@ NAMES = ("train_mean", "damped_trend", "last_value_linear", "ridge", "ridge_acti
 ALPHAS = (1e1, 1e2, 1e3, 1e4, 1e5, 1e6)  # against standardised features and sums over windows, as in scikit-learn
 PHIS = tuple(step / 20 for step in range(21))
 CHUNK = 2048  # windows whose features are held at once: 35 MB of 1,100 features and 960 targets
-RIDGE_SHARE = 1e-6  # of NLinear's mean square, added to each: frames that repeat leave its matrix all but singular
+RIDGE_SHARE = 1e-6  # fraction of NLinear's mean square added to each: repeated frames leave its matrix nearly singular
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class Map:
 
 @dataclass(frozen=True)
 class Baselines:
-    """What was fitted; float32, as the forecasts."""
+    """Hold the fitted baselines, float32 as the forecasts."""
 
     mean_count: AnyFloats  # (channel,)
     phi: float
@@ -86,19 +86,19 @@ class Baselines:
         """
         _check("training", training)
         _check("validation", validation)
-        if [one.shape[1:] for one in training] != [one.shape[1:] for one in validation]:
+        if [arrays.shape[1:] for arrays in training] != [arrays.shape[1:] for arrays in validation]:
             raise TacpipeError(
                 f"Validation windows of {_shapes(validation)} do not fit training windows of {_shapes(training)}; all "
                 "but their number must be equal."
             )
         past, motion, ahead = training
         (context, channels), horizon = past.shape[1:], ahead.shape[1]
-        means = [one.mean(axis=0, dtype=np.float64) for one in training]
+        means = [arrays.mean(axis=0, dtype=np.float64) for arrays in training]
         centre = _features(means[0][None], means[1][None])[0]
         bias = (means[2] - means[0][-1]).ravel()
         sums, evaluated = (_Sums.over(part, centre, bias) for part in (training, validation))
         blind = centre.size - horizon * motion.shape[2]  # features that do not know the plan
-        shared = _Shared.of(sums, centre, bias, (context - 1, channels, horizon))
+        shared = _Shared.from_sums(sums, centre, bias, (context - 1, channels, horizon))
         phi, lag = shared.damped_trend()
         shared_weight, shared_bias = shared.least_squares()
         return cls(
@@ -113,7 +113,7 @@ class Baselines:
 
     @property
     def chosen(self) -> dict[str, float]:
-        """What was picked by squared error: phi, the lag in rows and the two alphas."""
+        """The settings with the least squared error: phi, the lag in rows and the two alphas."""
         return {
             "damped_trend.phi": self.phi,
             "damped_trend.lag": float(self.lag),
@@ -123,9 +123,9 @@ class Baselines:
 
     def predict(self, past: AnyFloats, motion: AnyFloats) -> dict[str, AnyFloats]:
         """Return what `each` yields, by name."""
-        return dict(self.each(past, motion))
+        return dict(self.forecasts(past, motion))
 
-    def each(self, past: AnyFloats, motion: AnyFloats) -> Iterator[tuple[str, AnyFloats]]:
+    def forecasts(self, past: AnyFloats, motion: AnyFloats) -> Iterator[tuple[str, AnyFloats]]:
         """Yield each baseline's name and counts above rest, (window, horizon, channel), float32.
 
         ``past`` is (window, context, channel) and ``motion`` (window, context + horizon, state). Raises `TacpipeError`
@@ -151,8 +151,8 @@ class Baselines:
         yield "last_value_linear", last + shared
         del shared
         features = _features(past, motion.astype(np.float32, copy=False))
-        for name, one in (("ridge", self.ridge), ("ridge_actions", self.ridge_actions)):
-            yield name, last + one(features[:, : len(one.centre)]).reshape(shape)
+        for name, ridge in (("ridge", self.ridge), ("ridge_actions", self.ridge_actions)):
+            yield name, last + ridge(features[:, : len(ridge.centre)]).reshape(shape)
 
     def to_tensors(self) -> dict[str, AnyFloats]:
         """Return all that `from_tensors` needs."""
@@ -192,10 +192,10 @@ class _Sums:
         past, motion, ahead = part
         xx, xy = np.zeros((centre.size, centre.size)), np.zeros((centre.size, bias.size))
         for first in range(0, len(past), CHUNK):
-            some = slice(first, first + CHUNK)
-            frames = past[some].astype(np.float64)
-            features = _features(frames, motion[some]) - centre
-            increments = (ahead[some] - frames[:, -1:]).reshape(len(frames), -1) - bias
+            rows = slice(first, first + CHUNK)
+            frames = past[rows].astype(np.float64)
+            features = _features(frames, motion[rows]) - centre
+            increments = (ahead[rows] - frames[:, -1:]).reshape(len(frames), -1) - bias
             xx += features.T @ features
             xy += features.T @ increments
         if not (np.isfinite(xx).all() and np.isfinite(xy).all()):
@@ -218,10 +218,10 @@ class _Shared:
     xy: AnyFloats  # (context - 1, horizon)
 
     @classmethod
-    def of(cls, sums: _Sums, centre: AnyFloats, bias: AnyFloats, shape: tuple[int, int, int]) -> _Shared:
+    def from_sums(cls, sums: _Sums, centre: AnyFloats, bias: AnyFloats, shape: tuple[int, int, int]) -> _Shared:
         """Return the sums of the blocks of each channel with itself; ``shape`` is context - 1, channel and horizon."""
         before, channels, horizon = shape
-        changes = before * channels  # which come first among the features
+        changes = before * channels  # the first features
         x, y = centre[:changes].reshape(before, channels), bias.reshape(horizon, channels)
         xx = sums.xx[:changes, :changes].reshape(before, channels, before, channels)
         xy = sums.xy[:changes].reshape(before, channels, horizon, channels)
@@ -264,7 +264,7 @@ def _ridge(sums: _Sums, evaluated: _Sums, centre: AnyFloats, bias: AnyFloats) ->
     moves = spread > np.finfo(np.float32).eps * np.abs(centre)  # else rounding would pass for a feature
     gain = np.where(moves, 1 / np.where(moves, spread, 1), 0)
     values, vectors = np.linalg.eigh(sums.xx * np.outer(gain, gain))
-    turn = gain[:, None] * vectors  # from standardised features to where their matrix is diagonal
+    turn = gain[:, None] * vectors  # maps standardised features to the basis in which their matrix is diagonal
     xy = turn.T @ sums.xy
     bent = (turn.T @ evaluated.xx @ turn) * (xy @ xy.T)
     straight = np.einsum("fy,fy->f", xy, turn.T @ evaluated.xy)
@@ -294,7 +294,7 @@ def _check(name: str, part: Windows) -> None:
             f"The {name} recordings hold no window. Give more or longer ones, or shorten context and horizon."
         )
     fits = (
-        [one.ndim for one in part] == [3, 3, 3]
+        [arrays.ndim for arrays in part] == [3, 3, 3]
         and len(past) == len(motion) == len(ahead)
         and motion.shape[1] == past.shape[1] + ahead.shape[1]
         and past.shape[2] == ahead.shape[2]
@@ -308,4 +308,4 @@ def _check(name: str, part: Windows) -> None:
 
 
 def _shapes(part: Windows) -> str:
-    return ", ".join(str(one.shape) for one in part)
+    return ", ".join(str(arrays.shape) for arrays in part)

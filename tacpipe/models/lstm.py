@@ -49,10 +49,10 @@ def lstm(inputs: Tensor, state: State | None, weights: Weights, lead: Lead | Non
     first = None if lead is None else lead[0] @ lead[1].t()
     hidden, cell = (None, None) if state is None else state
     from_input, from_state, bias = weights
-    given = (inputs, first, hidden, cell, from_input, from_state, bias)
+    arguments = (inputs, first, hidden, cell, from_input, from_state, bias)
     with torch.autocast("cpu", enabled=False):  # its products go to memory that is made before
-        whole = (one if one is None else one.to(from_state.dtype) for one in given)
-        states, last_hidden, last_cell = _Layer.apply(*whole)  # type: ignore[no-untyped-call]
+        converted = (argument if argument is None else argument.to(from_state.dtype) for argument in arguments)
+        states, last_hidden, last_cell = _Layer.apply(*converted)  # type: ignore[no-untyped-call]
     return states, (last_hidden, last_cell)
 
 
@@ -106,8 +106,8 @@ class _Layer(torch.autograd.Function):
         every_read, every_h, every_c = read.unbind(), read[..., :size].unbind(), cells.unbind()
         steps_of = zip(gates.unbind(), *columns, tanhs.unbind(), every_read, every_c, strict=False)
         by_step, minus = weights.t(), inputs.new_tensor(-1.0)
-        for step, (row, i, f, g, o, tanh, given, before) in enumerate(steps_of):
-            torch.mm(given, by_step, out=row)
+        for step, (row, i, f, g, o, tanh, step_inputs, before) in enumerate(steps_of):
+            torch.mm(step_inputs, by_step, out=row)
             if first is not None and not step:
                 row += first
                 g += first[:, 2 * size : 3 * size]
@@ -132,19 +132,19 @@ class _Layer(torch.autograd.Function):
         from_input, from_state, read, gates, cells, tanhs = ctx.saved_tensors
         steps, windows, size = tanhs.shape
         dh, dc = (tanhs.new_zeros(windows, size) for _ in range(2))
-        for total, given in ((dh, by_hidden), (dh, None if by_states is None else by_states[-1]), (dc, by_cell)):
-            if given is not None:
-                total += given
+        for total, gradient in ((dh, by_hidden), (dh, None if by_states is None else by_states[-1]), (dc, by_cell)):
+            if gradient is not None:
+                total += gradient
         later = None if by_states is None else by_states.unbind()
-        by_read = gates.new_zeros(gates.shape[-1], read.shape[-1])  # of all three weights, as they were multiplied
+        by_read = gates.new_zeros(gates.shape[-1], read.shape[-1])  # gradient of all three weights side by side
         needs = ctx.needs_input_grad
         by_inputs = _empty(gates, steps, windows, from_input.shape[1]) if needs[0] else None
-        some = min(steps, max(1, CACHED // (windows * gates.shape[-1])))
-        every_gates, every_slopes = gates.new_empty(some, *gates.shape[1:]), gates.new_empty(some, windows, size)
+        block = min(steps, max(1, CACHED // (windows * gates.shape[-1])))
+        every_gates, every_slopes = gates.new_empty(block, *gates.shape[1:]), gates.new_empty(block, windows, size)
         views = _views(every_gates, every_slopes)
         forgets = gates[..., size : 2 * size].unbind()
-        for start in reversed(range(0, steps, some)):
-            stop = min(start + some, steps)
+        for start in reversed(range(0, steps, block)):
+            stop = min(start + block, steps)
             by_gates = every_gates[: stop - start]
             before = slice(start, stop)
             after = read[start + 1 : stop + 1, :, :size]
@@ -199,7 +199,7 @@ def _factors(gates: Tensor, hiddens: Tensor, cells: Tensor, tanhs: Tensor, by_ga
     torch.addcmul(o, hiddens, tanhs, value=-1, out=slopes)
 
 
-_free: deque[Bytes] = deque(maxlen=16)  # of two layers in both directions, of this batch and the last
+_free: deque[Bytes] = deque(maxlen=16)  # enough for two layers in both directions, for this batch and the last
 
 
 class _Loan(Bytes if TYPE_CHECKING else np.ndarray):  # type: ignore[misc]
@@ -217,10 +217,10 @@ def _empty(like: Tensor, *shape: int) -> Tensor:
     """
     needed = math.prod(shape) * like.element_size()
     for _ in range(len(_free)):
-        found = _free.popleft()
-        if needed <= found.nbytes <= 2 * needed:
+        memory = _free.popleft()
+        if needed <= memory.nbytes <= 2 * needed:
             break
-        _free.append(found)
+        _free.append(memory)
     else:
-        found = np.empty(needed, np.uint8)
-    return torch.from_numpy(found.view(_Loan))[:needed].view(like.dtype).view(shape)
+        memory = np.empty(needed, np.uint8)
+    return torch.from_numpy(memory.view(_Loan))[:needed].view(like.dtype).view(shape)

@@ -27,10 +27,10 @@ from tacpipe.errors import TacpipeError
 LENGTH = 9  # weights of a kernel
 HEAVY = np.array(list(itertools.combinations(range(LENGTH), 3)))  # (kernel, 3): where its weights are 2
 KERNELS = len(HEAVY)  # 84
-DILATIONS = 32  # at most, of each kernel
-MOST_CHANNELS = 9  # that one kernel sums
-GOLDEN = (5**0.5 + 1) / 2  # whose multiples, modulo 1, fill the unit interval evenly
-BLOCK_BYTES = 2**18  # of one channel of a block of slides: several such arrays fit into a cache of 1 MB
+DILATIONS = 32  # most dilations of a kernel
+MOST_CHANNELS = 9  # most channels that one kernel sums
+GOLDEN = (5**0.5 + 1) / 2  # its multiples, modulo 1, fill the unit interval evenly
+BLOCK_BYTES = 2**18  # size of one channel of a block of slides: several such arrays fit into a cache of 1 MB
 COUNTED = 255  # positions that a byte can count
 
 
@@ -40,7 +40,7 @@ class Rocket:
 
     frames: int
     dilations: Int32s  # (dilation,), frames
-    each: Int32s  # (dilation,): biases of each kernel
+    counts: Int32s  # (dilation,): biases of each kernel
     channels: Bools  # (dilation, kernel, channel): which it sums
     biases: AnyFloats  # (feature,), in the slides' unit
 
@@ -56,21 +56,21 @@ class Rocket:
             raise TacpipeError(f"{features} features do not go round {KERNELS} kernels; ask for {KERNELS} or more.")
         slides, frames, channels = x.shape
         rng = np.random.default_rng(seed)
-        dilations, each = _dilations(frames, features // KERNELS)
-        most = min(channels, MOST_CHANNELS)
-        counts = (2 ** rng.uniform(0, np.log2(most + 1), (len(dilations), KERNELS))).astype(int)
+        dilations, counts_per_kernel = _dilations(frames, features // KERNELS)
+        limit = min(channels, MOST_CHANNELS)
+        channel_counts = (2 ** rng.uniform(0, np.log2(limit + 1), (len(dilations), KERNELS))).astype(int)
         drawn = rng.random((len(dilations), KERNELS, channels)).argsort(axis=-1).argsort(axis=-1)
-        chosen = drawn < counts[..., None]
+        chosen = drawn < channel_counts[..., None]
         examples = rng.integers(slides, size=(len(dilations), KERNELS))
-        quantiles = np.arange(1, KERNELS * each.sum() + 1) * GOLDEN % 1
+        quantiles = np.arange(1, KERNELS * counts_per_kernel.sum() + 1) * GOLDEN % 1
         padded, answers = _padded(x, dilations[-1]), []
         for at, dilation in enumerate(dilations):
             for kernel in range(KERNELS):
-                one = padded[:, :, examples[at, kernel], None]
-                answers.append(_answer(one, frames, at, kernel, dilation, chosen)[:, 0])
-        taken = np.split(quantiles, np.repeat(each, KERNELS).cumsum()[:-1])
-        biases = [np.quantile(answer, some) for answer, some in zip(answers, taken, strict=True)]
-        return cls(frames, dilations, each, chosen, np.concatenate(biases).astype(np.float32))
+                example = padded[:, :, examples[at, kernel], None]
+                answers.append(_answer(example, frames, at, kernel, dilation, chosen)[:, 0])
+        quantiles_by_answer = np.split(quantiles, np.repeat(counts_per_kernel, KERNELS).cumsum()[:-1])
+        biases = [np.quantile(answer, levels) for answer, levels in zip(answers, quantiles_by_answer, strict=True)]
+        return cls(frames, dilations, counts_per_kernel, chosen, np.concatenate(biases).astype(np.float32))
 
     def transform(self, x: AnyFloats) -> AnyFloats:
         """Return the features of slides (slide, time, channel): shares from 0 to 1, (slide, feature), float32.
@@ -93,15 +93,15 @@ class Rocket:
         """Return the features of a few slides, (feature, slide)."""
         features, at = np.empty((len(self.biases), len(x)), np.float32), 0
         padded = _padded(x, self.dilations[-1])
-        for index, (dilation, each) in enumerate(zip(self.dilations, self.each, strict=True)):
+        for index, (dilation, features_per_kernel) in enumerate(zip(self.dilations, self.counts, strict=True)):
             for kernel in range(KERNELS):
                 answer = _answer(padded, self.frames, index, kernel, dilation, self.channels)
                 flags = np.empty(answer.shape, np.bool_)
-                for _ in range(each):
+                for _ in range(features_per_kernel):
                     np.greater(answer, self.biases[at], out=flags)
                     features[at] = _counts(flags)
                     at += 1
-                features[at - each : at] /= len(answer)
+                features[at - features_per_kernel : at] /= len(answer)
         return features
 
     def to_tensors(self) -> dict[str, AnyArray]:
@@ -109,7 +109,7 @@ class Rocket:
         return {
             "frames": np.array([self.frames], np.int32),
             "dilations": self.dilations,
-            "each": self.each,
+            "each": self.counts,
             "channels": self.channels,
             "biases": self.biases,
         }
@@ -118,30 +118,32 @@ class Rocket:
     def from_tensors(cls, tensors: Mapping[str, AnyArray]) -> Rocket:
         """Return the transform that `to_tensors` described. Raises `ValueError` where its parts do not fit one another."""
         names = ("dilations", "each", "channels", "biases")
-        made = cls(int(tensors["frames"][0]), *(tensors[name] for name in names))
-        count = len(made.dilations)
+        rocket = cls(int(tensors["frames"][0]), *(tensors[name] for name in names))
+        count = len(rocket.dilations)
         fits = (
-            made.each.shape == (count,)
-            and made.channels.shape[:2] == (count, KERNELS)
-            and made.channels.dtype == np.bool_
+            rocket.counts.shape == (count,)
+            and rocket.channels.shape[:2] == (count, KERNELS)
+            and rocket.channels.dtype == np.bool_
         )
-        fits = fits and bool((made.each >= 0).all()) and made.biases.shape == (KERNELS * int(made.each.sum()),)
-        if not count or not fits or not ((made.dilations >= 1) & (made.dilations <= made.frames)).all():
-            raise ValueError(f"{len(made.biases)} biases do not fit {count} dilations of {KERNELS} kernels")
-        return made
+        fits = (
+            fits and bool((rocket.counts >= 0).all()) and rocket.biases.shape == (KERNELS * int(rocket.counts.sum()),)
+        )
+        if not count or not fits or not ((rocket.dilations >= 1) & (rocket.dilations <= rocket.frames)).all():
+            raise ValueError(f"{len(rocket.biases)} biases do not fit {count} dilations of {KERNELS} kernels")
+        return rocket
 
 
-def _dilations(frames: int, each: int) -> tuple[Int32s, Int32s]:
-    """Return the dilations and how many of a kernel's ``each`` features every one gets, both (dilation,).
+def _dilations(frames: int, features_per_kernel: int) -> tuple[Int32s, Int32s]:
+    """Return the dilations and how many of a kernel's ``features_per_kernel`` features every one gets, both (dilation,).
 
     They are spread evenly over powers of two, up to that at which a kernel spans the slide; those that fall on the same
     whole number share it, and what rounding leaves over goes round from the first on.
     """
-    most = min(each, DILATIONS)
-    powers = np.linspace(0, np.log2((frames - 1) / (LENGTH - 1)), most)
+    limit = min(features_per_kernel, DILATIONS)
+    powers = np.linspace(0, np.log2((frames - 1) / (LENGTH - 1)), limit)
     dilations, shared = np.unique((2**powers).astype(np.int32), return_counts=True)
-    counts = (shared * (each / most)).astype(np.int32)
-    counts[np.arange(each - counts.sum()) % len(counts)] += 1
+    counts = (shared * (features_per_kernel / limit)).astype(np.int32)
+    counts[np.arange(features_per_kernel - counts.sum()) % len(counts)] += 1
     return dilations, counts
 
 
@@ -157,7 +159,7 @@ def _answer(padded: AnyFloats, frames: int, index: int, kernel: int, dilation: i
     """Return what a kernel answers at each position, (time, slide)."""
     reach = (LENGTH - 1) * int(dilation)
     spare = padded.shape[1] - frames
-    rows = frames + reach if (index + kernel) % 2 == 0 else frames  # with zeros beyond the ends, or without
+    rows = frames + reach if (index + kernel) % 2 == 0 else frames  # every other kernel reads zeros beyond the ends
     first = (spare - (rows - frames)) // 2
     rows -= reach
     chosen = np.flatnonzero(channels[index, kernel])

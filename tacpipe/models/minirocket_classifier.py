@@ -19,17 +19,17 @@ from tacpipe.models.minirocket import Rocket
 from tacpipe.models.readout import Readout
 from tacpipe.models.tensors import under
 
-QUANTILES = (0.5, 0.75, 0.9, 1.0)  # of the channels at one moment
-SHARES = (0.0, 0.3, 1.0)  # that strength may have next to the 1 of patterns; finer steps let it in by chance
+QUANTILES = (0.5, 0.75, 0.9, 1.0)  # taken over the channels at one moment
+SHARES = (0.0, 0.3, 1.0)  # weights of strength that are tried, patterns have 1; finer steps let it in by chance
 
 
 @dataclass(frozen=True)
 class MinirocketClassifier:
-    """What was fitted."""
+    """Hold a fitted classifier."""
 
     patterns: Rocket
     readout: Readout
-    share: float  # of strength, next to the 1 of patterns
+    share: float  # weight of strength; patterns have 1
 
     @classmethod
     def fit(cls, x: AnyFloats, labels: Ints, *, seed: int = 0, features: int = 10_000) -> MinirocketClassifier:
@@ -62,8 +62,8 @@ class MinirocketClassifier:
 
     def predict(self, x: AnyFloats) -> Int32s:
         """Return the class of the highest score of each slide, (slide,)."""
-        named: Int32s = self.classes[self.scores(x).argmax(axis=1)]
-        return named
+        predicted: Int32s = self.classes[self.scores(x).argmax(axis=1)]
+        return predicted
 
     def to_tensors(self) -> dict[str, AnyArray]:
         """Return all that `from_tensors` needs."""
@@ -83,13 +83,13 @@ class MinirocketClassifier:
 
 def _read(patterns: AnyFloats, strength: AnyFloats, labels: Ints) -> tuple[Readout, float]:
     """Return the readout of patterns and strength, each (slide, feature), and the weight of strength."""
-    found = np.concatenate([patterns, strength], axis=1)
+    features = np.concatenate([patterns, strength], axis=1)
 
     def shares(share: float) -> AnyFloats:
         return np.repeat([1 / patterns.shape[1], share / strength.shape[1]], [patterns.shape[1], strength.shape[1]])
 
-    best = min(SHARES, key=lambda share: Readout.fit(found, labels, shares(share)).left_out_error)
-    return Readout.nearest_mean(found, labels, shares(best)), best
+    best = min(SHARES, key=lambda share: Readout.fit(features, labels, shares(share)).left_out_error)
+    return Readout.nearest_mean(features, labels, shares(best)), best
 
 
 def with_profile(x: AnyFloats) -> AnyFloats:

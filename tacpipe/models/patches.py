@@ -22,15 +22,15 @@ WIDTHS = (64, 128, 256)
 
 @dataclass(frozen=True)
 class Shape:
-    """What a network of touch reads and predicts, as numbers."""
+    """Sizes of what a network of touch reads and predicts."""
 
-    channels: int  # of a point
-    numbers: int  # of the grasp
-    values: int  # of touch, those of all targets side by side
+    channels: int  # numbers per point
+    numbers: int  # numbers that describe the grasp
+    values: int  # predicted values, those of all targets side by side
 
 
 class PatchNetwork(nn.Module):
-    """From patches (cloud, patch, point, channel) and the grasp's numbers (cloud, number) to touch (cloud, value)."""
+    """Map patches (cloud, patch, point, channel) and the grasp's numbers (cloud, number) to touch (cloud, value)."""
 
     def __init__(
         self, channels: int, numbers: int, outputs: int, *, backbone: str, hidden: int, dropout: float
@@ -85,8 +85,8 @@ class EdgeBackbone(nn.Module):
     def forward(self, points: Tensor) -> Tensor:
         """Return the features; neighbours are those in space, which comes first among the channels."""
         clouds, count, channels = points.shape
-        apart = torch.cdist(points[:, :, :3], points[:, :, :3])
-        nearest = apart.topk(min(NEIGHBOURS, count), largest=False).indices  # (cloud, point, neighbour)
+        distances = torch.cdist(points[:, :, :3], points[:, :, :3])
+        nearest = distances.topk(min(NEIGHBOURS, count), largest=False).indices  # (cloud, point, neighbour)
         rows = torch.arange(clouds, device=points.device)[:, None, None]
         around = points[rows, nearest] - points[:, :, None]  # (cloud, point, neighbour, channel)
         centre = points[:, :, None].expand(clouds, count, nearest.shape[2], channels)

@@ -22,7 +22,7 @@ HEADS = {f"fc{depth}": (1024, 512, 256, 128, 64, 32)[:depth] for depth in range(
 
 
 class PointNet(nn.Module):
-    """From points (cloud, point, channel) and numbers of the grasp (cloud, number) to values of touch (cloud, value)."""
+    """Map points (cloud, point, channel) and numbers of the grasp (cloud, number) to values of touch (cloud, value)."""
 
     def __init__(
         self, channels: int, grasp: int, outputs: int, *, head: Sequence[int] = HEADS["fc3"], transform: bool = True
@@ -70,8 +70,8 @@ class PointTransform(nn.Module):
 
     def forward(self, points: Tensor) -> Tensor:
         """Return the map to multiply points with from the right."""
-        found: Tensor = self.head(torch.relu(self.points(points))).view(-1, self.channels, self.channels)
-        return found + torch.eye(self.channels, device=points.device)
+        transform: Tensor = self.head(torch.relu(self.points(points))).view(-1, self.channels, self.channels)
+        return transform + torch.eye(self.channels, device=points.device)
 
 
 def _connected(inputs: int, hidden: Sequence[int], outputs: int) -> nn.Sequential:

@@ -35,26 +35,26 @@ class NormalisedLinear(nn.Module):
         self.shift = nn.Parameter(torch.zeros(outputs))
         self.register_buffer("mean", torch.zeros(outputs))
         self.register_buffer("variance", torch.ones(outputs))
-        nn.init.kaiming_uniform_(self.weight, a=5**0.5)  # as torch.nn.Linear begins
+        nn.init.kaiming_uniform_(self.weight, a=5**0.5)  # the initial weights of torch.nn.Linear
 
-    def affine(self, given: Tensor) -> tuple[Tensor, Tensor]:
+    def affine(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
         """Return weight (output, input) and bias (output,) of the layer for these inputs (…, input)."""
         if self.training:
-            with torch.autocast(given.device.type, enabled=False):  # small differences of sums over many points
-                mean, variance = self._moments(given.reshape(-1, given.shape[-1]).to(self.weight.dtype))
+            with torch.autocast(inputs.device.type, enabled=False):  # small differences of sums over many points
+                mean, variance = self._moments(inputs.reshape(-1, inputs.shape[-1]).to(self.weight.dtype))
         else:
             mean, variance = self.mean, self.variance
         gain = self.scale * torch.rsqrt(variance + EPSILON)
         return self.weight * gain[:, None], self.shift - mean * gain
 
-    def forward(self, given: Tensor) -> Tensor:
+    def forward(self, inputs: Tensor) -> Tensor:
         """Return the normalised outputs (…, output) of inputs (…, input)."""
-        return nn.functional.linear(given, *self.affine(given))
+        return nn.functional.linear(inputs, *self.affine(inputs))
 
-    def _moments(self, given: Tensor) -> tuple[Tensor, Tensor]:
+    def _moments(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean and variance (output,) over rows (row, input), and let the running ones follow."""
-        centre, rows = given.mean(dim=0), len(given)
-        centred = given - centre
+        centre, rows = inputs.mean(dim=0), len(inputs)
+        centred = inputs - centre
         covariance = centred.T @ centred / rows  # (input, input)
         mean = self.weight @ centre
         variance = ((self.weight @ covariance) * self.weight).sum(dim=1).clamp_min(0)
@@ -100,8 +100,8 @@ def _weighed(weights: Tensor, rows: Tensor) -> Tensor:
 
 def _largest(points: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     """Return the largest products over points (cloud, output), and which point gives each."""
-    found = torch.max(weight @ points.transpose(1, 2), dim=2)
-    return found.values, found.indices
+    maxima = torch.max(weight @ points.transpose(1, 2), dim=2)
+    return maxima.values, maxima.indices
 
 
 def _largest_cached(points: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
@@ -120,5 +120,5 @@ def largest(layer: NormalisedLinear, points: Tensor) -> Tensor:
     """Return the largest value over points (cloud, output) of the layer on clouds (cloud, point, input)."""
     weight, bias = layer.affine(points)
     with torch.autocast(points.device.type, enabled=False):
-        found: Tensor = LargestOverPoints.apply(points.to(weight.dtype), weight, bias)  # type: ignore[no-untyped-call]
-    return found
+        maxima: Tensor = LargestOverPoints.apply(points.to(weight.dtype), weight, bias)  # type: ignore[no-untyped-call]
+    return maxima

@@ -30,14 +30,14 @@ STEADY = 1e-6  # standard deviation below which a feature is constant but for ro
 
 @dataclass(frozen=True)
 class Readout:
-    """What was fitted: scores are bias + (features - centre) @ weight."""
+    """Hold fitted scores: bias + (features - centre) @ weight."""
 
     classes: Int32s  # (class,), sorted
     centre: AnyFloats  # (feature,)
     weight: AnyFloats  # (feature, class)
     bias: AnyFloats  # (class,)
-    alpha: float  # of ridge regression; of the nearest mean what is added to the covariance
-    left_out_error: float  # of ridge regression: mean square over slides left out one by one, targets +-1; else NaN
+    alpha: float  # penalty of ridge regression; for the nearest mean the amount added to the covariance
+    left_out_error: float  # ridge regression: mean square over slides left out one by one, targets +-1; else NaN
 
     @classmethod
     def fit(cls, features: AnyFloats, labels: Ints, shares: AnyFloats | None = None) -> Readout:
@@ -51,21 +51,21 @@ class Readout:
         _check(features, labels, len(classes))
         targets = np.where(labels[:, None] == classes, 1.0, -1.0)  # (slide, class)
         centre, gain = _standard(features, shares)
-        known = (features - centre) * gain
-        values, vectors = np.linalg.eigh((known @ known.T).astype(np.float64))
+        standardised = (features - centre) * gain
+        values, vectors = np.linalg.eigh((standardised @ standardised.T).astype(np.float64))
         values = np.maximum(values, 0)
         bias = targets.mean(axis=0)
         turned = vectors.T @ (targets - bias)
         best = None
         for alpha in ALPHAS:
             dual = vectors @ (turned / (values + alpha)[:, None])  # (slide, class)
-            own = np.square(vectors) @ (values / (values + alpha)) + 1 / len(labels)
-            error = float(np.square(alpha * dual / np.maximum(1 - own, STEADY)[:, None]).mean())
+            leverage = np.square(vectors) @ (values / (values + alpha)) + 1 / len(labels)
+            error = float(np.square(alpha * dual / np.maximum(1 - leverage, STEADY)[:, None]).mean())
             if best is None or error < best[0]:
                 best = error, alpha, dual
         assert best is not None
         error, alpha, dual = best
-        weight = gain[:, None] * (known.T @ dual.astype(np.float32))
+        weight = gain[:, None] * (standardised.T @ dual.astype(np.float32))
         return cls(classes, centre, weight, bias.astype(np.float32), alpha, error)
 
     @classmethod
@@ -78,12 +78,14 @@ class Readout:
         classes, index = np.unique(labels, return_inverse=True)
         _check(features, labels, len(classes))
         centre, gain = _standard(features, shares)
-        known = (features - centre) * gain
-        means = np.stack([known[index == i].mean(axis=0) for i in range(len(classes))])  # (class, feature)
-        known -= means[index]
-        inner = (known @ known.T).astype(np.float64) + len(known) * SPREAD * np.eye(len(known))
-        dual = np.linalg.solve(inner, (known @ means.T).astype(np.float64))  # (slide, class)
-        weight = means.T - known.T @ dual.astype(np.float32)
+        standardised = (features - centre) * gain
+        means = np.stack([standardised[index == i].mean(axis=0) for i in range(len(classes))])  # (class, feature)
+        standardised -= means[index]
+        inner = (standardised @ standardised.T).astype(np.float64) + len(standardised) * SPREAD * np.eye(
+            len(standardised)
+        )
+        dual = np.linalg.solve(inner, (standardised @ means.T).astype(np.float64))  # (slide, class)
+        weight = means.T - standardised.T @ dual.astype(np.float32)
         bias = -np.einsum("cf,fc->c", means, weight) / 2
         return cls(classes.astype(np.int32), centre, gain[:, None] * weight, bias, SPREAD, float("nan"))
 
@@ -102,8 +104,8 @@ class Readout:
 
     def predict(self, features: AnyFloats) -> Int32s:
         """Return the class of the highest score of each slide, (slide,)."""
-        named: Int32s = self.classes[self.scores(features).argmax(axis=1)]
-        return named
+        predicted: Int32s = self.classes[self.scores(features).argmax(axis=1)]
+        return predicted
 
     def to_tensors(self) -> dict[str, AnyArray]:
         """Return all that `from_tensors` needs."""

@@ -25,7 +25,7 @@ DECODERS = ("D1", "D2")
 
 @dataclass(frozen=True)
 class Shape:
-    """What a sensor's network reads and returns, and how it is built."""
+    """Sizes and layers of a sensor's network."""
 
     channels: int
     classes: int
@@ -33,7 +33,7 @@ class Shape:
     decoder: str = "D1"  # D1: the latents are the decoder's first state; D2: they are its input at every step
     hidden: int = HIDDEN
     latents: int = LATENTS
-    unpool: str = "nearest"  # of the cnn: nearest, or last as in the published code
+    unpool: str = "nearest"  # undoes the pooling of a cnn: nearest, or last as in the published code
     dropout: float = (
         0.0  # fraction of the latents, or last states, left out before the classifier in each training step
     )
@@ -78,12 +78,12 @@ class RecurrentAutoencoder(nn.Module):
         return scores
 
     def _decoded(self, latents: Tensor, steps: int) -> Tensor:
-        begun = self.from_latents(latents)  # (slide, hidden)
+        initial = self.from_latents(latents)  # (slide, hidden)
         if self.shape.decoder == "D1":
-            nothing = begun.new_zeros(steps, len(begun), 1)
-            states = _through(self.decoder, nothing, begun)
+            zeros = initial.new_zeros(steps, len(initial), 1)
+            states = _through(self.decoder, zeros, initial)
         else:
-            states = _through(self.decoder, begun.expand(steps, *begun.shape))
+            states = _through(self.decoder, initial.expand(steps, *initial.shape))
         return self.header.decode(self.to_features(states))
 
 

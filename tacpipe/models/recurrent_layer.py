@@ -15,12 +15,12 @@ from torch import Tensor
 T = TypeVar("T")
 
 
-def through(layer: Callable[..., T], inputs: Tensor, *given: Any) -> T:
+def through(layer: Callable[..., T], inputs: Tensor, *tensors: Any) -> T:
     """Return what a layer returns for ``inputs`` and more tensors, tuples of tensors or None; on a GPU in float32."""
     if not in_float16(inputs):
-        return layer(inputs, *given)
+        return layer(inputs, *tensors)
     with torch.autocast(inputs.device.type, enabled=False):
-        return layer(inputs.float(), *map(_whole, given))
+        return layer(inputs.float(), *map(_to_float32, tensors))
 
 
 def in_float16(inputs: Tensor) -> bool:
@@ -28,8 +28,8 @@ def in_float16(inputs: Tensor) -> bool:
     return inputs.device.type == "cuda" and torch.is_autocast_enabled("cuda")
 
 
-def _whole(given: Any) -> Any:
+def _to_float32(value: Any) -> Any:
     """Return tensors, and those of tuples, in float32."""
-    if isinstance(given, tuple):
-        return tuple(map(_whole, given))
-    return given if given is None else given.float()
+    if isinstance(value, tuple):
+        return tuple(map(_to_float32, value))
+    return value if value is None else value.float()

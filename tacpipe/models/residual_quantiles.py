@@ -31,14 +31,14 @@ FARTHEST = 8.0  # deviations at which a feature is cut
 
 @dataclass(frozen=True)
 class ResidualQuantiles:
-    """What was fitted: weights of the network, scales of its features, and units of errors."""
+    """Hold the weights of the network, scales of its features, and units of errors."""
 
     levels: AnyFloats  # (level,), fractions in ascending order, symmetric about 0.5
     unit: AnyFloats  # (channel, step), mean absolute error
     centre: AnyFloats  # (feature,)
     spread: AnyFloats  # (feature,)
-    weights: tuple[AnyFloats, ...]  # of three layers, (in, out)
-    biases: tuple[AnyFloats, ...]  # of three layers, (out,)
+    weights: tuple[AnyFloats, ...]  # three layers, (in, out)
+    biases: tuple[AnyFloats, ...]  # three layers, (out,)
 
     @classmethod
     def fit(
@@ -73,10 +73,10 @@ class ResidualQuantiles:
     def predict(self, features: Float32s) -> Float32s:
         """Return quantiles of the error (window, channel, step, level), in ascending order, of features (window, channel,
         feature)."""
-        found: AnyFloats = _scaled(features.reshape(-1, features.shape[-1]), self.centre, self.spread)
+        hidden: AnyFloats = _scaled(features.reshape(-1, features.shape[-1]), self.centre, self.spread)
         for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
-            found = _silu(found @ weight + bias)
-        raw = found @ self.weights[-1] + self.biases[-1]
+            hidden = _silu(hidden @ weight + bias)
+        raw = hidden @ self.weights[-1] + self.biases[-1]
         steps = self.unit.shape[1]
         ordered = _ordered(raw.reshape(*features.shape[:2], steps, len(self.levels)), len(self.levels) // 2)
         return (ordered * self.unit[None, :, :, None]).astype(np.float32, copy=False)
@@ -92,7 +92,7 @@ class ResidualQuantiles:
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, AnyArray]) -> Self:
         """Return what `to_tensors` described. Raises `ValueError` where shapes do not fit one another."""
-        made = cls(
+        quantiles = cls(
             tensors["levels"],
             tensors["unit"],
             tensors["centre"],
@@ -100,15 +100,15 @@ class ResidualQuantiles:
             tuple(tensors[f"{n}.w"] for n in range(3)),
             tuple(tensors[f"{n}.b"] for n in range(3)),
         )
-        widths = [one.shape for one in made.weights]
-        inner = [made.centre.shape[0], widths[0][1], widths[1][1], made.unit.shape[1] * len(made.levels)]
-        if widths != [(inner[n], inner[n + 1]) for n in range(3)] or [one.shape for one in made.biases] != [
-            (one,) for one in inner[1:]
+        widths = [array.shape for array in quantiles.weights]
+        inner = [quantiles.centre.shape[0], widths[0][1], widths[1][1], quantiles.unit.shape[1] * len(quantiles.levels)]
+        if widths != [(inner[n], inner[n + 1]) for n in range(3)] or [array.shape for array in quantiles.biases] != [
+            (array,) for array in inner[1:]
         ]:
             raise ValueError(f"the layers of quantiles are {widths}")
-        if len(made.levels) % 2 == 0 or (np.diff(made.levels) <= 0).any():
-            raise ValueError(f"the levels of quantiles are {made.levels.tolist()}")
-        return made
+        if len(quantiles.levels) % 2 == 0 or (np.diff(quantiles.levels) <= 0).any():
+            raise ValueError(f"the levels of quantiles are {quantiles.levels.tolist()}")
+        return quantiles
 
 
 def _trained(read: Float32s, errors: Float32s, levels: AnyFloats, seed: int, passes: int) -> nn.Sequential:
@@ -124,9 +124,9 @@ def _trained(read: Float32s, errors: Float32s, levels: AnyFloats, seed: int, pas
         optimiser = torch.optim.Adam(network.parameters(), LEARNING_RATE)
         schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, LEARNING_RATE, total_steps=passes + 1)
         for _ in range(passes):
-            some = torch.randint(len(x), (BATCH,))
-            quantiles = _ordered_tensor(network(x[some]).view(BATCH, steps, len(levels)), middle)
-            above = y[some][..., None] - quantiles
+            rows = torch.randint(len(x), (BATCH,))
+            quantiles = _ordered_tensor(network(x[rows]).view(BATCH, steps, len(levels)), middle)
+            above = y[rows][..., None] - quantiles
             lost = torch.maximum(p * above, (p - 1) * above).mean()
             optimiser.zero_grad()
             lost.backward()  # type: ignore[no-untyped-call]
@@ -152,8 +152,8 @@ def _ordered(raw: AnyFloats, middle: int) -> AnyFloats:
 
 
 def _silu(x: AnyFloats) -> AnyFloats:
-    found: AnyFloats = x / (1 + np.exp(-np.clip(x, -60, 60)))
-    return found
+    activated: AnyFloats = x / (1 + np.exp(-np.clip(x, -60, 60)))
+    return activated
 
 
 def _scaled(rows: AnyFloats, centre: AnyFloats, spread: AnyFloats) -> Float32s:

@@ -1,4 +1,4 @@
-"""What a slide shows of a surface, in terms that unlike sensors share: how strong waves of each length are.
+"""Measure how strong waves of each length are in a slide, which unlike sensors share.
 
 A wave of the surface with k periods a metre shakes a sensor that slides at v metres a second with f = k v hertz. Over
 spatial frequency k, the spectra of one material are therefore alike whatever sensor recorded it, at whatever speed and rate,
@@ -19,11 +19,13 @@ from tacpipe.arrays import AnyFloats
 from tacpipe.errors import TacpipeError
 
 BANDS = 16
-PERIODS = 3.0  # of the longest wave in the way; a slower one cannot be separated from a change of pressure
+PERIODS = (
+    3.0  # fewest periods of the longest wave in the way; a slower one cannot be separated from a change of pressure
+)
 HIGHEST = 0.6  # fraction of the spatial frequency above which a sensor would take a wave for a longer one
 LINES = 4  # spatial frequencies at which a band is read
 LEADING = 0.3  # fraction of the channels that are read, those pressed most; the others may not touch at all
-HOP = 0.25  # by which windows are apart, as a fraction of their length
+HOP = 0.25  # distance of windows, as a fraction of their length
 ROUNDING = 1 / 12  # counts^2, power of whole counts' rounding: no spectrum lies below
 READ = 256  # slides that are read at once
 
@@ -64,8 +66,8 @@ class Bands:
         >>> Bands.common([Sampling(400, 100.0, 0.025), Sampling(75, 50.0, 0.05)]).edges_per_m[[0, -1]].round(3).tolist()
         [40.0, 300.0]
         """
-        way_m = min(one.way_m for one in sensors)
-        lowest, highest = PERIODS / way_m, HIGHEST * min(one.highest_per_m for one in sensors)
+        way_m = min(sampling.way_m for sampling in sensors)
+        lowest, highest = PERIODS / way_m, HIGHEST * min(sampling.highest_per_m for sampling in sensors)
         if not lowest < highest:
             raise TacpipeError(
                 f"The shortest slide goes {way_m:.3g} m and shows waves of more than {lowest:.3g} periods a metre, but a "
@@ -92,9 +94,9 @@ class Bands:
         step_m = speed_m_s / rate_hz
         waves = self._waves(window, step_m)
         parts = [self._read(slides[first : first + READ], waves) for first in range(0, len(slides), READ)]
-        found = np.concatenate(parts) if parts else np.empty((0, len(self.edges_per_m)))
-        found[:, -1] += np.log(step_m)
-        return found
+        features = np.concatenate(parts) if parts else np.empty((0, len(self.edges_per_m)))
+        features[:, -1] += np.log(step_m)
+        return features
 
     def _read(self, slides: AnyFloats, waves: NDArray[np.complex64]) -> AnyFloats:
         """Return the features of a few slides."""

@@ -32,7 +32,7 @@ CHUNK = 64  # slides at once, which bounds memory
 
 @dataclass(frozen=True)
 class StatisticsClassifier:
-    """What was fitted."""
+    """Hold a fitted classifier."""
 
     readout: Readout
     view: View = "all"
@@ -59,13 +59,13 @@ class StatisticsClassifier:
 
     def predict(self, x: AnyFloats) -> Int32s:
         """Return the class of the highest score of each slide, (slide,)."""
-        named: Int32s = self.classes[self.scores(x).argmax(axis=1)]
-        return named
+        predicted: Int32s = self.classes[self.scores(x).argmax(axis=1)]
+        return predicted
 
     def to_tensors(self) -> dict[str, AnyArray]:
         """Return all that `from_tensors` needs."""
-        named = {f"readout.{key}": value for key, value in self.readout.to_tensors().items()}
-        return named | {"view": np.array([VIEWS.index(self.view)], np.int32)}
+        tensors = {f"readout.{key}": value for key, value in self.readout.to_tensors().items()}
+        return tensors | {"view": np.array([VIEWS.index(self.view)], np.int32)}
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, AnyArray]) -> Self:
@@ -82,8 +82,8 @@ def read(x: AnyFloats, view: View = "all") -> Float32s:
     if view == "level_removed":
         _check(x)
         x = x - x.mean(axis=1, keepdims=True, dtype=np.float64)
-    found = statistics(x)
-    return found[:, : x.shape[2] + len(ACROSS) + 2] if view == "level" else found
+    features = statistics(x)
+    return features[:, : x.shape[2] + len(ACROSS) + 2] if view == "level" else features
 
 
 def statistics(x: AnyFloats) -> Float32s:
@@ -116,7 +116,7 @@ def _statistics(x: AnyFloats) -> Float32s:
     steps = np.diff(root, axis=1)
     step = np.abs(steps).mean(axis=1)
     turn = np.abs(np.diff(steps, axis=1)).mean(axis=1)
-    found = [
+    parts = [
         root.mean(axis=1),
         root.std(axis=1),
         step,
@@ -127,7 +127,7 @@ def _statistics(x: AnyFloats) -> Float32s:
         (root == 0).mean(axis=1),
         *(third.mean(axis=1) for third in np.array_split(root, 3, axis=1)),
     ]
-    return np.concatenate(found, axis=1, dtype=np.float32)
+    return np.concatenate(parts, axis=1, dtype=np.float32)
 
 
 def _wide(root: Floats) -> Floats:

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from tacpipe.errors import TacpipeError
 from tacpipe.models import recurrent_layer
 from tacpipe.models.change import CLIPPED, ChangeForecast, closing, spread
-from tacpipe.models.windows import MOTION, UP, Windows, held
+from tacpipe.models.windows import MOTION, UP, Windows, repeats
 
 TRAITS = 16  # numbers that identify a place on the sensors
 RANK = 32
@@ -29,7 +29,7 @@ class TaxelwiseForecast(ChangeForecast):
     """Reads raw channels; begins at persistence."""
 
     axis_scale: Tensor
-    told_mean: Tensor  # of the inputs of the whole; stored models have this name
+    told_mean: Tensor  # mean of the inputs of the shared network; stored models have this name
     told_scale: Tensor
 
     def __init__(self, layout: Sequence[Mapping[str, str]], *, hidden: int, **shared: Any) -> None:
@@ -80,8 +80,8 @@ class TaxelwiseForecast(ChangeForecast):
         )
         whole = self.drop(self.whole(whole_inputs))  # (window, hidden)
         hidden = self.own(own) + self.from_whole(whole)[:, None] + self.from_traits(self.traits)
-        hidden = nn.functional.gelu(self.mixing(nn.functional.gelu(hidden) * self._kept(hidden)))
-        hidden = hidden * self._kept(hidden)
+        hidden = nn.functional.gelu(self.mixing(nn.functional.gelu(hidden) * self._dropout_mask(hidden)))
+        hidden = hidden * self._dropout_mask(hidden)
         factors = self.factors(hidden).view(*hidden.shape[:2], self.axes, RANK)  # (window, taxel, axis, rank)
         new = self._new(windows)
         plan = self.arm(windows)[0][windows.context :]  # (horizon, window, motion)
@@ -93,16 +93,16 @@ class TaxelwiseForecast(ChangeForecast):
 
     def _new(self, windows: Windows) -> Tensor:
         """Return which rows are new (window, context): new frames are rare, so they weigh more."""
-        return 3 - 4 * held(windows.touch).T
+        return 3 - 4 * repeats(windows.touch).T
 
     def _by_taxel(self, touch: Tensor) -> Tensor:
         """Return ``touch`` (…, channel) as (…, taxel, axis)."""
         return touch.reshape(*touch.shape[:-1], self.sensors * self.taxels, self.axes)
 
-    def _kept(self, hidden: Tensor) -> Tensor:
+    def _dropout_mask(self, hidden: Tensor) -> Tensor:
         """Return what dropout keeps (window, 1, hidden): the same units for all taxels, which costs little to draw."""
-        kept: Tensor = self.drop(hidden.new_ones(len(hidden), 1, hidden.shape[-1]))
-        return kept
+        mask: Tensor = self.drop(hidden.new_ones(len(hidden), 1, hidden.shape[-1]))
+        return mask
 
     def _read(self, windows: Windows) -> tuple[Tensor, Tensor]:
         """Return the inputs of each taxel (window, taxel, …) and of the whole (window, …)."""
@@ -120,7 +120,7 @@ class TaxelwiseForecast(ChangeForecast):
         load = torch.cat([sensors.mean(3), sensors.std(3)], -1).permute(1, 0, 2, 3).flatten(1)
         steps, up = self.arm(windows)
         past = steps[: windows.context].transpose(0, 1).flatten(1)
-        return own, torch.cat([load, up, past, closing(windows).T, 1 - held(touch).T], -1)
+        return own, torch.cat([load, up, past, closing(windows).T, 1 - repeats(touch).T], -1)
 
 
 def grid(layout: Sequence[Mapping[str, str]]) -> tuple[int, int, int]:
@@ -128,20 +128,20 @@ def grid(layout: Sequence[Mapping[str, str]]) -> tuple[int, int, int]:
 
     Raises `TacpipeError` where channels do not lie sensor by sensor and taxel by taxel, or sensors differ in size.
     """
-    streams = list(dict.fromkeys(one.get("stream", "") for one in layout))
-    axes = list(dict.fromkeys(one.get("axis", "") for one in layout))
+    streams = list(dict.fromkeys(channel.get("stream", "") for channel in layout))
+    axes = list(dict.fromkeys(channel.get("axis", "") for channel in layout))
     taxels = len(layout) // max(len(streams) * len(axes), 1)
-    places = [(one.get("stream", ""), one.get("taxel"), one.get("axis", "")) for one in layout]
+    places = [(channel.get("stream", ""), channel.get("taxel"), channel.get("axis", "")) for channel in layout]
     names = list(dict.fromkeys(taxel for _, taxel, _ in places))
-    wanted = [(stream, taxel, axis) for stream in streams for taxel in names for axis in axes]
-    if None in names or places != wanted or taxels < 2:
-        held = f"these {len(layout)} do not" if layout else "the recordings hold latents"
+    expected = [(stream, taxel, axis) for stream in streams for taxel in names for axis in axes]
+    if None in names or places != expected or taxels < 2:
+        reason = f"these {len(layout)} do not" if layout else "the recordings hold latents"
         declared = (
             "Write {taxel}, and {axis} where there are several, in match of [streams.…] columns of the layout file. "
         )
         raise TacpipeError(
-            f"The taxelwise model reads raw channels that lie sensor by sensor and taxel by taxel, as many of each; {held}. "
-            f"{declared if layout and None in names else ''}"
+            f"The taxelwise model reads raw channels that lie sensor by sensor and taxel by taxel, as many of each; "
+            f"{reason}. {declared if layout and None in names else ''}"
             f"Train it on segments without a codec, or choose --architecture gru, lstm, tcn or recurrent."
         )
     return len(streams), taxels, len(axes)

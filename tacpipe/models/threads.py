@@ -1,4 +1,4 @@
-"""How many threads torch and numpy compute with."""
+"""Limit the threads that torch and numpy compute with."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from contextvars import ContextVar
 import torch
 from threadpoolctl import ThreadpoolController
 
-_within: ContextVar[bool] = ContextVar("within", default=False)
+_is_limited: ContextVar[bool] = ContextVar("within", default=False)
 
 
 @contextmanager
@@ -19,17 +19,17 @@ def one_thread() -> Iterator[None]:
 
     Within another such block it does nothing, and costs nothing.
     """
-    if _within.get():
+    if _is_limited.get():
         yield
         return
-    before, token = torch.get_num_threads(), _within.set(True)
+    before, token = torch.get_num_threads(), _is_limited.set(True)
     torch.set_num_threads(1)
     try:
         with _libraries().limit(limits=1, user_api="blas"):
             yield
     finally:
         torch.set_num_threads(before)
-        _within.reset(token)
+        _is_limited.reset(token)
 
 
 @functools.cache

@@ -1,4 +1,4 @@
-"""What sensors can learn of classes from one another: features of the same kind, each sensor's changed in a way of its own.
+"""Share classes between sensors: features of the same kind, each sensor's changed in a way of its own.
 
 In sensor s, slides of class c have features N(m_sc, W_s). What another sensor t knows of the class predicts where m_sc is to
 be expected: in each feature alone at ``a + g m_tc``, give or take a variance b. The offset a and the gain g are fitted
@@ -23,7 +23,7 @@ from tacpipe.arrays import AnyArray, AnyFloats, Int32s, Ints
 from tacpipe.errors import TacpipeError
 
 SHARED = 3  # fewest classes from which the difference of two sensors is fitted
-PULL = 0.5  # of the gain of all features on that of each, as a fraction of a feature's mean sum of squares
+PULL = 0.5  # weight of the gain of all features on that of each, as a fraction of a feature's mean sum of squares
 STEADY = (
     1e-4  # fraction of a covariance's mean variance that is added to each variance: features may depend on each other
 )
@@ -58,44 +58,44 @@ class Gaussians:
 
 @dataclass(frozen=True)
 class Transfer:
-    """What was fitted for one sensor: classes as it knows them, and as other sensors alone make it expect them."""
+    """Hold the classes of one sensor: as it learned them, and as other sensors alone predict them."""
 
     classes: Int32s  # (class,), sorted
-    known: Gaussians
+    learned: Gaussians
     expected: Gaussians  # nothing of a class that no other sensor knows
 
     @classmethod
-    def fit(cls, own: Labelled, others: Sequence[Labelled] = ()) -> Transfer:
-        """Return what a sensor of which the labelled slides ``own`` are known can classify, with the help of ``others``.
+    def fit(cls, slides: Labelled, other_sensors: Sequence[Labelled] = ()) -> Transfer:
+        """Return the classes of a sensor, fitted on its labelled ``slides`` and on those of ``other_sensors``.
 
         Raises `TacpipeError` where arrays do not fit one another, values are not finite, no class has two slides, the
         sensor has fewer than two classes, or fewer than `SHARED` of those of another sensor.
         """
-        for one in (own, *others):
-            _check(one, own.features.shape[-1])
-        classes = np.unique(np.concatenate([one.labels for one in (own, *others)]))
-        means = _means(own, classes)
-        within = _within(own)
-        learned = np.isfinite(means[:, 0])
-        expected, variance = _expected(means, [_means(other, classes) for other in others])
+        for part in (slides, *other_sensors):
+            _check(part, slides.features.shape[-1])
+        classes = np.unique(np.concatenate([part.labels for part in (slides, *other_sensors)]))
+        means = _means(slides, classes)
+        inner = _covariance_within(slides)
+        labelled = np.isfinite(means[:, 0])
+        expected, variance = _expected(means, [_means(sensor, classes) for sensor in other_sensors])
         foreign = np.isfinite(expected[:, 0])
-        prior = np.where(foreign[:, None], expected, means[learned].mean(axis=0))
-        spread = np.where(foreign[:, None], variance, means[learned].var(axis=0, ddof=1) + _least(within))
-        mean, covariance = prior.copy(), within + np.stack([np.diag(one) for one in spread])
+        prior = np.where(foreign[:, None], expected, means[labelled].mean(axis=0))
+        spread = np.where(foreign[:, None], variance, means[labelled].var(axis=0, ddof=1) + _smallest_variance(inner))
+        mean, covariance = prior.copy(), inner + np.stack([np.diag(variances) for variances in spread])
         borrowed = Gaussians(np.where(foreign[:, None], prior, 0), np.where(foreign[:, None, None], covariance, 0))
-        for index in np.flatnonzero(learned):
+        for index in np.flatnonzero(labelled):
             wide = np.diag(spread[index])
-            trust = wide @ np.linalg.inv(wide + within / (own.labels == classes[index]).sum())
+            trust = wide @ np.linalg.inv(wide + inner / (slides.labels == classes[index]).sum())
             mean[index] += trust @ (means[index] - prior[index])
-            covariance[index] = within + wide - trust @ wide
+            covariance[index] = inner + wide - trust @ wide
         return cls(classes.astype(np.int32), Gaussians(mean, (covariance + covariance.swapaxes(1, 2)) / 2), borrowed)
 
     def to_tensors(self) -> dict[str, AnyArray]:
         """Return all that `from_tensors` needs."""
         return {
             "classes": self.classes,
-            "known.mean": self.known.mean,
-            "known.covariance": self.known.covariance,
+            "known.mean": self.learned.mean,
+            "known.covariance": self.learned.covariance,
             "expected.mean": self.expected.mean,
             "expected.covariance": self.expected.covariance,
         }
@@ -103,73 +103,74 @@ class Transfer:
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, AnyArray]) -> Transfer:
         """Return the knowledge that `to_tensors` described."""
-        known, expected = (
+        learned, expected = (
             Gaussians(tensors[f"{kind}.mean"], tensors[f"{kind}.covariance"]) for kind in ("known", "expected")
         )
-        return cls(tensors["classes"], known, expected)
+        return cls(tensors["classes"], learned, expected)
 
 
-def _expected(means: AnyFloats, others: Sequence[AnyFloats]) -> tuple[AnyFloats, AnyFloats]:
+def _expected(means: AnyFloats, other_means: Sequence[AnyFloats]) -> tuple[AnyFloats, AnyFloats]:
     """Return where other sensors' class means make one expect those of a sensor, and the variance of that.
 
     All are (class, feature), NaN in the rows of classes that a sensor did not learn, or that no other one knows.
     """
     weight, total = np.zeros(means.shape), np.zeros(means.shape)
-    for other in others:
-        both = np.isfinite(means[:, 0]) & np.isfinite(other[:, 0])
-        if both.sum() < SHARED:
+    for foreign in other_means:
+        shared = np.isfinite(means[:, 0]) & np.isfinite(foreign[:, 0])
+        if shared.sum() < SHARED:
             raise TacpipeError(
-                f"Two sensors learned {both.sum()} classes in common; {SHARED} at least show how they differ. Record "
+                f"Two sensors learned {shared.sum()} classes in common; {SHARED} at least show how they differ. Record "
                 "more with both, or learn for each sensor alone."
             )
-        there, here = other[both], means[both]
-        wrong = [
-            here[i] - _mapped(np.delete(there, i, 0), np.delete(here, i, 0), there[i]) for i in range(int(both.sum()))
+        source, target = foreign[shared], means[shared]
+        errors = [
+            target[i] - _mapped(np.delete(source, i, 0), np.delete(target, i, 0), source[i])
+            for i in range(int(shared.sum()))
         ]
-        precise = 1 / (np.square(wrong).mean(axis=0) + 1e-9)
-        knows = np.isfinite(other[:, 0])
+        precise = 1 / (np.square(errors).mean(axis=0) + 1e-9)
+        knows = np.isfinite(foreign[:, 0])
         weight[knows] += precise
-        total[knows] += precise * _mapped(there, here, other[knows])
+        total[knows] += precise * _mapped(source, target, foreign[knows])
     with np.errstate(invalid="ignore", divide="ignore"):
         return total / weight, np.where(weight > 0, 1 / weight, np.nan)
 
 
-def _mapped(there: AnyFloats, here: AnyFloats, features: AnyFloats) -> AnyFloats:
+def _mapped(source: AnyFloats, target: AnyFloats, features: AnyFloats) -> AnyFloats:
     """Return features of one sensor as another's, by the means (class, feature) of classes that both learned."""
-    centre, target = there.mean(axis=0), here.mean(axis=0)
-    squares = np.square(there - centre).sum(axis=0)
-    products = ((there - centre) * (here - target)).sum(axis=0)
+    centre, target_centre = source.mean(axis=0), target.mean(axis=0)
+    squares = np.square(source - centre).sum(axis=0)
+    products = ((source - centre) * (target - target_centre)).sum(axis=0)
     pull = PULL * squares.mean() + 1e-12
     gain = (products + pull * products.sum() / (squares.sum() + 1e-12)) / (squares + pull)
-    found: AnyFloats = target + (features - centre) * gain
-    return found
+    mapped: AnyFloats = target_centre + (features - centre) * gain
+    return mapped
 
 
 def _means(slides: Labelled, classes: Ints) -> AnyFloats:
     """Return the mean features of each class (class, feature), NaN where a class has no slide."""
-    found = np.full((len(classes), slides.features.shape[1]), np.nan)
-    for index, one in enumerate(classes):
-        if (slides.labels == one).any():
-            found[index] = slides.features[slides.labels == one].mean(axis=0)
-    return found
+    means = np.full((len(classes), slides.features.shape[1]), np.nan)
+    for index, label in enumerate(classes):
+        if (slides.labels == label).any():
+            means[index] = slides.features[slides.labels == label].mean(axis=0)
+    return means
 
 
-def _within(slides: Labelled) -> AnyFloats:
+def _covariance_within(slides: Labelled) -> AnyFloats:
     """Return the covariance (feature, feature) of features within classes."""
     from sklearn.covariance import ledoit_wolf
 
     classes, index = np.unique(slides.labels, return_inverse=True)
-    left = slides.features - _means(slides, classes)[index]
-    spread = left.std(axis=0)
+    residuals = slides.features - _means(slides, classes)[index]
+    spread = residuals.std(axis=0)
     spread = np.where(spread > 0, spread, 1.0)
-    shrunk, _ = ledoit_wolf(left / spread, assume_centered=True)
-    found: AnyFloats = shrunk * np.outer(spread, spread) * len(left) / (len(left) - len(classes))
-    return found
+    shrunk, _ = ledoit_wolf(residuals / spread, assume_centered=True)
+    covariance: AnyFloats = shrunk * np.outer(spread, spread) * len(residuals) / (len(residuals) - len(classes))
+    return covariance
 
 
-def _least(within: AnyFloats) -> float:
+def _smallest_variance(covariance: AnyFloats) -> float:
     """Return a variance between classes that is as good as none."""
-    return float(STEADY * np.trace(within) / len(within))
+    return float(STEADY * np.trace(covariance) / len(covariance))
 
 
 def _check(slides: Labelled, number: int) -> None:

@@ -1,4 +1,4 @@
-"""What a forecaster reads: windows of touch and arm, time first, in the units of the recording."""
+"""Hold windows of touch and arm, time first, in the units of the recording."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Windows(NamedTuple):
 
 @dataclass(frozen=True)
 class Shape:
-    """What a forecaster reads and predicts: sizes, and where each channel lies."""
+    """Sizes of what a forecaster reads and predicts, and where each channel lies."""
 
     features: int  # channels of touch, or latents
     context: int  # rows of the past
@@ -53,7 +53,7 @@ class Shape:
         return MOTION + UP
 
 
-def held(touch: Tensor) -> Tensor:
+def repeats(touch: Tensor) -> Tensor:
     """Return 1 where a row of ``touch`` (context, window, feature) repeats the one before, (context, window); else 0.
 
     The first row counts as new: what came before it lies outside the window.
@@ -84,7 +84,7 @@ def motion(windows: Windows) -> tuple[Tensor, Tensor]:
     now = windows.context - 1
     turned = rotations(quaternions)  # (row, window, 3, 3)
     inward = turned[now].transpose(-1, -2)  # (window, 3, 3), from the base's frame to the hand's
-    apart = _apply(inward, position - position[now])
+    displacement = _apply(inward, position - position[now])
     relative = inward @ turned
     vector = 0.5 * torch.stack(
         [
@@ -95,7 +95,7 @@ def motion(windows: Windows) -> tuple[Tensor, Tensor]:
         -1,
     )
     linear, angular = _apply(inward, windows.arm[..., POSE : POSE + 3]), _apply(inward, windows.arm[..., POSE + 3 :])
-    return torch.cat([apart, vector, linear, angular], -1), inward[..., 2]
+    return torch.cat([displacement, vector, linear, angular], -1), inward[..., 2]
 
 
 def without_plan(windows: Windows) -> Windows:
@@ -104,19 +104,19 @@ def without_plan(windows: Windows) -> Windows:
     return windows._replace(arm=torch.cat([windows.arm[: windows.context], now.expand(windows.horizon, -1, -1)]))
 
 
-def with_plans_of(windows: Windows, others: Tensor) -> Windows:
-    """Return the windows with the plans of ``others`` (window,), begun where the hand is now: plausible, and wrong.
+def with_plans_of(windows: Windows, sources: Tensor) -> Windows:
+    """Return the windows with the plans of ``sources`` (window,), begun where the hand is now: plausible, and wrong.
 
     Positions, orientations and velocities of the other plan are turned as one rigid motion from its own start to here.
     """
     now = windows.context - 1
-    here, there = windows.arm[now], windows.arm[now, others]  # (window, 13)
-    plan = windows.arm[windows.context :, others]
-    bridge = _product(here[..., 3:POSE], _conjugate(there[..., 3:POSE]))  # (window, 4)
+    start, source_start = windows.arm[now], windows.arm[now, sources]  # (window, 13)
+    plan = windows.arm[windows.context :, sources]
+    bridge = _product(start[..., 3:POSE], _conjugate(source_start[..., 3:POSE]))  # (window, 4)
     turn = rotations(bridge)
     moved = torch.cat(
         [
-            here[..., :3] + _apply(turn, plan[..., :3] - there[..., :3]),
+            start[..., :3] + _apply(turn, plan[..., :3] - source_start[..., :3]),
             _product(bridge.expand(len(plan), -1, -1), plan[..., 3:POSE]),
             _apply(turn, plan[..., POSE : POSE + 3]),
             _apply(turn, plan[..., POSE + 3 :]),

@@ -49,7 +49,7 @@ def test_a_row_on_a_cut_goes_the_way_it_goes_in_scikit_learn() -> None:
 
 def test_tensors_and_their_bytes_give_back_the_forest() -> None:
     forest = Forest.fitted(*rows(), trees=3, leaf=2, seed=0)
-    again = Forest.of(load(save(forest.tensors())))
+    again = Forest.from_tensors(load(save(forest.tensors())))
     for name, kept in forest.tensors().items():
         assert np.array_equal(getattr(again, name), kept.numpy())
         assert getattr(again, name).dtype == getattr(forest, name).dtype

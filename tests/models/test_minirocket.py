@@ -55,7 +55,7 @@ def test_features_are_the_shares_of_answers_above_each_bias(fitted: Rocket) -> N
     assert found.shape == (4, 84 * 12)
     assert found.dtype == np.float32
     expected, at = np.zeros(found.shape), 0
-    for index, each in enumerate(fitted.each):
+    for index, each in enumerate(fitted.counts):
         for kernel in range(84):
             answers = [answer(slide, fitted, index, kernel) for slide in x]
             for _ in range(each):

@@ -39,7 +39,7 @@ def test_classes_that_only_another_sensor_was_told_are_named() -> None:
 def test_what_is_expected_is_the_other_sensors_mean_by_gain_and_offset() -> None:
     own, other = sided(range(6), 400, -0.5, 3.0, 0.05), sided(range(CLASSES), 400, noise=0.05, seed=2)
     found = Transfer.fit(own, [other])
-    np.testing.assert_allclose(found.known.mean[6:], 3 - 0.5 * MEANS[6:], atol=0.05)
+    np.testing.assert_allclose(found.learned.mean[6:], 3 - 0.5 * MEANS[6:], atol=0.05)
     np.testing.assert_allclose(found.expected.mean, 3 - 0.5 * MEANS, atol=0.05)
 
 
@@ -70,8 +70,8 @@ def test_a_few_slides_correct_what_is_expected_by_the_rule_of_bayes() -> None:
         + 6 * np.linalg.inv(within) @ own.features[own.labels == number].mean(axis=0)
     )
     np.testing.assert_allclose(np.diag(np.diag(prior)), prior, atol=1e-12)
-    np.testing.assert_allclose(found.known.mean[number], mean, rtol=1e-6)
-    np.testing.assert_allclose(found.known.covariance[number], within + precise, rtol=1e-6)
+    np.testing.assert_allclose(found.learned.mean[number], mean, rtol=1e-6)
+    np.testing.assert_allclose(found.learned.covariance[number], within + precise, rtol=1e-6)
 
 
 def test_many_slides_of_its_own_outweigh_what_others_expect() -> None:
@@ -80,7 +80,7 @@ def test_many_slides_of_its_own_outweigh_what_others_expect() -> None:
     own = sided(range(CLASSES), 500)
     found = Transfer.fit(own, [wrong])
     means = np.stack([own.features[own.labels == one].mean(axis=0) for one in range(CLASSES)])
-    np.testing.assert_allclose(found.known.mean, means, atol=0.01)
+    np.testing.assert_allclose(found.learned.mean, means, atol=0.01)
 
 
 def test_few_slides_are_told_better_with_another_sensor_than_without() -> None:
@@ -101,7 +101,7 @@ def test_the_more_exact_of_two_sensors_counts_more() -> None:
     vague = Labelled(vague.features + rng.normal(size=(CLASSES, WIDE))[vague.labels], vague.labels)
     own = sided(range(6), 20, noise=0.01)
     errors = {
-        name: np.abs(Transfer.fit(own, others).known.mean[6:] - MEANS[6:]).mean()
+        name: np.abs(Transfer.fit(own, others).learned.mean[6:] - MEANS[6:]).mean()
         for name, others in {"exact": [exact], "vague": [vague], "both": [vague, exact]}.items()
     }
     assert errors["both"] < 0.1 * errors["vague"]
@@ -116,10 +116,10 @@ def test_scores_are_logarithms_of_normal_densities() -> None:
     expected = np.array(
         [
             multivariate_normal(mean, cov + STEADY * np.trace(cov) / WIDE * np.eye(WIDE)).logpdf(new.features)
-            for mean, cov in zip(found.known.mean, found.known.covariance, strict=True)
+            for mean, cov in zip(found.learned.mean, found.learned.covariance, strict=True)
         ]
     ).T
-    np.testing.assert_allclose(found.known.scores(new.features), expected + WIDE / 2 * np.log(2 * np.pi), rtol=1e-5)
+    np.testing.assert_allclose(found.learned.scores(new.features), expected + WIDE / 2 * np.log(2 * np.pi), rtol=1e-5)
 
 
 def test_nothing_is_expected_of_classes_that_no_other_sensor_knows() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from tacpipe.models.windows import POSE, Windows, held, motion, rotations, with_plans_of, without_plan
+from tacpipe.models.windows import POSE, Windows, motion, repeats, rotations, with_plans_of, without_plan
 from tests.models.window_fakes import CONTEXT, HORIZON, windows
 
 
@@ -80,10 +80,10 @@ def test_the_sign_of_a_quaternion_does_not_tell() -> None:
         assert torch.allclose(one, other)
 
 
-def test_a_row_is_held_where_every_channel_repeats_and_the_first_is_always_new() -> None:
+def test_a_row_is_repeats_where_every_channel_repeats_and_the_first_is_always_new() -> None:
     touch = torch.tensor([[[1.0, 2.0]], [[1.0, 2.0]], [[1.0, 3.0]], [[1.0, 3.0]]])
-    assert held(touch).squeeze(1).tolist() == [0, 1, 0, 1]
-    assert held(touch[:1]).tolist() == [[0]]
+    assert repeats(touch).squeeze(1).tolist() == [0, 1, 0, 1]
+    assert repeats(touch[:1]).tolist() == [[0]]
 
 
 def test_without_a_plan_the_arm_stays_where_it_is_now() -> None:

@@ -119,7 +119,7 @@ class _Predictions(Mapping[str, Prediction]):
         if forecaster.baselines is not None:
             moved = motion(some.windows)[0].transpose(0, 1).numpy()
             past = past.astype(np.float32)
-            for name, counts in forecaster.baselines.each(past, moved):
+            for name, counts in forecaster.baselines.forecasts(past, moved):
                 yield name, Prediction(None, counts)
 
 

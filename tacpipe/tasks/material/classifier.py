@@ -131,7 +131,7 @@ class SpectraReader:
     def read(self, frames: Float32s) -> ReaderOutput:
         """Return log-likelihoods and, as latents, spectra of slides (slide, time, channel) in device counts."""
         spectra = self.bands.log_power(frames, self.rate_hz, self.speed_m_s).astype(np.float32)
-        return ReaderOutput(spread(self.transfer.known.scores(spectra), self.transfer.classes, self.classes), spectra)
+        return ReaderOutput(spread(self.transfer.learned.scores(spectra), self.transfer.classes, self.classes), spectra)
 
     def expected(self, latents: Float32s) -> Float32s:
         """Return the scores (slide, class) of spectra by the classes that other sensors alone learned."""

@@ -154,7 +154,8 @@ def _member(params: Params, about: Mapping[str, Any], tensors: dict[str, Any], d
     width = sum(biotac_sp.width(target) for target in targets)
     if about["kind"] == FOREST:
         forests = tuple(
-            (tuple(group), Forest.of(under(f"{number}.", tensors))) for number, group in enumerate(about["groups"])
+            (tuple(group), Forest.from_tensors(under(f"{number}.", tensors)))
+            for number, group in enumerate(about["groups"])
         )
         for group, forest in forests:
             forest.check(len(about["features"]), sum(biotac_sp.width(target) for target in group))
