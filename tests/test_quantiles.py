@@ -35,7 +35,7 @@ def true_quantiles(feature: np.ndarray) -> np.ndarray:
 def test_pinball_is_that_of_scikit_learn() -> None:
     rng = np.random.default_rng(1)
     truth, predicted = rng.normal(size=(50, 2)), np.sort(rng.normal(size=(50, 2, 3)), axis=-1)
-    found = quantiles.Sums.of(truth, predicted, LEVELS)
+    found = quantiles.Sums.from_predictions(truth, predicted, LEVELS)
     for step in range(2):
         for at, level in enumerate(LEVELS):
             wanted = mean_pinball_loss(truth[:, step], predicted[:, step, at], alpha=level)
@@ -45,7 +45,7 @@ def test_pinball_is_that_of_scikit_learn() -> None:
 def test_coverage_and_width_are_those_counted_by_hand() -> None:
     truth = np.array([[0.0], [1.0], [5.0], [-3.0]])
     predicted = np.broadcast_to([-1.0, 0.0, 1.0], (4, 1, 3))
-    tree = quantiles.tree([quantiles.Sums.of(truth, predicted, LEVELS)], (10, 50, 90))
+    tree = quantiles.tree([quantiles.Sums.from_predictions(truth, predicted, LEVELS)], (10, 50, 90))
     assert tree["coverage"] == {"t1": 0.5, "mean": 0.5}
     assert tree["width"]["t1"] == 2.0
     assert [tree[f"below_q{one}"]["t1"] for one in (10, 50, 90)] == [0.25, 0.5, 0.75]
@@ -55,8 +55,10 @@ def test_coverage_and_width_are_those_counted_by_hand() -> None:
 def test_sums_of_two_parts_are_those_of_the_whole() -> None:
     rng = np.random.default_rng(2)
     truth, predicted = rng.normal(size=(20, 3)), np.sort(rng.normal(size=(20, 3, 3)), axis=-1)
-    whole = quantiles.Sums.of(truth, predicted, LEVELS)
-    parts = [quantiles.Sums.of(truth[some], predicted[some], LEVELS) for some in (slice(0, 7), slice(7, 20))]
+    whole = quantiles.Sums.from_predictions(truth, predicted, LEVELS)
+    parts = [
+        quantiles.Sums.from_predictions(truth[some], predicted[some], LEVELS) for some in (slice(0, 7), slice(7, 20))
+    ]
     one, two = quantiles.tree([whole], (10, 50, 90)), quantiles.tree([parts[0] + parts[1]], (10, 50, 90))
     assert one == two
 

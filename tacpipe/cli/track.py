@@ -31,6 +31,8 @@ def run(paths: Sequence[Path], trackers: Sequence[str]) -> list[str]:
         identity, made = known(store).get(one.digest, {}), one.manifest
         params = {**made.params, "stage": made.stage, "fold": identity.get("fold", 0)}
         name = tracking.name_of(path, digest(identity) if identity else one.digest)
-        Tracking(tracking.opened(trackers), name, tracker.params(params)).finish(path, tracking.files(made, store))
+        Tracking(tracking.open_trackers(trackers), name, tracker.params(params)).finish(
+            path, tracking.files(made, store)
+        )
         names.append(name)
     return names

@@ -1,1 +1,1 @@
-"""What turns tactile channels into latents and back."""
+"""Turn tactile channels into latents and back."""

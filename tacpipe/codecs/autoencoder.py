@@ -83,7 +83,7 @@ class Autoencoder:
             "of": self.representation,
             "frames": self.frames,
             "channels": list(self.channels),
-            "layout": [dict(one) for one in self.layout],
+            "layout": [dict(channel) for channel in self.layout],
             "latents": len(self.latents),
             "layers": {"encoder": len(self.encoder), "decoder": len(self.decoder)},
         }
@@ -118,18 +118,18 @@ class Autoencoder:
 def scaled(inputs: Floats, mean_count: Floats, scale_count: Floats) -> Floats:
     """Return rows (row, frames * channel) as float32 with every frame's channels in units of their scale."""
     frames = inputs.shape[1] // len(mean_count)
-    found: Floats = ((inputs - np.tile(mean_count, frames)) / np.tile(scale_count, frames)).astype(np.float32)
-    return found
+    inputs_scaled: Floats = ((inputs - np.tile(mean_count, frames)) / np.tile(scale_count, frames)).astype(np.float32)
+    return inputs_scaled
 
 
 def _through(layers: Layers, rows: Floats) -> Floats:
     """Return what ``layers`` make of ``rows`` (row, in), shape (row, out)."""
-    made = np.empty((len(rows), len(layers[-1][1])), dtype=np.float32)
+    outputs = np.empty((len(rows), len(layers[-1][1])), dtype=np.float32)
     for first in range(0, len(rows), CHUNK):
-        held = rows[first : first + CHUNK]
+        hidden = rows[first : first + CHUNK]
         for weight, bias in layers[:-1]:
-            held = held @ weight.T + bias
-            held = np.where(held > 0, held, np.expm1(np.minimum(held, 0)))
+            hidden = hidden @ weight.T + bias
+            hidden = np.where(hidden > 0, hidden, np.expm1(np.minimum(hidden, 0)))
         weight, bias = layers[-1]
-        made[first : first + CHUNK] = held @ weight.T + bias
-    return made
+        outputs[first : first + CHUNK] = hidden @ weight.T + bias
+    return outputs

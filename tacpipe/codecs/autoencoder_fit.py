@@ -30,10 +30,10 @@ from tacpipe.training import devices, loop
 if TYPE_CHECKING:
     Floats = np.ndarray[Any, np.dtype[np.floating[Any]]]
 
-FRAMES = (1, 2, 3)  # of the classes C1, C2 and C3
+FRAMES = (1, 2, 3)  # widths for the classes C1, C2 and C3
 HIDDEN = {1: (64, 32), 2: (128, 64), 3: (192, 96)}  # layers between input and latent, by frames
-SHAPES = ((64, 32), (128, 64, 32), (128, 64))  # that a search tries, times the frames
-STEPS = ((1, 1), (3, 1), (1, 10), (3, 10))  # that it takes learning rate and weight decay times
+SHAPES = ((64, 32), (128, 64, 32), (128, 64))  # widths that a search tries, times the frames
+STEPS = ((1, 1), (3, 1), (1, 10), (3, 10))  # factors of learning rate and weight decay that a search tries
 MOST = len(SHAPES) * len(STEPS)
 GRADIENT_CLIP = 1.0  # largest norm of the gradient, without unit, as of the forecasters
 
@@ -44,7 +44,7 @@ class Network:
 
     hidden: tuple[int, ...]
     learning_rate: float
-    weight_decay: float  # of Adam: this fraction of a weight is added to its gradient
+    weight_decay: float  # Adam: this fraction of a weight is added to its gradient
 
 
 def networks(
@@ -69,8 +69,8 @@ def networks(
     if not search:
         return [Network(_widths(hidden) if hidden else HIDDEN[frames], learning_rate, weight_decay)]
     tried = [
-        Network(tuple(frames * width for width in shape), learning_rate * fast, weight_decay * much)
-        for fast, much in STEPS
+        Network(tuple(frames * width for width in shape), learning_rate * fast, weight_decay * decay)
+        for fast, decay in STEPS
         for shape in SHAPES
     ]
     return tried[:search]
@@ -107,17 +107,18 @@ def fit(
         )
     mean, scale = standard(train[:, -width:], representation)
     learned, watched = (torch.from_numpy(scaled(part, mean, scale)).to(devices.kind()) for part in (train, val))
-    found = [
+    results = [
         _trained(learned, watched, network, schedule, workspace, (index, len(tried)), components, representation)
         for index, network in enumerate(tried)
     ]
-    best = min(range(len(found)), key=lambda index: _lowest(found[index]))
-    encoder, decoder = (_layers(found[best].weights, part) for part in ("encoder", "decoder"))
+    best = min(range(len(results)), key=lambda index: _lowest(results[index]))
+    encoder, decoder = (_layers(results[best].weights, part) for part in ("encoder", "decoder"))
     codec = Autoencoder(
         rows.channels, rows.layout, mean, scale, encoder, decoder, train.shape[1] // width, representation
     )
     described = [
-        _told(network, one) | {"kept": at == best} for at, (network, one) in enumerate(zip(tried, found, strict=True))
+        _record(network, trained) | {"kept": at == best}
+        for at, (network, trained) in enumerate(zip(tried, results, strict=True))
     ]
     measured = {
         "reconstruction": measures.reconstructions(codec, {"train": [train], "val": [val]}),
@@ -154,7 +155,7 @@ def _trained(
     network: Network,
     schedule: loop.Schedule,
     workspace: Path,
-    place: tuple[int, int],  # among the networks that are tried: index and number
+    place: tuple[int, int],  # index and number among the networks that are tried
     components: int,
     representation: str,
 ) -> loop.Trained:
@@ -183,7 +184,7 @@ def _lowest(trained: loop.Trained) -> float:
     return min(float(line["val_loss"]) for line in trained.history)
 
 
-def _told(network: Network, trained: loop.Trained) -> dict[str, Any]:
+def _record(network: Network, trained: loop.Trained) -> dict[str, Any]:
     """Return the record of a network in the search; no seconds, which are never the same."""
     return {
         "hidden": list(network.hidden),
@@ -197,9 +198,9 @@ def _told(network: Network, trained: loop.Trained) -> dict[str, Any]:
 
 def _layers(weights: dict[str, Tensor], part: str) -> tuple[tuple[Floats, Floats], ...]:
     """Return weight and bias of each layer of ``encoder`` or ``decoder``; a layer without bias has zeros."""
-    found = {name: value.numpy() for name, value in weights.items() if name.startswith(f"{part}.")}
-    places = sorted({int(name.split(".")[1]) for name in found})
-    pairs = ((found[f"{part}.{at}.weight"], found.get(f"{part}.{at}.bias")) for at in places)
+    tensors = {name: value.numpy() for name, value in weights.items() if name.startswith(f"{part}.")}
+    places = sorted({int(name.split(".")[1]) for name in tensors})
+    pairs = ((tensors[f"{part}.{at}.weight"], tensors.get(f"{part}.{at}.bias")) for at in places)
     return tuple((w, np.zeros(len(w), dtype=np.float32) if b is None else b) for w, b in pairs)
 
 

@@ -1,4 +1,4 @@
-"""What every codec can do, and how a stored one is read back."""
+"""Define the interface of codecs, and read stored ones back."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Codec(Protocol):
 
     @property
     def representation(self) -> str:
-        """What latents encode: ``levels``, counts above rest, or ``increments``, what a row adds to the one before."""
+        """The values that latents encode: ``levels``, counts above rest, or ``increments``, changes from row to row."""
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -115,15 +115,15 @@ def encode_finite(project: Callable[[Floats], Floats], inputs: Floats, width: in
     return latents
 
 
-def check_channels(expected: Sequence[str], given: Sequence[str]) -> None:
-    """Raise `TacpipeError` unless ``given`` names the channels a codec was fitted on, in their order."""
-    if tuple(expected) == tuple(given):
+def check_channels(expected: Sequence[str], channels: Sequence[str]) -> None:
+    """Raise `TacpipeError` unless ``channels`` names the channels a codec was fitted on, in their order."""
+    if tuple(expected) == tuple(channels):
         return
-    at = next((i for i, pair in enumerate(zip(expected, given, strict=False)) if pair[0] != pair[1]), None)
+    at = next((i for i, pair in enumerate(zip(expected, channels, strict=False)) if pair[0] != pair[1]), None)
     if at is None:
-        differ = f"it was fitted on {len(expected)} channels and is given {len(given)}"
+        differ = f"it was fitted on {len(expected)} channels and is given {len(channels)}"
     else:
-        differ = f"channel {at + 1} is {given[at]} where it was fitted on {expected[at]}"
+        differ = f"channel {at + 1} is {channels[at]} where it was fitted on {expected[at]}"
     raise TacpipeError(f"The codec does not fit this table: {differ}. Fit one on recordings of this rig.")
 
 

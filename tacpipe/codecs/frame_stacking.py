@@ -1,4 +1,4 @@
-"""What a codec reads of the rows that follow one another: levels or increments, of one frame or of some in a row.
+"""Build the inputs of a codec: levels or increments, for one frame or several in a row.
 
 A stretch is a run of rows without a gap in time. Nothing here looks ahead, and nothing looks across the start of a
 stretch: its first row stands in for the rows before it.
@@ -45,12 +45,12 @@ def inputs(values: AnyFloats, begins: Bools | None, representation: str, frames:
 
 
 class Stacking:
-    """What `inputs` makes of rows that come in pieces; it keeps the last rows of a piece, which the next one reads."""
+    """Stack rows that come in pieces as `inputs` does; it keeps the last rows of a piece, which the next one reads."""
 
     def __init__(self, representation: str, frames: int = 1) -> None:
         check(representation)
         self._representation, self._frames = representation, frames
-        self._values: AnyFloats | None = None  # of the last rows
+        self._values: AnyFloats | None = None  # the last rows
         self._begins = np.zeros(0, dtype=bool)
 
     def next(self, values: AnyFloats, begins: Bools) -> AnyFloats:

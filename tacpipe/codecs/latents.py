@@ -30,7 +30,7 @@ def added(recording: Recording, fitted: Fitted) -> pa.Table | pa.RecordBatchRead
     """
     codec, columns = stored.load(fitted), recording.columns()
     channels = tactile.columns(columns.schema, "tactile")
-    with _named(recording.name):
+    with _errors_naming(recording.name):
         codecs.check_channels(codec.channels, channels)
         begins = frame_stacking.breaks(tactile.times(columns))
         columns.forget()
@@ -42,7 +42,7 @@ def added(recording: Recording, fitted: Fitted) -> pa.Table | pa.RecordBatchRead
 
 
 @contextmanager
-def _named(name: str) -> Iterator[None]:
+def _errors_naming(name: str) -> Iterator[None]:
     """Have an error of encoding name the recording."""
     try:
         yield
@@ -54,26 +54,26 @@ def _in_pieces(name: str, columns: Columns, codec: Any, begins: Flags) -> pa.Rec
     """Return the rows of a recording with their latents, each piece encoded behind the rows before it that it reads."""
     before = codec.reads - 1
 
-    def made() -> Iterator[pa.RecordBatch]:
+    def batches() -> Iterator[pa.RecordBatch]:
         counts: Floats = np.zeros((0, len(codec.channels)))
         row = 0
         for table in columns.batches():
             lead = min(row, before)
             counts = np.concatenate([counts[len(counts) - lead :], tactile.above_rest(table, codec.channels)])
-            with _named(name):
+            with _errors_naming(name):
                 latents = codec.encode(counts, codec.channels, begins[row - lead : row + table.num_rows])[lead:]
                 piece = _with(table, codec, latents)
             yield from piece.combine_chunks().to_batches()
             row += table.num_rows
 
-    return pa.RecordBatchReader.from_batches(_with(columns.schema.empty_table(), codec, None).schema, made())
+    return pa.RecordBatchReader.from_batches(_with(columns.schema.empty_table(), codec, None).schema, batches())
 
 
 def _with(table: pa.Table, codec: codecs.FittedCodec, latents: Floats | None) -> pa.Table:
     """Return a table with its latents (time, latent), or with none for a table without rows."""
-    found = np.zeros((0, len(codec.latents)), np.float32) if latents is None else latents
-    stored.check_latents(codec, found, table.num_rows)
+    values = np.zeros((0, len(codec.latents)), np.float32) if latents is None else latents
+    stored.check_latents(codec, values, table.num_rows)
     for index, name in enumerate(codec.latents):
         field = pa.field(name, pa.float32(), metadata={"quantity": "latent", "unit": "1"})
-        table = table.append_column(field, pa.array(found[:, index], pa.float32()))
+        table = table.append_column(field, pa.array(values[:, index], pa.float32()))
     return table

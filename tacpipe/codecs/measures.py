@@ -1,4 +1,4 @@
-"""What a fit measures of its codec, as it stands in ``codec.json``.
+"""Measure a fitted codec, as ``codec.json`` holds it.
 
 ==================  ==============================================================================================
 reconstruction      of ``train`` rows and of ``val``, training recordings that were held out: mean squared error of
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     Floats = np.ndarray[Any, np.dtype[np.floating[Any]]]
 
 NAMES = ("reconstruction", "latent_covariance", "search")
-DIGITS = 6  # that are stored; beyond them the order of additions matters, which the number of threads changes
+DIGITS = 6  # stored digits; beyond them the order of additions matters, which the number of threads changes
 
 
 class Fitted(Protocol):
@@ -41,8 +41,8 @@ class Fitted(Protocol):
 
 def reconstructions(codec: Fitted, parts: Mapping[str, Iterable[Floats]]) -> dict[str, dict[str, float]]:
     """Return the errors on each part, of rows (row, frames * channel) in pieces; a part without rows is left out."""
-    found = {name: reconstruction(codec, pieces) for name, pieces in parts.items()}
-    return {name: errors for name, errors in found.items() if errors}
+    errors_by_part = {name: reconstruction(codec, pieces) for name, pieces in parts.items()}
+    return {name: errors for name, errors in errors_by_part.items() if errors}
 
 
 def reconstruction(codec: Fitted, pieces: Iterable[Floats]) -> dict[str, float]:
@@ -68,10 +68,10 @@ def covariance(latents: Floats) -> list[list[float]]:
     return rounded_matrix(np.atleast_2d(np.cov(latents.astype(np.float64), rowvar=False)))
 
 
-def rounded_matrix(found: Floats) -> list[list[float]]:
+def rounded_matrix(matrix: Floats) -> list[list[float]]:
     """Return a matrix rounded to the stored digits of its largest entry."""
-    digits = DIGITS - 1 - int(np.floor(np.log10(max(float(np.abs(found).max()), 1e-30))))
-    return (found.round(digits) + 0.0).tolist()  # type: ignore[no-any-return]  # + 0.0: no minus before a 0
+    digits = DIGITS - 1 - int(np.floor(np.log10(max(float(np.abs(matrix).max()), 1e-30))))
+    return (matrix.round(digits) + 0.0).tolist()  # type: ignore[no-any-return]  # + 0.0: no minus before a 0
 
 
 def rounded(value: float) -> float:

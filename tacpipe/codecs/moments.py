@@ -1,4 +1,4 @@
-"""What a linear codec needs to know of training rows, added up piece by piece: their number, means and covariances.
+"""Add up training rows for a linear codec piece by piece: their number, means and covariances.
 
 Covariances are kept as the triangle R of a QR decomposition of all rows, [1 | x] = Q R, which has as many rows as columns.
 The triangle of more rows is that of R and the new rows below it (Golub, Van Loan, Matrix Computations, 4th ed., 6.5), so
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class Moments:
-    """Of rows (row, channel) that were added."""
+    """Number, range and triangle of rows (row, channel)."""
 
     def __init__(self, width: int) -> None:
         self.count = 0  # rows
@@ -29,12 +29,12 @@ class Moments:
         self._triangle: Floats = np.zeros((width + 1, width + 1))
 
     @classmethod
-    def of(cls, pieces: Iterable[Floats], width: int) -> Moments:
-        """Return those of rows that come in pieces."""
-        made = cls(width)
+    def from_pieces(cls, pieces: Iterable[Floats], width: int) -> Moments:
+        """Return the moments of rows that come in pieces."""
+        moments = cls(width)
         for piece in pieces:
-            made.add(piece)
-        return made
+            moments.add(piece)
+        return moments
 
     def add(self, rows: Floats) -> None:
         """Add rows (row, channel)."""
@@ -43,25 +43,25 @@ class Moments:
             self._low, self._high = np.minimum(self._low, rows.min(axis=0)), np.maximum(self._high, rows.max(axis=0))
             self._extend(np.column_stack([np.ones(len(rows)), rows]))
 
-    def merged(self, other: Moments) -> Moments:
-        """Return those of the rows of both."""
-        made = Moments(len(self._low))
-        made.count = self.count + other.count
-        made._low, made._high = np.minimum(self._low, other._low), np.maximum(self._high, other._high)
-        made._triangle = self._triangle
-        made._extend(other._triangle)
-        return made
+    def merged(self, further: Moments) -> Moments:
+        """Return the moments of both sets of rows."""
+        merged = Moments(len(self._low))
+        merged.count = self.count + further.count
+        merged._low, merged._high = np.minimum(self._low, further._low), np.maximum(self._high, further._high)
+        merged._triangle = self._triangle
+        merged._extend(further._triangle)
+        return merged
 
     @property
     def moves(self) -> Flags:
-        """Whether a channel has more than one value: exact, where a standard deviation would leave rounding."""
+        """Channels with more than one value: exact, where a standard deviation would leave rounding."""
         return self._high > self._low
 
     @property
     def centred(self) -> Floats:
         """The triangle of the rows without their means (channel, channel)."""
-        found: Floats = self._triangle[1:, 1:] * self.moves
-        return found
+        triangle: Floats = self._triangle[1:, 1:] * self.moves
+        return triangle
 
     def standard(self, representation: str) -> tuple[Floats, Floats]:
         """Return mean and scale of each channel, (channel,) each, as `tacpipe.codecs.standard.standard` does of the rows."""
@@ -84,5 +84,5 @@ class Moments:
 
 def _triangle(rows: Floats) -> Floats:
     """Return the R of a QR decomposition."""
-    found: Floats = np.asarray(np.linalg.qr(rows, mode="r"))
-    return found
+    triangle: Floats = np.asarray(np.linalg.qr(rows, mode="r"))
+    return triangle

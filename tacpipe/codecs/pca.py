@@ -84,7 +84,7 @@ class PCA:
             "kind": self.kind,
             "of": self.representation,
             "channels": list(self.channels),
-            "layout": [dict(one) for one in self.layout],
+            "layout": [dict(channel) for channel in self.layout],
             "latents": len(self.components),
             "explained_ratio": [round(float(ratio), 9) for ratio in self.explained_ratio],
         }
@@ -128,24 +128,24 @@ def fit(
     Raises `TacpipeError` for a count or fraction that the data cannot give.
     """
     width = len(channels)
-    most = min(rows.count - 1, width)
-    if most < 1:
+    limit = min(rows.count - 1, width)
+    if limit < 1:
         raise TacpipeError(f"A codec cannot be fitted on {rows.count} rows. Give it training recordings with contact.")
     if not 0 <= variance < 1:
         raise TacpipeError(
             f"variance is {variance}; it must be a fraction between 0 and 1. Use 0 to count components instead."
         )
-    if variance == 0 and not 1 <= components <= most:
-        raise TacpipeError(f"components is {components}; {rows.count} rows of {width} channels give 1 to {most}.")
+    if variance == 0 and not 1 <= components <= limit:
+        raise TacpipeError(f"components is {components}; {rows.count} rows of {width} channels give 1 to {limit}.")
     mean, scale = rows.standard(representation)
     # scikit-learn's PCA always takes the mean off, which increments keep; the triangle of a QR has the same singular
     # values and right vectors as all the rows, and as few rows as there are channels.
     _, singular, weights = np.linalg.svd(rows.standardised(representation))
     power = singular**2
     ratio = power / power.sum()
-    kept = int(np.searchsorted(ratio.cumsum(), variance, side="right")) + 1 if variance else components
-    kept = min(kept, most)
-    weights = weights[:kept]  # (latent, channel)
+    count = int(np.searchsorted(ratio.cumsum(), variance, side="right")) + 1 if variance else components
+    count = min(count, limit)
+    weights = weights[:count]  # (latent, channel)
     largest = np.take_along_axis(weights, np.abs(weights).argmax(axis=1)[:, None], axis=1)
     return PCA(
         tuple(channels),
@@ -153,7 +153,7 @@ def fit(
         mean,
         scale,
         weights * np.where(largest < 0, -1.0, 1.0),
-        ratio[:most],
+        ratio[:limit],
         representation,
     )
 
@@ -167,26 +167,26 @@ def fit_and_measure(
     the same recordings is, so that the two compare. Without any held out, ``val`` is left out. Warns of channels that
     never move while others do.
     """
-    held = held_out(rows.names)
-    parts: dict[str, Collection[str]] = {"train": set(rows.names) - held, "val": held}
+    validation = held_out(rows.names)
+    parts: dict[str, Collection[str]] = {"train": set(rows.names) - validation, "val": validation}
     width = len(rows.channels)
-    train, val = (Moments.of(rows.each(names), width) for names in parts.values())
-    everything = train.merged(val)
-    if everything.count > 1:
-        still = [name for name, moves in zip(rows.channels, everything.moves, strict=True) if not moves]
-        warn_of_still(still, width)
-    made = functools.partial(fit, channels=rows.channels, layout=rows.layout, representation=representation)
-    codec = made(everything, components=components, variance=variance)
+    train, val = (Moments.from_pieces(rows.pieces(names), width) for names in parts.values())
+    all_rows = train.merged(val)
+    if all_rows.count > 1:
+        unmoving = [name for name, moves in zip(rows.channels, all_rows.moves, strict=True) if not moves]
+        warn_of_still(unmoving, width)
+    fit_rows = functools.partial(fit, channels=rows.channels, layout=rows.layout, representation=representation)
+    codec = fit_rows(all_rows, components=components, variance=variance)
     evaluated = codec
     if val.count and train.count > len(codec.components):
-        evaluated = made(train, components=len(codec.components))
+        evaluated = fit_rows(train, components=len(codec.components))
     else:
         parts = {"train": rows.names}
     measured = {
         "reconstruction": measures.reconstructions(
-            evaluated, {part: rows.each(names) for part, names in parts.items()}
+            evaluated, {part: rows.pieces(names) for part, names in parts.items()}
         ),
-        "latent_covariance": _covariance(codec, everything),
+        "latent_covariance": _covariance(codec, all_rows),
     }
     return replace(codec, measured=measured)
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     Floats = np.ndarray[Any, np.dtype[np.floating[Any]]]
 
 
-def still(values: Floats, channels: Sequence[str]) -> list[str]:
+def unmoving_channels(values: Floats, channels: Sequence[str]) -> list[str]:
     """Return the names of the channels that have one value in all rows of ``values`` (time, channel)."""
     return [name for name, moves in zip(channels, _moves(values), strict=True) if not moves]
 

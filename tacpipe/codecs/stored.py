@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from tacpipe.codecs.codec import Floats
 
 NEEDED = {"of": str, "channels": list, "layout": list}
-PLUGIN = "plugin"  # in `codec.json`: the package and version of a codec that is not tacpipe's own
+PLUGIN = "plugin"  # field of `codec.json`: the package and version of a codec that is not tacpipe's own
 
 
 def load(files: Mapping[str, bytes]) -> FittedCodec:
@@ -33,16 +33,17 @@ def load(files: Mapping[str, bytes]) -> FittedCodec:
     content = model_files.tree(files, DESCRIPTION, {"kind": str})
     kind = content["kind"]
     if kind not in registry.codecs():
-        known = f"{', '.join(registry.codecs())} are installed"
+        installed = f"{', '.join(registry.codecs())} are installed"
         if PLUGIN in content:
             package = plain(str(content[PLUGIN]), 100)
             raise TacpipeError(
-                f"The codec {excerpt(kind)} comes from the package {package}, which is not installed; {known}. Install it."
+                f"The codec {excerpt(kind)} comes from the package {package}, which is not installed; "
+                f"{installed}. Install it."
             )
-        raise TacpipeError(f"A codec of kind {excerpt(kind)} is not installed here; {known}.")
+        raise TacpipeError(f"A codec of kind {excerpt(kind)} is not installed here; {installed}.")
     model_files.tree(files, DESCRIPTION, NEEDED)
-    made = registry.load_codec(kind)
-    return _tried(lambda: made.from_files(files))
+    codec_class = registry.load_codec(kind)
+    return _tried(lambda: codec_class.from_files(files))
 
 
 def to_files(codec: FittedCodec) -> dict[str, bytes]:
@@ -66,10 +67,10 @@ def to_files(codec: FittedCodec) -> dict[str, bytes]:
 
 def check_latents(codec: Codec, latents: Floats, rows: int) -> None:
     """Raise `TacpipeError` unless ``latents`` are as many as the codec names, of each of so many ``rows``."""
-    wanted = (rows, len(codec.latents))
-    if latents.shape != wanted:
+    expected = (rows, len(codec.latents))
+    if latents.shape != expected:
         raise TacpipeError(
-            f"The codec {codec.kind} returns latents {latents.shape}; they must be (time, latent), {wanted}."
+            f"The codec {codec.kind} returns latents {latents.shape}; they must be (time, latent), {expected}."
         )
 
 
@@ -81,7 +82,9 @@ def _tried(read: Callable[[], FittedCodec]) -> FittedCodec:
             isinstance(name, str) for name in codec.channels
         ):
             raise ValueError(f"it is of {codec.representation} and of {len(codec.channels)} channels")
-        if len(codec.layout) != len(codec.channels) or not all(isinstance(one, Mapping) for one in codec.layout):
+        if len(codec.layout) != len(codec.channels) or not all(
+            isinstance(channel, Mapping) for channel in codec.layout
+        ):
             raise ValueError(f"{len(codec.channels)} channels lie in {len(codec.layout)} places")
         row = np.zeros((1, len(codec.channels)))
         latents = codec.encode(row, codec.channels)

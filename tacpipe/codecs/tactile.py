@@ -32,15 +32,18 @@ def columns(schema: pa.Schema, quantity: str) -> tuple[str, ...]:
 def layout(schema: pa.Schema, channels: Sequence[str]) -> list[dict[str, str]]:
     """Return stream, taxel and axis of each channel, as far as its metadata names them."""
     described = [metadata(schema.field(name)) for name in channels]
-    return [{key: one[key] for key in LAYOUT if key in one} for one in described]
+    return [
+        {key: metadata_of_channel[key] for key in LAYOUT if key in metadata_of_channel}
+        for metadata_of_channel in described
+    ]
 
 
 def rest_counts(schema: pa.Schema, channels: Sequence[str]) -> Floats:
-    """Return each channel's level without load in counts, shape (channel,), from its field metadata ``rest``.
+    """Return each channel's level without load in counts, shape (channel,), from its field metadata ``levels``.
 
     Raises `TacpipeError` where a channel has none.
     """
-    rest = []
+    levels = []
     for name in channels:
         level = metadata(schema.field(name)).get("rest")
         if level is None:
@@ -48,8 +51,8 @@ def rest_counts(schema: pa.Schema, channels: Sequence[str]) -> Floats:
                 f"Channel {name} has no rest level, so its counts cannot be distinguished from its load. "
                 "Run `tacpipe segment contacts` first: it writes the level into the column's metadata."
             )
-        rest.append(float(level))
-    return np.array(rest, dtype=np.float64)
+        levels.append(float(level))
+    return np.array(levels, dtype=np.float64)
 
 
 def matrix(table: pa.Table, names: Sequence[str]) -> Floats:

@@ -25,7 +25,7 @@ log = logging.getLogger(__name__)
 
 
 class Rows(Protocol):
-    """What codecs read of rows in contact that no gap touches and that are finite, by recording."""
+    """Rows that codecs are fitted on, by recording: finite, in contact, and outside of gaps."""
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -39,7 +39,7 @@ class Rows(Protocol):
     def names(self) -> Collection[str]:
         """The names of all recordings."""
 
-    def each(self, names: Collection[str]) -> Iterator[Floats]:
+    def pieces(self, names: Collection[str]) -> Iterator[Floats]:
         """Yield the rows (row, frames * channel) of some recordings, in the order of their names and of time, in pieces."""
 
 
@@ -69,9 +69,9 @@ class TrainingRows:
     def of(self, names: Collection[str]) -> Floats:
         """Return the rows (row, frames * channel) of some recordings, in the order of their names."""
         width = max(rows.shape[1] for rows in self.inputs.values())
-        return np.concatenate([np.zeros((0, width)), *self.each(names)])
+        return np.concatenate([np.zeros((0, width)), *self.pieces(names)])
 
-    def each(self, names: Collection[str]) -> Iterator[Floats]:
+    def pieces(self, names: Collection[str]) -> Iterator[Floats]:
         """Yield the rows of each of some recordings, in the order of their names."""
         return (self.inputs[name] for name in sorted(names))
 
@@ -91,7 +91,7 @@ class StoredRows:
         """The names of all recordings."""
         return self.recordings.keys()
 
-    def each(self, names: Collection[str]) -> Iterator[Floats]:
+    def pieces(self, names: Collection[str]) -> Iterator[Floats]:
         """Yield the rows of some recordings, in the order of their names and of time, in pieces.
 
         Raises `TacpipeError` naming the recording whose channels are others.
@@ -104,11 +104,11 @@ class StoredRows:
 
     def read(self) -> TrainingRows:
         """Return the rows of all recordings. Warns of channels that never move while others do."""
-        inputs = {name: np.concatenate([self._none, *self.each([name])]) for name in sorted(self.names)}
+        inputs = {name: np.concatenate([self._none, *self.pieces([name])]) for name in sorted(self.names)}
         rows = TrainingRows(self.channels, self.layout, inputs)
         newest = rows.of(rows.names)[:, -len(self.channels) :]
         if len(newest) > 1:
-            warn_of_still(standard.still(newest, self.channels), len(self.channels))
+            warn_of_still(standard.unmoving_channels(newest, self.channels), len(self.channels))
         return rows
 
     @property
@@ -127,9 +127,9 @@ class StoredRows:
         for table in stored.batches(self.channels):
             now = slice(row, row + table.num_rows)
             counts = tactile.above_rest(table, self.channels)
-            counts[gaps[now]] = np.nan  # what is made of such a row is not finite either
-            made = stacking.next(counts, begins[now])
-            yield made[np.isfinite(made).all(axis=1) & in_contact[now]]
+            counts[gaps[now]] = np.nan  # results of such a row are not finite either
+            stacked = stacking.next(counts, begins[now])
+            yield stacked[np.isfinite(stacked).all(axis=1) & in_contact[now]]
             row += table.num_rows
 
 

@@ -32,13 +32,13 @@ class Row:
     kind: Kind
     family: str
     predictor: str
-    method: Method  # whose runs report on it
-    values: tuple[float, ...]  # by the comparison's columns
-    score: Estimate  # what charts draw
+    method: Method  # methods whose runs report on the question
+    values: tuple[float, ...]  # one value for each column of the comparison
+    score: Estimate  # the score that charts draw
     spread: float  # standard deviation of the score over runs; NaN for a single one
     baseline: str  # the best baseline on the same recordings; empty where none was evaluated, and for baselines
     gain: Gain  # over it
-    p: float  # that both are alike (`pairing.swap_test`), not corrected for the number of methods
+    p: float  # p of the hypothesis that both are alike (`pairing.swap_test`), not corrected for the number of methods
     n: int  # clusters
     recordings: int
     runs: int
@@ -302,8 +302,8 @@ class PairedRuns:
     """Two methods compared over what both were repeated for."""
 
     unit: str  # ``folds``, or ``seeds`` where there is one fold
-    units: int  # that both methods have; 0 where there are fewer than two
-    p: float  # of the paired t test, NaN below two units and where all differ by as much
+    units: int  # units that both methods have; 0 where there are fewer than two
+    p: float  # p of the paired t test, NaN below two units and where all differ by as much
 
 
 def observations(runs: Sequence[Run], question: Question, predictor: str = MODEL) -> pd.DataFrame:

@@ -84,11 +84,11 @@ MODEL = "model"  # the predictor that a run is about
 
 @dataclass(frozen=True)
 class Question:
-    """What is compared: which recordings ("unseen objects"), and which of several targets ("PDC thumb"), as text."""
+    """A comparison: its recordings ("unseen objects"), and which of several targets ("PDC thumb"), as text."""
 
     part: str = ""
     target: str = ""
-    place: int = 0  # among the questions of a task: 0 is the main one
+    place: int = 0  # order of the questions of a task: 0 is the main one
 
     @property
     def where(self) -> str:
@@ -98,11 +98,11 @@ class Question:
 
 @dataclass(frozen=True)
 class Errors:
-    """What the predictors of one run err on one question."""
+    """Errors of the predictors of one run on one question."""
 
     measure: Measure
-    sums: Mapping[str, Mapping[str, AnyFloats]]  # by predictor and recording, what `Measure` adds up, (part,)
-    clusters: Mapping[str, str] | None = None  # by recording, what it is resampled with; None: itself
+    sums: Mapping[str, Mapping[str, AnyFloats]]  # sums of `Measure` by predictor and recording, (part,)
+    clusters: Mapping[str, str] | None = None  # cluster of each recording for resampling; None: itself
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,15 +111,15 @@ class Run:
 
     dataset: Dataset
     task: str
-    method: str  # what runs that differ in settings alone are called
+    method: str  # name of all runs that differ in settings only
     settings: Settings  # all that makes its method; neither seed nor fold
     questions: Mapping[Question, Errors]
-    family: str = ""  # of methods, such as an architecture
+    family: str = ""  # group of methods, such as an architecture
     seed: Hashable = None
     fold: Hashable = None
     simulated: bool = False
-    control: bool = False  # whether it was trained to show what an effect is worth, as with a wrong plan or fewer data
-    published: bool = False  # whether it was evaluated on the recordings of the task's paper alone
+    control: bool = False  # True if it was trained to show the size of an effect, as with a wrong plan or fewer data
+    published: bool = False  # True if it was evaluated on the recordings of the task's paper only
     details: Any = None  # whatever the task's own sections read
 
 
@@ -135,22 +135,22 @@ class Method:
 
     @property
     def control(self) -> bool:
-        """Whether it was trained to show what an effect is worth, and does not compete."""
+        """True if it was trained to show the size of an effect, and does not compete."""
         return self.runs[0].control
 
     @property
     def simulated(self) -> bool:
-        """Whether any of its runs was evaluated on simulated recordings."""
+        """True if any of its runs was evaluated on simulated recordings."""
         return any(run.simulated for run in self.runs)
 
     @property
     def published(self) -> bool:
-        """Whether all its runs were evaluated on the recordings of the task's paper."""
+        """True if all its runs were evaluated on the recordings of the task's paper."""
         return all(run.published for run in self.runs)
 
     @property
     def details(self) -> list[Any]:
-        """What the task's own sections read of its runs."""
+        """Details of its runs for the sections of the task."""
         return [run.details for run in self.runs]
 
     def key_without(self, *names: str) -> str:
@@ -167,7 +167,7 @@ class Method:
 
     def sums(self, question: Question, predictor: str = MODEL) -> Sums:
         """Return what a predictor of its runs errs, by seed and recording; of several runs with a seed, added up."""
-        return pairing.added(
+        return pairing.add_by_key(
             ((run.seed, name), run_sums)
             for run in self.of(question)
             for name, run_sums in run.questions[question].sums.get(predictor, {}).items()

@@ -1,4 +1,4 @@
-"""What a task states about its results, so that they can be compared and reported."""
+"""Describe the results of a task, so that they can be compared and reported."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class TaskReport:
     An instance of this class reports results by their headlines and the numbers of ``metrics.json``.
     """
 
-    title: str = ""  # what the task predicts, in a few words; empty: the name of the task
+    title: str = ""  # predicted quantity, in a few words; empty: the name of the task
     usual: Sequence[str | tuple[str, Any]] = ()  # settings that no method's name states, or these values of them
 
     def __init__(self, name: str) -> None:

@@ -53,7 +53,7 @@ def run(request: Request) -> Outcome:
         raise UsageError("--rerun computes and stores; it does not go with --check or --recompute-and-compare.")
     if request.track and (request.check or request.compare):
         raise UsageError("--track follows what is stored; it does not go with --check or --recompute-and-compare.")
-    trackers = tracking.opened(request.track) if request.track else {}
+    trackers = tracking.open_trackers(request.track) if request.track else {}
     replacing.refuse_inputs(request.output, request.reads)
     store = locate(*request.locations)
     inputs = Inputs(request, store)

@@ -1,4 +1,4 @@
-"""Whether probabilities are frequencies: temperature, reliability, and how well a score distinguishes unknown classes.
+"""Measure how well probabilities match frequencies: temperature, reliability, and detection of unknown classes.
 
 Temperature scaling divides scores by one number before the softmax, which changes no name (Guo, Pleiss, Sun and Weinberger,
 On calibration of modern neural networks, ICML 2017). It is fitted by the likelihood of labels that hedge as Platt's do
@@ -15,7 +15,7 @@ from scipy.stats import rankdata
 from tacpipe.arrays import AnyFloats, Bools, Floats, Ints
 from tacpipe.errors import TacpipeError
 
-BINS = 10  # of confidence, as wide as each other
+BINS = 10  # equally wide bins of confidence
 SMALLEST = 1e-12  # probability
 RANGE = 8.0  # natural logarithm of a temperature, about that of the spread of scores
 
@@ -24,8 +24,8 @@ def probabilities(scores: AnyFloats, temperature: float = 1.0) -> Floats:
     """Return the softmax of scores (slide, class) divided by a temperature; a score of minus infinity gets 0."""
     wide = scores.astype(np.float64) / temperature
     weights = np.exp(wide - wide.max(axis=1, keepdims=True))
-    found: Floats = weights / weights.sum(axis=1, keepdims=True)
-    return found
+    softmax: Floats = weights / weights.sum(axis=1, keepdims=True)
+    return softmax
 
 
 def temperature(scores: AnyFloats, labels: Ints) -> float:
@@ -46,22 +46,22 @@ def temperature(scores: AnyFloats, labels: Ints) -> float:
         logs = np.log(np.maximum(probabilities(scores, spread * np.exp(log)), SMALLEST))
         return float(-(targets * logs).sum(axis=1).mean())
 
-    found = minimize_scalar(loss, bounds=(-RANGE, RANGE), method="bounded", options={"xatol": 1e-4})
-    return spread * float(np.exp(found.x))
+    optimum = minimize_scalar(loss, bounds=(-RANGE, RANGE), method="bounded", options={"xatol": 1e-4})
+    return spread * float(np.exp(optimum.x))
 
 
-def log_loss(found: AnyFloats, labels: Ints) -> float:
+def log_loss(class_probabilities: AnyFloats, labels: Ints) -> float:
     """Return the mean negative log-likelihood of labels (slide,), columns of probabilities (slide, class)."""
-    own = np.maximum(found[np.arange(len(labels)), labels], SMALLEST)
-    return float(-np.log(own).mean())
+    likelihoods = np.maximum(class_probabilities[np.arange(len(labels)), labels], SMALLEST)
+    return float(-np.log(likelihoods).mean())
 
 
 def reliability(confidence: AnyFloats, right: Bools) -> list[dict[str, float]]:
     """Return for each bin of confidence that holds slides how many, their mean confidence and their accuracy."""
     bins = np.minimum((confidence * BINS).astype(int), BINS - 1)
     rows = []
-    for one in np.unique(bins):
-        chosen = bins == one
+    for number in np.unique(bins):
+        chosen = bins == number
         rows.append(
             {
                 "n": int(chosen.sum()),
@@ -78,10 +78,10 @@ def calibration_error(confidence: AnyFloats, right: Bools) -> float:
     With n slides it is above 0 by chance alone, by about sqrt(accuracy (1 - accuracy) / n) and more with several bins.
     """
     rows = reliability(confidence, right)
-    return sum(one["n"] * abs(one["confidence"] - one["accuracy"]) for one in rows) / max(1, len(right))
+    return sum(row["n"] * abs(row["confidence"] - row["accuracy"]) for row in rows) / max(1, len(right))
 
 
-def auroc(known: AnyFloats, unknown: AnyFloats) -> float:
+def auroc(known_scores: AnyFloats, unknown_scores: AnyFloats) -> float:
     """Return the probability that a slide of a known class has a higher score than one of an unknown class, ties half.
 
     It is the area under the receiver operating characteristic (Hanley and McNeil, 1982); NaN without slides of both.
@@ -89,7 +89,9 @@ def auroc(known: AnyFloats, unknown: AnyFloats) -> float:
     >>> auroc(np.array([2.0, 3.0]), np.array([1.0, 2.0]))
     0.875
     """
-    if not len(known) or not len(unknown):
+    if not len(known_scores) or not len(unknown_scores):
         return float("nan")
-    ranks = rankdata(np.concatenate([known, unknown]))[: len(known)]
-    return float((ranks.sum() - len(known) * (len(known) + 1) / 2) / (len(known) * len(unknown)))
+    ranks = rankdata(np.concatenate([known_scores, unknown_scores]))[: len(known_scores)]
+    return float(
+        (ranks.sum() - len(known_scores) * (len(known_scores) + 1) / 2) / (len(known_scores) * len(unknown_scores))
+    )

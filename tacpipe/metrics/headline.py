@@ -1,4 +1,4 @@
-"""What came out of an evaluation: a model next to the best of its baselines, and how sure the difference between them is.
+"""Compare a model with the best of its baselines, with the certainty of their difference.
 
 Tasks compute headlines (`tacpipe.headlines`), ``tacpipe evaluate`` writes them to ``headline.json`` and prints them, pages
 and ``tacpipe show`` show them. This module imports neither numpy nor anything else that a cache hit must not wait for.
@@ -32,15 +32,15 @@ class Headline:
 
     task: str
     method: str
-    part: str  # which recordings: "unseen objects", "BioTac"; empty: all that the model has not seen
-    target: str  # what of them is predicted, where a part has several targets; empty: all
+    part: str  # recordings: "unseen objects", "BioTac"; empty: all that the model has not seen
+    target: str  # predicted target, where a part has several; empty: all
     columns: tuple[str, ...]  # names of the errors
-    unit: str  # of the errors
+    unit: str  # names of the errors
     ranked_by: str  # the error that orders the baselines and that the gain is computed from
     model: Row
     baselines: tuple[Row, ...]  # the best first
-    measure: str  # what the gain is: "skill" (1 − error / error of the best baseline) or "points" (of percent)
-    gain: float  # of the model over the best baseline; NaN where it is not defined
+    measure: str  # kind of gain: "skill" (1 − error / error of the best baseline) or "points" (of percent)
+    gain: float  # gain of the model over the best baseline; NaN where it is not defined
     low: float  # 95 % interval of the gain; NaN with fewer than three clusters
     high: float
     clusters: int  # units of the interval
@@ -83,9 +83,9 @@ class Headline:
 
     def to_json(self) -> dict[str, Any]:
         """Return the headline as JSON holds it: what is not defined is null; best baseline and verdict are next to it."""
-        told = asdict(self)
+        fields = asdict(self)
         best = self.best
-        return {**_json(told), "best_baseline": best.name if best else None, "verdict": self.verdict}
+        return {**_json(fields), "best_baseline": best.name if best else None, "verdict": self.verdict}
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> Headline:
@@ -98,13 +98,13 @@ class Headline:
 
 def write(headlines: Sequence[Headline]) -> bytes:
     """Return the content of ``headline.json``."""
-    told = {"headlines": [one.to_json() for one in headlines]}
-    return (json.dumps(told, indent=1, sort_keys=True, allow_nan=False) + "\n").encode()
+    content = {"headlines": [headline.to_json() for headline in headlines]}
+    return (json.dumps(content, indent=1, sort_keys=True, allow_nan=False) + "\n").encode()
 
 
 def read(content: bytes) -> list[Headline]:
     """Return the headlines that ``headline.json`` holds."""
-    return [Headline.from_json(one) for one in json.loads(content)["headlines"]]
+    return [Headline.from_json(stored) for stored in json.loads(content)["headlines"]]
 
 
 def verdict_of(low: float, high: float, clusters: int, effective: float) -> str:
@@ -131,43 +131,45 @@ def too_few(clusters: int, cluster: str, effective: float) -> str:
 
 def verdict(headlines: Sequence[Headline]) -> str:
     """Return the verdict on several headlines together: ``better`` only where each is, ``worse`` only where each is."""
-    found = {one.verdict for one in headlines}
-    return next(iter(found)) if len(found) == 1 else UNCLEAR if found else NO_VERDICT
+    verdicts = {headline.verdict for headline in headlines}
+    return next(iter(verdicts)) if len(verdicts) == 1 else UNCLEAR if verdicts else NO_VERDICT
 
 
-def sentence(one: Headline) -> str:
+def sentence(headline: Headline) -> str:
     """Return how the model compares with the best baseline, no more surely than the interval allows."""
-    return f"{_capital(one.where)}: {one.method} {clause(one)}."
+    return f"{_capital(headline.where)}: {headline.method} {clause(headline)}."
 
 
-def clause(one: Headline) -> str:
+def clause(headline: Headline) -> str:
     """Return what follows the method's name in a sentence: "is better than ridge, the best of 3 baselines: skill …"."""
-    best = one.best
+    best = headline.best
     if best is None:
-        return f"was evaluated without a baseline, on {counted(one.clusters, one.cluster)}"
-    name = f"{best.name}, the best of {len(one.baselines)} baselines" if len(one.baselines) > 1 else best.name
-    gain = f"{amount(one)}"
-    if one.verdict == NO_VERDICT:
-        return f"has {gain} over the baseline {name}; {too_few(one.clusters, one.cluster, one.effective)}"
-    interval = f" ({bounds(one)}, {one.interval})"
+        return f"was evaluated without a baseline, on {counted(headline.clusters, headline.cluster)}"
+    name = f"{best.name}, the best of {len(headline.baselines)} baselines" if len(headline.baselines) > 1 else best.name
+    gain = f"{amount(headline)}"
+    if headline.verdict == NO_VERDICT:
+        return (
+            f"has {gain} over the baseline {name}; {too_few(headline.clusters, headline.cluster, headline.effective)}"
+        )
+    interval = f" ({bounds(headline)}, {headline.interval})"
     return {
         BETTER: f"is better than the baseline {name}: {gain}{interval}",
         WORSE: f"is worse than the baseline {name}: {gain}{interval}",
         UNCLEAR: f"does not differ measurably from the baseline {name}: {gain}{interval}",
-    }[one.verdict]
+    }[headline.verdict]
 
 
-def amount(one: Headline) -> str:
+def amount(headline: Headline) -> str:
     """Return the gain with its name: "skill +0.119", "+3.5 points"."""
-    told = signed(one.gain, one.measure)
-    return f"{told} points" if one.measure == "points" else f"{one.measure} {told}"
+    gain = signed(headline.gain, headline.measure)
+    return f"{gain} points" if headline.measure == "points" else f"{headline.measure} {gain}"
 
 
-def bounds(one: Headline) -> str:
+def bounds(headline: Headline) -> str:
     """Return the interval of the gain, empty where it is not defined."""
-    if math.isnan(one.low):
+    if math.isnan(headline.low):
         return ""
-    return f"{signed(one.low, one.measure)} to {signed(one.high, one.measure)}"
+    return f"{signed(headline.low, headline.measure)} to {signed(headline.high, headline.measure)}"
 
 
 def signed(value: float, measure: str = "skill") -> str:
@@ -209,17 +211,19 @@ def table(headlines: Sequence[Headline]) -> tuple[list[str], list[list[str]]]:
     first = headlines[0]
     heads = ["", "", *first.columns, first.measure, "95 % interval", "n"]
     rows = []
-    for one in headlines:
-        best = one.best
-        gain = [signed(one.gain, one.measure) if best else NONE, bounds(one) or NONE]
-        n = counted(one.clusters, one.cluster) + (f", {one.seeds} seeds" if one.seeds > 1 else "")
-        rows.append([one.where, one.method, *map(number, one.model.values), *gain, n])
+    for headline in headlines:
+        best = headline.best
+        gain = [signed(headline.gain, headline.measure) if best else NONE, bounds(headline) or NONE]
+        n = counted(headline.clusters, headline.cluster) + (f", {headline.seeds} seeds" if headline.seeds > 1 else "")
+        rows.append([headline.where, headline.method, *map(number, headline.model.values), *gain, n])
         if best:
-            told = {BETTER: "model is better", WORSE: "baseline is better", UNCLEAR: "no clear difference"}
-            said = told.get(one.verdict, "too few for a verdict")
-            rows.append(["", f"best baseline: {best.name}", *map(number, best.values), "", said, ""])
+            verdicts = {BETTER: "model is better", WORSE: "baseline is better", UNCLEAR: "no clear difference"}
+            verdict_text = verdicts.get(headline.verdict, "too few for a verdict")
+            rows.append(["", f"best baseline: {best.name}", *map(number, best.values), "", verdict_text, ""])
             rows += [
-                ["", row.name, *map(number, row.values), "", "", ""] for row in one.table_baselines if row is not best
+                ["", row.name, *map(number, row.values), "", "", ""]
+                for row in headline.table_baselines
+                if row is not best
             ]
     return heads, rows
 
@@ -248,16 +252,16 @@ def _capital(words: str) -> str:
 def _json(value: Any) -> Any:
     """Return a value with null in place of what is not a number, floats to 9 digits: more would differ between machines."""
     if isinstance(value, dict):
-        return {name: _json(one) for name, one in value.items()}
+        return {name: _json(entry) for name, entry in value.items()}
     if isinstance(value, list | tuple):
-        return [_json(one) for one in value]
+        return [_json(entry) for entry in value]
     if isinstance(value, float):
         return float(f"{value:.9g}") if math.isfinite(value) else None
     return value
 
 
 def _row(value: Mapping[str, Any]) -> Row:
-    return Row(value["name"], tuple(_number(one) for one in value["values"]))
+    return Row(value["name"], tuple(_number(number) for number in value["values"]))
 
 
 def _number(value: float | None) -> float:

@@ -20,7 +20,9 @@ from tacpipe.metrics import intervals
 from tacpipe.metrics.headline import Headline, Row, verdict_of
 from tacpipe.metrics.intervals import Estimate, Interval, Jackknife
 
-Sums = Mapping[tuple[Hashable, str], AnyFloats]  # by seed and recording, (part,): what adds up over recordings
+Sums = Mapping[
+    tuple[Hashable, str], AnyFloats
+]  # keyed by seed and recording, (part,): sums that add up over recordings
 ENUMERATED, SWAPS = 12, 9_999  # clusters that are exchanged in all ways; random ways of more
 Key = TypeVar("Key", bound=Hashable)
 
@@ -35,15 +37,15 @@ class Measure:
 
     columns: tuple[str, ...]
     unit: str
-    ranked_by: str  # what ``error`` is, in words
-    name: str  # of the gain: "skill" or "points"
-    cluster: str  # what recordings and their clusters are called, in the plural
+    ranked_by: str  # name of ``error``
+    name: str  # kind of gain: "skill" or "points"
+    cluster: str  # name of the clusters of recordings, in the plural
     error: Callable[[AnyFloats], AnyFloats]  # sums (draw, part) to (draw,): the lower the better, NaN where not defined
     gain: Callable[[AnyFloats, AnyFloats], AnyFloats]  # errors of model and baseline (draw,) to (draw,)
     values: Callable[[AnyFloats], tuple[float, ...]]  # sums (part,) to a value a column
-    score: Callable[[AnyFloats], AnyFloats] = lambda error: error  # what charts draw, from errors (draw,) to (draw,)
-    scored: str = "error"  # what ``score`` is, with its unit
-    rises: bool = False  # whether a higher score is better
+    score: Callable[[AnyFloats], AnyFloats] = lambda error: error  # maps errors (draw,) to the values of charts (draw,)
+    scored: str = "error"  # name of ``score``, with its unit
+    rises: bool = False  # True if a higher score is better
     weight: Callable[[AnyFloats], AnyFloats] = (
         _equal  # a baseline's sums (cluster, part) to how much each counts (cluster,)
     )
@@ -239,16 +241,16 @@ def swap_test(measure: Measure, first: AnyFloats, second: AnyFloats) -> float:
     if clusters < 2:
         return float("nan")
 
-    def apart(swapped: AnyFloats) -> AnyFloats:
-        kept = 1 - swapped
-        one, other = (kept @ a + swapped @ b for a, b in ((first, second), (second, first)))
-        return measure.error(one) - measure.error(other)
+    def difference(swapped: AnyFloats) -> AnyFloats:
+        unswapped = 1 - swapped
+        first_sums, second_sums = (unswapped @ a + swapped @ b for a, b in ((first, second), (second, first)))
+        return measure.error(first_sums) - measure.error(second_sums)
 
-    seen = float(apart(np.zeros((1, clusters)))[0])
-    if np.isnan(seen):
+    observed = float(difference(np.zeros((1, clusters)))[0])
+    if np.isnan(observed):
         return float("nan")
-    drawn = apart(_swaps(clusters).astype(np.float64))
-    extreme = int((np.abs(drawn) >= abs(seen) * (1 - 1e-9) - 1e-12).sum())  # NaN is not extreme
+    drawn = difference(_swaps(clusters).astype(np.float64))
+    extreme = int((np.abs(drawn) >= abs(observed) * (1 - 1e-9) - 1e-12).sum())  # NaN is not extreme
     return extreme / len(drawn) if clusters <= ENUMERATED else (extreme + 1) / (len(drawn) + 1)
 
 
@@ -305,16 +307,16 @@ def _repeats(keys: Iterable[tuple[Hashable, str]]) -> dict[Hashable, int]:
     return {seed: at for group in groups for at, seed in enumerate(sorted(group, key=order.__getitem__))}
 
 
-def added(parts: Iterable[tuple[Key, AnyFloats]]) -> dict[Key, AnyFloats]:
+def add_by_key(parts: Iterable[tuple[Key, AnyFloats]]) -> dict[Key, AnyFloats]:
     """Return sums by key, those of one key added up.
 
-    >>> added([("a", np.array([1.0])), ("b", np.array([2.0])), ("a", np.array([3.0]))])
+    >>> add_by_key([("a", np.array([1.0])), ("b", np.array([2.0])), ("a", np.array([3.0]))])
     {'a': array([4.]), 'b': array([2.])}
     """
-    found: dict[Key, AnyFloats] = {}
-    for key, one in parts:
-        found[key] = found[key] + one if key in found else one
-    return found
+    sums: dict[Key, AnyFloats] = {}
+    for key, part in parts:
+        sums[key] = sums[key] + part if key in sums else part
+    return sums
 
 
 def value_intervals(sums: Sums, statistic: Callable[[AnyFloats], AnyFloats]) -> Interval:

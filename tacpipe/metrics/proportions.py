@@ -22,7 +22,7 @@ COVERAGE = 0.95
 
 
 class Difference(NamedTuple):
-    """What a paired test gives for second less first."""
+    """The result of a paired test: second less first."""
 
     difference: float  # mean over pairs, in the unit of what was given
     t: float  # infinite where all pairs differ alike; NaN where none does
@@ -80,15 +80,15 @@ def paired_t(first: Sequence[float] | AnyArray, second: Sequence[float] | AnyArr
     """
     from scipy.stats import t as student
 
-    one, other = np.asarray(first, np.float64), np.asarray(second, np.float64)
-    if one.shape != other.shape or one.ndim != 1 or len(one) < 2:
+    before, after = np.asarray(first, np.float64), np.asarray(second, np.float64)
+    if before.shape != after.shape or before.ndim != 1 or len(before) < 2:
         raise TacpipeError(
-            f"Values of {one.shape} and {other.shape} are not two or more pairs; give as many of both, two at least."
+            f"Values of {before.shape} and {after.shape} are not two or more pairs; give as many of both, two at least."
         )
-    differences = np.round(other - one, 12)  # accuracies that differ alike shall not differ by rounding
-    mean, error = float(differences.mean()), float(differences.std(ddof=1) / np.sqrt(len(one)))
+    differences = np.round(after - before, 12)  # accuracies that differ alike shall not differ by rounding
+    mean, error = float(differences.mean()), float(differences.std(ddof=1) / np.sqrt(len(before)))
     if error <= 1e-12 * abs(mean):
         t = float("nan") if mean == 0 else float(np.copysign(np.inf, mean))
         return Difference(mean, t, float("nan") if mean == 0 else 0.0)
     t = mean / error
-    return Difference(round(mean, 12), t, float(2 * student.sf(abs(t), len(one) - 1)))
+    return Difference(round(mean, 12), t, float(2 * student.sf(abs(t), len(before) - 1)))

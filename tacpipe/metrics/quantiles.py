@@ -23,11 +23,12 @@ def check_levels(percents: tuple[int, ...]) -> None:
     >>> check_levels((10, 50, 90))
     """
     ordered = tuple(sorted(set(percents)))
-    mirrored = tuple(100 - one for one in reversed(ordered))
+    mirrored = tuple(100 - percent for percent in reversed(ordered))
     if ordered != percents or ordered != mirrored or 50 not in ordered or len(ordered) < 3 or ordered[0] < 1:
-        given = ",".join(map(str, percents))
+        listed_percents = ",".join(map(str, percents))
         raise TacpipeError(
-            f"The quantiles {given} are not levels that lie symmetrically about 50. Give percentages from 1 to 99 in "
+            f"The quantiles {listed_percents} are not levels that lie symmetrically about 50. Give percentages "
+            f"from 1 to 99 in "
             f"ascending order with 50 in the middle, as 10,50,90."
         )
 
@@ -48,24 +49,24 @@ class Sums:
     values: AnyFloats  # (step,)
 
     @classmethod
-    def of(cls, truth: AnyFloats, predicted: AnyFloats, levels: AnyFloats) -> Sums:
+    def from_predictions(cls, truth: AnyFloats, predicted: AnyFloats, levels: AnyFloats) -> Sums:
         """Return the sums over true values (value, step) of predicted quantiles (value, step, level).
 
         ``levels`` (level,) are fractions in ascending order.
         """
         above = truth[..., None].astype(np.float64) - predicted
-        within = (above[..., 0] >= 0) & (above[..., -1] <= 0)
+        inside = (above[..., 0] >= 0) & (above[..., -1] <= 0)
         return cls(
             pinball(above, levels).sum(axis=0),
             (above <= 0).sum(axis=0).astype(np.float64),
-            within.sum(axis=0).astype(np.float64),
+            inside.sum(axis=0).astype(np.float64),
             (predicted[..., -1].astype(np.float64) - predicted[..., 0]).sum(axis=0),
             np.full(truth.shape[1], float(len(truth))),
         )
 
-    def __add__(self, other: Sums) -> Sums:
+    def __add__(self, further: Sums) -> Sums:
         """Return the sums over the values of both."""
-        return Sums(*(getattr(self, name) + getattr(other, name) for name in self.__dataclass_fields__))
+        return Sums(*(getattr(self, name) + getattr(further, name) for name in self.__dataclass_fields__))
 
 
 def tree(recordings: list[Sums], percents: tuple[int, ...], baseline: list[Sums] | None = None) -> dict[str, Any]:
@@ -77,42 +78,44 @@ def tree(recordings: list[Sums], percents: tuple[int, ...], baseline: list[Sums]
     recordings.
     """
     total = recordings[0]
-    for one in recordings[1:]:
-        total = total + one
-    found: dict[str, Any] = {
+    for recording in recordings[1:]:
+        total = total + recording
+    measures: dict[str, Any] = {
         "pinball": _steps(total.pinball.mean(axis=1), total.values),
         "coverage": _steps(total.covered, total.values),
         "width": _steps(total.width, total.values),
     }
     for at, percent in enumerate(percents):
-        found[f"below_q{percent}"] = _steps(total.below[:, at], total.values)
+        measures[f"below_q{percent}"] = _steps(total.below[:, at], total.values)
     if len(recordings) > 1:
         low, high = _interval(recordings)
-        found["coverage_low"], found["coverage_high"] = low, high
+        measures["coverage_low"], measures["coverage_high"] = low, high
     if baseline is not None:
-        other = np.sum([one.pinball.sum(axis=1) for one in baseline], axis=0)
-        own = total.pinball.sum(axis=1)
-        gains = intervals.skill(np.append(own, own.sum()), np.append(other, other.sum()))
-        found["pinball_skill"] = _named(gains)
-    return found
+        baseline_pinball = np.sum([recording.pinball.sum(axis=1) for recording in baseline], axis=0)
+        pinball_sums = total.pinball.sum(axis=1)
+        gains = intervals.skill(
+            np.append(pinball_sums, pinball_sums.sum()), np.append(baseline_pinball, baseline_pinball.sum())
+        )
+        measures["pinball_skill"] = _by_step(gains)
+    return measures
 
 
 def _steps(sums: AnyFloats, values: AnyFloats) -> dict[str, float]:
     """Return sums (step,) divided by how many values each is of, by step and over all."""
-    return _named(np.append(sums / values, sums.sum() / values.sum()))
+    return _by_step(np.append(sums / values, sums.sum() / values.sum()))
 
 
 def _interval(recordings: list[Sums]) -> tuple[dict[str, float], dict[str, float]]:
     """Return the ends of the 95 % interval of coverage over recordings, by step and over all."""
     covered, values = (
-        np.stack([np.append(getattr(one, name), getattr(one, name).sum()) for one in recordings])
+        np.stack([np.append(getattr(recording, name), getattr(recording, name).sum()) for recording in recordings])
         for name in ("covered", "values")
     )
     shares = intervals.share_interval(covered, values)
-    return _named(shares.low), _named(shares.high)
+    return _by_step(shares.low), _by_step(shares.high)
 
 
-def _named(values: AnyFloats) -> dict[str, float]:
+def _by_step(values: AnyFloats) -> dict[str, float]:
     """Return values (step + 1,) by their names, to 9 digits; what is not defined is left out."""
     names = [*(f"t{step}" for step in range(1, len(values))), "mean"]
     return {name: float(f"{value:.9g}") for name, value in zip(names, values, strict=True) if np.isfinite(value)}

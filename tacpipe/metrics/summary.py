@@ -15,7 +15,7 @@ MOST = 30  # numbers: those of headlines that would be more are left out
 Names = Mapping[str, str]
 
 
-def of(headlines: Sequence[Headline], names: Names = MappingProxyType({})) -> dict[str, float | int]:
+def from_headlines(headlines: Sequence[Headline], names: Names = MappingProxyType({})) -> dict[str, float | int]:
     """Return the least gain over the best baseline with its interval and clusters, and an error a part and target.
 
     ``gain``, ``low``, ``high`` and ``n`` are of the headline whose gain is least: a model is better than its baselines only
@@ -25,34 +25,41 @@ def of(headlines: Sequence[Headline], names: Names = MappingProxyType({})) -> di
     """
     if not headlines:
         return {}
-    least = min(headlines, key=lambda one: math.inf if math.isnan(one.gain) else one.gain)
-    found: dict[str, float | int] = {"gain": least.gain, "low": least.low, "high": least.high, "n": least.clusters}
-    targets = len({one.target for one in headlines}) > 1  # their errors are of one measure, which no name repeats
+    weakest = min(headlines, key=lambda headline: math.inf if math.isnan(headline.gain) else headline.gain)
+    summary: dict[str, float | int] = {
+        "gain": weakest.gain,
+        "low": weakest.low,
+        "high": weakest.high,
+        "n": weakest.clusters,
+    }
+    targets = (
+        len({headline.target for headline in headlines}) > 1
+    )  # their errors are of one measure, which no name repeats
     for headline, place in zip(headlines, _places(headlines, names), strict=True):
-        found["_".join(place if targets else [*place, _short(headline.columns[-1])])] = headline.model.values[-1]
+        summary["_".join(place if targets else [*place, _short(headline.columns[-1])])] = headline.model.values[-1]
     for headline, place in zip(headlines, _places(headlines, names), strict=True):
         reference = next((row for row in headline.baselines if row.name == headline.reference), None)
         for at, column in enumerate(headline.columns if reference else ()):
             if reference and column.startswith("MAE"):
-                found["_".join([*place, _short(column)])] = headline.model.values[at]
-                found["_".join([*place, reference.name, _short(column)])] = reference.values[at]
-    known = {name: value for name, value in found.items() if math.isfinite(value)}
-    return {name: _rounded(value) for name, value in list(known.items())[: MOST - 1]}
+                summary["_".join([*place, _short(column)])] = headline.model.values[at]
+                summary["_".join([*place, reference.name, _short(column)])] = reference.values[at]
+    finite = {name: value for name, value in summary.items() if math.isfinite(value)}
+    return {name: _rounded(value) for name, value in list(finite.items())[: MOST - 1]}
 
 
 def write(headlines: Sequence[Headline], names: Names = MappingProxyType({})) -> bytes:
     """Return the content of ``summary.json``."""
-    return (json.dumps(of(headlines, names), indent=1, allow_nan=False) + "\n").encode()
+    return (json.dumps(from_headlines(headlines, names), indent=1, allow_nan=False) + "\n").encode()
 
 
 def _places(headlines: Sequence[Headline], names: Names) -> list[list[str]]:
     """Return the short names of target and part of each headline, without what is the same for all."""
-    found: list[list[str]] = [[] for _ in headlines]
-    for texts in ([one.target for one in headlines], [one.part for one in headlines]):
+    places: list[list[str]] = [[] for _ in headlines]
+    for texts in ([headline.target for headline in headlines], [headline.part for headline in headlines]):
         if len(set(texts)) > 1:
-            for place, text in zip(found, texts, strict=True):
+            for place, text in zip(places, texts, strict=True):
                 place.append(names.get(text) or _short(text))
-    return found
+    return places
 
 
 def _short(text: str) -> str:

@@ -223,9 +223,9 @@ def recordings(context: Context) -> list[Fold]:
 def _by_recording(comparison: Comparison, row: Row) -> list[blocks.Block]:
     measure, question = comparison.measure, comparison.question
     best = next((base for base in comparison.of("baseline") if base.name == row.baseline), None)
-    mine = pairing.added((name, comparison) for (_, name), comparison in row.method.sums(question).items())
+    mine = pairing.add_by_key((name, comparison) for (_, name), comparison in row.method.sums(question).items())
     based_on = best.method.sums(question, best.predictor) if best else {}
-    baseline_sums = pairing.added((name, comparison) for (_, name), comparison in based_on.items())
+    baseline_sums = pairing.add_by_key((name, comparison) for (_, name), comparison in based_on.items())
     names = sorted(mine)
     errors, based = (
         np.array([float(measure.error(sums[name][None])[0]) if name in sums else np.nan for name in names])

@@ -17,7 +17,7 @@ EMULATED = "emulated"  # the folder of the emulated rig's own rig file
 def commands(output: Path) -> list[list[str]]:
     """Return the commands of each task's demo without the leading ``tacpipe``, and the page of all results."""
     demos = _demos(output)
-    given = [*(name for demo in demos for name in demo.results), *(name for demo in demos for name in demo.others)]
+    given = [*(name for demo in demos for name in demo.results), *(name for demo in demos for name in demo.datasets)]
     return [*(words for demo in demos for words in demo.commands), ["report", *given, "-o", str(page(output))]]
 
 

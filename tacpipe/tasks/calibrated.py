@@ -1,4 +1,4 @@
-"""What a calibration asks of a task, as the tasks read it, and the quantiles that are asked of a calibrated model."""
+"""Describe a requested calibration, and find requested quantiles of a calibrated model."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from tacpipe.errors import TacpipeError
 
 @dataclass(frozen=True)
 class CalibrationRequest:
-    """How a trained model is to state its uncertainty."""
+    """The uncertainty that a trained model is to state."""
 
     quantiles: tuple[int, ...]  # percent, ascending
-    promise: bool  # whether bands must hold in a new recording with at least their level
-    false_unknown: float  # fraction of known slides that may be answered unknown
+    promise: bool  # True if bands must hold in a new recording with at least their level
+    false_unknown: float  # fraction of slides of learned classes that may be answered unknown
     seed: int
 
 
 class Levelled(Protocol):
-    """What a model knows of its uncertainty, as quantiles of some levels."""
+    """The uncertainty of a model, as quantiles of some levels."""
 
     @property
     def percents(self) -> tuple[int, ...]:
@@ -29,7 +29,7 @@ class Levelled(Protocol):
         ...  # a protocol has no body
 
 
-Known = TypeVar("Known", bound=Levelled)
+Uncertain = TypeVar("Uncertain", bound=Levelled)
 
 
 def percents(levels: AnyFloats) -> tuple[int, ...]:
@@ -39,24 +39,25 @@ def percents(levels: AnyFloats) -> tuple[int, ...]:
     >>> percents(np.array([0.1, 0.5, 0.9]))
     (10, 50, 90)
     """
-    return tuple(round(float(100 * one)) for one in levels)
+    return tuple(round(float(100 * level)) for level in levels)
 
 
-def quantiles_of(known: Known | None, wanted: Sequence[int]) -> tuple[Known, list[int]]:
-    """Return what a model knows of its uncertainty, and where quantiles of the levels ``wanted``, in percent, stand in it.
+def quantiles_of(uncertainty: Uncertain | None, requested: Sequence[int]) -> tuple[Uncertain, list[int]]:
+    """Return the uncertainty of a model, and the indices of the ``requested`` quantiles, in percent.
 
     Raises `TacpipeError` where the model has none, or not these.
     """
-    if known is None:
+    if uncertainty is None:
         raise TacpipeError(
             "The model has no quantiles. Run `tacpipe calibrate MODEL DATASET --split SPLIT -o CALIBRATED` and give "
             "that one."
         )
-    there = known.percents
-    for one in wanted:
-        if one not in there:
+    available = uncertainty.percents
+    for percent in requested:
+        if percent not in available:
             raise TacpipeError(
-                f"The model has the quantiles {','.join(map(str, there))}, not {one}. Give --quantiles of these, or run "
+                f"The model has the quantiles {','.join(map(str, available))}, not {percent}. Give --quantiles "
+                f"of these, or run "
                 f"`tacpipe calibrate` with others."
             )
-    return known, [there.index(one) for one in wanted]
+    return uncertainty, [available.index(percent) for percent in requested]

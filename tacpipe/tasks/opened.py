@@ -44,15 +44,15 @@ def opened(recordings: Dataset | Recording, chain: Chain | None) -> Dataset:
     return continuation.continued(recordings, chain.model)
 
 
-def _check(wanted: Sequence[Mapping[str, Any]], recordings: Dataset) -> None:
-    found = recordings.source.chain
-    if list(found) != list(wanted[: len(found)]):
+def _check(expected: Sequence[Mapping[str, Any]], recordings: Dataset) -> None:
+    chain = recordings.source.chain
+    if list(chain) != list(expected[: len(chain)]):
         raise UsageError(
             f"These recordings went through other stages than those that the model was trained behind: "
-            f"{chain_difference(wanted, found)}. Give the recordings before that stage."
+            f"{chain_difference(expected, chain)}. Give the recordings before that stage."
         )
     if recordings.path is None:
-        missing = ", then ".join(f"`tacpipe {_command(step)}`" for step in wanted[len(found) :])
+        missing = ", then ".join(f"`tacpipe {_command(step)}`" for step in expected[len(chain) :])
         raise UsageError(
             f"These recordings did not go through all stages that the model was trained behind: {missing} is missing. "
             f"Run it, or give what tacpipe.open returned."

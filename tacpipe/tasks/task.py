@@ -46,15 +46,15 @@ class PredictionRequest:
 
     steps: Sequence[int]  # steps ahead, ascending, for tasks that predict a future
     quantiles: Sequence[int] = ()  # percent, ascending
-    probabilities: bool = False  # whether calibrated probabilities are added
-    allow_look_ahead: bool = False  # with causal predictions: accept a model that was trained on rows that look ahead
+    probabilities: bool = False  # True if calibrated probabilities are added
+    allow_look_ahead: bool = False  # causal predictions: accept a model that was trained on rows that look ahead
 
 
 @dataclass(frozen=True)
 class Calibration:
     """A task's way to measure how uncertain its models are."""
 
-    states: Literal["quantiles", "probabilities"]  # what a calibrated model states, by its name in `PredictionRequest`
+    states: Literal["quantiles", "probabilities"]  # the field of `PredictionRequest` that a calibrated model answers
     # Returns the files of a model, which are given, with those that state its uncertainty, measured on recordings with the
     # role train and with the role val.
     calibrate: Callable[[Files, CalibrationRequest, Dataset, Dataset], dict[str, bytes]]
@@ -63,17 +63,17 @@ class Calibration:
 class Demo(NamedTuple):
     """The part of `tacpipe demo` that shows a task."""
 
-    commands: list[list[str]]  # in their order, each without the leading ``tacpipe``
+    commands: list[list[str]]  # commands in their order, each without the leading ``tacpipe``
     results: list[str]  # paths of results that the page shows
-    others: Sequence[str] = ()  # paths of datasets that the page uses, which are not results
-    # commands from ``recordings`` below the output, which an emulated rig wrote, to ``results``; empty without such a part
+    datasets: Sequence[str] = ()  # paths of datasets that the page uses, which are not results
+    # commands from the emulated rig's ``recordings`` below the output to ``results``; empty without such a part
     recorded: Sequence[list[str]] = ()
 
 
 class Task(ABC):
     """A task. The abstract members are required; every property without a body in the subclass is an absent capability."""
 
-    name: ClassVar[str]  # as the entry point states it
+    name: ClassVar[str]  # the name in the entry point
     # A stage whose function is in the module of the subclass: its signature, params, version and requirements are those of
     # ``tacpipe train NAME``. Its result holds ``config.json`` with ``task``, `name`, and ``trained_on``, the digests of the
     # recordings that the model has seen by name.

@@ -21,10 +21,10 @@ DATABASE = "sqlite:///mlflow.db"  # MLflow refuses its store of files
 EXPERIMENT = "tacpipe"
 TAG = "tacpipe.run"
 LONGEST = 500  # letters of a param that every release stores
-_DEFAULTS = {  # where a user has not set these
+_DEFAULTS = {  # defaults where a user has not set these
     "MLFLOW_DISABLE_TELEMETRY": "true",
     "MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT": "true",
-    "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "2",  # of 7: each waits longer, and training with it
+    "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "2",  # attempts, 7 by default: each waits longer, and training with it
     "MLFLOW_HTTP_REQUEST_TIMEOUT": "10",
 }
 
@@ -51,20 +51,24 @@ class MLflow:
         """Create the run, or resume that of this name."""
         from mlflow.entities import Param
 
-        wanted = os.environ.get("MLFLOW_EXPERIMENT_NAME") or EXPERIMENT
-        found = self._client.get_experiment_by_name(wanted)
-        experiment = found.experiment_id if found else self._client.create_experiment(wanted)
+        experiment_name = os.environ.get("MLFLOW_EXPERIMENT_NAME") or EXPERIMENT
+        stored_experiment = self._client.get_experiment_by_name(experiment_name)
+        experiment = (
+            stored_experiment.experiment_id if stored_experiment else self._client.create_experiment(experiment_name)
+        )
         runs = self._client.search_runs([experiment], f"tags.`{TAG}` = '{name}'", max_results=1)
         if runs:
             self._run = runs[0].info.run_id
             self._client.update_run(self._run, status="RUNNING")
             for metric in runs[0].data.metrics:
-                self._steps[metric] = max(one.step for one in self._client.get_metric_history(self._run, metric))
+                self._steps[metric] = max(
+                    measurement.step for measurement in self._client.get_metric_history(self._run, metric)
+                )
         else:
             self._run = self._client.create_run(experiment, run_name=name, tags={TAG: name}).info.run_id
-            every = [Param(key, str(value)[:LONGEST]) for key, value in params.items()]
-            self._client.log_batch(self._run, params=every)
-        return f"run {name} of experiment {wanted} at {self._uri}"
+            logged_params = [Param(key, str(value)[:LONGEST]) for key, value in params.items()]
+            self._client.log_batch(self._run, params=logged_params)
+        return f"run {name} of experiment {experiment_name} at {self._uri}"
 
     def line(self, epoch: int, metrics: Mapping[str, float]) -> None:
         """Add the metrics that the run does not have of this epoch."""
@@ -82,5 +86,5 @@ class MLflow:
 
         now_ms = time.time_ns() // 1_000_000
         if metrics:
-            every = [Metric(name, value, now_ms, step) for name, value in metrics.items()]
-            self._client.log_batch(self._run, metrics=every)
+            logged = [Metric(name, value, now_ms, step) for name, value in metrics.items()]
+            self._client.log_batch(self._run, metrics=logged)

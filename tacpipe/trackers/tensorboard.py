@@ -30,8 +30,8 @@ class TensorBoard:
         from tensorboardX import SummaryWriter
 
         folder, self._params = self._folder / name, params
-        again = folder.is_dir() and any(folder.iterdir())
-        self._writer = SummaryWriter(str(folder), purge_step=0 if again else None)
+        resumes = folder.is_dir() and any(folder.iterdir())
+        self._writer = SummaryWriter(str(folder), purge_step=0 if resumes else None)
         rows = "\n".join(f"| {key} | {value} |" for key, value in params.items())
         self._writer.add_text("params", f"| param | value |\n|---|---|\n{rows}", 0)
         self._writer.flush()

@@ -1,4 +1,4 @@
-"""What a tracker of experiments implements, and how params, epochs and figures are flattened for it."""
+"""Define the interface of trackers of experiments, and flatten params, epochs and figures for them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 Scalar = str | int | float | bool
-_LABELS = ("target", "network")  # of the lines of several networks
+_LABELS = ("target", "network")  # labels in the lines of several networks
 
 
 class Tracker(Protocol):
@@ -30,22 +30,22 @@ class Tracker(Protocol):
         """End the run: its model or results are at ``path``, with these figures; None where they were not made."""
 
 
-def params(given: Mapping[str, Any]) -> dict[str, Scalar]:
+def params(nested: Mapping[str, Any]) -> dict[str, Scalar]:
     """Return params by dotted name; lists as text.
 
     >>> params({"epochs": 2, "sweep": {"kind": "pca", "widths": [2, 4]}, "init": None})
     {'epochs': 2, 'sweep.kind': 'pca', 'sweep.widths': '2, 4', 'init': 'none'}
     """
-    return dict(_leaves(given, "."))
+    return dict(_leaves(nested, "."))
 
 
-def figures(given: Mapping[str, Any], under: str = "") -> dict[str, float]:
+def figures(nested: Mapping[str, Any], under: str = "") -> dict[str, float]:
     """Return the numbers in nested values by their path; what is not a finite number is left out.
 
     >>> figures({"val_loss": 0.5, "best": True, "val": {"biotac": {"accuracy": 0.25}}, "note": "x"}, "a/")
     {'a/val_loss': 0.5, 'a/val/biotac/accuracy': 0.25}
     """
-    return {f"{under}{name}": float(value) for name, value in _leaves(given, "/") if _is_number(value)}
+    return {f"{under}{name}": float(value) for name, value in _leaves(nested, "/") if _is_number(value)}
 
 
 def metrics(line: Mapping[str, Any], *, labelled: bool) -> dict[str, float]:
@@ -58,7 +58,7 @@ def metrics(line: Mapping[str, Any], *, labelled: bool) -> dict[str, float]:
     return figures({name: value for name, value in line.items() if name not in ("epoch", *_LABELS)}, under)
 
 
-def several(lines: Iterable[Mapping[str, Any]]) -> bool:
+def has_several_networks(lines: Iterable[Mapping[str, Any]]) -> bool:
     """Return whether the lines of a history are of several networks."""
     return len({tuple(line.get(name) for name in _LABELS) for line in lines}) > 1
 
@@ -68,11 +68,11 @@ def _is_number(value: object) -> bool:
 
 
 def _leaves(value: Mapping[str, Any], between: str, name: str = "") -> Iterable[tuple[str, Scalar]]:
-    for key, one in value.items():
+    for key, entry in value.items():
         path = f"{name}{between}{key}" if name else str(key)
-        if isinstance(one, Mapping):
-            yield from _leaves(one, between, path)
-        elif isinstance(one, Sequence) and not isinstance(one, str):
-            yield path, ", ".join(map(str, one))
+        if isinstance(entry, Mapping):
+            yield from _leaves(entry, between, path)
+        elif isinstance(entry, Sequence) and not isinstance(entry, str):
+            yield path, ", ".join(map(str, entry))
         else:
-            yield path, "none" if one is None else one
+            yield path, "none" if entry is None else entry

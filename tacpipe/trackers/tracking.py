@@ -23,42 +23,42 @@ from tacpipe.training.schedule import learning_rate
 
 CONFIG, HISTORY = "config.json", "history.jsonl"
 LEARNING_RATE = "learning_rate"
-_DIGITS = 8  # of a key that make a run's name unique
+_DIGITS = 8  # digits of a key that make a run's name unique
 Line = Mapping[str, Any]
 
 
-def opened(wanted: Sequence[str]) -> dict[str, Tracker]:
+def open_trackers(options: Sequence[str]) -> dict[str, Tracker]:
     """Return the trackers that ``--track`` names, as ``mlflow`` or ``mlflow:http://127.0.0.1:5000``.
 
     Raises `UsageError` for a name that there is not, and `MissingModuleError` for one whose extra is not installed.
     """
-    found = {}
-    for text in wanted:
+    trackers = {}
+    for text in options:
         name, _, place = text.partition(":")
         with extras.named(f"The tracker {name}"):
-            found[text] = registry.load_tracker(name)(place)
-    return found
+            trackers[text] = registry.load_tracker(name)(place)
+    return trackers
 
 
 def name_of(output: Path, key: str) -> str:
     """Return the name of a run: the output as seen from the working directory, and the start of the result's key."""
     path = output.absolute()
-    here = path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else Path(path.name)
-    return f"{here.as_posix()}-{key[:_DIGITS]}"
+    relative = path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else Path(path.name)
+    return f"{relative.as_posix()}-{key[:_DIGITS]}"
 
 
-def files(made: Manifest, store: Store) -> dict[str, bytes]:
+def files(manifest: Manifest, store: Store) -> dict[str, bytes]:
     """Return those files of a dataset that a run is given figures and epochs from."""
-    wanted = (CONFIG, HISTORY, headline.FILE, summary.FILE)
-    return {name: store.read(made.files[name]["digest"]) for name in wanted if name in made.files}
+    names = (CONFIG, HISTORY, headline.FILE, summary.FILE)
+    return {name: store.read(manifest.files[name]["digest"]) for name in names if name in manifest.files}
 
 
 @dataclass
 class Tracking:
     """Several trackers as one, which follows trainings; what one of them raises ends it alone."""
 
-    trackers: dict[str, Tracker]  # by what ``--track`` gave
-    name: str  # of the run
+    trackers: dict[str, Tracker]  # keyed by the option ``--track``
+    name: str  # params of the run
     params: Mapping[str, Scalar]
     failures: list[str] = field(default_factory=list)
     _started: bool = False
@@ -91,10 +91,10 @@ class Tracking:
         """Start the run, if it has not begun, and report where each tracker shows it."""
         if not self._started:
             self._started = True
-            for wanted, one in list(self.trackers.items()):
-                place = self._call(wanted, functools.partial(one.start, self.name, self.params))
+            for option, tracker_client in list(self.trackers.items()):
+                place = self._call(option, functools.partial(tracker_client.start, self.name, self.params))
                 if place is not None:
-                    progress.report(f"tracked by {wanted.partition(':')[0]}: {place}")
+                    progress.report(f"tracked by {option.partition(':')[0]}: {place}")
 
     def finish(self, path: Path, files: Mapping[str, bytes]) -> None:
         """End the run of a dataset at ``path``, some of whose files are given.
@@ -107,42 +107,42 @@ class Tracking:
             self.params = {**tracker.params(config.get("params", {})), **self.params}
         self.start()
         self.replay(files.get(HISTORY, b""), config.get("params", {}))
-        found = tracker.figures(config.get("validation") or {}, "best/")
+        figures = tracker.figures(config.get("validation") or {}, "best/")
         if headline.FILE in files:  # a result: those of an older version have no summary
             stored = _tree(files.get(summary.FILE, b"{}"))
-            found = tracker.figures(stored or summary.of(headline.read(files[headline.FILE])))
-        for wanted, one in list(self.trackers.items()):
-            self._call(wanted, functools.partial(one.end, path, found))
+            figures = tracker.figures(stored or summary.from_headlines(headline.read(files[headline.FILE])))
+        for option, tracker_client in list(self.trackers.items()):
+            self._call(option, functools.partial(tracker_client.end, path, figures))
 
     def replay(self, history: bytes, params: Mapping[str, Any]) -> None:
         """Add the epochs of a stored history that were not added yet; ``params`` are the model's, for the learning rate."""
         lines = [json.loads(line) for line in history.splitlines() if line.strip()]
-        self._labelled = tracker.several(lines)
+        self._labelled = tracker.has_several_networks(lines)
         for line in lines[self._lines :]:
             self._add(line, _rate(params, line["epoch"]))
 
     def abandon(self) -> None:
         """End a run whose result was not made."""
         if self._started:
-            for wanted, one in list(self.trackers.items()):
-                self._call(wanted, functools.partial(one.end, None, {}))
+            for option, tracker_client in list(self.trackers.items()):
+                self._call(option, functools.partial(tracker_client.end, None, {}))
 
-    def _add(self, line: Line, more: Mapping[str, float]) -> None:
+    def _add(self, line: Line, additions: Mapping[str, float]) -> None:
         self._lines += 1
-        found = tracker.metrics({**line, **more}, labelled=self._labelled)
-        for wanted, one in list(self.trackers.items()):
-            self._call(wanted, functools.partial(one.line, int(line["epoch"]), found))
+        metrics = tracker.metrics({**line, **additions}, labelled=self._labelled)
+        for option, tracker_client in list(self.trackers.items()):
+            self._call(option, functools.partial(tracker_client.line, int(line["epoch"]), metrics))
 
-    def _call(self, wanted: str, call: Callable[[], Any]) -> Any:
+    def _call(self, option: str, call: Callable[[], Any]) -> Any:
         """Return what the call returns; None where it fails, which ends the tracker. Standard output is the command's."""
         try:
             with contextlib.redirect_stdout(sys.stderr):
                 return call()
         except (Exception, SystemExit) as error:  # whatever a third party's client raises
-            del self.trackers[wanted]
+            del self.trackers[option]
             text = str(error) if isinstance(error, TacpipeError) else f"{type(error).__name__}: {error}"
             first = text.strip().splitlines()[0] if text.strip() else type(error).__name__
-            sentence = f"the tracker {wanted} failed and is left out ({first[:300]})"
+            sentence = f"the tracker {option} failed and is left out ({first[:300]})"
             progress.report(f"{sentence}; the command continues.")
             self.failures.append(f"{sentence}.")
             return None
@@ -157,5 +157,5 @@ def _rate(params: Mapping[str, Any], epoch: int) -> dict[str, float]:
 
 
 def _tree(content: bytes) -> dict[str, Any]:
-    found = json.loads(content)
-    return found if isinstance(found, dict) else {}
+    value = json.loads(content)
+    return value if isinstance(value, dict) else {}

@@ -1,1 +1,1 @@
-"""What trains a network: loop, checkpoints, scaling."""
+"""Train networks: the loop, checkpoints, scaling."""

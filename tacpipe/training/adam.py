@@ -30,16 +30,16 @@ class Adam:
 
     def step(self) -> None:
         """Change each weight that has a gradient; others stay, and so does what is known of them."""
-        some = [(number, weight) for number, weight in enumerate(self.weights) if weight.grad is not None]
-        state = [self._known(number) for number, _ in some]
+        changed = [(number, weight) for number, weight in enumerate(self.weights) if weight.grad is not None]
+        state = [self._moments(number) for number, _ in changed]
         with torch.no_grad():
             adam(
-                [weight for _, weight in some],
-                [weight.grad for _, weight in some if weight.grad is not None],
-                [one["exp_avg"] for one in state],
-                [one["exp_avg_sq"] for one in state],
+                [weight for _, weight in changed],
+                [weight.grad for _, weight in changed if weight.grad is not None],
+                [moments["exp_avg"] for moments in state],
+                [moments["exp_avg_sq"] for moments in state],
                 [],
-                [one["step"] for one in state],
+                [moments["step"] for moments in state],
                 fused=True,
                 amsgrad=False,
                 beta1=BETAS[0],
@@ -57,11 +57,11 @@ class Adam:
     def load(self, state: Mapping[int, Mapping[str, Tensor]]) -> None:
         """Take over what `state` returned of weights in the same order, maybe on another device."""
         self._state = {
-            number: {name: value.to(self.weights[number].device) for name, value in known.items()}
-            for number, known in state.items()
+            number: {name: value.to(self.weights[number].device) for name, value in moments.items()}
+            for number, moments in state.items()
         }
 
-    def _known(self, number: int) -> dict[str, Tensor]:
+    def _moments(self, number: int) -> dict[str, Tensor]:
         if number not in self._state:
             weight = self.weights[number]
             self._state[number] = {

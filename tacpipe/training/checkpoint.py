@@ -1,4 +1,4 @@
-"""What an interrupted training resumes from: one file, replaced as a whole after every epoch.
+"""Store the state that an interrupted training resumes from: one file, replaced as a whole after every epoch.
 
 Its first line is the digest of the rest, a safetensors file with the state as JSON in its header: two files could be torn
 apart by a crash between them, and training must not resume from a weight that a disk has changed.
@@ -32,7 +32,7 @@ def write(folder: Path, tensors: Mapping[str, Tensor], state: Mapping[str, Any])
     with readable_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
         draft = folder / f"{FILE}.draft"
-        draft.unlink(missing_ok=True)  # of a run that was killed
+        draft.unlink(missing_ok=True)  # left by a run that was killed
         write_whole(str(folder / FILE), signed, str(draft))
         sync_folder(str(folder))
 
@@ -45,8 +45,8 @@ def read(folder: Path) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
     except FileNotFoundError:
         return None
     except (OSError, TacpipeError) as error:
-        why = error.strerror if isinstance(error, OSError) else error
-        log.warning("The checkpoint %s cannot be read (%s); training starts over.", path, why)
+        reason = error.strerror if isinstance(error, OSError) else error
+        log.warning("The checkpoint %s cannot be read (%s); training starts over.", path, reason)
         return None
     stored, _, content = signed.partition(b"\n")
     try:

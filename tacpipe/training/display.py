@@ -10,9 +10,9 @@ from pathlib import Path
 from tacpipe.io import progress, terminal
 from tacpipe.training.following import HISTORY, Follower, Line, Network
 
-REDRAW_S = 0.1  # between two readings of the loss: each waits for the device
+REDRAW_S = 0.1  # least time between two readings of the loss: each waits for the device
 _DIGEST = 64  # letters of a folder that is named by a key
-_SHOWN = 8  # of these, enough for a shell to complete
+_SHOWN = 8  # characters of a key, enough for a shell to complete
 
 
 @contextlib.contextmanager
@@ -28,11 +28,11 @@ def on_stderr(stage: str, workspace: Path | None) -> Iterator[list[Follower]]:
     elif not progress.is_visible():
         yield [Lines(workspace)]
     else:
-        shown = Bar(stage, workspace)
+        bar = Bar(stage, workspace)
         try:
-            yield [shown]
+            yield [bar]
         finally:
-            shown.close()
+            bar.close()
 
 
 def duration(seconds: float) -> str:
@@ -41,13 +41,13 @@ def duration(seconds: float) -> str:
     >>> duration(7.4), duration(65), duration(3725), duration(100 * 3600)
     ('0:07', '1:05', '1:02:05', '100:00:00')
     """
-    minutes, rest = divmod(round(seconds), 60)
+    minutes, remainder = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+    return f"{hours}:{minutes:02d}:{remainder:02d}" if hours else f"{minutes}:{remainder:02d}"
 
 
 class _Shown:
-    """What both have in common: which epochs are done, and what is reported at the beginning and the end."""
+    """Count epochs, and report the beginning and the end of a training."""
 
     def __init__(self, workspace: Path | None) -> None:
         self._workspace = workspace
@@ -62,7 +62,7 @@ class _Shown:
         self.network, self.history, self._resumed = network, list(history), len(history)
         self._begun_s = time.monotonic()
         if not self._announced and self._workspace is not None:
-            terminal.note(f"each epoch is appended to {_shown(self._workspace / HISTORY)}")
+            terminal.note(f"each epoch is appended to {_shorten_path(self._workspace / HISTORY)}")
             self._announced = True
         if history:
             terminal.note(f"{self._prefix}resumes from epoch {len(history) + 1} of {network.epochs}")
@@ -84,8 +84,8 @@ class _Shown:
     @property
     def best(self) -> str:
         """The validation loss of the last epoch that was the best so far, and its number; empty before any."""
-        found = next((line for line in reversed(self.history) if line.get("best")), None)
-        return f"{found['val_loss']:#.4g} (epoch {found['epoch']})" if found else ""
+        best_line = next((line for line in reversed(self.history) if line.get("best")), None)
+        return f"{best_line['val_loss']:#.4g} (epoch {best_line['epoch']})" if best_line else ""
 
     @property
     def _prefix(self) -> str:
@@ -93,11 +93,11 @@ class _Shown:
 
     def left(self, passed: float = 0.0) -> str:
         """Return the time that all epochs take from here, at most: patience may end them before."""
-        done = len(self.history) - self._resumed + passed
-        if not done:
+        trained_epochs = len(self.history) - self._resumed + passed
+        if not trained_epochs:
             return ""
-        each_s = (time.monotonic() - self._begun_s) / done
-        return f"{duration(each_s * (self.network.epochs - len(self.history) - passed))} left"
+        epoch_s = (time.monotonic() - self._begun_s) / trained_epochs
+        return f"{duration(epoch_s * (self.network.epochs - len(self.history) - passed))} left"
 
 
 class Lines(_Shown):
@@ -176,7 +176,7 @@ class Bar(_Shown):
         self.progress.stop()
 
 
-def _shown(path: Path) -> str:
+def _shorten_path(path: Path) -> str:
     """Return a path as a shell takes it, seen from the working directory; a folder named by a key is cut to its start."""
     with contextlib.suppress(ValueError):
         path = path.relative_to(Path.cwd())

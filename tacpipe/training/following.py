@@ -1,4 +1,4 @@
-"""Who follows a training while it runs: a growing file, the terminal, trackers. None of them changes what is learned.
+"""Follow a training while it runs: a growing file, the terminal, trackers. None of them changes the result.
 
 A stage with a workspace is run within `in_workspace`; the loop calls `network` for each network that it trains there.
 """
@@ -17,14 +17,14 @@ from typing import Any, Protocol
 from tacpipe.io import progress, termination
 
 HISTORY = "history.jsonl"
-Line = dict[str, Any]  # of the history: the results of an epoch, as JSON holds them
+Line = dict[str, Any]  # one line of the history: the results of an epoch, as JSON holds them
 
 
 @dataclass(frozen=True)
 class Network:
     """One of the networks that a stage trains: which it is, and how long it may take."""
 
-    epochs: int  # at most
+    epochs: int  # upper limit
     number: int = 1
     count: int = 1
     labels: Mapping[str, Any] = field(default_factory=dict)  # are added to each of its lines
@@ -36,7 +36,7 @@ class Network:
 
 
 class Follower(Protocol):
-    """What is called as a training proceeds."""
+    """Receive calls as a training proceeds."""
 
     def begin(self, network: Network, history: Sequence[Line]) -> None:
         """A network is trained from here; ``history`` are its epochs before an interruption."""
@@ -55,21 +55,21 @@ class Follower(Protocol):
 class Followers:
     """Several as one."""
 
-    each: Sequence[Follower] = ()
+    followers: Sequence[Follower] = ()
 
     def batch(self, passed: float, loss: Callable[[], float]) -> None:
         """Call ``batch`` of each."""
-        for one in self.each:
-            one.batch(passed, loss)
+        for follower in self.followers:
+            follower.batch(passed, loss)
 
     def line(self, line: Line, learning_rate: float) -> None:
         """Call ``line`` of each."""
-        for one in self.each:
-            one.line(line, learning_rate)
+        for follower in self.followers:
+            follower.line(line, learning_rate)
 
 
-_trackers: ContextVar[tuple[Follower, ...]] = ContextVar("trackers", default=())  # of the command
-_current: ContextVar[tuple[Follower, ...]] = ContextVar("followers", default=())  # of the stage that runs
+_trackers: ContextVar[tuple[Follower, ...]] = ContextVar("trackers", default=())  # trackers of the command
+_current: ContextVar[tuple[Follower, ...]] = ContextVar("followers", default=())  # followers of the stage that runs
 
 
 @contextlib.contextmanager
@@ -83,10 +83,10 @@ def tracked(trackers: Sequence[Follower]) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def in_workspace(workspace: Path, *shown: Follower) -> Iterator[None]:
-    """Have each training in the block followed by a file in ``workspace``, by ``shown``, and by the command's trackers."""
+def in_workspace(workspace: Path, *displays: Follower) -> Iterator[None]:
+    """Have a file in ``workspace``, ``displays`` and the command's trackers follow each training in the block."""
     file = _HistoryFile(workspace / HISTORY)
-    before = _current.set((file, *_trackers.get(), *shown))
+    before = _current.set((file, *_trackers.get(), *displays))
     try:
         yield
     finally:
@@ -100,25 +100,26 @@ def trackers() -> tuple[Follower, ...]:
 
 
 @contextlib.contextmanager
-def network(found: Network, history: Sequence[Line]) -> Iterator[Followers]:
+def network(described: Network, history: Sequence[Line]) -> Iterator[Followers]:
     """Yield the followers of a network that is trained in the block."""
     followers, trained = _current.get(), False
-    for one in followers:
-        one.begin(found, history)
+    for follower in followers:
+        follower.begin(described, history)
     try:
         yield Followers(followers)
         trained = True
     finally:
-        for one in followers:
-            one.end(trained=trained)
+        for follower in followers:
+            follower.end(trained=trained)
 
 
 @contextlib.contextmanager
-def resumable(found: Network, done: int) -> Iterator[None]:
+def resumable(network: Network, epochs_trained: int) -> Iterator[None]:
     """Have an interrupt of the epoch in the block stated with the epoch that the same command resumes from."""
-    name = f" of {found.name}" if found.name else ""
-    sentence = f"tacpipe: interrupted; the same command resumes training{name} from epoch {done + 1} of {found.epochs}."
-    with termination.reporting(sentence if done else termination.SENTENCE):
+    name = f" of {network.name}" if network.name else ""
+    epoch = f"epoch {epochs_trained + 1} of {network.epochs}"
+    sentence = f"tacpipe: interrupted; the same command resumes training{name} from {epoch}."
+    with termination.reporting(sentence if epochs_trained else termination.SENTENCE):
         yield
 
 

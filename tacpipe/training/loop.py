@@ -40,7 +40,7 @@ class Part:
 
 
 class Work(Protocol):
-    """What is to be learned: batches of an epoch, the loss of each, and what is watched when the epoch is over."""
+    """Define a training: the batches of an epoch, the loss of each, and the validation after the epoch."""
 
     def batches(self, epoch: int) -> Sequence[Any]:
         """Return the batches of an epoch, from 0; what is random in them comes from torch's generator."""
@@ -110,7 +110,7 @@ class Trained:
 
 @dataclass
 class _Run:
-    """What an epoch changes; all of it is in the checkpoint."""
+    """Hold the state that an epoch changes; all of it is in the checkpoint."""
 
     model: nn.Module
     optimiser: Adam
@@ -121,7 +121,7 @@ class _Run:
         slots = self.optimiser.state()
         tensors = {f"model.{name}": value for name, value in self.model.state_dict().items()}
         tensors |= {f"best.{name}": value for name, value in self.best.items()}
-        tensors |= {f"adam.{slot}.{name}": value for slot, held in slots.items() for name, value in held.items()}
+        tensors |= {f"adam.{slot}.{name}": value for slot, moments in slots.items() for name, value in moments.items()}
         tensors["random"] = torch.get_rng_state()
         checkpoint.write(folder, tensors, {"history": self.history})
 
@@ -134,8 +134,8 @@ class _Run:
         self.best = under("best.", tensors)
         slots: dict[int, dict[str, Tensor]] = {}
         for name, value in under("adam.", tensors).items():
-            slot, held = name.split(".", 1)
-            slots.setdefault(int(slot), {})[held] = value
+            slot, tensor = name.split(".", 1)
+            slots.setdefault(int(slot), {})[tensor] = value
         self.optimiser.load(slots)
         torch.set_rng_state(tensors["random"])
         self.history = state["history"]
@@ -185,12 +185,12 @@ def _follow(run: _Run, work: Work, schedule: Schedule, workspace: Path, network:
     with following.network(network, list(run.history)) as followers:
         torch.set_rng_state(random)  # whatever a tracker drew
         while not run.over(schedule):
-            done = len(run.history)
-            with following.resumable(network, done):
+            epochs_trained = len(run.history)
+            with following.resumable(network, epochs_trained):
                 line = _epoch(run, work, schedule, followers)
                 run.save(workspace)
             with torch.random.fork_rng(devices=[]):
-                followers.line(line, schedule.of_epoch(done + 1))
+                followers.line(line, schedule.of_epoch(epochs_trained + 1))
 
 
 def _epoch(run: _Run, work: Work, schedule: Schedule, followers: Followers) -> Line:
@@ -245,10 +245,10 @@ def _mean(total: Tensor | float, count: int) -> float:
     return float(total) / count
 
 
-def _better(ranks: Mapping[str, Sequence[float]], before: Iterable[Mapping[str, Sequence[float]]]) -> list[str]:
+def _better(ranks: Mapping[str, Sequence[float]], ranks_before: Iterable[Mapping[str, Sequence[float]]]) -> list[str]:
     """Return the parts of the model that were never as good as now."""
-    known = list(before)
-    return [part for part, rank in ranks.items() if all(tuple(rank) < tuple(old[part]) for old in known)]
+    earlier = list(ranks_before)
+    return [part for part, rank in ranks.items() if all(tuple(rank) < tuple(old[part]) for old in earlier)]
 
 
 def _pieces(indices: Tensor, batch: int) -> Iterator[Tensor]:

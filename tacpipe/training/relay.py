@@ -12,7 +12,7 @@ from typing import Any
 
 from tacpipe.training.following import Follower, Line, Network
 
-BATCH_S = 0.5  # between two messages about batches: each reads the loss, and travels
+BATCH_S = 0.5  # least time between two messages about batches: each reads the loss
 Message = dict[str, Any]
 
 
@@ -51,15 +51,15 @@ class Receiver:
     def __init__(self, followers: Sequence[Follower]) -> None:
         self._followers = followers
         self._network: Network | None = None
-        self._epochs = 0  # of the network, that the followers have
+        self._epochs = 0  # epochs of the network that the followers have received
 
     def take(self, message: Message) -> None:
         """Call the followers with what a message holds."""
         if "begin" in message:
             self._begin(Network(**message["begin"]), message["history"])
         elif "batch" in message:
-            for one in self._followers:
-                one.batch(message["batch"], lambda: float(message["loss"]))
+            for follower in self._followers:
+                follower.batch(message["batch"], lambda: float(message["loss"]))
         elif "line" in message:
             self._line(message["line"], message["learning_rate"])
         elif message["end"]:  # else another process may continue the training
@@ -76,17 +76,17 @@ class Receiver:
                 self._line(line, 0.0)
             return
         self._network, self._epochs = network, len(history)
-        for one in self._followers:
-            one.begin(network, history)
+        for follower in self._followers:
+            follower.begin(network, history)
 
     def _line(self, line: Line, learning_rate: float) -> None:
         if line["epoch"] <= self._epochs:
             return
         self._epochs = line["epoch"]
-        for one in self._followers:
-            one.line(line, learning_rate)
+        for follower in self._followers:
+            follower.line(line, learning_rate)
 
     def _end(self, *, trained: bool) -> None:
         self._network = None
-        for one in self._followers:
-            one.end(trained=trained)
+        for follower in self._followers:
+            follower.end(trained=trained)

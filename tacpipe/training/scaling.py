@@ -68,7 +68,7 @@ KINDS = ("none", "standard", "spread", "log")
 
 @dataclass(frozen=True)
 class Affine:
-    """What is taken off each channel and what it is divided by, float64 (channel,); a logarithm may come first."""
+    """Offset and scale of each channel, float64 (channel,); a logarithm may come first."""
 
     offset: Floats
     scale: Floats
@@ -105,14 +105,14 @@ class Affine:
         log(1 + x). Raises `TacpipeError` for another kind.
         """
         channels = values.shape[-1]
-        zeros, ones = np.zeros(channels), np.ones(channels)
+        zeros, unscaled = np.zeros(channels), np.ones(channels)
         if kind == "none":
-            return cls(zeros, ones)
+            return cls(zeros, unscaled)
         if kind == "standard":
             flat = values.reshape(-1, channels)
             spread = flat.std(axis=0, dtype=np.float64)
             return cls(flat.mean(axis=0, dtype=np.float64), np.where(spread > 0, spread, 1.0))
         if kind in ("spread", "log"):
             spread = float(np.std(np.log1p(values) if kind == "log" else values, dtype=np.float64))
-            return cls(zeros, ones * (spread or 1.0), kind == "log")
+            return cls(zeros, unscaled * (spread or 1.0), kind == "log")
         raise TacpipeError(f"There is no scaling {kind!r}; there are {', '.join(KINDS)}.")

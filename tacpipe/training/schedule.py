@@ -57,12 +57,12 @@ class Schedule:
     patience: int  # epochs without a better validation loss after which training ends
     gradient_clip: float  # largest norm of the gradient
     seed: int
-    cycle: bool = False  # whether the rate rises over the first part of all epochs and falls over the rest
+    cycle: bool = False  # the rate rises over the first part of all epochs and then falls
     # bfloat16: of products in forward and backward passes; weights, their sums and what is validated stay in float32
     precision: Precision = "float32"
 
     @classmethod
-    def of(cls, params: Trainable, seed: int, gradient_clip: float = math.inf) -> Self:
+    def from_params(cls, params: Trainable, seed: int, gradient_clip: float = math.inf) -> Self:
         """Return the schedule of a network's params; with a patience of 0 it trains for all epochs."""
         return cls(
             epochs=params.epochs,

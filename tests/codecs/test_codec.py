@@ -12,7 +12,7 @@ WALKS = np.cumsum(np.random.default_rng(2).normal(size=(4, 30, 6)), axis=1) * 20
 def latents_and_codec(of: str) -> tuple[np.ndarray, codec.Codec]:
     levels = np.concatenate(WALKS)
     rows = np.concatenate(np.diff(WALKS, axis=1)) if of == "increments" else levels
-    fitted = pca.fit(Moments.of([rows], 6), CHANNELS, [], components=6, representation=of)
+    fitted = pca.fit(Moments.from_pieces([rows], 6), CHANNELS, [], components=6, representation=of)
     return np.stack([fitted.encode(walk, CHANNELS) for walk in WALKS]), fitted
 
 

@@ -35,7 +35,7 @@ def test_a_long_recording_gets_the_latents_of_the_whole(
     shard = recording()
     counts = tactile.above_rest(shard.content, tuple(CHANNELS))
     fitted = pca.fit(
-        Moments.of([counts[:300]], len(CHANNELS)),
+        Moments.from_pieces([counts[:300]], len(CHANNELS)),
         CHANNELS,
         [{}] * len(CHANNELS),
         components=3,
@@ -59,6 +59,6 @@ def test_a_long_recording_gets_the_latents_of_the_whole(
 
 def test_latents_of_other_channels_are_refused_with_the_name_of_the_recording() -> None:
     counts = tactile.above_rest(recording().content, tuple(CHANNELS))
-    fitted = pca.fit(Moments.of([counts[:300, :5]], 5), CHANNELS[:5], [{}] * 5, components=3)
+    fitted = pca.fit(Moments.from_pieces([counts[:300, :5]], 5), CHANNELS[:5], [{}] * 5, components=3)
     with pytest.raises(TacpipeError, match="a: The codec does not fit this table"):
         latents.added(recording(), stored.to_files(fitted))  # type: ignore[arg-type]

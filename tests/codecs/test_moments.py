@@ -28,7 +28,7 @@ def rows(seed: int, count: int = 200) -> np.ndarray:
 def test_moments_of_pieces_are_those_of_all_rows(seed: int, of: str) -> None:
     whole, rng = rows(seed), np.random.default_rng(seed)
     cuts = [0, *sorted(rng.integers(0, 201, 5).tolist()), 200]
-    found = Moments.of((whole[start:stop] for start, stop in itertools.pairwise(cuts)), 5)
+    found = Moments.from_pieces((whole[start:stop] for start, stop in itertools.pairwise(cuts)), 5)
 
     mean, scale = standard(whole, of)
     assert found.count == 200
@@ -41,11 +41,13 @@ def test_moments_of_pieces_are_those_of_all_rows(seed: int, of: str) -> None:
 
 def test_moments_of_two_parts_are_those_of_both_together() -> None:
     whole = rows(1)
-    merged = Moments.of([whole[:50]], 5).merged(Moments.of([whole[50:]], 5))
-    np.testing.assert_allclose(np.abs(merged.centred), np.abs(Moments.of([whole], 5).centred), rtol=1e-9, atol=1e-9)
+    merged = Moments.from_pieces([whole[:50]], 5).merged(Moments.from_pieces([whole[50:]], 5))
+    np.testing.assert_allclose(
+        np.abs(merged.centred), np.abs(Moments.from_pieces([whole], 5).centred), rtol=1e-9, atol=1e-9
+    )
     assert merged.merged(Moments(5)).count == 200
 
 
 def test_rows_of_which_no_channel_moves_have_no_scale() -> None:
     with pytest.raises(TacpipeError, match="None of the 2 tactile channels moves in 3 training rows"):
-        Moments.of([np.full((3, 2), 0.1)], 2).standard(LEVELS)
+        Moments.from_pieces([np.full((3, 2), 0.1)], 2).standard(LEVELS)

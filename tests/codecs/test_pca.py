@@ -24,7 +24,7 @@ def values(seed: int = 0, rows: int = 60) -> np.ndarray:
 
 
 def fit(content: np.ndarray, **how: float | str) -> pca.PCA:
-    return pca.fit(Moments.of([content], len(CHANNELS)), CHANNELS, LAYOUT, **how)  # type: ignore[arg-type]
+    return pca.fit(Moments.from_pieces([content], len(CHANNELS)), CHANNELS, LAYOUT, **how)  # type: ignore[arg-type]
 
 
 def standardised(content: np.ndarray) -> np.ndarray:
@@ -133,7 +133,7 @@ def test_six_components_hold_data_of_rank_six_and_the_error_falls_with_their_num
     rng = np.random.default_rng(5)
     content = rng.normal(size=(2000, 6)) @ rng.normal(size=(6, 96)) * 300
     channels = [f"c{index}" for index in range(96)]
-    fitted = [pca.fit(Moments.of([content], 96), channels, [], components=count) for count in range(1, 7)]
+    fitted = [pca.fit(Moments.from_pieces([content], 96), channels, [], components=count) for count in range(1, 7)]
     errors = [float(np.square(one.decode(one.encode(content, channels)) - content).mean()) for one in fitted]
     assert fitted[-1].explained_ratio[:6].sum() >= 0.99
     assert all(before > after for before, after in itertools.pairwise(errors))

@@ -97,6 +97,6 @@ def test_rows_that_are_read_in_pieces_are_those_of_the_whole_recording(
     whole = read(shard, representation=representation, frames=2).inputs["a"]
     decode_few_rows_at_a_time(monkeypatch, rows)
     found = training_rows.stored({"a": shard}, representation, 2)  # type: ignore[dict-item]
-    pieces = list(found.each(["a"]))
+    pieces = list(found.pieces(["a"]))
     assert len(pieces) == -(-20 // rows)
     assert np.array_equal(np.concatenate(pieces), whole)

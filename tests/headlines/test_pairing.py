@@ -148,7 +148,7 @@ def test_the_row_of_persistence_is_shown_where_another_baseline_is_better() -> N
     row = next(line.split() for line in table.splitlines() if line.startswith("  persistence"))
     assert row[-2:] == ["0", "0"]
     assert "vs ridge" in table and "\n  persistence" in table and "mean " not in table.split("n: recordings")[0]
-    known = summary.of([found])
+    known = summary.from_headlines([found])
     assert (known["mae_t_1"], known["persistence_mae_t_1"]) == (0.5, 1.0)
 
 

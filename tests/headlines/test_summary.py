@@ -20,7 +20,9 @@ def of(gain: float, part: str = "", target: str = "", error: float = 7.5) -> Hea
 
 
 def test_the_gain_is_that_of_the_part_where_it_is_least() -> None:
-    found = summary.of([of(0.3, "known objects"), of(0.1, "unseen objects", error=9.0), of(math.nan, "others")])
+    found = summary.from_headlines(
+        [of(0.3, "known objects"), of(0.1, "unseen objects", error=9.0), of(math.nan, "others")]
+    )
 
     assert (found["gain"], found["low"], found["high"], found["n"]) == (0.1, 0.0, 0.2, 12)
     assert found["known_objects_mae_t_1"] == 7.5 and found["unseen_objects_mae_t_1"] == 9.0
@@ -29,14 +31,14 @@ def test_the_gain_is_that_of_the_part_where_it_is_least() -> None:
 def test_names_are_those_that_differ_and_may_be_given() -> None:
     several = [of(0.1, "novel objects", target) for target in ("PDC thumb", "electrodes thumb")]
 
-    assert list(summary.of(several))[4:] == ["pdc_thumb", "electrodes_thumb"]
-    assert list(summary.of(several, {"PDC thumb": "pdc_th"}))[4:] == ["pdc_th", "electrodes_thumb"]
-    assert list(summary.of([of(0.1)]))[4:] == ["mae_t_1"]
+    assert list(summary.from_headlines(several))[4:] == ["pdc_thumb", "electrodes_thumb"]
+    assert list(summary.from_headlines(several, {"PDC thumb": "pdc_th"}))[4:] == ["pdc_th", "electrodes_thumb"]
+    assert list(summary.from_headlines([of(0.1)]))[4:] == ["mae_t_1"]
 
 
 def test_what_is_not_defined_is_left_out_and_there_are_fewer_than_thirty() -> None:
-    assert summary.of([]) == {}
-    assert "gain" not in summary.of([of(math.nan)]) and summary.of([of(math.nan)])["n"] == 12
+    assert summary.from_headlines([]) == {}
+    assert "gain" not in summary.from_headlines([of(math.nan)]) and summary.from_headlines([of(math.nan)])["n"] == 12
     many = [of(0.1, f"part {number}") for number in range(100)]
-    assert len(summary.of(many)) < 30
+    assert len(summary.from_headlines(many)) < 30
     assert json.loads(summary.write([of(1 / 3)]))["gain"] == pytest.approx(1 / 3, rel=1e-5)

@@ -205,7 +205,9 @@ def _descriptors() -> list[bytes]:
 def _codec_files() -> dict[str, bytes]:
     names = [f"taxel{number}" for number in range(5)]
     rows = np.random.default_rng(0).normal(size=(40, 5))
-    return dict(sorted(fit(Moments.of([rows], 5), names, [{"stream": "xela1"}] * 5, components=2).to_files().items()))
+    return dict(
+        sorted(fit(Moments.from_pieces([rows], 5), names, [{"stream": "xela1"}] * 5, components=2).to_files().items())
+    )
 
 
 def _codec(data: bytes) -> object:

@@ -52,7 +52,7 @@ class Bands:
                 for name, predicted in _predicted(forecaster, uncertainty, track, some, part):
                     flat = predicted.transpose(0, 2, 1, 3).reshape(-1, truth.shape[1], len(uncertainty.percents))
                     true = truth.transpose(0, 2, 1).reshape(-1, truth.shape[1])
-                    own = Sums.of(true, flat, uncertainty.errors.levels)
+                    own = Sums.from_predictions(true, flat, uncertainty.errors.levels)
                     found[name] = found[name] + own if name in found else own
                     if drawn is not None and name == MODEL:
                         drawn.add(some.now[part], truth, predicted)

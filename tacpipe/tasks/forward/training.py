@@ -103,7 +103,7 @@ def train(
             raise tracks.no_window(f"The {role} recordings hold", dataset, params.context, params.horizon)
     _check_channels(codec, parts[0])
     build = partial(_built, params, codec, known, start, device)
-    schedule = loop.Schedule.of(params, params.seed, params.gradient_clip)
+    schedule = loop.Schedule.from_params(params, params.seed, params.gradient_clip)
     trained = loop.train(build, loop.Windows(known.part, watched.part, params.batch), schedule, workspace)
     weights = trained.weights | _shrinkage(trained.weights, params, codec, watched)
     best = min(trained.history, key=lambda line: line["val_loss"])

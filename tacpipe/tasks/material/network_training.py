@@ -104,7 +104,7 @@ def train(
             networks.check(network, params, training[name].frames, shapes[name].classes)
         return built
 
-    trained = loop.train(build, work, loop.Schedule.of(params, params.seed), workspace)
+    trained = loop.train(build, work, loop.Schedule.from_params(params, params.seed), workspace)
     config["validation"] = _validation(trained.history, work.joint)
     files = _files(trained, config, params)
     if params.baselines:

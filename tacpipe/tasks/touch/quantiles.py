@@ -166,7 +166,9 @@ def _sums(
     bands = fitted.quantiles({target: predicted[predictor][target][mask]}, predictor)[target]
     truth = grasps.readings[target][mask]
     return [
-        Sums.of(truth[in_cluster].reshape(-1, 1), bands[in_cluster].reshape(-1, 1, bands.shape[2]), fitted.levels)
+        Sums.from_predictions(
+            truth[in_cluster].reshape(-1, 1), bands[in_cluster].reshape(-1, 1, bands.shape[2]), fitted.levels
+        )
         for in_cluster in (clusters == name for name in sorted(set(clusters.tolist())))
     ]
 

@@ -202,7 +202,7 @@ def _train_networks(params: NetworkParams, grasps: TrainingGrasps, model: Fitted
         work = _work(params, scale, (learned, followed), group, device)
         for number in range(params.networks):
             place = grasps.workspace / f"{'-'.join(group)}-{number}"
-            schedule = loop.Schedule.of(params, params.seed + 1000 * number)
+            schedule = loop.Schedule.from_params(params, params.seed + 1000 * number)
             build = functools.partial(_built, params, group, device)
             whose = {"target": "all" if params.multi_target else group[0], "network": number}
             trained = loop.train(

@@ -40,7 +40,7 @@ def sums_of_method(
         clusters = methods.object_clusters(run.details, known_objects) or {}
         sums = methods.sums_by_recording(run.details, predictor, steps, known_objects, group)
         parts += [((run.seed, clusters.get(name, name)), errors) for name, errors in sums.items()]
-    return pairing.added(parts)
+    return pairing.add_by_key(parts)
 
 
 def at_steps(draws: AnyFloats) -> AnyFloats:
