@@ -69,18 +69,18 @@ def test_dilations_are_powers_of_two_evenly_up_to_the_slide_and_share_the_featur
     longest = np.log2((FRAMES - 1) / 8)
     wanted = [int(2 ** (longest * step / 11)) for step in range(12)]
     assert fitted.dilations.tolist() == sorted(set(wanted))
-    assert fitted.each.tolist() == [wanted.count(dilation) for dilation in sorted(set(wanted))]
+    assert fitted.counts.tolist() == [wanted.count(dilation) for dilation in sorted(set(wanted))]
     many = Rocket.fit(slides(3, 400), features=10_000)
     assert 8 * many.dilations[-1] <= 399
-    assert many.each.sum() == 10_000 // 84
-    assert len(many.biases) == 84 * many.each.sum()
+    assert many.counts.sum() == 10_000 // 84
+    assert len(many.biases) == 84 * many.counts.sum()
 
 
 def test_biases_are_quantiles_of_one_training_slides_answers_at_multiples_of_the_golden_ratio() -> None:
     x = slides(1, seed=5)  # a single slide, so that biases can be of it alone
     rocket = Rocket.fit(x, features=84 * 4, seed=1)
     at = 0
-    for index, each in enumerate(rocket.each):
+    for index, each in enumerate(rocket.counts):
         for kernel in range(84):
             quantiles = [(n * (1 + 5**0.5) / 2) % 1 for n in range(at + 1, at + 1 + int(each))]
             expected = np.quantile(answer(x[0], rocket, index, kernel), quantiles)
@@ -108,7 +108,7 @@ def test_slides_are_transformed_alike_alone_and_among_others(fitted: Rocket, mon
 def test_positions_beyond_what_a_byte_counts_are_counted() -> None:
     x = slides(2, frames=600)
     rocket = Rocket.fit(x, features=84)
-    always = Rocket(rocket.frames, rocket.dilations, rocket.each, rocket.channels, np.full(84, -1e9, np.float32))
+    always = Rocket(rocket.frames, rocket.dilations, rocket.counts, rocket.channels, np.full(84, -1e9, np.float32))
     assert (always.transform(x) == 1).all()
 
 

@@ -31,9 +31,9 @@ def named(of: Transfer, gaussians: Gaussians, slides: Labelled) -> float:
 def test_classes_that_only_another_sensor_was_told_are_named() -> None:
     found = Transfer.fit(sided(range(6), 8, 0.5, 3.0), [sided(range(CLASSES), 8, seed=2)])
     new = sided(range(6, CLASSES), 30, 0.5, 3.0, seed=3)
-    assert named(found, found.known, new) > 0.9
+    assert named(found, found.learned, new) > 0.9
     assert named(found, found.expected, new) > 0.9
-    assert named(found, found.known, sided(range(6), 30, 0.5, 3.0, seed=4)) > 0.95
+    assert named(found, found.learned, sided(range(6), 30, 0.5, 3.0, seed=4)) > 0.95
 
 
 def test_what_is_expected_is_the_other_sensors_mean_by_gain_and_offset() -> None:
@@ -89,9 +89,9 @@ def test_few_slides_are_told_better_with_another_sensor_than_without() -> None:
     for seed in range(5):
         own = sided(range(CLASSES), 2, 0.5, 3.0, 1.0, seed=10 + seed)
         found = Transfer.fit(own, [sided(range(CLASSES), 50, noise=0.3, seed=2)])
-        with_other.append(named(found, found.known, new))
+        with_other.append(named(found, found.learned, new))
         found = Transfer.fit(own)
-        alone.append(named(found, found.known, new))
+        alone.append(named(found, found.learned, new))
     assert np.mean(with_other) > np.mean(alone) + 0.05
 
 
@@ -127,13 +127,13 @@ def test_nothing_is_expected_of_classes_that_no_other_sensor_knows() -> None:
     scores = found.expected.scores(MEANS)
     assert np.isfinite(scores[:, :7]).all()
     assert np.isneginf(scores[:, 7:]).all()
-    assert named(found, found.known, sided(range(CLASSES), 20, seed=3)) > 0.95
+    assert named(found, found.learned, sided(range(CLASSES), 20, seed=3)) > 0.95
 
 
 def test_tensors_hold_everything() -> None:
     found = Transfer.fit(sided(range(6), 8), [sided(range(CLASSES), 8, seed=2)])
     again = Transfer.from_tensors(found.to_tensors())
-    for one, other in ((found.known, again.known), (found.expected, again.expected)):
+    for one, other in ((found.learned, again.learned), (found.expected, again.expected)):
         assert np.array_equal(one.scores(MEANS), other.scores(MEANS))
     assert again.classes.tolist() == list(range(CLASSES))
 
