@@ -23,7 +23,7 @@ _metadata = st.dictionaries(st.sampled_from(["unit", "quantity", "", "\u00e9"]),
 
 @st.composite
 def tables(draw: st.DrawFn, *, columns: int = 6) -> pa.Table:
-    """Draw a table: none or many rows, which may hold still, nulls anywhere, extremes, and what is told of fields."""
+    """Draw a table with no or many rows, which may repeat, nulls anywhere, extreme values, and metadata of fields."""
     rows = draw(st.sampled_from([0, 1, 2]) | st.integers(0, 40) | st.integers(41, MOST_ROWS))
     names = (
         draw(st.lists(_names, max_size=columns, unique=True))
@@ -31,12 +31,14 @@ def tables(draw: st.DrawFn, *, columns: int = 6) -> pa.Table:
         else draw(st.lists(_names, min_size=1, max_size=columns, unique=True))
     )
     rng = np.random.default_rng(draw(st.integers(0, 2**32)))
-    order = _order(rows, draw(st.sampled_from([1, 2, 50])), rng)  # of all columns, so that whole rows repeat
+    order = _order(
+        rows, draw(st.sampled_from([1, 2, 50])), rng
+    )  # Rows of the values of all columns, so that full rows repeat.
     fields, arrays = [], []
     for name in names:
         kind = draw(st.sampled_from(TYPES))
-        some = pa.array(draw(st.lists(st.none() | _value(kind), min_size=1, max_size=6)), _raw(kind))
-        array = some.take(pa.array(order % len(some))) if rows else some.slice(0, 0)
+        distinct_values = pa.array(draw(st.lists(st.none() | _value(kind), min_size=1, max_size=6)), _raw(kind))
+        array = distinct_values.take(pa.array(order % len(distinct_values))) if rows else distinct_values.slice(0, 0)
         arrays.append(array.view(kind) if pa.types.is_floating(kind) else array)
         fields.append(pa.field(name, kind, metadata=draw(_metadata) or None))
     return pa.Table.from_arrays(arrays, schema=pa.schema(fields))
@@ -51,8 +53,8 @@ def bits(table: pa.Table) -> list[tuple[Any, ...]]:
 
 
 def _values(column: pa.ChunkedArray) -> list[Any]:
-    whole = column.combine_chunks()
-    return list((whole.view(_raw(whole.type)) if pa.types.is_floating(whole.type) else whole).to_pylist())
+    array = column.combine_chunks()
+    return list((array.view(_raw(array.type)) if pa.types.is_floating(array.type) else array).to_pylist())
 
 
 def _raw(kind: pa.DataType) -> pa.DataType:

@@ -14,10 +14,10 @@ def run(folder: Path, commands: Sequence[str]) -> None:
 
     Each in a process of its own would spend most of its time on imports.
     """
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, __file__], cwd=folder, input=json.dumps(commands), capture_output=True, text=True, check=False
     )
-    assert done.returncode == 0, f"{done.stdout}\n{done.stderr}"
+    assert process.returncode == 0, f"{process.stdout}\n{process.stderr}"
 
 
 def main() -> None:

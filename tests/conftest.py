@@ -42,10 +42,10 @@ pulse = toy_sensor:Pulse
 """
 
 settings.register_profile("tacpipe", deadline=None, max_examples=40)  # nothing is timed in tests
-settings.register_profile("faults", deadline=None, max_examples=500)  # for `make test-faults`
+settings.register_profile("faults", deadline=None, max_examples=500)  # `make test-faults` runs with it.
 settings.load_profile("tacpipe")
 
-if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as under nohup: programs that the tests interrupt inherit it
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # Under nohup, programs that the tests interrupt inherit it.
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
@@ -60,13 +60,13 @@ def pytest_collection_finish(session: pytest.Session) -> None:
 
 
 def name_signals() -> None:
-    """Have a signal that would end this process without a word named first: else a worker dies and nobody knows why."""
+    """Have a signal that would end this process print its name first: else a worker dies and nobody knows why."""
     error = os.dup(2)  # now: while tests run it is captured, and what is captured dies with the process
 
     def name(number: int, frame: FrameType | None) -> None:
         test = os.environ.get("PYTEST_CURRENT_TEST", "no test")
-        told = f"\nprocess {os.getpid()} of pytest ends by {signal.Signals(number).name} in {test}:\n"
-        os.write(error, (told + "".join(traceback.format_stack(frame, limit=4))).encode())
+        message = f"\nprocess {os.getpid()} of pytest ends by {signal.Signals(number).name} in {test}:\n"
+        os.write(error, (message + "".join(traceback.format_stack(frame, limit=4))).encode())
         signal.signal(number, signal.SIG_DFL)
         os.kill(os.getpid(), number)
 
@@ -83,21 +83,21 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--faults", default="1/1", help="K/N: of those marked faults, run each Nth from the Kth.")
 
 
-@pytest.hookimpl(trylast=True)  # after markers chose what runs
+@pytest.hookimpl(trylast=True)  # The markers choose what runs first.
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     faults = {id(item) for item in items if item.get_closest_marker("faults")}
     slow = {id(item) for item in items if item.get_closest_marker("long") or item.get_closest_marker("rig")} - faults
-    left = left_out([id(item) for item in items if id(item) in slow], config.getoption("--slow"))
-    left |= left_out([id(item) for item in items if id(item) in faults], config.getoption("--faults"))
-    left |= left_out([id(item) for item in items], config.getoption("--every"))
-    config.hook.pytest_deselected(items=[item for item in items if id(item) in left])
-    items[:] = [item for item in items if id(item) not in left]
+    deselected = left_out([id(item) for item in items if id(item) in slow], config.getoption("--slow"))
+    deselected |= left_out([id(item) for item in items if id(item) in faults], config.getoption("--faults"))
+    deselected |= left_out([id(item) for item in items], config.getoption("--every"))
+    config.hook.pytest_deselected(items=[item for item in items if id(item) in deselected])
+    items[:] = [item for item in items if id(item) not in deselected]
 
 
 def left_out(items: Sequence[int], part: str) -> set[int]:
     """Return those of the items that do not belong to a part ``K/N``, which is each Nth from the Kth; N alone is 1/N."""
-    first, _, every = part.rpartition("/")
-    return {item for number, item in enumerate(items, 1) if (number - int(first or 1)) % int(every)}
+    first, _, step = part.rpartition("/")
+    return {item for number, item in enumerate(items, 1) if (number - int(first or 1)) % int(step)}
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -108,7 +108,7 @@ def pytest_xdist_auto_num_workers() -> int:
 
 @dataclass
 class Ran:
-    """What a command printed, and how it ended."""
+    """Exit code and output of a command."""
 
     code: int
     out: str
@@ -139,9 +139,9 @@ class Lab:
 
 
 def sample_data() -> Path:
-    """Return where published recordings lie, if they are there."""
-    named = os.environ.get("TACPIPE_SAMPLE_DATA")
-    return Path(named) if named else Path(__file__).parents[2] / "shared" / "data"
+    """Return the folder in which published recordings are looked for."""
+    configured = os.environ.get("TACPIPE_SAMPLE_DATA")
+    return Path(configured) if configured else Path(__file__).parents[2] / "shared" / "data"
 
 
 @pytest.fixture(scope="session")
@@ -204,7 +204,9 @@ def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path],
     with (folder / "lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not (folder / "whole").exists():
-            shutil.rmtree(folder / "content", ignore_errors=True)  # what failed another worker fails this one too
+            shutil.rmtree(
+                folder / "content", ignore_errors=True
+            )  # An attempt that failed in another worker fails in this one too.
             (folder / "content").mkdir()
             make(folder / "content")
             (folder / "whole").touch()

@@ -16,7 +16,7 @@ from tacpipe.io.parquet import ParquetTable, to_parquet
 
 
 class _Fake:
-    """What a stage sees of one recording."""
+    """A recording as a stage sees it."""
 
     tables: Mapping[str, pa.Table]
     name: str
@@ -60,7 +60,7 @@ class FakeShard(_Fake):
 
 @dataclass
 class FakeDataset:
-    """What a stage sees of a dataset: recordings by name, and files."""
+    """A dataset as a stage sees it: recordings by name, and files."""
 
     recordings: Mapping[str, Any] = field(default_factory=dict)
     files: Mapping[str, bytes] = field(default_factory=dict)

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 FILE = Path(__file__).parent / "golden" / "digests.json"
-DIGITS = {"double": 6, "float": 4}  # of a column's largest value: another machine may differ beyond
-RAW = "simulate touch --raw --trials 2 --seed 7 -o raw"  # what `segment grasps` reads; its values are in those below
+DIGITS = {"double": 6, "float": 4}  # Digits relative to a column's largest value: another machine may differ beyond.
+RAW = "simulate touch --raw --trials 2 --seed 7 -o raw"  # `segment grasps` reads it; its values are in those below.
 COMMANDS = {
     "simulate.forward": "simulate forward --trials 3 --duration-s 4 --seed 7 -o {0}",
     "synchronize": "synchronize simulate.forward --rate-hz 50 --values interpolate -o {0}",
@@ -33,7 +33,7 @@ def values_digest(path: Path) -> str:
     import tacpipe
     from tacpipe.io.hashing import bytes_digest, digest
 
-    found: dict[str, Any] = {}
+    digests: dict[str, Any] = {}
     for name, shard in tacpipe.open(path).recordings.items():
         for stream in shard.streams:
             table = shard.table(stream)
@@ -44,8 +44,8 @@ def values_digest(path: Path) -> str:
                     content = (np.nan_to_num(values / largest, nan=9.0).round(DIGITS[str(field.type)]) + 0.0).tobytes()
                 else:
                     content = json.dumps(column.to_pylist()).encode()
-                found[f"{name}/{stream}/{field.name}"] = bytes_digest(content)
-    return digest(found)
+                digests[f"{name}/{stream}/{field.name}"] = bytes_digest(content)
+    return digest(digests)
 
 
 def current() -> dict[str, dict[str, Any]]:
@@ -56,20 +56,20 @@ def current() -> dict[str, dict[str, Any]]:
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / ".tacpipe").mkdir()
         commands.run(Path(folder), [RAW, *(command.format(name) for name, command in COMMANDS.items())])
-        found = {}
+        digests = {}
         for name in COMMANDS:
             stage = registry.load(name)
             version = [stage.version] + ([stage.fit.version] if stage.fit else [])
-            found[name] = {"version": version, "digest": values_digest(Path(folder) / name)}
-    return found
+            digests[name] = {"version": version, "digest": values_digest(Path(folder) / name)}
+    return digests
 
 
 def bless() -> None:
     """Write the digests; refuse one that changed under an unchanged version."""
-    known = json.loads(FILE.read_text()) if FILE.exists() else {}
+    pinned = json.loads(FILE.read_text()) if FILE.exists() else {}
     now = current()
     for name, value in now.items():
-        before = known.get(name)
+        before = pinned.get(name)
         if before and before["version"] == value["version"] and before["digest"] != value["digest"]:
             sys.exit(f"{name} gives other values under the same version {value['version']}: raise its version first.")
     FILE.write_text(json.dumps(now, indent=1, sort_keys=True) + "\n")

@@ -18,7 +18,7 @@ PITCH_M = 4e-3
 SKIN_HZ, ARM_HZ = 100, 500
 PERIODS_M = {"cork": 2.2e-3, "foam": 9e-3, "felt": 1.2e-3, "rubber": 4.5e-3}
 STIFFNESS = 2.4e7  # counts of a depth in metres to the power of Hertz
-LAG_S = 0.03  # of the skin behind the load
+LAG_S = 0.03  # The skin lags behind the load.
 
 
 def write(folder: Path, count: int = 20, seconds: float = 8.0, seed: int = 0) -> None:
@@ -37,12 +37,12 @@ def write(folder: Path, count: int = 20, seconds: float = 8.0, seed: int = 0) ->
         counts = np.rint(np.clip(counts + rng.normal(0, 1.5, counts.shape), 0, 65535)).astype(int)
         names = [f"t{row}{column}" for row in range(SIDE) for column in range(SIDE)]
         skin = pd.DataFrame(counts, columns=names)
-        skin.insert(0, "time", [f"{start_s + one:.6f}" for one in skin_s])
+        skin.insert(0, "time", [f"{start_s + t_s:.6f}" for t_s in skin_s])
         skin.to_csv(place / "skin.csv", index=False)
         arm = pd.DataFrame(position_m, columns=["x", "y", "z"]).assign(
             qx=np.sin(tilt_rad / 2), qy=0.0, qz=0.0, qw=np.cos(tilt_rad / 2)
         )
-        arm.insert(0, "time", [f"{start_s + one:.6f}" for one in time_s])
+        arm.insert(0, "time", [f"{start_s + t_s:.6f}" for t_s in time_s])
         arm.to_csv(place / "arm.csv", index=False, float_format="%.8f")
         (place / "labels.yaml").write_text(f"material: {material}\nobject: plate_{trial % 5 + 1}\n")
 
@@ -54,9 +54,9 @@ def moved(rng: np.random.Generator, seconds: float) -> tuple[AnyFloats, AnyFloat
     height = np.interp(
         time_s, [0, down, down + 0.3, up, up + 0.25, seconds], [0.01, 0.004, -press_m, -press_m, 0.01, 0.01]
     )
-    within = np.clip((time_s - down - 0.3) / 0.3, 0, 1) * np.clip((up - 0.1 - time_s) / 0.3, 0, 1)
+    sliding = np.clip((time_s - down - 0.3) / 0.3, 0, 1) * np.clip((up - 0.1 - time_s) / 0.3, 0, 1)
     waves = zip(rng.uniform(0.1, 0.3, 3), rng.uniform(0.4, 1.8, 3), rng.uniform(0, 2 * np.pi, 3), strict=True)
-    height += within * sum(press_m * size * np.sin(2 * np.pi * hz * time_s + phase) for size, hz, phase in waves)
+    height += sliding * sum(press_m * size * np.sin(2 * np.pi * hz * time_s + phase) for size, hz, phase in waves)
     speed = 0.02 * np.clip((time_s - down - 0.4) / 0.1, 0, 1) * np.clip((up - 0.1 - time_s) / 0.1, 0, 1)
     along = 0.3 + np.cumsum(speed) / ARM_HZ + rng.uniform(-0.01, 0.01)
     tilt_rad = 0.02 * np.sin(2 * np.pi * 0.2 * time_s + rng.uniform(0, 2 * np.pi))
@@ -72,7 +72,9 @@ def pressed(
     tilt_rad: AnyFloats,
 ) -> AnyFloats:
     """Return the load of each taxel (time, taxel) in counts."""
-    along, height, tilt = (np.interp(skin_s, time_s, one) for one in (position_m[:, 0], position_m[:, 2], tilt_rad))
+    along, height, tilt = (
+        np.interp(skin_s, time_s, values) for values in (position_m[:, 0], position_m[:, 2], tilt_rad)
+    )
     place = np.tile(np.arange(SIDE) * PITCH_M, SIDE)  # (taxel,), along the slide
     texture = sum(
         np.sin(2 * np.pi * order * (along[:, None] + place) / period_m + rng.uniform(0, 2 * np.pi)) / order
@@ -80,8 +82,8 @@ def pressed(
     )
     depth_m = np.clip(tilt[:, None] * (place - place.mean()) / 2 - height[:, None], 0, None)
     load: AnyFloats = STIFFNESS * depth_m**1.5 * (1 + 0.12 * texture)
-    kept = np.exp(-1 / SKIN_HZ / LAG_S)
-    found: AnyFloats = np.zeros_like(load)
+    decay = np.exp(-1 / SKIN_HZ / LAG_S)
+    lagged: AnyFloats = np.zeros_like(load)
     for row in range(1, len(load)):
-        found[row] = kept * found[row - 1] + (1 - kept) * load[row]
-    return found
+        lagged[row] = decay * lagged[row - 1] + (1 - decay) * load[row]
+    return lagged

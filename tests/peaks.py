@@ -35,8 +35,8 @@ def bytes_of(folder: Path, command: str, constants: Mapping[str, int] = MappingP
     words = [sys.executable, "-c", PROGRAM, json.dumps(dict(constants)), *shlex.split(command)]
     environment = {name: value for name, value in os.environ.items() if name != "TACPIPE_STORE"}
     environment |= {"OMP_NUM_THREADS": "1", "TMPDIR": str(folder), "COLUMNS": "120"}
-    done = subprocess.run(words, cwd=folder, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    name, kilobytes = done.stdout.splitlines()[-1].split()
+    process = subprocess.run(words, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    assert process.returncode == 0, process.stderr
+    name, kilobytes = process.stdout.splitlines()[-1].split()
     assert name == "peak"
     return int(kilobytes) << 10

@@ -11,7 +11,7 @@ import pytest
 from tests import lab_recordings
 from tests.conftest import Lab
 
-ANSWERS = {  # of who knows the rig: the line that has it, and what replaces its "?"
+ANSWERS = {  # Answers of a user who knows the rig: the line that has it, and what replaces its "?".
     r'match = "[xyz]"': {"quantity": "position", "unit": "m"},
     r'match = "t\{taxel\}"': {"quantity": "tactile", "unit": "count"},
     r"^sensor = ": {"sensor": "lab-array"},

@@ -62,10 +62,10 @@ def publish(lab: Lab, path: str, tables: dict[str, dict[str, pa.Table]], **label
             "attributes": {label: values[place] for label, values in labels.items() if values[place] is not None},
             "shards": {
                 stream: {**vars(store.put(to_parquet(table))), "rows": table.num_rows}
-                for stream, table in several.items()
+                for stream, table in streams.items()
             },
         }
-        for place, (name, several) in enumerate(tables.items())
+        for place, (name, streams) in enumerate(tables.items())
     }
     directory.publish(store, Manifest("scale", 1, {"factor": 2}, recordings=entries), lab.folder / path)
     return tacpipe.open(lab.folder / path)
@@ -93,8 +93,8 @@ def test_importing_tacpipe_imports_nothing_heavy_and_every_public_name_is_there(
         "missing = [name for name in tacpipe.__all__ if not hasattr(tacpipe, name) or name not in dir(tacpipe)];"
         "print(json.dumps([before, missing, sorted(name.partition('.')[0] for name in sys.modules)]))"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    before, missing, after = json.loads(done.stdout)
+    process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    before, missing, after = json.loads(process.stdout)
     assert not set(before) & HEAVY and not missing
     assert not set(after) & HEAVY  # the classes of datasets are light too
 
@@ -103,12 +103,14 @@ def test_the_public_names_are_those_promised_and_documented() -> None:
     assert set(inspect.get_annotations(calling.How)) <= set(inspect.signature(tacpipe.run).parameters)
     promised = {"open", "load", "run", "Dataset", "Recording", "RecordingOutput", "Result", "stage", "Stage"}
     assert promised | {"__version__", "TacpipeError", "UsageError"} <= set(tacpipe.__all__)
-    errors = {found for _, found in inspect.getmembers(tacpipe.errors, inspect.isclass) if issubclass(found, Exception)}
-    assert {found.__name__ for found in errors if found.__module__ == "tacpipe.errors"} <= set(tacpipe.__all__)
+    errors = {
+        member for _, member in inspect.getmembers(tacpipe.errors, inspect.isclass) if issubclass(member, Exception)
+    }
+    assert {error.__name__ for error in errors if error.__module__ == "tacpipe.errors"} <= set(tacpipe.__all__)
     for name in tacpipe.__all__:
-        found = getattr(tacpipe, name)
-        assert name == "__version__" or (found.__doc__ or "").strip(), name
-        members = inspect.getmembers(found) if inspect.isclass(found) and not issubclass(found, Exception) else []
+        public = getattr(tacpipe, name)
+        assert name == "__version__" or (public.__doc__ or "").strip(), name
+        members = inspect.getmembers(public) if inspect.isclass(public) and not issubclass(public, Exception) else []
         for member, value in members:
             if not member.startswith("_") and (inspect.isfunction(value) or isinstance(value, property)):
                 assert (inspect.getdoc(value) or "").strip(), f"{name}.{member}"
@@ -117,9 +119,9 @@ def test_the_public_names_are_those_promised_and_documented() -> None:
 
 
 def test_no_param_of_a_built_in_stage_shares_its_name_with_an_argument_of_run() -> None:
-    taken = set(inspect.signature(tacpipe.run).parameters) - {"params", "name", "datasets"}
+    arguments = set(inspect.signature(tacpipe.run).parameters) - {"params", "name", "datasets"}
     for name in registry.stages():
-        assert not taken & set(params_of.fields(registry.load(name))), name
+        assert not arguments & set(params_of.fields(registry.load(name))), name
 
 
 # ---- run
@@ -129,8 +131,8 @@ def test_run_answers_what_the_command_computed_and_the_other_way_round(lab: Lab)
     lab.run("simulate toy -o data/r --trials 3")
     lab.run("scale data/r -o data/s --factor 3")
     before = lab.store.roots.get((lab.folder / "data/s").absolute())
-    made = tacpipe.run("scale", "data/r", output="data/s", factor=3)
-    assert made.path == lab.folder / "data/s" and made.manifest["params"]["factor"] == 3
+    dataset = tacpipe.run("scale", "data/r", output="data/s", factor=3)
+    assert dataset.path == lab.folder / "data/s" and dataset.manifest["params"]["factor"] == 3
     assert lab.store.roots.get((lab.folder / "data/s").absolute()) == before
     tacpipe.run("scale", tacpipe.open("data/r"), output=Path("data/five"), factor=5)
     assert json.loads(lab.run("scale data/r -o data/five --factor 5 --json").out)["reused"] == 3
@@ -141,8 +143,10 @@ def test_run_splits_fits_and_writes_one_file_like_the_commands(lab: Lab) -> None
     tacpipe.run("scale", "data/r", output="data/s")
     split = tacpipe.run("halves", "data/s", output="data/split")
     centred = tacpipe.run("centre", "data/s", split="data/split", output="data/c")
-    again = tacpipe.run("centre", "data/s", codec=centred, output="data/c2")
-    assert centred.digest == again.digest and [one.name for one in again] == [f"trial-{n:03d}" for n in range(4)]
+    recentred = tacpipe.run("centre", "data/s", codec=centred, output="data/c2")
+    assert centred.digest == recentred.digest and [recording.name for recording in recentred] == [
+        f"trial-{n:03d}" for n in range(4)
+    ]
     assert set(centred.select(split=split, role="train").recordings) == {"trial-000", "trial-001"}
     page = tacpipe.run("page", "data/s", output="page.html")
     assert page == Path("page.html") and page.read_text() == "<p>4 recordings</p>"
@@ -153,7 +157,7 @@ def test_run_splits_fits_and_writes_one_file_like_the_commands(lab: Lab) -> None
 
 
 @pytest.mark.parametrize(
-    ("given", "named"),
+    ("options", "words"),
     [
         ({"faktor": 3}, "faktor"),
         ({"factor": "many"}, "many"),
@@ -164,10 +168,10 @@ def test_run_splits_fits_and_writes_one_file_like_the_commands(lab: Lab) -> None
     ],
 )
 def test_run_refuses_a_wrong_keyword_or_value_before_anything_is_read(
-    lab: Lab, given: dict[str, Any], named: str
+    lab: Lab, options: dict[str, Any], words: str
 ) -> None:
-    with pytest.raises(tacpipe.UsageError, match=named):
-        tacpipe.run("scale", "data/none", output="data/s", **given)
+    with pytest.raises(tacpipe.UsageError, match=words):
+        tacpipe.run("scale", "data/none", output="data/s", **options)
     assert not (lab.folder / "data").exists()
 
 
@@ -186,18 +190,18 @@ def test_run_shows_no_progress_and_warns_of_recordings_that_it_left_out(
     (lab.folder / "numbers").mkdir()
     for name, text in (("good", "1 2"), ("bad", "1 x")):
         (lab.folder / "numbers" / f"{name}.txt").write_text(text)
-    with pytest.warns(tacpipe.ResultWarning, match=r"bad.*x") as found:
-        made = tacpipe.run("ingest.numbers", "numbers", output="data/n", skip_bad=True)
-    assert {Path(one.filename).name for one in found} == {Path(__file__).name}
-    assert [one.name for one in made] == ["good"]
+    with pytest.warns(tacpipe.ResultWarning, match=r"bad.*x") as warnings:
+        dataset = tacpipe.run("ingest.numbers", "numbers", output="data/n", skip_bad=True)
+    assert {Path(warning.filename).name for warning in warnings} == {Path(__file__).name}
+    assert [recording.name for recording in dataset] == ["good"]
     assert capsys.readouterr() == ("", "")
 
 
 def test_a_script_without_a_guard_runs_once_and_its_workers_do_not_run_it(lab: Lab) -> None:
     script = "import tacpipe\nprint('once')\ntacpipe.run('simulate.toy', output='data/r', trials=9, jobs=2)\n"
     (lab.folder / "script.py").write_text(script)
-    done = subprocess.run([sys.executable, "script.py"], capture_output=True, text=True)
-    assert (done.returncode, done.stdout, done.stderr) == (0, "once\n", "")
+    process = subprocess.run([sys.executable, "script.py"], capture_output=True, text=True)
+    assert (process.returncode, process.stdout, process.stderr) == (0, "once\n", "")
     assert len(tacpipe.open("data/r")) == 9
 
 
@@ -206,7 +210,7 @@ def test_a_script_without_a_guard_runs_once_and_its_workers_do_not_run_it(lab: L
 
 def test_a_dataset_is_a_collection_of_its_recordings_by_name(four: Dataset) -> None:
     names = [f"trial-{place:03d}" for place in range(4)]
-    assert len(four) == 4 and [one.name for one in four] == names and list(four.recordings) == names
+    assert len(four) == 4 and [recording.name for recording in four] == names and list(four.recordings) == names
     assert four["trial-002"] is four.recordings["trial-002"] and "trial-002" in four and "trial-009" not in four
     with pytest.raises(tacpipe.UsageError, match="trial-009"):
         four["trial-009"]
@@ -214,27 +218,27 @@ def test_a_dataset_is_a_collection_of_its_recordings_by_name(four: Dataset) -> N
 
 
 def test_a_stream_of_a_synchronized_recording_has_the_names_with_which_it_was_recorded(four: Dataset) -> None:
-    one = four["trial-001"]
-    assert one.table("left").to_pydict() == {"t_ns": [n * STEP_NS for n in range(12)], "x": list(range(12))}
-    assert one.table("arm", ["force_n"]).column_names == ["force_n"]
-    assert one.table().column_names == synced().column_names
+    recording = four["trial-001"]
+    assert recording.table("left").to_pydict() == {"t_ns": [n * STEP_NS for n in range(12)], "x": list(range(12))}
+    assert recording.table("arm", ["force_n"]).column_names == ["force_n"]
+    assert recording.table().column_names == synced().column_names
     with pytest.raises(tacpipe.UsageError, match=r"right.*left"):
-        one.table("right")
+        recording.table("right")
     assert four.to_pandas("left").columns.tolist() == ["recording", "t_ns", "x"]
 
 
 def test_labels_are_one_row_a_recording_in_types_that_hold_them(four: Dataset) -> None:
-    found = four.labels
-    assert found.index.tolist() == list(four.recordings) and found.index.name == "recording"
-    assert found["object"].tolist()[:3] == ["cup", "egg", "cup"] and found["object"].isna().tolist() == [False] * 3 + [
-        True
-    ]
-    assert found["speed_m_s"].dtype == np.float64 and found["trial"].dtype == pd.Int64Dtype()
+    labels = four.labels
+    assert labels.index.tolist() == list(four.recordings) and labels.index.name == "recording"
+    assert labels["object"].tolist()[:3] == ["cup", "egg", "cup"] and labels["object"].isna().tolist() == [
+        False
+    ] * 3 + [True]
+    assert labels["speed_m_s"].dtype == np.float64 and labels["trial"].dtype == pd.Int64Dtype()
 
 
 def test_select_keeps_the_recordings_that_meet_every_condition(four: Dataset, lab: Lab) -> None:
     def chosen(*names: str, **conditions: Any) -> list[int]:
-        return [int(one.name[-3:]) for one in four.select(*names, **conditions)]
+        return [int(recording.name[-3:]) for recording in four.select(*names, **conditions)]
 
     assert chosen("trial-00[12]") == [1, 2]
     assert chosen(object="cup") == [0, 2]
@@ -279,10 +283,10 @@ def test_frames_hold_the_rows_of_all_recordings_and_labels_if_asked(four: Datase
 
 
 def test_a_label_that_shares_its_name_with_a_column_is_refused_by_name(lab: Lab) -> None:
-    found = publish(lab, "data/one", {"a": {"": pa.table({"x": [1]})}}, x=["label"], y=[3])
+    dataset = publish(lab, "data/one", {"a": {"": pa.table({"x": [1]})}}, x=["label"], y=[3])
     with pytest.raises(tacpipe.UsageError, match=r"\['y'\]"):
-        found.to_pandas(labels=True)
-    assert found.to_pandas(labels=["y"])["y"].tolist() == [3]
+        dataset.to_pandas(labels=True)
+    assert dataset.to_pandas(labels=["y"])["y"].tolist() == [3]
 
 
 def test_duckdb_has_a_view_a_stream_and_one_of_the_labels(lab: Lab, four: Dataset) -> None:
@@ -293,31 +297,31 @@ def test_duckdb_has_a_view_a_stream_and_one_of_the_labels(lab: Lab, four: Datase
         "group by object order by object"
     ).fetchall()
     assert sums == [("cup", 2 * sum(range(12))), ("egg", sum(range(12)))]
-    apart = publish(lab, "data/apart", {"a": {"left": pa.table({"x": [1, 2]})}, "b": {"right": pa.table({"y": [3]})}})
-    views = apart.duckdb()
+    unlike = publish(lab, "data/apart", {"a": {"left": pa.table({"x": [1, 2]})}, "b": {"right": pa.table({"y": [3]})}})
+    views = unlike.duckdb()
     assert [row[0] for row in views.sql("show tables").fetchall()] == ["labels", "left", "right"]
     assert views.sql('select recording, y from "right"').fetchall() == [("b", 3)]
 
 
 def test_a_dataset_describes_itself_and_nothing_of_it_reaches_a_notebook_as_markup(lab: Lab) -> None:
     word = "<script>alert(1)</script>"
-    found = publish(lab, "data/odd", {"a": {"": synced()}}, object=[word])
-    text = repr(found)
+    dataset = publish(lab, "data/odd", {"a": {"": synced()}}, object=[word])
+    text = repr(dataset)
     for part in ("scale", "factor=2", "1: a", "50 Hz", "left", "arm", word):
         assert part in text
-    markup = found._repr_html_()
+    markup = dataset._repr_html_()
     assert word not in markup and html.escape(word) in markup and len(markup) < 2000
     assert "of 2" in repr(publish(lab, "data/two", {n: {"": synced()} for n in "ab"}).select("a"))
     (lab.folder / "data/odd/a.parquet").unlink()
-    Path(lab.store.object_path(found["a"].digest)).unlink()
-    assert "not readable" in repr(tacpipe.open("data/odd"))  # to look at a damaged dataset is no error
+    Path(lab.store.object_path(dataset["a"].digest)).unlink()
+    assert "not readable" in repr(tacpipe.open("data/odd"))  # Looking at a damaged dataset is no error.
 
 
 def test_a_dataset_and_a_recording_can_be_pickled(four: Dataset) -> None:
     part = pickle.loads(pickle.dumps(four.select(object="cup")))
-    assert [one.name for one in part] == ["trial-000", "trial-002"] and part.path == four.path
-    one = pickle.loads(pickle.dumps(four["trial-001"]))
-    assert one.table().equals(four["trial-001"].table()) and one.attributes == four["trial-001"].attributes
+    assert [recording.name for recording in part] == ["trial-000", "trial-002"] and part.path == four.path
+    recording = pickle.loads(pickle.dumps(four["trial-001"]))
+    assert recording.table().equals(four["trial-001"].table()) and recording.attributes == four["trial-001"].attributes
 
 
 # ---- windows
@@ -327,16 +331,16 @@ def oracle(table: pa.Table, context: int, horizon: int, stride: int) -> list[int
     """Return the first rows of windows, looked for one by one."""
     t_ns, force = table["t_ns"].to_numpy(), table["arm_force_n"].to_numpy()
     bad = table["left_gap"].to_numpy() | ~np.isfinite(force)
-    found, run = [], 0
+    starts, run = [], 0
     for row in range(len(t_ns)):
         if bad[row] or (row and (bad[row - 1] or t_ns[row] - t_ns[row - 1] > 1.5 * STEP_NS)):
             run = row + bad[row]
         if not bad[row] and (row - run) % stride == 0:
             rows = range(row, row + context + horizon)
-            whole = rows[-1] < len(t_ns) and not bad[list(rows)].any()
-            if whole and (np.diff(t_ns[list(rows)]) < 1.5 * STEP_NS).all():
-                found.append(row)
-    return found
+            complete = rows[-1] < len(t_ns) and not bad[list(rows)].any()
+            if complete and (np.diff(t_ns[list(rows)]) < 1.5 * STEP_NS).all():
+                starts.append(row)
+    return starts
 
 
 @pytest.mark.parametrize(("context", "horizon", "stride"), [(2, 1, 1), (3, 2, 2), (6, 6, 1), (1, 1, 5)])
@@ -350,22 +354,22 @@ def test_windows_are_those_of_one_recording_without_a_gap_a_late_row_or_a_missin
         "nan": synced(nan=3),
         "short": synced(2),
     }
-    found = publish(lab, "data/w", {name: {"": table} for name, table in tables.items()})
-    windows = found.windows(context, horizon, stride=stride)
-    wanted = [(name, row) for name in sorted(tables) for row in oracle(tables[name], context, horizon, stride)]
-    assert len(windows) == len(wanted) and windows.columns == ("left_x", "arm_force_n")
-    for index, (name, row) in enumerate(wanted):
-        one = windows[index]
-        assert one["recording"] == name
+    dataset = publish(lab, "data/w", {name: {"": table} for name, table in tables.items()})
+    windows = dataset.windows(context, horizon, stride=stride)
+    expected = [(name, row) for name in sorted(tables) for row in oracle(tables[name], context, horizon, stride)]
+    assert len(windows) == len(expected) and windows.columns == ("left_x", "arm_force_n")
+    for index, (name, row) in enumerate(expected):
+        window = windows[index]
+        assert window["recording"] == name
         rows = tables[name].slice(row, context + horizon)
-        assert one["t_ns"].tolist() == rows["t_ns"].to_pylist() and one["t_ns"].dtype == torch.int64
-        values = torch.cat([one["past"], one["future"]])
+        assert window["t_ns"].tolist() == rows["t_ns"].to_pylist() and window["t_ns"].dtype == torch.int64
+        values = torch.cat([window["past"], window["future"]])
         assert values.tolist() == [
             list(pair) for pair in zip(*(rows[n].to_pylist() for n in windows.columns), strict=True)
         ]
-        assert one["past"].shape == (context, 2) and one["past"].dtype == torch.float32
+        assert window["past"].shape == (context, 2) and window["past"].dtype == torch.float32
     with pytest.raises(IndexError):
-        windows[len(wanted)]
+        windows[len(expected)]
 
 
 def test_windows_go_through_a_loader_in_worker_processes_and_read_nothing_before(four: Dataset) -> None:
@@ -394,7 +398,7 @@ def test_windows_separate_inputs_and_targets_by_names_and_patterns(four: Dataset
     assert window["past"].tolist() == [[1.5, 3.0], [2.0, 4.0]]
     assert window["future"].tolist() == [[5.0]]
     assert four.windows(2, 1, targets=["left_*"]).inputs == ("left_x", "arm_force_n")  # masks match no pattern
-    assert four.windows(2, 1, columns=["*_x"]).columns == ("left_x",)  # and neither does ground truth
+    assert four.windows(2, 1, columns=["*_x"]).columns == ("left_x",)  # Ground truth matches no pattern either.
     with pytest.raises(tacpipe.UsageError, match=r"right_\*.*left_x"):
         len(four.windows(2, 1, inputs=["right_*"]))
     with pytest.raises(tacpipe.UsageError, match="columns"):
@@ -412,28 +416,28 @@ def test_windows_subtract_the_level_at_rest_of_tactile_channels(four: Dataset) -
 
 def test_windows_are_scaled_by_the_rows_that_they_hold_or_as_others_are(lab: Lab) -> None:
     tables = {"a": synced(nan=11), "b": synced(7, gap=0)}  # the last row of a and the first of b are in no window
-    found = publish(lab, "data/w", {name: {"": table} for name, table in tables.items()})
-    rows = np.concatenate([np.arange(11.0), np.arange(1, 7.0)])  # of left_x
-    windows = found.windows(2, 1, inputs=["left_x"], targets=["arm_force_n"], scale=True, dtype="float64")
+    dataset = publish(lab, "data/w", {name: {"": table} for name, table in tables.items()})
+    rows = np.concatenate([np.arange(11.0), np.arange(1, 7.0)])  # Values of left_x.
+    windows = dataset.windows(2, 1, inputs=["left_x"], targets=["arm_force_n"], scale=True, dtype="float64")
     np.testing.assert_allclose(windows[4]["past"][:, 0], (np.array([4, 5]) - rows.mean()) / rows.std())
     np.testing.assert_allclose(windows[4]["future"][0], (6 / 2 - rows.mean() / 2) / (rows.std() / 2))
     np.testing.assert_allclose(windows.unscaled(windows[4]["future"]), [[3.0]])
-    one = found.select("b").windows(2, 1, columns=["left_x"], scale=windows, dtype="float64")
-    np.testing.assert_allclose(one[0]["past"][:, 0], (np.array([1, 2]) - rows.mean()) / rows.std())
-    sent = pickle.loads(pickle.dumps(one))
-    assert torch.equal(sent[0]["past"], one[0]["past"])
+    rescaled = dataset.select("b").windows(2, 1, columns=["left_x"], scale=windows, dtype="float64")
+    np.testing.assert_allclose(rescaled[0]["past"][:, 0], (np.array([1, 2]) - rows.mean()) / rows.std())
+    sent = pickle.loads(pickle.dumps(rescaled))
+    assert torch.equal(sent[0]["past"], rescaled[0]["past"])
     with pytest.raises(tacpipe.UsageError, match="not scaled"):
-        found.windows(2, 1, scale=found.windows(2, 1))[0]
+        dataset.windows(2, 1, scale=dataset.windows(2, 1))[0]
     with pytest.raises(tacpipe.UsageError, match="arm_force_n"):
-        found.windows(2, 1, scale=found.windows(2, 1, columns=["left_x"], scale=True))[0]
+        dataset.windows(2, 1, scale=dataset.windows(2, 1, columns=["left_x"], scale=True))[0]
 
 
 def test_windows_refuse_unlike_channels_and_integers_that_they_would_round(lab: Lab) -> None:
     long = pa.table({"t_ns": [0, 1, 2], "x": [1 << 24, (1 << 24) + 1, 0]})
-    one = publish(lab, "data/long", {"a": {"": long}})
+    long_dataset = publish(lab, "data/long", {"a": {"": long}})
     with pytest.raises(tacpipe.UsageError, match="float64"):
-        len(one.windows(1, 1))
-    assert one.windows(1, 1, dtype="float64")[0]["future"].tolist() == [[float((1 << 24) + 1)]]
+        len(long_dataset.windows(1, 1))
+    assert long_dataset.windows(1, 1, dtype="float64")[0]["future"].tolist() == [[float((1 << 24) + 1)]]
     two = publish(lab, "data/unlike", {"a": {"": long}, "b": {"": pa.table({"t_ns": [0, 1], "y": [1.0, 2.0]})}})
     with pytest.raises(tacpipe.UsageError, match="b "):
         len(two.windows(1, 1, dtype="float64"))

@@ -268,10 +268,10 @@ def test_a_model_without_its_package_names_architecture_package_and_version(pack
     (package / "lab_architectures.egg-info" / "entry_points.txt").write_text("")
     forget()
     stage = registry.load("train.forward")
-    for read, of in ((params_of.read, stage.params), (params_of.from_json, stage)):
-        where = ("config.json",) if read is params_of.read else ()
+    for read, owner in ((params_of.read, stage.params), (params_of.from_json, stage)):
+        place = ("config.json",) if read is params_of.read else ()
         with pytest.raises(TacpipeError, match=r"'plain' comes from the package lab-architectures 1\.0"):
-            read(of, stored, *where)
+            read(owner, stored, *place)
 
 
 def test_an_architecture_without_a_way_to_learn_is_no_choice_and_the_reason_names_the_method(package: Path) -> None:
@@ -297,9 +297,9 @@ def test_a_forward_network_is_trained_stored_and_read_back_and_another_shape_is_
 ) -> None:
     from tests.tasks.forward import trials
 
-    made = trials.trained(tmp_path, architecture="plain", epochs=1, baselines=False)
-    assert "network.layer.weight" in str(made["model.safetensors"][:2000])
-    assert json.loads(made["config.json"])["params"]["plugin"] == "lab-architectures 1.0"
+    files = trials.trained(tmp_path, architecture="plain", epochs=1, baselines=False)
+    assert "network.layer.weight" in str(files["model.safetensors"][:2000])
+    assert json.loads(files["config.json"])["params"]["plugin"] == "lab-architectures 1.0"
     with pytest.raises(TacpipeError, match=r"architecture plain returns \(\d+, 2, \d+\).*\(horizon, window, feature\)"):
         trials.trained(tmp_path / "wrong", architecture="plain", returned="wrong", epochs=1)
 
@@ -316,14 +316,14 @@ def test_an_estimator_is_stored_without_pickle_and_the_same_one_has_the_same_byt
 
     params = built("material", architecture="nearest")
     frames, materials = slides(0)
-    one, other = (estimators.Fitted.fit(params, frames, materials) for _ in range(2))
-    content = estimators.packed({"biotac": one}, params)
-    assert content == estimators.packed({"biotac": other}, params)
+    fitted, refitted = (estimators.Fitted.fit(params, frames, materials) for _ in range(2))
+    content = estimators.packed({"biotac": fitted}, params)
+    assert content == estimators.packed({"biotac": refitted}, params)
     assert b"pickle" not in content
     read = estimators.unpacked(content, "model.skops", params)["biotac"]
-    assert np.array_equal(read.scores(slides(1)[0]), one.scores(slides(1)[0]))
+    assert np.array_equal(read.scores(slides(1)[0]), fitted.scores(slides(1)[0]))
     assert read.classes == (0, 1, 2)
-    assert (one.scores(frames).argmax(axis=1) == materials).mean() > 0.8
+    assert (fitted.scores(frames).argmax(axis=1) == materials).mean() > 0.8
     with pytest.raises(TacpipeError, match=r"model\.skops is not a file of skops"):
         estimators.unpacked(content[:-30], "model.skops", params)
 
@@ -348,12 +348,12 @@ def test_a_changed_file_of_an_estimator_is_refused_or_read_and_names_of_other_pa
         members = {name: file.read(name) for name in file.namelist()}
     for module, name in (("os", "system"), (type(params).__module__, "run")):
         call = {"__class__": name, "__module__": module, "__loader__": "FunctionNode", "__id__": 1, "content": name}
-        written, described = io.BytesIO(), json.loads(members["schema.json"])
-        with zipfile.ZipFile(written, "w") as file:
+        archive, described = io.BytesIO(), json.loads(members["schema.json"])
+        with zipfile.ZipFile(archive, "w") as file:
             for member, data in {**members, "schema.json": json.dumps({**described, **call}).encode()}.items():
                 file.writestr(member, data)
         with pytest.raises(TacpipeError, match=rf"holds {module}\.{name}"):
-            estimators.unpacked(written.getvalue(), "model.skops", params)
+            estimators.unpacked(archive.getvalue(), "model.skops", params)
 
 
 def test_types_that_are_not_validated_are_refused_unless_the_architecture_trusts_them(package: Path) -> None:
@@ -379,9 +379,9 @@ def test_features_and_scores_of_another_shape_are_refused(package: Path) -> None
     frames, materials = slides(0)
     fitted = estimators.Fitted.fit(params, frames, materials)
     with pytest.raises(TacpipeError, match=r"30 slides are \(8, 4\)"):
-        dataclasses.replace(fitted, features=lambda given: given.mean(axis=0)).scores(frames)
+        dataclasses.replace(fitted, features=lambda values: values.mean(axis=0)).scores(frames)
     with pytest.raises(TacpipeError, match="not all finite"):
-        dataclasses.replace(fitted, features=lambda given: given.mean(axis=1) * np.nan).scores(frames)
+        dataclasses.replace(fitted, features=lambda values: values.mean(axis=1) * np.nan).scores(frames)
 
 
 def test_plain_networks_of_material_and_touch_are_called_as_they_promise(package: Path) -> None:
@@ -392,15 +392,15 @@ def test_plain_networks_of_material_and_touch_are_called_as_they_promise(package
     from tacpipe.tasks.touch import members
 
     scores = built("material", architecture="scores")
-    made = networks.build(scores, Shape(channels=4, classes=3))
-    networks.check(made, scores, torch.zeros(5, 8, 4), 3)
+    scores_network = networks.build(scores, Shape(channels=4, classes=3))
+    networks.check(scores_network, scores, torch.zeros(5, 8, 4), 3)
     with pytest.raises(TacpipeError, match=r"returns \(2, 3\) for 2 slides.*\(2, 4\)"):
-        networks.check(made, scores, torch.zeros(5, 8, 4), 4)
+        networks.check(scores_network, scores, torch.zeros(5, 8, 4), 4)
     flat = built("touch", architecture="flat")
     network = members.network(flat, ["pdc_th"])
     read = members.patches(flat)
-    found = network(torch.zeros(2, 3, 7, read.channels), torch.zeros(2, read.grasp_numbers))
-    assert found.shape == (2, 1)
+    prediction = network(torch.zeros(2, 3, 7, read.channels), torch.zeros(2, read.grasp_numbers))
+    assert prediction.shape == (2, 1)
 
 
 def test_an_architecture_that_extends_none_of_the_two_is_trained_by_its_own_fit(package: Path, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""What looks at a store while a collection removes things from it: what vanished is not damaged."""
+"""Looking at a store while a collection removes things from it reports nothing that vanished as damaged."""
 
 import shutil
 from collections.abc import Callable, Iterator
@@ -28,17 +28,17 @@ def littered(lab: Lab) -> Lab:
 def between(monkeypatch: pytest.MonkeyPatch, folder: str, act: Callable[[], object]) -> list[int]:
     """Have ``act`` done once, after the next listing of ``folder`` and before its first name is looked at."""
     honest = layout.entries
-    done: list[int] = []
+    listed_counts: list[int] = []
 
     def entries(root: Path, name: str) -> Iterator[Path]:
-        found = list(honest(root, name))
-        if name == folder and not done:
-            done.append(len(found))
+        paths = list(honest(root, name))
+        if name == folder and not listed_counts:
+            listed_counts.append(len(paths))
             act()
-        return iter(found)
+        return iter(paths)
 
     monkeypatch.setattr(layout, "entries", entries)
-    return done
+    return listed_counts
 
 
 @pytest.mark.parametrize("folder", ["objects", "records"])
@@ -47,11 +47,15 @@ def test_what_a_collection_removed_since_it_was_listed_is_not_damaged(
 ) -> None:
     collected: list[garbage.Collected] = []
     store = littered.store
-    done = between(monkeypatch, folder, lambda: collected.append(garbage.collect(Store(store.root), dry_run=False)))
-    found = repair.verify(store)
-    gone = collected[0].objects if folder == "objects" else collected[0].records
-    assert gone > 0 and done[0] - gone == (found.objects if folder == "objects" else found.records)
-    assert found.clean and found.damaged == found.missing == []
+    listed_counts = between(
+        monkeypatch, folder, lambda: collected.append(garbage.collect(Store(store.root), dry_run=False))
+    )
+    soundness = repair.verify(store)
+    removed_count = collected[0].objects if folder == "objects" else collected[0].records
+    assert removed_count > 0 and listed_counts[0] - removed_count == (
+        soundness.objects if folder == "objects" else soundness.records
+    )
+    assert soundness.clean and soundness.damaged == soundness.missing == []
 
 
 def test_what_a_collection_has_moved_aside_is_sound(littered: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -103,11 +107,11 @@ def test_what_a_root_named_at_the_first_look_and_no_more_at_the_second_is_not_mi
     honest = repair._wanted
     looks: list[dict[str, str]] = []
 
-    def wanted(store: Store, found: repair.Soundness) -> dict[str, str]:
-        looks.append(honest(store, found))
+    def with_another(store: Store, soundness: repair.Soundness) -> dict[str, str]:
+        looks.append(honest(store, soundness))
         return {**looks[-1], **({"ab" * 32: "manifest.json"} if len(looks) == 1 else {})}
 
-    monkeypatch.setattr(repair, "_wanted", wanted)
+    monkeypatch.setattr(repair, "_wanted", with_another)
     assert repair.verify(littered.store).clean and len(looks) == 2
 
 
@@ -117,23 +121,23 @@ def test_a_status_beside_a_collection_counts_what_it_still_finds(
     store, honest = littered.store, files_of.walk
     draft = store.root / "tmp" / f".{'ab' * 16}"
     draft.write_bytes(b"touch")
-    gone: list[Path] = []
+    removed: list[Path] = []
 
-    def walk(folder: Path, **given: Any) -> Iterator[Any]:
-        for place, folders, files in honest(folder, **given):
+    def walk(folder: Path, **options: Any) -> Iterator[Any]:
+        for place, folders, files in honest(folder, **options):
             if place.endswith("objects"):  # a shelf goes after it was listed
-                gone.append(Path(place) / folders[0])
-                shutil.rmtree(gone[-1])
+                removed.append(Path(place) / folders[0])
+                shutil.rmtree(removed[-1])
             for file in files if place.endswith("tmp") else ():
-                gone.append(Path(place) / file)
-                gone[-1].unlink()
+                removed.append(Path(place) / file)
+                removed[-1].unlink()
             yield place, folders, files
 
     before = repair.status(store)
     monkeypatch.setattr(repair, "walk", walk)
-    found = repair.status(store)
-    assert draft in gone and len(gone) == 2
-    assert found["tmp"]["files"] == 0 < found["objects"]["files"] < before["objects"]["files"]
+    status = repair.status(store)
+    assert draft in removed and len(removed) == 2
+    assert status["tmp"]["files"] == 0 < status["objects"]["files"] < before["objects"]["files"]
 
 
 def test_a_dry_run_beside_a_collection_counts_what_it_still_finds(
@@ -141,14 +145,14 @@ def test_a_dry_run_beside_a_collection_counts_what_it_still_finds(
 ) -> None:
     store = littered.store
     honest = garbage._young
-    done: list[garbage.Collected] = []
+    collections: list[garbage.Collected] = []
 
     def young(path: Path) -> bool:
-        if not done and "/objects/" in str(path):
+        if not collections and "/objects/" in str(path):
             monkeypatch.setattr(garbage, "_young", honest)
-            done.append(garbage.collect(Store(store.root), dry_run=False))
+            collections.append(garbage.collect(Store(store.root), dry_run=False))
             return False
         return honest(path)
 
     monkeypatch.setattr(garbage, "_young", young)
-    assert garbage.collect(store, dry_run=True).objects == 0 < done[0].objects
+    assert garbage.collect(store, dry_run=True).objects == 0 < collections[0].objects

@@ -10,8 +10,8 @@ from tacpipe.errors import TacpipeError, UsageError
 
 
 def field(name: str, quantity: str, stream: str = "", unit: str = "", **about: str) -> pa.Field:
-    told = {"quantity": quantity, "stream": stream, "unit": unit, **about}
-    return pa.field(name, pa.float64(), metadata={key: value for key, value in told.items() if value})
+    metadata = {"quantity": quantity, "stream": stream, "unit": unit, **about}
+    return pa.field(name, pa.float64(), metadata={key: value for key, value in metadata.items() if value})
 
 
 def arm(stream: str, names: str = "xyz", unit: str = "m") -> list[pa.Field]:
@@ -46,9 +46,9 @@ def test_the_components_of_one_quaternion_share_a_name_and_those_of_two_do_not()
 
 def test_a_pose_is_found_in_any_stream_in_the_order_of_its_components() -> None:
     turned = [field(f"ur5_q{part}", "orientation", "ur5", "1") for part in "wxyz"]
-    found = pose.pose(pa.schema([*turned, *arm("ur5", "zyx"), field("skin_t1", "tactile", "skin", "kPa")]))
-    assert found.position == ("ur5_x", "ur5_y", "ur5_z")
-    assert found.orientation == ("ur5_qx", "ur5_qy", "ur5_qz", "ur5_qw")
+    columns = pose.pose(pa.schema([*turned, *arm("ur5", "zyx"), field("skin_t1", "tactile", "skin", "kPa")]))
+    assert columns.position == ("ur5_x", "ur5_y", "ur5_z")
+    assert columns.orientation == ("ur5_qx", "ur5_qy", "ur5_qz", "ur5_qw")
 
 
 def test_an_arm_without_a_quaternion_has_none_and_no_position_is_no_arm() -> None:
@@ -62,22 +62,22 @@ def test_columns_without_metadata_are_found_by_the_names_of_the_first_versions()
 
 
 def test_of_two_positions_the_stream_named_is_taken_and_else_the_robot() -> None:
-    both = pa.schema([*arm("robot"), *arm("object")])
-    assert pose.pose(both).position[0] == "robot_x"
-    assert pose.pose(both, "object").position[0] == "object_x"
+    two_arms = pa.schema([*arm("robot"), *arm("object")])
+    assert pose.pose(two_arms).position[0] == "robot_x"
+    assert pose.pose(two_arms, "object").position[0] == "object_x"
     with pytest.raises(TacpipeError, match="--arm"):
         pose.pose(pa.schema([*arm("left"), *arm("right")]))
     assert pose.pose(pa.schema([*arm("left"), *arm("right")]), needed=False) == pose.Pose()
     with pytest.raises(UsageError, match=r"wrist.*robot, object"):
-        pose.pose(both, "wrist")
+        pose.pose(two_arms, "wrist")
 
 
 def test_a_height_alone_is_no_arm_unless_an_arm_is_needed_or_named() -> None:
     height = pa.schema([field("tcp_z_m", "position", "arm", "m")])
     assert pose.pose(height, needed=False) == pose.Pose()
-    for named, needed in (("", True), ("arm", False)):
+    for stream, needed in (("", True), ("arm", False)):
         with pytest.raises(TacpipeError, match=r"--actions none"):
-            pose.pose(height, named, needed=needed)
+            pose.pose(height, stream, needed=needed)
 
 
 def test_ground_truth_is_no_pose() -> None:
@@ -101,9 +101,9 @@ def test_a_position_in_another_unit_names_the_line_of_the_layout_file() -> None:
 
 def test_what_is_absent_is_named_with_what_is_there_and_where_to_declare_it() -> None:
     bare = pa.field("skin_t1", pa.uint16(), metadata={"stream": "skin"})
-    said = str(absent.absent("trial-3", "tactile", [pa.field("t_ns", pa.int64()), bare, *arm("ee")]))
+    message = str(absent.absent("trial-3", "tactile", [pa.field("t_ns", pa.int64()), bare, *arm("ee")]))
     for part in ("trial-3", "tactile", "3 of position", "skin_t1", "[streams.skin] columns", 'quantity = "tactile"'):
-        assert part in said
+        assert part in message
 
 
 def test_columns_of_streams_name_the_stream_in_which_to_declare_them() -> None:

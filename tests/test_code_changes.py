@@ -113,16 +113,16 @@ def prepared(folder: Path) -> None:
 
 
 @pytest.fixture
-def own(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The project that `prepared` makes."""
+def project(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Copy the project that `prepared` makes."""
     folder = tmp_path / "own"
     return shutil.copytree(made_once(tmp_path_factory, "own", prepared), folder, symlinks=True)
 
 
 def call(folder: Path, command: str) -> tuple[int, str, str]:
     path = os.pathsep.join([str(folder / "package"), os.environ.get("PYTHONPATH", "")])
-    done = tacpipe(folder, command, PYTHONPATH=path, PYTHONDONTWRITEBYTECODE="1")
-    return done.returncode, done.stdout, done.stderr
+    process = tacpipe(folder, command, PYTHONPATH=path, PYTHONDONTWRITEBYTECODE="1")
+    return process.returncode, process.stdout, process.stderr
 
 
 def ran(folder: Path, command: str) -> str:
@@ -138,80 +138,84 @@ def edit(folder: Path, before: str, after: str, module: str = "lab_stages") -> N
     path.write_text(text.replace(before, after))
 
 
-def test_a_hit_on_results_of_edited_code_says_so_and_rerun_computes_them_again(own: Path) -> None:
-    assert json.loads(ran(own, "times data/r -o data/t"))["notes"] == []
-    edit(own, "params.factor)", "params.factor + 1)")
-    first = json.loads(ran(own, "times data/r -o data/t"))
+def test_a_hit_on_results_of_edited_code_says_so_and_rerun_computes_them_again(project: Path) -> None:
+    assert json.loads(ran(project, "times data/r -o data/t"))["notes"] == []
+    edit(project, "params.factor)", "params.factor + 1)")
+    first = json.loads(ran(project, "times data/r -o data/t"))
     assert (first["ran"], first["reused"]) == (0, 3)
     (note,) = first["notes"]
     assert note.startswith("3 of these results were computed by other code of times than there is now in lab_stages")
     assert "version 1" in note and "--rerun" in note
-    (note,) = json.loads(ran(own, "sums data/t -o data/s"))["notes"]
+    (note,) = json.loads(ran(project, "sums data/t -o data/s"))["notes"]
     assert note.startswith("1 of these results were computed by other code of sums")
-    again = json.loads(ran(own, "times data/r -o data/t --rerun"))
-    assert (again["ran"], again["reused"], again["notes"]) == (3, 0, [])
-    assert json.loads(ran(own, "times data/r -o data/t"))["notes"] == []
-    ran(own, "sums data/t -o data/s --rerun")
-    assert (own / "data/s/sum.txt").read_text() == str(3 * ((0 + 2 + 3) + (1 + 2 + 3) + (2 + 2 + 3)))
+    rerun = json.loads(ran(project, "times data/r -o data/t --rerun"))
+    assert (rerun["ran"], rerun["reused"], rerun["notes"]) == (3, 0, [])
+    assert json.loads(ran(project, "times data/r -o data/t"))["notes"] == []
+    ran(project, "sums data/t -o data/s --rerun")
+    assert (project / "data/s/sum.txt").read_text() == str(3 * ((0 + 2 + 3) + (1 + 2 + 3) + (2 + 2 + 3)))
 
 
-def test_new_recordings_do_not_hide_that_others_are_of_older_code(own: Path) -> None:
-    edit(own, "params.factor)", "params.factor + 1)")
-    ran(own, "simulate numbers -o data/r --trials 5 --rerun")
-    for _ in range(2):  # as it runs, and as a hit
-        found = json.loads(ran(own, "times data/r -o data/t"))
-        (note,) = found["notes"]
+def test_new_recordings_do_not_hide_that_others_are_of_older_code(project: Path) -> None:
+    edit(project, "params.factor)", "params.factor + 1)")
+    ran(project, "simulate numbers -o data/r --trials 5 --rerun")
+    for _ in range(2):  # The first run computes, the second is a hit.
+        outcome = json.loads(ran(project, "times data/r -o data/t"))
+        (note,) = outcome["notes"]
         assert note.startswith("3 of these results were computed by other code of times")
-    assert found["reused"] == 5
+    assert outcome["reused"] == 5
 
 
-def test_a_hit_names_the_package_of_which_a_module_was_edited_that_the_stage_imports_late(own: Path) -> None:
-    assert json.loads(ran(own, "sums data/t -o data/s2"))["notes"] == []
-    edit(own, "ReLU", "Tanh", "lab_helper")
+def test_a_hit_names_the_package_of_which_a_module_was_edited_that_the_stage_imports_late(project: Path) -> None:
+    assert json.loads(ran(project, "sums data/t -o data/s2"))["notes"] == []
+    edit(project, "ReLU", "Tanh", "lab_helper")
     for command, count in (("sums data/t -o data/s2", 1), ("times data/r -o data/t", 3)):
         for _ in range(2):
-            outcome = json.loads(ran(own, command))
+            outcome = json.loads(ran(project, command))
             (note,) = outcome["notes"]
             assert outcome["ran"] == 0 and note.startswith(
                 f"{count} of these results were computed by other code of the package lab than is installed now."
             )
-    ran(own, "sums data/t -o data/s2 --rerun")
-    assert json.loads(ran(own, "sums data/t -o data/s2"))["notes"] == []
+    ran(project, "sums data/t -o data/s2 --rerun")
+    assert json.loads(ran(project, "sums data/t -o data/s2"))["notes"] == []
 
 
 @pytest.mark.long
-def test_a_model_and_its_evaluation_name_the_edited_package_of_their_architecture(own: Path) -> None:
-    package = own / "package"
+def test_a_model_and_its_evaluation_name_the_edited_package_of_their_architecture(project: Path) -> None:
+    package = project / "package"
     (package / "lab_estimator.py").write_text(ESTIMATOR)
     (package / "lab_helper.py").write_text(BAYES)
     (package / "lab.egg-info/top_level.txt").write_text("lab_estimator\nlab_helper\n")
     (package / "lab.egg-info/entry_points.txt").write_text(
         "[tacpipe.models]\nmaterial.nearest = lab_estimator:Nearest\n"
     )
-    ran(own, "simulate material --trials 12 --materials 2 -o data/m")
-    ran(own, "segment slides data/m -o data/slides")
-    ran(own, "split data/slides -o data/split --scheme random --stratify material")
+    ran(project, "simulate material --trials 12 --materials 2 -o data/m")
+    ran(project, "segment slides data/m -o data/slides")
+    ran(project, "split data/slides -o data/split --scheme random --stratify material")
     train = "train material data/slides --split data/split -o models/m --architecture nearest"
     evaluate = "evaluate models/m data/slides --split data/split -o results/m"
-    assert json.loads(ran(own, train))["notes"] == json.loads(ran(own, evaluate))["notes"] == []
-    edit(own, "GaussianNB()", "GaussianNB(var_smoothing=0.5)", "lab_helper")
+    assert json.loads(ran(project, train))["notes"] == json.loads(ran(project, evaluate))["notes"] == []
+    edit(project, "GaussianNB()", "GaussianNB(var_smoothing=0.5)", "lab_helper")
     for command in (train, evaluate):
-        assert any("other code of the package lab " in note for note in json.loads(ran(own, command))["notes"]), command
-    ran(own, f"{train} --rerun")
-    assert not any("other code" in note for note in json.loads(ran(own, train))["notes"])
+        assert any("other code of the package lab " in note for note in json.loads(ran(project, command))["notes"]), (
+            command
+        )
+    ran(project, f"{train} --rerun")
+    assert not any("other code" in note for note in json.loads(ran(project, train))["notes"])
 
 
-def test_a_training_never_resumes_a_checkpoint_that_other_code_wrote(own: Path) -> None:
+def test_a_training_never_resumes_a_checkpoint_that_other_code_wrote(project: Path) -> None:
     train = "train numbers data/r -o models/m"
-    assert call(own, train)[0] == 9
-    assert ran(own, train) and (own / "models/m/model.txt").read_text() == "of ReLU"  # by the same code
-    assert call(own, f"{train}2 --factor 3")[0] == 9
-    edit(own, "ReLU", "Tanh", "lab_helper")
-    code, _, err = call(own, f"{train}2 --factor 3")
+    assert call(project, train)[0] == 9
+    assert (
+        ran(project, train) and (project / "models/m/model.txt").read_text() == "of ReLU"
+    )  # The same code resumes it.
+    assert call(project, f"{train}2 --factor 3")[0] == 9
+    edit(project, "ReLU", "Tanh", "lab_helper")
+    code, _, err = call(project, f"{train}2 --factor 3")
     assert code == 9 and "was written by other code; training starts over" in err
-    ran(own, f"{train}2 --factor 3")
-    assert (own / "models/m2/model.txt").read_text() == "of Tanh"
-    assert not list((own / ".tacpipe/checkpoints").iterdir())
+    ran(project, f"{train}2 --factor 3")
+    assert (project / "models/m2/model.txt").read_text() == "of Tanh"
+    assert not list((project / ".tacpipe/checkpoints").iterdir())
 
 
 def test_a_change_of_a_built_in_stage_is_not_named_where_it_is_installed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -219,7 +223,7 @@ def test_a_change_of_a_built_in_stage_is_not_named_where_it_is_installed(monkeyp
     from tacpipe.plugins import registry
 
     stage = registry.load("split")
-    assert provenance.code(stage) is not None  # of a checkout
+    assert provenance.code(stage) is not None  # A checkout has a digest of its code.
     installed = "/usr/lib/python3/dist-packages/tacpipe_stages/split.py"
     monkeypatch.setattr(sys.modules[stage.function.__module__], "__file__", installed)
     assert provenance.code(stage) is None
@@ -232,16 +236,16 @@ def test_a_change_of_a_built_in_stage_is_not_named_where_it_is_installed(monkeyp
         ("import pyarrow.compute as pc; int('x')", "raised ValueError on recording trial-000:"),
     ],
 )
-def test_code_that_breaks_shows_its_own_frames_alone(own: Path, after: str, words: str) -> None:
-    edit(own, "import pyarrow.compute as pc\n", f"{after}\n")
-    code, out, err = call(own, "times data/r -o data/other --factor 5 --json")
+def test_code_that_breaks_shows_its_own_frames_alone(project: Path, after: str, words: str) -> None:
+    edit(project, "import pyarrow.compute as pc\n", f"{after}\n")
+    code, out, err = call(project, "times data/r -o data/other --factor 5 --json")
     lines = err.splitlines()
     assert code == 1 and lines[0] == f"tacpipe: The code of stage times {words}"
-    assert err.count('  File "') == 1 and f'File "{own}/package/lab_stages.py", line' in err and len(lines) <= 8
+    assert err.count('  File "') == 1 and f'File "{project}/package/lab_stages.py", line' in err and len(lines) <= 8
     failed = json.loads(out)
     assert failed["exit_code"] == 1 and words in failed["error"]
-    path = os.pathsep.join([str(own / "package"), os.environ.get("PYTHONPATH", "")])
-    full = tacpipe(own, "times data/r -o data/other --factor 5", PYTHONPATH=path, TACPIPE_TRACEBACK="1")
+    path = os.pathsep.join([str(project / "package"), os.environ.get("PYTHONPATH", "")])
+    full = tacpipe(project, "times data/r -o data/other --factor 5", PYTHONPATH=path, TACPIPE_TRACEBACK="1")
     assert full.returncode == 1 and full.stderr.count('  File "') > 5
 
 
@@ -250,10 +254,10 @@ def test_code_that_breaks_shows_its_own_frames_alone(own: Path, after: str, word
     [("NOTES = (", "SyntaxError: '(' was never closed"), ("NOTES = 1 / 0", "ZeroDivisionError: division by zero")],
 )
 def test_a_module_that_cannot_be_loaded_is_one_sentence_though_its_results_are_stored(
-    own: Path, after: str, words: str
+    project: Path, after: str, words: str
 ) -> None:
-    edit(own, "NOTES = ()", after)
-    code, _, err = call(own, "times data/r -o data/t")
+    edit(project, "NOTES = ()", after)
+    code, _, err = call(project, "times data/r -o data/t")
     assert (
         code == 1
         and err.count("\n") == 1
@@ -263,14 +267,14 @@ def test_a_module_that_cannot_be_loaded_is_one_sentence_though_its_results_are_s
     assert words in err and f"lab_stages.py, line {line}" in err
 
 
-def test_notes_of_a_stage_are_printed_once_for_all_recordings_and_on_a_hit_too(own: Path) -> None:
-    edit(own, "NOTES = ()", 'NOTES = ("no number is above 100.",)')
+def test_notes_of_a_stage_are_printed_once_for_all_recordings_and_on_a_hit_too(project: Path) -> None:
+    edit(project, "NOTES = ()", 'NOTES = ("no number is above 100.",)')
     for ran_anew in (True, False):
-        found = json.loads(ran(own, "times data/r -o data/n --factor 3"))
-        assert found["notes"] == ["all 3 recordings: no number is above 100."] and (found["ran"] == 3) == ran_anew
-    ran(own, "simulate numbers -o data/r --trials 5")
-    edit(own, "notes=NOTES", "notes=NOTES if table['x'][0].as_py() < 2 else ()")
-    code, _, err = call(own, "times data/r -o data/m --factor 4")
+        outcome = json.loads(ran(project, "times data/r -o data/n --factor 3"))
+        assert outcome["notes"] == ["all 3 recordings: no number is above 100."] and (outcome["ran"] == 3) == ran_anew
+    ran(project, "simulate numbers -o data/r --trials 5")
+    edit(project, "notes=NOTES", "notes=NOTES if table['x'][0].as_py() < 2 else ()")
+    code, _, err = call(project, "times data/r -o data/m --factor 4")
     assert code == 0 and "tacpipe: 2 recordings (trial-000, trial-001): no number is above 100.\n" in err
 
 
@@ -315,7 +319,7 @@ def test_a_recording_that_lost_a_stream_is_one_object_with_the_error_in_it(
     lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     Path("rig.toml").write_text('[[stream]]\nname = "f"\nsensor = "pulse"\ntransport = "serial:/dev/ttyACM0"\n')
-    monkeypatch.setattr("tacpipe.cli.acquire._record", lambda *given, **more: ([], ["f was lost."]))
+    monkeypatch.setattr("tacpipe.cli.acquire._record", lambda *arguments, **options: ([], ["f was lost."]))
     failed = lab.call("acquire rig.toml -o rec --json")
     value = json.loads(failed.out)
     assert failed.code == value["exit_code"] == 5 and value["error"].endswith("f was lost.")

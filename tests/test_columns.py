@@ -20,21 +20,21 @@ def test_each_column_is_that_of_the_table_whatever_the_order_and_the_size_of_a_b
     table: pa.Table, block_bytes: int, chance: Random
 ) -> None:
     content = to_parquet(table)
-    whole, found = from_parquet(content), Columns(content, block_bytes)
-    assert found.schema.equals(whole.schema, check_metadata=True)
-    assert (found.num_rows, found.column_names) == (whole.num_rows, whole.column_names)
-    names = chance.choices(whole.column_names, k=2 * whole.num_columns) if whole.num_columns else []
+    expected, columns = from_parquet(content), Columns(content, block_bytes)
+    assert columns.schema.equals(expected.schema, check_metadata=True)
+    assert (columns.num_rows, columns.column_names) == (expected.num_rows, expected.column_names)
+    names = chance.choices(expected.column_names, k=2 * expected.num_columns) if expected.num_columns else []
     for name in names:
-        assert bits(pa.table({name: found.column(name)})) == bits(pa.table({name: whole.column(name)}))
+        assert bits(pa.table({name: columns.column(name)})) == bits(pa.table({name: expected.column(name)}))
 
 
 def test_a_stream_that_is_larger_than_a_block_is_never_decoded_whole() -> None:
     rows, names = 1000, [f"x{number}" for number in range(40)]
     content = to_parquet(pa.table({name: pa.array(range(rows), pa.int32()) for name in names}))
-    found = Columns(content, block_bytes=3 * 4 * rows)
+    columns = Columns(content, block_bytes=3 * 4 * rows)
     before = pa.total_allocated_bytes()
     for name in names:
-        assert found.column(name).to_pylist() == list(range(rows))
+        assert columns.column(name).to_pylist() == list(range(rows))
         assert pa.total_allocated_bytes() - before < 5 * 4 * rows
 
 

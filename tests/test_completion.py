@@ -28,23 +28,23 @@ print("IMPORTED", *sorted({name.partition(".")[0] for name in sys.modules}))
 
 def environment(shell: str, line: str) -> dict[str, str]:
     """Return what a shell's script sets when TAB is pressed behind ``line``."""
-    given = {"_TACPIPE_COMPLETE": f"complete_{shell}"}
+    variables = {"_TACPIPE_COMPLETE": f"complete_{shell}"}
     if shell == "bash":
-        return given | {"COMP_WORDS": line, "COMP_CWORD": str(len(line.split()) - (not line.endswith(" ")))}
-    return given | {"_TYPER_COMPLETE_ARGS": line, "_TYPER_COMPLETE_FISH_ACTION": "get-args"}
+        return variables | {"COMP_WORDS": line, "COMP_CWORD": str(len(line.split()) - (not line.endswith(" ")))}
+    return variables | {"_TYPER_COMPLETE_ARGS": line, "_TYPER_COMPLETE_FISH_ACTION": "get-args"}
 
 
 def completed(folder: Path, shell: str, line: str) -> set[str]:
-    done = tacpipe(folder, "", **environment(shell, line))
-    assert "Traceback" not in done.stderr
-    return {word.partition("\t")[0].strip('(")*:') for word in done.stdout.replace('":"', "\t").split("\n")}
+    process = tacpipe(folder, "", **environment(shell, line))
+    assert "Traceback" not in process.stderr
+    return {word.partition("\t")[0].strip('(")*:') for word in process.stdout.replace('":"', "\t").split("\n")}
 
 
 @pytest.mark.parametrize("shell", ["bash", *(pytest.param(name, marks=pytest.mark.long) for name in ("zsh", "fish"))])
 def test_commands_methods_and_options_are_completed_in_every_shell(tmp_path: Path, shell: str) -> None:
-    named = {name.partition(".")[0] for name in registry.stages()} | set(commands.NAMES)
-    every = completed(tmp_path, shell, "tacpipe ")
-    assert {name for name in named if any(word.endswith(name) for word in every)} == named
+    names = {name.partition(".")[0] for name in registry.stages()} | set(commands.NAMES)
+    words = completed(tmp_path, shell, "tacpipe ")
+    assert {name for name in names if any(word.endswith(name) for word in words)} == names
     assert any("material" in word for word in completed(tmp_path, shell, "tacpipe train m"))
     options = completed(tmp_path, shell, "tacpipe split --s")
     for option in ("--seed", "--scheme", "--set", "--skip-bad"):
@@ -57,7 +57,7 @@ def test_a_group_of_commands_completes_its_verbs(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("line", ["tacpipe ", "tacpipe train forward --", "tacpipe synchronize --r"])
 def test_completion_imports_nothing_heavy(tmp_path: Path, line: str) -> None:
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-c", PROBE],
         cwd=tmp_path,
         env={**os.environ, **environment("bash", line)},
@@ -65,12 +65,12 @@ def test_completion_imports_nothing_heavy(tmp_path: Path, line: str) -> None:
         text=True,
         check=True,
     )
-    printed, _, imported = done.stdout.partition("IMPORTED ")
+    printed, _, imported = process.stdout.partition("IMPORTED ")
     assert printed.strip()
     assert set(imported.split()) & HEAVY == set()
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
 def test_the_script_for_a_shell_asks_tacpipe(tmp_path: Path, shell: str) -> None:
-    done = tacpipe(tmp_path, "", _TACPIPE_COMPLETE=f"source_{shell}")
-    assert f"_TACPIPE_COMPLETE=complete_{shell}" in done.stdout
+    process = tacpipe(tmp_path, "", _TACPIPE_COMPLETE=f"source_{shell}")
+    assert f"_TACPIPE_COMPLETE=complete_{shell}" in process.stdout

@@ -18,8 +18,8 @@ LEVELS = st.floats(0.05, 0.95)
 
 
 def joined(groups: list[list[float]]) -> tuple[np.ndarray, np.ndarray]:
-    return np.concatenate([np.array(one) for one in groups]), np.repeat(
-        range(len(groups)), [len(one) for one in groups]
+    return np.concatenate([np.array(group) for group in groups]), np.repeat(
+        range(len(groups)), [len(group) for group in groups]
     )
 
 
@@ -27,26 +27,26 @@ def joined(groups: list[list[float]]) -> tuple[np.ndarray, np.ndarray]:
 def test_a_group_left_out_lies_below_the_promised_quantile_of_the_others_as_often_as_promised(
     groups: list[list[float]], level: float
 ) -> None:
-    # of exchangeable groups each is the new one with the same probability, so this mean is the coverage given the values
+    # Each of exchangeable groups is the new one with the same probability, so this mean is the coverage given the values.
     below = []
-    for at, one in enumerate(groups):
+    for at, group in enumerate(groups):
         scores, numbers = joined(groups[:at] + groups[at + 1 :])
-        below.append(np.mean(np.array(one) <= quantile(scores, numbers, level, promised=True)))
+        below.append(np.mean(np.array(group) <= quantile(scores, numbers, level, promised=True)))
     assert np.mean(below) >= level - 1e-9
 
 
 @given(st.lists(SCORES, min_size=1, max_size=40), LEVELS)
 def test_with_one_score_a_group_it_is_split_conformal_prediction(scores: list[float], level: float) -> None:
     rank = math.ceil(level * (len(scores) + 1) - 1e-6)
-    wanted = sorted(scores)[rank - 1] if rank <= len(scores) else math.inf
-    assert quantile(np.array(scores), np.arange(len(scores)), level, promised=True) == wanted
+    expected = sorted(scores)[rank - 1] if rank <= len(scores) else math.inf
+    assert quantile(np.array(scores), np.arange(len(scores)), level, promised=True) == expected
 
 
 @given(st.lists(SCORES, min_size=1, max_size=40), LEVELS)
 def test_pooled_scores_of_one_group_have_the_quantile_of_numpy(scores: list[float], level: float) -> None:
-    found = quantile(np.array(scores), np.zeros(len(scores), int), level)
-    near = [level - 1e-7, level, level + 1e-7]  # where the level falls between two scores, either is right
-    assert found in {float(np.quantile(scores, min(one, 1), method="inverted_cdf")) for one in near}
+    estimate = quantile(np.array(scores), np.zeros(len(scores), int), level)
+    near = [level - 1e-7, level, level + 1e-7]  # Either is right if the level falls between two scores.
+    assert estimate in {float(np.quantile(scores, min(near_level, 1), method="inverted_cdf")) for near_level in near}
 
 
 def test_a_long_recording_weighs_as_much_as_a_short_one() -> None:

@@ -27,8 +27,8 @@ def rows() -> list[list[str]]:
     return [line.strip("| ").split(" | ") for line in simulation.lines() if line and "---" not in line]
 
 
-def stated() -> list[list[str]]:
-    """The cells of the same tables on the page."""
+def tables_of_page() -> list[list[str]]:
+    """Return the cells of the same tables on the page."""
     text = PAGE.read_text().split("python docs/intervals.py")[1].split("## Known limits")[0]
     return [line.strip("| ").split(" | ") for line in text.splitlines() if line.startswith("|") and "---" not in line]
 
@@ -64,8 +64,10 @@ def test_a_rate_over_slides_of_few_materials_holds_less_than_it_states(rows: lis
 
 
 def test_the_page_holds_the_tables_that_the_command_prints(rows: list[list[str]]) -> None:
-    for printed, shown in zip(rows, stated(), strict=True):
-        for one, other in zip(printed, shown, strict=True):  # another machine rounds otherwise
-            tolerance = 2.0 if one.endswith("%") else 0.02
-            assert number(one) == pytest.approx(number(other), abs=tolerance, nan_ok=True)
-        assert [one for one in printed if math.isnan(number(one))] == [one for one in shown if math.isnan(number(one))]
+    for printed, stated_row in zip(rows, tables_of_page(), strict=True):
+        for cell, page_cell in zip(printed, stated_row, strict=True):  # Another machine rounds differently.
+            tolerance = 2.0 if cell.endswith("%") else 0.02
+            assert number(cell) == pytest.approx(number(page_cell), abs=tolerance, nan_ok=True)
+        assert [cell for cell in printed if math.isnan(number(cell))] == [
+            cell for cell in stated_row if math.isnan(number(cell))
+        ]

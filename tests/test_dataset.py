@@ -44,10 +44,10 @@ def published(recordings: Mapping[str, Mapping[str, pa.Table]]) -> Iterator[Path
                 "attributes": {},
                 "shards": {
                     stream: {**vars(store.put(to_parquet(table))), "rows": table.num_rows}
-                    for stream, table in several.items()
+                    for stream, table in streams.items()
                 },
             }
-            for name, several in recordings.items()
+            for name, streams in recordings.items()
         }
         manifest = Manifest("scale", 1, recordings=entries)
         store.put(manifest.content)
@@ -63,9 +63,9 @@ def test_every_table_comes_out_of_a_dataset_as_it_went_in_to_the_bit(
     with published(recordings) as path:
         dataset = tacpipe.open(path)
         assert set(dataset.recordings) == set(recordings)
-        for name, several in recordings.items():
-            assert dataset.recordings[name].streams == tuple(sorted(several))
-            for stream, table in several.items():
+        for name, tables in recordings.items():
+            assert dataset.recordings[name].streams == tuple(sorted(tables))
+            for stream, table in tables.items():
                 assert bits(dataset.recordings[name].table(stream)) == bits(table)
 
 
@@ -80,8 +80,8 @@ def test_pandas_and_duckdb_read_the_values_that_were_written(table: pa.Table) ->
         frame = pd.read_parquet(file, dtype_backend="pyarrow")
         assert bits(pa.Table.from_pandas(frame, schema=table.schema)) == bits(table)
         rows = duckdb.execute(f"select * from '{file}'").fetchall()
-        found = [plain(column) for column in zip(*rows, strict=True)] or [[]] * table.num_columns
-        assert found == [plain(column.to_pylist()) for column in table.columns]
+        values = [plain(column) for column in zip(*rows, strict=True)] or [[]] * table.num_columns
+        assert values == [plain(column.to_pylist()) for column in table.columns]
 
 
 def plain(values: Any) -> list[Any]:
@@ -96,13 +96,13 @@ def test_all_recordings_in_one_table_are_the_recordings_one_after_another(table:
     sizes = np.random.default_rng(seed).integers(0, first.num_rows + 1, 4)
     recordings = {f"trial-{place:03d}": {"": first.slice(0, int(size))} for place, size in enumerate(sizes)}
     with published(recordings) as path:
-        found = tacpipe.open(path).table()
-        assert found["recording"].to_pylist() == [
-            name for name, one in recordings.items() for _ in range(one[""].num_rows)
+        joined = tacpipe.open(path).table()
+        assert joined["recording"].to_pylist() == [
+            name for name, tables in recordings.items() for _ in range(tables[""].num_rows)
         ]
-        wanted = pa.concat_tables([one[""] for one in recordings.values()])
-        bare = [(name, kind, values) for name, kind, _, values in bits(wanted)]
-        assert [(name, kind, values) for name, kind, _, values in bits(found.drop_columns(["recording"]))] == bare
+        expected = pa.concat_tables([tables[""] for tables in recordings.values()])
+        bare = [(name, kind, values) for name, kind, _, values in bits(expected)]
+        assert [(name, kind, values) for name, kind, _, values in bits(joined.drop_columns(["recording"]))] == bare
 
 
 @given(st.integers(1, 5), st.integers(0, 30), st.integers(0, 1000))
@@ -115,10 +115,10 @@ def test_arrays_and_tensors_hold_the_columns_that_were_asked_for_in_their_order(
     order = [f"c{place}" for place in np.random.default_rng(seed).permutation(columns)]
     with published({"trial-000": {"": table}}) as path:
         dataset = tacpipe.open(path)
-        wanted = values[:, [int(name[1:]) for name in order]]
+        expected = values[:, [int(name[1:]) for name in order]]
         arrays, tensors = dataset.to_numpy(columns=order)["trial-000"], dataset.to_torch(columns=order)["trial-000"]
         assert arrays.columns == tensors.columns == tuple(order)
-        assert arrays.values.tobytes() == tensors.values.numpy().tobytes() == wanted.tobytes()
+        assert arrays.values.tobytes() == tensors.values.numpy().tobytes() == expected.tobytes()
         assert arrays.t_ns is None and tensors.t_ns is None
         assert dataset.to_numpy()["trial-000"].values.shape == (rows, columns)
 
@@ -140,10 +140,10 @@ def as_stored(column: pa.ChunkedArray) -> list[Any]:
 @drawn
 def test_no_value_that_is_read_differs_from_that_of_the_file(table: pa.Table) -> None:
     with published({"trial-000": {"": table}}) as path:
-        dataset, wanted = tacpipe.open(path), {name: as_stored(table[name]) for name in table.column_names}
+        dataset, expected = tacpipe.open(path), {name: as_stored(table[name]) for name in table.column_names}
         frame, arrays = dataset.to_pandas(), dataset.to_numpy()["trial-000"]
-        assert {name: exactly(frame[name]) for name in wanted} == wanted
-        assert {name: exactly(array) for name, array in arrays.by_column.items()} == wanted
+        assert {name: exactly(frame[name]) for name in expected} == expected
+        assert {name: exactly(array) for name, array in arrays.by_column.items()} == expected
         for name, array in arrays.by_column.items():
             assert (
                 pa.types.is_string(table.schema.field(name).type)
@@ -153,11 +153,11 @@ def test_no_value_that_is_read_differs_from_that_of_the_file(table: pa.Table) ->
         try:
             values = arrays.values
         except UsageError:
-            wide = [value for name in arrays.columns if arrays[name].dtype.kind in "iu" for value in wanted[name]]
+            wide = [value for name in arrays.columns if arrays[name].dtype.kind in "iu" for value in expected[name]]
             assert any(abs(value) > 2**53 for value in wide if value is not None)
             return
         assert {name: exactly(values[:, at]) for at, name in enumerate(arrays.columns)} == {
-            name: wanted[name] for name in arrays.columns
+            name: expected[name] for name in arrays.columns
         }
 
 
@@ -174,7 +174,7 @@ def test_times_stay_whole_nanoseconds_beside_channels_of_floats() -> None:
     table = pa.table(
         {"t_ns": t_ns, "x": pa.array(np.linspace(0, 1, 5), pa.float32()), "y": np.arange(5, dtype=np.uint16)}
     )
-    assert (t_ns.astype(np.float64).astype(np.int64) != t_ns).any()  # what a matrix with the times in it would hold
+    assert (t_ns.astype(np.float64).astype(np.int64) != t_ns).any()  # A matrix with the times in it would hold these.
     with published({"trial-000": {"": table}}) as path:
         arrays, tensors = (read()["trial-000"] for read in (tacpipe.open(path).to_numpy, tacpipe.open(path).to_torch))
         assert arrays.t_ns is not None and tensors.t_ns is not None
@@ -185,8 +185,8 @@ def test_times_stay_whole_nanoseconds_beside_channels_of_floats() -> None:
 
 def test_masks_labels_and_counters_are_read_by_name_and_are_no_channels() -> None:
     label = pa.field("contact", pa.int32(), metadata={"quantity": "label"})
-    others = [pa.field("x_gap", pa.bool_()), pa.field("seq", pa.int64()), pa.field("gt_force_n", pa.float64())]
-    fields = pa.schema([pa.field("x", pa.int16()), label, *others])
+    unread = [pa.field("x_gap", pa.bool_()), pa.field("seq", pa.int64()), pa.field("gt_force_n", pa.float64())]
+    fields = pa.schema([pa.field("x", pa.int16()), label, *unread])
     table = pa.table([[1, 2], [-1, 0], [True, False], [2**62, 2**62 + 1], [0.5, 1.5]], schema=fields)
     with published({"trial-000": {"": table}}) as path:
         arrays = tacpipe.open(path).to_numpy()["trial-000"]
@@ -206,8 +206,8 @@ def test_an_integer_channel_that_a_matrix_of_floats_would_round_is_refused_there
 
 
 def test_integers_that_some_recordings_lack_stay_integers_in_one_frame() -> None:
-    one = pa.table({"t_ns": [1], "t_device_ns": [2**60 + 1]})
-    with published({"trial-000": {"": one}, "trial-001": {"": one.select(["t_ns"])}}) as path:
+    table = pa.table({"t_ns": [1], "t_device_ns": [2**60 + 1]})
+    with published({"trial-000": {"": table}, "trial-001": {"": table.select(["t_ns"])}}) as path:
         frame = tacpipe.open(path).to_pandas()
         assert frame["t_device_ns"].tolist() == [2**60 + 1, pd.NA]
 

@@ -1,4 +1,4 @@
-"""What the texts and the help say is true: commands run as printed, paths exist, examples parse."""
+"""Texts and help are true: commands run as printed, paths exist, examples parse."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ EXTENDING = [  # pages whose packages tests/test_extending.py installs and whose
     ROOT / "docs" / "extending" / f"{name}.md"
     for name in ("model", "codec", "task", "tracker", "executor", "stage", "format", "sensor")
 ]
-PYTHON = ROOT / "docs" / "python.md"  # whose blocks tests/test_python_page.py runs
+PYTHON = ROOT / "docs" / "python.md"  # tests/test_python_page.py runs its blocks.
 BUILT_IN = sorted(
     name for name, target in registry.stages().items() if target.startswith(("tacpipe.", "tacpipe_stages."))
 )
@@ -65,8 +65,8 @@ COMMANDS = [
 
 def blocks(text: str, language: str) -> list[str]:
     """Return the fenced blocks of a language."""
-    found: list[str] = re.findall(rf"^```{language}[^\n]*\n(.*?)^```$", text, re.DOTALL | re.MULTILINE)
-    return found
+    code_blocks: list[str] = re.findall(rf"^```{language}[^\n]*\n(.*?)^```$", text, re.DOTALL | re.MULTILINE)
+    return code_blocks
 
 
 def section(text: str, title: str) -> str:
@@ -86,24 +86,24 @@ class Block:
 
 def fenced(text: str) -> list[Block]:
     """Return the fenced blocks of a page, with the comment ``<!-- not run: REASON -->`` above one as its mark."""
-    found = re.findall(
+    matches = re.findall(
         r'(?:^<!-- not run: ([^\n]+) -->\n)?^```(\w+)(?: title="([^"]+)")?\n(.*?)^```$', text, re.DOTALL | re.MULTILINE
     )
-    return [Block(language, code, title, mark) for mark, language, title, code in found]
+    return [Block(language, code, title, mark) for mark, language, title, code in matches]
 
 
-MORE = "…"  # in a page, for lines that a command prints besides
+MORE = "…"  # This stands in a page for further lines that a command prints.
 
 
 def printed(block: str) -> list[tuple[str, list[str]]]:
     """Return the commands of a console block, each with the lines that are printed below it, but for empty ones."""
-    found: list[tuple[str, list[str]]] = []
+    outputs: list[tuple[str, list[str]]] = []
     for line in block.splitlines():
         if line.startswith("$ "):
-            found.append((line.removeprefix("$ "), []))
+            outputs.append((line.removeprefix("$ "), []))
         elif line:
-            found[-1][1].append(line)
-    return found
+            outputs[-1][1].append(line)
+    return outputs
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -143,12 +143,12 @@ def test_the_commands_and_python_of_every_page_run_and_print_what_it_says(tmp_pa
     before: set[str] = set()  # commands of earlier pages
 
     for page in RUN:
-        found = [block for block in fenced(page.read_text()) if not block.mark]
-        for name, text in entry_points(found):
+        page_blocks = [block for block in fenced(page.read_text()) if not block.mark]
+        for name, text in entry_points(page_blocks):
             (tmp_path / f"{name}.egg-info").mkdir()
             (tmp_path / f"{name}.egg-info" / "entry_points.txt").write_text(text)
-        here: set[str] = set()
-        for block in found:
+        page_commands: set[str] = set()
+        for block in page_blocks:
             if block.title:
                 (tmp_path if block.title.endswith(".py") else project).joinpath(block.title).write_text(block.text)
             elif block.language == "python":
@@ -157,31 +157,31 @@ def test_the_commands_and_python_of_every_page_run_and_print_what_it_says(tmp_pa
                 for command, lines in printed(block.text):
                     ran = tacpipe(project, command.removeprefix("tacpipe "), **environment)
                     assert ran.returncode == 0, f"{page.name}: {command}: {ran.stderr}"
-                    shown = [line for line in (ran.stderr + ran.stdout).splitlines() if line]
-                    compare(f"{page.name}: {command}", lines, shown, again=command in before)
-                    here.add(command)
-        before |= here
+                    lines_printed = [line for line in (ran.stderr + ran.stdout).splitlines() if line]
+                    compare(f"{page.name}: {command}", lines, lines_printed, rerun=command in before)
+                    page_commands.add(command)
+        before |= page_commands
 
 
-def compare(name: str, lines: list[str], shown: list[str], *, again: bool) -> None:
-    """Require that a command printed the lines of its page; seconds differ, and reuse where it ran ``again``."""
-    shown = [line for line in shown if not line.startswith("tacpipe: created the store ")]
+def compare(name: str, lines: list[str], printed_lines: list[str], *, rerun: bool) -> None:
+    """Require that a command printed the lines of its page; seconds differ, and reuse where it ran as a ``rerun``."""
+    printed_lines = [line for line in printed_lines if not line.startswith("tacpipe: created the store ")]
     seconds, counts = re.compile(r"\d+\.\d s$"), re.compile(r"^\d+ ran, \d+ reused, ")
-    wanted, found = ([seconds.sub("", line) for line in some] for some in (lines, shown))
-    if again:  # what the page computes was computed on an earlier page
-        wanted = ["reused" if counts.match(line) else line for line in wanted]
-        found = ["reused" if counts.match(line) and line.startswith("0 ran") else line for line in found]
-    if MORE in wanted:  # lines whose numbers are another machine's
-        at = wanted.index(MORE)
-        after = len(wanted) - at - 1
-        assert len(found) >= len(wanted) - again, name  # a hit prints nothing of a training
-        found = [*found[:at], MORE, *found[len(found) - after :]]
-    assert found == wanted, name
+    expected, actual = ([seconds.sub("", line) for line in lines_of_side] for lines_of_side in (lines, printed_lines))
+    if rerun:  # An earlier page computed it already.
+        expected = ["reused" if counts.match(line) else line for line in expected]
+        actual = ["reused" if counts.match(line) and line.startswith("0 ran") else line for line in actual]
+    if MORE in expected:  # lines whose numbers are another machine's
+        at = expected.index(MORE)
+        after = len(expected) - at - 1
+        assert len(actual) >= len(expected) - rerun, name  # a hit prints nothing of a training
+        actual = [*actual[:at], MORE, *actual[len(actual) - after :]]
+    assert actual == expected, name
 
 
 def run_python(page: Path, text: str, folder: Path, environment: dict[str, str]) -> None:
     """Require that a Python block runs."""
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-c", text],
         cwd=folder,
         env={**os.environ, **environment},
@@ -189,17 +189,17 @@ def run_python(page: Path, text: str, folder: Path, environment: dict[str, str])
         text=True,
         check=False,
     )
-    assert done.returncode == 0, f"{page.name}: {done.stderr}"
+    assert process.returncode == 0, f"{page.name}: {process.stderr}"
 
 
-def entry_points(found: list[Block]) -> list[tuple[str, str]]:
+def entry_points(page_blocks: list[Block]) -> list[tuple[str, str]]:
     """Return name and ``entry_points.txt`` of each block of entry points."""
-    made = []
-    for block in found:
+    files = []
+    for block in page_blocks:
         if block.language == "toml" and block.text.startswith("[project.entry-points"):
             text = block.text.replace("[project.entry-points.", "[").replace('"', "")
-            made.append((text.split()[1].replace("-", "_"), text))
-    return made
+            files.append((text.split()[1].replace("-", "_"), text))
+    return files
 
 
 def test_every_block_of_commands_or_python_runs_or_states_why_it_does_not() -> None:
@@ -219,26 +219,30 @@ def test_every_block_of_commands_or_python_runs_or_states_why_it_does_not() -> N
 
 
 def test_the_commands_in_all_pages_exist(lab: Lab) -> None:
-    found = []
+    lines_of_pages = []
     for page in PAGES:
         text = page.read_text()
         lines = [line.split("#")[0] for block in blocks(text, "sh") for line in block.splitlines()]
-        found += [line for line in lines if line.startswith("tacpipe ")] + re.findall(r"`(tacpipe [^`]+)`", text)
-    known = [words for line in dict.fromkeys(found) if (words := shlex.split(re.sub(r"\.\.\.|<TAB>", "", line)))]
-    assert len(known) >= 40
+        lines_of_pages += [line for line in lines if line.startswith("tacpipe ")] + re.findall(
+            r"`(tacpipe [^`]+)`", text
+        )
+    command_words = [
+        words for line in dict.fromkeys(lines_of_pages) if (words := shlex.split(re.sub(r"\.\.\.|<TAB>", "", line)))
+    ]
+    assert len(command_words) >= 40
 
-    for words in known:
+    for words in command_words:
         if not words[1][0].isupper():  # `tacpipe COMMAND --help`
             lab.run(shlex.join([*words[1:], *([] if {"--help", "--version"} & set(words) else ["--help"])]))
 
 
 def test_the_file_tree_of_contributing_names_what_is_there_and_every_package() -> None:
     (tree,) = blocks(section((ROOT / "CONTRIBUTING.md").read_text(), "What lies where"), "text")
-    named = {path for line in tree.splitlines() for path in re.split(r", ", re.split(r"\s{2,}", line)[0])}
+    paths = {path for line in tree.splitlines() for path in re.split(r", ", re.split(r"\s{2,}", line)[0])}
     packages = {f"tacpipe/{path.parent.name}/" for path in (ROOT / "tacpipe").glob("*/__init__.py")}
 
-    assert not [path for path in named if not (ROOT / path).exists()]
-    assert packages <= named
+    assert not [path for path in paths if not (ROOT / path).exists()]
+    assert packages <= paths
 
 
 def test_the_readme_is_short_and_its_picture_small() -> None:
@@ -259,21 +263,21 @@ def hooks() -> ModuleType:
 def module(name: str) -> ModuleType:
     spec = importlib.util.spec_from_file_location(f"docs_{name}", ROOT / "docs" / f"{name}.py")
     assert spec is not None and spec.loader is not None
-    found = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = found  # dataclasses look their module up there
-    spec.loader.exec_module(found)
-    return found
+    loaded = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = loaded  # dataclasses look their module up there
+    spec.loader.exec_module(loaded)
+    return loaded
 
 
 def test_the_reference_has_every_command_with_the_help_that_it_prints(
     lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made = hooks()
-    named = {" ".join(words) for words in made.command_names()}
-    page = made.command_line()
+    reference = hooks()
+    names = {" ".join(words) for words in reference.command_names()}
+    page = reference.command_line()
     monkeypatch.setenv("COLUMNS", "102")
 
-    assert set(COMMANDS) <= named
+    assert set(COMMANDS) <= names
     for command in ("synchronize", "store gc", "train forward", "acquire"):
         assert lab.run(f"{command} --help").out.strip() in page
 
@@ -288,9 +292,9 @@ def test_the_reference_has_every_param_of_every_stage() -> None:
 
 
 def test_the_tables_of_results_are_on_the_page_and_have_their_picture() -> None:
-    made, text = hooks(), (ROOT / "docs" / "results.md").read_text()
+    documentation, text = hooks(), (ROOT / "docs" / "results.md").read_text()
     tables = sorted(path.stem for path in (ROOT / "docs" / "results").glob("*.csv"))
-    page = made.on_page_markdown(text)
+    page = documentation.on_page_markdown(text)
 
     assert tables == ["forward", "material", "touch"]
     for name in tables:
@@ -301,40 +305,40 @@ def test_the_tables_of_results_are_on_the_page_and_have_their_picture() -> None:
 
 
 def test_the_params_of_the_result_pages_are_of_published_recordings(tmp_path: Path) -> None:
-    made = module("result_pages")
-    given = yaml.safe_load((ROOT / "params.yaml").read_text())
+    pages = module("result_pages")
+    params = yaml.safe_load((ROOT / "params.yaml").read_text())
     for name in ("bleach", "spam"):
         (tmp_path / "vision2tactile" / name).mkdir(parents=True)
-    found = made.published(given, tmp_path)
+    published = pages.published(params, tmp_path)
 
-    assert "simulate" not in " ".join([found["forward"]["recordings"], found["touch"]["recordings"]])
-    assert found["forward"]["synchronize"]["grid"] == "logged" and set(found["material"]["sources"]) == {
+    assert "simulate" not in " ".join([published["forward"]["recordings"], published["touch"]["recordings"]])
+    assert published["forward"]["synchronize"]["grid"] == "logged" and set(published["material"]["sources"]) == {
         "biotac",
         "roboskin",
     }
-    assert found["material"]["split"]["scheme"] == "authors" and "folds" not in found["material"]["split"]
-    assert found["touch"]["objects"] == [0, 1]
-    assert found["touch"]["quick"]["methods"]["pointnet"]["wrist"] == "estimated"
-    assert given["forward"]["recordings"].startswith("simulate")
+    assert published["material"]["split"]["scheme"] == "authors" and "folds" not in published["material"]["split"]
+    assert published["touch"]["objects"] == [0, 1]
+    assert published["touch"]["quick"]["methods"]["pointnet"]["wrist"] == "estimated"
+    assert params["forward"]["recordings"].startswith("simulate")
 
 
 def test_reduced_params_have_one_fold_one_epoch_and_one_method_and_splits_stay() -> None:
     import yaml
 
-    given = yaml.safe_load((ROOT / "params.yaml").read_text())
-    found = module("result_pages").reduced(given)
-    assert found["touch"]["methods"] == given["touch"]["methods"][:1] and found["forward"]["folds"] == [0]
-    assert found["forward"]["quick"]["methods"]["gru"]["epochs"] == 1
-    assert found["forward"]["split"] == given["forward"]["split"]
-    assert given["forward"]["quick"]["methods"]["gru"]["epochs"] == 10
+    params = yaml.safe_load((ROOT / "params.yaml").read_text())
+    reduced = module("result_pages").reduced(params)
+    assert reduced["touch"]["methods"] == params["touch"]["methods"][:1] and reduced["forward"]["folds"] == [0]
+    assert reduced["forward"]["quick"]["methods"]["gru"]["epochs"] == 1
+    assert reduced["forward"]["split"] == params["forward"]["split"]
+    assert params["forward"]["quick"]["methods"]["gru"]["epochs"] == 10
 
 
 def test_the_tables_of_results_are_made_from_results() -> None:
     from tacpipe.comparison import engine
     from tests.tasks.touch.report.touch_fakes import result
 
-    made = module("result_pages").table(engine.compare([result(), result("trees", off=0.02)]))
-    rows = list(csv.DictReader(io.StringIO(made)))
+    table = module("result_pages").table(engine.compare([result(), result("trees", off=0.02)]))
+    rows = list(csv.DictReader(io.StringIO(table)))
     assert list(rows[0]) == ["method", "target", "rmse", "low", "high", "grasps"]
     assert [(row["method"], row["rmse"]) for row in rows[:2]] == [
         ("trees on geometry and colour", "0.020"), ("constant (best baseline)", "0.100")
@@ -366,7 +370,7 @@ def test_every_page_is_at_most_two_links_from_the_readme() -> None:
 @pytest.mark.long
 @pytest.mark.skipif(importlib.util.find_spec("mkdocs") is None, reason="the extra docs is not installed")
 def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "-d", str(tmp_path / "site")],
         cwd=ROOT,
         env={**os.environ, "NO_MKDOCS_2_WARNING": "1"},
@@ -374,7 +378,7 @@ def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
         text=True,
         check=False,
     )
-    assert done.returncode == 0, done.stderr
+    assert process.returncode == 0, process.stderr
     assert "tacpipe synchronize" in (tmp_path / "site" / "reference" / "cli.html").read_text()
     assert (tmp_path / "site" / "reference" / "python.html").read_text().count("doc-heading") > 5
 
@@ -382,24 +386,26 @@ def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
 def test_the_targets_that_the_texts_name_are_in_the_makefile() -> None:
     targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
     pages = [*PAGES, ROOT / "CONTRIBUTING.md"]
-    named = {name for page in pages for name in re.findall(r"(?:^|`)make ([a-z-]+)", page.read_text(), re.MULTILINE)}
+    targets_in_texts = {
+        name for page in pages for name in re.findall(r"(?:^|`)make ([a-z-]+)", page.read_text(), re.MULTILINE)
+    }
 
-    assert {"demo", "test", "lint", "types", "bench"} <= named
-    assert named <= targets
+    assert {"demo", "test", "lint", "types", "bench"} <= targets_in_texts
+    assert targets_in_texts <= targets
 
 
 def test_the_install_commands_of_the_texts_work_without_a_package_index() -> None:
     about = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     wheel = f"./{about['name']}-{about['version']}-py3-none-any.whl"
-    found = [
+    install_commands = [
         words
         for page in PAGES
         for line in re.findall(r"(?:^|`)(pip (?:install|wheel) [^`#\n]+)", page.read_text(), re.MULTILINE)
         for words in [shlex.split(line)]
     ]
-    assert len(found) >= 6
+    assert len(install_commands) >= 6
 
-    for words in found:
+    for words in install_commands:
         if words[1] == "wheel":
             assert words == ["pip", "wheel", "--no-deps", "-w", "dist", "."]
             continue
@@ -428,7 +434,7 @@ def test_make_says_in_one_sentence_that_python_is_missing(tmp_path: Path) -> Non
     (tmp_path / "bin").mkdir()
     for name in ("bash", "make", "touch"):
         (tmp_path / "bin" / name).symlink_to(str(shutil.which(name)))
-    done = subprocess.run(
+    process = subprocess.run(
         ["make", "-C", str(ROOT), f"VENV={tmp_path / 'venv'}", "SHELL=bash", str(tmp_path / "venv" / ".python")],
         env={"PATH": str(tmp_path / "bin")},
         capture_output=True,
@@ -436,6 +442,6 @@ def test_make_says_in_one_sentence_that_python_is_missing(tmp_path: Path) -> Non
         check=False,
     )
 
-    assert done.returncode != 0
-    assert "Python 3.11 or newer is missing" in done.stderr
+    assert process.returncode != 0
+    assert "Python 3.11 or newer is missing" in process.stderr
     assert not (tmp_path / "venv").exists()

@@ -20,8 +20,8 @@ MODULES = sorted(
 def tried(name: str) -> doctest.TestResults:
     """Import a module and run its examples; none are looked for where no line begins one, which takes its time."""
     module = importlib.import_module(name)
-    found = Path(str(module.__file__)).read_text().count(">>> ")
-    return doctest.testmod(module) if found else doctest.TestResults(0, 0)
+    has_examples = Path(str(module.__file__)).read_text().count(">>> ")
+    return doctest.testmod(module) if has_examples else doctest.TestResults(0, 0)
 
 
 @pytest.mark.parametrize("name", MODULES)

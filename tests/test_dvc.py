@@ -56,11 +56,11 @@ class Project:
 
     def run(self, command: str) -> str:
         """Return what a command that must succeed printed."""
-        done = subprocess.run(
+        process = subprocess.run(
             shlex.split(command), cwd=self.folder, env=self.environment, capture_output=True, text=True, check=False
         )
-        assert done.returncode == 0, f"{command} ended with {done.returncode}: {done.stdout}{done.stderr}"
-        return done.stdout + done.stderr
+        assert process.returncode == 0, f"{command} ended with {process.returncode}: {process.stdout}{process.stderr}"
+        return process.stdout + process.stderr
 
     def start(self) -> None:
         """Make the folder a repository and commit what is in it."""
@@ -84,8 +84,8 @@ class Project:
         shards = tacpipe.open(self.folder / dataset).recordings
         return {name: shard.table()["x"].to_pylist() for name, shard in shards.items()}
 
-    def beside(self, dataset: str) -> dict[str, list[int]]:
-        """Return the values in the Parquet files that lie beside the manifest, whatever that names."""
+    def values_in_folder(self, dataset: str) -> dict[str, list[int]]:
+        """Return the values in the Parquet files of the manifest's folder, whether or not the manifest names them."""
         return {path.stem: pq.read_table(path)["x"].to_pylist() for path in (self.folder / dataset).glob("*.parquet")}
 
 
@@ -93,9 +93,9 @@ class Project:
 def environment(tmp_path: Path, plugin: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
     """An environment in which neither git nor DVC knows who runs them."""
     monkeypatch.delenv("TACPIPE_STORE", raising=False)
-    kept = {name: value for name, value in os.environ.items() if not name.startswith(("GIT_", "DVC_", "TACPIPE_"))}
+    inherited = {name: value for name, value in os.environ.items() if not name.startswith(("GIT_", "DVC_", "TACPIPE_"))}
     return {
-        **kept,
+        **inherited,
         "PATH": os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]]),
         "PYTHONPATH": str(plugin),
         "HOME": str(tmp_path),
@@ -128,12 +128,12 @@ def toy(tmp_path: Path, environment: Mapping[str, str], tmp_path_factory: pytest
         project.run("dvc repro")
         project.commit("factor 3")
 
-    made = made_once(tmp_path_factory, "dvc", make)
-    return Project(shutil.copytree(made, tmp_path / "toy", symlinks=True), environment)
+    prototype = made_once(tmp_path_factory, "dvc", make)
+    return Project(shutil.copytree(prototype, tmp_path / "toy", symlinks=True), environment)
 
 
 def expected(factor: int) -> dict[str, list[int]]:
-    """What the toy chain gives with an offset of 1."""
+    """Return the values that the toy chain computes with an offset of 1."""
     return {f"trial-{trial:03d}": [factor * (row * (trial + 1) + 1) for row in range(20)] for trial in range(4)}
 
 
@@ -160,17 +160,17 @@ def test_a_method_of_the_forward_chain_runs_once_and_dvc_shows_its_metrics_param
     project.start()
     target, results = "forward-calibrated@taxelwise-0", "results/forward/taxelwise/0"
     project.run(f"dvc repro {target}")
-    again = project.run(f"dvc repro {target}")
+    second_run = project.run(f"dvc repro {target}")
     project.commit("one epoch")
 
-    assert "Running stage" not in again
-    assert "up to date" in again
-    shown = json.loads(project.run(f"dvc metrics show --json {results}/metrics.json"))
-    metrics = shown[""]["data"][f"{results}/metrics.json"]["data"]
+    assert "Running stage" not in second_run
+    assert "up to date" in second_run
+    printed = json.loads(project.run(f"dvc metrics show --json {results}/metrics.json"))
+    metrics = printed[""]["data"][f"{results}/metrics.json"]["data"]
     assert metrics["model"]["mae_counts"]["both"]["t10"] > 0
     assert metrics["persistence"]["mae_counts"]["both"]["t10"] > 0
-    stated = json.loads((project.folder / "results/forward/taxelwise-calibrated/0/metrics.json").read_text())
-    assert stated["quantiles"]["levels"] == [10, 50, 90] and stated["model"] == metrics["model"]
+    calibrated = json.loads((project.folder / "results/forward/taxelwise-calibrated/0/metrics.json").read_text())
+    assert calibrated["quantiles"]["levels"] == [10, 50, 90] and calibrated["model"] == metrics["model"]
     project.change("rest_s: 0.2", "rest_s: 0.3")
     changed = json.loads(project.run("dvc params diff --json"))["params.yaml"]
     assert changed == {"forward.segment.rest_s": {"old": 0.2, "new": 0.3, "diff": pytest.approx(0.1)}}
@@ -200,13 +200,13 @@ def test_a_method_of_the_material_chain_runs_once_and_is_reported(
     params = yaml.safe_load((project.folder / "params.yaml").read_text())
     params["material"]["sources"] = {"simulated": "simulate material --trials 96 --materials 3 --no-pac"}
     params["material"]["readouts"]["patterns"]["features"] = 200
-    params["material"]["calibrate"] = {"false_unknown": 0.4}  # so few slides can promise no less
+    params["material"]["calibrate"] = {"false_unknown": 0.4}  # So few slides cannot promise a lower rate.
     (project.folder / "params.yaml").write_text(yaml.safe_dump(params, sort_keys=False))
     project.start()
     project.run("dvc repro material-readout@patterns-0")
-    again = project.run("dvc repro material-readout@patterns-0")
+    second_run = project.run("dvc repro material-readout@patterns-0")
 
-    assert "Running stage" not in again
+    assert "Running stage" not in second_run
     metrics = json.loads((project.folder / "results/material/patterns/0/metrics.json").read_text())
     assert metrics["model"]["n"] == {"biotac": 12, "roboskin": 12}
     assert metrics["model"]["accuracy"]["biotac"] > metrics["chance"]["accuracy"]["biotac"]
@@ -233,29 +233,39 @@ def test_methods_and_settings_of_the_touch_chain_run_once_and_are_reported(
     params["touch"] |= {"recordings": "simulate touch --trials 24 --objects 1 --families box,sphere", **small}
     methods, settings = params["touch"]["quick"]["methods"], params["touch"]["quick"]["settings"]
     methods["trees"]["trees"] = 5
-    for one in (methods["pointnet"], settings["xyz"]):
-        one |= {"epochs": 1, "points": 32, "head": "fc1"}
+    for options in (methods["pointnet"], settings["xyz"]):
+        options |= {"epochs": 1, "points": 32, "head": "fc1"}
     (project.folder / "params.yaml").write_text(yaml.safe_dump(params, sort_keys=False))
     project.start()
     project.run("dvc repro touch")
-    again = project.run("dvc repro touch")
+    second_run = project.run("dvc repro touch")
 
-    assert "Running stage" not in again
-    found = sorted(
+    assert "Running stage" not in second_run
+    result_folders = sorted(
         str(path.relative_to(project.folder / "results")) for path in project.folder.glob("results/touch/*/*")
     )
-    both = [f"touch/{method}-{split}/0" for method in ("pointnet", "trees") for split in ("known", "later", "novel")]
-    assert found == ["touch/calibrated/0", *both, "touch/xyz/0"]
-    stated = json.loads((project.folder / "results/touch/calibrated/0/metrics.json").read_text())["quantiles"]
-    assert stated["levels"] == [10, 50, 90] and 0 <= stated["known"]["model"]["coverage"]["e_th"] <= 1
-    metrics = {name: json.loads((project.folder / f"results/{name}/metrics.json").read_text()) for name in both}
-    assert metrics["touch/trees-known/0"]["known"]["counts"]["grasps"] in (4, 5, 6)  # of 24 in 5 folds of 2 objects
+    methods_and_splits = [
+        f"touch/{method}-{split}/0" for method in ("pointnet", "trees") for split in ("known", "later", "novel")
+    ]
+    assert result_folders == ["touch/calibrated/0", *methods_and_splits, "touch/xyz/0"]
+    quantiles = json.loads((project.folder / "results/touch/calibrated/0/metrics.json").read_text())["quantiles"]
+    assert quantiles["levels"] == [10, 50, 90] and 0 <= quantiles["known"]["model"]["coverage"]["e_th"] <= 1
+    metrics = {
+        name: json.loads((project.folder / f"results/{name}/metrics.json").read_text()) for name in methods_and_splits
+    }
+    assert metrics["touch/trees-known/0"]["known"]["counts"]["grasps"] in (
+        4,
+        5,
+        6,
+    )  # A fold of 5 tests 2 objects of the 24 grasps.
     assert metrics["touch/trees-novel/0"]["novel"]["counts"] == {"grasps": 12, "objects": 1}
     assert metrics["touch/trees-later/0"]["known"]["counts"] == {"grasps": 6, "objects": 2}
-    lines = project.run("dvc metrics show " + " ".join(f"results/{name}/summary.json" for name in both)).splitlines()
+    lines = project.run(
+        "dvc metrics show " + " ".join(f"results/{name}/summary.json" for name in methods_and_splits)
+    ).splitlines()
     assert lines[0].split()[:5] == ["Path", "e_mf", "e_th", "gain", "high"] and max(map(len, lines)) <= 120
     page = (project.folder / "results/touch.html").read_text()
-    for shown in (
+    for text in (
         "5 folds",
         "5 folds, calibrated",
         "Coverage of each electrode",
@@ -264,8 +274,8 @@ def test_methods_and_settings_of_the_touch_chain_run_once_and_are_reported(
         "<td>XYZ</td>",
         "<td>RGBCont</td>",
     ):
-        assert shown in page
-    assert "XYZCont" not in page  # of the paper's rows, those that were run
+        assert text in page
+    assert "XYZCont" not in page  # The page has the rows of the paper that were run.
 
 
 @pytest.mark.long
@@ -276,10 +286,10 @@ def test_after_checkout_of_an_older_commit_tacpipe_reads_what_the_manifest_names
     toy.run("git checkout --quiet HEAD~1")
     toy.run("dvc checkout")
 
-    assert toy.beside("data/scaled") == expected(3)  # stale: DVC knows nothing of them
+    assert toy.values_in_folder("data/scaled") == expected(3)  # stale: DVC knows nothing of them
     assert toy.values("data/scaled") == expected(2)
     toy.run("tacpipe store link data/scaled")
-    assert toy.beside("data/scaled") == expected(2)
+    assert toy.values_in_folder("data/scaled") == expected(2)
     assert "Running stage" not in toy.run("dvc repro")
 
 
@@ -288,10 +298,10 @@ def test_after_checkout_of_an_older_commit_tacpipe_reads_what_the_manifest_names
 @NEEDS_DVC
 def test_after_a_restore_from_the_run_cache_tacpipe_reads_what_the_manifest_names(toy: Project) -> None:
     toy.change("factor: 3", "factor: 2")
-    told = toy.run("dvc repro")
+    output = toy.run("dvc repro")
 
-    assert "Stage 'scaled' is cached" in told
-    assert toy.beside("data/scaled") == expected(3)  # stale: the stage did not run
+    assert "Stage 'scaled' is cached" in output
+    assert toy.values_in_folder("data/scaled") == expected(3)  # stale: the stage did not run
     assert toy.values("data/scaled") == expected(2)
     metrics = json.loads((toy.folder / "results" / "toy" / "metrics.json").read_text())
     assert metrics == {name: sum(values) for name, values in expected(2).items()}
@@ -325,10 +335,10 @@ def test_a_second_clone_with_the_same_caches_gets_the_results_without_running_a_
 @NEEDS_DVC
 def test_labels_set_by_hand_survive_the_next_repro(toy: Project) -> None:
     toy.run("tacpipe label data/recordings trial-002 --label material=foam")
-    told = toy.run("dvc repro")
+    output = toy.run("dvc repro")
 
-    assert "Running stage 'scaled'" in told
-    assert "0 ran, 4 reused" in told  # no shard reads the label
+    assert "Running stage 'scaled'" in output
+    assert "0 ran, 4 reused" in output  # no shard reads the label
     assert tacpipe.open(toy.folder / "data/scaled").recordings["trial-002"].attributes["material"] == "foam"
     assert "Running stage" not in toy.run("dvc repro")
 
@@ -340,9 +350,9 @@ def filled(value: Any, names: Mapping[str, str]) -> Any:
             value = value.replace(f"${{{name}}}", text)
         return value
     if isinstance(value, list):
-        return [filled(one, names) for one in value]
+        return [filled(item, names) for item in value]
     if isinstance(value, dict):
-        return {filled(name, names): filled(one, names) for name, one in value.items()}
+        return {filled(name, names): filled(item, names) for name, item in value.items()}
     return value
 
 
@@ -358,32 +368,39 @@ def looked_up(value: Any, params: Mapping[str, Any]) -> Any:
 def items_of(value: Mapping[str, Any], params: Mapping[str, Any]) -> Iterator[dict[str, str]]:
     """Yield what stands for ``${item...}`` and ``${key}`` in each stage that a ``matrix`` or ``foreach`` makes."""
     if "foreach" in value:
-        for key, one in looked_up(value["foreach"], params).items():
-            yield {"key": key, "item": one}
+        for key, choice in looked_up(value["foreach"], params).items():
+            yield {"key": key, "item": choice}
         return
-    matrix = {key: looked_up(one, params) for key, one in value.get("matrix", {}).items()}
-    matrix = {key: one[:1] if key == "fold" else one for key, one in matrix.items()}
+    matrix = {key: looked_up(values, params) for key, values in value.get("matrix", {}).items()}
+    matrix = {key: values[:1] if key == "fold" else values for key, values in matrix.items()}
     for chosen in itertools.product(*matrix.values()):
-        found: dict[str, str] = {}
-        for key, one in zip(matrix, chosen, strict=True):
-            parts = {f"item.{key}.{part}": str(text) for part, text in one.items()} if isinstance(one, dict) else {}
-            found |= parts or {f"item.{key}": str(one)}
-        yield found
+        replacements: dict[str, str] = {}
+        for key, choice in zip(matrix, chosen, strict=True):
+            parts = (
+                {f"item.{key}.{part}": str(text) for part, text in choice.items()} if isinstance(choice, dict) else {}
+            )
+            replacements |= parts or {f"item.{key}": str(choice)}
+        yield replacements
 
 
 def stages(preset: str) -> Iterator[tuple[str, dict[str, Any], list[list[str]]]]:
     """Yield each stage of the project's own chains in its first fold, and the words of each of its commands."""
     params = yaml.safe_load((HERE / "params.yaml").read_text())
-    known = {
-        f"{task}.{name}": text for task, own in params.items() for name, text in own.items() if isinstance(text, str)
+    replacements = {
+        f"{task}.{name}": text
+        for task, task_params in params.items()
+        for name, text in task_params.items()
+        if isinstance(text, str)
     }
-    known |= {f"{task}.preset": preset for task in params}
+    replacements |= {f"{task}.preset": preset for task in params}
     for name, value in yaml.safe_load((HERE / "dvc.yaml").read_text())["stages"].items():
         for items in items_of(value, params):
             body = value.get("do", value)
-            found = filled({key: one for key, one in body.items() if key != "matrix"}, {**known, **items})
-            commands = found["cmd"] if isinstance(found["cmd"], list) else [found["cmd"]]
-            yield "-".join([name, *items.values()]), found, [shlex.split(command) for command in commands]
+            filled_stage = filled(
+                {key: part for key, part in body.items() if key != "matrix"}, {**replacements, **items}
+            )
+            commands = filled_stage["cmd"] if isinstance(filled_stage["cmd"], list) else [filled_stage["cmd"]]
+            yield "-".join([name, *items.values()]), filled_stage, [shlex.split(command) for command in commands]
 
 
 def output_of(words: list[str]) -> str:
@@ -394,18 +411,18 @@ def output_of(words: list[str]) -> str:
 
 @pytest.mark.parametrize("preset", ["quick", pytest.param("paper", marks=pytest.mark.long)])
 def test_every_command_of_the_chain_is_a_stage_whose_block_of_params_fits(preset: str, lab: Lab) -> None:
-    known, seen = registry.stages(), set()
+    stage_names, printed_blocks = registry.stages(), set()
     shutil.copy(HERE / "params.yaml", lab.folder)
     for name, value, commands in stages(preset):
         for words in commands:
             assert words[0] == "tacpipe", name
-            assert words[1] in known or f"{words[1]}.{words[2]}" in known, name
+            assert words[1] in stage_names or f"{words[1]}.{words[2]}" in stage_names, name
             block = words[words.index("--block") + 1] if "--block" in words else ""
-            assert not block or any(block.startswith(one) for one in value["params"]), name
-            if (*words[1:3], block) not in seen:
+            assert not block or any(block.startswith(param) for param in value["params"]), name
+            if (*words[1:3], block) not in printed_blocks:
                 printed = json.loads(lab.run(shlex.join([*words[1:], "--print-params"])).out)
                 assert isinstance(printed, dict), name
-            seen.add((*words[1:3], block))
+            printed_blocks.add((*words[1:3], block))
 
 
 def test_dvc_tracks_manifests_and_the_report_alone() -> None:

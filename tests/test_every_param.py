@@ -75,12 +75,12 @@ SELECTING = [name for name in STAGES if name.startswith(("ingest.", "segment.", 
 FREE |= {f"{name}.{field}": "names of streams" for name in SELECTING for field in ("streams", "without")}
 
 
-def each() -> Iterator[tuple[str, Any, str, Any]]:
+def every_param() -> Iterator[tuple[str, Any, str, Any]]:
     """Yield stage, kind of params, name and annotation of every field."""
     for name in STAGES:
         for kind in params_of.kinds(registry.load(name)):
-            for field, wanted in fields.hints(kind).items():
-                yield name, kind, field, wanted
+            for field, annotation in fields.hints(kind).items():
+                yield name, kind, field, annotation
 
 
 def tagged(name: str, kind: Any) -> dict[str, Any]:
@@ -89,16 +89,16 @@ def tagged(name: str, kind: Any) -> dict[str, Any]:
     return {tag: get_args(fields.bare(fields.hints(kind)[tag]))[0]} if tag else {}
 
 
-def outside(wanted: Any) -> Iterator[Any]:
+def outside(annotation: Any) -> Iterator[Any]:
     """Yield values just outside of each end of a range."""
-    whole = fields.bare(wanted) is int
-    for one in fields.constraints(wanted):
-        if isinstance(one, Range):
-            yield from () if one.least is None else (one.least - (1 if whole else 0.001),)
-            yield from () if one.most is None else (one.most + (1 if whole else 0.001),)
-            yield from () if one.above is None else (one.above,)
-            yield from () if one.below is None else (one.below,)
-            yield from () if whole else (math.nan, math.inf)
+    is_integer = fields.bare(annotation) is int
+    for constraint in fields.constraints(annotation):
+        if isinstance(constraint, Range):
+            yield from () if constraint.least is None else (constraint.least - (1 if is_integer else 0.001),)
+            yield from () if constraint.most is None else (constraint.most + (1 if is_integer else 0.001),)
+            yield from () if constraint.above is None else (constraint.above,)
+            yield from () if constraint.below is None else (constraint.below,)
+            yield from () if is_integer else (math.nan, math.inf)
 
 
 def command(name: str, options: dict[str, Any]) -> str:
@@ -109,19 +109,28 @@ def command(name: str, options: dict[str, Any]) -> str:
     return f"{name.replace('.', ' ')} {inputs.get(name.partition('.')[0], 'nowhere')} {split} -o out {' '.join(words)}"
 
 
-RANGED = {(name, kind, field): wanted for name, kind, field, wanted in each() if any(True for _ in outside(wanted))}
+RANGED = {
+    (name, kind, field): annotation
+    for name, kind, field, annotation in every_param()
+    if any(True for _ in outside(annotation))
+}
 CHOICES = {
-    (name, kind, field): wanted for name, kind, field, wanted in each() if get_origin(fields.bare(wanted)) is Literal
+    (name, kind, field): annotation
+    for name, kind, field, annotation in every_param()
+    if get_origin(fields.bare(annotation)) is Literal
 }
 
 
 def test_every_param_is_a_choice_a_range_a_list_a_truth_or_free_for_a_reason() -> None:
     free = {
         f"{name}.{field}"
-        for name, _, field, wanted in each()
-        if fields.bare(wanted) is not bool
-        and get_origin(fields.bare(wanted)) is not Literal
-        and not any(not (isinstance(one, CommaList) and one.of is str) for one in fields.constraints(wanted))
+        for name, _, field, annotation in every_param()
+        if fields.bare(annotation) is not bool
+        and get_origin(fields.bare(annotation)) is not Literal
+        and not any(
+            not (isinstance(constraint, CommaList) and constraint.of is str)
+            for constraint in fields.constraints(annotation)
+        )
     }
     assert free == set(FREE)
     assert len(RANGED) > 100 and len(CHOICES) > 40
@@ -130,9 +139,9 @@ def test_every_param_is_a_choice_a_range_a_list_a_truth_or_free_for_a_reason() -
 @pytest.mark.parametrize("name", SELECTING)
 def test_streams_are_selected_by_the_same_options_which_are_in_keys_only_where_they_are_given(name: str) -> None:
     kind = params_of.kinds(registry.load(name))[0]
-    given = {"layout": json.dumps({"streams": {}})} if name == "ingest.table" else {}
-    assert not {"streams", "without"} & set(params_of.to_json(kind(**given)))
-    assert params_of.to_json(kind(**given, without="a"))["without"] == "a"
+    required = {"layout": json.dumps({"streams": {}})} if name == "ingest.table" else {}
+    assert not {"streams", "without"} & set(params_of.to_json(kind(**required)))
+    assert params_of.to_json(kind(**required, without="a"))["without"] == "a"
 
 
 @pytest.mark.parametrize("key", RANGED, ids=lambda key: f"{key[0]}.{key[1].__name__}.{key[2]}")
@@ -159,10 +168,12 @@ def test_a_number_out_of_its_range_ends_with_code_2_before_anything_is_read(
 
 @pytest.mark.parametrize("key", RANGED, ids=lambda key: f"{key[0]}.{key[1].__name__}.{key[2]}")
 def test_the_ends_of_a_range_belong_to_it_or_not_as_it_says(key: tuple[str, Any, str]) -> None:
-    for one in fields.constraints(RANGED[key]):
-        if isinstance(one, Range):
-            assert all(fields.fits(end, RANGED[key]) for end in (one.least, one.most) if end is not None)
-            assert not any(fields.fits(end, RANGED[key]) for end in (one.above, one.below) if end is not None)
+    for constraint in fields.constraints(RANGED[key]):
+        if isinstance(constraint, Range):
+            assert all(fields.fits(end, RANGED[key]) for end in (constraint.least, constraint.most) if end is not None)
+            assert not any(
+                fields.fits(end, RANGED[key]) for end in (constraint.above, constraint.below) if end is not None
+            )
             default = key[1].__dataclass_fields__[key[2]].default
             assert fields.fits(default, RANGED[key])
 
@@ -185,28 +196,28 @@ def test_an_option_of_another_kind_of_params_is_refused_and_is_in_no_key(
     stage = registry.load(name)
     monkeypatch.chdir(tmp_path)
     for kind in params_of.kinds(stage):
-        own = given_params.build(name, stage, options=tagged(name, kind))
-        assert set(params_of.to_input(own)) == set(fields.hints(kind))
-        for other in params_of.kinds(stage):
-            for field in set(fields.hints(other)) - set(fields.hints(kind)):
-                default = other.__dataclass_fields__[field].default
+        params = given_params.build(name, stage, options=tagged(name, kind))
+        assert set(params_of.to_input(params)) == set(fields.hints(kind))
+        for other_kind in params_of.kinds(stage):
+            for field in set(fields.hints(other_kind)) - set(fields.hints(kind)):
+                default = other_kind.__dataclass_fields__[field].default
                 with pytest.raises(UsageError, match=f"--{field.replace('_', '-')} belongs to the "):
                     given_params.build(name, stage, options={**tagged(name, kind), field: default})
                 (tmp_path / "params.yaml").write_text(json.dumps({"own": {**tagged(name, kind), field: default}}))
                 ran = call(f"{command(name, {})} --block own")
                 assert ran.code == 2
                 assert f"params.yaml, block own: {field} belongs to the {params_of.tag(stage)} " in ran.err
-                assert get_args(fields.bare(fields.hints(other)[params_of.tag(stage) or ""]))[0] in ran.err
+                assert get_args(fields.bare(fields.hints(other_kind)[params_of.tag(stage) or ""]))[0] in ran.err
 
 
 @pytest.mark.parametrize("name", STAGES)
 def test_a_preset_that_a_stage_does_not_have_is_refused_and_those_it_has_can_be_built(name: str, call: Call) -> None:
     stage = registry.load(name)
-    there = params_of.presets(stage)
+    presets = params_of.presets(stage)
     ran = call(f"{command(name, {})} --preset glossy")
     assert ran.code == 2
-    assert ran.err == f"tacpipe: There is no preset glossy for {name}; it has {', '.join(there) or 'none'}.\n"
-    for preset in there:
+    assert ran.err == f"tacpipe: There is no preset glossy for {name}; it has {', '.join(presets) or 'none'}.\n"
+    for preset in presets:
         assert given_params.build(name, stage, preset=preset)
 
 
@@ -217,22 +228,22 @@ def test_help_shows_choices_ranges_and_whose_an_option_is(name: str, call: Call)
     choices = [f"--{tag} {params_of.choices(kind, tag)[0]} " for kind in params_of.kinds(stage)] if tag else [""]
     texts = [call(f"{name.replace('.', ' ')} {words}--help").out for words in choices]
     printed = " ".join(" ".join(texts).split())
-    for field, wanted in params_of.fields(stage).items():
+    for field, annotation in params_of.fields(stage).items():
         assert f"--{field.replace('_', '-')}" in printed
-        if get_origin(fields.bare(wanted)) is Literal:
-            assert f"[{'|'.join(map(str, get_args(fields.bare(wanted))))}]" in printed
+        if get_origin(fields.bare(annotation)) is Literal:
+            assert f"[{'|'.join(map(str, get_args(fields.bare(annotation))))}]" in printed
         assert not params_of.having(stage, field) or f"only with {params_of.tag(stage)}" in printed
 
 
 @pytest.mark.parametrize("name", STAGES)
 def test_every_param_has_a_help_text(name: str) -> None:
     stage = registry.load(name)
-    told = params_of.comments(stage)
-    assert [field for field in params_of.fields(stage) if not told.get(field)] == []
+    comments = params_of.comments(stage)
+    assert [field for field in params_of.fields(stage) if not comments.get(field)] == []
 
 
 @pytest.mark.parametrize(
-    ("name", "field", "known"),
+    ("name", "field", "choices"),
     [
         ("train.forward", "architecture", {"auto", *registry.architectures("forward")}),
         ("train.forward", "actions", ACTIONS),
@@ -253,8 +264,8 @@ def test_every_param_has_a_help_text(name: str) -> None:
         ("simulate.touch", "stiffness", {"mixed", *MODULI_PA}),
     ],
 )
-def test_choices_are_those_that_the_code_behind_them_knows(name: str, field: str, known: Any) -> None:
-    assert set(get_args(fields.bare(params_of.fields(registry.load(name))[field]))) == set(known)
+def test_choices_are_those_that_the_code_behind_them_knows(name: str, field: str, choices: Any) -> None:
+    assert set(get_args(fields.bare(params_of.fields(registry.load(name))[field]))) == set(choices)
 
 
 def test_lists_and_limits_are_those_that_the_code_behind_them_knows() -> None:
@@ -271,10 +282,17 @@ UNITS = {  # the end of a name and the unit that help must show
 
 
 def test_a_number_whose_name_ends_in_a_unit_shows_that_unit() -> None:
-    numbers = {(name, field): wanted for name, _, field, wanted in each() if fields.bare(wanted) in (int, float)}
+    numbers = {
+        (name, field): annotation
+        for name, _, field, annotation in every_param()
+        if fields.bare(annotation) in (int, float)
+    }
     ends = {key: max((end for end in UNITS if key[1].endswith(end)), key=len, default="") for key in numbers}
-    shown = {key: [one.name for one in fields.constraints(numbers[key]) if isinstance(one, Unit)] for key in numbers}
-    wrong = {key: shown[key] for key, end in ends.items() if end and shown[key] != [UNITS[end]]}
+    units = {
+        key: [constraint.name for constraint in fields.constraints(numbers[key]) if isinstance(constraint, Unit)]
+        for key in numbers
+    }
+    wrong = {key: units[key] for key, end in ends.items() if end and units[key] != [UNITS[end]]}
     assert not wrong
     assert sum(map(bool, ends.values())) > 30
     assert fields.describe(numbers["synchronize", "gap_ms"]).endswith("(ms)")
@@ -283,7 +301,7 @@ def test_a_number_whose_name_ends_in_a_unit_shows_that_unit() -> None:
 def test_each_param_of_a_model_is_in_one_panel_of_the_help() -> None:
     for name in STAGES:
         kinds, panels = params_of.kinds(registry.load(name)), params_of.panels(registry.load(name))
-        if not set(panels) - {"streams", "without"}:  # which many stages share
+        if not set(panels) - {"streams", "without"}:  # Many stages share these.
             assert not name.startswith(("train.", "compress."))
             continue
         assert set(panels) == set(params_of.fields(registry.load(name))), name
@@ -304,17 +322,19 @@ def test_the_options_of_a_command_know_their_panels(name: str) -> None:
 
     program = typer.Typer()
     stages.add(program, name, "stage")
-    found = {param.name: getattr(param, "rich_help_panel", None) for param in typer.main.get_command(program).params}
+    panel_of_option = {
+        param.name: getattr(param, "rich_help_panel", None) for param in typer.main.get_command(program).params
+    }
     panels = params_of.panels(registry.load(name))
-    assert {field: found[field] for field in panels} == panels
+    assert {field: panel_of_option[field] for field in panels} == panels
 
 
 def test_models_and_tasks_read_params_as_attributes_of_their_dataclasses() -> None:
     root = Path(params_of.__file__).parents[1]
     files = [file for part in ("tasks", "models", "codecs", "training") for file in (root / part).rglob("*.py")]
     lookups = re.compile(r"\bparams(?:\[[\"']|\.get\()|\bparams: (?:Mapping|dict)\b|\bParams = (?:Mapping|dict)\b")
-    found = {file.name: lookups.findall(file.read_text(encoding="utf-8")) for file in files}
-    assert {name: texts for name, texts in found.items() if texts} == {}
+    found_lookups = {file.name: lookups.findall(file.read_text(encoding="utf-8")) for file in files}
+    assert {name: texts for name, texts in found_lookups.items() if texts} == {}
     assert len(files) > 50
 
 

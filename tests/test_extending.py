@@ -19,7 +19,7 @@ TITLED = (".py", ".toml")
 
 def packages(folder: Path) -> list[Path]:
     """Write the package of each page below ``folder``, and return their folders."""
-    made = []
+    folders = []
     for page in docs.EXTENDING:
         place = folder / page.stem
         place.mkdir(parents=True)
@@ -27,15 +27,15 @@ def packages(folder: Path) -> list[Path]:
             if block.title:
                 (place / block.title).write_text(block.text)
         assert (place / "pyproject.toml").exists(), page
-        made.append(place)
-    return made
+        folders.append(place)
+    return folders
 
 
 def environment(folder: Path) -> Path:
     """Return the folder of programs of a fresh environment, which has what this one has and nothing of its own."""
     venv.create(folder, with_pip=False, symlinks=True)
-    (own,) = folder.glob("lib/python*/site-packages")
-    (own / "known.pth").write_text(f"import site; site.addsitedir({sysconfig.get_paths()['purelib']!r})\n")
+    (site_packages,) = folder.glob("lib/python*/site-packages")
+    (site_packages / "known.pth").write_text(f"import site; site.addsitedir({sysconfig.get_paths()['purelib']!r})\n")
     program = folder / "bin" / "tacpipe"
     program.write_text(
         f"#!{folder}/bin/python\nfrom tacpipe.cli.main import main\n\nif __name__ == '__main__':\n    main()\n"
@@ -54,35 +54,40 @@ def test_the_package_of_every_page_installs_and_does_what_the_page_prints(tmp_pa
     clean = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "TACPIPE_STORE")}
     around = {**clean, "PATH": f"{programs}{os.pathsep}{os.environ['PATH']}", "OMP_NUM_THREADS": "1"}
 
-    def done(words: list[str], what: str) -> list[str]:
+    def run_program(words: list[str], label: str) -> list[str]:
         ran = subprocess.run(words, cwd=project, env=around, capture_output=True, text=True, check=False)
-        assert ran.returncode == 0, f"{what}: {ran.stderr}"
+        assert ran.returncode == 0, f"{label}: {ran.stderr}"
         return [line for line in (ran.stderr + ran.stdout).splitlines() if line]
 
     quiet = ["--quiet", "--no-deps", "--no-build-isolation", "--no-index", "--disable-pip-version-check"]
     pip = [sys.executable, "-m", "pip", "--python", str(programs / "python"), "install", *quiet]
-    done([*pip, *map(str, packages(tmp_path / "packages"))], "pip install")
+    run_program([*pip, *map(str, packages(tmp_path / "packages"))], "pip install")
 
     before: set[str] = set()
     for page in docs.EXTENDING:
-        here = set()
+        page_commands = set()
         for block in docs.fenced(page.read_text()):
             if block.language == "python" and not block.title:
-                done([str(programs / "python"), "-c", block.text], page.name)
+                run_program([str(programs / "python"), "-c", block.text], page.name)
             elif block.language == "console":
                 for command, lines in docs.printed(block.text):
-                    shown = done([str(programs / "tacpipe"), *shlex.split(command)[1:]], f"{page.name}: {command}")
-                    docs.compare(f"{page.name}: {command}", lines, shown, again=command in before)
-                    here.add(command)
-        before |= here
+                    printed_lines = run_program(
+                        [str(programs / "tacpipe"), *shlex.split(command)[1:]], f"{page.name}: {command}"
+                    )
+                    docs.compare(f"{page.name}: {command}", lines, printed_lines, rerun=command in before)
+                    page_commands.add(command)
+        before |= page_commands
 
 
 def test_every_group_of_plug_ins_has_a_page() -> None:
     from tacpipe.plugins import registry
 
     text = (docs.ROOT / "docs" / "extending" / "index.md").read_text()
-    apart = {registry.EXPORTS, registry.COMMANDS}  # exports are stages, the order of commands is a part of a package
-    assert {group for group in registry.GROUPS if f"`{group}`" not in text} == apart
+    without_page = {
+        registry.EXPORTS,
+        registry.COMMANDS,
+    }  # exports are stages, the order of commands is a part of a package
+    assert {group for group in registry.GROUPS if f"`{group}`" not in text} == without_page
     assert {page.name for page in docs.EXTENDING} == {
         page.name for page in (docs.ROOT / "docs" / "extending").glob("*.md") if page.name != "index.md"
     }

@@ -1,4 +1,4 @@
-"""Without tacpipe's extras every command either works or ends in one sentence that names the extra and how to install it."""
+"""Commands without tacpipe's extras work or end in one sentence with the extra and how to install it."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ WORK = (  # a command for each that needs no extra; {o} is a new place
     "store push {o} data/split",
     "store pull elsewhere data/split",
 )
-LACK = {  # and for each that does need one, with that extra
+LACK = {  # Commands that need an extra, with that extra.
     "compress pca data/segments --split data/split -o {o}": "learn",
     "compress autoencoder data/segments --split data/split -o {o}": "learn",
     "compress pca data/segments --codec data/latents -o {o}": "learn",
@@ -127,7 +127,7 @@ LACK = {  # and for each that does need one, with that extra
     "sensors emulate ws.toml -o {o} --duration-s 1": "devices",
     "sensors emulate can.toml -o {o} --duration-s 1": "devices",
 }
-PATIENCE_S = 300.0  # that no command takes unless it hangs
+PATIENCE_S = 300.0  # No command takes this long unless it hangs.
 HEADER = "ply\nformat ascii 1.0\nelement vertex {0}\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
 RIGS = {
     "serial": ("optoforce", "serial:/dev/null"),
@@ -218,33 +218,33 @@ def words(commands_of: Iterator[str] | tuple[str, ...] | dict[str, str]) -> set[
 
 
 def test_every_command_is_walked() -> None:
-    every = {name.replace(".", " ") for name in BUILT_IN}
-    every |= {name for name in commands.NAMES if name not in GROUPS}
-    every |= {f"{group} {name}" for group, names in GROUPS.items() for name in names}
+    expected_commands = {name.replace(".", " ") for name in BUILT_IN}
+    expected_commands |= {name for name in commands.NAMES if name not in GROUPS}
+    expected_commands |= {f"{group} {name}" for group, names in GROUPS.items() for name in names}
 
-    assert words(WORK) | words(LACK) == every
+    assert words(WORK) | words(LACK) == expected_commands
 
 
 @pytest.mark.long
 def test_what_needs_no_extra_works_without_any(bare: Callable[[str], tuple[int, str]]) -> None:
-    failed = {command: told for command in WORK for code, told in [bare(command)] if code}
+    failed = {command: output for command in WORK for code, output in [bare(command)] if code}
 
     assert failed == {}
 
 
 @pytest.mark.long
 def test_what_needs_an_extra_ends_in_one_sentence_that_names_it(bare: Callable[[str], tuple[int, str]]) -> None:
-    other = {}
+    unexpected = {}
     for command, extra in LACK.items():
-        code, told = bare(command)
+        code, output = bare(command)
         sentence = (
             r"tacpipe: [^\n]+ needs [\w-]+, which is not installed: install it with the extra "
             rf"{extra}, by `[^`\n]+ install [^`\n]*\[{extra}\]'?`\.\n"
         )
-        if code != 1 or not re.fullmatch(sentence, told):
-            other[command] = (code, told)
+        if code != 1 or not re.fullmatch(sentence, output):
+            unexpected[command] = (code, output)
 
-    assert other == {}
+    assert unexpected == {}
 
 
 LIBRARY = """
@@ -262,7 +262,7 @@ except ImportError as error:
     [('tacpipe.load("models/forward")', "forward"), ('tacpipe.open("data/split").to_torch()', "to_torch")],
 )
 def test_python_gets_the_same_sentence(chained: Path, tmp_path: Path, call: str, needed_by: str) -> None:
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-c", LIBRARY.format(call)],
         cwd=chained,
         env={**os.environ, "PYTHONPATH": str(without_extras.hide(tmp_path / "hiding"))},
@@ -272,7 +272,7 @@ def test_python_gets_the_same_sentence(chained: Path, tmp_path: Path, call: str,
     )
 
     start = f"MissingModuleError {needed_by} needs torch, which is not installed: install it with the extra learn, by `"
-    assert done.stdout.startswith(start) and done.stdout.count("\n") == 1
+    assert process.stdout.startswith(start) and process.stdout.count("\n") == 1
 
 
 def installed(folder: Path, monkeypatch: pytest.MonkeyPatch, url: Any) -> None:
@@ -288,8 +288,8 @@ def installed(folder: Path, monkeypatch: pytest.MonkeyPatch, url: Any) -> None:
     (about / "INSTALLER").write_text("pip\n")
     if url is not None:
         (about / "direct_url.json").write_text(json.dumps(url))
-    found = Distribution.at(about)
-    monkeypatch.setattr("importlib.metadata.distributions", lambda **_: [found])
+    distribution = Distribution.at(about)
+    monkeypatch.setattr("importlib.metadata.distributions", lambda **_: [distribution])
     monkeypatch.setattr(extras, "_pip", lambda: "pip")
 
 
@@ -303,24 +303,36 @@ def test_the_command_installs_from_where_tacpipe_came_from(tmp_path: Path, monke
         f"pip install '{clone}[learn]'": {"url": clone.as_uri(), "dir_info": {}},
         f"pip install '{wheel}[learn]'": {"url": wheel.as_uri(), "archive_info": {}},
         "pip install 'tacpipe[learn] @ git+https://host/tacpipe.git@abc'": git,
-        "pip install 'tacpipe[learn]'": None,  # of an index
+        "pip install 'tacpipe[learn]'": None,  # The source is an index.
         "pip install 'scikit-learn>=1.4' 'torch>=2.4'": {"url": "file:///gone/tacpipe.whl", "archive_info": {}},
     }
-    for number, (wanted, url) in enumerate(cases.items()):
+    for number, (command, url) in enumerate(cases.items()):
         (tmp_path / str(number)).mkdir()
         with monkeypatch.context() as patch:
             installed(tmp_path / str(number), patch, url)
-            assert extras.command("learn") == wanted
+            assert extras.command("learn") == command
             patch.chdir(clone)
-            assert extras.command("learn") == wanted.replace(f"-e '{clone}[", "-e '.[").replace(f" '{clone}[", " '.[")
+            assert extras.command("learn") == command.replace(f"-e '{clone}[", "-e '.[").replace(f" '{clone}[", " '.[")
 
 
 def test_modules_belong_to_the_extra_whose_package_brings_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    wanted = {"torch": "learn", "sklearn": "learn", "scipy": "learn", "safetensors": "learn", "matplotlib": "learn"}
-    wanted |= {"open3d": "clouds", "serial": "devices", "hid": "devices", "hidraw": "devices", "can": "devices"}
-    wanted |= {"obstore": "bucket", "websockets": "devices", "rerun": "view", "rerun_cli": "view"}
+    extra_by_module = {
+        "torch": "learn",
+        "sklearn": "learn",
+        "scipy": "learn",
+        "safetensors": "learn",
+        "matplotlib": "learn",
+    }
+    extra_by_module |= {
+        "open3d": "clouds",
+        "serial": "devices",
+        "hid": "devices",
+        "hidraw": "devices",
+        "can": "devices",
+    }
+    extra_by_module |= {"obstore": "bucket", "websockets": "devices", "rerun": "view", "rerun_cli": "view"}
 
-    assert {module: extras.of(module) for module in wanted} == wanted
+    assert {module: extras.of(module) for module in extra_by_module} == extra_by_module
     assert extras.of("numpy") is None and extras.of("nobody") is None
     installed(tmp_path, monkeypatch, None)
     assert (extras.of("sklearn"), extras.of("scipy")) == ("learn", "dev")

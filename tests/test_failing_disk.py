@@ -31,11 +31,11 @@ def failing(number: int, meets: Callable[[str], bool], calls: tuple[str, ...] = 
     real = {name: getattr(os, name) for name in calls}
 
     def call(name: str) -> Callable[..., Any]:
-        def fail(path: Any, *given: Any, **named: Any) -> Any:
+        def fail(path: Any, *arguments: Any, **options: Any) -> Any:
             if isinstance(path, str | os.PathLike) and meets(os.fspath(path)):
                 met.append(os.fspath(path))
                 raise OSError(number, os.strerror(number), os.fspath(path))
-            return real[name](path, *given, **named)
+            return real[name](path, *arguments, **options)
 
         return fail
 
@@ -121,26 +121,31 @@ def test_no_command_calls_what_the_disk_does_not_give_damaged_or_missing(full: L
 @pytest.mark.long
 @pytest.mark.parametrize("folder", ["objects", "records", "roots"])
 def test_a_collection_that_meets_a_file_it_cannot_read_removes_nothing(full: Lab, folder: str) -> None:
-    there = tree(full.folder)
+    before = tree(full.folder)
     read = 0
-    for path in sorted(one for one in full.store.root.glob(f"{folder}/**/*") if one.is_file()):
-        with failing(errno.EIO, lambda one, wanted=str(path): one == wanted) as met:  # type: ignore[misc]
+    for path in sorted(file for file in full.store.root.glob(f"{folder}/**/*") if file.is_file()):
+        with failing(errno.EIO, lambda opened, target=str(path): opened == target) as met:  # type: ignore[misc]
             dry = full.call("store gc --grace-days 0 --dry-run")
-            if not met:  # of a shard, or a manifest that lies in its dataset's directory too
+            if not met:  # Shards, and manifests that are also in their dataset's folder, are not read.
                 continue
             read += 1
             assert dry.code == full.call("store gc --grace-days 0").code == FAILED, path
-        assert tree(full.folder) == there, path
+        assert tree(full.folder) == before, path
     assert read > 2
 
 
 def test_a_failing_object_is_listed_apart_and_the_rest_is_verified(full: Lab) -> None:
     path = next(full.store.root.glob("objects/*/*"))
-    with failing(errno.EIO, lambda one: one == str(path)):
-        found = repair.verify(full.store)
+    with failing(errno.EIO, lambda opened: opened == str(path)):
+        soundness = repair.verify(full.store)
         ran = full.call("store verify --json")
-    assert list(found.unread) == [path.name] and not found.damaged and not found.missing and not found.clean
-    assert found.objects == len(list(full.store.root.glob("objects/*/*")))
+    assert (
+        list(soundness.unread) == [path.name]
+        and not soundness.damaged
+        and not soundness.missing
+        and not soundness.clean
+    )
+    assert soundness.objects == len(list(full.store.root.glob("objects/*/*")))
     assert ran.code == FAILED and path.name in ran.out and '"damaged": []' in ran.out.replace("\n", "")
     assert full.run("store verify").code == 0
 
@@ -150,7 +155,7 @@ def opening(store: Store, folder: Path) -> dict[str, Callable[[], Any]]:
     objects = sorted(store.root.glob("objects/*/*"))
     key = next(store.root.glob("records/*/*.json")).stem
     name = next(path.name for path in objects if path.read_bytes()[:2] == b"{\n")
-    (root,) = (one for one in store.roots.all() if one["path"].endswith("data/s"))
+    (root,) = (root for root in store.roots.all() if root["path"].endswith("data/s"))
     return {
         "read": lambda: store.read(name),
         "blocks": lambda: list(store.blocks(name, 1 << 20)),
@@ -178,7 +183,7 @@ def test_each_function_that_opens_a_file_states_that_the_system_failed(full: Lab
     store = full.store
     before = tree(full.folder)
     for name, call in opening(store, full.folder).items():
-        (store.root / f"leases/run-{'ab' * 16}.lock").write_bytes(b"{}")  # of a run that was killed
+        (store.root / f"leases/run-{'ab' * 16}.lock").write_bytes(b"{}")  # A lease of a run that was killed.
         with failing(number, lambda path: str(full.folder) in path) as met:
             try:
                 call()
@@ -218,7 +223,7 @@ def test_an_object_that_is_aside_and_cannot_be_put_back_is_not_gone(full: Lab, n
     store = full.store
     path = next(store.root.glob("objects/*/*"))
     path.rename(store.aside(path.name))
-    with failing(number, lambda one: "/tmp/gc-" in one, ("rename",)), pytest.raises(StorageError):
+    with failing(number, lambda opened: "/tmp/gc-" in opened, ("rename",)), pytest.raises(StorageError):
         store.has(path.name)
     assert store.has(path.name)
 

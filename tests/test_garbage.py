@@ -20,10 +20,10 @@ from tests.test_pipeline import counts, replace_stream
 
 def age(lab: Lab, days: float = 30.0) -> None:
     """Make everything in the store look old."""
-    then = time.time() - days * 86400
+    changed_s = time.time() - days * 86400
     for path in lab.store.root.rglob("*"):
         if path.is_file():
-            os.utime(path, (then, then))
+            os.utime(path, (changed_s, changed_s))
 
 
 def collected(lab: Lab, options: str = "") -> dict[str, int]:
@@ -103,22 +103,22 @@ def test_what_is_announced_while_a_collection_is_at_it_is_put_back(lab: Lab, mon
     age(lab)
     looks = 0
 
-    def looking(store: Store, *given: object, **more: object) -> garbage.Live:
+    def looking(store: Store, *arguments: object, **options: object) -> garbage.Live:
         nonlocal looks
         looks += 1
         if looks == 2:  # everything was moved aside by now
             assert not any(Path(store.object_path(name)).exists() for name in names)
-            other.announce(names)
-        return live(store, *given, **more)  # type: ignore[arg-type]
+            working_store.announce(names)
+        return live(store, *arguments, **options)  # type: ignore[arg-type]
 
     live = garbage.live
     monkeypatch.setattr(garbage, "live", looking)
-    other = lab.store
-    with other.at_work():
+    working_store = lab.store
+    with working_store.at_work():
         garbage.collect(lab.store, dry_run=False)
     assert looks == 2
-    assert all(Path(other.object_path(name)).exists() for name in names)
-    assert list((other.root / "tmp").iterdir()) == []
+    assert all(Path(working_store.object_path(name)).exists() for name in names)
+    assert list((working_store.root / "tmp").iterdir()) == []
 
 
 def test_what_a_killed_collection_had_moved_aside_is_found_and_put_back(lab: Lab) -> None:
@@ -149,7 +149,7 @@ def test_nothing_is_removed_while_a_manifest_that_something_descends_from_is_dam
     before = sorted(lab.store.root.glob("objects/*/*"))
     failed = lab.call("store gc --grace-days 0")
     assert failed.code == 4 and name[:12] in failed.err and "nothing was removed" in failed.err
-    assert sorted(lab.store.root.glob("objects/*/*")) == [kept for kept in before if kept != path]
+    assert sorted(lab.store.root.glob("objects/*/*")) == [remaining for remaining in before if remaining != path]
     lab.run("scale data/r -o data/s")
     assert collected(lab, "--grace-days 0")["objects"] > 0
 
@@ -172,7 +172,7 @@ def test_a_recording_whose_record_was_damaged_is_kept_though_nothing_names_it(la
     name = replaced_recording(lab)
     (record,) = (path for path in lab.store.root.glob("records/*/*") if name in path.read_text())
     record.write_text(record.read_text().replace("irreplaceable", "irreplaceablf"))
-    for path in lab.store.root.glob("roots/*"):  # which names the manifest that names it
+    for path in lab.store.root.glob("roots/*"):  # A root names the manifest that names the record.
         path.unlink()
     assert lab.call("store verify").code == 4 and not record.exists()
     for _ in range(3):

@@ -12,9 +12,9 @@ def current() -> dict[str, dict[str, object]]:
 
 @pytest.mark.parametrize("name", golden_values.COMMANDS)
 def test_a_version_and_a_result_change_together(name: str, current: dict[str, dict[str, object]]) -> None:
-    known = json.loads(golden_values.FILE.read_text())[name]
-    if known["version"] == current[name]["version"]:
-        assert known["digest"] == current[name]["digest"], (
+    pinned = json.loads(golden_values.FILE.read_text())[name]
+    if pinned["version"] == current[name]["version"]:
+        assert pinned["digest"] == current[name]["digest"], (
             f"{name} gives other values than before under the same version. If that is meant, raise its version and run "
             f"`make bless`; if not, the change is a mistake."
         )

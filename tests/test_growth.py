@@ -1,4 +1,4 @@
-"""What grows with the number of recordings, counted and not timed: what one more costs."""
+"""One more recording costs the same however many there are, counted in reads and writes."""
 
 from __future__ import annotations
 
@@ -27,20 +27,20 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], dict[str, 
         calls["records"] += 1
         return read(self, key)
 
-    def placing(*given: Any, **how: Any) -> None:
+    def placing(*arguments: Any, **options: Any) -> None:
         calls["placed"] += 1
-        place(*given, **how)
+        place(*arguments, **options)
 
     monkeypatch.setattr(Store, "read_record", reading)
     monkeypatch.setattr(directory, "place", placing)
     monkeypatch.setattr(pages, "GROUPED", GROUPED)
 
-    def taken() -> dict[str, int]:
-        found = dict(calls)
+    def take_counts() -> dict[str, int]:
+        counts = dict(calls)
         calls.update(records=0, placed=0)
-        return found
+        return counts
 
-    yield taken
+    yield take_counts
 
 
 def test_one_more_recording_reads_the_records_of_its_group_and_places_its_own_files(
@@ -59,9 +59,9 @@ def test_one_more_recording_reads_the_records_of_its_group_and_places_its_own_fi
     assert {path: path.stat().st_ino for path in before} == before
 
     ran = lab.run("scale data/toy -o data/scaled --jobs 1 --json")
-    once = counted()
-    assert once["placed"] == 1
-    assert once["records"] < len(sizes) + 2 * (max(sizes) + 1) + 8 < COUNT
+    reads_and_writes = counted()
+    assert reads_and_writes["placed"] == 1
+    assert reads_and_writes["records"] < len(sizes) + 2 * (max(sizes) + 1) + 8 < COUNT
     assert f'"reused": {COUNT}' in ran.out and '"ran": 1,' in ran.out
 
 
@@ -99,8 +99,8 @@ def test_a_file_that_is_gone_or_has_another_size_is_placed_again_when_another_re
     lab.run("simulate toy --trials 3 -o data/toy")
     lab.run("scale data/toy -o data/scaled")
     content = {path: path.read_bytes() for path in sorted((lab.folder / "data/scaled").glob("*.parquet"))}
-    gone, cut, _ = content
-    gone.unlink()
+    removed, cut, _ = content
+    removed.unlink()
     cut.unlink()
     cut.write_bytes(b"cut")
     lab.run("simulate toy --trials 4 -o data/toy")

@@ -24,8 +24,8 @@ def test_the_order_of_keys_does_not_change_a_digest(value: dict[str, object]) ->
 
 
 @given(values, values)
-def test_two_values_share_a_digest_only_if_they_share_their_canonical_json(left: object, right: object) -> None:
-    assert (digest(left) == digest(right)) == (canonical(left) == canonical(right))
+def test_two_values_share_a_digest_only_if_they_share_their_canonical_json(first: object, right: object) -> None:
+    assert (digest(first) == digest(right)) == (canonical(first) == canonical(right))
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), {1, 2}, b"bytes", object()])
@@ -48,21 +48,21 @@ def test_the_digest_of_a_value_is_that_of_its_canonical_json() -> None:
 @pytest.fixture
 def reads(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """The names of files whose content is read."""
-    found: list[str] = []
+    names: list[str] = []
 
     def read(path: Path | str) -> str:
-        found.append(Path(path).name)
+        names.append(Path(path).name)
         return file_digest(path)
 
     monkeypatch.setattr(hashing, "file_digest", read)
     monkeypatch.setattr(hashing, "_remembered", {})
-    return found
+    return names
 
 
 def test_a_file_that_stays_as_it_is_is_read_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reads: list[str]
 ) -> None:
-    monkeypatch.setattr(hashing, "SETTLED_NS", -1)  # as if it had been written long ago
+    monkeypatch.setattr(hashing, "SETTLED_NS", -1)  # The file looks as if it had been written long ago.
     file = tmp_path / "block.npy"
     file.write_bytes(b"slides")
     assert {remembered_file_digest(path) for path in (file, str(file), file)} == {bytes_digest(b"slides")}
@@ -73,7 +73,10 @@ def test_a_file_that_stays_as_it_is_is_read_once(
 
 def test_a_file_that_was_written_just_now_is_read_each_time(tmp_path: Path, reads: list[str]) -> None:
     file = tmp_path / "block.npy"
-    for content in (b"one", b"two"):  # of the same length, perhaps within one tick of the file system's clock
+    for content in (
+        b"one",
+        b"two",
+    ):  # Both have the same length, and may be written within one tick of the file system's clock.
         file.write_bytes(content)
         assert remembered_file_digest(file) == remembered_file_digest(file) == bytes_digest(content)
     assert len(reads) == 4

@@ -1,4 +1,4 @@
-"""What help looks like: short and long option, whole summaries, options in panels, versions."""
+"""Help has short and long options, uncut summaries, options in panels, and versions."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ def test_h_shows_the_common_options_in_40_lines_and_what_must_be_given_first(lab
     text = lab.run(f"{command} -h").out
     complete = lab.run(f"{command} --help").out
     assert len(text.splitlines()) <= 40
-    options, shown = (
+    options, common_options = (
         set(re.findall(r"^  (?:-\w, )?(--[\w-]+)", page.partition("\nExample")[2], re.MULTILINE))
         for page in (complete, text)
     )
-    assert shown <= options and "--help" in shown
-    more = re.search(r"^(\d+) more options?: (.+)$", text, re.MULTILINE)
-    assert int(more[1] if more else 0) == len(options - shown)
-    assert (more is None) or more[2] == f"tacpipe {command} --help"
+    assert common_options <= options and "--help" in common_options
+    remark = re.search(r"^(\d+) more options?: (.+)$", text, re.MULTILINE)
+    assert int(remark[1] if remark else 0) == len(options - common_options)
+    assert (remark is None) or remark[2] == f"tacpipe {command} --help"
     if "\nRequired:\n" in complete:
         assert complete.split("\nRequired:\n")[1].split("\n\n")[0].split()[0] in text.split("\nRequired:\n")[1]
 
@@ -37,8 +37,8 @@ def test_help_is_as_wide_as_the_terminal_and_an_example_is_one_line(lab: Lab, mo
     for columns in (60, 80, 150):
         monkeypatch.setenv("COLUMNS", str(columns))
         for option in ("-h", "--help"):
-            head, rest = lab.run(f"train material {option}").out.split("\nExample:\n")
-            example, text = rest.split("\n", 1)
+            head, after_head = lab.run(f"train material {option}").out.split("\nExample:\n")
+            example, text = after_head.split("\n", 1)
             assert example.startswith("  tacpipe train material data/slides ") and " -o " in example
             longest = max(map(len, (head + text).splitlines()))
             assert columns - 15 < longest <= columns
@@ -74,11 +74,11 @@ def test_no_summary_is_cut(lab: Lab, command: str) -> None:
     listed = lab.run(f"{command} --help").out.split("\nCommands:\n" if command else "\nRecord:\n")[1]
 
     assert "..." not in listed
-    whole = " ".join(re.sub(r"^\w[\w ,-]*:$", "", listed, flags=re.MULTILINE).split())
+    summaries = " ".join(re.sub(r"^\w[\w ,-]*:$", "", listed, flags=re.MULTILINE).split())
     texts = [*registry.commands().values(), *commands.SUMMARIES.values()] if not command else []
     texts += [registry.summary(name) for name in BUILT_IN if command and name.startswith(f"{command}.")]
-    assert not [text for text in texts if text not in whole]
-    assert whole.endswith(".")
+    assert not [text for text in texts if text not in summaries]
+    assert summaries.endswith(".")
 
 
 @pytest.mark.parametrize("command", COMMANDS)

@@ -1,4 +1,4 @@
-"""What starting the command line may import: a rerun must not wait for libraries that it does not use."""
+"""Starting the command line imports no library that a rerun does not use."""
 
 import json
 import subprocess
@@ -25,10 +25,10 @@ print(json.dumps(sorted(sys.modules)))
 
 def imported_modules(folder: Path, words: str) -> set[str]:
     """Return the full names of all modules that a command imports."""
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-c", PROBE, *words.split()], cwd=folder, capture_output=True, text=True, check=True
     )
-    return set(json.loads(done.stdout.splitlines()[-1]))
+    return set(json.loads(process.stdout.splitlines()[-1]))
 
 
 def imported(folder: Path, words: str) -> set[str]:
@@ -59,8 +59,8 @@ def test_a_hit_imports_nothing_heavy(lab: Path, words: str) -> None:
 
 
 def test_showing_explaining_and_looking_after_the_store_import_nothing_heavy(lab: Path) -> None:
-    shown = ("show models/forward --json", "show results/forward --json")
-    for words in (*shown, "explain report.html", "store status", "store verify", "store gc --dry-run"):
+    show_commands = ("show models/forward --json", "show results/forward --json")
+    for words in (*show_commands, "explain report.html", "store status", "store verify", "store gc --dry-run"):
         assert imported(lab, words) & HEAVY == set()
 
 
@@ -77,8 +77,8 @@ def test_the_report_of_a_task_imports_no_torch(task: str) -> None:
         "    importlib.import_module(module.name)",
         "print('torch' in sys.modules)",
     )
-    done = subprocess.run([sys.executable, "-c", "\n".join(lines)], capture_output=True, text=True, check=True)
-    assert done.stdout == "False\n"
+    process = subprocess.run([sys.executable, "-c", "\n".join(lines)], capture_output=True, text=True, check=True)
+    assert process.stdout == "False\n"
 
 
 def test_using_the_default_forecaster_imports_only_what_models_need(lab: Path) -> None:

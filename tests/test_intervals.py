@@ -23,32 +23,32 @@ def test_a_baseline_that_never_errs_leaves_skill_undefined() -> None:
 @settings(max_examples=30, deadline=None)
 def test_a_model_whose_error_is_a_fixed_share_of_the_baseline_has_no_spread(seed: int, share: float) -> None:
     baseline = np.random.default_rng(seed).uniform(1, 2, size=(5, 3))
-    found = intervals.skill_interval(share * baseline, baseline)
-    for part in (found.mean, found.low, found.high):
+    interval = intervals.skill_interval(share * baseline, baseline)
+    for part in (interval.mean, interval.low, interval.high):
         assert np.allclose(part, 1 - share)
 
 
 def test_the_interval_is_students_over_values_that_leave_out_one_recording_each() -> None:
     model, baseline = RNG.uniform(0, 1, size=(12, 2)), RNG.uniform(1, 2, size=(12, 2))
-    found = intervals.skill_interval(model, baseline)
+    interval = intervals.skill_interval(model, baseline)
     for step in range(2):
         logs = [
             math.log(np.delete(model[:, step], at).sum() / np.delete(baseline[:, step], at).sum()) for at in range(12)
         ]
-        error = math.sqrt(11 / 12 * sum((one - np.mean(logs)) ** 2 for one in logs))
+        error = math.sqrt(11 / 12 * sum((log - np.mean(logs)) ** 2 for log in logs))
         equal = (
             baseline[:, step].sum() ** 2 / (baseline[:, step] ** 2).sum()
         )  # recordings of one size that weigh as much
         ratio = model[:, step].sum() / baseline[:, step].sum()
         ends = [1 - ratio * math.exp(sign * stats.t.ppf(0.975, equal - 1) * error) for sign in (1, -1)]
-        assert (found.mean[step], found.low[step], found.high[step]) == pytest.approx((1 - ratio, *ends))
+        assert (interval.mean[step], interval.low[step], interval.high[step]) == pytest.approx((1 - ratio, *ends))
 
 
 def test_of_a_mean_of_equal_recordings_it_is_the_interval_of_students_t() -> None:
     values = RNG.normal(size=(9, 1))
     sums = np.hstack([values, np.ones((9, 1))])[None]
-    found = intervals.jackknife(sums, lambda drawn: drawn[:, :1] / drawn[:, 1:]).interval().first
-    assert (found.low, found.high) == pytest.approx(
+    interval = intervals.jackknife(sums, lambda drawn: drawn[:, :1] / drawn[:, 1:]).interval().first
+    assert (interval.low, interval.high) == pytest.approx(
         stats.t.interval(0.95, 8, float(values.mean()), float(stats.sem(values[:, 0])))
     )
 
@@ -60,27 +60,29 @@ def test_quantiles_of_students_t_are_scipys(freedom: float) -> None:
 
 
 def test_two_recordings_give_no_interval() -> None:
-    found = intervals.skill_interval(np.array([[1.0], [1.0]]), np.array([[2.0], [2.0]]))
-    assert found.mean.tolist() == [0.5]
-    assert np.isnan(found.low).all() and np.isnan(found.high).all()
+    interval = intervals.skill_interval(np.array([[1.0], [1.0]]), np.array([[2.0], [2.0]]))
+    assert interval.mean.tolist() == [0.5]
+    assert np.isnan(interval.low).all() and np.isnan(interval.high).all()
 
 
 def test_a_share_has_ends_from_nothing_to_all() -> None:
-    found = intervals.share_interval(np.array([[9.0], [10.0], [2.0], [10.0]]), np.full((4, 1), 10.0))
-    assert found.mean[0] == pytest.approx(31 / 40) and 0 <= found.low[0] < found.high[0] == 1
+    interval = intervals.share_interval(np.array([[9.0], [10.0], [2.0], [10.0]]), np.full((4, 1), 10.0))
+    assert interval.mean[0] == pytest.approx(31 / 40) and 0 <= interval.low[0] < interval.high[0] == 1
 
 
 def test_seeds_that_differ_make_it_less_sure_than_seeds_that_agree() -> None:
     recordings = RNG.uniform(1, 2, size=12)
     widths = []
-    for apart in (0.0, 0.5):
-        sums = np.stack([np.column_stack([recordings + apart * seed, np.ones(12)]) for seed in range(3)])
-        found = intervals.jackknife(sums, lambda drawn: drawn[:, :1] / drawn[:, 1:]).interval().first
-        widths.append(found.high - found.low)
+    for seed_step in (0.0, 0.5):
+        sums = np.stack([np.column_stack([recordings + seed_step * seed, np.ones(12)]) for seed in range(3)])
+        interval = intervals.jackknife(sums, lambda drawn: drawn[:, :1] / drawn[:, 1:]).interval().first
+        widths.append(interval.high - interval.low)
     assert widths[1] > 1.5 * widths[0]
 
 
 def test_the_largest_of_several_independent_statistics_is_that_of_sidak() -> None:
-    apart = np.linalg.qr(np.column_stack([np.ones(40), RNG.normal(size=(40, 6))]))[0][:, 1:].T
-    assert intervals.largest_quantile(list(apart), 1e6) == pytest.approx(stats.norm.ppf(0.975 ** (1 / 6)), abs=0.03)
-    assert intervals.largest_quantile([apart[0]] * 6, 10.0) == pytest.approx(stats.t.ppf(0.975, 10), rel=0.02)
+    directions = np.linalg.qr(np.column_stack([np.ones(40), RNG.normal(size=(40, 6))]))[0][:, 1:].T
+    assert intervals.largest_quantile(list(directions), 1e6) == pytest.approx(
+        stats.norm.ppf(0.975 ** (1 / 6)), abs=0.03
+    )
+    assert intervals.largest_quantile([directions[0]] * 6, 10.0) == pytest.approx(stats.t.ppf(0.975, 10), rel=0.02)

@@ -35,20 +35,20 @@ shas = st.binary(min_size=1, max_size=2).map(lambda content: hashlib.sha256(cont
 scalars = st.none() | st.booleans() | numbers | texts
 attributes = st.dictionaries(names, scalars, max_size=4)
 shards = st.dictionaries(names, shas.map(lambda sha: {"digest": sha, "rows": 1, "bytes": 2}), min_size=1, max_size=3)
-entries = st.builds(lambda found, streams: {"attributes": found, "shards": streams}, attributes, shards)
+entries = st.builds(lambda attributes, streams: {"attributes": attributes, "shards": streams}, attributes, shards)
 recordings = st.dictionaries(names, entries, min_size=1, max_size=4)
 
 
 @dataclass(frozen=True)
 class Params:
-    rate_hz: float = 50.0  # of the grid
+    rate_hz: float = 50.0  # rate of the grid
     frames: int = 400  # kept
-    grid: Literal["uniform", "logged"] = "uniform"  # which rows
-    order: Literal[1, 2] = 1  # of the filter
+    grid: Literal["uniform", "logged"] = "uniform"  # rows of the grid
+    order: Literal[1, 2] = 1  # order of the filter
     gains: tuple[float, ...] = (1.0, 2.0)  # one a channel
     strict: bool = True  # refuse gaps
     note: str | None = None  # free text
-    cutoff_hz: float | None = None  # of the filter
+    cutoff_hz: float | None = None  # cutoff of the filter
 
 
 finite = st.floats(allow_nan=False, allow_infinity=False)
@@ -77,8 +77,10 @@ def built(**options: Any) -> Params:
     return params
 
 
-def key(params: Any = None, inputs: Mapping[str, Any] | None = None, name: str = "cut", given: AnyStage = STAGE) -> str:
-    return digest(keys.identity(name, given.version, params or Params(), inputs or {}))
+def key(
+    params: Any = None, inputs: Mapping[str, Any] | None = None, name: str = "cut", definition: AnyStage = STAGE
+) -> str:
+    return digest(keys.identity(name, definition.version, params or Params(), inputs or {}))
 
 
 def typed(value: Any) -> Any:
@@ -108,11 +110,24 @@ def test_canonical_json_tells_the_value_back_so_no_two_values_share_a_digest(val
 
 
 @given(values, values)
-def test_where_one_value_ends_and_the_next_begins_is_part_of_the_digest(left: Any, right: Any) -> None:
-    together = [[left, right], [[left], right], [left, [right]], [[left, right]], {"a": left, "b": right}]
-    digests = [digest(value) for value in together]
-    same = {(one, other) for one in range(5) for other in range(one) if typed(together[one]) == typed(together[other])}
-    assert {(one, other) for one in range(5) for other in range(one) if digests[one] == digests[other]} == same
+def test_where_one_value_ends_and_the_next_begins_is_part_of_the_digest(first_value: Any, right: Any) -> None:
+    structures = [
+        [first_value, right],
+        [[first_value], right],
+        [first_value, [right]],
+        [[first_value, right]],
+        {"a": first_value, "b": right},
+    ]
+    digests = [digest(value) for value in structures]
+    same = {
+        (first, second)
+        for first in range(5)
+        for second in range(first)
+        if typed(structures[first]) == typed(structures[second])
+    }
+    assert {
+        (first, second) for first in range(5) for second in range(first) if digests[first] == digests[second]
+    } == same
 
 
 @given(values)
@@ -174,9 +189,9 @@ def test_two_halves_of_a_character_are_not_the_character() -> None:
     [np.float32(1.5), np.int64(3), np.bool_(True), np.array([1]), Path("a"), 1j, pytest.param(1 << 20_000, id="huge")],
 )
 def test_what_json_does_not_know_is_refused_in_a_sentence_that_is_not_endless(value: object) -> None:
-    for whole in (value, {"recordings": {f"trial-{number}": value for number in range(1000)}}):
+    for content in (value, {"recordings": {f"trial-{number}": value for number in range(1000)}}):
         with pytest.raises(TacpipeError, match="cannot be made") as caught:
-            digest(whole)
+            digest(content)
         assert len(str(caught.value)) < 1000
 
 
@@ -202,16 +217,16 @@ def test_the_order_in_which_params_are_given_does_not_count(params: Params) -> N
 
 
 @given(any_params, any_params)
-def test_two_sets_of_params_share_a_key_only_if_they_are_equal(one: Params, other: Params) -> None:
-    left, right = built(**asdict(one)), built(**asdict(other))
-    assert (key(left) == key(right)) == (left == right)
+def test_two_sets_of_params_share_a_key_only_if_they_are_equal(first: Params, second: Params) -> None:
+    first_built, right = built(**asdict(first)), built(**asdict(second))
+    assert (key(first_built) == key(right)) == (first_built == right)
 
 
 @given(any_params, st.data())
 def test_any_one_param_that_changes_changes_the_key(params: Params, data: st.DataObject) -> None:
-    other = data.draw(any_params)
+    alternative = data.draw(any_params)
     name = data.draw(st.sampled_from(list(asdict(params))))
-    value = getattr(other, name)
+    value = getattr(alternative, name)
     assume(value != getattr(params, name))
     assert key(built(**asdict(replace(params, **{name: value})))) != key(built(**asdict(params)))
 
@@ -225,10 +240,10 @@ def test_params_come_back_from_a_key_and_give_it_again(params: Params) -> None:
 
 @given(st.integers(-(10**15), 10**15))
 def test_a_whole_number_given_for_a_number_gives_the_same_key_from_wherever_it_comes(number: int) -> None:
-    wanted = key(built(rate_hz=float(number), gains=[float(number)], cutoff_hz=float(number)))
-    assert key(built(rate_hz=number, gains=[number], cutoff_hz=number)) == wanted
+    expected = key(built(rate_hz=float(number), gains=[float(number)], cutoff_hz=float(number)))
+    assert key(built(rate_hz=number, gains=[number], cutoff_hz=number)) == expected
     sets = [f"rate_hz={number}", f"gains=[{number}.0]", f"cutoff_hz={number}"]
-    assert key(given_params.build("cut", STAGE, sets=sets)) == wanted
+    assert key(given_params.build("cut", STAGE, sets=sets)) == expected
 
 
 @pytest.mark.parametrize("text", ["2e-2", "0.02", "+2.0E-2", ".2e-1"])
@@ -238,7 +253,7 @@ def test_a_number_with_an_exponent_is_a_number_as_everywhere_but_in_yaml(text: s
 
 def test_minus_zero_is_zero() -> None:
     assert key(built(rate_hz=-0.0, gains=[-0.0], cutoff_hz=-0.0)) == key(built(rate_hz=0, gains=[0], cutoff_hz=0.0))
-    assert str(built(rate_hz=-0.0).rate_hz) == "0.0"  # so that no stage divides by what its key does not tell
+    assert str(built(rate_hz=-0.0).rate_hz) == "0.0"  # No stage divides by a sign that its key does not hold.
 
 
 @pytest.mark.parametrize("value", [True, 1.0])
@@ -256,7 +271,7 @@ def test_a_number_that_is_none_is_refused_with_the_name_of_its_param(name: str, 
 
 
 def test_text_that_is_no_unicode_is_refused_with_the_name_of_its_param() -> None:
-    with pytest.raises(UsageError, match="note"):  # what a terminal gives for bytes that are no UTF-8
+    with pytest.raises(UsageError, match="note"):  # A terminal gives this for bytes that are no UTF-8.
         built(note="caf\udce9")
 
 
@@ -279,66 +294,69 @@ def test_a_recordings_key_rests_on_its_streams_and_on_the_attributes_that_are_de
     reads = tuple(data.draw(st.lists(names, max_size=3)))
     changed = data.draw(attributes)
     before, after = keys.of_recording(entry, reads), keys.of_recording({**entry, "attributes": changed}, reads)
-    known = [{name: found[name] for name in reads if name in found} for found in (entry["attributes"], changed)]
-    assert (digest(before) == digest(after)) == (typed(known[0]) == typed(known[1]))
+    declared = [
+        {name: values_by_name[name] for name in reads if name in values_by_name}
+        for values_by_name in (entry["attributes"], changed)
+    ]
+    assert (digest(before) == digest(after)) == (typed(declared[0]) == typed(declared[1]))
 
 
 @given(entries, entries)
 def test_streams_their_names_and_their_digests_count_and_rows_and_bytes_do_not(
-    one: dict[str, Any], other: dict[str, Any]
+    first: dict[str, Any], second: dict[str, Any]
 ) -> None:
-    streams = [{name: shard["digest"] for name, shard in entry["shards"].items()} for entry in (one, other)]
-    left, right = (keys.of_recording(entry, ()) for entry in (one, other))
-    assert (digest(left) == digest(right)) == (streams[0] == streams[1])
-    counted = {name: {**shard, "rows": 7, "bytes": 8} for name, shard in one["shards"].items()}
-    assert digest(keys.of_recording({**one, "shards": counted}, ())) == digest(left)
+    streams = [{name: shard["digest"] for name, shard in entry["shards"].items()} for entry in (first, second)]
+    first_key, right = (keys.of_recording(entry, ()) for entry in (first, second))
+    assert (digest(first_key) == digest(right)) == (streams[0] == streams[1])
+    counted = {name: {**shard, "rows": 7, "bytes": 8} for name, shard in first["shards"].items()}
+    assert digest(keys.of_recording({**first, "shards": counted}, ())) == digest(first_key)
 
 
 @given(recordings, recordings)
 def test_a_key_over_a_dataset_rests_on_names_attributes_and_streams_in_any_order(
-    one: dict[str, Any], other: dict[str, Any]
+    first: dict[str, Any], second: dict[str, Any]
 ) -> None:
-    def described(found: dict[str, Any], reads: tuple[str, ...] | None = None) -> str:
-        return digest(keys.of_dataset(Manifest("scale", 1, recordings=found), reads, found))
+    def described(dataset_entries: dict[str, Any], reads: tuple[str, ...] | None = None) -> str:
+        return digest(keys.of_dataset(Manifest("scale", 1, recordings=dataset_entries), reads, dataset_entries))
 
-    def content(found: dict[str, Any]) -> Any:
+    def content(dataset_entries: dict[str, Any]) -> Any:
         return {
             name: [entry["attributes"], {stream: shard["digest"] for stream, shard in entry["shards"].items()}]
-            for name, entry in found.items()
+            for name, entry in dataset_entries.items()
         }
 
-    assert described(dict(reversed(one.items()))) == described(one)
-    assert (described(one) == described(other)) == (typed(content(one)) == typed(content(other)))
-    bare = {name: {**entry, "attributes": {}} for name, entry in one.items()}
-    assert described(one, ()) == described(bare, ())
+    assert described(dict(reversed(first.items()))) == described(first)
+    assert (described(first) == described(second)) == (typed(content(first)) == typed(content(second)))
+    bare = {name: {**entry, "attributes": {}} for name, entry in first.items()}
+    assert described(first, ()) == described(bare, ())
 
 
 def test_stage_version_params_and_inputs_each_change_the_key() -> None:
     later = stage(version=4)(cut)
-    found = {
+    distinct = {
         key(),
         key(name="cut.fit"),
-        key(given=later),
+        key(definition=later),
         key(built(frames=401)),
         key(inputs={"recording": {}}),
         key(inputs={"other": {}}),
         key(inputs={"recording": {"shards": {}}}),
     }
-    assert len(found) == 7
+    assert len(distinct) == 7
 
 
 @given(st.lists(names, min_size=2, max_size=2, unique=True))
 def test_what_lies_behind_a_dataset_counts_where_the_whole_of_it_is_read(stages: list[str]) -> None:
     step = {"stage": stages[0], "version": 1, "params": {"factor": 2}, "fitted": None}
-    others = [
+    other_steps = [
         {**step, "stage": stages[1]},
         {**step, "version": 2},
         {**step, "params": {"factor": 3}},
         {**step, "fitted": {}},
     ]
-    chains = [[], [step], [step, step], *([other] for other in others)]
-    found = {digest(keys.of_dataset(Manifest("scale", 1, chain=chain), None, {})) for chain in chains}
-    assert len(found) == len(chains)
+    chains = [[], [step], [step, step], *([other_step] for other_step in other_steps)]
+    distinct = {digest(keys.of_dataset(Manifest("scale", 1, chain=chain), None, {})) for chain in chains}
+    assert len(distinct) == len(chains)
 
 
 # ---- what keys were, so that they never change silently
@@ -377,13 +395,13 @@ def test_keys_and_digests_are_those_of_the_identities_as_the_format_tells_them(l
     lab.run("total data/s -o data/t")
     lab.run("ingest numbers src -o data/i")
     streams = lab.manifest("data/r").recordings["trial-000"]["shards"]
-    both = (streams["left"]["digest"], streams["right"]["digest"])
+    streams_digests = (streams["left"]["digest"], streams["right"]["digest"])
     scaled = lab.manifest("data/s").recordings["trial-000"]["shards"][""]["digest"]
     manifest = SHA((lab.folder / "data/r/manifest.json").read_bytes()).hexdigest()
     identities = [
         TRIAL,
-        SCALE % both,
-        NAMED % both,
+        SCALE % streams_digests,
+        NAMED % streams_digests,
         TOTAL % scaled,
         INGEST % SHA(b"1 2 3").hexdigest(),
         RUN % manifest,
@@ -391,7 +409,7 @@ def test_keys_and_digests_are_those_of_the_identities_as_the_format_tells_them(l
     for identity in identities:
         name = SHA(identity.encode()).hexdigest()
         assert (lab.folder / ".tacpipe" / "records" / name[:2] / f"{name}.json").exists(), identity
-    assert lab.manifest("data/r").digest == SHA((DATASET % both).encode()).hexdigest()
+    assert lab.manifest("data/r").digest == SHA((DATASET % streams_digests).encode()).hexdigest()
 
 
 def test_a_key_is_to_the_digit_what_it_was() -> None:

@@ -39,8 +39,8 @@ def toys(lab: Lab) -> Lab:
 
 
 def labels(lab: Lab) -> dict[str, dict[str, Any]]:
-    found = {name: dict(entry["attributes"]) for name, entry in lab.manifest("data/r").recordings.items()}
-    return {name: {key: one[key] for key in one if key != "trial"} for name, one in found.items()}
+    attributes = {name: dict(entry["attributes"]) for name, entry in lab.manifest("data/r").recordings.items()}
+    return {name: {key: values[key] for key in values if key != "trial"} for name, values in attributes.items()}
 
 
 @pytest.mark.parametrize("name", TABLES)
@@ -49,17 +49,19 @@ def test_each_row_labels_its_recording_with_the_types_that_it_has(toys: Lab, nam
     value = json.loads(toys.run(f"label data/r --from {name} --json").out)
     assert labels(toys) == WANTED
     assert value["recordings"] == ["trial-000", "trial-002"] and value["without"] == ["trial-001"]
-    for one, wanted in WANTED.items():
-        assert {key: type(value) for key, value in labels(toys)[one].items()} == {k: type(v) for k, v in wanted.items()}
+    for recording, expected in WANTED.items():
+        assert {key: type(value) for key, value in labels(toys)[recording].items()} == {
+            k: type(v) for k, v in expected.items()
+        }
 
 
 def test_a_parquet_table_keeps_its_types_and_an_empty_cell_changes_nothing(toys: Lab) -> None:
     table = pa.table({"recording": ["trial-000", "trial-001"], "material": [None, "foam"], "grams": [1.0, None]})
     pq.write_table(table, "labels.parquet")
     toys.run("label data/r --from labels.parquet")
-    found = labels(toys)
-    assert found["trial-000"] == {"material": "cork", "grams": 1.0}
-    assert found["trial-001"] == {"material": "foam"}
+    read_back = labels(toys)
+    assert read_back["trial-000"] == {"material": "cork", "grams": 1.0}
+    assert read_back["trial-001"] == {"material": "foam"}
 
 
 def test_a_changed_row_costs_the_recordings_whose_labels_changed(toys: Lab) -> None:
@@ -69,17 +71,17 @@ def test_a_changed_row_costs_the_recordings_whose_labels_changed(toys: Lab) -> N
     Path("labels.csv").write_text(TABLES["labels.csv"].replace("foam", "felt"))
     value = json.loads(toys.run("label data/r --from labels.csv --json").out)
     assert value["labels"] == {"trial-000": {"material": "felt"}}
-    done = json.loads(toys.run("named data/r -o data/named --json").out)
-    assert (done["ran"], done["reused"]) == (1, 2)
+    rerun = json.loads(toys.run("named data/r -o data/named --json").out)
+    assert (rerun["ran"], rerun["reused"]) == (1, 2)
 
 
 def test_a_dry_run_prints_each_change_and_makes_none(toys: Lab) -> None:
     Path("labels.csv").write_text(TABLES["labels.csv"])
     before = toys.manifest("data/r").content
-    shown = toys.run("label data/r --from labels.csv --dry-run").out
+    printed = toys.run("label data/r --from labels.csv --dry-run").out
     assert toys.manifest("data/r").content == before
     for part in ("trial-000", "'cork' → 'foam'", "grit none → 3", "trial-001", "2 of 3"):
-        assert part in shown
+        assert part in printed
 
 
 def test_the_key_is_the_column_whose_values_are_names_whatever_it_is_called(toys: Lab) -> None:

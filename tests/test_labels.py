@@ -1,4 +1,4 @@
-"""What `label` and `show` cost: they read and write what they change or list, however many recordings there are."""
+"""`label` and `show` read and write only what they change or list, however many recordings there are."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from tacpipe.store.store import Store
 from tests.conftest import Lab
 
 MANY = SHOWN + 10
-STREAMS = 2  # of each recording of the toy
+STREAMS = 2  # Each recording of the toy has this many.
 
 
 @pytest.fixture
-def many(lab: Lab) -> Lab:
+def many_recordings(lab: Lab) -> Lab:
     lab.run(f"simulate toy --trials {MANY} -o data/r --jobs 1")
     return lab
 
@@ -35,55 +35,55 @@ def read(monkeypatch: pytest.MonkeyPatch) -> Callable[[], int]:
     monkeypatch.setattr(Store, "read", read)
 
     def count() -> int:
-        found = len(names)
+        read_count = len(names)
         names.clear()
-        return found
+        return read_count
 
     return count
 
 
-def test_show_reads_the_shards_of_the_recordings_that_it_lists(many: Lab, read: Callable[[], int]) -> None:
-    text = many.run("show data/r").out
+def test_show_reads_the_shards_of_the_recordings_that_it_lists(many_recordings: Lab, read: Callable[[], int]) -> None:
+    text = many_recordings.run("show data/r").out
     assert read() == SHOWN * STREAMS
     assert text.count("left") == SHOWN
     assert f"… and {MANY - SHOWN} more (--full)" in text
     assert f"{MANY} recordings, {MANY * STREAMS * 20} rows" in text
     assert f"material: cork ({MANY})" in text
-    assert many.run("show data/r --full").out.count("left") == MANY
+    assert many_recordings.run("show data/r --full").out.count("left") == MANY
     assert read() == MANY * STREAMS
-    assert len(json.loads(many.run("show data/r --json").out)["recordings"]) == MANY
+    assert len(json.loads(many_recordings.run("show data/r --json").out)["recordings"]) == MANY
 
 
 def inodes(folder: Path) -> dict[str, int]:
     return {str(path): path.stat().st_ino for path in folder.rglob("*.parquet")}
 
 
-def test_a_label_reads_and_writes_no_shard(many: Lab, read: Callable[[], int]) -> None:
-    before = inodes(many.folder / "data/r")
+def test_a_label_reads_and_writes_no_shard(many_recordings: Lab, read: Callable[[], int]) -> None:
+    before = inodes(many_recordings.folder / "data/r")
     assert len(before) == MANY * STREAMS
     read()
-    many.run("label data/r trial-003 --label material=foam")
-    shards = {digest for _, digest in many.manifest("data/r").objects()}
+    many_recordings.run("label data/r trial-003 --label material=foam")
+    shards = {digest for _, digest in many_recordings.manifest("data/r").objects()}
     assert read() <= 3  # manifests
-    assert inodes(many.folder / "data/r") == before
-    assert all(many.store.has(digest) for digest in shards)
-    assert many.manifest("data/r").recordings["trial-003"]["attributes"]["material"] == "foam"
+    assert inodes(many_recordings.folder / "data/r") == before
+    assert all(many_recordings.store.has(digest) for digest in shards)
+    assert many_recordings.manifest("data/r").recordings["trial-003"]["attributes"]["material"] == "foam"
 
 
-def test_a_shard_that_is_gone_when_a_label_is_set_is_brought_back_by_link(many: Lab) -> None:
-    shard = many.folder / "data/r/trial-000/left.parquet"
+def test_a_shard_that_is_gone_when_a_label_is_set_is_brought_back_by_link(many_recordings: Lab) -> None:
+    shard = many_recordings.folder / "data/r/trial-000/left.parquet"
     content = shard.read_bytes()
     shard.unlink()
-    many.run("label data/r trial-003 --label material=foam")
-    many.run("store link data/r")
+    many_recordings.run("label data/r trial-003 --label material=foam")
+    many_recordings.run("store link data/r")
     assert shard.read_bytes() == content
 
 
-@pytest.mark.parametrize(("trials", "named"), [(3, "it has trial-000, trial-001, trial-002."), (7, "and 2 more.")])
-def test_a_recording_that_is_not_there_is_refused_with_those_that_are(lab: Lab, trials: int, named: str) -> None:
+@pytest.mark.parametrize(("trials", "ending"), [(3, "it has trial-000, trial-001, trial-002."), (7, "and 2 more.")])
+def test_a_recording_that_is_not_there_is_refused_with_those_that_are(lab: Lab, trials: int, ending: str) -> None:
     lab.run(f"simulate toy --trials {trials} -o data/r --jobs 1")
     failed = lab.call("label data/r nobody --label a=b")
-    assert failed.code == 2 and "nobody" in failed.err and failed.err.rstrip().endswith(named)
+    assert failed.code == 2 and "nobody" in failed.err and failed.err.rstrip().endswith(ending)
 
 
 def test_a_label_of_several_lines_is_refused_on_one(lab: Lab) -> None:

@@ -48,22 +48,22 @@ RUN = f"run-{'ab' * 16}"
 
 def tree(folder: Path) -> dict[str, object]:
     """Return what lies beneath a folder: content of files, targets of links, with the times at which they were changed."""
-    found: dict[str, object] = {}
+    contents: dict[str, object] = {}
     for path in sorted(folder.rglob("*")):
-        what = str(path.readlink()) if path.is_symlink() else path.read_bytes() if path.is_file() else None
-        found[str(path.relative_to(folder))] = what, path.lstat().st_mtime_ns
-    return found
+        content = str(path.readlink()) if path.is_symlink() else path.read_bytes() if path.is_file() else None
+        contents[str(path.relative_to(folder))] = content, path.lstat().st_mtime_ns
+    return contents
 
 
 def write(folder: Path, files: Mapping[str, str]) -> None:
     for name, text in files.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(text)
-        os.utime(folder / name, (0, 0))  # as old as can be
+        os.utime(folder / name, (0, 0))  # The files are as old as can be.
 
 
 @pytest.fixture
-def made(lab: Lab) -> Lab:
+def made_project(lab: Lab) -> Lab:
     """A project with recordings, a dataset made of them, and a store to which that was pushed."""
     lab.run("simulate toy -o data/r")
     lab.run("scale data/r -o data/s")
@@ -88,45 +88,49 @@ SOMEBODYS = {
 
 @pytest.mark.parametrize("files", SOMEBODYS.values(), ids=SOMEBODYS)
 def test_a_folder_that_is_not_a_store_is_refused_by_every_command_and_stays_as_it_is(
-    made: Lab, monkeypatch: pytest.MonkeyPatch, files: dict[str, str]
+    made_project: Lab, monkeypatch: pytest.MonkeyPatch, files: dict[str, str]
 ) -> None:
-    theirs = made.folder / "theirs"
+    theirs = made_project.folder / "theirs"
     write(theirs, files)
-    before = tree(theirs), tree(made.folder / "data")
+    before = tree(theirs), tree(made_project.folder / "data")
     monkeypatch.setenv("TACPIPE_STORE", str(theirs))
     for command in EVERY:
-        ran = made.call(command)
+        ran = made_project.call(command)
         refused(ran, str(theirs), "is not a store of tacpipe", "no file format", "TACPIPE_STORE")
-        assert (tree(theirs), tree(made.folder / "data")) == before, command
+        assert (tree(theirs), tree(made_project.folder / "data")) == before, command
 
 
-def test_a_folder_that_is_not_a_store_is_no_remote(made: Lab) -> None:
-    theirs = made.folder / "theirs"
+def test_a_folder_that_is_not_a_store_is_no_remote(made_project: Lab) -> None:
+    theirs = made_project.folder / "theirs"
     write(theirs, {"objects/ab/thesis.tex": "chapter 1", "tmp/scene.blend": "mesh"})
     before = tree(theirs)
     for command in ("push", "pull"):
-        ran = made.call(f"store {command} theirs data/s")
+        ran = made_project.call(f"store {command} theirs data/s")
         assert ran.code == 2 and str(theirs.name) in ran.err, ran
         assert tree(theirs) == before
 
 
 @pytest.mark.parametrize("there", [True, False])
 def test_commands_that_make_no_result_do_not_begin_a_store(
-    made: Lab, monkeypatch: pytest.MonkeyPatch, there: bool
+    made_project: Lab, monkeypatch: pytest.MonkeyPatch, there: bool
 ) -> None:
-    empty = made.folder / "empty"
+    empty = made_project.folder / "empty"
     if there:
         empty.mkdir()
         (empty / ".gitkeep").touch()
     monkeypatch.setenv("TACPIPE_STORE", str(empty))
     for command in (*READ, "store repair"):
-        ran = made.run(command)
+        ran = made_project.run(command)
         assert ran.err == "" and empty.is_dir() == there
         assert not there or [path.name for path in empty.iterdir()] == [".gitkeep"], command
-    assert "there is no store yet" in made.run("store status").out + made.run("store verify").out
-    assert "all sound" not in made.run("store verify").out
-    assert made.call("store checkout data/s -o data/t").code == made.call("store gc --forget data/s").code == 2
-    made.run("simulate toy -o data/new")
+    assert "there is no store yet" in made_project.run("store status").out + made_project.run("store verify").out
+    assert "all sound" not in made_project.run("store verify").out
+    assert (
+        made_project.call("store checkout data/s -o data/t").code
+        == made_project.call("store gc --forget data/s").code
+        == 2
+    )
+    made_project.run("simulate toy -o data/new")
     assert (empty / "format").read_text() == "1\n" and Store(empty).check()
 
 
@@ -157,65 +161,68 @@ def test_a_store_that_another_process_begins_between_two_looks_is_one(
 
 
 @pytest.mark.parametrize("mark", ["2\n", "17\n", "", "\x1b[2J"])
-def test_a_store_of_another_format_is_refused_by_every_command(made: Lab, mark: str) -> None:
-    (made.store.root / "format").write_text(mark)
-    before = tree(made.folder)
+def test_a_store_of_another_format_is_refused_by_every_command(made_project: Lab, mark: str) -> None:
+    (made_project.store.root / "format").write_text(mark)
+    before = tree(made_project.folder)
     for command in EVERY:
-        refused(made.call(command), "has format", "reads format 1")
-        assert tree(made.folder) == before, command
+        refused(made_project.call(command), "has format", "reads format 1")
+        assert tree(made_project.folder) == before, command
 
 
 @pytest.mark.parametrize("name", LINKED)
 def test_a_folder_of_a_store_that_is_a_link_is_refused_by_every_command(
-    made: Lab, name: str, tmp_path_factory: pytest.TempPathFactory
+    made_project: Lab, name: str, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     theirs = tmp_path_factory.mktemp("theirs")
     write(
         theirs, {"scene.blend": "mesh", f"ab/{'ab' * 32}": "blob", f"{'ab' * 32}.lock": "", f"{'ab' * 32}.json": "{}"}
     )
-    folder = made.store.root / name
+    folder = made_project.store.root / name
     if folder.exists():
         folder.rename(theirs / "before")
     folder.symlink_to(theirs)
-    before = tree(theirs), tree(made.folder)
+    before = tree(theirs), tree(made_project.folder)
     for command in EVERY:
-        refused(made.call(command), str(folder), "is a symbolic link")
-        assert (tree(theirs), tree(made.folder)) == before, command
+        refused(made_project.call(command), str(folder), "is a symbolic link")
+        assert (tree(theirs), tree(made_project.folder)) == before, command
 
 
 def test_a_store_that_is_itself_a_link_to_another_disk_works(
-    made: Lab, tmp_path_factory: pytest.TempPathFactory
+    made_project: Lab, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     disk = tmp_path_factory.mktemp("disk") / "store"
-    made.store.root.rename(disk)
-    made.store.root.symlink_to(disk)
-    made.run("scale data/r -o data/t --factor 9")
-    made.run("label data/r trial-000 --label material=foam")
-    age(made)
+    made_project.store.root.rename(disk)
+    made_project.store.root.symlink_to(disk)
+    made_project.run("scale data/r -o data/t --factor 9")
+    made_project.run("label data/r trial-000 --label material=foam")
+    age(made_project)
     for command in ("store verify", "store repair", "store gc --recordings --grace-days 0", "store push remote data/t"):
-        made.run(command)
-    assert (disk / "format").exists() and made.store.root.is_symlink()
-    made.store.root.unlink()
-    made.store.root.symlink_to(disk.parent / "fresh")
+        made_project.run(command)
+    assert (disk / "format").exists() and made_project.store.root.is_symlink()
+    made_project.store.root.unlink()
+    made_project.store.root.symlink_to(disk.parent / "fresh")
     for command in (*READ, "simulate toy -o data/new"):
-        refused(made.call(command), "which is not there", "Mount its disk")
+        refused(made_project.call(command), "which is not there", "Mount its disk")
     (disk.parent / "fresh").mkdir()
-    made.run("simulate toy -o data/new")
+    made_project.run("simulate toy -o data/new")
     assert (disk.parent / "fresh" / "format").exists()
 
 
 def test_what_is_not_of_a_stores_form_is_left_alone_and_named(
-    made: Lab, tmp_path_factory: pytest.TempPathFactory
+    made_project: Lab, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     theirs = tmp_path_factory.mktemp("theirs")
-    other = bytes_digest(b"theirs")
-    write(theirs, {other: "theirs", "scene.blend": "mesh", "bytes": "", "header.json": "{}", f"{other}.json": "{}"})
-    root = made.store.root
+    other_digest = bytes_digest(b"theirs")
+    write(
+        theirs,
+        {other_digest: "theirs", "scene.blend": "mesh", "bytes": "", "header.json": "{}", f"{other_digest}.json": "{}"},
+    )
+    root = made_project.store.root
     files = {
         "notes.txt",
         "objects/ab/thesis.tex",
         "objects/thesis.tex",
-        f"objects/cd/{'ab' * 32}",  # on another shelf than its name says
+        f"objects/cd/{'ab' * 32}",  # This is another shelf than its name says.
         "records/ab/old.json",
         "roots/mine.json",
         "leases/mine.lock",
@@ -230,28 +237,32 @@ def test_what_is_not_of_a_stores_form_is_left_alone_and_named(
     (root / "tmp" / f"{RUN}.{'cd' * 16}").mkdir()  # a folder named as a draft is
     (root / "objects" / "zz").mkdir()
     links = {
-        f"objects/{other[:2]}": theirs,  # a shelf
-        f"records/{other[:2]}": theirs,
-        f"tmp/gc-{other}": theirs / other,
-        f"quarantine/{other}.1": theirs / other,
-        f"leases/{other}.lock": theirs / other,
-        f"checkpoints/{other}": theirs,
+        f"objects/{other_digest[:2]}": theirs,  # a shelf
+        f"records/{other_digest[:2]}": theirs,
+        f"tmp/gc-{other_digest}": theirs / other_digest,
+        f"quarantine/{other_digest}.1": theirs / other_digest,
+        f"leases/{other_digest}.lock": theirs / other_digest,
+        f"checkpoints/{other_digest}": theirs,
         f"spool/{'cd' * 16}": theirs,
     }
     for name, target in links.items():
         (root / name).parent.mkdir(exist_ok=True)
         assert not os.path.lexists(root / name)
         (root / name).symlink_to(target)
-    wanted = sorted([*files, *links, f"tmp/{RUN}.{'cd' * 16}", "objects/zz"])
-    age(made)
-    before = tree(theirs), {name: value for name, value in tree(root).items() if name in wanted}
+    foreign = sorted([*files, *links, f"tmp/{RUN}.{'cd' * 16}", "objects/zz"])
+    age(made_project)
+    before = tree(theirs), {name: value for name, value in tree(root).items() if name in foreign}
     for command in (*READ, "store repair", "store verify --json"):
-        ran = made.run(command)
-    assert json.loads(ran.out)["foreign"] == wanted
+        ran = made_project.run(command)
+    assert json.loads(ran.out)["foreign"] == foreign
     assert spool_folders.abandoned(root) == []
-    assert (tree(theirs), {name: value for name, value in tree(root).items() if name in wanted}) == before
-    told = made.run("store verify").out
-    assert "not part of a store, left as it is: checkpoints/mine" in told and "12 more" in told and "all sound" in told
+    assert (tree(theirs), {name: value for name, value in tree(root).items() if name in foreign}) == before
+    output = made_project.run("store verify").out
+    assert (
+        "not part of a store, left as it is: checkpoints/mine" in output
+        and "12 more" in output
+        and "all sound" in output
+    )
 
 
 def test_a_file_is_not_written_through_a_link_within_a_store(tmp_path: Path) -> None:
@@ -292,8 +303,8 @@ def test_only_drafts_of_our_own_form_are_swept_from_a_dataset(tmp_path: Path) ->
     write(tmp_path / "theirs", {".left.parquet.0123456789ab.draft": "text"})
     (tmp_path / "data/linked").symlink_to(tmp_path / "theirs")
     directory.sweep(tmp_path / "data")
-    left = {str(path.relative_to(tmp_path / "data")) for path in (tmp_path / "data").rglob("*") if path.is_file()}
-    assert left == set(mine) and (tmp_path / "theirs/.left.parquet.0123456789ab.draft").exists()
+    remaining = {str(path.relative_to(tmp_path / "data")) for path in (tmp_path / "data").rglob("*") if path.is_file()}
+    assert remaining == set(mine) and (tmp_path / "theirs/.left.parquet.0123456789ab.draft").exists()
     write(tmp_path / "data", {".page.html.old.draft": "mine", ".page.html.0123456789ab.draft": "ours"})
     directory.sweep_beside(tmp_path / "data/page.html")
     assert (tmp_path / "data/.page.html.old.draft").exists()

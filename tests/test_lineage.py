@@ -85,7 +85,7 @@ def test_explain_reads_the_record_of_the_dataset_and_not_those_of_its_recordings
 
 def test_a_record_that_was_written_at_another_time_than_its_root_is_found_all_the_same(lab: Lab) -> None:
     lab.run("simulate toy --trials 3 --rows 3 -o data/r --jobs 1")
-    made = explained(lab, "data/r")["provenance"]
+    provenance = explained(lab, "data/r")["provenance"]
     for number, path in enumerate(sorted(lab.store.root.glob("records/*/*"))):
         os.utime(path, (10**9 + number, 10**9 + number))
-    assert made is not None and explained(lab, "data/r")["provenance"] == made
+    assert provenance is not None and explained(lab, "data/r")["provenance"] == provenance

@@ -1,4 +1,4 @@
-"""What a stage holds in memory does not grow with the recordings of a dataset: peaks over 10 and over 100 of them."""
+"""Compare a stage's peak of memory over 10 and 100 recordings: it does not grow with the recordings of a dataset."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from tests.conftest import tacpipe
 pytestmark = pytest.mark.long
 
 SIMULATE = "simulate forward --duration-s 20 --robot-rate-hz 50 --jobs 1 -o rec"
-LITTLE = {  # of what may stay in memory, less than ten recordings have
+LITTLE = {  # Ten recordings have more than these bytes, which may stay in memory.
     "tacpipe.tasks.forward.evaluation.KEPT_BYTES": 1 << 20,
     "tacpipe.tasks.forward.prediction.KEPT_BYTES": 1 << 20,
     "tacpipe.tasks.forward.training.IN_MEMORY": 1 << 20,
@@ -19,7 +19,7 @@ LITTLE = {  # of what may stay in memory, less than ten recordings have
     "tacpipe.io.mapped.SEGMENT_BYTES": 1 << 22,
     "tacpipe.io.mapped.MOST_READ": 1 << 22,
 }
-STAGES = {  # in this order
+STAGES = {  # The stages run in this order.
     "synchronize": "synchronize rec --jobs 1 -o synced",
     "segment": "segment contacts synced --jobs 1 -o segments",
     "split": "split segments --scheme blocked --val 0.1 --test 0 -o split",
@@ -37,17 +37,17 @@ MOST = 1.2  # times; the alarms of `evaluate` take 680 bytes a row
 @pytest.fixture(scope="module")
 def grown(tmp_path_factory: pytest.TempPathFactory) -> dict[str, float]:
     """Return the peak of each stage over 100 recordings, in units of that over 10."""
-    found: dict[int, dict[str, int]] = {}
+    peak_bytes: dict[int, dict[str, int]] = {}
     for count in (10, 100):
         folder = tmp_path_factory.mktemp(f"of-{count}")
         (folder / ".tacpipe").mkdir()
-        done = tacpipe(folder, f"{SIMULATE} --trials {count}")
-        assert done.returncode == 0, done.stderr
-        found[count] = {
+        process = tacpipe(folder, f"{SIMULATE} --trials {count}")
+        assert process.returncode == 0, process.stderr
+        peak_bytes[count] = {
             stage: peaks.bytes_of(folder, command, LITTLE if stage in OF_MODELS else {})
             for stage, command in STAGES.items()
         }
-    return {stage: found[100][stage] / found[10][stage] for stage in STAGES}
+    return {stage: peak_bytes[100][stage] / peak_bytes[10][stage] for stage in STAGES}
 
 
 @pytest.mark.parametrize("stage", STAGES)

@@ -22,8 +22,8 @@ def test_arrays_of_all_shapes_and_types_come_back_also_after_they_were_let_go_of
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(mapped, "SEGMENT_BYTES", 1 << 16)
-    rng, aside = np.random.default_rng(0), MappedArrays(100)
-    given: list[AnyArray] = [
+    rng, mapped_arrays = np.random.default_rng(0), MappedArrays(100)
+    arrays: list[AnyArray] = [
         rng.normal(size=(7, 3)).astype(np.float32),
         rng.integers(0, 9, 5000),
         rng.random(11) < 0.5,
@@ -31,32 +31,32 @@ def test_arrays_of_all_shapes_and_types_come_back_also_after_they_were_let_go_of
         rng.normal(size=(900, 12)),
         np.asfortranarray(rng.normal(size=(20, 30))),
     ]
-    kept = [aside.kept(one) for one in given]
-    filled = aside.empty((50, 2), np.float32)
+    copies = [mapped_arrays.kept(array) for array in arrays]
+    filled = mapped_arrays.empty((50, 2), np.float32)
     filled[:] = 3
-    aside.release()
-    assert kept[0] is given[0]  # the first bytes stay in memory
-    for one, other in zip(kept, given, strict=True):
-        assert one.dtype == other.dtype and np.array_equal(one, other)
+    mapped_arrays.release()
+    assert copies[0] is arrays[0]  # the first bytes stay in memory
+    for copy, array in zip(copies, arrays, strict=True):
+        assert copy.dtype == array.dtype and np.array_equal(copy, array)
     assert (filled == 3).all()
 
 
 def resident() -> int:
     """Return how many bytes of this process are in memory."""
-    found = re.search(r"VmRSS:\s+(\d+)", Path("/proc/self/status").read_text())
-    assert found
-    return int(found[1]) << 10
+    match = re.search(r"VmRSS:\s+(\d+)", Path("/proc/self/status").read_text())
+    assert match
+    return int(match[1]) << 10
 
 
 def test_what_was_read_takes_no_memory_once_it_is_let_go_of() -> None:
-    aside, size = MappedArrays(0), 200 << 20
-    made = aside.empty((size // 8,), np.float64)
+    mapped_arrays, size = MappedArrays(0), 200 << 20
+    array = mapped_arrays.empty((size // 8,), np.float64)
     before = resident()
-    made[:] = 1.0
+    array[:] = 1.0
     assert resident() > before + size // 2
-    aside.read(mapped.MOST_READ + 1)
+    mapped_arrays.read(mapped.MOST_READ + 1)
     assert resident() < before + size // 8
-    assert made.sum() == len(made)
+    assert array.sum() == len(array)
 
 
 def test_a_full_disk_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -70,10 +70,10 @@ def test_a_recording_that_memory_does_not_hold_is_no_bad_recording(lab: Lab, mon
         (lab.folder / "raw" / f"{name}.txt").write_text("1\n2\n")
     real = Path.read_text
 
-    def read_text(path: Path, *given: Any, **named: Any) -> str:
+    def read_text(path: Path, *arguments: Any, **options: Any) -> str:
         if path.name == "b.txt":
             raise MemoryError
-        return real(path, *given, **named)
+        return real(path, *arguments, **options)
 
     monkeypatch.setattr(Path, "read_text", read_text)
     ran = lab.call("ingest numbers raw -o data/r --skip-bad")

@@ -96,8 +96,8 @@ def test_an_identity_with_the_params_of_every_architecture_is_read(name: str, ch
     stage = registry.load(name)
     tag = params_of.tag(stage)
     assert tag is not None
-    found = params_of.from_json(stage, {**BEFORE[name], tag: choice})
-    values = params_of.to_json(found)
+    params = params_of.from_json(stage, {**BEFORE[name], tag: choice})
+    values = params_of.to_json(params)
     assert values[tag] == choice
     assert all(values[key] == BEFORE[name][key] for key in set(values) & set(BEFORE[name]) - {tag})
 
@@ -140,8 +140,8 @@ def test_people_read_a_renamed_param_of_a_chain_by_its_name_of_today() -> None:
     stored = params_of.to_json(asked("compress.pca", components=3, representation="increments"))
     step = {"stage": "compress.pca", "version": 2, "params": stored, "fitted": None}
     assert opened._command(step) == "compress pca --components 3 --representation increments"
-    other = {**step, "params": {**stored, "of": "levels"}}
-    assert "representation" in chain_difference([step], [other])
+    renamed_step = {**step, "params": {**stored, "of": "levels"}}
+    assert "representation" in chain_difference([step], [renamed_step])
     assert params_of.named("no.such.stage", {"of": "levels"}) == {"of": "levels"}
 
 
@@ -167,8 +167,8 @@ def test_a_models_params_are_of_the_class_of_its_architecture_and_of_the_right_t
 def test_stored_values_are_read_without_the_checks_of_new_ones() -> None:
     stage = registry.load("segment.contacts")
     stored = params_of.to_json(asked("segment.contacts")) | {"on_count": 1.0, "min_s": -1.0}
-    found = params_of.from_json(stage, stored)
-    assert (found.on_count, found.min_s) == (1.0, -1.0)
+    params = params_of.from_json(stage, stored)
+    assert (params.on_count, params.min_s) == (1.0, -1.0)
 
 
 def test_a_step_of_a_chain_with_a_param_that_is_gone_is_refused() -> None:
@@ -185,10 +185,10 @@ def older(files: Mapping[str, bytes], name: str, **changed: Any) -> dict[str, by
 
 
 def metrics(task: str, files: Mapping[str, bytes], recordings: Any) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads(
+    report: dict[str, Any] = json.loads(
         registry.load_task(task).evaluate(cast(Any, FakeDataset({}, files, {})), recordings).files["metrics.json"]
     )
-    return found
+    return report
 
 
 @pytest.mark.parametrize("architecture", ["taxelwise", "recurrent"])

@@ -29,9 +29,9 @@ def older(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_every_object_of_an_older_store_is_sound(older: Path, call: Callable[[str], Ran]) -> None:
-    done = call("store verify --json")
-    assert done.code == 0, done.err
-    assert json.loads(done.out)["damaged"] == []
+    result = call("store verify --json")
+    assert result.code == 0, result.err
+    assert json.loads(result.out)["damaged"] == []
 
 
 @pytest.mark.parametrize("output", HITS)
@@ -39,9 +39,9 @@ def test_a_command_finds_its_older_result_under_the_same_key(
     older: Path, call: Callable[[str], Ran], output: str
 ) -> None:
     before = (older / output / "manifest.json").read_bytes()
-    done = call(f"{HITS[output]} -o {output} --json")
-    assert done.code == 0, done.err
-    assert json.loads(done.out)["ran"] == 0
+    result = call(f"{HITS[output]} -o {output} --json")
+    assert result.code == 0, result.err
+    assert json.loads(result.out)["ran"] == 0
     assert (older / output / "manifest.json").read_bytes() == before
 
 
@@ -49,28 +49,28 @@ def test_rows_are_computed_again_since_they_no_longer_look_ahead_and_older_ones_
     older: Path, call: Callable[[str], Ran]
 ) -> None:
     rows = tacpipe.open("data/synced").table().num_rows
-    done = call("synchronize data/recordings --rate-hz 25 -o data/held --json")
-    assert done.code == 0, done.err
-    assert json.loads(done.out)["ran"] == 3
+    result = call("synchronize data/recordings --rate-hz 25 -o data/held --json")
+    assert result.code == 0, result.err
+    assert json.loads(result.out)["ran"] == 3
     assert tacpipe.open("data/synced").table().num_rows == rows
 
 
 def test_components_are_fitted_anew_since_their_stage_has_another_version_and_are_those_of_before(
     older: Path, call: Callable[[str], Ran]
 ) -> None:
-    then = tacpipe.open("data/latents").table()
-    done = call("compress pca data/segments --split data/split --components 2 -o data/latents --json")
-    assert done.code == 0, done.err
-    assert json.loads(done.out)["ran"] == 3
-    found = tacpipe.open("data/latents").table()
-    assert found.column_names == then.column_names
+    before = tacpipe.open("data/latents").table()
+    result = call("compress pca data/segments --split data/split --components 2 -o data/latents --json")
+    assert result.code == 0, result.err
+    assert json.loads(result.out)["ran"] == 3
+    after = tacpipe.open("data/latents").table()
+    assert after.column_names == before.column_names
     for name in ("z00", "z01"):
-        assert np.allclose(found.column(name).to_numpy(), then.column(name).to_numpy(), rtol=1e-5, atol=1e-5), name
+        assert np.allclose(after.column(name).to_numpy(), before.column(name).to_numpy(), rtol=1e-5, atol=1e-5), name
 
 
 def test_an_older_dataset_is_opened_with_the_label_that_was_set_by_hand(older: Path) -> None:
-    found = tacpipe.open("data/recordings")
-    assert found.recordings["trial-001"].attributes["object"] == "cup"
+    dataset = tacpipe.open("data/recordings")
+    assert dataset.recordings["trial-001"].attributes["object"] == "cup"
 
 
 def test_an_older_model_and_an_older_result_are_shown(older: Path, call: Callable[[str], Ran]) -> None:
@@ -82,8 +82,10 @@ def test_an_older_model_and_an_older_result_are_shown(older: Path, call: Callabl
 
 
 def test_an_older_model_predicts_what_it_predicted_then(older: Path) -> None:
-    found = tacpipe.load("models/forward").predict(tacpipe.open("data/latents"), steps=[1])
-    then = tacpipe.open("data/predicted").table()
-    assert found.column_names == then.column_names
-    for name in found.column_names[2:]:
-        assert np.allclose(found.column(name).to_numpy(), then.column(name).to_numpy(), rtol=1e-4, atol=1e-3), name
+    predicted = tacpipe.load("models/forward").predict(tacpipe.open("data/latents"), steps=[1])
+    before = tacpipe.open("data/predicted").table()
+    assert predicted.column_names == before.column_names
+    for name in predicted.column_names[2:]:
+        assert np.allclose(predicted.column(name).to_numpy(), before.column(name).to_numpy(), rtol=1e-4, atol=1e-3), (
+            name
+        )

@@ -1,4 +1,4 @@
-"""What `tacpipe show` and `tacpipe evaluate` print of models, results, splits and recordings."""
+"""`tacpipe show` and `tacpipe evaluate` print models, results, splits and recordings."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tacpipe.metrics import headline
 from tests import chain
 from tests.conftest import tacpipe
 
-EVALUATE = next(one for one in chain.CHAIN if one.startswith("evaluate"))
+EVALUATE = next(command for command in chain.CHAIN if command.startswith("evaluate"))
 
 
 @pytest.fixture(scope="module")
@@ -24,22 +24,22 @@ def lab(chained: Path) -> Path:
     return chained
 
 
-def shown(folder: Path, what: str) -> tuple[str, dict[str, Any]]:
+def show(folder: Path, arguments: str) -> tuple[str, dict[str, Any]]:
     """Return what `tacpipe show` prints as text and as JSON."""
-    text, value = (tacpipe(folder, f"show {what}{option}") for option in ("", " --json"))
+    text, value = (tacpipe(folder, f"show {arguments}{option}") for option in ("", " --json"))
     assert (text.returncode, value.returncode) == (0, 0), text.stderr
-    found: dict[str, Any] = json.loads(value.stdout)
-    return text.stdout, found
+    parsed: dict[str, Any] = json.loads(value.stdout)
+    return text.stdout, parsed
 
 
 def row(text: str, name: str) -> str:
-    """Return what stands behind a name."""
-    (found,) = [line for line in text.splitlines() if line.startswith(f"{name} ")]
-    return found.removeprefix(name).strip()
+    """Return the text after a name."""
+    (line_of_name,) = [line for line in text.splitlines() if line.startswith(f"{name} ")]
+    return line_of_name.removeprefix(name).strip()
 
 
 def test_a_model_is_shown_by_what_it_is_and_what_it_was_trained_on(lab: Path) -> None:
-    text, value = shown(lab, "models/forward")
+    text, value = show(lab, "models/forward")
     config = json.loads((lab / "models/forward/config.json").read_text())
     assert value["kind"] == "model"
     assert (row(text, "task"), row(text, "architecture")) == ("forward", "gru")
@@ -57,17 +57,17 @@ def test_a_model_is_shown_by_what_it_is_and_what_it_was_trained_on(lab: Path) ->
 def test_the_parameters_of_a_model_are_counted_in_its_weights(lab: Path) -> None:
     from safetensors.numpy import load_file
 
-    wanted = sum(math.prod(one.shape) for one in load_file(lab / "models/forward/model.safetensors").values())
-    assert shown(lab, "models/forward")[1]["parameters"] == wanted
+    expected = sum(math.prod(tensor.shape) for tensor in load_file(lab / "models/forward/model.safetensors").values())
+    assert show(lab, "models/forward")[1]["parameters"] == expected
 
 
 def test_a_result_is_shown_by_its_headline_its_baselines_and_what_it_rests_on(lab: Path) -> None:
-    text, value = shown(lab, "results/forward")
-    told = headline.read((lab / "results/forward/headline.json").read_bytes())
+    text, value = show(lab, "results/forward")
+    headlines = headline.read((lab / "results/forward/headline.json").read_bytes())
     assert value["kind"] == "result"
-    assert text.startswith(headline_table.text(told, terminal.width_of(sys.stdout)))
-    assert value["headline"] == [one.to_json() for one in told]
-    assert value["baselines"] == [one.name for one in told[0].baselines]
+    assert text.startswith(headline_table.text(headlines, terminal.width_of(sys.stdout)))
+    assert value["headline"] == [part.to_json() for part in headlines]
+    assert value["baselines"] == [baseline.name for baseline in headlines[0].baselines]
     assert "ridge" in row(text, "baselines") and "codec" not in row(text, "baselines")
     counts = json.loads((lab / "results/forward/metrics.json").read_text())["counts"]
     assert f"recordings {counts['recordings']}" in row(text, "evaluated on")
@@ -93,7 +93,7 @@ def test_a_result_of_before_headlines_says_so() -> None:
 
 
 def test_a_split_is_shown_by_how_many_recordings_have_each_role(lab: Path) -> None:
-    text, value = shown(lab, "data/split")
+    text, value = show(lab, "data/split")
     assert value["kind"] == "split"
     assert text.splitlines()[0].split() == ["fold", "train", "val", "test"]
     counts = value["folds"]["0"]
@@ -102,7 +102,7 @@ def test_a_split_is_shown_by_how_many_recordings_have_each_role(lab: Path) -> No
 
 
 def test_the_truth_of_a_simulator_takes_one_line(lab: Path) -> None:
-    text, value = shown(lab, "data/recordings")
+    text, value = show(lab, "data/recordings")
     assert value["kind"] == "recordings"
     assert [line for line in text.splitlines() if line.startswith("gt_")] == [
         "gt_*: 13 labels with the simulator's ground truth (--full lists them)"
@@ -120,11 +120,11 @@ def test_a_picture_hatches_the_padding_of_contacts(lab: Path, tmp_path: Path) ->
 
 
 def test_evaluate_prints_its_headline_on_a_hit_too_and_stdout_is_the_output_alone(lab: Path) -> None:
-    found = headline.read((lab / "results/forward/headline.json").read_bytes())
-    told = headline_table.text(found, terminal.width_of(sys.stderr))
-    done = tacpipe(lab, EVALUATE)
-    assert done.stdout == "results/forward\n"
-    assert "0 ran" in done.stderr and told in done.stderr
+    headlines = headline.read((lab / "results/forward/headline.json").read_bytes())
+    table = headline_table.text(headlines, terminal.width_of(sys.stderr))
+    process = tacpipe(lab, EVALUATE)
+    assert process.stdout == "results/forward\n"
+    assert "0 ran" in process.stderr and table in process.stderr
 
 
 def test_quiet_hides_the_headline_and_json_carries_it(lab: Path) -> None:
@@ -132,7 +132,7 @@ def test_quiet_hides_the_headline_and_json_carries_it(lab: Path) -> None:
     assert (quiet.stdout, quiet.stderr) == ("results/forward\n", "")
     value = json.loads(tacpipe(lab, f"{EVALUATE} --quiet --json").stdout)
     read = headline.read((lab / "results/forward/headline.json").read_bytes())
-    assert value["headline"] == [one.to_json() for one in read]
+    assert value["headline"] == [part.to_json() for part in read]
 
 
 def test_a_page_says_of_a_result_what_the_terminal_says(lab: Path) -> None:
@@ -149,5 +149,5 @@ def test_a_page_says_of_a_result_what_the_terminal_says(lab: Path) -> None:
 
 
 def test_other_commands_have_no_headline(lab: Path) -> None:
-    done = tacpipe(lab, f"{next(one for one in chain.CHAIN if one.startswith('split'))} --json")
-    assert "headline" not in json.loads(done.stdout)
+    process = tacpipe(lab, f"{next(command for command in chain.CHAIN if command.startswith('split'))} --json")
+    assert "headline" not in json.loads(process.stdout)

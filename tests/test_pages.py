@@ -65,12 +65,12 @@ class Objects:
         return self.content[page.digest]
 
 
-def read_again(whole: Manifest) -> tuple[Manifest, Objects]:
+def read_again(full_manifest: Manifest) -> tuple[Manifest, Objects]:
     """Return a manifest as another process reads it, and its pages."""
-    assert whole.pages is not None
-    objects = Objects(dict(whole.pages.fresh))
+    assert full_manifest.pages is not None
+    objects = Objects(dict(full_manifest.pages.fresh))
     manifest._parsed.clear()
-    return manifest.parse(whole.content, "manifest", objects), objects
+    return manifest.parse(full_manifest.content, "manifest", objects), objects
 
 
 @pytest.fixture
@@ -92,13 +92,16 @@ def divided(grouped: int) -> Iterator[None]:
 
 def test_a_dataset_of_a_thousand_recordings_has_the_manifest_that_it_always_had() -> None:
     entry = {"attributes": {}, "shards": {"": {"digest": "0" * 64, "rows": 1, "bytes": 1}}}
-    few, many = ({f"r{number:05d}": entry for number in range(count)} for count in (1000, 1001))
+    thousand, thousand_and_one = ({f"r{number:05d}": entry for number in range(count)} for count in (1000, 1001))
 
-    value = json.loads(Manifest("stage", 1, recordings=few).content)
+    value = json.loads(Manifest("stage", 1, recordings=thousand).content)
     assert value["format"] == 1
-    assert value["recordings"] == few
-    assert Manifest("stage", 1, recordings=few).content == (json.dumps(value, sort_keys=True, indent=1) + "\n").encode()
-    root = json.loads(Manifest("stage", 1, recordings=many).content)
+    assert value["recordings"] == thousand
+    assert (
+        Manifest("stage", 1, recordings=thousand).content
+        == (json.dumps(value, sort_keys=True, indent=1) + "\n").encode()
+    )
+    root = json.loads(Manifest("stage", 1, recordings=thousand_and_one).content)
     assert root["format"] == 2
     assert "recordings" not in root
     assert sum(page["recordings"] for page in root["pages"]) == 1001
@@ -107,23 +110,27 @@ def test_a_dataset_of_a_thousand_recordings_has_the_manifest_that_it_always_had(
 @given(MANY, st.integers(1, 5))
 def test_a_manifest_that_lists_pages_holds_what_it_was_made_of(items: dict[str, Item], grouped: int) -> None:
     with divided(grouped):
-        whole = of_items(items)
-        found, _ = read_again(whole)
+        full_manifest = of_items(items)
+        parsed, _ = read_again(full_manifest)
 
-        assert dict(found.recordings) == whole.recordings
-        assert list(found.recordings) == sorted(items)
-        assert dict(found.labels) == whole.labels
-        assert dict(found.sources) == whole.sources
-        assert found.recordings.get("not there/") is None
-        assert (found.digest, found.rows, found.shard_bytes) == (whole.digest, whole.rows, whole.shard_bytes)
-        shards = [(path, name, size) for path, name, size in found.contents() if not path.startswith("page-")]
-        assert sorted(shards) == sorted((p, n, s) for p, n, s in whole.contents() if not p.startswith("page-"))
-        assert dict(found.included) == {
+        assert dict(parsed.recordings) == full_manifest.recordings
+        assert list(parsed.recordings) == sorted(items)
+        assert dict(parsed.labels) == full_manifest.labels
+        assert dict(parsed.sources) == full_manifest.sources
+        assert parsed.recordings.get("not there/") is None
+        assert (parsed.digest, parsed.rows, parsed.shard_bytes) == (
+            full_manifest.digest,
+            full_manifest.rows,
+            full_manifest.shard_bytes,
+        )
+        shards = [(path, name, size) for path, name, size in parsed.contents() if not path.startswith("page-")]
+        assert sorted(shards) == sorted((p, n, s) for p, n, s in full_manifest.contents() if not p.startswith("page-"))
+        assert dict(parsed.included) == {
             name: item.entry for name, item in items.items() if not item.entry["attributes"].get("excluded")
         }
-        assert pickle.loads(pickle.dumps(found.recordings)) == whole.recordings
-        again = Manifest("stage", 1, files=FILES, recordings=dict(found.recordings), labels=found.labels)
-        assert again.digest == found.digest  # how the recordings came together does not count
+        assert pickle.loads(pickle.dumps(parsed.recordings)) == full_manifest.recordings
+        rebuilt = Manifest("stage", 1, files=FILES, recordings=dict(parsed.recordings), labels=parsed.labels)
+        assert rebuilt.digest == parsed.digest  # how the recordings came together does not count
 
 
 @given(MANY, st.data(), st.integers(1, 5))
@@ -131,10 +138,10 @@ def test_recordings_that_come_change_or_go_give_the_pages_of_a_dataset_made_at_o
     items: dict[str, Item], data: st.DataObject, grouped: int
 ) -> None:
     with divided(grouped):
-        found, _ = read_again(of_items(items))
+        parsed, _ = read_again(of_items(items))
         changes = data.draw(st.dictionaries(st.sampled_from(sorted(items)) | NAMES, st.none() | ITEMS, max_size=5))
         expected = {name: item for name, item in {**items, **changes}.items() if item is not None}
-        changed = found.with_recordings(changes)
+        changed = parsed.with_recordings(changes)
 
         assert dict(changed.recordings) == {name: item.entry for name, item in expected.items()}
         assert changed.content == of_items(dict(sorted(expected.items()))).content
@@ -143,8 +150,8 @@ def test_recordings_that_come_change_or_go_give_the_pages_of_a_dataset_made_at_o
 @given(MANY, st.integers(1, 5))
 def test_a_key_over_a_dataset_in_pages_is_that_of_its_recordings(items: dict[str, Item], grouped: int) -> None:
     with divided(grouped):
-        found, _ = read_again(of_items(items))
-        value = keys.of_dataset(found, None, found.included)
+        parsed, _ = read_again(of_items(items))
+        value = keys.of_dataset(parsed, None, parsed.included)
     plain = {name: keys.of_recording(item.entry, None) for name, item in sorted(items.items())}
     included = {name: entry for name, entry in plain.items() if not entry["attributes"].get("excluded")}
     assert hashing.digest(value) == hashing.digest({**value, "recordings": included})
@@ -153,9 +160,11 @@ def test_a_key_over_a_dataset_in_pages_is_that_of_its_recordings(items: dict[str
 def test_one_changed_recording_reads_and_writes_one_page(few_are_many: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pages, "GROUPED", 16)
     shard = {"digest": "0" * 64, "rows": 1, "bytes": 1}
-    whole = of_items({f"r{number:04d}": Item({"attributes": {}, "shards": {"": shard}}) for number in range(400)})
-    found, objects = read_again(whole)
-    changed = found.labelled({"r0123": {"material": "felt"}})
+    full_manifest = of_items(
+        {f"r{number:04d}": Item({"attributes": {}, "shards": {"": shard}}) for number in range(400)}
+    )
+    parsed, objects = read_again(full_manifest)
+    changed = parsed.labelled({"r0123": {"material": "felt"}})
     assert changed.pages is not None
     assert len(changed.content) > 0
     assert objects.reads == 1
@@ -181,8 +190,8 @@ ROOT_CHANGES: dict[str, Callable[[dict[str, Any]], object]] = {
 @pytest.mark.parametrize("change", ROOT_CHANGES)
 def test_a_root_that_none_can_be_is_refused_before_a_page_is_read(few_are_many: None, change: str) -> None:
     shard = {"digest": "0" * 64, "rows": 1, "bytes": 1}
-    whole = of_items({f"r{number}": Item({"attributes": {}, "shards": {"": shard}}) for number in range(9)})
-    root = json.loads(whole.content)
+    full_manifest = of_items({f"r{number}": Item({"attributes": {}, "shards": {"": shard}}) for number in range(9)})
+    root = json.loads(full_manifest.content)
     ROOT_CHANGES[change](root)
     with pytest.raises(TacpipeError):
         manifest.parse(json.dumps(root).encode(), "given", Objects({}))
@@ -197,35 +206,35 @@ def test_a_page_that_holds_what_no_manifest_can_is_refused_when_it_is_read(few_a
     except (ValueError, TypeError, KeyError, AttributeError, TacpipeError, RecursionError):
         pass
     else:
-        return  # what is hostile is not in its recordings
+        return  # The hostile part is not in its recordings.
     try:
         page = Page(next(iter(entries)), hashing.bytes_digest(stored), len(stored), "0" * 64, len(entries), 1, 1)
-        found = Pages([page], Objects({page.digest: stored}), {})
+        loaded = Pages([page], Objects({page.digest: stored}), {})
     except (TypeError, AttributeError, UnboundLocalError, StopIteration):
         return
     with pytest.raises(DamagedError):
-        found.load(0)
+        loaded.load(0)
 
 
 @pytest.mark.parametrize("field", ["first", "content", "recordings", "rows", "shard_bytes", "labelled", "excluded"])
 def test_a_page_that_is_not_what_its_root_states_is_refused(few_are_many: None, field: str) -> None:
     shard = {"digest": "0" * 64, "rows": 1, "bytes": 1}
-    whole = of_items({f"r{number}": Item({"attributes": {}, "shards": {"": shard}}) for number in range(9)})
-    assert whole.pages is not None
-    value = whole.pages.pages[0].to_json()
+    full_manifest = of_items({f"r{number}": Item({"attributes": {}, "shards": {"": shard}}) for number in range(9)})
+    assert full_manifest.pages is not None
+    value = full_manifest.pages.pages[0].to_json()
     value[field] = value.get(field, 0) + 1 if field not in ("first", "content") else "a" * 64
-    found = Pages([Page.from_json(value)], Objects(dict(whole.pages.fresh)), {})
+    changed_pages = Pages([Page.from_json(value)], Objects(dict(full_manifest.pages.fresh)), {})
     with pytest.raises(DamagedError):
-        found.load(0)
+        changed_pages.load(0)
 
 
 def large(lab: Lab, count: int = 9) -> Pages:
     """Make data/r and data/s of it, whose manifests list pages, and return the pages of data/r."""
     lab.run(f"simulate toy --rows 3 --trials {count} -o data/r --jobs 1")
     lab.run("scale data/r -o data/s --jobs 1")
-    found = tacpipe.open(lab.folder / "data/r").source.pages
-    assert found is not None and len(found) > 1
-    return found
+    dataset_pages = tacpipe.open(lab.folder / "data/r").source.pages
+    assert dataset_pages is not None and len(dataset_pages) > 1
+    return dataset_pages
 
 
 @pytest.mark.usefixtures("few_are_many")
@@ -257,10 +266,10 @@ def test_a_missing_page_is_an_error_that_says_so_and_the_other_pages_are_read(la
 @pytest.mark.usefixtures("few_are_many")
 def test_a_missing_page_of_a_result_is_made_again_by_its_stage(lab: Lab) -> None:
     large(lab)
-    found = tacpipe.open(lab.folder / "data/s").source
-    before = found.content
-    assert found.pages is not None
-    for page in found.pages.pages:
+    source = tacpipe.open(lab.folder / "data/s").source
+    before = source.content
+    assert source.pages is not None
+    for page in source.pages.pages:
         Path(lab.store.object_path(page.digest)).unlink()
         (lab.folder / "data/s" / page.path).unlink()
     manifest._parsed.clear()
@@ -275,22 +284,22 @@ def test_collections_keep_pages_of_labels_even_where_no_manifest_names_them(lab:
     large(lab)
     lab.run("label data/r trial-003 --set material=felt")
     manifest._parsed.clear()
-    found = tacpipe.open(lab.folder / "data/r").source
-    assert found.pages is not None
-    labelled = next(page for page in found.pages.pages if page.labelled)
+    source = tacpipe.open(lab.folder / "data/r").source
+    assert source.pages is not None
+    labelled = next(page for page in source.pages.pages if page.labelled)
     for path in (lab.folder / ".tacpipe").rglob("*"):
         if path.is_file():
-            os.utime(path, (1, 1))  # what was written just now is left alone
+            os.utime(path, (1, 1))  # A file that was just written is left alone.
     shutil.rmtree(lab.folder / "data/r")
     for folder in ("roots", "records"):
         shutil.rmtree(lab.folder / ".tacpipe" / folder)
         (lab.folder / ".tacpipe" / folder).mkdir()
-    Path(lab.store.object_path(found.content_digest)).unlink()
+    Path(lab.store.object_path(source.content_digest)).unlink()
     lab.run("store gc --grace-days 0")
     assert lab.store.has(labelled.digest)
     shards = shards_of(pages.PageContent.from_bytes(lab.store.read(labelled.digest)))
     assert all(lab.store.has(name) for name in shards)
-    unlabelled = [page.digest for page in found.pages.pages if not page.labelled]
+    unlabelled = [page.digest for page in source.pages.pages if not page.labelled]
     assert not any(lab.store.has(name) for name in unlabelled)
 
 
@@ -307,23 +316,23 @@ def test_a_dataset_in_pages_is_pushed_pulled_and_checked_out(
     remote = tmp_path_factory.mktemp("remote") / "store"
     lab.run(f"store push {remote} data/r data/s")
     content = {name: (lab.folder / name / "manifest.json").read_bytes() for name in ("data/r", "data/s")}
-    other = tmp_path_factory.mktemp("other")
-    (other / ".tacpipe").mkdir()
-    monkeypatch.chdir(other)
+    clone = tmp_path_factory.mktemp("other")
+    (clone / ".tacpipe").mkdir()
+    monkeypatch.chdir(clone)
     manifest._parsed.clear()
-    (other / "data/r").mkdir(parents=True)
-    (other / "data/r/manifest.json").write_bytes(content["data/r"])  # as git or DVC brings it
+    (clone / "data/r").mkdir(parents=True)
+    (clone / "data/r/manifest.json").write_bytes(content["data/r"])  # Git or DVC brings the manifest.
     ran = lab.call("scale data/r -o data/s --jobs 1")
     assert ran.code == DAMAGED and "store pull" in ran.err
     lab.run(f"store pull {remote} data/r")
     manifest._parsed.clear()
-    opened = tacpipe.open(other / "data/r")
+    opened = tacpipe.open(clone / "data/r")
     assert opened["trial-003"].attributes["material"] == "felt"
     assert all(recording.table("left").num_rows == 3 for recording in opened)
-    shutil.rmtree(other / "data/r")
+    shutil.rmtree(clone / "data/r")
     manifest._parsed.clear()
     lab.run(f"store checkout {hashing.bytes_digest(content['data/s'])} --remote {remote} -o data/s")
-    assert (other / "data/s/manifest.json").read_bytes() == content["data/s"]
+    assert (clone / "data/s/manifest.json").read_bytes() == content["data/s"]
     lab.run("store verify")
 
 

@@ -13,10 +13,10 @@ from tacpipe.plugins.stage import AnyStage, stage
 
 @dataclass(frozen=True)
 class Params:
-    rate_hz: float = 50.0  # of the grid
+    rate_hz: float = 50.0  # rate of the grid
     frames: int = 400  # kept
-    grid: Literal["uniform", "logged"] = "uniform"  # which rows
-    sensors: tuple[int, ...] = (1, 2)  # which ones
+    grid: Literal["uniform", "logged"] = "uniform"  # rows of the grid
+    sensors: tuple[int, ...] = (1, 2)  # numbers of sensors
     strict: bool = True  # refuse gaps
     note: str | None = None  # free text
     PRESETS: ClassVar[dict[str, dict[str, object]]] = {"quick": {"frames": 10}}
@@ -28,8 +28,8 @@ def cut(params: Params) -> None: ...
 STAGE: AnyStage = stage(version=1)(cut)
 
 
-def built(**given: object) -> Params:
-    params = given_params.build("cut", STAGE, **given)  # type: ignore[arg-type]
+def built(**inputs: object) -> Params:
+    params = given_params.build("cut", STAGE, **inputs)  # type: ignore[arg-type]
     assert isinstance(params, Params)
     return params
 
@@ -104,14 +104,14 @@ def test_the_comment_behind_a_field_is_its_help() -> None:
 
 @dataclass(frozen=True)
 class Part:
-    name: str  # of the part
-    size: float = 1.0  # in metres
+    name: str  # name of the part
+    size: float = 1.0  # size in metres
 
 
 @dataclass(frozen=True)
 class Whole:
-    parts: tuple[Part, ...]  # in order
-    lid: Part | None = None  # on top
+    parts: tuple[Part, ...]  # parts in order
+    lid: Part | None = None  # lid on top
 
 
 def test_tables_fill_the_dataclasses_that_stand_for_them() -> None:
@@ -139,17 +139,17 @@ def test_what_is_wrong_in_a_table_is_told_with_the_table(values: dict[str, objec
 @dataclass(frozen=True)
 class Small:
     size: Literal["small", "tiny"] = "small"  # small, or tiny
-    seed: int = 0  # of draws
-    cells: Annotated[int, Range(1, 9)] = 3  # of a small one
+    seed: int = 0  # seed of draws
+    cells: Annotated[int, Range(1, 9)] = 3  # cells of a small one
     PRESETS: ClassVar[dict[str, dict[str, object]]] = {"quick": {"cells": 1}}
 
 
 @dataclass(frozen=True)
 class Large:
     size: Literal["large"] = "large"  # large
-    seed: int = 0  # of draws
+    seed: int = 0  # seed of draws
     # layers of a large one
-    # behind one another
+    # stacked
     layers: Annotated[int, Range(1)] = 4
     shares: tuple[Annotated[float, Range(0, 1)], ...] = ()
     PRESETS: ClassVar[dict[str, dict[str, object]]] = {"quick": {"layers": 1}, "paper": {"layers": 9}}
@@ -169,12 +169,12 @@ def grow(params: Sized) -> None: ...
 GROW: AnyStage = stage(version=1)(grow)
 
 
-def grown(**given: object) -> Any:
-    return given_params.build("grow", GROW, **given)  # type: ignore[arg-type]
+def grown(**inputs: object) -> Any:
+    return given_params.build("grow", GROW, **inputs)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
-    ("given", "wanted"),
+    ("inputs", "expected"),
     [
         ({}, Small()),
         ({"options": {"size": "tiny"}}, Small("tiny")),
@@ -188,9 +188,9 @@ def grown(**given: object) -> Any:
         ({"options": {"size": "large", "layers": 2, "shares": [0, 0.5]}}, Large(layers=2, shares=(0.0, 0.5))),
     ],
 )
-def test_the_tag_chooses_the_kind_of_params(given: dict[str, Any], wanted: Sized) -> None:
-    assert grown(**given) == wanted
-    assert params_of.from_json(GROW, params_of.to_json(wanted)) == wanted
+def test_the_tag_chooses_the_kind_of_params(inputs: dict[str, Any], expected: Sized) -> None:
+    assert grown(**inputs) == expected
+    assert params_of.from_json(GROW, params_of.to_json(expected)) == expected
 
 
 def test_a_file_chooses_a_kind_and_a_preset_or_an_option_another(tmp_path: Path) -> None:
@@ -207,7 +207,7 @@ def test_a_file_chooses_a_kind_and_a_preset_or_an_option_another(tmp_path: Path)
 
 
 @pytest.mark.parametrize(
-    ("given", "sentence"),
+    ("inputs", "sentence"),
     [
         (
             {"options": {"layers": 2}},
@@ -236,15 +236,15 @@ def test_a_file_chooses_a_kind_and_a_preset_or_an_option_another(tmp_path: Path)
         ({"preset": "huge"}, r"^There is no preset huge for grow; it has quick, paper\.$"),
     ],
 )
-def test_what_does_not_belong_to_the_kind_is_refused_with_whose_it_is(given: dict[str, Any], sentence: str) -> None:
+def test_what_does_not_belong_to_the_kind_is_refused_with_whose_it_is(inputs: dict[str, Any], sentence: str) -> None:
     with pytest.raises(UsageError, match=sentence):
-        grown(**given)
+        grown(**inputs)
 
 
 def test_help_of_a_field_stands_behind_it_or_above_it_and_is_joined_over_kinds() -> None:
-    told = params_of.comments(GROW)
-    assert told["layers"] == "layers of a large one behind one another"
-    assert (told["size"], told["seed"]) == ("small, or tiny; large", "of draws")
+    comments = params_of.comments(GROW)
+    assert comments["layers"] == "layers of a large one stacked"
+    assert (comments["size"], comments["seed"]) == ("small, or tiny; large", "seed of draws")
     assert params_of.having(GROW, "cells") == ["small", "tiny"] and params_of.having(GROW, "seed") == []
 
 

@@ -175,7 +175,7 @@ def test_a_damaged_object_is_made_again_through_the_whole_chain(lab: Lab) -> Non
     lab.run("simulate toy -o data/r")
     lab.run("scale data/r -o data/s")
     lab.run("total data/s -o data/t")
-    wanted = Path("data/t/metrics.json").read_bytes()
+    totals = Path("data/t/metrics.json").read_bytes()
     for path in lab.store.root.glob("objects/*/*"):
         if path.read_bytes()[:4] == b"PAR1":
             path.chmod(0o644)
@@ -186,7 +186,7 @@ def test_a_damaged_object_is_made_again_through_the_whole_chain(lab: Lab) -> Non
     lab.run("scale data/r -o data/s3 --factor 3")
     lab.run("total data/s3 -o data/t3")
     sums = json.loads(Path("data/t3/metrics.json").read_text())
-    assert sums == {name: value * 3 // 2 for name, value in json.loads(wanted).items()}
+    assert sums == {name: value * 3 // 2 for name, value in json.loads(totals).items()}
 
 
 def test_damage_to_a_recording_that_cannot_be_made_again_is_said_so_unless_its_copy_is_sound(lab: Lab) -> None:
@@ -229,12 +229,12 @@ def test_a_rerun_links_anew_what_does_not_match_though_it_has_the_same_size(lab:
     lab.run("simulate toy -o data/r --trials 1 --rows 2")
     lab.run("scale data/r -o data/s --factor 1")
     for path in (Path("data/s/trial-000.parquet"), Path("data/r/trial-000/left.parquet")):
-        wanted = path.read_bytes()
+        content = path.read_bytes()
         path.unlink()
-        path.write_bytes(wanted[:-9] + b"?" + wanted[-8:])
+        path.write_bytes(content[:-9] + b"?" + content[-8:])
         lab.run("simulate toy -o data/r --trials 1 --rows 2")
         lab.run("scale data/r -o data/s --factor 1")
-        assert path.read_bytes() == wanted
+        assert path.read_bytes() == content
 
 
 def test_a_dataset_copied_without_its_store_opens_and_is_adopted(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -304,7 +304,7 @@ def test_recompute_and_compare_names_what_differs(lab: Lab, monkeypatch: pytest.
 
 
 @pytest.mark.parametrize(
-    ("module", "function", "value", "named"),
+    ("module", "function", "value", "difference"),
     [
         (processor, "threads", 977, r"threads: \d+, now 977"),
         (
@@ -318,7 +318,7 @@ def test_recompute_and_compare_names_what_differs(lab: Lab, monkeypatch: pytest.
     ids=["threads", "processor", "libraries"],
 )
 def test_a_difference_to_what_another_processor_number_of_threads_or_library_computed_names_them(
-    lab: Lab, monkeypatch: pytest.MonkeyPatch, module: ModuleType, function: str, value: Any, named: str
+    lab: Lab, monkeypatch: pytest.MonkeyPatch, module: ModuleType, function: str, value: Any, difference: str
 ) -> None:
     import toy_stages
 
@@ -335,22 +335,22 @@ def test_a_difference_to_what_another_processor_number_of_threads_or_library_com
     monkeypatch.setitem(toy_stages.scale.__dict__, "function", changed)
     failed = lab.call("scale data/r -o data/s --jobs 1 --recompute-and-compare")
     assert failed.code == 1
-    assert re.search(named, failed.err), failed.err
+    assert re.search(difference, failed.err), failed.err
 
 
-@pytest.mark.parametrize("rows", range(3, 9))  # of keys that come before and after one another
+@pytest.mark.parametrize("rows", range(3, 9))  # The keys come before and after one another.
 def test_a_lost_shard_that_a_stage_gave_as_it_got_it_is_made_again_by_the_stage_that_made_it(
     lab: Lab, rows: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("TACPIPE_LOCK_TIMEOUT_S", "0")  # who waits for itself waits for ever
+    monkeypatch.setenv("TACPIPE_LOCK_TIMEOUT_S", "0")  # Waiting for itself would last for ever.
     lab.run(f"simulate toy --trials 1 --rows {rows} -o data/r")
     lab.run("named data/r -o data/n")
-    wanted = tacpipe.open("data/r").recordings["trial-000"].table("left")
+    table = tacpipe.open("data/r").recordings["trial-000"].table("left")
     shard = lab.manifest("data/n").recordings["trial-000"]["shards"][""]["digest"]
     assert shard == lab.manifest("data/r").recordings["trial-000"]["shards"]["left"]["digest"]
     for path in (lab.store.object_path(shard), "data/n/trial-000.parquet", "data/r/trial-000/left.parquet"):
         Path(path).unlink()
-    assert tacpipe.open("data/n").recordings["trial-000"].table().equals(wanted)
+    assert tacpipe.open("data/n").recordings["trial-000"].table().equals(table)
 
 
 def test_shards_are_linked_and_recordings_copied(lab: Lab) -> None:

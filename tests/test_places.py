@@ -1,4 +1,4 @@
-"""Where taxels lie."""
+"""Taxels are placed by layout, by row and column numbers, or on a grid."""
 
 from __future__ import annotations
 
@@ -9,38 +9,38 @@ from tacpipe.channels import biotac_sp, places, schema
 
 
 def test_a_xela_uskin_is_a_square_of_four_by_four_in_the_order_of_its_taxels() -> None:
-    found, unit = places.of_taxels([one for one in schema.uskin_fields() if one.name.endswith("_x")])
+    positions, unit = places.of_taxels([field for field in schema.uskin_fields() if field.name.endswith("_x")])
 
-    assert unit == "mm" and found.shape == (16, 2)
+    assert unit == "mm" and positions.shape == (16, 2)
     pitch = places.USKIN_PITCH_M * 1e3
-    np.testing.assert_allclose(found[0] - found[-1], [-3 * pitch, -3 * pitch])
-    np.testing.assert_allclose(np.linalg.norm(np.diff(found[:4], axis=0), axis=1), pitch)
+    np.testing.assert_allclose(positions[0] - positions[-1], [-3 * pitch, -3 * pitch])
+    np.testing.assert_allclose(np.linalg.norm(np.diff(positions[:4], axis=0), axis=1), pitch)
 
 
 def test_electrodes_lie_by_their_number_whatever_the_order_of_the_columns() -> None:
-    fields = [one for one in schema.biotac_fields() if one.name.startswith("electrode")]
+    fields = [field for field in schema.biotac_fields() if field.name.startswith("electrode")]
 
-    found, unit = places.of_taxels(fields)
+    positions, unit = places.of_taxels(fields)
     turned, _ = places.of_taxels(fields[::-1])
 
     assert unit == "mm"
-    np.testing.assert_array_equal(found, turned[::-1])
-    assert found[:, 1].argmax() == 6  # electrode 7 is at the tip, which is at the top
-    np.testing.assert_allclose(found[0], found[10] * (-1, 1))  # 11 mirrors 1
+    np.testing.assert_array_equal(positions, turned[::-1])
+    assert positions[:, 1].argmax() == 6  # electrode 7 is at the tip, which is at the top
+    np.testing.assert_allclose(positions[0], positions[10] * (-1, 1))  # 11 mirrors 1
 
 
 def test_a_biotac_sp_is_rolled_out_as_its_published_electrodes() -> None:
-    fields = [one for one in biotac_sp.fields() if one.name.startswith("th_electrode")]
+    fields = [field for field in biotac_sp.fields() if field.name.startswith("th_electrode")]
 
-    found, _ = places.of_taxels(fields)
+    positions, _ = places.of_taxels(fields)
 
-    np.testing.assert_allclose(found, 1e3 * biotac_sp.unrolled_m()[:, ::-1])
+    np.testing.assert_allclose(positions, 1e3 * biotac_sp.unrolled_m()[:, ::-1])
 
 
 def test_a_roboskin_has_sixty_places_of_its_own() -> None:
-    found, unit = places.of_taxels(schema.roboskin_fields())
+    positions, unit = places.of_taxels(schema.roboskin_fields())
 
-    assert unit == "mm" and len({tuple(one) for one in found.round(3).tolist()}) == 60
+    assert unit == "mm" and len({tuple(position) for position in positions.round(3).tolist()}) == 60
 
 
 def test_row_and_column_numbers_come_before_any_layout() -> None:
@@ -48,16 +48,16 @@ def test_row_and_column_numbers_come_before_any_layout() -> None:
         pa.field(f"t{n}", pa.float32(), metadata={"row": str(n % 2 + 1), "column": str(n // 2 + 1)}) for n in range(6)
     ]
 
-    found, unit = places.of_taxels(fields)
+    positions, unit = places.of_taxels(fields)
 
     assert unit == "grid"
-    np.testing.assert_array_equal(found[:3], [[1, -1], [1, -2], [2, -1]])
+    np.testing.assert_array_equal(positions[:3], [[1, -1], [1, -2], [2, -1]])
 
 
 def test_an_unknown_array_is_a_grid_in_which_no_two_taxels_lie_on_one_another() -> None:
     for count in (1, 2, 7, 48, 96):
-        found, unit = places.of_taxels([pa.field(f"c{n}", pa.int16()) for n in range(count)])
-        assert unit == "grid" and len({tuple(one) for one in found.tolist()}) == count
+        positions, unit = places.of_taxels([pa.field(f"c{n}", pa.int16()) for n in range(count)])
+        assert unit == "grid" and len({tuple(position) for position in positions.tolist()}) == count
 
 
 def test_numbers_beyond_a_known_layout_make_a_grid() -> None:

@@ -22,19 +22,19 @@ DAY_NS = 86_400 * 10**9
 @pytest.fixture
 def shows(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Path]]:
     """The directories of which each file was looked at; all datasets are large, and all folders changed long ago."""
-    asked: list[Path] = []
+    shown_directories: list[Path] = []
     look, clock_ns = directory.showing, presence.Look._clock_ns
 
-    def looked(*given: object) -> str:
-        asked.append(Path(str(given[2])))
-        return look(*given)  # type: ignore[arg-type]
+    def record_look(*arguments: object) -> str:
+        shown_directories.append(Path(str(arguments[2])))
+        return look(*arguments)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(directory, "showing", looked)
+    monkeypatch.setattr(directory, "showing", record_look)
     monkeypatch.setattr(presence.Look, "_clock_ns", lambda self: clock_ns(self) + DAY_NS)
     monkeypatch.setattr(pages, "INLINE", 1)
     monkeypatch.setattr(pages, "GROUPED", 2)
     monkeypatch.setattr(manifest, "_parsed", {})
-    yield asked
+    yield shown_directories
 
 
 @pytest.fixture
@@ -55,13 +55,13 @@ def content(folder: Path) -> dict[str, str]:
 def test_what_is_noted_is_a_hit_that_looks_at_no_file_and_reports_what_the_look_reported(
     noted: Lab, shows: list[Path]
 ) -> None:
-    known = json.loads(noted.run(f"{SCALE} --json").out)
+    from_note = json.loads(noted.run(f"{SCALE} --json").out)
     assert shows == []
     shutil.rmtree(noted.folder / ".tacpipe/presence")
-    looked = json.loads(noted.run(f"{SCALE} --json").out)
+    from_look = json.loads(noted.run(f"{SCALE} --json").out)
     assert shows == [noted.folder / "data/s"]
-    assert {**known, "seconds": 0} == {**looked, "seconds": 0}
-    assert known["reused"] == 4 and known["rows"] == 12
+    assert {**from_note, "seconds": 0} == {**from_look, "seconds": 0}
+    assert from_note["reused"] == 4 and from_note["rows"] == 12
 
 
 def first(lab: Lab) -> tuple[Path, Path]:
@@ -76,9 +76,9 @@ def remove_file(lab: Lab) -> None:
 
 def replace_file(lab: Lab) -> None:
     path, _ = first(lab)
-    wanted = path.read_bytes()
+    before = path.read_bytes()
     path.unlink()
-    path.write_bytes(wanted[:-9] + b"?" + wanted[-8:])
+    path.write_bytes(before[:-9] + b"?" + before[-8:])
 
 
 def remove_object(lab: Lab) -> None:
@@ -106,19 +106,19 @@ def remove_stored_manifest(lab: Lab) -> None:
 
 
 def exchange_directory(lab: Lab) -> None:
-    there = lab.folder / "data/s"
-    shutil.copytree(there, lab.folder / "data/t")
+    dataset_folder = lab.folder / "data/s"
+    shutil.copytree(dataset_folder, lab.folder / "data/t")
     (lab.folder / "data/t/trial-002.parquet").unlink()
-    shutil.rmtree(there)
-    (lab.folder / "data/t").rename(there)
+    shutil.rmtree(dataset_folder)
+    (lab.folder / "data/t").rename(dataset_folder)
 
 
 def exchange_shelf(lab: Lab) -> None:
     shelf = first(lab)[1].parent
-    aside = shelf.with_name("aside")
-    shelf.rename(aside)
+    moved = shelf.with_name("aside")
+    shelf.rename(moved)
     shelf.mkdir()
-    shutil.rmtree(aside)
+    shutil.rmtree(moved)
 
 
 def lose_root(lab: Lab) -> None:
@@ -156,7 +156,7 @@ def test_what_comes_goes_or_is_exchanged_is_found_by_the_next_command(
         noted.run("scale data/r -o data/s --factor 3 --jobs 1")
         noted.run(SCALE)
     folder = noted.folder / "data/s"
-    wanted = content(folder)
+    before = content(folder)
     folders = [path for path in noted.folder.rglob("*") if path.is_dir()]
     times = {path: path.stat() for path in folders}
     fault(noted)
@@ -164,7 +164,7 @@ def test_what_comes_goes_or_is_exchanged_is_found_by_the_next_command(
         if path.exists():
             os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
     noted.run(SCALE)
-    assert content(folder) == wanted
+    assert content(folder) == before
     noted.run("store verify")
 
 
@@ -192,7 +192,7 @@ def test_a_note_is_written_anew_where_many_shelves_changed(
     (stored.parent / "x").touch()
     noted.run(SCALE)
     assert shows == [] and note.read_bytes() != before
-    monkeypatch.setattr(presence.Look, "_lie", lambda *given: False)  # nothing is looked at now
+    monkeypatch.setattr(presence.Look, "_lie", lambda *arguments: False)  # nothing is looked at now
     noted.run(SCALE)
     assert shows == []
 
@@ -200,9 +200,9 @@ def test_a_note_is_written_anew_where_many_shelves_changed(
 def test_after_a_restart_of_the_computer_each_file_is_looked_at(
     noted: Lab, shows: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    other = tmp_path / "boot"
-    other.write_text("another\n")
-    monkeypatch.setattr(presence, "BOOT", other)
+    boot_id = tmp_path / "boot"
+    boot_id.write_text("another\n")
+    monkeypatch.setattr(presence, "BOOT", boot_id)
     noted.run(SCALE)
     assert len(shows) == 1
     monkeypatch.setattr(presence, "BOOT", tmp_path / "none")
@@ -214,12 +214,12 @@ def test_after_a_restart_of_the_computer_each_file_is_looked_at(
 @pytest.mark.parametrize("at", [0, 40, -3, None])
 def test_a_damaged_note_is_passed_over(noted: Lab, shows: list[Path], at: int | None) -> None:
     (note,) = (noted.folder / ".tacpipe/presence").iterdir()
-    found = bytearray(note.read_bytes())
+    note_bytes = bytearray(note.read_bytes())
     if at is None:
-        found.clear()
+        note_bytes.clear()
     else:
-        found[at] ^= 1
-    note.write_bytes(found)
+        note_bytes[at] ^= 1
+    note.write_bytes(note_bytes)
     for shelf in (noted.store.root / "objects").iterdir():
         (shelf / "x").touch()  # the rows of all shelves are read
     noted.run(SCALE)
@@ -293,7 +293,7 @@ def test_a_collection_removes_the_notes_on_directories_that_are_gone(noted: Lab)
 def test_a_store_that_cannot_be_written_is_a_hit_all_the_same(noted: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
     shutil.rmtree(noted.folder / ".tacpipe/presence")
 
-    def refused(*given: object) -> None:
+    def refused(*arguments: object) -> None:
         raise PermissionError("no")
 
     monkeypatch.setattr(notes, "write", refused)

@@ -1,4 +1,4 @@
-"""What is taken over from the run before where few recordings changed: the result is that of a first run, byte for byte."""
+"""A run over a dataset in which few recordings changed reuses the previous run, with the bytes of a first run."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ NOTES = ("a", 'say ": this', "é", "\\", "a\nb")
 
 
 @pytest.fixture
-def taken(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
+def reused_counts(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
     """How many results each command took over; all datasets are large, a group has two recordings in the mean."""
     counts: list[int] = []
     take = Previous.taken
 
-    def taking(self: Previous, *given: Any) -> Taken | None:
-        found = take(self, *given)
-        counts.append(0 if found is None else found.count)
-        return found
+    def taking(self: Previous, *arguments: Any) -> Taken | None:
+        previous_results = take(self, *arguments)
+        counts.append(0 if previous_results is None else previous_results.count)
+        return previous_results
 
     monkeypatch.setattr(Previous, "taken", taking)
     monkeypatch.setattr(pages, "INLINE", 1)
@@ -53,7 +53,7 @@ def clock(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(presence.Look, "_clock_ns", lambda self: clock_ns(self) + ago_ns)
 
 
-def shown(folder: Path) -> dict[str, str]:
+def digests(folder: Path) -> dict[str, str]:
     return {str(path.relative_to(folder)): file_digest(path) for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
@@ -62,7 +62,7 @@ def first_run(lab: Lab, place: Path, command: str) -> dict[str, str]:
     shutil.rmtree(place, ignore_errors=True)
     shutil.copytree(lab.folder / "data/r", place / "data/r")
     (place / ".tacpipe").mkdir()
-    known = dict(manifest._parsed)
+    parsed = dict(manifest._parsed)
     manifest._parsed.clear()
     os.chdir(place)
     try:
@@ -70,24 +70,24 @@ def first_run(lab: Lab, place: Path, command: str) -> dict[str, str]:
     finally:
         os.chdir(lab.folder)
         manifest._parsed.clear()
-        manifest._parsed.update(known)
-    return shown(place / "data/s")
+        manifest._parsed.update(parsed)
+    return digests(place / "data/s")
 
 
 def change(lab: Lab, chance: random.Random) -> None:
     """Change the recordings in one of the ways in which commands do."""
     names = [path.name for path in (lab.folder / "data/r").iterdir() if path.is_dir()]
-    some = chance.sample(sorted(names), chance.randint(1, 3))
-    which = chance.choice(["more", "one", "several", "excluded", "included", "all"])
-    if which == "more":
+    changed_names = chance.sample(sorted(names), chance.randint(1, 3))
+    kind = chance.choice(["more", "one", "several", "excluded", "included", "all"])
+    if kind == "more":
         lab.run(f"simulate toy --rows 3 --trials {len(names) + chance.randint(1, 3)} -o data/r --jobs 1")
-    elif which == "one":
-        lab.run(f"label data/r {some[0]} --set material={chance.choice(MATERIALS)}")
-    elif which == "several":
-        lab.run(f"label data/r {' '.join(some)} --set note={shlex.quote(chance.choice(NOTES))}")
-    elif which == "excluded":
-        lab.run(f"label data/r {' '.join(some)} --exclude dropped")
-    elif which == "included":
+    elif kind == "one":
+        lab.run(f"label data/r {changed_names[0]} --set material={chance.choice(MATERIALS)}")
+    elif kind == "several":
+        lab.run(f"label data/r {' '.join(changed_names)} --set note={shlex.quote(chance.choice(NOTES))}")
+    elif kind == "excluded":
+        lab.run(f"label data/r {' '.join(changed_names)} --exclude dropped")
+    elif kind == "included":
         lab.run("label data/r '*' --include")
     else:
         lab.run(f"label data/r '*' --set batch={chance.randint(1, 3)}")
@@ -96,9 +96,9 @@ def change(lab: Lab, chance: random.Random) -> None:
 @pytest.mark.usefixtures("clock")
 @pytest.mark.parametrize("seed", range(4))
 def test_a_run_over_a_changed_dataset_gives_the_bytes_of_a_first_run_in_an_empty_store(
-    lab: Lab, taken: list[int], tmp_path_factory: pytest.TempPathFactory, seed: int
+    lab: Lab, reused_counts: list[int], tmp_path_factory: pytest.TempPathFactory, seed: int
 ) -> None:
-    chance, other = random.Random(seed), tmp_path_factory.mktemp("other")
+    chance, folder = random.Random(seed), tmp_path_factory.mktemp("other")
     lab.run(f"simulate toy --rows 3 --trials {TRIALS} -o data/r --jobs 1")
     lab.run(NAMED)
     for _ in range(8):
@@ -108,9 +108,9 @@ def test_a_run_over_a_changed_dataset_gives_the_bytes_of_a_first_run_in_an_empty
         if chance.random() < 0.2:
             manifest._parsed.clear()  # a command is a process of its own
         lab.run(NAMED)
-        assert shown(lab.folder / "data/s") == first_run(lab, other / "first", NAMED)
+        assert digests(lab.folder / "data/s") == first_run(lab, folder / "first", NAMED)
         assert '"ran": 0' in lab.run(f"{NAMED} --json").out
-    assert max(taken) >= TRIALS // 2
+    assert max(reused_counts) >= TRIALS // 2
     shutil.rmtree(lab.folder / ".tacpipe/presence")
     assert '"ran": 0' in lab.run(f"{NAMED} --json").out  # each file is looked at
     lab.run("store verify")
@@ -119,23 +119,23 @@ def test_a_run_over_a_changed_dataset_gives_the_bytes_of_a_first_run_in_an_empty
 @pytest.mark.usefixtures("clock")
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: str(fault.__name__))
 def test_what_is_lost_is_found_by_the_run_that_takes_over_the_rest(
-    lab: Lab, taken: list[int], fault: Callable[[Lab], None], tmp_path_factory: pytest.TempPathFactory
+    lab: Lab, reused_counts: list[int], fault: Callable[[Lab], None], tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     lab.run(f"simulate toy --rows 3 --trials {TRIALS} -o data/r --jobs 1")
     lab.run(NAMED)
     lab.run("label data/r trial-009 --set material=felt")
     lab.run(NAMED)
-    assert taken[-1] > 0
+    assert reused_counts[-1] > 0
     lab.run("label data/r trial-010 --set material=silk")
     fault(lab)
     manifest._parsed.clear()
     lab.run(NAMED)
     lab.run("store verify")
-    assert shown(lab.folder / "data/s") == first_run(lab, tmp_path_factory.mktemp("other") / "first", NAMED)
+    assert digests(lab.folder / "data/s") == first_run(lab, tmp_path_factory.mktemp("other") / "first", NAMED)
 
 
 def test_of_a_dataset_of_which_one_recording_changed_no_other_group_is_asked_for(
-    lab: Lab, taken: list[int], monkeypatch: pytest.MonkeyPatch
+    lab: Lab, reused_counts: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(pages, "GROUPED", 4)
     count = 60
@@ -149,55 +149,57 @@ def test_of_a_dataset_of_which_one_recording_changed_no_other_group_is_asked_for
     ran = json.loads(lab.run(f"{NAMED} --json").out)
 
     assert (ran["ran"], ran["reused"]) == (1, count - 1)
-    assert taken[-1] >= count - max(sizes)
+    assert reused_counts[-1] >= count - max(sizes)
     assert len(keys) < max(sizes) + 10 < count / 2
 
 
 def test_while_results_are_taken_over_a_collection_sees_the_manifests_that_name_them(
-    lab: Lab, taken: list[int], monkeypatch: pytest.MonkeyPatch
+    lab: Lab, reused_counts: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     lab.run(f"simulate toy --rows 3 --trials {TRIALS} -o data/r --jobs 1")
     lab.run(NAMED)
     before = {file_digest(lab.folder / place / "manifest.json") for place in ("data/r", "data/s")}
     lab.run("label data/r trial-003 --set material=felt")
-    named: list[set[str]] = []
+    named_manifests: list[set[str]] = []
     holds = presence.Look.holds
 
-    def looked(self: presence.Look, *given: Any, **how: Any) -> bool:
-        named.append({name for run in lab.store.leases.runs() for name in run.manifests})
-        return holds(self, *given, **how)
+    def record_manifests(self: presence.Look, *arguments: Any, **options: Any) -> bool:
+        named_manifests.append({name for run in lab.store.leases.runs() for name in run.manifests})
+        return holds(self, *arguments, **options)
 
-    monkeypatch.setattr(presence.Look, "holds", looked)
+    monkeypatch.setattr(presence.Look, "holds", record_manifests)
     lab.run(NAMED)
-    assert taken[-1] > 0
-    assert named and before <= named[-1]
+    assert reused_counts[-1] > 0
+    assert named_manifests and before <= named_manifests[-1]
 
 
-def test_what_records_state_of_results_is_the_same_with_and_without_a_previous_run(lab: Lab, taken: list[int]) -> None:
+def test_what_records_state_of_results_is_the_same_with_and_without_a_previous_run(
+    lab: Lab, reused_counts: list[int]
+) -> None:
     lab.run(f"simulate toy --rows 3 --trials {TRIALS} -o data/r --jobs 1")
     lab.run(NAMED)
     lab.run("label data/r trial-003 --set material=felt")
     lab.run(NAMED)
-    assert taken[-1] > 0
+    assert reused_counts[-1] > 0
 
-    def stated() -> Any:
-        wanted = file_digest(lab.folder / "data/s/manifest.json")
+    def run_provenance() -> Any:
+        manifest_digest = file_digest(lab.folder / "data/s/manifest.json")
         (run,) = [
             record
             for _, record in lab.store.records()
-            if record["result"]["files"].get("manifest.json", {}).get("digest") == wanted
+            if record["result"]["files"].get("manifest.json", {}).get("digest") == manifest_digest
         ]
         return {name: run["provenance"][name] for name in ("code", "notes")}
 
-    by_taking = stated()
+    by_taking = run_provenance()
     shutil.rmtree(lab.folder / ".tacpipe/presence")
     lab.run(f"{NAMED} --rerun")
-    assert by_taking == stated()
+    assert by_taking == run_provenance()
     assert sum(by_taking["code"]["named"].values()) == TRIALS
 
 
 def test_results_that_other_code_gave_are_not_taken_over_as_it_is_not_known_which(
-    lab: Lab, taken: list[int], monkeypatch: pytest.MonkeyPatch
+    lab: Lab, reused_counts: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     lab.run(f"simulate toy --rows 3 --trials {TRIALS} -o data/r --jobs 1")
     lab.run(NAMED)
@@ -206,15 +208,17 @@ def test_results_that_other_code_gave_are_not_taken_over_as_it_is_not_known_whic
     monkeypatch.setattr(provenance, "code", lambda stage: "0" * 64)
     lab.run("label data/r trial-003 --set material=felt")
     lab.run(NAMED)
-    assert taken[-1] > 0
+    assert reused_counts[-1] > 0
     lab.run("label data/r trial-004 --set material=felt")
     ran = json.loads(lab.run(f"{NAMED} --json").out)
-    assert taken[-1] == 0
+    assert reused_counts[-1] == 0
     assert (ran["ran"], ran["reused"]) == (1, TRIALS - 1)
 
 
 @pytest.mark.parametrize("number", [0, -1])
-def test_a_manifest_that_lists_pages_and_was_edited_by_hand_is_refused(lab: Lab, taken: list[int], number: int) -> None:
+def test_a_manifest_that_lists_pages_and_was_edited_by_hand_is_refused(
+    lab: Lab, reused_counts: list[int], number: int
+) -> None:
     lab.run(f"simulate toy --rows 3 --trials {TRIALS} -o data/r --jobs 1")
     lab.run(NAMED)
     lab.run("label data/r trial-003 --set material=felt")
@@ -222,17 +226,17 @@ def test_a_manifest_that_lists_pages_and_was_edited_by_hand_is_refused(lab: Lab,
     root = json.loads(file.read_bytes())
     root["pages"][number]["content"] = "0" * 64
     file.write_text(json.dumps(root))
-    kept = shown(lab.folder / "data/s")
+    before = digests(lab.folder / "data/s")
     ran = lab.call(NAMED)
     assert ran.code == DAMAGED
     assert "edited by hand" in ran.err
-    assert shown(lab.folder / "data/s") == kept
+    assert digests(lab.folder / "data/s") == before
 
 
-def test_another_stage_and_other_params_take_over_nothing(lab: Lab, taken: list[int]) -> None:
+def test_another_stage_and_other_params_take_over_nothing(lab: Lab, reused_counts: list[int]) -> None:
     lab.run(f"simulate toy --rows 3 --trials {TRIALS} -o data/r --jobs 1")
     lab.run("scale data/r -o data/s --factor 2 --jobs 1")
     lab.run("scale data/r -o data/s --factor 3 --jobs 1")
-    assert taken[-1] == 0
+    assert reused_counts[-1] == 0
     lab.run(f"{NAMED} --replace")
-    assert taken[-1] == 0
+    assert reused_counts[-1] == 0

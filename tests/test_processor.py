@@ -1,4 +1,4 @@
-"""What a record says of the processor and the threads that computed it."""
+"""A record states the processor and the threads that computed it."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ def test_the_first_core_says_model_and_instructions(tmp_path: Path, monkeypatch:
     (tmp_path / "cpuinfo").write_text(CPUINFO)
     monkeypatch.setattr(processor, "_CPUINFO", tmp_path / "cpuinfo")
     monkeypatch.setenv("OPENBLAS_CORETYPE", "Haswell")
-    found = processor.here()
-    assert found["model"] == "Zen 4" and found["instructions"] == ["avx", "avx2", "fma", "avx512f"]
-    assert found["chosen"] == {"OPENBLAS_CORETYPE": "Haswell"}
+    described = processor.here()
+    assert described["model"] == "Zen 4" and described["instructions"] == ["avx", "avx2", "fma", "avx512f"]
+    assert described["chosen"] == {"OPENBLAS_CORETYPE": "Haswell"}
 
 
 def test_without_a_list_of_cores_the_machine_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -55,10 +55,14 @@ def test_threads_are_those_that_torch_and_blas_use(threads: int) -> None:
 def test_computers_differ_in_processor_threads_device_and_libraries() -> None:
     stored = provenance.of(1.0)
     assert provenance.unlike(stored, provenance.of(2.0)) == []
-    other = {**stored, "device": "cuda", "processor": {**stored["processor"], "instructions": ["sve"], "threads": 977}}
-    found = provenance.unlike(other, stored)
-    assert [one.partition(":")[0] for one in found] == ["device", "instructions", "threads"]
-    assert found[0] == f"device: cuda, now {stored['device']}"
+    other_computer = {
+        **stored,
+        "device": "cuda",
+        "processor": {**stored["processor"], "instructions": ["sve"], "threads": 977},
+    }
+    differences = provenance.unlike(other_computer, stored)
+    assert [difference.partition(":")[0] for difference in differences] == ["device", "instructions", "threads"]
+    assert differences[0] == f"device: cuda, now {stored['device']}"
 
 
 def test_a_git_that_does_not_answer_leaves_the_commit_out(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -81,12 +85,12 @@ def test_each_of_several_processes_gets_its_part_of_the_cores_unless_the_environ
     monkeypatch.setattr(processor, "usable_cores", lambda: 8)
     for name in processor.THREADS:
         monkeypatch.delenv(name, raising=False)
-    found = [{name: os.environ.get(name)} for name in processor.THREADS]
+    before = [{name: os.environ.get(name)} for name in processor.THREADS]
     assert processor.each_of(2) == dict.fromkeys(processor.THREADS, "4")
     assert processor.each_of(16) == dict.fromkeys(processor.THREADS, "1")
     with processor.shared_by(3):
         assert [os.environ[name] for name in processor.THREADS] == ["2", "2", "2"]
-    assert [{name: os.environ.get(name)} for name in processor.THREADS] == found
+    assert [{name: os.environ.get(name)} for name in processor.THREADS] == before
 
     monkeypatch.setenv("OMP_NUM_THREADS", "3")
     assert processor.each_of(2) == {}
@@ -105,8 +109,8 @@ def test_a_command_starts_as_many_processes_as_the_environment_states_else_one_a
     assert processor.jobs_of(2) == {}
 
 
-@pytest.mark.parametrize("stated", ["0", "-1", "two", "1.5"])
-def test_a_number_of_processes_that_is_none_is_refused(stated: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(processor.JOBS, stated)
-    with pytest.raises(UsageError, match=f"TACPIPE_JOBS is '{stated}'"):
+@pytest.mark.parametrize("jobs", ["0", "-1", "two", "1.5"])
+def test_a_number_of_processes_that_is_none_is_refused(jobs: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(processor.JOBS, jobs)
+    with pytest.raises(UsageError, match=f"TACPIPE_JOBS is '{jobs}'"):
         processor.jobs()

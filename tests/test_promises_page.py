@@ -30,14 +30,14 @@ def test_a_file_that_the_page_names_exists(name: str) -> None:
 
 
 def test_every_file_of_tests_promises_is_named() -> None:
-    named = {path for name in NAMED.findall(TEXT) for path in TESTS.glob(name)}
-    assert sorted(set(TESTS.glob("promises/test_*.py")) - named) == []
+    named_files = {path for name in NAMED.findall(TEXT) for path in TESTS.glob(name)}
+    assert sorted(set(TESTS.glob("promises/test_*.py")) - named_files) == []
 
 
 def test_every_promise_names_a_test() -> None:
-    found = list(rows())
-    assert len(found) > 20
-    without = [cells[0] for cells in found if len(cells) != 3 or not NAMED.search(cells[2])]
+    promises = list(rows())
+    assert len(promises) > 20
+    without = [cells[0] for cells in promises if len(cells) != 3 or not NAMED.search(cells[2])]
     assert without == ["Bad input gives one sentence and the documented exit code, and leaves everything as it was."]
 
 

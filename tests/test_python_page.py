@@ -48,8 +48,8 @@ def test_the_python_of_the_page_runs_as_printed_and_predicts_what_the_command_wr
     (block, *_) = (block for block in fenced(section((ROOT / "README.md").read_text(), FIRST_COMMANDS)))
     commands = [command.removeprefix("tacpipe ") for command, _ in printed(block.text)]
     for command in [*commands, "predict models/forward data/synced -o data/predicted"]:
-        done = tacpipe(tmp_path, command, OMP_NUM_THREADS="1")
-        assert done.returncode == 0, f"{command}: {done.stderr}"
+        process = tacpipe(tmp_path, command, OMP_NUM_THREADS="1")
+        assert process.returncode == 0, f"{command}: {process.stderr}"
     code = "\n".join([*(block.text for block in fenced(PYTHON.read_text()) if not block.mark), CHECKS])
     ran = subprocess.run([sys.executable, "-W", "error", "-c", code], cwd=tmp_path, capture_output=True, text=True)
     assert ran.returncode == 0, ran.stderr

@@ -28,18 +28,18 @@ def drawn(windows: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
 def true_quantiles(feature: np.ndarray) -> np.ndarray:
     """Return the quantiles (window, channel, step, level) of what `drawn` draws."""
     base = 0.3 * feature[..., None] + np.exp(feature)[..., None] * norm.ppf(LEVELS)
-    found: np.ndarray = base * np.array([[1.0, 3.0], [10.0, 30.0]])[None, :, :, None]
-    return found
+    true: np.ndarray = base * np.array([[1.0, 3.0], [10.0, 30.0]])[None, :, :, None]
+    return true
 
 
 def test_pinball_is_that_of_scikit_learn() -> None:
     rng = np.random.default_rng(1)
     truth, predicted = rng.normal(size=(50, 2)), np.sort(rng.normal(size=(50, 2, 3)), axis=-1)
-    found = quantiles.Sums.from_predictions(truth, predicted, LEVELS)
+    sums = quantiles.Sums.from_predictions(truth, predicted, LEVELS)
     for step in range(2):
         for at, level in enumerate(LEVELS):
-            wanted = mean_pinball_loss(truth[:, step], predicted[:, step, at], alpha=level)
-            assert found.pinball[step, at] / 50 == pytest.approx(wanted)
+            expected = mean_pinball_loss(truth[:, step], predicted[:, step, at], alpha=level)
+            assert sums.pinball[step, at] / 50 == pytest.approx(expected)
 
 
 def test_coverage_and_width_are_those_counted_by_hand() -> None:
@@ -48,28 +48,28 @@ def test_coverage_and_width_are_those_counted_by_hand() -> None:
     tree = quantiles.tree([quantiles.Sums.from_predictions(truth, predicted, LEVELS)], (10, 50, 90))
     assert tree["coverage"] == {"t1": 0.5, "mean": 0.5}
     assert tree["width"]["t1"] == 2.0
-    assert [tree[f"below_q{one}"]["t1"] for one in (10, 50, 90)] == [0.25, 0.5, 0.75]
-    assert "coverage_low" not in tree  # of one recording
+    assert [tree[f"below_q{level}"]["t1"] for level in (10, 50, 90)] == [0.25, 0.5, 0.75]
+    assert "coverage_low" not in tree  # There is one recording.
 
 
 def test_sums_of_two_parts_are_those_of_the_whole() -> None:
     rng = np.random.default_rng(2)
     truth, predicted = rng.normal(size=(20, 3)), np.sort(rng.normal(size=(20, 3, 3)), axis=-1)
-    whole = quantiles.Sums.from_predictions(truth, predicted, LEVELS)
+    total = quantiles.Sums.from_predictions(truth, predicted, LEVELS)
     parts = [
-        quantiles.Sums.from_predictions(truth[some], predicted[some], LEVELS) for some in (slice(0, 7), slice(7, 20))
+        quantiles.Sums.from_predictions(truth[rows], predicted[rows], LEVELS) for rows in (slice(0, 7), slice(7, 20))
     ]
-    one, two = quantiles.tree([whole], (10, 50, 90)), quantiles.tree([parts[0] + parts[1]], (10, 50, 90))
-    assert one == two
+    total_tree, two = quantiles.tree([total], (10, 50, 90)), quantiles.tree([parts[0] + parts[1]], (10, 50, 90))
+    assert total_tree == two
 
 
 def test_fitted_quantiles_are_near_those_of_the_distribution_that_errors_are_drawn_from() -> None:
     fitted = ResidualQuantiles.fit(*drawn(8000, 0), LEVELS)
     feature, errors = drawn(2000, 1)
-    found, wanted = fitted.predict(feature), true_quantiles(feature)
+    predicted, expected = fitted.predict(feature), true_quantiles(feature)
     spread = np.exp(feature)[..., None] * np.array([[1.0, 3.0], [10.0, 30.0]])[None, :, :, None]
-    assert np.abs((found - wanted) / spread).mean() < 0.1
-    below = (errors[..., None] <= found).mean(axis=(0, 1, 2))
+    assert np.abs((predicted - expected) / spread).mean() < 0.1
+    below = (errors[..., None] <= predicted).mean(axis=(0, 1, 2))
     assert below == pytest.approx(LEVELS, abs=0.02)
 
 
@@ -79,22 +79,22 @@ def test_fitted_quantiles_lose_no_more_than_linear_quantile_regression() -> None
     for at, level in enumerate(LEVELS):
         x, y = feature[:, 0], errors[:, 0, 0]
         linear = QuantileRegressor(quantile=level, alpha=0, solver="highs").fit(x, y).predict(x)
-        own = mean_pinball_loss(y, fitted[:, 0, 0, at], alpha=level)
-        assert own < 1.01 * mean_pinball_loss(y, linear, alpha=level)
+        loss = mean_pinball_loss(y, fitted[:, 0, 0, at], alpha=level)
+        assert loss < 1.01 * mean_pinball_loss(y, linear, alpha=level)
 
 
 def test_quantiles_never_cross_and_are_the_same_after_storage() -> None:
     fitted = ResidualQuantiles.fit(*drawn(300, 0), np.array([0.05, 0.25, 0.5, 0.75, 0.95]), passes=50)
     far = np.linspace(-100, 100, 50, dtype=np.float32).reshape(25, 2, 1)
-    found = fitted.predict(far)
-    assert (np.diff(found, axis=-1) >= 0).all()
-    again = ResidualQuantiles.from_tensors(fitted.to_tensors())
-    assert (again.predict(far) == found).all()
+    predicted = fitted.predict(far)
+    assert (np.diff(predicted, axis=-1) >= 0).all()
+    restored = ResidualQuantiles.from_tensors(fitted.to_tensors())
+    assert (restored.predict(far) == predicted).all()
 
 
 def test_the_same_seed_fits_the_same_quantiles() -> None:
-    one, two = (ResidualQuantiles.fit(*drawn(200, 0), LEVELS, seed=3, passes=20) for _ in range(2))
-    assert all((a == b).all() for a, b in zip(one.weights, two.weights, strict=True))
+    first, second = (ResidualQuantiles.fit(*drawn(200, 0), LEVELS, seed=3, passes=20) for _ in range(2))
+    assert all((a == b).all() for a, b in zip(first.weights, second.weights, strict=True))
 
 
 def test_too_few_values_are_refused() -> None:

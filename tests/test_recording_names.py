@@ -65,7 +65,7 @@ def nameless(params: Params, files: Files) -> RecordingOutput:
 
 
 @stage(version=1, discover=discover)
-def named(params: Params, files: Files, name: RecordingName) -> RecordingOutput:
+def read_name(params: Params, files: Files, name: RecordingName) -> RecordingOutput:
     """Read the name."""
     return RecordingOutput(pa.table({"x": [1]}), {"name": name})
 
@@ -73,10 +73,13 @@ def named(params: Params, files: Files, name: RecordingName) -> RecordingOutput:
 def test_the_name_is_part_of_the_key_of_a_stage_that_takes_it_and_of_no_other(tmp_path: Path) -> None:
     sources = {name: Source({"a.txt": tmp_path / "a.txt"}) for name in ("one", "two")}
     digests = {name: {"a.txt": "0"} for name in sources}
-    for made, inputs in ((nameless, {"files": {"a.txt": "0"}}), (named, {"files": {"a.txt": "0"}, "name": "one"})):
-        first, second = keys.source_tasks(Store(tmp_path / "s"), "ingest.x", made, Params(), sources, digests)
+    for format_stage, inputs in (
+        (nameless, {"files": {"a.txt": "0"}}),
+        (read_name, {"files": {"a.txt": "0"}, "name": "one"}),
+    ):
+        first, second = keys.source_tasks(Store(tmp_path / "s"), "ingest.x", format_stage, Params(), sources, digests)
         assert first.identity["inputs"] == inputs
-        assert (first.identity == second.identity) == (made is nameless)
+        assert (first.identity == second.identity) == (format_stage is nameless)
 
 
 def test_a_format_of_a_plug_in_is_given_the_name_and_a_renamed_recording_is_read_again(lab: Lab) -> None:
@@ -94,11 +97,11 @@ def test_a_format_of_a_plug_in_is_given_the_name_and_a_renamed_recording_is_read
             Path("in", name).mkdir(parents=True)
             Path("in", name, "numbers.txt").write_text("1 2 3")
         lab.run("ingest named-numbers in -o data/r --jobs 1")
-        found = {name: one["attributes"] for name, one in lab.manifest("data/r").recordings.items()}
-        assert found == {"cup": {"called": "cup"}, "can": {"called": "can"}}
+        attributes = {name: entry["attributes"] for name, entry in lab.manifest("data/r").recordings.items()}
+        assert attributes == {"cup": {"called": "cup"}, "can": {"called": "can"}}
         Path("in/cup").rename("in/mug")
-        done = json.loads(lab.run("ingest named-numbers in -o data/r --replace --json --jobs 1").out)
-        assert (done["ran"], done["reused"]) == (1, 1)
+        result = json.loads(lab.run("ingest named-numbers in -o data/r --replace --json --jobs 1").out)
+        assert (result["ran"], result["reused"]) == (1, 1)
         Path("in/mug/numbers.txt").write_text("")
         ran = lab.call("ingest named-numbers in -o data/r --replace --jobs 1")
         assert ran.code == 1 and "mug has no number" in ran.err

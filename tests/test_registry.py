@@ -23,10 +23,10 @@ def test_the_names_are_those_that_importlib_finds() -> None:
 def test_every_built_in_stage_loads_and_has_a_summary_and_help_for_each_param(name: str) -> None:
     from tacpipe.plugins import params
 
-    found = registry.load(name)
-    assert found.version >= 1
+    loaded = registry.load(name)
+    assert loaded.version >= 1
     assert registry.summary(name).endswith(".")
-    assert set(params.comments(found)) >= set(params.fields(found))
+    assert set(params.comments(loaded)) >= set(params.fields(loaded))
 
 
 def test_a_third_party_s_stage_stands_beside_the_built_in_ones(lab: Lab) -> None:
@@ -140,7 +140,7 @@ def test_no_module_outside_of_a_task_s_own_packages_names_a_task() -> None:
 
 def test_no_module_outside_of_tasks_reports_formats_and_simulation_names_a_stage() -> None:
     data = {"split", "train", "report", "export"}  # words of data too: a role, kinds of dataset, a message of HID
-    known = {*registry.stages(), *registry.commands()} - data
+    stage_names = {*registry.stages(), *registry.commands()} - data
     # the command line has aliases and groups of commands, an export of frames runs synchronize before it, the viewer
     # reads the thresholds of contacts, and a live session reads the params of an earlier version of synchronize
     needed = {
@@ -151,7 +151,7 @@ def test_no_module_outside_of_tasks_reports_formats_and_simulation_names_a_stage
         "viewer/contents.py",
     }
 
-    assert _modules_with(re.compile("|".join(map(re.escape, known)))) == needed
+    assert _modules_with(re.compile("|".join(map(re.escape, stage_names)))) == needed
 
 
 def test_the_demo_runs_the_part_of_every_task_and_one_page_of_their_results(lab: Lab) -> None:
@@ -196,20 +196,20 @@ def test_a_plug_in_states_the_order_and_the_lines_of_its_commands(
 def _modules_with(literal: re.Pattern[str]) -> set[str]:
     """Return the modules outside of plug-ins' own packages that have such a text in their code."""
     root = Path(registry.__file__).parents[1]
-    own = {root / part for part in ("tasks", "report", "formats", "simulation")}
+    plugin_packages = {root / part for part in ("tasks", "report", "formats", "simulation")}
     return {
         str(file.relative_to(root))
         for file in root.rglob("*.py")
-        if not own & set(file.parents) and any(literal.fullmatch(text) for text in _texts(file))
+        if not plugin_packages & set(file.parents) and any(literal.fullmatch(text) for text in _texts(file))
     }
 
 
 def _texts(file: Path) -> set[str]:
     """Return the texts in a module's code; its docstrings are other nodes."""
     tree = ast.parse(file.read_text())
-    told = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    docstrings = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
     return {
         node.value
         for node in ast.walk(tree)
-        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in told
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docstrings
     }

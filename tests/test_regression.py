@@ -40,7 +40,8 @@ def test_errors_are_those_of_scikit_learn(width: int) -> None:
     assert regression.rmse(true, predicted) == pytest.approx(sklearn_metrics.mean_squared_error(true, predicted) ** 0.5)
     assert regression.mae(true, predicted) == pytest.approx(sklearn_metrics.mean_absolute_error(true, predicted))
     weighted, single = (
-        sklearn_metrics.r2_score(true, predicted, multioutput=how) for how in ("variance_weighted", "raw_values")
+        sklearn_metrics.r2_score(true, predicted, multioutput=multioutput)
+        for multioutput in ("variance_weighted", "raw_values")
     )
     assert regression.r2(true, predicted) == pytest.approx(weighted)
     np.testing.assert_allclose(regression.r2_by_value(true, predicted), single)
@@ -81,7 +82,7 @@ def test_errors_in_shares_of_a_range_are_the_device_units_that_were_printed(targ
     for share, units in PRINTED[target]:
         true = biotac_sp.counts(target, np.full((4, biotac_sp.width(target)), 0.25))
         predicted = biotac_sp.counts(target, np.full((4, biotac_sp.width(target)), 0.25 + share))
-        normalised = (biotac_sp.normalised(target, one) for one in (true, predicted))
+        normalised = (biotac_sp.normalised(target, values_in_counts) for values_in_counts in (true, predicted))
         assert regression.rmse(*normalised) == pytest.approx(share)
         assert int(regression.rmse(true, predicted)) == units  # the letter cuts decimals: it tells 74.6 as 74
 
@@ -95,11 +96,11 @@ def test_skill_is_the_share_of_the_baselines_error_that_is_saved() -> None:
 def test_skill_of_sums_is_that_of_the_errors_themselves() -> None:
     true, predicted = values(24)
     constant = np.broadcast_to(true.mean(axis=0), true.shape)
-    model, baseline = (regression.squared_sums(true, one) for one in (predicted, constant))
-    found = regression.skill_interval(model, baseline, np.arange(len(true)))
+    model, baseline = (regression.squared_sums(true, estimate) for estimate in (predicted, constant))
+    interval = regression.skill_interval(model, baseline, np.arange(len(true)))
     expected = skill(regression.rmse(true, predicted), regression.rmse(true, constant))
-    assert found.mean == pytest.approx(expected)
-    assert found.low < found.mean < found.high
+    assert interval.mean == pytest.approx(expected)
+    assert interval.low < interval.mean < interval.high
 
 
 def test_the_interval_is_near_the_one_that_drawing_clusters_one_by_one_gives() -> None:
@@ -111,16 +112,18 @@ def test_the_interval_is_near_the_one_that_drawing_clusters_one_by_one_gives() -
     for _ in range(4000):
         rows = np.concatenate([np.flatnonzero(clusters == name) for name in rng.choice(names, len(names))])
         skills.append(1 - math.sqrt(model[rows].sum() / baseline[rows].sum()))
-    found = regression.skill_interval(model, baseline, clusters)
-    np.testing.assert_allclose(found[1:], np.quantile(skills, [0.025, 0.975]), atol=0.05)  # which is too narrow
+    interval = regression.skill_interval(model, baseline, clusters)
+    np.testing.assert_allclose(
+        interval[1:], np.quantile(skills, [0.025, 0.975]), atol=0.05
+    )  # The drawn interval is too narrow.
 
 
 def test_telling_every_grasp_five_times_makes_nothing_surer() -> None:
     rng = np.random.default_rng(4)
     model, baseline, names = rng.gamma(1, 1, 30), rng.gamma(2, 1, 30), np.arange(30)
-    once = regression.skill_interval(model, baseline, names)
+    single = regression.skill_interval(model, baseline, names)
     often = regression.skill_interval(np.tile(model, 5), np.tile(baseline, 5), np.tile(names, 5))
-    assert list(often) == pytest.approx(list(once))
+    assert list(often) == pytest.approx(list(single))
 
 
 def test_a_few_objects_make_it_less_sure_than_as_many_single_grasps_would() -> None:
@@ -138,7 +141,7 @@ def test_a_few_objects_make_it_less_sure_than_as_many_single_grasps_would() -> N
 def test_one_cluster_has_no_interval_and_none_no_skill() -> None:
     single = regression.skill_interval(np.ones(3), np.full(3, 4.0), np.array(["a"] * 3))
     assert single.mean == 0.5 and math.isnan(single.low) and math.isnan(single.high)
-    assert all(math.isnan(one) for one in regression.skill_interval(np.ones(0), np.ones(0), np.ones(0)))
+    assert all(math.isnan(value) for value in regression.skill_interval(np.ones(0), np.ones(0), np.ones(0)))
 
 
 def test_without_grasps_or_without_spread_there_is_no_number() -> None:

@@ -22,10 +22,10 @@ def sparse(path: Path, size: int = TERA) -> None:
 
 
 def bind(path: Path) -> None:
-    with socket.socket(socket.AF_UNIX) as one:
+    with socket.socket(socket.AF_UNIX) as listener:
         folder = os.open(path.parent, os.O_RDONLY)  # a socket's address is short: it is named from its folder
         try:
-            one.bind(f"/proc/self/fd/{folder}/{path.name}")
+            listener.bind(f"/proc/self/fd/{folder}/{path.name}")
         finally:
             os.close(folder)
 
@@ -67,10 +67,10 @@ def test_a_file_of_as_many_bytes_as_may_be_is_read_and_one_more_is_refused(tmp_p
 
 @pytest.mark.parametrize("size", [0, 1, regular.BLOCK_BYTES, 3 * regular.BLOCK_BYTES + 7])
 def test_content_and_blocks_are_the_whole_file(tmp_path: Path, size: int) -> None:
-    whole = os.urandom(size)
-    (tmp_path / "file").write_bytes(whole)
-    assert regular.content(tmp_path / "file") == whole
-    assert b"".join(regular.blocks(tmp_path / "file", size)) == whole
+    content = os.urandom(size)
+    (tmp_path / "file").write_bytes(content)
+    assert regular.content(tmp_path / "file") == content
+    assert b"".join(regular.blocks(tmp_path / "file", size)) == content
 
 
 def test_a_file_that_grows_while_it_is_read_is_read_to_its_end_or_its_limit(

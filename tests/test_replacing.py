@@ -24,19 +24,19 @@ def content(folder: str) -> dict[str, bytes]:
     return {str(path): path.read_bytes() for path in sorted(Path(folder).rglob("*")) if path.is_file()}
 
 
-def refused(lab: Lab, command: str, kept: str, *words: str) -> None:
+def refused(lab: Lab, command: str, dataset: str, *words: str) -> None:
     """Check that a command is refused with exit code 2 and these words, and leaves a dataset as it was."""
-    before = content(kept)
-    for more in ("", " --check"):
-        ran = lab.call(command + more)
+    before = content(dataset)
+    for option in ("", " --check"):
+        ran = lab.call(command + option)
         assert ran.code == 2 and ran.err.startswith("tacpipe: ") and ran.err.count("\n") == 1, ran
         assert all(word in ran.err for word in words), ran.err
-        assert content(kept) == before
+        assert content(dataset) == before
 
 
 def listed(lab: Lab) -> list[dict[str, object]]:
-    found: list[dict[str, object]] = json.loads(lab.run("store list --json").out)["manifests"]
-    return found
+    manifests: list[dict[str, object]] = json.loads(lab.run("store list --json").out)["manifests"]
+    return manifests
 
 
 # ---- inputs
@@ -77,7 +77,7 @@ def test_a_dataset_of_another_stage_needs_replace_and_can_be_had_back_with_its_l
     lab.run("simulate toy -o data/r --replace")
     assert sorted(lab.manifest("data/r").recordings) == ["trial-000", "trial-001", "trial-002", "trial-003"]
     assert not Path("data/r/a").exists()
-    (old,) = [one for one in listed(lab) if one["stage"] == "ingest.numbers" and one["labelled"]]
+    (old,) = [entry for entry in listed(lab) if entry["stage"] == "ingest.numbers" and entry["labelled"]]
     assert (old["recordings"], old["state"], old["path"]) == (2, "replaced", str(lab.folder / "data/r"))
     shutil.rmtree("src")
     lab.run(f"store checkout {str(old['manifest'])[:12]} -o data/back")
@@ -164,12 +164,14 @@ def test_ingest_appends(lab: Lab) -> None:
     lab.run("ingest numbers monday -o data/r")
     lab.run("label data/r b --set material=foam")
     ran, reused = counts(lab.run("ingest numbers tuesday -o data/r --json").out)
-    found = lab.manifest("data/r")
-    assert (ran, reused) == (1, 0) and sorted(found.recordings) == sorted(found.sources) == ["a", "b", "c"]
-    assert found.recordings["b"]["attributes"]["material"] == "foam" and found.labels == {"b": {"material": "foam"}}
+    appended = lab.manifest("data/r")
+    assert (ran, reused) == (1, 0) and sorted(appended.recordings) == sorted(appended.sources) == ["a", "b", "c"]
+    assert appended.recordings["b"]["attributes"]["material"] == "foam" and appended.labels == {
+        "b": {"material": "foam"}
+    }
     assert tacpipe.open("data/r").table("left")["x"].to_pylist() == [1, 2, 3, 4, 5, 6]
     assert counts(lab.run("ingest numbers monday -o data/r --json").out) == (0, 2)
-    assert lab.manifest("data/r") == found and lab.call("ingest numbers tuesday -o data/r --check").code == 0
+    assert lab.manifest("data/r") == appended and lab.call("ingest numbers tuesday -o data/r --check").code == 0
 
 
 def test_the_order_in_which_recordings_are_ingested_leaves_no_trace(lab: Lab) -> None:
@@ -203,8 +205,12 @@ def test_a_recording_that_cannot_be_read_this_time_keeps_what_it_was(lab: Lab) -
     lab.run("ingest numbers src -o data/r")
     source("more", b="3", c="none")
     ran = lab.run("ingest numbers more -o data/r --skip-bad")
-    found = lab.manifest("data/r")
-    assert sorted(found.recordings) == ["a", "b"] and list(found.skipped) == ["c"] and "left out c" in ran.err
+    kept_manifest = lab.manifest("data/r")
+    assert (
+        sorted(kept_manifest.recordings) == ["a", "b"]
+        and list(kept_manifest.skipped) == ["c"]
+        and "left out c" in ran.err
+    )
 
 
 # ---- labels
@@ -215,18 +221,18 @@ def test_labels_of_recordings_that_would_go_are_refused(lab: Lab) -> None:
     lab.run("label data/r trial-003 --set material=foam")
     refused(lab, "simulate toy -o data/r --trials 3", "data/r", "labels that were set by hand", "trial-003")
     lab.run("simulate toy -o data/r --trials 3 --replace")
-    (old,) = [one for one in listed(lab) if one["labelled"]]
+    (old,) = [entry for entry in listed(lab) if entry["labelled"]]
     lab.run(f"store checkout {old['manifest']} -o data/back")
     assert lab.manifest("data/back").recordings["trial-003"]["attributes"]["material"] == "foam"
 
 
-@pytest.mark.parametrize("gone", ["data/r", "data/r/manifest.json"])
-def test_labels_come_back_with_their_recordings_when_the_directory_was_deleted(lab: Lab, gone: str) -> None:
+@pytest.mark.parametrize("removed", ["data/r", "data/r/manifest.json"])
+def test_labels_come_back_with_their_recordings_when_the_directory_was_deleted(lab: Lab, removed: str) -> None:
     source("src", a="1 2", b="3 4")
     lab.run("ingest numbers src -o data/r")
     lab.run("label data/r a --exclude dropped")
     before = Path("data/r/manifest.json").read_bytes()
-    shutil.rmtree(gone) if Path(gone).is_dir() else Path(gone).unlink()
+    shutil.rmtree(removed) if Path(removed).is_dir() else Path(removed).unlink()
     assert counts(lab.run("ingest numbers src -o data/r --json").out) == (0, 2)
     assert Path("data/r/manifest.json").read_bytes() == before
     lab.run("scale data/r -o data/s")
@@ -289,14 +295,14 @@ def test_an_acquired_dataset_comes_back_with_its_labels_long_after_its_directory
     lab.run("acquire --recover")
     lab.run("label rec one --exclude dropped")
     before = content("rec")
-    named = name if name == "rec" else bytes_digest(before["rec/manifest.json"])[:12]
+    dataset = name if name == "rec" else bytes_digest(before["rec/manifest.json"])[:12]
     shutil.rmtree("rec")
     for _ in range(3):
         age(lab, 300)
         lab.run("store gc --grace-days 0")
-    (known,) = [one for one in listed(lab) if one["state"] == "directory gone"]
-    assert (known["stage"], known["recordings"], known["labelled"]) == ("acquire", 1, 1)
-    lab.run(f"store checkout {named} -o rec")
+    (listed_entry,) = [entry for entry in listed(lab) if entry["state"] == "directory gone"]
+    assert (listed_entry["stage"], listed_entry["recordings"], listed_entry["labelled"]) == ("acquire", 1, 1)
+    lab.run(f"store checkout {dataset} -o rec")
     assert content("rec") == before
 
 
@@ -338,7 +344,7 @@ def test_what_was_replaced_outlives_gc_but_not_one_that_is_asked_to_take_recordi
     lab.run("ingest numbers src -o data/r")
     lab.run("label data/r a --set material=cork")
     lab.run("simulate toy -o data/r --replace")
-    (old,) = [one for one in listed(lab) if one["labelled"]]
+    (old,) = [entry for entry in listed(lab) if entry["labelled"]]
     age(lab)
     assert json.loads(lab.run("store gc --json").out)["kept_recordings"] == 2
     lab.run(f"store checkout {old['manifest']} -o data/back")
@@ -347,7 +353,7 @@ def test_what_was_replaced_outlives_gc_but_not_one_that_is_asked_to_take_recordi
     lab.run("store gc --forget data/back")
     age(lab)
     lab.run("store gc --recordings --grace-days 0")
-    assert not [one for one in listed(lab) if one["labelled"]]
+    assert not [entry for entry in listed(lab) if entry["labelled"]]
     assert lab.call(f"store checkout {old['manifest']} -o data/back").code == 2
 
 
@@ -361,8 +367,8 @@ def test_a_directory_that_was_deleted_keeps_its_recordings_and_labels_in_the_sto
     for _ in range(2):
         age(lab, 300)
         lab.run("store gc --grace-days 0")
-    (known,) = [one for one in listed(lab) if one["state"] == "directory gone"]
-    for name in (known["dataset"], "data/r"):
+    (listed_entry,) = [entry for entry in listed(lab) if entry["state"] == "directory gone"]
+    for name in (listed_entry["dataset"], "data/r"):
         lab.run(f"store checkout {name} -o data/r")
         assert content("data/r") == before
         shutil.rmtree("data/r")
@@ -377,7 +383,7 @@ def test_a_derived_dataset_that_was_replaced_is_computed_again_when_it_is_checke
     assert old is not None
     first = old["history"][0]["manifest"]
     for name in {
-        shard["digest"] for one in lab.manifest("data/s").recordings.values() for shard in one["shards"].values()
+        shard["digest"] for entry in lab.manifest("data/s").recordings.values() for shard in entry["shards"].values()
     }:
         assert lab.store.has(name)
     for path in lab.store.root.glob("objects/*/*"):
@@ -388,7 +394,7 @@ def test_a_derived_dataset_that_was_replaced_is_computed_again_when_it_is_checke
 
 
 def _shards(manifest: dict[str, dict[str, dict[str, dict[str, dict[str, str]]]]]) -> list[str]:
-    return [shard["digest"] for one in manifest["recordings"].values() for shard in one["shards"].values()]
+    return [shard["digest"] for entry in manifest["recordings"].values() for shard in entry["shards"].values()]
 
 
 def test_a_manifest_that_no_root_names_any_more_is_checked_out_by_its_digest(lab: Lab) -> None:
@@ -430,7 +436,7 @@ def test_a_copy_without_its_store_is_kept_whole_when_it_is_replaced(
     before = content("data/copy")
     refused(lab, "simulate toy -o data/copy", "data/copy", "1 recording written by ingest.numbers")
     lab.run("simulate toy -o data/copy --replace")
-    (old,) = [one for one in listed(lab) if one["stage"] == "ingest.numbers"]
+    (old,) = [entry for entry in listed(lab) if entry["stage"] == "ingest.numbers"]
     lab.run(f"store checkout {old['manifest']} -o data/copy --replace")
     assert content("data/copy") == before
 
@@ -444,7 +450,7 @@ def test_a_hundred_reruns_leave_a_short_history_and_one_loss_stays_in_it(lab: La
     for offset in range(1, 101):
         lab.store.roots.set(lab.folder / "data/r", f"{offset:064x}")
     history = (lab.store.roots.get(lab.folder / "data/r") or {})["history"]
-    assert len(history) == 21 and [one["manifest"] for one in history if one["lasting"]] == [root["manifest"]]
+    assert len(history) == 21 and [entry["manifest"] for entry in history if entry["lasting"]] == [root["manifest"]]
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""What `train TASK --requirements` prints is what the task asks for: without it recordings are refused, or are not."""
+"""`train TASK --requirements` prints what the task needs: recordings without it are refused, others are read."""
 
 from __future__ import annotations
 
@@ -44,9 +44,11 @@ FIELDS = [
 
 def without(quantity: str) -> FakeShard:
     """A recording that has all that forecasts can read but ``quantity``."""
-    kept = [one for one in FIELDS if (one.metadata or {}).get(b"quantity") != quantity.encode()]
-    columns = [pa.array([1] * 40, one.type) if one.name != "t_ns" else pa.array(range(40), pa.int64()) for one in kept]
-    return FakeShard("trial", pa.Table.from_arrays(columns, schema=pa.schema(kept)), {"object": "cup"})
+    fields = [field for field in FIELDS if (field.metadata or {}).get(b"quantity") != quantity.encode()]
+    columns = [
+        pa.array([1] * 40, field.type) if field.name != "t_ns" else pa.array(range(40), pa.int64()) for field in fields
+    ]
+    return FakeShard("trial", pa.Table.from_arrays(columns, schema=pa.schema(fields)), {"object": "cup"})
 
 
 def read(shard: Any, actions: str) -> tracks.Track:
@@ -54,7 +56,7 @@ def read(shard: Any, actions: str) -> tracks.Track:
     return tracks.track(shard, codec, tracks.pose_of(shard, actions))
 
 
-@pytest.mark.parametrize("quantity", [one.quantity for one in FORWARD.channels])
+@pytest.mark.parametrize("quantity", [channels.quantity for channels in FORWARD.channels])
 def test_forecasts_refuse_recordings_without_what_is_needed_and_read_those_without_the_rest(quantity: str) -> None:
     if quantity in FORWARD.needed:
         with pytest.raises(TacpipeError, match=f'{quantity}.*quantity = "{quantity}".*layout file'):
@@ -65,20 +67,20 @@ def test_forecasts_refuse_recordings_without_what_is_needed_and_read_those_witho
 
 def test_what_forecasts_can_do_without_is_everything_but_touch() -> None:
     assert FORWARD.needed == ("tactile",)
-    assert set(FORWARD.needed) < {(one.metadata or {}).get(b"quantity", b"").decode() for one in FIELDS}
+    assert set(FORWARD.needed) < {(field.metadata or {}).get(b"quantity", b"").decode() for field in FIELDS}
     with pytest.raises(TacpipeError, match="--actions none"):
         read(without("position"), "planned")
 
 
-@pytest.mark.parametrize("label", [one.name for one in MATERIAL.labels])
+@pytest.mark.parametrize("label", [label.name for label in MATERIAL.labels])
 def test_materials_refuse_slides_without_a_needed_label_and_read_those_without_the_rest(label: str) -> None:
-    given = slides_of(slide("biotac", 1, 0, **{"session": "a", label: None}))
-    needed = {one.name for one in MATERIAL.labels if not one.without}
+    slides = slides_of(slide("biotac", 1, 0, **{"session": "a", label: None}))
+    needed = {needed_label.name for needed_label in MATERIAL.labels if not needed_label.without}
     if label in needed:
         with pytest.raises(TacpipeError, match=f"no label {label}"):
-            material_slides.read(given, labelled=True)
+            material_slides.read(slides, labelled=True)
     else:
-        assert len(material_slides.read(given, labelled=True)["biotac"]) == 1
+        assert len(material_slides.read(slides, labelled=True)["biotac"]) == 1
 
 
 def test_materials_refuse_slides_without_touch() -> None:
@@ -98,9 +100,9 @@ def test_every_task_prints_what_it_needs_without_a_dataset_and_its_page_has_it(l
         assert channels.quantity in printed and all(unit in printed for unit in channels.units)
     assert printed in (DOCS / f"{task}.md").read_text()
     assert max(map(len, printed.splitlines())) <= 112
-    known = registry.stages()
+    stage_names = registry.stages()
     for name in stage.requirements.stages:
-        assert name.replace(" ", ".") in known
+        assert name.replace(" ", ".") in stage_names
 
 
 @pytest.mark.parametrize("task", TASKS)

@@ -33,7 +33,7 @@ STAGES: dict[str, dict[str, Any]] = {
 }
 
 
-def written(stages: Mapping[str, Any], folder: Path = Path(), **params: Any) -> Path:
+def write_chain(stages: Mapping[str, Any], folder: Path = Path(), **params: Any) -> Path:
     """Return a chain's file, with its params next to it."""
     (folder / "dvc.yaml").write_text(yaml.safe_dump({"stages": stages}, sort_keys=False))
     (folder / "params.yaml").write_text(yaml.safe_dump({"factor": 3, **params}))
@@ -50,40 +50,40 @@ def content(folder: Path) -> dict[str, bytes]:
     }
 
 
-def one(value: str) -> dict[str, Any]:
+def stage_that_adds(value: str) -> dict[str, Any]:
     """Return a stage whose command adds a line to the file ``ran``."""
     return {"cmd": f"echo {value} >> ran"}
 
 
 def test_a_chain_gives_the_bytes_that_its_commands_give_one_by_one(lab: Lab, tmp_path: Path) -> None:
-    written(STAGES)
+    write_chain(STAGES)
     lab.run("run dvc.yaml")
-    alone = tmp_path / "alone"
-    (alone / ".tacpipe").mkdir(parents=True)
+    separate = tmp_path / "alone"
+    (separate / ".tacpipe").mkdir(parents=True)
     for name in ("toy", "scaled", "total"):
         command = str(STAGES[name]["cmd"]).removeprefix("tacpipe ").replace("${factor}", "3")
-        assert tacpipe(alone, command).returncode == 0
+        assert tacpipe(separate, command).returncode == 0
 
-    assert content(alone) and content(lab.folder) == content(alone)
+    assert content(separate) and content(lab.folder) == content(separate)
 
 
 def test_with_nothing_to_do_no_process_is_started_and_each_command_reports_as_by_itself(
     lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    written(STAGES)
+    write_chain(STAGES)
     lab.run("run dvc.yaml")
     before = content(lab.folder)
     monkeypatch.setattr(subprocess, "Popen", lambda *_, **__: pytest.fail("a process was started"))
     ran = lab.run("run dvc.yaml")
 
-    alone = lab.run("scale data/toy -o data/scaled --factor 3")
+    by_itself = lab.run("scale data/toy -o data/scaled --factor 3")
     assert ran.out.split() == ["data/toy", "data/scaled", "total"]
-    assert alone.err.partition(",")[0] in ran.err and "0 ran, 4 reused" in alone.err
+    assert by_itself.err.partition(",")[0] in ran.err and "0 ran, 4 reused" in by_itself.err
     assert content(lab.folder) == before
 
 
 def test_a_stage_is_run_where_its_params_its_input_or_a_file_of_its_output_changed(lab: Lab) -> None:
-    written(STAGES)
+    write_chain(STAGES)
     lab.run("run dvc.yaml")
     before = content(lab.folder)
 
@@ -92,7 +92,7 @@ def test_a_stage_is_run_where_its_params_its_input_or_a_file_of_its_output_chang
     assert "1 ran" in lab.run("run dvc.yaml").err.splitlines()[-1]
     assert content(lab.folder) == before
 
-    written(STAGES, factor=4)
+    write_chain(STAGES, factor=4)
     assert lab.run("run dvc.yaml").err.splitlines()[-1] == "1 unchanged, 2 ran"
     lab.run("scale data/toy -o expected --factor 4")
     assert (Path("expected") / shard.name).read_bytes() == (Path("data/scaled") / shard.name).read_bytes()
@@ -100,7 +100,7 @@ def test_a_stage_is_run_where_its_params_its_input_or_a_file_of_its_output_chang
 
 def test_a_failing_stage_keeps_back_what_depends_on_it_and_nothing_else(lab: Lab) -> None:
     scaled = {**STAGES["scaled"], "cmd": "tacpipe scale data/toy -o data/scaled --factor many"}
-    written({**STAGES, "scaled": scaled, "other": one("other")})
+    write_chain({**STAGES, "scaled": scaled, "other": stage_that_adds("other")})
     failed = lab.call("run dvc.yaml")
 
     assert failed.code == 2
@@ -110,14 +110,14 @@ def test_a_failing_stage_keeps_back_what_depends_on_it_and_nothing_else(lab: Lab
 
 
 def test_the_commands_of_a_stage_end_with_the_first_that_fails(lab: Lab) -> None:
-    written({"several": {"cmd": ["echo first >> ran", "exit 7", "echo third >> ran"]}})
+    write_chain({"several": {"cmd": ["echo first >> ran", "exit 7", "echo third >> ran"]}})
 
     assert lab.call("run dvc.yaml").code == 7
     assert Path("ran").read_text() == "first\n"
 
 
 def test_named_stages_run_with_all_that_they_depend_on(lab: Lab) -> None:
-    written({**STAGES, "other": one("other")})
+    write_chain({**STAGES, "other": stage_that_adds("other")})
     lab.run("run dvc.yaml scaled")
 
     assert Path("data/scaled/manifest.json").exists()
@@ -126,7 +126,7 @@ def test_named_stages_run_with_all_that_they_depend_on(lab: Lab) -> None:
 
 def test_a_chain_elsewhere_runs_in_its_own_folder(lab: Lab) -> None:
     (lab.folder / "project").mkdir()
-    written({"here": one("here")}, lab.folder / "project")
+    write_chain({"here": stage_that_adds("here")}, lab.folder / "project")
     lab.run("run project/dvc.yaml")
 
     assert (lab.folder / "project/ran").exists() and not (lab.folder / "ran").exists()
@@ -150,7 +150,7 @@ def test_patterns_of_paths_are_expanded_as_a_shell_expands_them(lab: Lab) -> Non
 
 
 @pytest.mark.parametrize(
-    ("text", "named"),
+    ("text", "part"),
     [
         ("stages: [1]", "stages"),
         ("stages: {a: {cmd: x, wdir: sub}}", "wdir"),
@@ -164,11 +164,11 @@ def test_patterns_of_paths_are_expanded_as_a_shell_expands_them(lab: Lab) -> Non
         ("[", "YAML"),
     ],
 )
-def test_a_chain_that_cannot_be_run_is_refused_before_anything_runs(lab: Lab, text: str, named: str) -> None:
+def test_a_chain_that_cannot_be_run_is_refused_before_anything_runs(lab: Lab, text: str, part: str) -> None:
     Path("dvc.yaml").write_text(text)
     refused = lab.call("run dvc.yaml")
 
-    assert refused.code == 2 and named in refused.err
+    assert refused.code == 2 and part in refused.err
 
 
 def dvc_errors() -> Any:
@@ -178,14 +178,14 @@ def dvc_errors() -> Any:
 def stages_of_dvc(folder: Path) -> tuple[list[str], list[tuple[str, str]]]:
     """Return the stages that DVC reads in a folder, and which depends on which."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of what DVC itself uses
+        warnings.simplefilter("ignore")  # DVC itself uses what it warns of.
         index = pytest.importorskip("dvc.repo").Repo(str(folder), uninitialized=True).index
         edges = sorted((after.name, before.name) for after, before in index.graph.edges)
     return sorted(stage.name for stage in index.stages), edges
 
 
 @pytest.mark.parametrize(
-    ("definition", "named"),
+    ("definition", "words"),
     [
         ("outs: data", "its outs is 'data'; it must be a list of paths"),
         ("outs: 5", "its outs is 5; it must be a list of paths"),
@@ -211,16 +211,16 @@ def stages_of_dvc(folder: Path) -> tuple[list[str], list[tuple[str, str]]]:
         ("matrix: {1: [1]}", "its matrix is"),
     ],
 )
-def test_a_stage_that_dvc_refuses_is_refused_with_what_is_wrong(lab: Lab, definition: str, named: str) -> None:
+def test_a_stage_that_dvc_refuses_is_refused_with_what_is_wrong(lab: Lab, definition: str, words: str) -> None:
     Path("dvc.yaml").write_text(f"stages: {{a: {{cmd: x, {definition}}}}}")
     with pytest.raises((dvc_errors().DvcException, ValueError)):
         stages_of_dvc(lab.folder)
     refused = lab.call("run dvc.yaml")
-    assert refused.code == 2 and named in refused.err and len(refused.err.splitlines()) == 1
+    assert refused.code == 2 and words in refused.err and len(refused.err.splitlines()) == 1
 
 
 @pytest.mark.parametrize(
-    ("text", "named"),
+    ("text", "words"),
     [
         ("stages: {a: {cmd: x}, a: {cmd: y}}", "the key a stands twice"),
         ("stages: {1: {cmd: x}, true: {cmd: y}}", "the key true stands twice"),
@@ -232,12 +232,12 @@ def test_a_stage_that_dvc_refuses_is_refused_with_what_is_wrong(lab: Lab, defini
         ("stages: {a: {cmd: '${l}'}}\nvars: [{l: [x, y]}]", "its cmd is"),
     ],
 )
-def test_a_file_that_dvc_refuses_is_refused_with_what_is_wrong(lab: Lab, text: str, named: str) -> None:
+def test_a_file_that_dvc_refuses_is_refused_with_what_is_wrong(lab: Lab, text: str, words: str) -> None:
     Path("dvc.yaml").write_text(text)
     with pytest.raises((dvc_errors().DvcException, ValueError)):
         stages_of_dvc(lab.folder)
     refused = lab.call("run dvc.yaml")
-    assert refused.code == 2 and named in refused.err and len(refused.err.splitlines()) == 1
+    assert refused.code == 2 and words in refused.err and len(refused.err.splitlines()) == 1
 
 
 @pytest.mark.parametrize(
@@ -255,12 +255,12 @@ def test_a_file_that_dvc_reads_has_the_same_stages_in_the_same_dependencies(lab:
     Path("dvc.yaml").write_text(text)
     Path("params.yaml").write_text("{}")
     chain = chains.load(Path("dvc.yaml"))
-    edges = sorted((name, before) for name, several in chain.after.items() for before in several)
+    edges = sorted((name, before) for name, predecessors in chain.after.items() for before in predecessors)
     assert (sorted(stage.name for stage in chain.stages), edges) == stages_of_dvc(lab.folder)
 
 
 def test_an_unknown_stage_and_a_missing_file_are_refused(lab: Lab) -> None:
-    written(STAGES)
+    write_chain(STAGES)
 
     assert "scaled" in lab.call("run dvc.yaml polish").err
     assert lab.call("run nowhere.yaml").code == 2
@@ -272,9 +272,9 @@ def test_stages_of_foreach_and_matrix_have_the_names_and_values_that_the_format_
         "keyed": {"foreach": "${sets}", "do": {"cmd": "x ${key} ${item.n}"}},
         "grid": {"matrix": {"m": ["u", {"v": True}], "fold": [0, 1]}, "cmd": "x ${item.fold}"},
     }
-    found = chains.load(written(stages, tmp_path, sets={"one": {"n": 1}, "two": {"n": 2}})).stages
+    expanded = chains.load(write_chain(stages, tmp_path, sets={"one": {"n": 1}, "two": {"n": 2}})).stages
 
-    assert {stage.name: stage.commands[0] for stage in found} == {
+    assert {stage.name: stage.commands[0] for stage in expanded} == {
         "each@a": "x a",
         "each@2": "x 2",
         "keyed@one": "x one 1",
@@ -291,10 +291,10 @@ def test_dvc_reads_the_stages_of_this_project_in_the_same_way() -> None:
     repo = pytest.importorskip("dvc.repo").Repo(str(ROOT), uninitialized=True)
     resolver = parsing.DataResolver(repo, str(ROOT), yaml.safe_load((ROOT / "dvc.yaml").read_text()))
     expected = resolver.resolve()["stages"]
-    found = {stage.name: stage for stage in chains.load(ROOT / "dvc.yaml").stages}
+    actual = {stage.name: stage for stage in chains.load(ROOT / "dvc.yaml").stages}
 
-    assert set(found) == set(expected) and len(found) > 100
-    for name, stage in found.items():
+    assert set(actual) == set(expected) and len(actual) > 100
+    for name, stage in actual.items():
         commands = expected[name]["cmd"]
         assert list(stage.commands) == ([commands] if isinstance(commands, str) else commands)
         assert list(stage.reads) == expected[name].get("deps", [])
@@ -302,10 +302,10 @@ def test_dvc_reads_the_stages_of_this_project_in_the_same_way() -> None:
 
 def test_each_stage_of_this_project_comes_after_those_whose_outputs_it_reads() -> None:
     chain = chains.load(ROOT / "dvc.yaml")
-    done: list[str] = []
+    earlier: list[str] = []
     for stage in chain.stages:
-        assert set(chain.after[stage.name]) <= set(done)
-        done.append(stage.name)
+        assert set(chain.after[stage.name]) <= set(earlier)
+        earlier.append(stage.name)
     assert "forward-synced" in chain.after["forward-segments"]
     assert any(name.startswith("forward-raw") or name.startswith("forward-latent") for name in chain.after["forward"])
 
@@ -321,7 +321,9 @@ def test_names_with_values_that_are_missing_are_named() -> None:
 @pytest.mark.long
 def test_an_interrupt_ends_the_stage_at_work_and_the_chain_with_the_exit_code_of_interrupts(lab: Lab) -> None:
     work = "import pathlib, time; pathlib.Path('began').touch(); time.sleep(600)"
-    written({"slow": {"cmd": f'exec {sys.executable} -c "{work}"'}, "after": {**one("after"), "deps": ["x"]}})
+    write_chain(
+        {"slow": {"cmd": f'exec {sys.executable} -c "{work}"'}, "after": {**stage_that_adds("after"), "deps": ["x"]}}
+    )
     command = [sys.executable, "-m", "tacpipe", "run", "dvc.yaml"]
     process = subprocess.Popen(command, env=dict(os.environ), stderr=subprocess.PIPE, text=True)
     while not Path("began").exists():
@@ -336,8 +338,10 @@ def test_an_interrupt_ends_the_stage_at_work_and_the_chain_with_the_exit_code_of
 
 
 def test_json_of_a_command_within_a_chain_is_what_it_prints_by_itself(lab: Lab) -> None:
-    written({"toy": {"cmd": "tacpipe simulate toy -o data/toy --json --quiet"}})
+    write_chain({"toy": {"cmd": "tacpipe simulate toy -o data/toy --json --quiet"}})
     lab.run("run dvc.yaml")
-    value, alone = (json.loads(lab.run(command).out) for command in ("run dvc.yaml", "simulate toy -o data/toy --json"))
+    value, by_itself = (
+        json.loads(lab.run(command).out) for command in ("run dvc.yaml", "simulate toy -o data/toy --json")
+    )
 
-    assert {**value, "seconds": 0} == {**alone, "seconds": 0}
+    assert {**value, "seconds": 0} == {**by_itself, "seconds": 0}

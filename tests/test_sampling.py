@@ -12,10 +12,10 @@ from tests.conftest import left_out
 ROOT = Path(__file__).parents[1]
 
 
-@pytest.mark.parametrize("every", [1, 3, 40])
-def test_parts_share_no_test_and_leave_none_out(every: int) -> None:
+@pytest.mark.parametrize("step", [1, 3, 40])
+def test_parts_share_no_test_and_leave_none_out(step: int) -> None:
     items = list(range(101))
-    parts = [set(items) - left_out(items, f"{first}/{every}") for first in range(1, every + 1)]
+    parts = [set(items) - left_out(items, f"{first}/{step}") for first in range(1, step + 1)]
     assert sorted(item for part in parts for item in part) == items
     assert max(map(len, parts)) - min(map(len, parts)) <= 1
 
@@ -25,7 +25,7 @@ def test_a_part_without_a_first_begins_with_the_first_test() -> None:
 
 
 def test_what_ci_samples_begins_with_another_test_at_each_commit() -> None:
-    found = re.findall(r"\$\(\(commits % (\d+) \+ 1\)\)/(\d+)", (ROOT / ".ci/run").read_text())
-    assert len(found) == 2
-    for modulo, every in found:
-        assert {commits % int(modulo) + 1 for commits in range(int(every))} == set(range(1, int(every) + 1))
+    samples = re.findall(r"\$\(\(commits % (\d+) \+ 1\)\)/(\d+)", (ROOT / ".ci/run").read_text())
+    assert len(samples) == 2
+    for modulo, step in samples:
+        assert {commits % int(modulo) + 1 for commits in range(int(step))} == set(range(1, int(step) + 1))

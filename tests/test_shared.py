@@ -12,9 +12,9 @@ from tacpipe.store.store import Store
 
 @pytest.fixture
 def store(tmp_path: Path) -> Store:
-    made = Store(tmp_path / ".tacpipe")
-    made.prepare()
-    return made
+    prepared = Store(tmp_path / ".tacpipe")
+    prepared.prepare()
+    return prepared
 
 
 class Made:
@@ -65,10 +65,10 @@ def test_a_disk_that_fails_is_asked_again(store: Store) -> None:
 
 def test_what_another_run_left_stays_where_it_is(store: Store) -> None:
     with store.at_work():
-        other = Store(store.root)
-        with other.at_work():
-            SharedFiles(other).file("a.csv", Made())
-            left = drafts(store)
+        second_store = Store(store.root)
+        with second_store.at_work():
+            SharedFiles(second_store).file("a.csv", Made())
+            drafts_of_first = drafts(store)
             SharedFiles(store).file("a.csv", Made())
             assert len(drafts(store)) == 2
-        assert drafts(store) and drafts(store) != left
+        assert drafts(store) and drafts(store) != drafts_of_first

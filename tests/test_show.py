@@ -1,4 +1,4 @@
-"""What `tacpipe show` and `tacpipe explain` print of what has many files, and what `store link` removes of it."""
+"""`tacpipe show` and `tacpipe explain` summarize what has many files, and `store link` removes leftovers of it."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ def _export(lab: Lab) -> Lab:
 
 def test_of_an_export_the_files_are_counted_and_the_first_are_named(lab: Lab) -> None:
     _export(lab)
-    found = json.loads(lab.run("show out --json").out)
-    assert found["kind"] == "export" and len(found["files"]) > MANY
+    value = json.loads(lab.run("show out --json").out)
+    assert value["kind"] == "export" and len(value["files"]) > MANY
     text = lab.run("show out").out
-    assert f"{len(found['files'])}, together" in text and "README.md" in text
-    assert sum(name in text for name in found["files"]) < MANY
-    every = " ".join(lab.run("show out --full").out.split())
-    assert all(name in every for name in found["files"])
+    assert f"{len(value['files'])}, together" in text and "README.md" in text
+    assert sum(name in text for name in value["files"]) < MANY
+    full_text = " ".join(lab.run("show out --full").out.split())
+    assert all(name in full_text for name in value["files"])
     traced = lab.run("explain out").out
-    assert f"{len(found['files'])} files" in traced and sum(name in traced for name in found["files"]) < MANY
+    assert f"{len(value['files'])} files" in traced and sum(name in traced for name in value["files"]) < MANY
 
 
 def test_link_removes_the_drafts_in_every_folder_of_an_export(lab: Lab) -> None:
@@ -67,10 +67,10 @@ def test_show_ends_when_nobody_reads_what_it_prints(lab: Lab) -> None:
     readable, writable = os.pipe()
     os.close(readable)
     command = [sys.executable, "-m", "tacpipe", "show", "data/r", "--full"]
-    done = subprocess.run(command, cwd=lab.folder, stdout=writable, stderr=subprocess.PIPE, check=False)
+    process = subprocess.run(command, cwd=lab.folder, stdout=writable, stderr=subprocess.PIPE, check=False)
     os.close(writable)
 
-    assert (done.returncode, done.stderr) == (-signal.SIGPIPE, b"")
+    assert (process.returncode, process.stderr) == (-signal.SIGPIPE, b"")
 
 
 def _skin() -> pa.Table:
@@ -91,7 +91,7 @@ FIGURES = {
     "rate_hz": 100.0,
     "mean_hz": 44.444,  # four steps in 90 ms
     "gaps": 1,
-    "held_share": 0.25,  # of four steps one has both channels as before; where there is no value nothing is held
+    "held_share": 0.25,  # One of four steps has both channels as before; a missing value is not repeated.
     "saturated": 4,  # 65535, 127 and twice the 0 of an unsigned channel
 }
 
@@ -122,12 +122,12 @@ def test_a_recording_is_shown_with_streams_columns_rates_gaps_and_labels(lab: La
     stamps = robot["t_ns"].to_numpy()
     lost = np.diff(robot["seq"].to_numpy()) - 1
     text = lab.run("show data/r trial-000").out
-    shown = json.loads(lab.run("show data/r trial-000 --json").out)
+    value = json.loads(lab.run("show data/r trial-000 --json").out)
 
-    figures = shown["streams"]["robot"]
+    figures = value["streams"]["robot"]
     assert figures["mean_hz"] == round((len(stamps) - 1) / ((stamps[-1] - stamps[0]) / 1e9), 3)
-    assert figures["gaps"] == np.count_nonzero(lost) == sum(gap["name"] == "robot" for gap in shown["gaps"])
-    assert {"stream": "robot", "name": "finger_m", "quantity": "finger_width", "unit": "m", "type": "double"} in shown[
+    assert figures["gaps"] == np.count_nonzero(lost) == sum(gap["name"] == "robot" for gap in value["gaps"])
+    assert {"stream": "robot", "name": "finger_m", "quantity": "finger_width", "unit": "m", "type": "double"} in value[
         "columns"
     ]
     assert "taxel01_x … taxel16_z" in text and "median step" in text and "object: bottle" in text
@@ -171,8 +171,8 @@ def test_recordings_that_fail_for_the_same_reason_are_one_line(lab: Lab) -> None
         (lab.folder / "raw" / f"{name}.txt").write_text(text)
     ran = lab.run("ingest numbers raw -o data/r --skip-bad")
     for text in (ran.err, lab.run("show data/r").out):
-        (equal, other) = [line for line in text.splitlines() if "left out" in line]
-        assert "b, c: " in equal and "NAME" in equal and "d: " in other
+        (equal, unequal) = [line for line in text.splitlines() if "left out" in line]
+        assert "b, c: " in equal and "NAME" in equal and "d: " in unequal
 
 
 def test_explain_prints_a_layout_as_a_table_and_names_the_part_of_it_that_changed(lab: Lab) -> None:
@@ -214,7 +214,7 @@ def test_a_name_that_nearly_exists_is_suggested_wherever_labels_recordings_and_p
 def test_print_params_needs_no_dataset(lab: Lab) -> None:
     for command in ("train forward", "synchronize --rate-hz 20", "evaluate", "ingest xela-psc", "simulate toy"):
         assert isinstance(json.loads(lab.run(f"{command} --print-params").out), dict)
-    assert lab.call("synchronize -o x").code == 2  # without it they are needed
+    assert lab.call("synchronize -o x").code == 2  # Without it they are required.
 
 
 def test_each_task_names_what_the_recordings_of_another_lack(lab: Lab) -> None:

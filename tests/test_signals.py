@@ -14,7 +14,7 @@ import pytest
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGALRM, signal.SIGIO])
 def test_a_signal_that_ends_pytest_is_named_before_it_does(number: signal.Signals) -> None:
     program = f"import os\nfrom tests import conftest\nconftest.name_signals()\nos.kill(os.getpid(), {int(number)})"
-    ended = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-c", program],
         cwd=Path(__file__).parents[1],
         env={**os.environ, "PYTEST_CURRENT_TEST": "test_x (call)"},
@@ -23,5 +23,5 @@ def test_a_signal_that_ends_pytest_is_named_before_it_does(number: signal.Signal
         check=False,
     )
 
-    assert ended.returncode == -number
-    assert f"of pytest ends by {number.name} in test_x (call):" in ended.stderr
+    assert process.returncode == -number
+    assert f"of pytest ends by {number.name} in test_x (call):" in process.stderr

@@ -19,7 +19,7 @@ def recordings(count: int, **attributes: str) -> dict[str, dict[str, str]]:
 
 
 def with_role(roles: Roles, role: str, fold: int = 0) -> set[str]:
-    return {name for (name, at), found in roles.items() if found == role and at == fold}
+    return {name for (name, at), role_of_name in roles.items() if role_of_name == role and at == fold}
 
 
 @given(st.integers(5, 200), st.floats(0, 0.4), st.floats(0, 0.4), st.integers(0, 9))
@@ -35,41 +35,43 @@ def test_random_gives_every_recording_one_role_and_the_shares_asked_for(
 @pytest.mark.parametrize("name", ["random", "kfold", "blocked", "leave-one-out", "authors"])
 def test_a_share_to_calibrate_on_is_taken_from_training_and_leaves_the_other_roles_as_they_are(name: str) -> None:
     labelled = {
-        f"{at}-{found}": one | {"authors_role": at} for at in ("train", "test") for found, one in recordings(30).items()
+        f"{at}-{name}": attributes | {"authors_role": at}
+        for at in ("train", "test")
+        for name, attributes in recordings(30).items()
     }
     without, roles = (assign(labelled, Scheme(name, calibration=share)) for share in (0, 0.2))
-    aside = {key for key, role in roles.items() if role == "calibration"}
+    calibration = {key for key, role in roles.items() if role == "calibration"}
     trained = Counter(fold for (_, fold), role in without.items() if role in ("train", "val"))
-    assert {key: role for key, role in without.items() if key not in aside} == {
-        key: role for key, role in roles.items() if key not in aside
+    assert {key: role for key, role in without.items() if key not in calibration} == {
+        key: role for key, role in roles.items() if key not in calibration
     }
     for fold in trained:
         total = 60 if name in ("random", "blocked") else trained[fold]
-        assert sum(at == fold for _, at in aside) == round(0.2 * total)
-    assert {without[key] for key in aside} == {"train"}
+        assert sum(at == fold for _, at in calibration) == round(0.2 * total)
+    assert {without[key] for key in calibration} == {"train"}
 
 
 def test_the_order_in_which_recordings_come_does_not_matter_and_the_seed_does() -> None:
-    found = recordings(30)
-    reverse = dict(reversed(found.items()))
+    labelled = recordings(30)
+    reverse = dict(reversed(labelled.items()))
     for name in ("random", "kfold", "blocked", "leave-one-out"):
-        assert assign(found, Scheme(name)) == assign(reverse, Scheme(name))
-    assert assign(found, Scheme(seed=0)) != assign(found, Scheme(seed=1))
+        assert assign(labelled, Scheme(name)) == assign(reverse, Scheme(name))
+    assert assign(labelled, Scheme(seed=0)) != assign(labelled, Scheme(seed=1))
 
 
 @pytest.mark.parametrize("name", ["random", "blocked"])
 def test_stratified_shares_hold_for_every_object(name: str) -> None:
-    found = recordings(60)
-    roles = assign(found, Scheme(name, val=0.1, test=0.2, stratify="object"))
-    tested = Counter(found[recording]["object"] for recording in with_role(roles, "test"))
+    labelled = recordings(60)
+    roles = assign(labelled, Scheme(name, val=0.1, test=0.2, stratify="object"))
+    tested = Counter(labelled[recording]["object"] for recording in with_role(roles, "test"))
     assert tested == {"4": 4, "10": 4, "bottle": 4}
 
 
 def test_kfold_tests_every_recording_once_in_parts_that_differ_by_one() -> None:
-    found = recordings(23)
-    roles = assign(found, Scheme("kfold", folds=5, val=0.1, stratify="object"))
+    labelled = recordings(23)
+    roles = assign(labelled, Scheme("kfold", folds=5, val=0.1, stratify="object"))
     parts = [with_role(roles, "test", fold) for fold in range(5)]
-    assert sorted(name for part in parts for name in part) == sorted(found)
+    assert sorted(name for part in parts for name in part) == sorted(labelled)
     assert {len(part) for part in parts} == {4, 5}
     assert all(len(with_role(roles, "val", fold)) == 2 for fold in range(5))
 
@@ -81,26 +83,28 @@ def objects(count: int, trials: int) -> dict[str, dict[str, str]]:
 
 @pytest.mark.parametrize("stratify", ["", "object"])
 def test_kfold_apart_tests_unknown_objects_and_known_ones_side_by_side(stratify: str) -> None:
-    found = objects(7, 6)
-    roles = assign(found, Scheme("kfold", folds=3, val=0.2, stratify=stratify, apart="object"))
-    plain = assign(found, Scheme("kfold", folds=3, val=0.2, stratify=stratify))
+    labelled = objects(7, 6)
+    roles = assign(labelled, Scheme("kfold", folds=3, val=0.2, stratify=stratify, apart="object"))
+    plain = assign(labelled, Scheme("kfold", folds=3, val=0.2, stratify=stratify))
     unknown_in: list[str] = []
     for fold in range(3):
-        learned = {found[name]["object"] for role in ("train", "val") for name in with_role(roles, role, fold)}
-        unknown = {one["object"] for one in found.values()} - learned
+        learned = {labelled[name]["object"] for role in ("train", "val") for name in with_role(roles, role, fold)}
+        unknown = {attributes["object"] for attributes in labelled.values()} - learned
         unknown_in += unknown
         tested = with_role(roles, "test", fold)
-        assert {name for name in found if found[name]["object"] in unknown} <= tested
-        known = {name for name in tested if found[name]["object"] in learned}
-        assert known == {name for name in with_role(plain, "test", fold) if found[name]["object"] in learned}
-        assert known
+        assert {name for name in labelled if labelled[name]["object"] in unknown} <= tested
+        known_objects = {name for name in tested if labelled[name]["object"] in learned}
+        assert known_objects == {name for name in with_role(plain, "test", fold) if labelled[name]["object"] in learned}
+        assert known_objects
         assert with_role(roles, "val", fold)
-    assert sorted(unknown_in) == sorted({one["object"] for one in found.values()})  # each is unknown once
+    assert sorted(unknown_in) == sorted(
+        {attributes["object"] for attributes in labelled.values()}
+    )  # each is unknown once
 
 
 def test_the_objects_that_are_unknown_together_follow_from_the_seed_and_parts_are_even() -> None:
-    found = objects(8, 1)
-    alike = [assign(found, Scheme("kfold", folds=4, val=0, seed=seed, apart="object")) for seed in (1, 1, 2)]
+    labelled = objects(8, 1)
+    alike = [assign(labelled, Scheme("kfold", folds=4, val=0, seed=seed, apart="object")) for seed in (1, 1, 2)]
     assert alike[0] == alike[1] != alike[2]
     assert all(2 <= len(with_role(alike[0], "test", fold)) <= 4 for fold in range(4))  # 2 unknown, up to 2 known
 
@@ -108,13 +112,15 @@ def test_the_objects_that_are_unknown_together_follow_from_the_seed_and_parts_ar
 def test_a_recording_that_comes_in_later_is_unknown_together_with_its_object() -> None:
     scheme = Scheme("kfold", folds=3, val=0.2, apart="object")
     old = assign(objects(6, 4), scheme)
-    found = objects(9, 5)
-    new = assign(found, scheme, keep=old)
+    labelled = objects(9, 5)
+    new = assign(labelled, scheme, keep=old)
     assert {key: new[key] for key in old} == old
-    learned = [{found[name]["object"] for name in found if new[name, fold] in ("train", "val")} for fold in range(3)]
-    unknown = [{f"o{i}" for i in range(9)} - one for one in learned]
-    assert sorted(name for one in unknown for name in one) == sorted(f"o{i}" for i in range(9))
-    assert {len(one) for one in unknown} == {3}
+    learned = [
+        {labelled[name]["object"] for name in labelled if new[name, fold] in ("train", "val")} for fold in range(3)
+    ]
+    unknown = [{f"o{i}" for i in range(9)} - fold_objects for fold_objects in learned]
+    assert sorted(name for fold_objects in unknown for name in fold_objects) == sorted(f"o{i}" for i in range(9))
+    assert {len(fold_objects) for fold_objects in unknown} == {3}
 
 
 def test_an_older_split_that_kept_nothing_apart_cannot_be_extended_to_do_so() -> None:
@@ -129,23 +135,23 @@ def test_blocked_trains_on_the_first_and_tests_the_last() -> None:
 
 
 def test_leave_one_out_has_a_fold_a_value_in_the_order_of_numbers() -> None:
-    found = recordings(12)
-    roles = assign(found, Scheme("leave-one-out", val=0.25))
+    labelled = recordings(12)
+    roles = assign(labelled, Scheme("leave-one-out", val=0.25))
     for fold, value in enumerate(("4", "10", "bottle")):
-        assert {found[name]["object"] for name in with_role(roles, "test", fold)} == {value}
+        assert {labelled[name]["object"] for name in with_role(roles, "test", fold)} == {value}
         assert len(with_role(roles, "val", fold)) == 2
 
 
 def test_authors_roles_are_taken_and_val_is_drawn_from_their_training_part() -> None:
-    found = recordings(20, authors_role="train") | {"x": {"authors_role": "test"}}
-    roles = assign(found, Scheme("authors", val=0.2))
+    labelled = recordings(20, authors_role="train") | {"x": {"authors_role": "test"}}
+    roles = assign(labelled, Scheme("authors", val=0.2))
     assert with_role(roles, "test") == {"x"}
     assert len(with_role(roles, "val")) == 4
 
 
 def test_authors_own_val_is_left_as_it_is() -> None:
-    found = recordings(5, authors_role="train") | {"x": {"authors_role": "val"}}
-    assert with_role(assign(found, Scheme("authors", val=0.4)), "val") == {"x"}
+    labelled = recordings(5, authors_role="train") | {"x": {"authors_role": "val"}}
+    assert with_role(assign(labelled, Scheme("authors", val=0.4)), "val") == {"x"}
 
 
 def test_a_missing_authors_role_is_named() -> None:
@@ -218,27 +224,27 @@ def two_sensors(materials: int = 4, trials: int = 10) -> dict[str, dict[str, str
 
 @pytest.mark.parametrize("name", ["random", "kfold"])
 def test_several_attributes_are_spread_evenly_in_all_their_combinations(name: str) -> None:
-    found = two_sensors()
-    roles = assign(found, Scheme(name, val=0.2, test=0.2, stratify="sensor, material"))
-    tested = Counter((found[one]["sensor"], found[one]["material"]) for one in with_role(roles, "test"))
+    labelled = two_sensors()
+    roles = assign(labelled, Scheme(name, val=0.2, test=0.2, stratify="sensor, material"))
+    tested = Counter((labelled[name]["sensor"], labelled[name]["material"]) for name in with_role(roles, "test"))
     assert len(tested) == 8
     assert set(tested.values()) == {2}
 
 
 def test_repeats_are_other_draws_and_the_first_is_that_without_repeats() -> None:
-    found = recordings(40)
-    once, thrice = assign(found, Scheme(seed=4)), assign(found, Scheme(seed=4, repeats=3))
-    assert {key: role for key, role in thrice.items() if key[1] == 0} == once
+    labelled = recordings(40)
+    single, thrice = assign(labelled, Scheme(seed=4)), assign(labelled, Scheme(seed=4, repeats=3))
+    assert {key: role for key, role in thrice.items() if key[1] == 0} == single
     tested = [with_role(thrice, "test", fold) for fold in range(3)]
-    assert {len(one) for one in tested} == {6}
-    assert len({frozenset(one) for one in tested}) == 3
+    assert {len(names) for names in tested} == {6}
+    assert len({frozenset(names) for names in tested}) == 3
 
 
 def test_blocked_in_reverse_tests_the_first_of_each_stratum_and_trains_on_the_last() -> None:
     roles = assign(recordings(10), Scheme("blocked", val=0.2, test=0.3, reverse=True))
     assert [roles[f"trial-{i:03d}", 0] for i in range(10)] == ["test"] * 3 + ["val"] * 2 + ["train"] * 5
-    found = two_sensors(materials=1)
-    roles = assign(found, Scheme("blocked", val=0.0, test=0.1, stratify="sensor", reverse=True))
+    labelled = two_sensors(materials=1)
+    roles = assign(labelled, Scheme("blocked", val=0.0, test=0.1, stratify="sensor", reverse=True))
     assert with_role(roles, "test") == {"biotac-m01-t000", "roboskin-m01-t000"}
 
 
@@ -246,53 +252,55 @@ def test_blocked_in_reverse_tests_the_first_of_each_stratum_and_trains_on_the_la
 
 
 def published(blocks: int = 4, size: int = 6, tests: int = 0) -> dict[str, dict[str, str | int]]:
-    found: dict[str, dict[str, str | int]] = {
+    labelled: dict[str, dict[str, str | int]] = {
         f"roboskin-fold{block}-{i:03d}": {"sensor": "roboskin", "material": i % 3, "authors_fold": block}
         for block in range(blocks)
         for i in range(size)
     }
     for i in range(tests):
-        found[f"roboskin-test-{i:03d}"] = {"sensor": "roboskin", "material": 0, "authors_role": "test"}
-    return found
+        labelled[f"roboskin-test-{i:03d}"] = {"sensor": "roboskin", "material": 0, "authors_role": "test"}
+    return labelled
 
 
 def test_blocks_of_the_authors_are_tested_in_turn_where_they_name_no_test() -> None:
-    found = published()
-    roles = assign(found, Scheme("authors", val=0.25, stratify="material"))
+    labelled = published()
+    roles = assign(labelled, Scheme("authors", val=0.25, stratify="material"))
     for fold in range(4):
-        assert with_role(roles, "test", fold) == {name for name in found if found[name]["authors_fold"] == fold}
+        assert with_role(roles, "test", fold) == {name for name in labelled if labelled[name]["authors_fold"] == fold}
         watched = with_role(roles, "val", fold)
         assert len(watched) == 4  # a quarter of 18, rounded to even
-        assert {found[name]["material"] for name in watched} == {0, 1, 2}
+        assert {labelled[name]["material"] for name in watched} == {0, 1, 2}
 
 
 def test_blocks_of_the_authors_are_watched_in_turn_where_they_name_the_test() -> None:
-    found = published(tests=5)
-    roles = assign(found, Scheme("authors", val=0.25))
+    labelled = published(tests=5)
+    roles = assign(labelled, Scheme("authors", val=0.25))
     for fold in range(4):
-        assert with_role(roles, "test", fold) == {name for name in found if "authors_role" in found[name]}
-        assert with_role(roles, "val", fold) == {name for name in found if found[name].get("authors_fold") == fold}
+        assert with_role(roles, "test", fold) == {name for name in labelled if "authors_role" in labelled[name]}
+        assert with_role(roles, "val", fold) == {
+            name for name in labelled if labelled[name].get("authors_fold") == fold
+        }
         assert len(with_role(roles, "train", fold)) == 18
 
 
 @pytest.mark.parametrize(("tests", "role"), [(0, "test"), (5, "val")])
 def test_recordings_beside_the_blocks_are_dealt_into_as_many_even_parts(tests: int, role: str) -> None:
-    beside: dict[str, dict[str, str | int]] = {
+    without_block: dict[str, dict[str, str | int]] = {
         f"biotac-{i:03d}": {"sensor": "biotac", "material": i % 3} for i in range(24)
     }
-    found = published(tests=tests) | beside
-    roles = assign(found, Scheme("authors", val=0.2, stratify="sensor,material"))
-    parts = [with_role(roles, role, fold) & set(beside) for fold in range(4)]
-    assert sorted(name for part in parts for name in part) == sorted(beside)
-    assert all(Counter(beside[name]["material"] for name in part) == {0: 2, 1: 2, 2: 2} for part in parts)
-    again = assign(found, Scheme("authors", val=0.2, stratify="sensor,material", seed=1))
-    assert parts != [with_role(again, role, fold) & set(beside) for fold in range(4)]
+    labelled = published(tests=tests) | without_block
+    roles = assign(labelled, Scheme("authors", val=0.2, stratify="sensor,material"))
+    parts = [with_role(roles, role, fold) & set(without_block) for fold in range(4)]
+    assert sorted(name for part in parts for name in part) == sorted(without_block)
+    assert all(Counter(without_block[name]["material"] for name in part) == {0: 2, 1: 2, 2: 2} for part in parts)
+    other_seed = assign(labelled, Scheme("authors", val=0.2, stratify="sensor,material", seed=1))
+    assert parts != [with_role(other_seed, role, fold) & set(without_block) for fold in range(4)]
 
 
 def test_roles_that_authors_gave_beside_their_blocks_hold_in_every_fold() -> None:
-    found = published()
-    found |= {"x": {"material": 0, "authors_role": "train"}, "y": {"material": 0, "authors_role": "val"}}
-    roles = assign(found, Scheme("authors", val=0.2))
+    labelled = published()
+    labelled |= {"x": {"material": 0, "authors_role": "train"}, "y": {"material": 0, "authors_role": "val"}}
+    roles = assign(labelled, Scheme("authors", val=0.2))
     assert {roles["x", fold] for fold in range(4)} == {"train"}
     assert {roles["y", fold] for fold in range(4)} == {"val"}
 
@@ -305,27 +313,27 @@ def test_a_block_that_is_no_number_is_named() -> None:
 # ---- few to train on
 
 
-def trained(few: int, **options: object) -> set[str]:
-    scheme = Scheme(val=0.2, test=0.2, stratify="sensor,material", few=few, **options)  # type: ignore[arg-type]
+def trained(count: int, **options: object) -> set[str]:
+    scheme = Scheme(val=0.2, test=0.2, stratify="sensor,material", few=count, **options)  # type: ignore[arg-type]
     return with_role(assign(two_sensors(), scheme), "train")
 
 
 def test_few_leaves_so_many_of_each_sensor_spread_over_materials_and_touches_no_other_role() -> None:
-    found = two_sensors()
+    labelled = two_sensors()
     scheme = Scheme(val=0.2, test=0.2, stratify="sensor,material")
-    every = assign(found, scheme)
-    roles = assign(found, Scheme(val=0.2, test=0.2, stratify="sensor,material", few=8, few_by="sensor"))
-    chosen = Counter((found[one]["sensor"], found[one]["material"]) for one in with_role(roles, "train"))
+    without_limit = assign(labelled, scheme)
+    roles = assign(labelled, Scheme(val=0.2, test=0.2, stratify="sensor,material", few=8, few_by="sensor"))
+    chosen = Counter((labelled[name]["sensor"], labelled[name]["material"]) for name in with_role(roles, "train"))
     assert set(chosen.values()) == {2}
     assert len(chosen) == 8
-    assert with_role(roles, "unused") == with_role(every, "train") - with_role(roles, "train")
-    assert all(with_role(roles, role) == with_role(every, role) for role in ("val", "test"))
+    assert with_role(roles, "unused") == with_role(without_limit, "train") - with_role(roles, "train")
+    assert all(with_role(roles, role) == with_role(without_limit, role) for role in ("val", "test"))
 
 
 @given(st.integers(1, 24), st.integers(1, 24), st.integers(0, 9))
-def test_the_fewer_are_among_the_more(one: int, other: int, seed: int) -> None:
-    fewer, more = sorted((one, other))
-    assert trained(fewer, few_by="sensor", seed=seed) <= trained(more, few_by="sensor", seed=seed)
+def test_the_fewer_are_among_the_more(first: int, second: int, seed: int) -> None:
+    fewer, larger = sorted((first, second))
+    assert trained(fewer, few_by="sensor", seed=seed) <= trained(larger, few_by="sensor", seed=seed)
     assert len(trained(fewer, few_by="sensor", seed=seed)) == 2 * fewer
 
 

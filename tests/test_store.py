@@ -23,9 +23,9 @@ EMPTY: dict[str, dict[str, object]] = {"recordings": {}, "files": {}}
 
 @pytest.fixture
 def store(tmp_path: Path) -> Store:
-    made = Store(tmp_path / ".tacpipe")
-    made.prepare()
-    return made
+    prepared = Store(tmp_path / ".tacpipe")
+    prepared.prepare()
+    return prepared
 
 
 def test_what_is_put_comes_back_and_lies_under_its_digest_read_only(store: Store) -> None:
@@ -133,14 +133,14 @@ def test_a_lease_is_held_by_one_and_its_wait_times_out_with_its_own_exit_code(st
 
 
 def test_leases_let_one_at_a_time_through(store: Store) -> None:
-    inside, most = 0, 0
+    inside, most_inside = 0, 0
 
     def work() -> None:
-        nonlocal inside, most
+        nonlocal inside, most_inside
         for _ in range(20):
             with store.leases.hold("cd" * 32):
                 inside += 1
-                most = max(most, inside)
+                most_inside = max(most_inside, inside)
                 inside -= 1
 
     threads = [threading.Thread(target=work) for _ in range(4)]
@@ -148,25 +148,25 @@ def test_leases_let_one_at_a_time_through(store: Store) -> None:
         thread.start()
     for thread in threads:
         thread.join()
-    assert most == 1
+    assert most_inside == 1
 
 
 def test_a_lease_that_another_computer_unlinked_meanwhile_is_taken_anew(
     store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    honest, gone = fcntl.flock, [errno.ESTALE, errno.ESTALE]  # as a network file system answers
+    honest, failures = fcntl.flock, [errno.ESTALE, errno.ESTALE]  # A network file system answers so.
 
     def flock(handle: int, operation: int) -> None:
-        if gone:
-            raise OSError(gone.pop(), "Stale file handle")
+        if failures:
+            raise OSError(failures.pop(), "Stale file handle")
         honest(handle, operation)
 
     monkeypatch.setattr(fcntl, "flock", flock)
     with store.leases.hold("ab" * 32, timeout_s=5):
-        assert not gone
-    gone.append(errno.ESTALE)
+        assert not failures
+    failures.append(errno.ESTALE)
     with store.at_work():
-        assert not gone
+        assert not failures
 
 
 def test_a_process_that_died_holds_no_lease(store: Store) -> None:
@@ -235,11 +235,11 @@ def folders(root: Path, *paths: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("present", "here", "datasets", "expected"),
+    ("present", "working_folder", "datasets", "expected"),
     [
         (["lab/.tacpipe/"], "lab/a", ["lab/a/data/r"], "lab/a"),  # a stray store above an unmarked folder
         (["lab/.tacpipe/", "lab/a/.git/"], "lab/a/data", ["lab/a/data/r"], "lab/a"),
-        (["lab/.tacpipe/project"], "lab/a", ["lab/a/data/r"], "lab"),  # as `tacpipe store init` marks it
+        (["lab/.tacpipe/project"], "lab/a", ["lab/a/data/r"], "lab"),  # `tacpipe store init` marks it so.
         (["lab/.tacpipe/", "lab/pyproject.toml"], "lab/a", ["lab/a/data/r"], "lab"),
         (["lab/.tacpipe/", "lab/params.yaml"], "", ["lab/a/data/r"], "lab"),
         (["lab/.git/", "lab/a/.tacpipe/"], "lab", ["lab/a/data/r"], "lab/a"),
@@ -254,12 +254,12 @@ def test_the_store_is_that_of_the_project_in_which_the_datasets_lie(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     present: list[str],
-    here: str,
+    working_folder: str,
     datasets: list[str],
     expected: str,
 ) -> None:
-    folders(tmp_path, *present, f"{here}/.keep")
-    monkeypatch.chdir(tmp_path / here)
+    folders(tmp_path, *present, f"{working_folder}/.keep")
+    monkeypatch.chdir(tmp_path / working_folder)
     assert project(*(tmp_path / path for path in datasets)) == tmp_path / expected
 
 
@@ -331,9 +331,9 @@ def test_settling_syncs_each_folder_above_the_names_once_and_those_within_first(
 
 
 @pytest.mark.parametrize("harmed", [("data/r",), ("data/s",), ("data/r", "data/s")], ids="+".join)
-@pytest.mark.parametrize("gone", [("data/r",), ("data/s",), ("data/r", "data/s")], ids="+".join)
+@pytest.mark.parametrize("removed", [("data/r",), ("data/s",), ("data/r", "data/s")], ids="+".join)
 def test_all_damaged_objects_are_recomputed_in_one_run(
-    lab: Lab, harmed: tuple[str, ...], gone: tuple[str, ...]
+    lab: Lab, harmed: tuple[str, ...], removed: tuple[str, ...]
 ) -> None:
     commands = {"data/r": "simulate toy -o data/r --trials 3 --rows 5", "data/s": "scale data/r -o data/s --factor 3"}
     for command in commands.values():
@@ -346,8 +346,8 @@ def test_all_damaged_objects_are_recomputed_in_one_run(
         Path(name).unlink()  # the outputs are links to it
         Path(name).write_bytes(content)
     for path in before:
-        if str(path).startswith(gone):
+        if str(path).startswith(removed):
             path.unlink()
-    for directory in gone:
+    for directory in removed:
         lab.run(commands[directory])
     assert {path: path.read_bytes() for path in Path("data").rglob("*.parquet")} == before

@@ -41,12 +41,12 @@ TIME = ([10, 20], {"quantity": "time"})
 
 
 def test_streams_that_lie_apart_are_given_without_truth_and_events() -> None:
-    one, other = table(t_ns=TIME, a=([1, 2], {})), table(t_ns=TIME, b=([3, 4], {}))
-    assert streams({"one": one, "events": other, "truth": other, "two": other}) == {"one": one, "two": other}
+    left, right = table(t_ns=TIME, a=([1, 2], {})), table(t_ns=TIME, b=([3, 4], {}))
+    assert streams({"one": left, "events": right, "truth": right, "two": right}) == {"one": left, "two": right}
 
 
 def test_a_synchronized_table_falls_apart_under_the_names_that_were_recorded() -> None:
-    found = streams(
+    parts = streams(
         {
             "": table(
                 t_ns=TIME,
@@ -57,12 +57,12 @@ def test_a_synchronized_table_falls_apart_under_the_names_that_were_recorded() -
             )
         }
     )
-    assert {name: part.to_pydict() for name, part in found.items()} == {
+    assert {name: part.to_pydict() for name, part in parts.items()} == {
         "xela": {"t_ns": [10, 20], "x": [1, 2]},
         "robot": {"t_ns": [10, 20], "xela_x": [3, 4]},
     }
-    assert of_quantity(found["xela"], "tactile") == ["x"]
-    assert of_quantity(found["robot"], "tactile") == []
+    assert of_quantity(parts["xela"], "tactile") == ["x"]
+    assert of_quantity(parts["robot"], "tactile") == []
 
 
 def test_a_table_that_was_one_from_the_start_is_one_stream_without_name() -> None:
@@ -71,12 +71,12 @@ def test_a_table_that_was_one_from_the_start_is_one_stream_without_name() -> Non
 
 def test_a_signal_is_that_of_the_first_stream_with_its_quantity() -> None:
     force = {"quantity": "force"}
-    given = {
+    tables = {
         "pose": table(t_ns=TIME, a=([1, 2], {})),
         "wrench": table(t_ns=TIME, x=([1.0, 2.0], force), other=([0.0, 0.0], {}), y=([3.0, 4.0], force)),
     }
-    found = signal(given, "force")
-    assert found is not None
-    np.testing.assert_array_equal(found[0], [10, 20])
-    np.testing.assert_array_equal(found[1], [[1.0, 3.0], [2.0, 4.0]])
-    assert signal(given, "velocity") is None
+    values = signal(tables, "force")
+    assert values is not None
+    np.testing.assert_array_equal(values[0], [10, 20])
+    np.testing.assert_array_equal(values[1], [[1.0, 3.0], [2.0, 4.0]])
+    assert signal(tables, "velocity") is None

@@ -45,27 +45,27 @@ def test_arrow_holds_no_memory_of_python_s(monkeypatch: pytest.MonkeyPatch) -> N
 
     monkeypatch.setattr(pq, "ParquetFile", keep)
     content = Content(to_parquet(pa.table({"a": list(range(1000))})))
-    held = weakref.ref(content)
+    reference = weakref.ref(content)
     assert from_parquet(content).num_rows == 1000  # type: ignore[arg-type]
     del content
-    assert files and held() is None
+    assert files and reference() is None
 
 
 def test_whatever_is_read_as_parquet_lies_in_memory_of_arrow_s_own() -> None:
     """Every reader of bytes in the program gets them from `owned`, which the test above is about."""
     readers = {"BufferReader", "input_stream", "BytesIO"}
-    found = 0
+    calls = 0
     for file in sorted((Path(__file__).parents[1] / "tacpipe").rglob("*.py")):
         text = file.read_text()
         if "pyarrow" not in text:
             continue
         for call in ast.walk(ast.parse(text)):
             name = getattr(getattr(call, "func", None), "attr", "")
-            if isinstance(call, ast.Call) and name in readers and call.args:  # without bytes it is written to
-                given = ast.unparse(call.args[0])  # `self._content` is what `ParquetTable` got from `owned`
-                assert given.startswith("owned(") or given == "self._content", f"{file}:{call.lineno}"
-                found += 1
-    assert found == 7
+            if isinstance(call, ast.Call) and name in readers and call.args:  # A call without bytes is for writing.
+                argument = ast.unparse(call.args[0])  # `self._content` is what `ParquetTable` got from `owned`
+                assert argument.startswith("owned(") or argument == "self._content", f"{file}:{call.lineno}"
+                calls += 1
+    assert calls == 7
 
 
 @given(tables(), st.data())
@@ -80,12 +80,12 @@ def test_columns_that_are_asked_for_come_alone(table: pa.Table, data: st.DataObj
 def test_the_same_values_give_the_same_bytes_however_they_lie_in_memory(table: pa.Table, cuts: list[int]) -> None:
     edges = [0, *sorted(min(cut, table.num_rows) for cut in cuts), table.num_rows]
     pieces = [table.slice(start, stop - start) for start, stop in itertools.pairwise(edges)]
-    within = pa.concat_tables([table.slice(0, 1), table]).slice(
+    sliced = pa.concat_tables([table.slice(0, 1), table]).slice(
         min(1, table.num_rows)
     )  # begins in the middle of a buffer
     content = to_parquet(table)
     assert to_parquet(pa.concat_tables(pieces)) == content
-    assert to_parquet(within) == content
+    assert to_parquet(sliced) == content
     assert to_parquet(pq.read_table(pa.BufferReader(owned(content))).cast(table.schema)) == content
 
 
@@ -93,7 +93,7 @@ def batches_of(table: pa.Table, rows: int) -> pa.RecordBatchReader:
     return pa.RecordBatchReader.from_batches(table.schema, iter(table.to_batches(max_chunksize=rows)))
 
 
-def written(source: pa.Table | pa.RecordBatchReader) -> bytes:
+def write_parquet(source: pa.Table | pa.RecordBatchReader) -> bytes:
     sink = io.BytesIO()
     assert parquet.write(source, sink) == pq.ParquetFile(io.BytesIO(sink.getvalue())).metadata.num_rows
     return sink.getvalue()
@@ -102,16 +102,16 @@ def written(source: pa.Table | pa.RecordBatchReader) -> bytes:
 @given(tables(), st.integers(1, 1500))
 @drawn
 def test_batches_as_they_come_give_the_bytes_of_the_table_that_they_make(table: pa.Table, rows: int) -> None:
-    assert written(batches_of(table, rows)) == to_parquet(table)
+    assert write_parquet(batches_of(table, rows)) == to_parquet(table)
 
 
-@pytest.mark.parametrize("rows", [400, 401, 2000])  # that make a group of rows, one more, and many
+@pytest.mark.parametrize("rows", [400, 401, 2000])  # These rows make one group of rows, one more, and many.
 def test_groups_of_rows_are_the_same_in_batches(monkeypatch: pytest.MonkeyPatch, rows: int) -> None:
     monkeypatch.setattr(parquet, "ROW_GROUP_ROWS", 400)
-    held = np.concatenate([np.repeat(np.arange(100), 4), np.arange(1600)])[:rows]  # still at first, moving later
-    table = pa.table({"t_ns": np.arange(rows), "x": pa.array(held, pa.uint16()), "y": np.sqrt(np.arange(rows))})
+    values = np.concatenate([np.repeat(np.arange(100), 4), np.arange(1600)])[:rows]  # still at first, moving later
+    table = pa.table({"t_ns": np.arange(rows), "x": pa.array(values, pa.uint16()), "y": np.sqrt(np.arange(rows))})
     content = to_parquet(table)
-    assert all(written(batches_of(table, size)) == content for size in (1, 7, 399, 400, 3000))
+    assert all(write_parquet(batches_of(table, size)) == content for size in (1, 7, 399, 400, 3000))
     groups = pq.ParquetFile(io.BytesIO(content)).metadata
     assert [groups.row_group(number).num_rows for number in range(groups.num_row_groups)][:-1] == [400] * (
         (rows - 1) // 400
@@ -127,22 +127,22 @@ def test_rows_that_are_put_aside_on_disk_give_the_bytes_of_their_table(
     monkeypatch.setattr(row_groups, "IN_MEMORY", 0)
     monkeypatch.setattr(row_groups, "WRITE_BYTES", 5000)
     rows, rng = 1001, np.random.default_rng(0)
-    gone = rng.random(rows) < 0.2
-    gone[400:800] = False  # a whole group without a null
+    missing = rng.random(rows) < 0.2
+    missing[400:800] = False  # a whole group without a null
     table = pa.table(
         {
             "t_ns": np.arange(rows),
             "x": rng.integers(0, 50_000, rows).astype(np.uint16),
-            "y": pa.array(rng.normal(size=rows), mask=gone),
-            "z": pa.array(rng.integers(-9, 9, rows), pa.int8(), mask=gone),
+            "y": pa.array(rng.normal(size=rows), mask=missing),
+            "z": pa.array(rng.integers(-9, 9, rows), pa.int8(), mask=missing),
             "at": pa.array(np.arange(rows), pa.timestamp("us")),
-            "on": pa.array(rng.random(rows) < 0.5, mask=gone),
-            "text": pa.array([f"row {row}" for row in range(rows)], mask=gone),
+            "on": pa.array(rng.random(rows) < 0.5, mask=missing),
+            "text": pa.array([f"row {row}" for row in range(rows)], mask=missing),
         }
     )
-    assert written(batches_of(table, size)) == to_parquet(table)
-    within = batches_of(pa.concat_tables([table.slice(0, 3), table]).combine_chunks().slice(3), size)
-    assert written(within) == to_parquet(table)
+    assert write_parquet(batches_of(table, size)) == to_parquet(table)
+    sliced = batches_of(pa.concat_tables([table.slice(0, 3), table]).combine_chunks().slice(3), size)
+    assert write_parquet(sliced) == to_parquet(table)
 
 
 def test_a_disk_that_is_full_while_rows_are_put_aside_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -153,7 +153,7 @@ def test_a_disk_that_is_full_while_rows_are_put_aside_is_one_sentence(monkeypatc
 
     monkeypatch.setattr(row_groups, "write_all", full)
     with pytest.raises(StorageError, match=f"The disk under {tempfile.gettempdir()} is full"):
-        written(batches_of(pa.table({"x": np.arange(100)}), 10))
+        write_parquet(batches_of(pa.table({"x": np.arange(100)}), 10))
 
 
 def test_frames_of_many_sizes_are_grouped_alike_in_a_table_and_in_batches(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -165,13 +165,13 @@ def test_frames_of_many_sizes_are_grouped_alike_in_a_table_and_in_batches(monkey
     content = to_parquet(table)
     assert pq.ParquetFile(io.BytesIO(content)).metadata.num_row_groups > 3
     cut = pa.concat_tables([table.slice(start, 11) for start in range(0, 300, 11)])
-    assert written(cut) == content
-    assert all(written(batches_of(table, size)) == content for size in (1, 7, 50, 1000))
+    assert write_parquet(cut) == content
+    assert all(write_parquet(batches_of(table, size)) == content for size in (1, 7, 50, 1000))
 
 
 def test_what_lies_under_a_null_does_not_count() -> None:
-    known, gone = pa.array([True, False, True]), pa.array([1.5, 2.5, 3.5])
-    hidden = pa.Array.from_buffers(pa.float64(), 3, [known.buffers()[1], gone.buffers()[1]])
+    validity, values = pa.array([True, False, True]), pa.array([1.5, 2.5, 3.5])
+    hidden = pa.Array.from_buffers(pa.float64(), 3, [validity.buffers()[1], values.buffers()[1]])
     assert to_parquet(pa.table({"x": hidden})) == to_parquet(pa.table({"x": [1.5, None, 3.5]}))
 
 

@@ -1,4 +1,4 @@
-"""What is printed: no control character of what files hold, and no command ends because of a standard stream."""
+"""No control character of a file's content is printed, and no standard stream makes a command fail."""
 
 from __future__ import annotations
 
@@ -45,12 +45,12 @@ def test_what_people_write_is_shown_as_it_is(text: str) -> None:
 def hostile(lab: Lab) -> Lab:
     """A dataset whose labels, names, exclusions and params are untrusted text."""
     lab.run("simulate toy -o data/r --trials 2")
-    made = lab.manifest("data/r")
-    first, second = made.recordings
-    entry = {**made.recordings[first], "attributes": {HOSTILE.replace("\n", ""): HOSTILE, "excluded": HOSTILE}}
+    manifest = lab.manifest("data/r")
+    first, second = manifest.recordings
+    entry = {**manifest.recordings[first], "attributes": {HOSTILE.replace("\n", ""): HOSTILE, "excluded": HOSTILE}}
     forged = replace(
-        made,
-        recordings={"a\x9b31m\u202eb": made.recordings[second], first: entry},
+        manifest,
+        recordings={"a\x9b31m\u202eb": manifest.recordings[second], first: entry},
         params={"note": HOSTILE},
         skipped={HOSTILE: HOSTILE},
         labels={first: {"note": HOSTILE}},

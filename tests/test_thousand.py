@@ -20,9 +20,9 @@ STAGES = {
 
 
 def outcome(folder: Path, words: str) -> tuple[int, int]:
-    done = command(folder, f"{words} --json")
-    assert done.returncode == 0, done.stderr
-    value = json.loads(done.stdout)
+    process = command(folder, f"{words} --json")
+    assert process.returncode == 0, process.stderr
+    value = json.loads(process.stdout)
     return value["ran"], value["reused"]
 
 

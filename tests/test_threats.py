@@ -53,7 +53,7 @@ def test_no_manifest_holds_a_path_of_the_computer_or_its_name(lab: Lab) -> None:
         assert str(lab.folder) not in content and platform.node() not in content, path
     assert any(
         platform.node() in path.read_text() for path in lab.store.root.glob("records/*/*")
-    )  # which the page states
+    )  # The page states it.
 
 
 def test_a_repair_writes_nothing_where_a_root_of_another_user_points(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -61,8 +61,8 @@ def test_a_repair_writes_nothing_where_a_root_of_another_user_points(lab: Lab, m
     lab.run("scale data/r -o data/s")
     (Path("data/s/manifest.json")).write_text('{"name": "a browser extension"}')
     before = Path("data/s/manifest.json").read_bytes()
-    with monkeypatch.context() as another:
-        another.setattr(os, "getuid", lambda: 12345)
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "getuid", lambda: 12345)
         repair.repair(lab.store)
     assert Path("data/s/manifest.json").read_bytes() == before
     repair.repair(lab.store)
@@ -72,8 +72,8 @@ def test_a_repair_writes_nothing_where_a_root_of_another_user_points(lab: Lab, m
 def test_an_object_is_not_read_beyond_its_declared_size(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
     store = Store(lab.folder / ".tacpipe")
     store.prepare()
-    made = store.put(b"touch")
-    path = Path(store.object_path(made.digest))
+    stored = store.put(b"touch")
+    path = Path(store.object_path(stored.digest))
     path.unlink()
     with path.open("wb") as file:
         file.truncate(memory.AT_HAND + 1)  # sparse
@@ -83,7 +83,7 @@ def test_an_object_is_not_read_beyond_its_declared_size(lab: Lab, monkeypatch: p
 
     monkeypatch.setattr(os, "read", read)
     with pytest.raises(MissingError, match="cannot be read"):
-        store.read(made.digest, made.bytes)
+        store.read(stored.digest, stored.bytes)
 
 
 def test_a_store_is_pushed_with_the_name_of_the_host_in_its_records(lab: Lab) -> None:

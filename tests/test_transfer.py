@@ -40,10 +40,10 @@ def remote_of(lab: Lab) -> Path:
 
 def test_an_empty_clone_pulls_what_was_pushed_and_works_on_it(lab: Lab, clone: Path) -> None:
     lab.run(f"store pull {remote_of(lab)} data/s data/split data/c")
-    wanted = (lab.folder / "data/c/manifest.json").read_bytes()
-    assert Path("data/c/manifest.json").read_bytes() == wanted
+    content = (lab.folder / "data/c/manifest.json").read_bytes()
+    assert Path("data/c/manifest.json").read_bytes() == content
     assert counts(lab.run("centre data/s --split data/split -o data/again --json").out) == (0, 4)
-    assert Path("data/again/manifest.json").read_bytes() == wanted
+    assert Path("data/again/manifest.json").read_bytes() == content
     assert repair.verify(Store(clone / ".tacpipe")).clean
 
 
@@ -127,7 +127,7 @@ def collect(lab: Lab, store: Path, options: str = "") -> None:
 def snapshots(lab: Lab) -> list[tuple[str, str, str]]:
     """Return project, path and state of all that was pushed, newest first where a project pushed."""
     listed = json.loads(lab.run(f"store list --remote {lab.folder}/remote --json").out)["manifests"]
-    return [(one["project"], one["path"], one["state"]) for one in listed]
+    return [(entry["project"], entry["path"], entry["state"]) for entry in listed]
 
 
 def test_two_projects_push_the_same_path_and_each_pulls_its_own(two: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -170,12 +170,12 @@ def test_projects_of_the_same_name_are_told_apart_by_their_ids(two: Lab, monkeyp
         enter(two, f"{name}/same", monkeypatch)
         two.run(f"simulate toy -o r --trials {len(name)} --rows {len(name) + (name == 'two')}")
         two.run("store push ../../remote r")
-    named = [f"{project}:{path}" for project, path, _ in snapshots(two)]
-    assert all(re.fullmatch(r"[0-9a-f]{8}:r", one) for one in named) and len(set(named)) == 2
+    names = [f"{project}:{path}" for project, path, _ in snapshots(two)]
+    assert all(re.fullmatch(r"[0-9a-f]{8}:r", prefixed) for prefixed in names) and len(set(names)) == 2
     (two.folder / "third/.tacpipe").mkdir(parents=True)
     enter(two, "third", monkeypatch)
     assert two.call("store pull ../remote same:r").code == 2
-    two.run(f"store pull ../remote {named[0]}")
+    two.run(f"store pull ../remote {names[0]}")
 
 
 def test_a_push_onto_what_somebody_else_pushed_since_is_refused_and_erases_nothing(
@@ -195,7 +195,9 @@ def test_a_push_onto_what_somebody_else_pushed_since_is_refused_and_erases_nothi
     two.run("store push ../remote data/r --replace")
     collect(two, two.folder / "remote", "--recordings")
     assert len(snapshots(two)) == 3
-    digests = [one["manifest"] for one in json.loads(two.run("store list --remote ../remote --json").out)["manifests"]]
+    digests = [
+        entry["manifest"] for entry in json.loads(two.run("store list --remote ../remote --json").out)["manifests"]
+    ]
     labelled = set()
     for digest in digests:
         two.run(f"store checkout {digest} --remote ../remote -o back/{digest}")
@@ -228,13 +230,15 @@ def test_what_was_pushed_earlier_is_kept_by_the_stated_rule(two: Lab, monkeypatc
     assert [path for _, path, _ in snapshots(two)].count("data/i") == 3
     assert [path for _, path, _ in snapshots(two)].count("data/r") == 1 + HISTORY
     newest, middle, oldest = (
-        one["manifest"]
-        for one in json.loads(two.run("store list --remote ../remote --json").out)["manifests"]
-        if one["path"] == "data/i"
+        entry["manifest"]
+        for entry in json.loads(two.run("store list --remote ../remote --json").out)["manifests"]
+        if entry["path"] == "data/i"
     )
     collect(two, two.folder / "remote", f"--recordings --forget {newest} --forget {oldest[:12]}")
-    left = json.loads(two.run("store list --remote ../remote --json").out)["manifests"]
-    assert [(one["manifest"], one["state"]) for one in left if one["path"] == "data/i"] == [(middle, "pushed here")]
+    remaining = json.loads(two.run("store list --remote ../remote --json").out)["manifests"]
+    assert [(entry["manifest"], entry["state"]) for entry in remaining if entry["path"] == "data/i"] == [
+        (middle, "pushed here")
+    ]
     collect(two, two.folder / "remote", "--recordings --forget one:data/i --forget data/r")
     assert snapshots(two) == [] and not list((two.folder / "remote/objects").glob("*/*"))
 
@@ -268,12 +272,12 @@ def test_a_store_elsewhere_serves_projects_without_a_mark_and_no_dataset_is_a_do
     monkeypatch.chdir(folder / "a/data/r")
     lab.run(f"store push {remote} .")
     listed = json.loads(lab.run(f"store list --remote {remote} --json").out)["manifests"]
-    names = sorted(f"{one['project']}:{one['path']}" for one in listed)
+    names = sorted(f"{entry['project']}:{entry['path']}" for entry in listed)
     assert names == ["a:data/r", "a:data/s", "b:data/r", "b:data/s", "data:r"]
 
 
 @pytest.mark.parametrize(
-    ("mark", "where", "given", "name"),
+    ("mark", "working_folder", "path", "name"),
     [
         (".git", "", "data/r", "data/r"),
         (".git", "data", "r", "data/r"),
@@ -290,15 +294,15 @@ def test_a_dataset_is_named_by_its_path_within_its_project(
     tmp_path_factory: pytest.TempPathFactory,
     monkeypatch: pytest.MonkeyPatch,
     mark: str,
-    where: str,
-    given: str,
+    working_folder: str,
+    path: str,
     name: str,
 ) -> None:
     folder = tmp_path_factory.mktemp("named")
-    for made in ("data/r", "elsewhere", *([mark] if mark else [])):
-        (folder / made).mkdir(parents=True, exist_ok=True)
-    monkeypatch.chdir(folder / where)
-    assert projects.place(Path(given))[1] == name
+    for place in ("data/r", "elsewhere", *([mark] if mark else [])):
+        (folder / place).mkdir(parents=True, exist_ok=True)
+    monkeypatch.chdir(folder / working_folder)
+    assert projects.place(Path(path))[1] == name
 
 
 def as_before_projects(remote: Path, name: str) -> None:
@@ -322,10 +326,10 @@ def test_what_was_pushed_before_projects_is_pulled_and_succeeded_by_whoever_has_
     enter(two, "two", monkeypatch)
     two.run("store push ../remote data/r")  # has never had it: it stays
     assert sorted(snapshots(two)) == [("", "data/r", "pushed here"), ("two", "data/r", "pushed here")]
-    for name, wanted in (("one", ":data/r"), ("two", "data/r")):
+    for name, source in (("one", ":data/r"), ("two", "data/r")):
         (two.folder / f"of-{name}/.tacpipe").mkdir(parents=True)
         enter(two, f"of-{name}", monkeypatch)
-        two.run(f"store pull ../remote {wanted if name == 'one' else 'two:data/r'}")
+        two.run(f"store pull ../remote {source if name == 'one' else 'two:data/r'}")
         assert Path("data/r/manifest.json").read_bytes() == (two.folder / name / "data/r/manifest.json").read_bytes()
     enter(two, "one", monkeypatch)
     two.run("label data/r trial-000 --label material=foam")
@@ -372,8 +376,8 @@ def test_a_push_replaces_what_has_another_size_there(
     content = path.read_bytes()
     path.chmod(0o644)
     os.truncate(path, size)
-    done = json.loads(lab.run(f"store push {remote_of(lab)} data/s --json").out)
-    assert (done["objects"], done["replaced"], path.read_bytes()) == (1, 1, content)
+    outcome = json.loads(lab.run(f"store push {remote_of(lab)} data/s --json").out)
+    assert (outcome["objects"], outcome["replaced"], path.read_bytes()) == (1, 1, content)
 
 
 def test_a_push_that_verifies_replaces_what_has_other_bytes_there(
@@ -394,20 +398,20 @@ def test_a_push_that_verifies_replaces_what_has_other_bytes_there(
 def test_an_object_of_many_blocks_goes_over_without_being_held_in_memory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    one, two = Store(tmp_path / "one"), Store(tmp_path / "two")
-    for store in (one, two):
+    source, target = Store(tmp_path / "one"), Store(tmp_path / "two")
+    for store in (source, target):
         store.prepare()
     content = os.urandom(5 * regular.BLOCK_BYTES + 3)
-    name = one.put(content).digest
-    blocks = list(one.blocks(name, len(content)))
+    name = source.put(content).digest
+    blocks = list(source.blocks(name, len(content)))
     assert max(map(len, blocks)) == regular.BLOCK_BYTES
-    two.take(name, blocks)
-    assert two.read(name) == content
-    Path(one.object_path(name)).chmod(0o644)
-    Path(one.object_path(name)).write_bytes(content[:-1])
+    target.take(name, blocks)
+    assert target.read(name) == content
+    Path(source.object_path(name)).chmod(0o644)
+    Path(source.object_path(name)).write_bytes(content[:-1])
     with pytest.raises(MissingError, match="damaged"):
-        Store(tmp_path / "two").take(name, one.blocks(name, len(content)))
-    assert two.read(name) == content and not list((tmp_path / "two/tmp").iterdir())
+        Store(tmp_path / "two").take(name, source.blocks(name, len(content)))
+    assert target.read(name) == content and not list((tmp_path / "two/tmp").iterdir())
 
 
 def test_a_push_that_another_one_writes_over_where_nothing_locks_says_so_and_its_rerun_keeps_both(
@@ -418,18 +422,18 @@ def test_a_push_that_another_one_writes_over_where_nothing_locks_says_so_and_its
     lab.run("label data/r trial-000 --label material=foam")
     remote = Store(lab.folder / "remote")
     (before,) = remote.roots.all()
-    other, honest = "ab" * 32, Roots.push
+    other_digest, honest = "ab" * 32, Roots.push
 
-    def push(roots: Roots, *given: Any, **more: Any) -> bool:
-        honest(roots, *given, **more)
-        name, project, _, _ = given  # the other one looked before this one wrote
-        return honest(roots, name, project, other, before, lasting=False)
+    def push(roots: Roots, *arguments: Any, **options: Any) -> bool:
+        honest(roots, *arguments, **options)
+        name, project, _, _ = arguments  # the other one looked before this one wrote
+        return honest(roots, name, project, other_digest, before, lasting=False)
 
-    with monkeypatch.context() as meanwhile:
-        meanwhile.setattr(Roots, "push", push)
+    with monkeypatch.context() as patch:
+        patch.setattr(Roots, "push", push)
         ran = lab.call("store push remote data/r")
     assert ran.code == 1 and "run the same command again" in ran.err.lower()
     lab.run("store push remote data/r --replace")
     (root,) = remote.roots.all()
-    assert {root["manifest"], *(one["manifest"] for one in root["history"])} >= {other, before["manifest"]}
+    assert {root["manifest"], *(entry["manifest"] for entry in root["history"])} >= {other_digest, before["manifest"]}
     assert root["manifest"] == bytes_digest(Path("data/r/manifest.json").read_bytes())

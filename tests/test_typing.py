@@ -74,7 +74,7 @@ def checked(folder: Path, *files: Path) -> subprocess.CompletedProcess[str]:
     ]
     (folder / "mypy.ini").write_text(CONFIG)
     cache = ["--cache-dir", str(ROOT / ".mypy_cache" / "texts")]
-    environment = {**os.environ, "MYPYPATH": str(ROOT)}  # which finds the package where it is installed as editable
+    environment = {**os.environ, "MYPYPATH": str(ROOT)}  # mypy needs the path of an editable install.
     arguments = [*command, *cache, *map(str, files)]
     return subprocess.run(arguments, cwd=folder, env=environment, capture_output=True, text=True, check=False)
 
@@ -82,8 +82,10 @@ def checked(folder: Path, *files: Path) -> subprocess.CompletedProcess[str]:
 def printed() -> dict[str, str]:
     """Return every stage that a text prints, by the name of a module."""
     pages = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
-    found = [(page.stem, code) for page in pages for code in blocks(page.read_text(), "python") if "@stage(" in code]
-    return {f"{re.sub(r'[^a-z]', '_', stem.lower())}_{place}": code for place, (stem, code) in enumerate(found)}
+    stage_blocks = [
+        (page.stem, code) for page in pages for code in blocks(page.read_text(), "python") if "@stage(" in code
+    ]
+    return {f"{re.sub(r'[^a-z]', '_', stem.lower())}_{place}": code for place, (stem, code) in enumerate(stage_blocks)}
 
 
 @pytest.mark.long
@@ -93,21 +95,21 @@ def test_mypy_refuses_a_stage_called_with_wrong_arguments_and_accepts_the_right_
         text = f"{STAGE}\n\ndef bad(recording: Recording) -> None:\n    {call}\n"
         (tmp_path / f"wrong{place}.py").write_text(text)
     ran = checked(tmp_path, *sorted(tmp_path.glob("*.py")))
-    told = [line for line in ran.stdout.splitlines() if "error:" in line]
+    errors = [line for line in ran.stdout.splitlines() if "error:" in line]
     for place, kind in enumerate(WRONG.values()):
-        (line,) = (one for one in told if one.startswith(f"wrong{place}.py"))
+        (line,) = (error for error in errors if error.startswith(f"wrong{place}.py"))
         assert f"[{kind}]" in line
-    assert len(told) == len(WRONG), ran.stdout  # and none of good.py
+    assert len(errors) == len(WRONG), ran.stdout  # good.py has no error.
 
 
-def beside() -> dict[str, str]:
+def imported_modules() -> dict[str, str]:
     """Return the modules that stages of the texts import from the same page, by the name of the file."""
-    found: dict[str, str] = {}
+    modules: dict[str, str] = {}
     for page in sorted((ROOT / "docs" / "extending").glob("*.md")):
         text = page.read_text()
         if any("@stage(" in code for code in blocks(text, "python")):
-            found |= {name: code for name, code in TITLED.findall(text) if "@stage(" not in code}
-    return found
+            modules |= {name: code for name, code in TITLED.findall(text) if "@stage(" not in code}
+    return modules
 
 
 @pytest.mark.long
@@ -115,16 +117,16 @@ def test_the_stages_of_the_texts_pass_mypy_strict_as_printed(tmp_path: Path) -> 
     files = [tmp_path / f"{name}.py" for name in printed()]
     for file, code in zip(files, printed().values(), strict=True):
         file.write_text(code)
-    for name, code in beside().items():
+    for name, code in imported_modules().items():
         (tmp_path / name).write_text(code)
     ran = checked(tmp_path, *files)
     assert files and (ran.returncode, ran.stdout) == (0, "")
 
 
 def test_the_stages_of_the_texts_pass_ruff_as_printed_with_the_rules_of_the_project() -> None:
-    found = printed()
-    assert found
-    for name, code in found.items():
+    stages = printed()
+    assert stages
+    for name, code in stages.items():
         for arguments in (["check"], ["format", "--check"]):
             command = [
                 sys.executable,

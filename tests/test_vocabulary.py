@@ -16,7 +16,7 @@ def test_the_quantities_of_the_page_of_formats_are_the_vocabulary() -> None:
 
 
 @pytest.mark.parametrize(
-    ("word", "meant"),
+    ("word", "symbol"),
     [
         ("Newton", "N"),
         ("counts", "count"),
@@ -26,10 +26,10 @@ def test_the_quantities_of_the_page_of_formats_are_the_vocabulary() -> None:
         ("rad/s", "rad/s"),
     ],
 )
-def test_a_unit_that_is_spelled_out_is_suggested_as_its_symbol(word: str, meant: str) -> None:
-    assert vocabulary.unit_from_text(word) == meant
+def test_a_unit_that_is_spelled_out_is_suggested_as_its_symbol(word: str, symbol: str) -> None:
+    assert vocabulary.unit_from_text(word) == symbol
     assert vocabulary.describe_unknown_unit(word) == (
-        "" if word == meant else f"There is no unit {word}. Did you mean {meant}?"
+        "" if word == symbol else f"There is no unit {word}. Did you mean {symbol}?"
     )
 
 

@@ -37,14 +37,14 @@ def test_a_run_settles_its_output_in_one_call() -> None:
 
 
 def test_identities_are_built_in_one_place() -> None:
-    found = {
+    modules_with_identities = {
         name
         for name, tree in modules()
         for node in ast.walk(tree)
         if isinstance(node, ast.Dict)
         and {key.value for key in node.keys if isinstance(key, ast.Constant)} == PARTS_OF_AN_IDENTITY
     }
-    assert found == {"engine/keys.py"}
+    assert modules_with_identities == {"engine/keys.py"}
 
 
 def test_datasets_and_the_store_know_nothing_of_the_engine_not_even_its_types() -> None:

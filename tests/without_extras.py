@@ -39,29 +39,33 @@ def normal(name: str) -> str:
 
 def core() -> set[str]:
     """Return the packages that `pip install tacpipe` brings where no extra is named."""
-    found: set[str] = set()
+    names: set[str] = set()
     waiting = [TACPIPE]
     while waiting:
         name = normal(waiting.pop())
-        if name in found:
+        if name in names:
             continue
-        found.add(name)
+        names.add(name)
         try:
             texts = distribution(name).requires or []
-        except PackageNotFoundError:  # of another platform
+        except PackageNotFoundError:  # Other platforms need this package.
             continue
-        wanted = [Requirement(text) for text in texts]
-        waiting += [one.name for one in wanted if one.marker is None or one.marker.evaluate({"extra": ""})]
-    return found
+        requirements = [Requirement(text) for text in texts]
+        waiting += [
+            requirement.name
+            for requirement in requirements
+            if requirement.marker is None or requirement.marker.evaluate({"extra": ""})
+        ]
+    return names
 
 
 def hidden() -> set[str]:
     """Return the modules that only other packages bring."""
-    there = core() | set(KEPT)
+    installed = core() | set(KEPT)
     return {
         module
         for module, packages in packages_distributions().items()
-        if not there & {normal(name) for name in packages} and module not in sys.stdlib_module_names
+        if not installed & {normal(name) for name in packages} and module not in sys.stdlib_module_names
     }
 
 
