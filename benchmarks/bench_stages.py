@@ -36,7 +36,7 @@ def make(params: Make, trial: Trial) -> RecordingOutput:
 
 @dataclass(frozen=True)
 class Add:
-    """What to add."""
+    """Params of the stage that adds a count."""
 
     count: int = 1  # added to the first channel; another value is another result
 
@@ -54,12 +54,12 @@ def add(params: Add, recording: Recording) -> pa.Table:
 
 @dataclass(frozen=True)
 class Long:
-    """What to make."""
+    """Params of the simulation of long recordings."""
 
     trials: int = 100  # recordings
     rows: int = 300_000  # rows of each
     kind: str = "moving"  # moving: integers of a skin; float: as after synchronize
-    channels: int = 48  # of a skin of 16 taxels
+    channels: int = 48  # a skin of 16 taxels has 48
 
 
 @stage(version=1)

@@ -89,8 +89,8 @@ def _unchanged_chain(place: Path, rounds: int) -> list[timing.Line]:
 
     contestants = {"tacpipe": tacpipe, "tacpipe run": chain, "dvc repro": dvc}
     times = timing.interleaved(contestants, max(5, rounds // 2))
-    what = f"nothing to do in a chain of {len(COMMANDS)} commands"
+    case = f"nothing to do in a chain of {len(COMMANDS)} commands"
     return [
-        timing.at_most(f"{what}, one process each", times, "tacpipe", "dvc repro"),
-        timing.at_most(f"{what}, `tacpipe run dvc.yaml`", times, "tacpipe run", "dvc repro", 1.0),
+        timing.at_most(f"{case}, one process each", times, "tacpipe", "dvc repro"),
+        timing.at_most(f"{case}, `tacpipe run dvc.yaml`", times, "tacpipe run", "dvc repro", 1.0),
     ]

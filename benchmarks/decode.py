@@ -1,4 +1,4 @@
-"""From bytes to samples, beside the vendors' own parsers on the same bytes.
+"""Measure decoding from bytes to samples, next to the vendors' own parsers on the same bytes.
 
 Ours is the framer and `decode`; the vendors' are fed through an object in place of the serial port, and called as their
 users call them. In bulk we get all bytes at once, as when a recording is sealed; live, in pieces of a tenth of a second at
@@ -42,21 +42,21 @@ FRAMES, PIECE_S, AIM = 2000, 0.1, 10.0
 
 
 class Port:
-    """What vendors read from in place of a serial port; ``most`` bytes can be had at a time."""
+    """Bytes in place of a serial port for vendors' code; at most ``piece_bytes`` can be read at a time."""
 
     is_open, timeout = True, 0.05
 
-    def __init__(self, data: bytes, most: int) -> None:
-        self.data, self.place, self.most = data, 0, most
+    def __init__(self, data: bytes, piece_bytes: int) -> None:
+        self.data, self.place, self.piece_bytes = data, 0, piece_bytes
 
     @property
     def in_waiting(self) -> int:
-        return min(self.most, len(self.data) - self.place)
+        return min(self.piece_bytes, len(self.data) - self.place)
 
     def read(self, size: int = 1) -> bytes:
-        found = self.data[self.place : self.place + min(size, self.most)]
-        self.place += len(found)
-        return found
+        piece = self.data[self.place : self.place + min(size, self.piece_bytes)]
+        self.place += len(piece)
+        return piece
 
     def read_until(self, expected: bytes = b"\n") -> bytes:
         stop = self.data.find(expected, self.place)
@@ -93,11 +93,11 @@ class Contest:
     name: str
     sensor: Sensor
     frames: Any  # (frame, byte), or lines
-    vendor: Callable[[bytes, int], AnyArray]  # of all bytes and how many come in a piece
+    vendor: Callable[[bytes, int], AnyArray]  # Arguments: all bytes, and how many come in a piece.
     ours: Callable[[Samples], AnyArray]  # the numbers of samples as the vendor gives them
 
     packets: bool = False  # a link gives the frames one by one
-    forget: Callable[[], object] = dict  # what the driver keeps of texts, so that each round reads them anew
+    forget: Callable[[], object] = dict  # Clears what the driver caches of texts, so that each round reads them anew.
 
     @functools.cached_property
     def data(self) -> bytes:
@@ -109,8 +109,8 @@ class Contest:
         """How many frames come in a piece."""
         return max(1, int(self.sensor.rate_hz * PIECE_S))
 
-    def given(self, count: int) -> Iterator[Chunks]:
-        """Yield what a link gives of so many frames at a time."""
+    def read_pieces(self, count: int) -> Iterator[Chunks]:
+        """Yield what a link delivers of so many frames at a time."""
         if self.packets:
             for start in range(0, FRAMES, count):
                 yield Chunks.of(enumerate(self.frames[start : start + count]))
@@ -122,13 +122,13 @@ class Contest:
     def read(self, count: int) -> AnyArray:
         """Return what our driver makes of the bytes of so many frames at a time."""
         self.forget()
-        framer, found = self.sensor.framer(), []
-        for chunks in self.given(count):
+        framer, decoded = self.sensor.framer(), []
+        for chunks in self.read_pieces(count):
             runs, _ = framer.feed(chunks)
-            found += [self.sensor.decode(run.frames) for run in runs]
+            decoded += [self.sensor.decode(run.frames) for run in runs]
         runs, _ = framer.flush()
-        found += [self.sensor.decode(run.frames) for run in runs]
-        columns = zip(*(samples.values for samples in found), strict=True)
+        decoded += [self.sensor.decode(run.frames) for run in runs]
+        columns = zip(*(samples.values for samples in decoded), strict=True)
         return self.ours(Samples(tuple(np.concatenate(blocks) for blocks in columns)))
 
 
@@ -155,15 +155,15 @@ def _measure(contest: Contest, rounds: int) -> Iterator[timing.Line]:
         rounds,
     )
     for name in ("bulk", "live"):
-        found = timing.ratio(times, "vendor", name)
+        speedup = timing.ratio(times, "vendor", name)
         aim = AIM if name == "bulk" else None
         yield timing.Line(
             f"{contest.name}, {'in bulk' if name == 'bulk' else f'{live} frames at a time'}",
             _rate(timing.median(times, name)),
             f"vendor: {_rate(timing.median(times, 'vendor'))}",
-            f"{found:.1f} times as fast",
+            f"{speedup:.1f} times as fast",
             "" if aim is None else f"{aim:g} times as fast",
-            None if aim is None else found >= aim,
+            None if aim is None else speedup >= aim,
         )
 
 
@@ -177,8 +177,8 @@ HEADLESS = ("anyskin", "anyskin, ASCII")  # the first frame is lost: where it be
 def contests() -> list[Contest]:
     """Return what is measured, each with frames of random numbers."""
     rng = np.random.default_rng(0)
-    made = [_flexitac(rng), _anyskin(rng, "binary"), _anyskin(rng, "ascii"), _optoforce(rng)]
-    return [*made, _paxini(rng), _robotiq(rng), _modbus(rng), _kuka(rng)]
+    first_contests = [_flexitac(rng), _anyskin(rng, "binary"), _anyskin(rng, "ascii"), _optoforce(rng)]
+    return [*first_contests, _paxini(rng), _robotiq(rng), _modbus(rng), _kuka(rng)]
 
 
 def _flexitac(rng: np.random.Generator) -> Contest:
@@ -187,7 +187,7 @@ def _flexitac(rng: np.random.Generator) -> Contest:
 
     def vendor(data: bytes, size: int) -> AnyArray:
         client = FlexiTacSensor("nowhere", baseline=0.0)
-        client._serial = Port(data, 386)  # what it reads beyond a frame piles up until it throws it away
+        client._serial = Port(data, 386)  # The bytes that it reads beyond a frame pile up until it throws them away.
         return np.stack([client.read().raw.ravel() for _ in range(FRAMES)])
 
     return Contest("flexitac", sensor, sensor.encode(Samples((taxels,))), vendor, lambda samples: samples.values[0])
@@ -236,13 +236,13 @@ def _paxini(rng: np.random.Generator) -> Contest:
 
     def vendor(data: bytes, size: int) -> AnyArray:
         transport = SerialTransport("nowhere")
-        transport._ser, found = Port(data, len(data) // FRAMES), []
+        transport._ser, frames_of_triples = Port(data, len(data) // FRAMES), []
         for _ in range(FRAMES):
             parsed = protocol.parse_auto_push(transport.read_auto_push_frame())
             frame = AutoPushFrame(config, parsed.error_code, parsed.valid_data, parsed.raw)
             forces, points = frame.resultant_forces, frame.distributed_forces
-            found.append([triple for name in forces for triple in (forces[name], *points[name])])
-        triples = np.array(found)  # (frame, point, axis)
+            frames_of_triples.append([triple for name in forces for triple in (forces[name], *points[name])])
+        triples = np.array(frames_of_triples)  # (frame, point, axis)
         return np.hstack([triples[:, :, :2].reshape(FRAMES, -1), triples[:, :, 2]])
 
     samples = Samples((np.zeros((FRAMES, 1), dtype=np.uint8), signed, unsigned))
@@ -251,7 +251,7 @@ def _paxini(rng: np.random.Generator) -> Contest:
         sensor,
         sensor.encode(samples),
         vendor,
-        lambda samples: np.hstack([each.astype(int) for each in samples.values[1:]]),
+        lambda samples: np.hstack([forces_and_points.astype(int) for forces_and_points in samples.values[1:]]),
     )
 
 
@@ -262,12 +262,12 @@ def _robotiq(rng: np.random.Generator) -> Contest:
     clocks = (np.arange(FRAMES, dtype=np.uint64)[:, None] * np.uint64(10_000)).repeat(2, axis=1)
 
     def vendor(data: bytes, size: int) -> AnyArray:
-        parser, found = PacketParser(), []
+        parser, taxels_of_frames = PacketParser(), []
         for place in range(0, len(data), size):
             for packet in parser.feed(data[place : place + size]):
                 parser.parse_sensor_packet(packet)
-                found.append([*parser.fingers[0].static_tactile, *parser.fingers[1].static_tactile])
-        return np.array(found)
+                taxels_of_frames.append([*parser.fingers[0].static_tactile, *parser.fingers[1].static_tactile])
+        return np.array(taxels_of_frames)
 
     frames = sensor.encode(Samples((taxels, signed, clocks)))
     return Contest("robotiq", sensor, frames, vendor, lambda samples: samples.values[0])
@@ -288,9 +288,9 @@ def _modbus(rng: np.random.Generator) -> Contest:
 
 def _kuka(rng: np.random.Generator) -> Contest:
     sensor = KukaRsi()
-    still = np.broadcast_to(np.array([0.0, 0, 0, 1]), (FRAMES, 4))
+    no_rotation = np.broadcast_to(np.array([0.0, 0, 0, 1]), (FRAMES, 4))
     joints_rad = rng.uniform(-3, 3, (FRAMES, 6))
-    poses = np.hstack([rng.uniform(-2, 2, (FRAMES, 3)), still])
+    poses = np.hstack([rng.uniform(-2, 2, (FRAMES, 3)), no_rotation])
     frames = sensor.encode(Samples((poses, joints_rad), seq=4 * np.arange(FRAMES)))
 
     def vendor(data: bytes, size: int) -> AnyArray:
@@ -299,11 +299,11 @@ def _kuka(rng: np.random.Generator) -> Contest:
             "AIPos": {f"A{n}": 0.0 for n in range(1, 7)},
             "IPOC": 0,
         }
-        parser, told, found = FastXMLParser(blank), dict(blank), []
+        parser, parsed, angles_deg = FastXMLParser(blank), dict(blank), []
         for frame in frames:
-            parser.parse(frame.decode(), told)
-            found.append([*told["AIPos"].values()])
-        return np.radians(found)
+            parser.parse(frame.decode(), parsed)
+            angles_deg.append([*parsed["AIPos"].values()])
+        return np.radians(angles_deg)
 
     forget = kuka_rsi._table.cache_clear
     return Contest("kuka-rsi", sensor, frames, vendor, lambda samples: samples.values[1], packets=True, forget=forget)

@@ -42,8 +42,8 @@ def _line(folder: Path, rounds: int, batch: int, latents: int) -> timing.Line:
 
     times = timing.interleaved({"tacpipe": epoch, "plain loop": lambda: next(plain)}, rounds)
     ours, plain_rate = (f"{WINDOWS / timing.median(times, name):.0f} windows/s" for name in times)
-    what = f"training, batch {batch}, {latents} latents, {torch.get_num_threads()} threads"
-    return timing.faster(what, times, "tacpipe", "plain loop", 2, (ours, plain_rate))
+    case = f"training, batch {batch}, {latents} latents, {torch.get_num_threads()} threads"
+    return timing.faster(case, times, "tacpipe", "plain loop", 2, (ours, plain_rate))
 
 
 class _Plain(nn.Module):
@@ -58,12 +58,12 @@ class _Plain(nn.Module):
     def forward(self, past: Tensor, plan: Tensor) -> Tensor:
         _, (hidden, cell) = self.encoder(past)
         state = hidden[0], cell[0]
-        predicted, found = past[-1, :, : self.head.out_features], []
+        predicted, predictions = past[-1, :, : self.head.out_features], []
         for planned in plan:
             state = self.decoder(torch.cat([predicted, planned], dim=1), state)
             predicted = self.head(state[0])
-            found.append(predicted)
-        return torch.stack(found)
+            predictions.append(predicted)
+        return torch.stack(predictions)
 
 
 def _plain_epochs(first: dict[str, Tensor], rows: Tensor, batch: int, latents: int) -> Iterator[None]:
@@ -93,7 +93,7 @@ def _check(first: dict[str, Tensor], rows: Tensor, latents: int) -> None:
         optimiser = torch.optim.Adam(model.parameters(), lr=1e-3, fused=fused)
         loss, count = _loss(rows, latents), len(rows) - CONTEXT - HORIZON
         indices = torch.arange(count).chunk(8)
-        losses.append([_step(model, optimiser, loss(model, some)) for some in indices])
+        losses.append([_step(model, optimiser, loss(model, window_indices)) for window_indices in indices])
     difference = max(abs(a - b) for a, b in zip(*losses, strict=True))
     if difference > 1e-5:
         raise SystemExit(f"The losses of the two training loops differ by {difference}.")

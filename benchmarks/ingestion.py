@@ -59,10 +59,10 @@ def _csv(folder: Path, rounds: int) -> list[timing.Line]:
         },
         rounds,
     )
-    what = f"a CSV of {CSV_ROWS:,} rows and {CSV_COLUMNS + 1} columns"
+    case = f"a CSV of {CSV_ROWS:,} rows and {CSV_COLUMNS + 1} columns"
     return [
-        timing.at_most(f"{what}: read and checked", times, "batches", "pyarrow", 2.0),
-        timing.at_most(f"{what}: tacpipe ingest table", times, "ingest", "pyarrow"),
+        timing.at_most(f"{case}: read and checked", times, "batches", "pyarrow", 2.0),
+        timing.at_most(f"{case}: tacpipe ingest table", times, "ingest", "pyarrow"),
     ]
 
 
@@ -107,7 +107,7 @@ def _arrays(folder: Path, rounds: int) -> list[timing.Line]:
         (f"{DEMOS} episodes of {ROWS} rows in Zarr", "zarr", replay, partial(_read_zarr, replay / "replay.zarr")),
     ]
     lines = []
-    for what, kind, place, plain in cases:
+    for case, kind, place, plain in cases:
         library = {"hdf5": "h5py", "zarr": "zarr"}[kind]
         contestants: dict[str, Callable[[], object]] = {
             library: plain,
@@ -116,8 +116,8 @@ def _arrays(folder: Path, rounds: int) -> list[timing.Line]:
             f"{library} and pandas": partial(plain, write=True),
         }
         times = timing.interleaved(contestants, rounds)
-        lines.append(timing.at_most(f"{what}: read", times, "tables", library))
-        lines.append(timing.at_most(f"{what}: read and written as Parquet", times, "Parquet", f"{library} and pandas"))
+        lines.append(timing.at_most(f"{case}: read", times, "tables", library))
+        lines.append(timing.at_most(f"{case}: read and written as Parquet", times, "Parquet", f"{library} and pandas"))
     return lines
 
 
@@ -199,8 +199,8 @@ def _bags(folder: Path, rounds: int) -> list[timing.Line]:
             "rosbags, deserialized": partial(_deserialize_messages, path),
         }
         times = timing.interleaved(contestants, rounds)
-        what = f"a bag of {BAG_S} s, {storage.name.lower()}"
-        lines += [timing.at_most(what, times, "columns", peer) for peer in contestants if peer != "columns"]
+        case = f"a bag of {BAG_S} s, {storage.name.lower()}"
+        lines += [timing.at_most(case, times, "columns", peer) for peer in contestants if peer != "columns"]
     return lines
 
 

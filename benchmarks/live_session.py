@@ -33,8 +33,8 @@ from tacpipe.simulation.emulation.world import World
 from tacpipe.tasks.forward.live.demo import EFFORT, SEED, SWITCH_S, send_plans
 
 RIG = Path(__file__).parents[1] / "rigs/first-paper.toml"
-LOOK_S = 2.0  # between two looks at memory
-SETTLED_S = 20.0  # after the start, from which memory is compared
+LOOK_S = 2.0  # Pause between two looks at memory.
+SETTLED_S = 20.0  # Time after the start from which memory is compared.
 
 
 def memory_mb(process: int) -> float:
@@ -49,19 +49,21 @@ def memory_mb(process: int) -> float:
 def models(process: int) -> list[int]:
     """Return the model's process of a session."""
     try:
-        found = Path(f"/proc/{process}/task/{process}/children").read_text().split()
-        return [int(one) for one in found if b"tacpipe.live.process" in Path(f"/proc/{one}/cmdline").read_bytes()]
+        children = Path(f"/proc/{process}/task/{process}/children").read_text().split()
+        return [
+            int(child) for child in children if b"tacpipe.live.process" in Path(f"/proc/{child}/cmdline").read_bytes()
+        ]
     except OSError:
         return []
 
 
-def watched(session: subprocess.Popen[str], found: dict[str, list[tuple[float, float]]]) -> None:
+def watched(session: subprocess.Popen[str], memory_mb_over_time: dict[str, list[tuple[float, float]]]) -> None:
     """Add the memory of a session's processes to ``found`` until it ends."""
     began_s = time.monotonic()
     while session.poll() is None:
         now_s = time.monotonic() - began_s
-        found["recorder"].append((now_s, memory_mb(session.pid)))
-        found["model"].append((now_s, sum(map(memory_mb, models(session.pid)))))
+        memory_mb_over_time["recorder"].append((now_s, memory_mb(session.pid)))
+        memory_mb_over_time["model"].append((now_s, sum(map(memory_mb, models(session.pid)))))
         time.sleep(LOOK_S)
 
 
@@ -75,8 +77,8 @@ def run(arguments: argparse.Namespace, folder: Path) -> tuple[dict[str, Any], di
         (folder / "emulated" / "rig.toml").write_text(rigs.to_toml(emulator.rig))
         gc.collect()
         gc.disable()  # a collection of the emulator's memory stops what a real rig would not stop
-        ended = threading.Event()
-        planner = threading.Thread(target=send_plans, args=(emulator, port, ended), daemon=True)
+        session_ended = threading.Event()
+        planner = threading.Thread(target=send_plans, args=(emulator, port, session_ended), daemon=True)
         planner.start()
         words = ["live", str(folder / "emulated" / "rig.toml"), "--model", str(arguments.model), "--quiet", "--json"]
         words += [
@@ -95,17 +97,17 @@ def run(arguments: argparse.Namespace, folder: Path) -> tuple[dict[str, Any], di
         watcher = threading.Thread(target=watched, args=(session, memory), daemon=True)
         watcher.start()
         printed, _ = session.communicate()
-        ended.set()
+        session_ended.set()
         planner.join()
     return json.loads(printed), memory
 
 
 def quantiles(name: str, values: Any) -> str:
     """Return a row of the table."""
-    known = np.asarray(values, np.float64)
-    known = known[np.isfinite(known)]
-    ends = " | ".join(f"{np.quantile(known, part):.1f}" for part in (0.5, 0.9, 0.99, 0.999, 1.0))
-    return f"| {name} | {ends} | {(known > 10).mean() * 100:.2f} | {(known > 20).mean() * 100:.2f} |"
+    finite = np.asarray(values, np.float64)
+    finite = finite[np.isfinite(finite)]
+    ends = " | ".join(f"{np.quantile(finite, part):.1f}" for part in (0.5, 0.9, 0.99, 0.999, 1.0))
+    return f"| {name} | {ends} | {(finite > 10).mean() * 100:.2f} | {(finite > 20).mean() * 100:.2f} |"
 
 
 def main() -> None:
@@ -132,8 +134,8 @@ def main() -> None:
         if busy is not None:
             busy.terminate()
             busy.wait()
-    found = tacpipe.open(folder / "live")
-    latency = found[max(found.recordings)].table("latency")
+    dataset = tacpipe.open(folder / "live")
+    latency = dataset[max(dataset.recordings)].table("latency")
     print("| ms | median | 90 % | 99 % | 99.9 % | largest | % above 10 | % above 20 |")
     print("| --- | --- | --- | --- | --- | --- | --- | --- |")
     total, compute = (latency.column(name).to_numpy() for name in ("latency_ms", "compute_ms"))
@@ -142,10 +144,10 @@ def main() -> None:
     print(quantiles("of it waiting, settling, publishing", total - compute))
     live = {name: value for name, value in printed["live"].items() if not isinstance(value, dict)}
     print(json.dumps(live))
-    for one in printed["recordings"]:
-        print(json.dumps(one)[:400])
-    for name, several in memory.items():
-        settled = [mb for at_s, mb in several if SETTLED_S <= at_s < chosen.seconds and mb]
+    for recording in printed["recordings"]:
+        print(json.dumps(recording)[:400])
+    for name, memory_mb_at in memory.items():
+        settled = [mb for at_s, mb in memory_mb_at if SETTLED_S <= at_s < chosen.seconds and mb]
         if len(settled) > 1:
             print(
                 f"MB of the {name}: {settled[0]:.0f} at first, {settled[-1]:.0f} at the end, {max(settled):.0f} at most"

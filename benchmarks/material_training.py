@@ -43,8 +43,8 @@ def measure(folder: Path, rounds: int) -> list[timing.Line]:
 
     times = timing.interleaved({"tacpipe": epoch, "plain loop": lambda: next(plain)}, max(3, rounds // 4))
     ours, plain_s = (f"{timing.median(times, name):.2f} s per epoch" for name in times)
-    what = f"joint training, {SLIDES} slides of BioTac and RoboSkin each, {torch.get_num_threads()} threads"
-    return [timing.faster(what, times, "tacpipe", "plain loop", 3, (ours, plain_s)), _minirocket(felt)]
+    case = f"joint training, {SLIDES} slides of BioTac and RoboSkin each, {torch.get_num_threads()} threads"
+    return [timing.faster(case, times, "tacpipe", "plain loop", 3, (ours, plain_s)), _minirocket(felt)]
 
 
 class _Plain(nn.Module):
@@ -72,13 +72,13 @@ class _Plain(nn.Module):
             features = maps.reshape(slides, steps, -1)
         _, (hidden, _) = self.encoder(features)
         latents = self.to_latents(hidden[0])
-        begun = self.from_latents(latents)[None]
-        states, _ = self.decoder(torch.zeros(slides, steps, 1), (begun, torch.zeros_like(begun)))
-        again = self.to_features(states)
+        decoder_state = self.from_latents(latents)[None]
+        states, _ = self.decoder(torch.zeros(slides, steps, 1), (decoder_state, torch.zeros_like(decoder_state)))
+        decoded = self.to_features(states)
         if self.grid:
-            maps = nn.functional.interpolate(again.reshape(-1, 3, 2, 3), scale_factor=2.0)
-            again = torch.relu(self.deconv(maps)).reshape(slides, steps, channels)
-        return latents, self.classifier(latents), again
+            maps = nn.functional.interpolate(decoded.reshape(-1, 3, 2, 3), scale_factor=2.0)
+            decoded = torch.relu(self.deconv(maps)).reshape(slides, steps, channels)
+        return latents, self.classifier(latents), decoded
 
 
 class _Paired(Dataset[tuple[Tensor, ...]]):
@@ -91,7 +91,7 @@ class _Paired(Dataset[tuple[Tensor, ...]]):
         return SLIDES
 
     def __getitem__(self, index: int) -> tuple[Tensor, ...]:
-        return (*(one.frames[index] for one in self.felt.values()), self.felt["biotac"].classes[index])
+        return (*(slides.frames[index] for slides in self.felt.values()), self.felt["biotac"].classes[index])
 
 
 def _plain_epochs(first: Mapping[str, Tensor], felt: Mapping[str, ScaledSlides]) -> Iterator[None]:
@@ -106,10 +106,12 @@ def _plain_epochs(first: Mapping[str, Tensor], felt: Mapping[str, ScaledSlides])
 
 def _plain_loss(models: nn.ModuleDict, frames: list[Tensor], classes: Tensor) -> Tensor:
     total, latents = torch.zeros(()), []
-    for model, one in zip(models.values(), frames, strict=True):
-        z, scores, again = model(one)
+    for model, sensor_frames in zip(models.values(), frames, strict=True):
+        z, scores, decoded = model(sensor_frames)
         latents.append(z)
-        total = total + nn.functional.cross_entropy(scores, classes) + 0.01 * nn.functional.mse_loss(again, one)
+        total = (
+            total + nn.functional.cross_entropy(scores, classes) + 0.01 * nn.functional.mse_loss(decoded, sensor_frames)
+        )
     return total + nn.functional.mse_loss(*latents)
 
 
@@ -122,12 +124,12 @@ def _check(first: Mapping[str, Tensor], felt: Mapping[str, ScaledSlides]) -> Non
     for model, fused in ((ours, True), (plain, False)):
         optimiser = torch.optim.Adam(model.parameters(), lr=RATE, fused=fused)
         losses.append([])
-        for some in rows:
+        for slide_indices in rows:
             if model is ours:
-                loss, _ = work.loss(ours, dict.fromkeys(felt, some), 0)
+                loss, _ = work.loss(ours, dict.fromkeys(felt, slide_indices), 0)
             else:
-                frames = [one.frames[some] for one in felt.values()]
-                loss = _plain_loss(plain, frames, felt["biotac"].classes[some])
+                frames = [slides.frames[slide_indices] for slides in felt.values()]
+                loss = _plain_loss(plain, frames, felt["biotac"].classes[slide_indices])
             losses[-1].append(_step(optimiser, loss))
     difference = max(abs(a - b) / abs(b) for a, b in zip(*losses, strict=True))
     if difference > 1e-5:
@@ -144,14 +146,14 @@ def _step(optimiser: torch.optim.Optimizer, loss: Tensor) -> float:
 def _minirocket(felt: Mapping[str, ScaledSlides]) -> timing.Line:
     """Return how long the MiniRocket classifier takes to fit the slides of both sensors."""
     seconds = {}
-    for name, one in felt.items():
-        begun = time.perf_counter()
-        MinirocketClassifier.fit(one.frames.numpy(), one.classes.numpy())
-        seconds[name] = time.perf_counter() - begun
+    for name, slides in felt.items():
+        start_s = time.perf_counter()
+        MinirocketClassifier.fit(slides.frames.numpy(), slides.classes.numpy())
+        seconds[name] = time.perf_counter() - start_s
     worst = max(seconds.values())
-    told = " and ".join(f"{value:.1f} s ({name})" for name, value in seconds.items())
+    seconds_by_sensor = " and ".join(f"{value:.1f} s ({name})" for name, value in seconds.items())
     return timing.Line(
-        f"MiniRocket classifier, {SLIDES} slides fitted", told, "–", "", f"{FIT_S:.0f} s", worst <= FIT_S
+        f"MiniRocket classifier, {SLIDES} slides fitted", seconds_by_sensor, "–", "", f"{FIT_S:.0f} s", worst <= FIT_S
     )
 
 
@@ -167,8 +169,8 @@ def _felt(name: str) -> ScaledSlides:
 
 
 def _work(felt: Mapping[str, ScaledSlides]) -> JointWork:
-    one_each = {name: ScaledSlides(one.frames[:1], one.classes[:1]) for name, one in felt.items()}
-    return JointWork(felt, one_each, Pairs({name: one.classes for name, one in felt.items()}, BATCH), WEIGHTS)
+    one_each = {name: ScaledSlides(slides.frames[:1], slides.classes[:1]) for name, slides in felt.items()}
+    return JointWork(felt, one_each, Pairs({name: slides.classes for name, slides in felt.items()}, BATCH), WEIGHTS)
 
 
 def _ours() -> nn.ModuleDict:

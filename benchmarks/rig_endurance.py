@@ -32,12 +32,12 @@ from tacpipe.testing import matching
 BIN = Path(sys.executable).parent
 TICKS = os.sysconf("SC_CLK_TCK")
 LOOK_S = 5.0
-SETTLED_S = 15.0  # after which memory should not grow
+SETTLED_S = 15.0  # Memory should not grow after this time.
 
 
 @dataclass(frozen=True)
 class Look:
-    """What the kernel says of a process at a moment."""
+    """The kernel's figures of a process at a moment."""
 
     at_s: float
     processor_s: float
@@ -102,10 +102,10 @@ def main() -> None:
         (shard,) = recordings.recordings.values()
         first, last = looks[0], looks[-1]
         share = (last.processor_s - first.processor_s) / (last.at_s - first.at_s)
-        settled = [one.resident_mb for one in looks if one.at_s - first.at_s > SETTLED_S]
+        settled = [look.resident_mb for look in looks if look.at_s - first.at_s > SETTLED_S]
         print(f"recorded {seconds:g} s: {100 * share:.1f} % of one core")
-        told = f"{max(settled):.0f} MB at most, {settled[-1]:.0f} MB at the end"
-        print(f"resident memory: {settled[0]:.0f} MB after {SETTLED_S:g} s, {told}")
+        memory_figures = f"{max(settled):.0f} MB at most, {settled[-1]:.0f} MB at the end"
+        print(f"resident memory: {settled[0]:.0f} MB after {SETTLED_S:g} s, {memory_figures}")
         sealing_s = sealed.at_s - first.at_s - seconds
         print(f"sealing: about {sealing_s:.0f} s more, {sealed.most_mb:.0f} MB at most, pages of the spool included")
         for stream in shard.streams:

@@ -47,16 +47,16 @@ USUAL = Faults(
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a sensor's frames under faults."""
+    """Counts of a sensor's frames under faults."""
 
     name: str
     harmed: dict[str, int]
     sent: int  # samples that went out unharmed
-    given: int  # samples that the driver gave
-    wrong: int  # of them that were never sent, and that the protocol could have told
-    invisible: int  # of them of frames whose harm the protocol cannot tell
+    delivered: int  # samples that the driver gave
+    wrong: int  # delivered samples that were never sent, and that the protocol could have detected
+    invisible: int  # delivered samples of frames whose harm the protocol cannot detect
     lost: int  # samples between the first and the last given that were not, harmed or not sent
-    told: int  # that the driver says were lost
+    reported_lost: int  # samples that the driver reports as lost
     longest: int  # unharmed frames in a row right behind a disturbance that were not given
     causes: dict[str, int]
 
@@ -89,7 +89,7 @@ def outcome(name: str, seconds: float, faults: Faults) -> Outcome:
             if size:
                 batches.append(reading.feed(_chunks(item, packets=packets)))
     batches.append(reading.finish())
-    return _held(name, ledger, batches, reading, dict(harmed))
+    return _compare_with_sent(name, ledger, batches, reading, dict(harmed))
 
 
 def _chunks(item: Item, *, packets: bool) -> Chunks:
@@ -99,39 +99,41 @@ def _chunks(item: Item, *, packets: bool) -> Chunks:
     return Chunks.of([(item.due_ns, piece) for piece in pieces])
 
 
-def _held(name: str, ledger: Ledger, batches: list[Batch], reading: Reading, harmed: dict[str, int]) -> Outcome:
+def _compare_with_sent(
+    name: str, ledger: Ledger, batches: list[Batch], reading: Reading, harmed: dict[str, int]
+) -> Outcome:
     """Hold samples against what was sent: in the order of their sending, by all that they say."""
     sent = ledger.samples()
     assert sent.rows is not None
-    whole = ledger.whole
-    wanted = _keys(sent, reading)
+    unharmed = ledger.whole
+    sent_keys = _keys(sent, reading)
     places: dict[bytes, list[int]] = {}
-    for place, key in enumerate(wanted):
+    for place, key in enumerate(sent_keys):
         places.setdefault(key, []).append(place)
-    given = np.zeros(len(wanted), dtype=bool)
+    delivered = np.zeros(len(sent_keys), dtype=bool)
     wrong, last = 0, -1
-    found = [key for batch in batches if len(batch) for key in _keys(batch, reading)]
-    for key in found:
-        there = places.get(key, [])
-        if not there:
+    delivered_keys = [key for batch in batches if len(batch) for key in _keys(batch, reading)]
+    for key in delivered_keys:
+        candidates = places.get(key, [])
+        if not candidates:
             wrong += 1
             continue
-        place = min(there, key=lambda one: abs(one - last - 1))
-        given[place], last = True, place
-    entries = whole[sent.rows]  # (sample,), the entry of each
+        place = min(candidates, key=lambda candidate: abs(candidate - last - 1))
+        delivered[place], last = True, place
+    entries = unharmed[sent.rows]  # (sample,), the entry of each
     invisible = int(ledger.column("invisible").sum())
-    first, final = int(given.argmax()), len(given) - 1 - int(given[::-1].argmax())
+    first, final = int(delivered.argmax()), len(delivered) - 1 - int(delivered[::-1].argmax())
     numbers = ledger.column("number")
     span = int(numbers[entries[final]] - numbers[entries[first]]) + 1
-    unwanted = min(wrong, invisible * max(1, len(wanted) // max(1, len(whole))))
+    unwanted = min(wrong, invisible * max(1, len(sent_keys) // max(1, len(unharmed))))
     causes = Counter[str]()
     for batch in batches:
         for event in batch.events:
             causes[event.cause] += 1
-    lost = span - len(np.unique(entries[first : final + 1][given[first : final + 1]]))
+    lost = span - len(np.unique(entries[first : final + 1][delivered[first : final + 1]]))
     return Outcome(
-        name, harmed, len(wanted), len(found), wrong - unwanted, unwanted, lost, reading.lost,
-        _longest(ledger, entries[given]), dict(causes),
+        name, harmed, len(sent_keys), len(delivered_keys), wrong - unwanted, unwanted, lost, reading.lost,
+        _longest(ledger, entries[delivered]), dict(causes),
     )  # fmt: skip
 
 
@@ -145,18 +147,18 @@ def _keys(samples: Samples | Batch, reading: Reading) -> list[bytes]:
     return matching.keys(columns)
 
 
-def _longest(ledger: Ledger, given: np.ndarray) -> int:
+def _longest(ledger: Ledger, delivered_rows: np.ndarray) -> int:
     """Return the most unharmed frames in a row right behind a disturbance, with more behind them, that were not given."""
-    there = np.zeros(len(ledger), dtype=bool)
-    there[given] = True
-    whole = np.zeros(len(ledger), dtype=bool)
-    whole[ledger.whole] = True
+    delivered = np.zeros(len(ledger), dtype=bool)
+    delivered[delivered_rows] = True
+    unharmed = np.zeros(len(ledger), dtype=bool)
+    unharmed[ledger.whole] = True
     longest = run = 0
     counting = False
-    for good, came in zip(whole.tolist(), there.tolist(), strict=True):
+    for good, was_delivered in zip(unharmed.tolist(), delivered.tolist(), strict=True):
         if not good:
             counting, run = True, 0
-        elif came:
+        elif was_delivered:
             longest, counting = max(longest, run if counting else 0), False
         elif counting:
             run += 1
@@ -176,14 +178,17 @@ def main() -> None:
     failed = False
     for name in chosen.only or rig_of.read(RIG).streams:
         began_s = time.monotonic()
-        found = outcome(name, 60 * chosen.minutes, faults)
-        failed |= bool(found.wrong)
-        harmed = sum(found.harmed.values())
+        result = outcome(name, 60 * chosen.minutes, faults)
+        failed |= bool(result.wrong)
+        harmed = sum(result.harmed.values())
         print(
-            f"| {name} | {harmed} | {found.given:,} | {found.wrong} | {found.invisible} | {found.lost} | {found.told} | "
-            f"{found.longest} |", flush=True,
+            f"| {name} | {harmed} | {result.delivered:,} | {result.wrong} | {result.invisible} | {result.lost} | "
+            f"{result.reported_lost} | "
+            f"{result.longest} |", flush=True,
         )  # fmt: skip
-        print(f"{name}: {found.harmed} {found.causes}, {time.monotonic() - began_s:.0f} s", file=sys.stderr, flush=True)
+        print(
+            f"{name}: {result.harmed} {result.causes}, {time.monotonic() - began_s:.0f} s", file=sys.stderr, flush=True
+        )
     raise SystemExit(int(failed))
 
 

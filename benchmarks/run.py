@@ -56,7 +56,7 @@ def table(lines: Sequence[timing.Line]) -> str:
     marks = {True: "reached", False: "**missed**", None: ""}
     rows = ["| what | tacpipe | peer | ratio | aim | |", "| --- | --- | --- | --- | --- | --- |"]
     rows += [
-        f"| {line.what} | {line.ours} | {line.peer} | {line.ratio} | {line.aim} | {marks[line.reached]} |"
+        f"| {line.case} | {line.ours} | {line.peer} | {line.ratio} | {line.aim} | {marks[line.reached]} |"
         for line in lines
     ]
     return "\n".join(rows)

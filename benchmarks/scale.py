@@ -33,7 +33,7 @@ from tacpipe.store.store import Store
 
 COUNTS = (10_000, 100_000)
 SIMULATE = "simulate forward --trials 1 --duration-s 4 --tactile-rate-hz 25 --robot-rate-hz 50 -o seed --quiet"
-STREAM, COLUMNS = "xela1", 5  # what each recording keeps of the simulated one
+STREAM, COLUMNS = "xela1", 5  # Stream of the simulated recording, and the columns of it that each recording keeps.
 LOOKS = "newfstatat,stat,lstat,statx,access,openat,getdents64"
 HIT = "synchronize recordings -o synced --quiet"
 OPEN = "import tacpipe; tacpipe.open('synced')['trial-0000001']"
@@ -55,12 +55,12 @@ class Lab:
         (folder / ".tacpipe").mkdir()
         self.folder, self.store = folder, Store(folder / ".tacpipe")
         timing.run(f"tacpipe {SIMULATE}", folder)
-        made = find(folder / "seed").manifest
-        shard = made.recordings["trial-000"]["shards"][STREAM]
+        seed = find(folder / "seed").manifest
+        shard = seed.recordings["trial-000"]["shards"][STREAM]
         table = parquet.from_parquet(self.store.read(shard["digest"]))
         self._raw = parquet.to_parquet(table.select(table.column_names[:COLUMNS]))
         self._rows = table.num_rows
-        self._made = replace(made, recordings={})
+        self._template = replace(seed, recordings={})
         self.count = 0
         self._listed = "", ""  # digests of the dataset and of its manifest, that was listed last
         self.entries: dict[str, Entry] = {}
@@ -68,8 +68,8 @@ class Lab:
         timing.run(f"tacpipe {HIT}", folder)
         synced = find(folder / "synced").manifest
         self._step = synced.chain[-1]
-        self._one = self._record(self.entries)
-        (stored,) = self._one["result"]["recordings"][""]["shards"].values()
+        self._synced_record = self._record(self.entries)
+        (stored,) = self._synced_record["result"]["recordings"][""]["shards"].values()
         self._synced = self.store.read(stored["digest"])
         if manifest_alone:
             self.list_alone(count)
@@ -82,22 +82,22 @@ class Lab:
         self.count += count
         self.entries |= new
         if synchronized:
-            result, provenance = self._one["result"], self._one["provenance"]
+            result, provenance = self._synced_record["result"], self._synced_record["provenance"]
             for number, task in enumerate(
-                keys.shard_tasks(self.store, replace(self._made, recordings=new), self._step, ())
+                keys.shard_tasks(self.store, replace(self._template, recordings=new), self._step, ())
             ):
-                shards = {"": {**result["recordings"][""]["shards"][""], **self._put(self._synced, number)}}
-                made = {"recordings": {"": {**result["recordings"][""], "shards": shards}}, "files": {}}
-                self.store.commit(task.identity, made, provenance)
-        manifest = replace(self._made, recordings=self.entries)
+                shards = {"": {**result["recordings"][""]["shards"][""], **self._put_numbered(self._synced, number)}}
+                commit_result = {"recordings": {"": {**result["recordings"][""], "shards": shards}}, "files": {}}
+                self.store.commit(task.identity, commit_result, provenance)
+        manifest = replace(self._template, recordings=self.entries)
         manifest.keep(self.store)
         directory.publish(self.store, manifest, self.folder / "recordings")
 
     def list_alone(self, count: int) -> None:
         """Have both manifests name ``count`` recordings with the shards of one, and write nothing else."""
         for place in ("recordings", "synced"):
-            found = find(self.folder / place).manifest
-            (entry,) = found.recordings.values()
+            manifest = find(self.folder / place).manifest
+            (entry,) = manifest.recordings.values()
             entries = {
                 f"trial-{number:07d}": {**entry, "attributes": {**entry["attributes"], "trial": number}}
                 for number in range(count)
@@ -107,26 +107,29 @@ class Lab:
                 if place == "recordings"
                 else {"datasets": [{"dataset": self._listed[0], "manifest": self._listed[1]}]}
             )
-            listed = replace(found, recordings=entries, inputs=inputs)
+            listed = replace(manifest, recordings=entries, inputs=inputs)
             self._listed = listed.digest, listed.keep(self.store).digest
             self.store.roots.set(self.folder / place, self._listed[1])
             (self.folder / place / NAME).write_bytes(listed.content)
 
     def _entry(self, number: int) -> Entry:
         attributes = {"material": f"m{number % 20}", "sensor": "xela-uskin", "trial": number}
-        return {"attributes": attributes, "shards": {STREAM: {**self._put(self._raw, number), "rows": self._rows}}}
+        return {
+            "attributes": attributes,
+            "shards": {STREAM: {**self._put_numbered(self._raw, number), "rows": self._rows}},
+        }
 
     def _record(self, entries: dict[str, Entry]) -> dict[str, Any]:
-        (task,) = keys.shard_tasks(self.store, replace(self._made, recordings=entries), self._step, ())
+        (task,) = keys.shard_tasks(self.store, replace(self._template, recordings=entries), self._step, ())
         return self.store.read_record(digest(task.identity))
 
-    def _put(self, content: bytes, number: int) -> dict[str, Any]:
+    def _put_numbered(self, content: bytes, number: int) -> dict[str, Any]:
         """Store a Parquet file with a number before its footer, where no reader looks."""
         footer = int.from_bytes(content[-8:-4], "little") + 8
         return vars(self.store.put(content[:-footer] + number.to_bytes(8, "little") + content[-footer:]))
 
 
-STEPS = {  # in this order; those that change the dataset come last
+STEPS = {  # Steps run in this order; those that change the dataset come last.
     "all results stored, the run new": HIT,
     "first hit": HIT,  # each file is looked at, which is noted
     "hit": HIT,
@@ -172,7 +175,7 @@ def looks(lab: Lab, command: str) -> int | None:
     with tempfile.NamedTemporaryFile("r") as counts:
         trace = ["strace", "-f", "-c", "--seccomp-bpf", "-U", "calls,name", "-o", counts.name, "-e", f"trace={LOOKS}"]
         timing.run([*trace, "tacpipe", *shlex.split(command)], lab.folder)
-        return sum(int(found[1]) for found in re.finditer(r"^ *(\d+) +(?!total)\w+$", counts.read(), re.MULTILINE))
+        return sum(int(match[1]) for match in re.finditer(r"^ *(\d+) +(?!total)\w+$", counts.read(), re.MULTILINE))
 
 
 def table(results: dict[int, dict[str, Measured]]) -> str:

@@ -1,4 +1,4 @@
-"""What it takes to seal ten minutes of a 1 kHz arm: its spool turned into a durable recording.
+"""Measure the cost of sealing ten minutes of a 1 kHz arm: its spool turned into a durable recording.
 
     python benchmarks/sealing.py [--minutes 10]
 
@@ -40,9 +40,9 @@ def spooled(folder: Path, seconds: int) -> Path:
         angle = 0.3 * np.sin(count[:, None] / 1000 + np.arange(FLOATS))  # (sample, channel)
         floats = angle + noise.normal(scale=1e-3, size=angle.shape)
         floats[:, 3:7] = [0.0, 0.0, 0.0, 1.0]  # no turn of the end effector
-        one = np.ones((BLOCK, 1), dtype=np.float32)
+        ones = np.ones((BLOCK, 1), dtype=np.float32)
         none = np.zeros((BLOCK, 3), dtype=np.uint8), np.zeros((BLOCK, 2), dtype=np.uint64)
-        data = sensor.encode(Samples((floats, one, *none), seq=count)).tobytes()
+        data = sensor.encode(Samples((floats, ones, *none), seq=count)).tobytes()
         total += len(data)
         spool.tally(0, len(count) * (second + 1), total, int(count[-1]) * 1_000_000)
         spool.append("robot", Chunks(count * 1_000_000, np.full(BLOCK, len(data) // BLOCK), data))
@@ -58,8 +58,8 @@ def main() -> None:
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="tacpipe-seal-") as name:
         folder = Path(name)
-        made = spooled(folder, round(60 * options.minutes))
-        size = (made / "bytes").stat().st_size
+        spool_folder = spooled(folder, round(60 * options.minutes))
+        size = (spool_folder / "bytes").stat().st_size
         cost = timing.cost(["tacpipe", "acquire", "--recover"], folder)
         manifest = find(folder / "rec").manifest
         print(

@@ -27,10 +27,10 @@ def measure(folder: Path, rounds: int) -> list[timing.Line]:
     project = folder / "sizes"
     (project / ".tacpipe").mkdir(parents=True)
     lines = []
-    for what, options in SIMULATED.items():
-        place = what.replace(" ", "-").replace(",", "")
+    for case, options in SIMULATED.items():
+        place = case.replace(" ", "-").replace(",", "")
         timing.run(f"tacpipe simulate forward --trials 4 {options} -o {place}", project)
-        lines.append(_line(f"tactile streams, simulated, {what}", project / place))
+        lines.append(_line(f"tactile streams, simulated, {case}", project / place))
     published = Path(os.environ.get("TACPIPE_SAMPLE_DATA", ROOT.parent / "shared" / "data")) / "xela_flat_pick_move"
     if published.is_dir():
         timing.run(["tacpipe", "ingest", "xela-flat", str(published), "-o", "published"], project)
@@ -38,7 +38,7 @@ def measure(folder: Path, rounds: int) -> list[timing.Line]:
     return lines
 
 
-def _line(what: str, dataset: Path) -> timing.Line:
+def _line(case: str, dataset: Path) -> timing.Line:
     raw = ours = pandas = 0
     draft = dataset / "pandas.parquet"
     for table in _tactile(dataset):
@@ -48,7 +48,7 @@ def _line(what: str, dataset: Path) -> timing.Line:
         pandas += draft.stat().st_size
     share = ours / raw
     return timing.Line(
-        what,
+        case,
         f"{ours / 1e6:.2f} MB of {raw / 1e6:.2f} MB",
         f"pandas.to_parquet: {pandas / raw:.3f} of the integers",
         f"{share:.3f} of the integers",

@@ -12,7 +12,7 @@ import timing
 
 HERE = Path(__file__).parent
 TRIALS = 1000
-FEW = 20  # as many as `tacpipe show` lists
+FEW = 20  # `tacpipe show` lists this many.
 ENTRY_POINTS = "[tacpipe.stages]\nsimulate.small = bench_stages:make\nadd = bench_stages:add\n"
 PLAIN = """
 import sys
@@ -56,17 +56,17 @@ def measure(folder: Path, rounds: int) -> list[timing.Line]:
 def _looks(tacpipe: Callable[[str], None], rounds: int) -> list[timing.Line]:
     """Return what `show` and one label take on all recordings, beside what they take on a few of them."""
     tacpipe(f"simulate small --trials {FEW} -o few")
-    values, many, few = itertools.count(), f"on {TRIALS:,}", f"on {FEW} recordings"
+    values, on_all, on_few = itertools.count(), f"on {TRIALS:,}", f"on {FEW} recordings"
     contestants: dict[str, dict[str, Callable[[], None]]] = {
-        "show": {many: lambda: tacpipe("show recordings"), few: lambda: tacpipe("show few")},
+        "show": {on_all: lambda: tacpipe("show recordings"), on_few: lambda: tacpipe("show few")},
         "one label": {
-            many: lambda: tacpipe(f"label recordings trial-000 --set pressed={next(values)}"),
-            few: lambda: tacpipe(f"label few trial-000 --set pressed={next(values)}"),
+            on_all: lambda: tacpipe(f"label recordings trial-000 --set pressed={next(values)}"),
+            on_few: lambda: tacpipe(f"label few trial-000 --set pressed={next(values)}"),
         },
     }
     return [
-        timing.at_most(f"{what} {many}", timing.interleaved(both, rounds), many, few, 2.0)
-        for what, both in contestants.items()
+        timing.at_most(f"{command} {on_all}", timing.interleaved(cases, rounds), on_all, on_few, 2.0)
+        for command, cases in contestants.items()
     ]
 
 

@@ -65,7 +65,7 @@ class Memory:
 def streams(seconds: int, seed: int = 0) -> dict[str, Stream]:
     """Return streams that jitter by a tenth of their period."""
     random = np.random.default_rng(seed)
-    found = {}
+    streams_by_name = {}
     for name, (channels, rate_hz, kind) in STREAMS.items():
         count = int(seconds * rate_hz)
         jitter_ns = np.rint(random.normal(0, 0.1e9 / rate_hz, count)).astype(np.int64)
@@ -73,8 +73,8 @@ def streams(seconds: int, seed: int = 0) -> dict[str, Stream]:
         walk = np.cumsum(random.normal(0, 5, (count, channels)), axis=0) + 30_000
         values = walk.astype(kind)
         columns = {f"{name}_{i}": values[:, i].copy() for i in range(channels)}
-        found[name] = Stream(t_ns, values, pd.DataFrame({"t_ns": t_ns, **columns}))
-    return found
+        streams_by_name[name] = Stream(t_ns, values, pd.DataFrame({"t_ns": t_ns, **columns}))
+    return streams_by_name
 
 
 def measure(folder: Path, rounds: int) -> list[timing.Line]:
@@ -96,18 +96,18 @@ def _clock(rounds: int) -> timing.Line:
 
 
 def _measure(seconds: int, rounds: int) -> list[timing.Line]:
-    given = streams(seconds)
-    first = max(stream.t_ns[0] for stream in given.values())
-    last = min(stream.t_ns[-1] for stream in given.values())
+    inputs = streams(seconds)
+    first = max(stream.t_ns[0] for stream in inputs.values())
+    last = min(stream.t_ns[-1] for stream in inputs.values())
     grid_ns = resampling.uniform_grid(int(first), int(last), RATE_HZ)
     grid = pd.DataFrame({"t_ns": grid_ns})
 
     def linear() -> None:
-        for stream in given.values():
+        for stream in inputs.values():
             resampling.linear(stream.t_ns, stream.values, grid_ns)
 
     def linear_with_masks() -> None:
-        for stream in given.values():
+        for stream in inputs.values():
             resampling.linear(stream.t_ns, stream.values, grid_ns)
             resampling.nearest(stream.t_ns, holds.held(stream.values), grid_ns)
             resampling.in_gap(stream.t_ns, grid_ns, GAP_NS)
@@ -115,16 +115,16 @@ def _measure(seconds: int, rounds: int) -> list[timing.Line]:
 
     def merge_asof() -> None:
         merged = grid
-        for stream in given.values():
+        for stream in inputs.values():
             merged = pd.merge_asof(merged, stream.frame, on="t_ns", direction="nearest")
 
     def reindex_and_interpolate() -> None:
-        for stream in given.values():
+        for stream in inputs.values():
             indexed = stream.frame.set_index("t_ns")
-            both = indexed.index.union(pd.Index(grid_ns))
-            indexed.reindex(both).interpolate(method="index").loc[grid_ns]
+            joined_index = indexed.index.union(pd.Index(grid_ns))
+            indexed.reindex(joined_index).interpolate(method="index").loc[grid_ns]
 
-    tables = {name: _table(name, stream) for name, stream in given.items()}
+    tables = {name: _table(name, stream) for name, stream in inputs.items()}
     stage = load("synchronize")
     params, recording = stage.params(rate_hz=RATE_HZ, master="tactile1"), Memory("benchmark", tables)
     times = timing.interleaved(
@@ -145,12 +145,12 @@ def _measure(seconds: int, rounds: int) -> list[timing.Line]:
     ]
 
 
-def _faster(what: str, times: timing.Times, ours: str, peer: str, aim: float | None = None) -> timing.Line:
+def _faster(case: str, times: timing.Times, ours: str, peer: str, aim: float | None = None) -> timing.Line:
     """Return the line of what must be at least ``aim`` times as fast as pandas."""
-    line, found = timing.at_most(what, times, ours, peer), timing.ratio(times, peer, ours)
-    told = "" if aim is None else f"{aim:g} times as fast"
-    reached = None if aim is None else found >= aim
-    return timing.Line(what, line.ours, f"pandas: {line.peer}", f"{found:.1f} times as fast", told, reached)
+    line, speedup = timing.at_most(case, times, ours, peer), timing.ratio(times, peer, ours)
+    aim_text = "" if aim is None else f"{aim:g} times as fast"
+    reached = None if aim is None else speedup >= aim
+    return timing.Line(case, line.ours, f"pandas: {line.peer}", f"{speedup:.1f} times as fast", aim_text, reached)
 
 
 def _table(name: str, stream: Stream) -> pa.Table:

@@ -34,9 +34,9 @@ sys.exit(os.waitstatus_to_exitcode(status))
 class Line:
     """One row of the table."""
 
-    what: str
+    case: str
     ours: str
-    peer: str  # what a user would do without tacpipe, and its cost
+    peer: str  # the way of a user without tacpipe, and its cost
     ratio: str
     aim: str = ""
     reached: bool | None = None  # None where there is no aim
@@ -46,7 +46,7 @@ class Line:
 class Cost:
     """The cost of one process and its children."""
 
-    seconds: float  # by the clock
+    seconds: float  # wall-clock time
     cpu_s: float  # user and system, on all cores
     memory_bytes: int  # peak of resident memory
     read_bytes: int
@@ -54,7 +54,7 @@ class Cost:
 
 def cpu_seconds() -> float:
     """Return the user and system time of this process and of the children that ended."""
-    usages = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    usages = (resource.getrusage(processes) for processes in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
     return sum(usage.ru_utime + usage.ru_stime for usage in usages)
 
 
@@ -82,11 +82,11 @@ def median(times: Times, name: str) -> float:
     return statistics.median(times[name])
 
 
-def at_most(what: str, times: Times, ours: str, peer: str, aim: float | None = None) -> Line:
+def at_most(case: str, times: Times, ours: str, peer: str, aim: float | None = None) -> Line:
     """Return the line of a contestant that must not take more than ``aim`` times the CPU seconds of a peer."""
     quotient = ratio(times, ours, peer)
     return Line(
-        what,
+        case,
         _format_seconds(median(times, ours)),
         f"{peer}: {_format_seconds(median(times, peer))}",
         f"{quotient:.2f}",
@@ -95,17 +95,17 @@ def at_most(what: str, times: Times, ours: str, peer: str, aim: float | None = N
     )
 
 
-def faster(what: str, times: Times, ours: str, peer: str, aim: float, rates: tuple[str, str]) -> Line:
+def faster(case: str, times: Times, ours: str, peer: str, aim: float, rates: tuple[str, str]) -> Line:
     """Return the line of a contestant that must be ``aim`` times as fast as a peer, with the ``rates`` of both."""
     quotient = 1 / ratio(times, ours, peer)
-    told = f"{quotient:.2f} times as fast"
-    return Line(what, rates[0], f"{peer}: {rates[1]}", told, f"{aim:g} times as fast", quotient >= aim)
+    speedup = f"{quotient:.2f} times as fast"
+    return Line(case, rates[0], f"{peer}: {rates[1]}", speedup, f"{aim:g} times as fast", quotient >= aim)
 
 
-def memory_line(what: str, ours: Cost, peer: str, theirs: Cost) -> Line:
+def memory_line(case: str, ours: Cost, peer: str, theirs: Cost) -> Line:
     """Return the line of the peaks of memory of two processes."""
     ours_mb, theirs_mb = ours.memory_bytes / 1e6, theirs.memory_bytes / 1e6
-    return Line(what, f"{ours_mb:.0f} MB", f"{peer}: {theirs_mb:.0f} MB", f"{ours_mb / theirs_mb:.2f}")
+    return Line(case, f"{ours_mb:.0f} MB", f"{peer}: {theirs_mb:.0f} MB", f"{ours_mb / theirs_mb:.2f}")
 
 
 def cost(command: Sequence[str], folder: Path) -> Cost:
@@ -146,10 +146,10 @@ def plugin(folder: Path, module: str, entry_points: str) -> Path:
     return place
 
 
-def environment_of(**more: str) -> dict[str, str]:
+def environment_of(**variables: str) -> dict[str, str]:
     """Return the environment of this process without a named store, with this Python's programs first."""
     inherited = {name: value for name, value in os.environ.items() if name != "TACPIPE_STORE"}
-    return {**inherited, "PATH": f"{BIN}{os.pathsep}{inherited.get('PATH', '')}", **more}
+    return {**inherited, "PATH": f"{BIN}{os.pathsep}{inherited.get('PATH', '')}", **variables}
 
 
 def _format_seconds(seconds: float) -> str:

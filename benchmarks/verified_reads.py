@@ -23,7 +23,7 @@ from tacpipe.store.location import locate
 
 AIM = 0.8
 SHARD_MB = 10
-ROWS = {"moving": 305_000, "float": 105_000}  # that take SHARD_MB as Parquet
+ROWS = {"moving": 305_000, "float": 105_000}  # So many rows take SHARD_MB as Parquet.
 ENTRY_POINTS = "[tacpipe.stages]\nsimulate.long = bench_stages:make_long\n"
 KINDS = {
     "moving": "integers that move",
@@ -46,12 +46,12 @@ def measure(folder: Path, rounds: int, megabytes: int = 1000) -> list[timing.Lin
 
 
 def _of_kind(dataset: Path, kind: str, rounds: int) -> list[timing.Line]:
-    found = tacpipe.open(dataset)
+    opened = tacpipe.open(dataset)
     store = locate(dataset)
-    objects = [Path(store.object_path(shard.digest)) for shard in found.recordings.values()]
+    objects = [Path(store.object_path(shard.digest)) for shard in opened.recordings.values()]
     files = sorted(dataset.glob("*.parquet"))
     size = sum(path.stat().st_size for path in objects)
-    plain = Dataset(found.source, lambda name, _: Path(store.object_path(name)).read_bytes())
+    plain = Dataset(opened.source, lambda name, _: Path(store.object_path(name)).read_bytes())
 
     def cold(way: Callable[[], Any]) -> Callable[[], Any]:
         def call() -> Any:
@@ -65,11 +65,11 @@ def _of_kind(dataset: Path, kind: str, rounds: int) -> list[timing.Line]:
         "unverified": lambda: [len(shard.table()) for shard in plain.recordings.values()],
         "pyarrow.parquet.read_table": lambda: [len(pq.read_table(path)) for path in files],
     }
-    what = f"{size / 1e9:.1f} GB in {len(files)} recordings, {kind}"
+    case = f"{size / 1e9:.1f} GB in {len(files)} recordings, {kind}"
     return [
-        *_lines(f"{what}: shards to tables", timing.interleaved(tables, rounds, time.perf_counter), size),
+        *_lines(f"{case}: shards to tables", timing.interleaved(tables, rounds, time.perf_counter), size),
         *_lines(
-            f"{what}: shards to tables, not in the page cache",
+            f"{case}: shards to tables, not in the page cache",
             timing.interleaved({name: cold(way) for name, way in tables.items()}, rounds, time.perf_counter),
             size,
         ),
@@ -85,22 +85,22 @@ def _forget(paths: list[Path]) -> None:
         os.close(handle)
 
 
-def _lines(what: str, times: timing.Times, size: int) -> list[timing.Line]:
-    return [_line(what, times, other, size) for other in times if other != "verified"]
+def _lines(case: str, times: timing.Times, size: int) -> list[timing.Line]:
+    return [_line(case, times, peer, size) for peer in times if peer != "verified"]
 
 
-def _line(what: str, times: timing.Times, other: str, size: int) -> timing.Line:
-    shares = sorted(b / a for a, b in zip(times["verified"], times[other], strict=True))
+def _line(case: str, times: timing.Times, peer: str, size: int) -> timing.Line:
+    shares = sorted(b / a for a, b in zip(times["verified"], times[peer], strict=True))
     share, (low, high) = statistics.median(shares), _interval(shares)
-    aim = other == "unverified"
+    aim = peer == "unverified"
 
-    def told(name: str) -> str:
+    def format_rate(name: str) -> str:
         return f"{size / timing.median(times, name) / 1e9:.2f} GB/s"
 
     return timing.Line(
-        what,
-        told("verified"),
-        f"{other}: {told(other)}",
+        case,
+        format_rate("verified"),
+        f"{peer}: {format_rate(peer)}",
         f"{share:.2f} ({low:.2f} to {high:.2f})",
         f"at least {AIM}" if aim else "",
         share >= AIM if aim else None,
@@ -109,7 +109,7 @@ def _line(what: str, times: timing.Times, other: str, size: int) -> timing.Line:
 
 def _interval(ordered: list[float]) -> tuple[float, float]:
     """Return the 95 % interval of the median of these values, by the signs of what lies above and below it."""
-    count, left = len(ordered), 0
-    while sum(math.comb(count, below) for below in range(left + 2)) / 2**count <= 0.025:
-        left += 1
-    return ordered[left], ordered[count - 1 - left]
+    count, rank = len(ordered), 0
+    while sum(math.comb(count, below) for below in range(rank + 2)) / 2**count <= 0.025:
+        rank += 1
+    return ordered[rank], ordered[count - 1 - rank]

@@ -99,7 +99,7 @@ def test_params_come_back_from_what_stands_in_a_key() -> None:
 
 
 def test_the_comment_behind_a_field_is_its_help() -> None:
-    assert params_of.comments(STAGE)["rate_hz"] == "of the grid"
+    assert params_of.comments(STAGE)["rate_hz"] == "rate of the grid"
 
 
 @dataclass(frozen=True)

@@ -25,14 +25,14 @@ class Cluster:
     def __init__(self, folder: Path, **environment: str) -> None:
         self.folder, self.environment = folder, environment
         self.scheduler = self._start("scheduler", "scheduler", "--host", "127.0.0.1", "--port", "0")
-        self.address = self._found("scheduler", r"Scheduler at:\s+tcp://(\S+)")
+        self.address = self._wait_for_log("scheduler", r"Scheduler at:\s+tcp://(\S+)")
         self.workers: dict[str, subprocess.Popen[bytes]] = {}
 
     def work(self, name: str, *options: str) -> None:
         """Start a worker, a process that nobody starts again."""
-        given = ("--nthreads", "1", "--no-nanny", "--name", name, "--memory-limit", "0", *options)
-        self.workers[name] = self._start(name, "worker", f"tcp://{self.address}", *given)
-        self._found(name, r"Starting established connection to (tcp)")
+        arguments = ("--nthreads", "1", "--no-nanny", "--name", name, "--memory-limit", "0", *options)
+        self.workers[name] = self._start(name, "worker", f"tcp://{self.address}", *arguments)
+        self._wait_for_log(name, r"Starting established connection to (tcp)")
 
     @property
     def executor(self) -> str:
@@ -56,13 +56,13 @@ class Cluster:
                 stderr=log,
             )
 
-    def _found(self, name: str, pattern: str) -> str:
+    def _wait_for_log(self, name: str, pattern: str) -> str:
         """Return what a pattern finds in a process's log, once it is there."""
         began_s = time.monotonic()
         while time.monotonic() - began_s < GIVE_UP_S:
-            found = re.search(pattern, (self.folder / f"{name}.log").read_text())
-            if found:
-                return found[1]
+            match = re.search(pattern, (self.folder / f"{name}.log").read_text())
+            if match:
+                return match[1]
             time.sleep(0.05)
         raise AssertionError((self.folder / f"{name}.log").read_text())
 
@@ -72,13 +72,13 @@ class Apart(Lab):
 
     def __init__(self, lab: Lab) -> None:
         super().__init__(lab.folder, self._call)
-        self.inside = lab.call  # in this process, where something is replaced
+        self.inside = lab.call  # Commands run in this process where a test replaces something.
 
     def _call(self, command: str) -> Ran:
         if not re.search(r"--executor (dask|tls|slurm)", command):
             return self.inside(command)
-        done = tacpipe(self.folder, command)
-        return Ran(done.returncode, done.stdout, done.stderr)
+        process = tacpipe(self.folder, command)
+        return Ran(process.returncode, process.stdout, process.stderr)
 
 
 @pytest.fixture
@@ -91,28 +91,28 @@ def lab(lab: Lab) -> Apart:
 def scheduler(tmp_path_factory: pytest.TempPathFactory, plugin: Path) -> Iterator[str]:
     """The executor of two workers that find the plug-in of ``lab``."""
     pytest.importorskip("distributed", reason="the extra dask is not installed")
-    found = Cluster(tmp_path_factory.mktemp("scheduler"), PYTHONPATH=str(plugin))
-    found.work("first")
-    found.work("second")
-    yield found.executor
-    found.close()
+    workers = Cluster(tmp_path_factory.mktemp("scheduler"), PYTHONPATH=str(plugin))
+    workers.work("first")
+    workers.work("second")
+    yield workers.executor
+    workers.close()
 
 
 @pytest.fixture
 def cluster(tmp_path_factory: pytest.TempPathFactory, lab: object) -> Iterator[Cluster]:
     """A scheduler without workers, which find the plug-in of ``lab``."""
     pytest.importorskip("distributed", reason="the extra dask is not installed")
-    found = Cluster(tmp_path_factory.mktemp("cluster"))
-    yield found
-    found.close()
+    workers = Cluster(tmp_path_factory.mktemp("cluster"))
+    yield workers
+    workers.close()
 
 
 @pytest.fixture(scope="module")
 def slurm_of_tests(plugin: Path) -> Iterator[dict[str, str]]:
     """The environment in which commands find a Slurm that runs, whose jobs find the plug-in of ``lab``."""
     pytest.importorskip("dask_jobqueue", reason="the extra slurm is not installed")
-    if why := slurm_server.lacking():
-        pytest.skip(why)
+    if reason := slurm_server.lacking():
+        pytest.skip(reason)
     with slurm_server.running() as environment:
         yield {**environment, "PYTHONPATH": str(plugin)}
 

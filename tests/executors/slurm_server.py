@@ -43,7 +43,7 @@ PartitionName={partition} Nodes=ALL Default=YES MaxTime=INFINITE State=UP
 
 def lacking() -> str:
     """Return why Slurm cannot be started here; empty where it can."""
-    missing = [one for one in NEEDED if shutil.which(one) is None]
+    missing = [program for program in NEEDED if shutil.which(program) is None]
     if missing:
         return f"Debian's slurm-wlm is not installed ({missing[0]})"
     return "" if os.geteuid() == 0 else "only root starts Slurm"
@@ -92,7 +92,7 @@ def running() -> Iterator[dict[str, str]]:
 
 def _free_ports() -> list[int]:
     with socket.create_server(("127.0.0.1", 0)) as first, socket.create_server(("127.0.0.1", 0)) as second:
-        return [one.getsockname()[1] for one in (first, second)]
+        return [server.getsockname()[1] for server in (first, second)]
 
 
 def _wait(environment: dict[str, str], folder: Path) -> None:
@@ -100,8 +100,8 @@ def _wait(environment: dict[str, str], folder: Path) -> None:
     began_s = time.monotonic()
     while time.monotonic() - began_s < _GIVE_UP_S:
         command = ["sinfo", "--noheader", "--format=%t"]
-        asked = subprocess.run(command, env=environment, check=False, capture_output=True, text=True)
-        if asked.stdout.strip() == "idle":
+        node_state = subprocess.run(command, env=environment, check=False, capture_output=True, text=True)
+        if node_state.stdout.strip() == "idle":
             return
         time.sleep(0.2)
     raise AssertionError("\n".join(file.read_text(errors="replace") for file in folder.glob("*.output")))

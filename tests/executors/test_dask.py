@@ -13,13 +13,13 @@ from tacpipe.engine.executors import agreement, dask
 from tacpipe.engine.task import Task
 from tests.conftest import Lab
 from tests.executors.conftest import GIVE_UP_S, Apart
-from tests.executors.test_ends import begun, records, wait_for_one_more
+from tests.executors.test_ends import records, start_command, wait_for_one_more
 
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning")
 
 
 @pytest.mark.parametrize(
-    ("address", "named"),
+    ("address", "words"),
     [
         ("dask://10.0.0.7:8786", "tls://10.0.0.7:8786"),
         ("dask://cluster.example:8786", "tls://cluster.example:8786"),
@@ -31,11 +31,11 @@ pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::Depr
         ("ray", "dask, local, slurm, tls"),
     ],
 )
-def test_a_scheduler_that_must_not_or_cannot_be_reached_is_refused(lab: Lab, address: str, named: str) -> None:
+def test_a_scheduler_that_must_not_or_cannot_be_reached_is_refused(lab: Lab, address: str, words: str) -> None:
     lab.run("simulate toy -o data/rec --jobs 1")
     ran = lab.call(f"scale data/rec -o data/out --executor {address}")
     assert ran.code == 2
-    assert named in ran.err and len(ran.err.splitlines()) == 1
+    assert words in ran.err and len(ran.err.splitlines()) == 1
 
 
 def test_a_scheduler_that_does_not_answer_is_named(lab: Apart, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -52,12 +52,12 @@ def test_a_scheduler_that_does_not_answer_is_named(lab: Apart, monkeypatch: pyte
 def test_a_record_names_the_worker(lab: Lab, scheduler: str) -> None:
     lab.run("simulate toy -o data/rec --jobs 1")
     lab.run(f"scale data/rec -o data/out --executor {scheduler}")
-    made = [record["provenance"] for _, record in lab.store.records() if record["identity"].get("stage") == "scale"]
-    assert [one["worker"] for one in made] and all(one["worker"] != "" for one in made)
-    others = [
+    scaled = [record["provenance"] for _, record in lab.store.records() if record["identity"].get("stage") == "scale"]
+    assert [provenance["worker"] for provenance in scaled] and all(provenance["worker"] != "" for provenance in scaled)
+    simulated = [
         record["provenance"] for _, record in lab.store.records() if record["identity"].get("stage") == "simulate.toy"
     ]
-    assert not any("worker" in one for one in others)
+    assert not any("worker" in provenance for provenance in simulated)
 
 
 @pytest.mark.long
@@ -65,8 +65,8 @@ def test_a_worker_with_other_versions_is_refused_in_one_sentence(
     lab: Apart, scheduler: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     lab.run("simulate toy -o data/rec --jobs 1")
-    here = agreement.here
-    monkeypatch.setattr(agreement, "here", lambda stage: {**here(stage), "numpy": "0.1"})
+    versions = agreement.here
+    monkeypatch.setattr(agreement, "here", lambda stage: {**versions(stage), "numpy": "0.1"})
     ran = lab.inside(f"scale data/rec -o data/out --executor {scheduler}")
     assert ran.code == 2
     assert "(here 0.1)" in ran.err
@@ -89,7 +89,7 @@ def test_a_worker_that_sees_another_store_is_refused(
 def test_a_collection_beside_a_worker_takes_nothing_that_it_made(lab: Lab, scheduler: str) -> None:
     """The worker's own lease announces what it makes; the command's lease, what it has heard of."""
     lab.run("simulate toy -o data/rec --trials 3 --jobs 1")
-    command = begun(lab, f"scale data/rec -o data/out --executor {scheduler}")
+    command = start_command(lab, f"scale data/rec -o data/out --executor {scheduler}")
     announced: set[str] = set()
     while command.poll() is None:  # the worker's lease may end right after the command does
         announced |= {digest for run in lab.store.leases.runs() for digest in run.objects}
@@ -128,15 +128,15 @@ def test_a_scheduler_that_ends_is_reported_and_what_was_finished_is_kept(lab: La
     lab.run("simulate toy -o data/rec --trials 6 --jobs 1")
     cluster.work("only")
     before = records(lab)
-    command = begun(lab, f"scale data/rec -o data/out --pause-s 0.7 --executor {cluster.executor}")
+    command = start_command(lab, f"scale data/rec -o data/out --pause-s 0.7 --executor {cluster.executor}")
     wait_for_one_more(lab, before)
     cluster.scheduler.send_signal(signal.SIGKILL)
     _, printed = command.communicate(timeout=GIVE_UP_S)
     assert command.returncode == 1
     assert cluster.address in printed
     assert "Traceback" not in printed
-    again = lab.run("scale data/rec -o data/out --pause-s 0.7 --jobs 1")
-    assert " 0 reused" not in again.err
+    local_run = lab.run("scale data/rec -o data/out --pause-s 0.7 --jobs 1")
+    assert " 0 reused" not in local_run.err
 
 
 @pytest.mark.long

@@ -22,7 +22,7 @@ RECORDINGS = 12
 SLOW = "scale data/rec -o data/out --pause-s 0.3"
 
 
-def begun(lab: Lab, command: str) -> subprocess.Popen[str]:
+def start_command(lab: Lab, command: str) -> subprocess.Popen[str]:
     """Start a command in a process of its own; what it prints is kept."""
     words = [sys.executable, "-m", "tacpipe", *shlex.split(command)]
     return subprocess.Popen(words, cwd=lab.folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
@@ -47,7 +47,7 @@ def test_ctrl_c_ends_the_command_and_what_waits(lab: Lab, cluster: Cluster, *, l
     lab.run(f"simulate toy -o data/rec --trials {RECORDINGS} --jobs 1")
     cluster.work("only")
     before = records(lab)
-    command = begun(lab, f"{SLOW} --jobs 1 --executor {'dask' if local else cluster.executor}")
+    command = start_command(lab, f"{SLOW} --jobs 1 --executor {'dask' if local else cluster.executor}")
     wait_for_one_more(lab, before)
     command.send_signal(signal.SIGINT)
     _, printed = command.communicate(timeout=GIVE_UP_S)
@@ -57,7 +57,7 @@ def test_ctrl_c_ends_the_command_and_what_waits(lab: Lab, cluster: Cluster, *, l
     if local:
         assert not workers_of(command.pid)
     finished = -1
-    while finished != records(lab):  # what is at work ends
+    while finished != records(lab):  # Wait until the workers' current results are complete.
         finished = records(lab)
         time.sleep(2.0)
     assert before < finished < before + RECORDINGS
@@ -73,7 +73,7 @@ def workers_of(pid: int) -> list[str]:
         except OSError:
             continue
         parents[status.parent.name] = lines.get("PPid", "")
-    return [one for one, parent in parents.items() if parent == str(pid)]
+    return [process for process, parent in parents.items() if parent == str(pid)]
 
 
 @pytest.mark.faults
@@ -82,10 +82,10 @@ def test_after_a_kill_of_any_of_them_the_result_is_that_of_one_process(lab: Lab,
     chance = random.Random(seed)
     lab.run(f"simulate toy -o data/rec --trials {RECORDINGS} --jobs 1")
     lab.run("scale data/rec -o data/one --jobs 1")
-    expected = [one["shards"] for one in lab.manifest("data/one").recordings.values()]
+    expected = [recording["shards"] for recording in lab.manifest("data/one").recordings.values()]
     cluster.work("first")
     cluster.work("second")
-    command = begun(lab, f"{SLOW} --executor {cluster.executor}")
+    command = start_command(lab, f"{SLOW} --executor {cluster.executor}")
     wait_for_one_more(lab, records(lab))
     time.sleep(chance.uniform(0.0, 1.5))
     victim: subprocess.Popen[Any] = chance.choice([*cluster.workers.values(), cluster.scheduler, command])
@@ -95,6 +95,6 @@ def test_after_a_kill_of_any_of_them_the_result_is_that_of_one_process(lab: Lab,
     assert command.returncode in ((0, 1) if victim is not command else (-signal.SIGKILL, 0))
     assert lab.run("store verify").code == 0
     lab.run(f"{SLOW} --jobs 1")
-    assert [one["shards"] for one in lab.manifest("data/out").recordings.values()] == expected
+    assert [recording["shards"] for recording in lab.manifest("data/out").recordings.values()] == expected
     assert os.path.exists(lab.folder / "data/out/manifest.json")  # noqa: PTH110
     count("workers, schedulers and commands killed")

@@ -1,4 +1,4 @@
-"""What a command gives is the same, whichever executor computes it: datasets, errors, exit codes."""
+"""Every executor gives the same datasets, errors and exit codes."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ TRIALS = 12  # more than this process would compute by itself
 def executor(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
     """An executor as `--executor` takes it."""
     fixtures = {"dask": "scheduler", "slurm": "slurm"}
-    found: str = "local" if request.param == "local" else request.getfixturevalue(fixtures[request.param])
-    return found
+    address: str = "local" if request.param == "local" else request.getfixturevalue(fixtures[request.param])
+    return address
 
 
-def made(lab: Lab, trials: int = TRIALS) -> None:
+def simulate_recordings(lab: Lab, trials: int = TRIALS) -> None:
     lab.run(f"simulate toy -o data/rec --trials {trials} --jobs 1")
 
 
 def test_every_recording_gives_the_bytes_that_one_process_gives(lab: Lab, executor: str) -> None:
-    made(lab)
+    simulate_recordings(lab)
     lab.run("scale data/rec -o data/one --jobs 1")
     expected = lab.manifest("data/one")
     shutil.rmtree(lab.folder / ".tacpipe/records")
@@ -38,7 +38,7 @@ def test_every_recording_gives_the_bytes_that_one_process_gives(lab: Lab, execut
 
 
 def test_a_stage_over_a_whole_dataset_and_a_fit_give_the_bytes_that_this_process_gives(lab: Lab, executor: str) -> None:
-    made(lab, 4)
+    simulate_recordings(lab, 4)
     for command in ("total data/one", "halves data/one", "centre data/one --split data/halves"):
         name = command.split()[0]
         lab.run("scale data/rec -o data/one --jobs 1")
@@ -72,7 +72,7 @@ def test_a_bad_recording_is_refused_or_left_out(lab: Lab, executor: str) -> None
 
 
 def test_a_mistake_in_a_stage_shows_its_own_line(lab: Lab, executor: str, plugin: Path) -> None:
-    made(lab)
+    simulate_recordings(lab)
     ran = lab.call(f"scale data/rec -o data/out --pause-s=-1 --jobs 2 --executor {executor}")
     assert ran.code == 1
     assert "toy_stages.py" in ran.err
@@ -80,7 +80,7 @@ def test_a_mistake_in_a_stage_shows_its_own_line(lab: Lab, executor: str, plugin
 
 
 def test_what_is_stored_is_compared(lab: Lab, executor: str) -> None:
-    made(lab)
+    simulate_recordings(lab)
     lab.run("scale data/rec -o data/out --jobs 1")
     ran = lab.run(f"scale data/rec -o data/out --recompute-and-compare --jobs 2 --executor {executor}")
     assert f"{TRIALS} ran" in ran.err
@@ -89,13 +89,13 @@ def test_what_is_stored_is_compared(lab: Lab, executor: str) -> None:
 def test_the_environment_names_an_executor_and_the_command_another(
     lab: Lab, executor: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made(lab, 2)
+    simulate_recordings(lab, 2)
     monkeypatch.setenv("TACPIPE_EXECUTOR", "none-such")
     assert lab.call("scale data/rec -o data/out").code == 2
     lab.run(f"scale data/rec -o data/out --executor {executor}")
 
 
 def test_a_hit_needs_no_worker(lab: Lab) -> None:
-    made(lab, 2)
+    simulate_recordings(lab, 2)
     lab.run("scale data/rec -o data/out")
     assert "0 ran" in lab.run("scale data/rec -o data/out --executor dask://localhost:1").err

@@ -28,9 +28,9 @@ def test_trackers_and_the_terminal_follow_a_training_in_a_worker(
         assert "epoch 1/" in ran.stderr
         assert "trained " in ran.stderr
 
-    there, here = (
+    in_worker, in_process = (
         [json.loads(line) for line in (tracked.folder / f"{name}.jsonl").read_text().splitlines()]
         for name in ("there", "here")
     )
-    assert [call[0] for call in there] == ["start", *["line"] * (len(there) - 2), "end"]
-    assert there == here
+    assert [call[0] for call in in_worker] == ["start", *["line"] * (len(in_worker) - 2), "end"]
+    assert in_worker == in_process

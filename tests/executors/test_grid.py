@@ -40,9 +40,9 @@ def test_a_fold_that_fails_keeps_no_other_from_its_result(split_lab: Lab) -> Non
     assert split_lab.manifest("data/all-0").recordings
 
 
-@pytest.mark.parametrize(("fold", "named"), [("x", "'x'"), ("3-1", "'3-1'"), ("-1", "-1"), ("0-1", "data/out-{fold}")])
-def test_folds_that_make_no_sense_are_refused(split_lab: Lab, fold: str, named: str) -> None:
+@pytest.mark.parametrize(("fold", "words"), [("x", "'x'"), ("3-1", "'3-1'"), ("-1", "-1"), ("0-1", "data/out-{fold}")])
+def test_folds_that_make_no_sense_are_refused(split_lab: Lab, fold: str, words: str) -> None:
     ran = split_lab.call(f"centre data/one --split data/split --fold={fold} -o data/out")
     assert ran.code == 2
-    assert named in ran.err
+    assert words in ran.err
     assert not (split_lab.folder / "data/out").exists()

@@ -12,7 +12,7 @@ import pytest
 
 from tests.conftest import Lab
 from tests.executors.conftest import GIVE_UP_S, Apart
-from tests.executors.test_ends import SLOW, begun, records, wait_for_one_more
+from tests.executors.test_ends import SLOW, records, start_command, wait_for_one_more
 
 TRIALS = 12
 
@@ -43,7 +43,7 @@ def test_a_computer_without_slurm_is_refused(lab: Apart, monkeypatch: pytest.Mon
 @pytest.mark.long
 @pytest.mark.usefixtures("slurm")
 class TestJobs:
-    """Of a Slurm that runs."""
+    """Tests that need a running Slurm."""
 
     def test_each_result_names_its_job_and_no_job_is_left(self, lab: Lab) -> None:
         lab.run(f"simulate toy -o data/rec --trials {TRIALS} --jobs 1")
@@ -84,16 +84,18 @@ class TestJobs:
         monkeypatch.setenv("DASK_JOBQUEUE__SLURM__ACCOUNT", "lab")
         monkeypatch.setenv("DASK_JOBQUEUE__SLURM__CORES", "3")
         monkeypatch.setenv("DASK_JOBQUEUE__SLURM__JOB_EXTRA_DIRECTIVES", "['--hold']")
-        command = begun(lab, f"{SLOW} --executor slurm --jobs 1")
+        command = start_command(lab, f"{SLOW} --executor slurm --jobs 1")
         began_s = time.monotonic()
-        while not (held := jobs("PENDING")):
+        while not (pending := jobs("PENDING")):
             assert time.monotonic() - began_s < GIVE_UP_S
             time.sleep(0.2)
-        shown = subprocess.run(["scontrol", "show", "job", held[0]], check=True, capture_output=True, text=True).stdout
+        job_description = subprocess.run(
+            ["scontrol", "show", "job", pending[0]], check=True, capture_output=True, text=True
+        ).stdout
         command.send_signal(signal.SIGINT)
         _, printed = command.communicate(timeout=GIVE_UP_S)
-        assert "Account=lab" in shown
-        assert "NumCPUs=3" in shown
+        assert "Account=lab" in job_description
+        assert "NumCPUs=3" in job_description
         assert command.returncode == 130
         assert "Traceback" not in printed
         wait_until_no_job_is_left()
@@ -111,7 +113,7 @@ class TestJobs:
     def test_what_a_cancelled_job_left_another_one_computes(self, lab: Lab) -> None:
         lab.run(f"simulate toy -o data/rec --trials {TRIALS} --jobs 1")
         before = records(lab)
-        command = begun(lab, f"{SLOW} --executor slurm --jobs 2")
+        command = start_command(lab, f"{SLOW} --executor slurm --jobs 2")
         wait_for_one_more(lab, before)
         subprocess.run(["scancel", jobs("RUNNING")[0]], check=True)
         _, printed = command.communicate(timeout=GIVE_UP_S)
@@ -121,7 +123,7 @@ class TestJobs:
     def test_ctrl_c_cancels_the_jobs(self, lab: Lab) -> None:
         lab.run(f"simulate toy -o data/rec --trials {TRIALS} --jobs 1")
         before = records(lab)
-        command = begun(lab, f"{SLOW} --executor slurm --jobs 1")
+        command = start_command(lab, f"{SLOW} --executor slurm --jobs 1")
         wait_for_one_more(lab, before)
         command.send_signal(signal.SIGINT)
         _, printed = command.communicate(timeout=GIVE_UP_S)

@@ -1,4 +1,4 @@
-"""What runs inside the virtual machine: a HID device made with the kernel's uhid, read through `open_link`.
+"""Inside the virtual machine, make a HID device with the kernel's uhid and read it through `open_link`.
 
 Prints one line, ``RESULT`` and JSON. Run as ``guest.py board`` it is the device: it reads commands as
 `tests/links/hid_board.py` does.
@@ -21,7 +21,7 @@ sys.path.insert(0, str(ROOT))
 
 from tests.links.raw_hid import DESCRIPTOR, report  # noqa: E402
 
-# of <linux/uhid.h>
+# Values of <linux/uhid.h>.
 DESTROY, OUTPUT, CREATE, INPUT = 1, 6, 11, 12
 CREATE_LAYOUT, INPUT_LAYOUT, EVENT = struct.Struct("<I128s64s64sHHIIII4096s"), struct.Struct("<IH4096s"), 4380
 USB = 3  # BUS_USB of <linux/input.h>
@@ -79,43 +79,43 @@ def reader() -> dict[str, Any]:
         [sys.executable, "-B", __file__, "board"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as device:
         assert device.stdin is not None and device.stdout is not None
-        ask, told = device.stdin, device.stdout
+        ask, answers = device.stdin, device.stdout
 
         def order(text: str) -> None:
             ask.write(f"{text}\n")
             ask.flush()
 
-        assert told.readline() == "made\n"
+        assert answers.readline() == "made\n"
         _await_node()
-        found: dict[str, Any] = {"kernel": os.uname().release, "ports": [str(port) for port in ports.hid_ports()]}
+        result: dict[str, Any] = {"kernel": os.uname().release, "ports": [str(port) for port in ports.hid_ports()]}
         link = open_link(parse("hid:16c0:0486"), RawHid(), "board")
         link.write(bytes(range(64)))
         order("heard")
-        found["heard"] = told.readline().strip()
+        result["heard"] = answers.readline().strip()
 
         order(f"send {COUNT} {RATE_HZ}")
-        came: list[tuple[int, bytes]] = []
-        busy, begun = time.process_time(), time.monotonic()
-        while len(came) < COUNT and time.monotonic() - begun < 60:
-            came += link.read(0.5)
-        found["busy_share"] = round((time.process_time() - busy) / (time.monotonic() - begun), 3)
-        found["rate_hz"] = round((len(came) - 1) * 1e9 / (came[-1][0] - came[0][0]), 1)
-        found["seq"] = _counters(came)
-        assert told.readline() == "sent\n"
+        received: list[tuple[int, bytes]] = []
+        busy, start_s = time.process_time(), time.monotonic()
+        while len(received) < COUNT and time.monotonic() - start_s < 60:
+            received += link.read(0.5)
+        result["busy_share"] = round((time.process_time() - busy) / (time.monotonic() - start_s), 3)
+        result["rate_hz"] = round((len(received) - 1) * 1e9 / (received[-1][0] - received[0][0]), 1)
+        result["seq"] = _counters(received)
+        assert answers.readline() == "sent\n"
 
         order(f"send {FLOOD} 0")
-        assert told.readline() == "sent\n"
-        found["flood"] = _counters([entry for _ in range(10) for entry in link.read(0.1)])
+        assert answers.readline() == "sent\n"
+        result["flood"] = _counters([entry for _ in range(10) for entry in link.read(0.1)])
 
         order("unplug")
         try:
             for _ in range(100):
                 link.read(0.1)
-            found["lost"] = ""
+            result["lost"] = ""
         except LinkLostError as error:
-            found["lost"] = str(error)
+            result["lost"] = str(error)
         link.close()
-    return found
+    return result
 
 
 def _await_node() -> None:
@@ -124,8 +124,8 @@ def _await_node() -> None:
         time.sleep(0.1)
 
 
-def _counters(came: list[tuple[int, bytes]]) -> list[int]:
-    return [int.from_bytes(data[-2:], "big") for _, data in came]
+def _counters(received: list[tuple[int, bytes]]) -> list[int]:
+    return [int.from_bytes(data[-2:], "big") for _, data in received]
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ MODULES = (
     "9p",
     "hid_generic",
     "uhid",
-)  # for its root, and for HID devices
+)  # The machine needs these modules for its root, and for HID devices.
 BOOT_S = 300
 TRAILER = "TRAILER!!!"
 INIT = """#!/bin/busybox sh
@@ -40,8 +40,10 @@ def lacking() -> str:
 
 def kernel(cache: Path) -> Path:
     """Return the folder of Debian's kernel package, unpacked, which is fetched if it is not in ``cache``."""
-    told = subprocess.run(["apt-cache", "depends", "linux-image-amd64"], capture_output=True, text=True, check=True)
-    name = re.search(r"Depends: (linux-image-\S+)", told.stdout)
+    dependencies = subprocess.run(
+        ["apt-cache", "depends", "linux-image-amd64"], capture_output=True, text=True, check=True
+    )
+    name = re.search(r"Depends: (linux-image-\S+)", dependencies.stdout)
     assert name is not None, "linux-image-amd64 is not in apt's lists; run `apt-get update`"
     folder = cache / name[1]
     if not folder.exists():
@@ -61,7 +63,7 @@ def run(folder: Path, command: str, scratch: Path) -> str:
     (image,) = (folder / "boot").glob("vmlinuz-*")
     initrd = scratch / "initrd.gz"
     initrd.write_bytes(gzip.compress(_initrd(folder, command), 1))
-    done = subprocess.run(
+    process = subprocess.run(
         [
             *("qemu-system-x86_64", "-accel", "tcg,thread=multi", "-cpu", "max", "-smp", "2", "-m", "768"),
             *("-nographic", "-no-reboot", "-nodefaults", "-serial", "stdio"),
@@ -76,7 +78,7 @@ def run(folder: Path, command: str, scratch: Path) -> str:
         timeout=BOOT_S,
         check=False,
     )
-    return done.stdout + done.stderr
+    return process.stdout + process.stderr
 
 
 def _initrd(folder: Path, command: str) -> bytes:
@@ -101,8 +103,8 @@ def _with_needs(name: str, files: dict[str, Path], ordered: list[str]) -> None:
     """Append a module to ``ordered``, those that it needs before it; what is no file is in the kernel itself."""
     if name in ordered or name not in files:
         return
-    told = re.search(rb"depends=([^\0]*)\0", _module(files[name]))
-    for needed in told[1].decode().split(",") if told else ():
+    match = re.search(rb"depends=([^\0]*)\0", _module(files[name]))
+    for needed in match[1].decode().split(",") if match else ():
         _with_needs(needed.replace("-", "_"), files, ordered)
     ordered.append(name)
 

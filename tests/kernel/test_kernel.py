@@ -26,35 +26,37 @@ pytestmark = [
 
 
 @pytest.fixture(scope="module")
-def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """What the guest saw."""
+def guest_result(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """Run the guest and return its result."""
     command = f"/usr/bin/env PYTHONPATH={HERE.parents[1]} HOME=/ {sys.executable} -B {HERE / 'guest.py'}"
     printed = machine.run(machine.kernel(CACHE), command, tmp_path_factory.mktemp("machine"))
-    _, there, result = printed.partition("RESULT ")  # behind what the BIOS prints on the same line
-    assert there, printed[-3000:]
-    told: dict[str, Any] = json.loads(result.splitlines()[0])
-    figures = {key: told[key] for key in ("kernel", "rate_hz", "busy_share")}
-    print(f"\n{figures}, {len(told['seq'])} of {guest.COUNT} reports, {len(told['flood'])} of a flood of {guest.FLOOD}")
-    return told
+    _, mark, result = printed.partition("RESULT ")  # The BIOS prints on the same line.
+    assert mark, printed[-3000:]
+    parsed: dict[str, Any] = json.loads(result.splitlines()[0])
+    figures = {key: parsed[key] for key in ("kernel", "rate_hz", "busy_share")}
+    print(
+        f"\n{figures}, {len(parsed['seq'])} of {guest.COUNT} reports, {len(parsed['flood'])} of a flood of {guest.FLOOD}"
+    )
+    return parsed
 
 
-def test_the_device_is_found_by_its_usage_page(found: dict[str, Any]) -> None:
-    assert len(found["ports"]) == 1
-    assert found["ports"][0].startswith("hid:/dev/hidraw0 (16c0:0486")
-    assert found["ports"][0].endswith("usage page ffab)")
+def test_the_device_is_found_by_its_usage_page(guest_result: dict[str, Any]) -> None:
+    assert len(guest_result["ports"]) == 1
+    assert guest_result["ports"][0].startswith("hid:/dev/hidraw0 (16c0:0486")
+    assert guest_result["ports"][0].endswith("usage page ffab)")
 
 
-def test_every_report_comes_at_a_thousand_a_second(found: dict[str, Any]) -> None:
-    assert found["seq"] == list(range(guest.COUNT))
+def test_every_report_comes_at_a_thousand_a_second(guest_result: dict[str, Any]) -> None:
+    assert guest_result["seq"] == list(range(guest.COUNT))
 
 
-def test_a_report_that_is_written_arrives(found: dict[str, Any]) -> None:
-    assert bytes.fromhex(found["heard"]) == b"\0" + bytes(range(64))
+def test_a_report_that_is_written_arrives(guest_result: dict[str, Any]) -> None:
+    assert bytes.fromhex(guest_result["heard"]) == b"\0" + bytes(range(64))
 
 
-def test_of_a_flood_the_kernel_keeps_the_oldest_reports(found: dict[str, Any]) -> None:
-    assert found["flood"] == list(range(QUEUED))
+def test_of_a_flood_the_kernel_keeps_the_oldest_reports(guest_result: dict[str, Any]) -> None:
+    assert guest_result["flood"] == list(range(QUEUED))
 
 
-def test_a_device_that_goes_away_is_lost(found: dict[str, Any]) -> None:
-    assert found["lost"].startswith("Stream board (hid:16c0:0486) is lost: it was unplugged")
+def test_a_device_that_goes_away_is_lost(guest_result: dict[str, Any]) -> None:
+    assert guest_result["lost"].startswith("Stream board (hid:16c0:0486) is lost: it was unplugged")

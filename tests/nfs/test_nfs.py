@@ -11,7 +11,7 @@ import pytest
 
 from tests.power import machine
 
-TOOLS = {  # and of which package
+TOOLS = {  # Programs that are needed, each with its package.
     "linux.uml": "user-mode-linux",
     "rpc.nfsd": "nfs-kernel-server",
     "rpc.mountd": "nfs-kernel-server",

@@ -38,12 +38,12 @@ LEARN = (
 )
 CLOUDS = ("candidates box.pcd",)
 DEVICES = ("sensors probe",)
-SILENT = 5  # where the computer has a serial port, and nothing answers there
+SILENT = 5  # Exit code where the computer has a serial port and nothing answers there.
 HDF5 = ("export hdf5 data/recordings -o hdf5", "ingest hdf5 hdf5 --guess")
 VIEW = ("view data/segments --limit 1 --save one.rrd",)
 ROS = ("export mcap data/recordings -o mcap", "ingest mcap mcap -o data/from-mcap")
 ZARR = ("export zarr data/synced -o zarr", "ingest zarr zarr --guess")
-EXTRAS: dict[str, tuple[str, ...]] = {  # to commands that work with it and not without
+EXTRAS: dict[str, tuple[str, ...]] = {  # Commands that work with each extra and not without it.
     "learn": LEARN,
     "bucket": (),
     "clouds": CLOUDS,
@@ -88,7 +88,7 @@ assert not lacking or sys.argv[1] != "all", lacking
 
 @dataclass(frozen=True)
 class Built:
-    """What is uploaded for a release."""
+    """Wheel and sdist that are uploaded for a release."""
 
     wheel: Path
     sdist: Path
@@ -113,12 +113,12 @@ def tried(folder: Path, package: Path, extra: str) -> float:
     environment, project = folder / "environment", folder / "project"
     venv.create(environment, with_pip=True)
     python, bare_mb = environment / "bin" / "python", size_mb(environment)
-    wanted = f"{package}[{extra}]" if extra else str(package)
+    requirement = f"{package}[{extra}]" if extra else str(package)
     pip = [str(python), "-m", "pip", "install", "-q", "--no-compile"]  # bytecode is no part of what is measured
-    run([*pip, "-c", str(ROOT / "constraints.txt"), wanted], folder)
+    run([*pip, "-c", str(ROOT / "constraints.txt"), requirement], folder)
     installed_mb = size_mb(environment) - bare_mb
     (testing,) = environment.glob("lib/python*/site-packages/tacpipe/testing")
-    shutil.rmtree(testing)  # what runs does not need it
+    shutil.rmtree(testing)  # Programs do not need it when they run.
     project.mkdir()
     write_box(project / "box.pcd")
     print(run([str(python), "-c", IMPORT_ALL, extra], project), end="")
@@ -145,10 +145,10 @@ def size_mb(folder: Path) -> float:
 
 def run(words: list[str], folder: Path, allowed: tuple[int, ...] = (0,)) -> str:
     """Return what a command prints; raises `FailedError` where it ends with a code that is not allowed."""
-    done = subprocess.run(words, cwd=folder, capture_output=True, text=True, check=False)
-    if done.returncode not in allowed:
-        raise FailedError(f"{shlex.join(words)} ended with {done.returncode}:\n{done.stdout}{done.stderr}")
-    return done.stdout
+    process = subprocess.run(words, cwd=folder, capture_output=True, text=True, check=False)
+    if process.returncode not in allowed:
+        raise FailedError(f"{shlex.join(words)} ended with {process.returncode}:\n{process.stdout}{process.stderr}")
+    return process.stdout
 
 
 def main() -> int:
@@ -157,7 +157,7 @@ def main() -> int:
     parser.add_argument(
         "--only", nargs="*", default=["core", "sdist", *EXTRAS], help="environments: core, sdist, an extra"
     )
-    wanted = parser.parse_args().only
+    environments = parser.parse_args().only
     failed = 0
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
@@ -165,7 +165,7 @@ def main() -> int:
         built = build(place / "dist")
         for path in (built.wheel, built.sdist):
             print(f"{path.name}: {path.stat().st_size / 1e6:.1f} MB", flush=True)
-        for name in wanted:
+        for name in environments:
             package = built.sdist if name == "sdist" else built.wheel
             (place / name).mkdir()
             try:

@@ -1,4 +1,4 @@
-"""What the wheel contains: every package of the sources, and of the extras each one is tried by `make test-install`."""
+"""The wheel contains every package of the sources, and `make test-install` tries each of the extras."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from random import Random
 
-MAGIC = 0x6A736677736872  # of the superblock
+MAGIC = 0x6A736677736872  # Magic number of the superblock.
 SECTOR = 512
 FLUSH, FUA, DISCARD, MARK, METADATA = 1, 2, 4, 8, 16
 _SUPER, _ENTRY = struct.Struct("<QQQI"), struct.Struct("<QQQQ")
@@ -33,7 +33,7 @@ def read(path: Path) -> list[Entry]:
     with path.open("rb") as log:
         magic, _, count, sector_bytes = _SUPER.unpack(log.read(_SUPER.size))
         assert magic == MAGIC, f"{path} is not a log of dm-log-writes"
-        found, place = [], sector_bytes
+        entries, place = [], sector_bytes
         for _ in range(count):
             log.seek(place)
             sector, sectors, flags, size = _ENTRY.unpack(log.read(_ENTRY.size))
@@ -44,13 +44,13 @@ def read(path: Path) -> list[Entry]:
                 log.seek(place)
                 data = log.read(sectors * sector_bytes)
                 place += sectors * sector_bytes
-            found.append(Entry(sector * sector_bytes, sectors * sector_bytes, flags, text or data))
-    return found
+            entries.append(Entry(sector * sector_bytes, sectors * sector_bytes, flags, text or data))
+    return entries
 
 
 @dataclass(frozen=True)
 class State:
-    """What a disk may hold after a loss of power: the writes that are on it, and the marks that were passed by then."""
+    """Writes that a disk may hold after a loss of power, and the marks that were passed by then."""
 
     writes: list[Entry]
     passed: tuple[str, ...]
@@ -62,23 +62,23 @@ def states(entries: list[Entry], seed: int) -> Iterator[State]:
     What came before a flush is on the disk. Of what came after the last one a disk may keep any part in any order.
     """
     chance = Random(seed)
-    kept: list[Entry] = []  # on the disk for certain
+    synced: list[Entry] = []  # These writes are on the disk for certain.
     loose: list[Entry] = []  # written since the last flush
     passed: tuple[str, ...] = ()
     for entry in entries:
         if entry.flags & MARK:
             passed += (entry.data.rstrip(b"\0").decode(),)
-            yield State(list(kept), passed)
+            yield State(list(synced), passed)
             continue
         if entry.flags & FLUSH:
             if loose:
-                yield State([*kept, *chance.sample(loose, chance.randint(0, len(loose)))], passed)
-            kept += loose
+                yield State([*synced, *chance.sample(loose, chance.randint(0, len(loose)))], passed)
+            synced += loose
             loose = []
         if entry.data:
-            (kept if entry.flags & FUA else loose).append(entry)
+            (synced if entry.flags & FUA else loose).append(entry)
         if entry.flags & (FLUSH | FUA):
-            yield State(list(kept), passed)
+            yield State(list(synced), passed)
 
 
 def write(state: State, image: Path) -> None:

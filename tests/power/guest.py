@@ -1,4 +1,4 @@
-"""What runs inside User-mode Linux, as its first process: commands on a logged disk, or looks at disks that lost power.
+"""Inside User-mode Linux, as its first process, run commands on a logged disk or look at disks that lost power.
 
 Each answer is a line, ``RESULT`` and JSON.
 """
@@ -23,9 +23,9 @@ from typing import Any
 from tests.recording import counted_device
 
 DISK, LOG, PLACE = "/dev/ubda", "/dev/ubdb", Path("/run/disk")
-FINIT_MODULE = 313  # of x86-64's system calls
-SIOCSIFFLAGS, IFF_UP = 0x8914, 1  # of <linux/sockios.h> and <linux/if.h>
-POWER_OFF = 0x4321FEDC  # of <linux/reboot.h>
+FINIT_MODULE = 313  # System call of x86-64.
+SIOCSIFFLAGS, IFF_UP = 0x8914, 1  # Constants of <linux/sockios.h> and <linux/if.h>.
+POWER_OFF = 0x4321FEDC  # Constant of <linux/reboot.h>.
 STEPS = {  # mark that is set once the command has returned, and the command
     "ingested": "ingest numbers src -o data/recordings --jobs 1",
     "labelled": "label data/recordings a --set material=foam",
@@ -140,24 +140,24 @@ def check(kind: str, disks: list[list[str]]) -> None:
         child = os.fork()
         if not child:
             disk, place = f"/dev/ubd{chr(ord('a') + number)}", PLACE.with_name(f"disk{number}")
-            answer = apart(lambda: survived(kind, disk, place, passed))  # noqa: B023
+            answer = catch_errors(lambda: survived(kind, disk, place, passed))  # noqa: B023
             os.write(writing, json.dumps(answer).encode())
             os._exit(0)
         os.close(writing)
-        with os.fdopen(reading, "rb") as told:
-            answer = json.loads(told.read())
+        with os.fdopen(reading, "rb") as pipe:
+            answer = json.loads(pipe.read())
         os.waitpid(child, 0)
         with contextlib.suppress(AssertionError):  # it was never mounted
             run("umount", str(PLACE.with_name(f"disk{number}")))
-        if kind == "btrfs":  # which refuses a second disk of the same identity, as all replayed ones are
+        if kind == "btrfs":  # btrfs refuses a second disk of the same identity, as all replayed ones are.
             run("btrfs", "device", "scan", "--forget")
         print("RESULT", json.dumps({"passed": passed, **answer}), flush=True)
 
 
-def apart(what: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+def catch_errors(function: Callable[[], dict[str, Any]]) -> dict[str, Any]:
     """Return what a function returns, or the error that it raised."""
     try:
-        return what()
+        return function()
     except BaseException:
         return {"wrong": traceback.format_exc()[-3000:]}
 
@@ -167,19 +167,19 @@ def survived(kind: str, disk: str, place: Path, passed: list[str]) -> dict[str, 
     import tacpipe as api
     from tacpipe.errors import TacpipeError
 
-    run("mount", "-t", kind, disk, str(place))  # which replays the file system's journal
+    run("mount", "-t", kind, disk, str(place))  # Mounting replays the file system's journal.
     os.chdir(place / "project")
     if "ingested" in passed:
         names = {*FIRST, *(MORE if "appended" in passed else ())}
-        held(api.open("data/recordings"), names, labelled="labelled" in passed)
+        check_recordings(api.open("data/recordings"), names, labelled="labelled" in passed)
     for path in ("data/recordings", "data/scaled"):
         with contextlib.suppress(TacpipeError):
             dataset = api.open(path)
             for name, shard in dataset.recordings.items():
                 with contextlib.suppress(TacpipeError):
                     factor = 2 if path == "data/scaled" else 1
-                    found = shard.table("left" if factor == 1 else "").column("x").to_pylist()
-                    assert found == [factor * value for value in values(name)], f"{path} {name} serves something else"
+                    served = shard.table("left" if factor == 1 else "").column("x").to_pylist()
+                    assert served == [factor * value for value in values(name)], f"{path} {name} serves something else"
     code, printed = tacpipe("store verify")
     assert code in (0, 4), printed
     assert code == 0 or "missing" in printed, printed
@@ -189,7 +189,7 @@ def survived(kind: str, disk: str, place: Path, passed: list[str]) -> dict[str, 
     for command in STEPS.values():
         code, printed = tacpipe(command)
         assert code == 0, f"{command}: {printed}"
-    held(api.open("data/recordings"), {*FIRST, *MORE}, labelled=True)
+    check_recordings(api.open("data/recordings"), {*FIRST, *MORE}, labelled=True)
     recovered(passed)
     code, printed = tacpipe("store verify")
     assert code == 0, printed
@@ -213,7 +213,7 @@ def recovered(passed: list[str]) -> None:
         assert len(numbers) > 300 or "acquired" not in passed, f"{len(numbers)} frames of 400"
 
 
-def held(dataset: Any, names: set[str], *, labelled: bool) -> None:
+def check_recordings(dataset: Any, names: set[str], *, labelled: bool) -> None:
     """Expect recordings with all their values, and the label that was set by hand."""
     assert names <= set(dataset.recordings), f"{sorted(dataset.recordings)} of {sorted(names)}"
     for name, shard in dataset.recordings.items():
@@ -225,11 +225,11 @@ def held(dataset: Any, names: set[str], *, labelled: bool) -> None:
 def main() -> None:
     """Do as the file that is named first says, then turn the power off."""
     boot()
-    given = json.loads(Path(sys.argv[1]).read_text())
-    if "modules" in given:
-        print("RESULT", json.dumps(apart(lambda: record(given["kind"], given["modules"]))), flush=True)
+    task = json.loads(Path(sys.argv[1]).read_text())
+    if "modules" in task:
+        print("RESULT", json.dumps(catch_errors(lambda: record(task["kind"], task["modules"]))), flush=True)
     else:
-        check(given["kind"], given["disks"])
+        check(task["kind"], task["disks"])
     os.sync()
     libc.reboot(POWER_OFF)
 

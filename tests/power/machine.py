@@ -18,7 +18,7 @@ LIMIT_S = 1200
 MAKE = {"ext4": ["mkfs.ext4", "-q", "-F"], "xfs": ["mkfs.xfs", "-q"], "btrfs": ["mkfs.btrfs", "-q"]}
 SIZE_MB = {"ext4": 64, "xfs": 320, "btrfs": 128}  # hardly more than each needs
 PATH = f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin"
-TOOLS = {  # and the Debian packages that have them
+TOOLS = {  # Programs that are needed, with the Debian packages that have them.
     "linux.uml": "user-mode-linux",
     "dmsetup": "dmsetup",
     "mkfs.ext4": "e2fsprogs",
@@ -34,8 +34,8 @@ def lacking(tools: Mapping[str, str] = TOOLS) -> str:
 
 def modules() -> Path:
     """Return where the kernel's modules for logged disks are."""
-    (found,) = MODULES.glob("*/kernel/drivers/md")
-    return found
+    (folder,) = MODULES.glob("*/kernel/drivers/md")
+    return folder
 
 
 def blank(path: Path, size_mb: int) -> Path:
@@ -56,9 +56,9 @@ def run(
     disks: Sequence[Path], task: Mapping[str, Any], scratch: Path, environment: Mapping[str, str]
 ) -> list[dict[str, Any]]:
     """Boot with these disks, do the ``task`` of `guest`, and return its answers."""
-    told = scratch / "task.json"
-    told.write_text(json.dumps(task))
-    command = f"cd {ROOT}\nexec {sys.executable} -B -m tests.power.guest {told}\n"
+    task_file = scratch / "task.json"
+    task_file.write_text(json.dumps(task))
+    command = f"cd {ROOT}\nexec {sys.executable} -B -m tests.power.guest {task_file}\n"
     ran = boot(disks, command, scratch, environment)
     answers = [line.partition("RESULT ")[2] for line in ran.stdout.splitlines() if "RESULT {" in line]
     assert answers, ran.stdout[-3000:] + ran.stderr[-1000:]

@@ -17,7 +17,7 @@ needs_machine = [
 
 @pytest.mark.parametrize("kind", [pytest.param(kind, marks=needs_machine) for kind in machine.MAKE])
 def test_what_was_answered_outlasts_a_loss_of_power_at_any_write(kind: str, tmp_path: Path) -> None:
-    tried = trials.trial(kind, tmp_path, every=int(os.environ.get("TACPIPE_TEST_POWER") or 1))
+    tried = trials.trial(kind, tmp_path, step=int(os.environ.get("TACPIPE_TEST_POWER") or 1))
     assert tried.states and not tried.wrong, "\n".join(tried.wrong)
 
 
@@ -26,12 +26,12 @@ def entry(sector: int, flags: int = 0, data: bytes = b"") -> block_log.Entry:
 
 
 def test_what_was_flushed_is_on_the_disk_and_of_the_rest_any_part_may_be() -> None:
-    one, two, three = (entry(512 * number, data=bytes([number]) * 512) for number in (1, 2, 3))
-    log = [one, two, entry(0, block_log.FLUSH), entry(0, block_log.MARK, b"done\0"), three, entry(0, block_log.FLUSH)]
-    found = list(block_log.states(log, seed=0))
-    assert [state.passed for state in found] == [(), (), ("done",), ("done",), ("done",)]
-    assert all(set(state.writes) >= {one, two} for state in found[1:])
-    assert set(found[0].writes) <= {one, two} and set(found[-1].writes) == {one, two, three}
+    first, two, three = (entry(512 * number, data=bytes([number]) * 512) for number in (1, 2, 3))
+    log = [first, two, entry(0, block_log.FLUSH), entry(0, block_log.MARK, b"done\0"), three, entry(0, block_log.FLUSH)]
+    states = list(block_log.states(log, seed=0))
+    assert [state.passed for state in states] == [(), (), ("done",), ("done",), ("done",)]
+    assert all(set(state.writes) >= {first, two} for state in states[1:])
+    assert set(states[0].writes) <= {first, two} and set(states[-1].writes) == {first, two, three}
 
 
 def test_a_forced_write_is_on_the_disk_though_nothing_was_flushed(tmp_path: Path) -> None:

@@ -41,7 +41,7 @@ def plugin(folder: Path) -> Path:
     return folder
 
 
-def trial(kind: str, scratch: Path, every: int = 1, seed: int = 0) -> Tried:
+def trial(kind: str, scratch: Path, step: int = 1, seed: int = 0) -> Tried:
     """Return what came of commands on a file system of this kind, whose disk loses power at any moment."""
     environment = {"PYTHONPATH": str(plugin(scratch / "plugin"))}
     base = machine.formatted(scratch / "base.img", kind)
@@ -51,25 +51,25 @@ def trial(kind: str, scratch: Path, every: int = 1, seed: int = 0) -> Tried:
     disk.unlink()
     entries = block_log.read(log)
     log.unlink()
-    states = [state for state in block_log.states(entries, seed) if "prepared" in state.passed][::every]
+    states = [state for state in block_log.states(entries, seed) if "prepared" in state.passed][::step]
     tried = Tried(kind)
     for first in range(0, len(states), TOGETHER):
-        some = states[first : first + TOGETHER]
-        disks = [copied(base, scratch / f"state{number}.img") for number in range(len(some))]
-        for state, image in zip(some, disks, strict=True):
+        batch = states[first : first + TOGETHER]
+        disks = [copied(base, scratch / f"state{number}.img") for number in range(len(batch))]
+        for state, image in zip(batch, disks, strict=True):
             block_log.write(state, image)
-        answers = look(kind, some, disks, scratch, environment)
+        answers = look(kind, batch, disks, scratch, environment)
         tried.states += len(answers)
-        tried.wrong += [f"{kind}, after {one['passed']}: {one['wrong']}" for one in answers if one["wrong"]]
+        tried.wrong += [f"{kind}, after {answer['passed']}: {answer['wrong']}" for answer in answers if answer["wrong"]]
     count("losses of power replayed on blocks", tried.states)
     return tried
 
 
 def look(
-    kind: str, some: list[block_log.State], disks: list[Path], scratch: Path, environment: Mapping[str, str]
+    kind: str, batch: list[block_log.State], disks: list[Path], scratch: Path, environment: Mapping[str, str]
 ) -> list[dict[str, str]]:
     """Return what the guest answers of each disk; it must answer of all."""
-    task = {"kind": kind, "disks": [state.passed for state in some]}
+    task = {"kind": kind, "disks": [state.passed for state in batch]}
     answers = machine.run(disks, task, scratch, environment)
     assert len(answers) == len(disks), answers
     return answers
@@ -95,11 +95,11 @@ def main() -> None:
     parser.add_argument("--kinds", nargs="+", default=list(machine.MAKE), choices=list(machine.MAKE))
     parser.add_argument("--every", type=int, default=1, help="Look at one of so many states.")
     parser.add_argument("--seed", type=int, default=0, help="Of what comes onto a disk without a flush.")
-    given = parser.parse_args()
+    options = parser.parse_args()
     wrong: list[str] = []
-    for kind in given.kinds:
+    for kind in options.kinds:
         with tempfile.TemporaryDirectory() as scratch:
-            tried = trial(kind, Path(scratch), given.every, given.seed)
+            tried = trial(kind, Path(scratch), options.every, options.seed)
         print(f"{kind}: {tried.states} states, {len(tried.wrong)} wrong", flush=True)
         wrong += tried.wrong
     print("\n".join(wrong))

@@ -12,7 +12,7 @@ from tests.promises.specimen import Specimen
 
 
 @pytest.fixture
-def made(lab: Lab, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def original(lab: Lab, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A sound project."""
 
     def make(folder: Path) -> None:
@@ -23,6 +23,6 @@ def made(lab: Lab, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def one(made: Path, lab: Lab) -> Specimen:
+def project(original: Path, lab: Lab) -> Specimen:
     """A copy of a sound project."""
-    return specimen.copy(made, lab)
+    return specimen.copy(original, lab)

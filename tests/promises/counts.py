@@ -15,20 +15,20 @@ PLACE = "TACPIPE_COUNTS"  # names the file that counts go to; without it they ar
 BEGIN, END = "<!-- counts -->", "<!-- end of counts -->"
 
 
-def count(what: str, number: int = 1) -> None:
-    """Note that ``number`` more of ``what`` were done, as in ``count("kills survived")``."""
+def count(event: str, number: int = 1) -> None:
+    """Note that ``number`` more of an event happened, as in ``count("kills survived")``."""
     place = os.environ.get(PLACE)
     if place and number:
         with open(place, "a") as file:  # a line is appended whole, whichever process writes
-            file.write(json.dumps([what, number]) + "\n")
+            file.write(json.dumps([event, number]) + "\n")
 
 
 def total(place: Path) -> dict[str, int]:
     """Return all counts of a file, by name."""
     sums: Counter[str] = Counter()
     for line in place.read_text().splitlines():
-        what, number = json.loads(line)
-        sums[what] += number
+        event, number = json.loads(line)
+        sums[event] += number
     return dict(sorted(sums.items()))
 
 
@@ -42,13 +42,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("counts", type=Path)
     parser.add_argument("--write", type=Path, default=None)
-    given = parser.parse_args()
-    text = table(total(given.counts))
+    options = parser.parse_args()
+    text = table(total(options.counts))
     print(text)
-    if given.write is not None:
-        before, _, rest = given.write.read_text().partition(BEGIN)
-        _, _, after = rest.partition(END)
-        given.write.write_text(f"{before}{BEGIN}\n{text}\n{END}{after}")
+    if options.write is not None:
+        before, _, after_begin = options.write.read_text().partition(BEGIN)
+        _, _, after = after_begin.partition(END)
+        options.write.write_text(f"{before}{BEGIN}\n{text}\n{END}{after}")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What disks, people and other programs do to files."""
+"""Damage files as disks, people and other programs do."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def replaced(path: Path) -> None:
     path.write_bytes(content[:-1] + b"?")
 
 
-def gone(path: Path) -> None:
+def delete(path: Path) -> None:
     """Delete it."""
     path.unlink()
 
@@ -73,5 +73,5 @@ ALL: dict[str, Damage] = {
     "it is all zeros": zeros,
     "it has a byte more": longer,
     "another file is in its place": replaced,
-    "it is gone": gone,
+    "it is gone": delete,
 }

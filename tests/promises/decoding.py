@@ -1,4 +1,4 @@
-"""What comes over a link, cut into frames and decoded as a recording does: however it is cut into chunks."""
+"""Cut what comes over a link into frames and decode it as a recording does, however it is cut into chunks."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from tacpipe.sensors.sensor import Sensor
 from tests.sensors import harm, made
 from tests.sensors.test_every_sensor import CASES, sent
 
-FRAMES = 30  # of an example
+FRAMES = 30  # Number of frames in an example.
 MOST_PENDING = 1 << 17  # bytes that a framer may hold undecided, whatever comes
-CUT = b"\xa5cut\x5a"  # between the packets of a link that gives packets
+CUT = b"\xa5cut\x5a"  # This separates the packets of a link that gives packets.
 
 
 @functools.cache
@@ -28,24 +28,24 @@ def sensor(case: str) -> Sensor:
 @functools.cache
 def examples(case: str) -> list[bytes]:
     """Return what the device sends, sound, as one text; packets with `CUT` between them."""
-    found = []
+    streams = []
     for seed in (0, 1):
-        one = sent(case, FRAMES, seed)
-        parts = [part for piece in one.pieces for part in harm.packets(one.sensor, piece)]
-        found.append((b"" if harm.is_stream(one.sensor) else CUT).join(parts))
-    return found
+        recorded = sent(case, FRAMES, seed)
+        parts = [part for piece in recorded.pieces for part in harm.packets(recorded.sensor, piece)]
+        streams.append((b"" if harm.is_stream(recorded.sensor) else CUT).join(parts))
+    return streams
 
 
 def chunks(case: str, data: bytes, sizes: Sequence[int] = (64,)) -> list[bytes]:
     """Return what a link gives: its packets, or a stream in chunks of these sizes, over and over."""
     if not harm.is_stream(sensor(case)):
         return data.split(CUT)
-    found, place, number = [], 0, 0
+    pieces, place, number = [], 0, 0
     while place < len(data):
         size = max(1, sizes[number % len(sizes)])
-        found.append(data[place : place + size])
+        pieces.append(data[place : place + size])
         place, number = place + size, number + 1
-    return found
+    return pieces
 
 
 def samples(case: str, pieces: Sequence[bytes], at_once: int = 8, passing_ns: int = 0) -> list[bytes]:
@@ -53,26 +53,26 @@ def samples(case: str, pieces: Sequence[bytes], at_once: int = 8, passing_ns: in
 
     Where time passes between chunks few bytes wait: some sensors hold back what comes in the first half second.
     """
-    one = sensor(case)
-    framer = one.framer()
+    tested_sensor = sensor(case)
+    framer = tested_sensor.framer()
     runs: list[Run] = []
-    told = 0
+    lost_bytes = 0
     for start in range(0, len(pieces), at_once):
         stamped = [(1 + passing_ns * (start + row), piece) for row, piece in enumerate(pieces[start : start + at_once])]
-        found, losses = framer.feed(Chunks.of(stamped))
+        new_runs, losses = framer.feed(Chunks.of(stamped))
         assert not passing_ns or framer.account.pending <= MOST_PENDING
-        runs, told = runs + found, told + sum(loss.bytes for loss in losses)
-    found, losses = framer.flush()
-    told += sum(loss.bytes for loss in losses)
+        runs, lost_bytes = runs + new_runs, lost_bytes + sum(loss.bytes for loss in losses)
+    new_runs, losses = framer.flush()
+    lost_bytes += sum(loss.bytes for loss in losses)
     assert framer.account.pending == 0
-    assert framer.account.received == sum(map(len, pieces)) == framer.account.framed + told
-    return rows(one, runs + found)
+    assert framer.account.received == sum(map(len, pieces)) == framer.account.framed + lost_bytes
+    return rows(tested_sensor, runs + new_runs)
 
 
-def rows(one: Sensor, runs: Sequence[Run]) -> list[bytes]:
+def rows(tested_sensor: Sensor, runs: Sequence[Run]) -> list[bytes]:
     """Return the samples of runs, each as its bytes."""
     with np.errstate(all="ignore"):
-        decoded: Any = made.decoded(one, runs)
+        decoded: Any = made.decoded(tested_sensor, runs)
     return made.rows(decoded) if len(decoded) else []
 
 

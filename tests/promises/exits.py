@@ -41,34 +41,40 @@ def main() -> int:
     parser.add_argument("--shows", type=int, default=2000, help="Runs of `tacpipe show`.")
     parser.add_argument("--others", type=int, default=300, help="Runs of other commands, in turns.")
     parser.add_argument("--jobs", type=int, default=2, help="Commands at a time.")
-    given = parser.parse_args()
+    options = parser.parse_args()
     with tempfile.TemporaryDirectory() as place:
         chain.run(Path(place))
-        found = ended(Path(place), [SHOW] * given.shows, given.jobs)
-        found += ended(Path(place), [OTHERS[number % len(OTHERS)] for number in range(given.others)], given.jobs)
-    for (command, code), times in sorted(found.items()):
+        counts = count_exit_codes(Path(place), [SHOW] * options.shows, options.jobs)
+        counts += count_exit_codes(
+            Path(place), [OTHERS[number % len(OTHERS)] for number in range(options.others)], options.jobs
+        )
+    for (command, code), times in sorted(counts.items()):
         print(f"{times:6} x exit code {code:4}  tacpipe {command}")
-    count("commands that ended as they should", sum(times for (_, code), times in found.items() if code == 0))
-    return int(any(code for _, code in found))
+    count("commands that ended as they should", sum(times for (_, code), times in counts.items() if code == 0))
+    return int(any(code for _, code in counts))
 
 
-def ended(folder: Path, commands: list[str], jobs: int) -> Counter[tuple[str, int]]:
+def count_exit_codes(folder: Path, commands: list[str], jobs: int) -> Counter[tuple[str, int]]:
     """Return how often each command ended with each exit code; what a failed one wrote to stderr is printed."""
 
     def run(command: str) -> tuple[str, int]:
-        done = tacpipe(folder, command)
-        if done.returncode:
-            print(f"tacpipe {command}: exit code {done.returncode}: {done.stderr[-300:]}", file=sys.stderr, flush=True)
-        return command, done.returncode
+        process = tacpipe(folder, command)
+        if process.returncode:
+            print(
+                f"tacpipe {command}: exit code {process.returncode}: {process.stderr[-300:]}",
+                file=sys.stderr,
+                flush=True,
+            )
+        return command, process.returncode
 
-    found: Counter[tuple[str, int]] = Counter()
+    counts: Counter[tuple[str, int]] = Counter()
     with ThreadPoolExecutor(jobs) as pool:
-        for number, one in enumerate(pool.map(run, commands), 1):
-            found[one] += 1
+        for number, command_and_code in enumerate(pool.map(run, commands), 1):
+            counts[command_and_code] += 1
             if number % _EVERY == 0:
-                failed = sum(times for (_, code), times in found.items() if code)
+                failed = sum(times for (_, code), times in counts.items() if code)
                 print(f"{number} of {len(commands)} ended, {failed} with another exit code than 0", file=sys.stderr)
-    return found
+    return counts
 
 
 if __name__ == "__main__":

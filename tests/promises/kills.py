@@ -31,7 +31,7 @@ from tests.promises import operations_cases
 from tests.promises.counts import count
 from tests.promises.warm import Warm, serving
 
-PATIENCE_S = 60.0  # after which a process that should have ended counts as hanging
+PATIENCE_S = 60.0  # A process that should have ended counts as hanging after this time.
 # Notes, which are not errors: on recordings, what an export does not carry, and a new store.
 NOTE = re.compile(r"tacpipe: (?:(?:not carried|[\w-]+|all \d+ recordings): |created the store )")
 
@@ -84,7 +84,7 @@ class Fresh:
         return self._process.poll()
 
 
-def ended(running: Running) -> int:
+def wait_for_exit(running: Running) -> int:
     """Wait for a command and return how it ended; one that hangs is killed and fails the test."""
     until_s = time.monotonic() + PATIENCE_S
     while (code := running.poll()) is None:
@@ -97,21 +97,21 @@ def ended(running: Running) -> int:
 
 def session(pid: int) -> list[int]:
     """Return the processes of the session that ``pid`` leads or led, those that only wait to be buried left out."""
-    found = []
+    pids = []
     for folder in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError):
             state, _, _, leader = (folder / "stat").read_text().rpartition(")")[2].split()[:4]
             if int(leader) == pid and state != "Z":
-                found.append(int(folder.name))
-    return sorted(found)
+                pids.append(int(folder.name))
+    return sorted(pids)
 
 
-def gone(pid: int) -> None:
+def wait_until_gone(pid: int) -> None:
     """Wait until no process of the session is left; fail if one stays."""
     until_s = time.monotonic() + PATIENCE_S
-    while left := session(pid):
+    while remaining := session(pid):
         if time.monotonic() > until_s:
-            names = [Path(f"/proc/{one}/cmdline").read_bytes() for one in left]
+            names = [Path(f"/proc/{process}/cmdline").read_bytes() for process in remaining]
             os.killpg(pid, signal.SIGKILL)
             raise AssertionError(f"processes outlive the command that started them: {names}")
         time.sleep(0.01)
@@ -119,7 +119,7 @@ def gone(pid: int) -> None:
 
 @dataclass(frozen=True)
 class State:
-    """What of a project must not depend on how often it was killed: provenance and times apart, all of it."""
+    """State of a project that must not depend on how often it was killed: all of it but provenance and times."""
 
     files: Mapping[str, bytes]
     objects: frozenset[str]
@@ -127,7 +127,7 @@ class State:
     roots: Mapping[str, object]
 
     @classmethod
-    def of(cls, project: Path) -> State:
+    def from_project(cls, project: Path) -> State:
         """Return the state of a project and of the stores in it."""
         stores = [Store(path.parent) for path in sorted(project.rglob("format"))]
         files = {
@@ -142,12 +142,16 @@ class State:
             {f"{store.root.name}/{root['path']}": root["manifest"] for store in stores for root in store.roots.all()},
         )
 
-    def differences(self, other: State) -> list[str]:
+    def differences(self, expected: State) -> list[str]:
         """Return names of what is not the same."""
-        found = []
-        for mine, theirs in ((self.files, other.files), (self.results, other.results), (self.roots, other.roots)):
-            found += [name for name in {*mine, *theirs} if mine.get(name) != theirs.get(name)]
-        return sorted([*found, *(self.objects ^ other.objects)])
+        names = []
+        for mine, theirs in (
+            (self.files, expected.files),
+            (self.results, expected.results),
+            (self.roots, expected.roots),
+        ):
+            names += [name for name in {*mine, *theirs} if mine.get(name) != theirs.get(name)]
+        return sorted([*names, *(self.objects ^ expected.objects)])
 
 
 @dataclass
@@ -158,11 +162,11 @@ class Scene:
     warm: Warm
     environment: Mapping[str, str]
     number: int = 0
-    latencies_s: list[float] = field(default_factory=list)  # from a wish to end until no process is left
+    latencies_s: list[float] = field(default_factory=list)  # Seconds from a request to end until no process is left.
 
     @property
     def project(self) -> Path:
-        """Where commands run."""
+        """Return the folder in which commands run."""
         return self.folder / "project"
 
     def keep(self) -> None:
@@ -170,7 +174,7 @@ class Scene:
         shutil.rmtree(self.folder / "before", ignore_errors=True)
         shutil.copytree(self.project, self.folder / "before", symlinks=True)
 
-    def again(self) -> None:
+    def restore(self) -> None:
         """Bring back what was kept."""
         shutil.rmtree(self.project)
         shutil.copytree(self.folder / "before", self.project, symlinks=True)
@@ -180,16 +184,16 @@ class Scene:
         self.number += 1
         out = self.folder / f"{self.number}.out"
         out.touch()
-        given = {**self.environment, **environment}
+        variables = {**self.environment, **environment}
         if fresh:
-            return Fresh(self.project, words, out, given)
-        return Forked(self.warm, self.warm.start(self.project, words, out, given), out)
+            return Fresh(self.project, words, out, variables)
+        return Forked(self.warm, self.warm.start(self.project, words, out, variables), out)
 
     def run(self, words: str) -> float:
         """Run a command that must succeed and return how long it took, in seconds."""
         began_s = time.monotonic()
         running = self.start(words)
-        code = ended(running)
+        code = wait_for_exit(running)
         assert code == 0, f"{words} ended with {code}: {running.out.read_text()}"
         return time.monotonic() - began_s
 
@@ -211,10 +215,10 @@ def one_below(generation: int) -> Strike:
     """Return what kills the server of forks (1) or a worker (2), if one is there yet."""
 
     def strike(running: Running) -> None:
-        wanted = [running.pid]
+        pids = [running.pid]
         for _ in range(generation):
-            wanted = [pid for pid in session(running.pid) if _parent(pid) in wanted and b"forkserver" in _command(pid)]
-        for pid in wanted[:1]:
+            pids = [pid for pid in session(running.pid) if _parent(pid) in pids and b"forkserver" in _command(pid)]
+        for pid in pids[:1]:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
 
@@ -244,19 +248,21 @@ def survive(
     rng = random.Random(words)
     scene.keep()
     running, began_s = scene.start(words, fresh=fresh), time.monotonic()
-    code = ended(running)
+    code = wait_for_exit(running)
     assert code == 0, f"{words} ended with {code}: {running.out.read_text()}"
-    lasts_s, wanted = time.monotonic() - began_s, State.of(scene.project)
+    lasts_s, expected = time.monotonic() - began_s, State.from_project(scene.project)
     for trial in range(trials):
         name = list(strikes)[trial % len(strikes)]
         after_s = lasts_s * (trial + rng.random()) / trials
-        scene.again()
+        scene.restore()
         try:
             hit = struck(scene, words, name, strikes[name], after_s, fresh=fresh)
             if sound:
                 _verify(scene)
             scene.run(words)
-            assert not (found := wanted.differences(State.of(scene.project))), f"a rerun gives other {found}"
+            assert not (differences := expected.differences(State.from_project(scene.project))), (
+                f"a rerun gives other {differences}"
+            )
         except AssertionError as error:
             error.add_note(f"{name} of `tacpipe {words}` after {after_s:.4f} of {lasts_s:.4f} s")
             raise
@@ -271,22 +277,22 @@ def struck(scene: Scene, words: str, name: str, strike: Strike, after_s: float, 
     with contextlib.suppress(ProcessLookupError):  # it has ended
         strike(running)
     struck_s = time.monotonic()
-    code = ended(running)
-    gone(running.pid)
-    said = running.out.read_text()
+    code = wait_for_exit(running)
+    wait_until_gone(running.pid)
+    printed = running.out.read_text()
     if code == 130:
         scene.latencies_s.append(time.monotonic() - struck_s)
-    assert code in _codes(name), f"it ended with {code}: {said}"
-    orderly(said, code)
+    assert code in _codes(name), f"it ended with {code}: {printed}"
+    orderly(printed, code)
     return code in (1, 130, -signal.SIGKILL)
 
 
-def orderly(said: str, code: int) -> None:
+def orderly(printed: str, code: int) -> None:
     """Fail unless a command that ended so said one sentence at most, and nothing of its insides."""
-    assert not any(word in said for word in ("Traceback", "Exception ignored", "Warning", "Aborted")), said
-    assert said.count(SENTENCE) == (code == 130), said
-    sentences = [line for line in said.splitlines() if line.startswith("tacpipe: ") and not NOTE.match(line)]
-    assert len(sentences) == (code in (1, 130)), said
+    assert not any(word in printed for word in ("Traceback", "Exception ignored", "Warning", "Aborted")), printed
+    assert printed.count(SENTENCE) == (code == 130), printed
+    sentences = [line for line in printed.splitlines() if line.startswith("tacpipe: ") and not NOTE.match(line)]
+    assert len(sentences) == (code in (1, 130)), printed
 
 
 def aged(project: Path) -> None:
@@ -299,8 +305,8 @@ def aged(project: Path) -> None:
 
 def _verify(scene: Scene) -> None:
     for path in scene.project.rglob("format"):
-        found = repair.verify(Store(path.parent))
-        assert found.clean, found.to_text()
+        soundness = repair.verify(Store(path.parent))
+        assert soundness.clean, soundness.to_text()
 
 
 def _codes(name: str) -> tuple[int, ...]:
@@ -309,7 +315,7 @@ def _codes(name: str) -> tuple[int, ...]:
         return 0, 1
     if "KILL" in name:
         return 0, -signal.SIGKILL
-    number = next((one for one in (signal.SIGTERM, signal.SIGHUP) if one.name in name), signal.SIGINT)
+    number = next((candidate for candidate in (signal.SIGTERM, signal.SIGHUP) if candidate.name in name), signal.SIGINT)
     return 0, 130, -number  # the last: Python itself was at its end
 
 
@@ -317,7 +323,7 @@ def main() -> None:
     """Interrupt commands as a terminal does, imports and all; print how long they took to end."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--trials", type=int, default=10, help="of each command")
-    given = parser.parse_args()
+    options = parser.parse_args()
     cases = [case for case in operations_cases.STAGES if case.before]
     latencies_s: list[float] = []
     for case in cases:
@@ -326,7 +332,7 @@ def main() -> None:
             scene = Scene(Path(name), warm, {})
             for command in case.before:
                 scene.run(command)
-            survive(scene, case.command, {"Ctrl-C": KILLS["Ctrl-C"]}, given.trials, fresh=True)
+            survive(scene, case.command, {"Ctrl-C": KILLS["Ctrl-C"]}, options.trials, fresh=True)
         print(f"{case.name}: {', '.join(f'{latency_s:.3f}' for latency_s in scene.latencies_s)} s", flush=True)
         latencies_s += scene.latencies_s
     print(

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 GIB = 1 << 30
-ENDS_S = 300  # for which a single piece of work may last, on a computer that is busy with other things
+ENDS_S = 300  # A single piece of work may last this long, on a computer that is busy with other things.
 LONGEST = 900  # letters of a sentence, a path of a test's folder in it
 
 
@@ -20,9 +20,9 @@ LONGEST = 900  # letters of a sentence, a path of a test's folder in it
 def bounded(memory: int = 2 * GIB) -> Iterator[None]:
     """Let what runs in the block take so many bytes more of address space, and end."""
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
-    held = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    used_bytes = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     before = signal.signal(signal.SIGALRM, _overdue)
-    resource.setrlimit(resource.RLIMIT_AS, (held + memory, hard))
+    resource.setrlimit(resource.RLIMIT_AS, (used_bytes + memory, hard))
     signal.alarm(ENDS_S)
     try:
         yield
@@ -32,7 +32,7 @@ def bounded(memory: int = 2 * GIB) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
 
 
-def some(cases: Iterable[Any], quick: int) -> list[Any]:
+def sample_cases(cases: Iterable[Any], quick: int) -> list[Any]:
     """Return cases for `pytest.mark.parametrize`, all but the first ``quick`` with the mark ``faults``."""
     return [case if row < quick else pytest.param(case, marks=pytest.mark.faults) for row, case in enumerate(cases)]
 

@@ -1,4 +1,4 @@
-"""What valid input becomes when bits flip, pieces are lost, and numbers are what no program would write."""
+"""Mutate valid input: bits flip, pieces are lost, and numbers are such as no program would write."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ LONGEST = 1 << 18  # bytes of what comes of it
 KINDS = 8
 
 
-def mutated(data: bytes, others: Sequence[bytes], random: Random) -> bytes:
-    """Return ``data`` after some changes; pieces of ``others`` may come into it."""
+def mutated(data: bytes, donors: Sequence[bytes], random: Random) -> bytes:
+    """Return ``data`` after some changes; pieces of ``donors`` may come into it."""
     for _ in range(random.choice((1, 1, 1, 2, 3, 5))):
-        data = _changed(data, others, random)[:LONGEST]
+        data = _changed(data, donors, random)[:LONGEST]
     return data
 
 
-def _changed(data: bytes, others: Sequence[bytes], random: Random) -> bytes:
+def _changed(data: bytes, donors: Sequence[bytes], random: Random) -> bytes:
     place = random.randrange(len(data) + 1)
     stop = min(len(data), place + random.choice((1, 1, 2, 4, 8, 30, 300, len(data))))
     kind = random.randrange(KINDS)
@@ -51,12 +51,12 @@ def _changed(data: bytes, others: Sequence[bytes], random: Random) -> bytes:
     if kind == 3:  # repeat a piece
         return data[:place] + data[place:stop] * random.choice((2, 3, 50, 1000)) + data[stop:]
     if kind == 4:  # a piece of another input, or of another place
-        other = random.choice([*others, data]) or b"\0"
-        start = random.randrange(len(other))
-        return data[:place] + other[start : start + random.choice((1, 4, 30, 300))] + data[stop:]
+        donor = random.choice([*donors, data]) or b"\0"
+        start = random.randrange(len(donor))
+        return data[:place] + donor[start : start + random.choice((1, 4, 30, 300))] + data[stop:]
     if kind == 5:  # a number or word that is extreme, in between
         return data[:place] + random.choice(EXTREMES) + data[place:]
-    if kind == 6:  # or instead
+    if kind == 6:  # An extreme replaces a piece.
         return data[:place] + random.choice(EXTREMES) + data[stop:]
     return data[:place] + random.randbytes(random.choice((1, 2, 8, 64))) + data[stop:]
 

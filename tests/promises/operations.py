@@ -32,8 +32,8 @@ _HANDLES = {  # those that take an open file
 }
 TAKES_SPACE = frozenset(("create", "write", "link", "mkdir", "symlink", "fallocate", "sendfile", "copy_file_range"))
 SYNCS = frozenset(("fsync", "fdatasync"))
-LASTING = {"full": errno.ENOSPC, "read-only": errno.EROFS, "gone": errno.EIO}  # from one call on
-_ERRORS = {  # that a call can give
+LASTING = {"full": errno.ENOSPC, "read-only": errno.EROFS, "gone": errno.EIO}  # Faults that last from one call on.
+_ERRORS = {  # Errors that a call can return.
     **dict.fromkeys(("read", "close"), ("EIO",)),
     **dict.fromkeys(("open", "stat", "scandir", "readlink", "unlink", "rmdir", "utime", "chmod"), ("EIO", "EACCES")),
     **dict.fromkeys(("create", "link", "replace", "rename", "mkdir", "symlink"), ("ENOSPC", "EIO", "EACCES")),
@@ -52,20 +52,20 @@ class Call:
 
     name: str
     path: str
-    source: str = ""  # of a link or a rename
+    source: str = ""  # The source of a link or a rename.
 
     @property
     def changes(self) -> bool:
-        """Whether it changes what lies on the disk, or what outlasts a loss of power."""
+        """Return whether it changes the disk's content, or what outlasts a loss of power."""
         return self.name in CHANGES
 
     @property
     def errors(self) -> list[str]:
-        """What it can fail with: an error, once or from then on, or a short write."""
-        found = list(_ERRORS[self.name])
-        found += ["short", "short, then full"] if self.name == "write" else []
-        found += ["full"] if self.name in TAKES_SPACE else []
-        return found + (["read-only", "gone"] if self.changes else [])
+        """Return the faults that it can have: an error, once or from then on, or a short write."""
+        faults = list(_ERRORS[self.name])
+        faults += ["short", "short, then full"] if self.name == "write" else []
+        faults += ["full"] if self.name in TAKES_SPACE else []
+        return faults + (["read-only", "gone"] if self.changes else [])
 
 
 class Watch(Protocol):
@@ -89,12 +89,12 @@ class Shim:
         self._real: dict[tuple[Any, str], Any] = {}
 
     def __enter__(self) -> Self:
-        for name, what in _PATHS.items():
-            self._patch(os, name, self._of_path(what, getattr(os, name)))
+        for name, operation in _PATHS.items():
+            self._patch(os, name, self._of_path(operation, getattr(os, name)))
         for name in _PAIRS:
             self._patch(os, name, self._of_pair(name, getattr(os, name)))
-        for name, what in _HANDLES.items():
-            self._patch(os, name, self._of_handle(what, getattr(os, name)))
+        for name, operation in _HANDLES.items():
+            self._patch(os, name, self._of_handle(operation, getattr(os, name)))
         for name in ("flock", "ioctl"):
             self._patch(fcntl, name, self._of_handle(name, getattr(fcntl, name)))
         for name in ("open", "write", "pwrite", "close"):
@@ -119,8 +119,8 @@ class Shim:
             return self._opened.get(path, (None, False))[0]
         text = os.fsdecode(path)
         if folder is not None:
-            within = self._ours(folder)
-            return None if within is None else f"{within}/{text}"
+            parent = self._ours(folder)
+            return None if parent is None else f"{parent}/{text}"
         if not text.startswith("/"):
             text = f"{os.getcwd()}/{text}"  # noqa: PTH109
         text = os.path.normpath(text)
@@ -129,10 +129,10 @@ class Shim:
     def make(self, call: Call, real: Callable[[], Any]) -> Any:
         """Count a call and make it, unless it is to fail."""
         self._count(call)
-        made = real()
+        result = real()
         if self._watch is not None:
             self._watch.after(call)
-        return made
+        return result
 
     def write(self, path: str | None, content: Any, real: Callable[[Any], int | None]) -> int:
         """Write by ``real``, less or nothing where that is to go wrong."""
@@ -140,12 +140,12 @@ class Shim:
             return int(real(content) or 0)
         call = Call("write", path)
         if self._count(call):
-            whole = memoryview(content).cast("B")
-            content = whole[: max(1, len(whole) // 2)]
-        written = int(real(content) or 0)
+            full_content = memoryview(content).cast("B")
+            content = full_content[: max(1, len(full_content) // 2)]
+        count = int(real(content) or 0)
         if self._watch is not None:
             self._watch.after(call)
-        return written
+        return count
 
     def _count(self, call: Call) -> str:
         """Count a call; raise if it is to fail, return how if it is to be cut short."""
@@ -169,41 +169,43 @@ class Shim:
 
     # ---- replacements
 
-    def _of_path(self, what: str, real: Callable[..., Any]) -> Callable[..., Any]:
-        def call(path: Any = ".", *given: Any, **named: Any) -> Any:
-            found = self._ours(path, named.get("dir_fd"))
-            if found is None:
-                return real(path, *given, **named)
-            return self.make(Call(what, found), lambda: real(path, *given, **named))
+    def _of_path(self, operation: str, real: Callable[..., Any]) -> Callable[..., Any]:
+        def call(path: Any = ".", *arguments: Any, **options: Any) -> Any:
+            our_path = self._ours(path, options.get("dir_fd"))
+            if our_path is None:
+                return real(path, *arguments, **options)
+            return self.make(Call(operation, our_path), lambda: real(path, *arguments, **options))
 
         return call
 
-    def _of_pair(self, what: str, real: Callable[..., Any]) -> Callable[..., Any]:
-        def call(source: Any, target: Any, **named: Any) -> Any:
-            found = self._ours(target)
-            if found is None:
-                return real(source, target, **named)
-            return self.make(Call(what, found, self._ours(source) or ""), lambda: real(source, target, **named))
+    def _of_pair(self, operation: str, real: Callable[..., Any]) -> Callable[..., Any]:
+        def call(source: Any, target: Any, **options: Any) -> Any:
+            our_path = self._ours(target)
+            if our_path is None:
+                return real(source, target, **options)
+            return self.make(
+                Call(operation, our_path, self._ours(source) or ""), lambda: real(source, target, **options)
+            )
 
         return call
 
-    def _of_handle(self, what: str, real: Callable[..., Any]) -> Callable[..., Any]:
-        def call(handle: Any, *given: Any, **named: Any) -> Any:
-            found = self._ours(handle if isinstance(handle, int) else handle.fileno())
-            if found is None:
-                return real(handle, *given, **named)
-            return self.make(Call(what, found), lambda: real(handle, *given, **named))
+    def _of_handle(self, operation: str, real: Callable[..., Any]) -> Callable[..., Any]:
+        def call(handle: Any, *arguments: Any, **options: Any) -> Any:
+            our_path = self._ours(handle if isinstance(handle, int) else handle.fileno())
+            if our_path is None:
+                return real(handle, *arguments, **options)
+            return self.make(Call(operation, our_path), lambda: real(handle, *arguments, **options))
 
         return call
 
     def _open(self, path: Any, flags: int, mode: int = 0o777, *, dir_fd: int | None = None) -> int:
         real = self._real[os, "open"]
-        found = self._ours(path, dir_fd)
-        if found is None:
+        our_path = self._ours(path, dir_fd)
+        if our_path is None:
             return int(real(path, flags, mode, dir_fd=dir_fd))
         name = "create" if flags & (os.O_CREAT | os.O_TRUNC) else "open"
-        handle = int(self.make(Call(name, found), lambda: real(path, flags, mode, dir_fd=dir_fd)))
-        self._opened[handle] = found, bool(flags & (os.O_WRONLY | os.O_RDWR))
+        handle = int(self.make(Call(name, our_path), lambda: real(path, flags, mode, dir_fd=dir_fd)))
+        self._opened[handle] = our_path, bool(flags & (os.O_WRONLY | os.O_RDWR))
         return handle
 
     def _write(self, handle: int, content: Any) -> int:
@@ -213,10 +215,10 @@ class Shim:
         return self.write(self._ours(handle), content, lambda part: self._real[os, "pwrite"](handle, part, offset))
 
     def _close(self, handle: int) -> None:
-        found, written = self._opened.pop(handle, (None, False))
+        our_path, is_written = self._opened.pop(handle, (None, False))
         self._real[os, "close"](handle)  # first: a descriptor is gone, whatever the disk says to it
-        if found is not None and written:
-            self._count(Call("close", found))
+        if our_path is not None and is_written:
+            self._count(Call("close", our_path))
 
     def _open_file(
         self,
@@ -229,22 +231,22 @@ class Shim:
         closefd: bool = True,
         opener: Any = None,
     ) -> Any:
-        found = None if isinstance(file, int) or opener is not None else self._ours(file)
-        if found is None:
+        our_path = None if isinstance(file, int) or opener is not None else self._ours(file)
+        if our_path is None:
             return self._real[io, "open"](file, mode, buffering, encoding, errors, newline, closefd, opener)
-        raw = _File(self, found, "".join(letter for letter in mode if letter not in "bt"))
-        self._opened[raw.fileno()] = found, False  # it counts its end itself
+        raw = _File(self, our_path, "".join(letter for letter in mode if letter not in "bt"))
+        self._opened[raw.fileno()] = our_path, False  # it counts its end itself
         if buffering == 0:
             return raw
         buffered: Any = io.BufferedRandom if "+" in mode else io.BufferedReader if "r" in mode else io.BufferedWriter
         stack = buffered(raw)
         return stack if "b" in mode else io.TextIOWrapper(stack, encoding, errors, newline)
 
-    def closed(self, handle: int, call: Call, real: Callable[[], None], *, written: bool) -> None:
+    def closed(self, handle: int, call: Call, real: Callable[[], None], *, is_written: bool) -> None:
         """Close a file by ``real``."""
         self._opened.pop(handle, None)
         real()
-        if written:
+        if is_written:
             self._count(call)
 
 
@@ -273,7 +275,7 @@ class _File(io.FileIO):
     def close(self) -> None:
         if not self.closed:
             call = Call("close", self._path)
-            self._shim.closed(self.fileno(), call, super().close, written=self.writable())
+            self._shim.closed(self.fileno(), call, super().close, is_written=self.writable())
 
 
 def _error(number: int, call: Call) -> OSError:

@@ -13,7 +13,7 @@ from pathlib import Path
 from tacpipe.io.hashing import bytes_digest
 
 
-def _nothing(lab: Path) -> None:
+def _leave_as_is(lab: Path) -> None:
     """Leave the lab as it is."""
 
 
@@ -24,15 +24,15 @@ class Case:
     name: str
     command: str
     before: tuple[str, ...] = ()
-    sources: Callable[[Path], None] = _nothing  # writes what the commands before it read
-    spoil: Callable[[Path], None] = _nothing  # happens right before it
-    outputs: tuple[str, ...] = field(default=())  # where it writes besides the store; by default behind -o
-    durable: bool = False  # what it was given cannot be made again: once it has ended it outlasts a loss of power
-    sound: bool = True  # whether the store is before it
+    sources: Callable[[Path], None] = _leave_as_is  # writes what the commands before it read
+    spoil: Callable[[Path], None] = _leave_as_is  # happens right before it
+    outputs: tuple[str, ...] = field(default=())  # Paths that it writes besides the store, by default behind -o.
+    durable: bool = False  # Its input cannot be made again, so once it has ended the result outlasts a loss of power.
+    sound: bool = True  # Whether the store is sound before the command.
 
     @property
-    def written(self) -> tuple[str, ...]:
-        """Where the command writes besides the store."""
+    def output_paths(self) -> tuple[str, ...]:
+        """Return the paths that the command writes besides the store."""
         words = self.command.split()
         return self.outputs or tuple(after for word, after in pairwise(words) if word == "-o")
 
@@ -55,7 +55,7 @@ def _numbers(lab: Path) -> None:
     (lab / "src/b.txt").write_text("4 5 6")
 
 
-def _more(lab: Path) -> None:
+def _add_source(lab: Path) -> None:
     _numbers(lab)
     (lab / "more").mkdir()
     (lab / "more/c.txt").write_text("7 8 9")
@@ -130,7 +130,7 @@ TOYS = (
         spoil=_lose,
         durable=True,
     ),
-    Case("ingest appends", "ingest numbers more -o data/i", (NUMBERS, LABEL), sources=_more, durable=True),
+    Case("ingest appends", "ingest numbers more -o data/i", (NUMBERS, LABEL), sources=_add_source, durable=True),
     Case("simulate replaces", "simulate toy -o data/i --replace", (NUMBERS, LABEL), sources=_numbers),
     Case("store gc", "store gc --grace-days 0", TOY, spoil=_leave),
     Case("store link", "store link data/s", TOY[:2], spoil=_unlink, outputs=("data/s",)),
@@ -169,14 +169,14 @@ CHAINS = {
     "forward": FORWARD,
     "material": MATERIAL,
     "touch": TOUCH,
-    **{  # what works recording by recording needs no more than two to show all that it does with files
-        f"two {name}": (re.sub(r"--trials \d+", "--trials 2", first), *rest)
-        for name, (first, *rest) in {"forward": FORWARD, "material": MATERIAL, "touch": TOUCH}.items()
+    **{  # A stage that works recording by recording needs no more than two to show all that it does with files.
+        f"two {name}": (re.sub(r"--trials \d+", "--trials 2", first), *later_commands)
+        for name, (first, *later_commands) in {"forward": FORWARD, "material": MATERIAL, "touch": TOUCH}.items()
     },
 }
 
 
-def _of(chain: str, names: dict[int, str]) -> list[Case]:
+def _cases_of_chain(chain: str, names: dict[int, str]) -> list[Case]:
     """Return cases of a chain's commands, by their numbers."""
     return [Case(name, CHAINS[chain][number], CHAINS[chain][:number]) for number, name in names.items()]
 
@@ -234,12 +234,12 @@ def _publish(name: str, place: Path) -> None:
 
 
 STAGES = (
-    *_of("two forward", {0: "simulate.forward", 1: "synchronize", 2: "segment.contacts"}),
-    *_of("forward", {3: "split", 4: "train.forward", 5: "evaluate"}),
-    *_of("two material", {0: "simulate.material", 1: "segment.slides"}),
-    *_of("material", {3: "train.material"}),
-    *_of("two touch", {0: "simulate.touch", 1: "segment.grasps"}),
-    *_of("touch", {3: "train.touch"}),
+    *_cases_of_chain("two forward", {0: "simulate.forward", 1: "synchronize", 2: "segment.contacts"}),
+    *_cases_of_chain("forward", {3: "split", 4: "train.forward", 5: "evaluate"}),
+    *_cases_of_chain("two material", {0: "simulate.material", 1: "segment.slides"}),
+    *_cases_of_chain("material", {3: "train.material"}),
+    *_cases_of_chain("two touch", {0: "simulate.touch", 1: "segment.grasps"}),
+    *_cases_of_chain("touch", {3: "train.touch"}),
     Case("segment.slips", "segment slips data/c -o data/slips", CHAINS["two forward"][:3]),
     Case("compress.pca", "compress pca data/c --split data/split -o data/z --components 2", FORWARD[:4]),
     Case(
@@ -258,5 +258,5 @@ STAGES = (
 CASES = {case.name: case for case in (*TOYS, *STAGES)}
 PART = int(
     os.environ.get("TACPIPE_TEST_CALLS", "3")
-)  # of a stage's calls one of so many is tried; 1: all of each stage
+)  # So many of a stage's calls are skipped for each that is tried; 1 tries all of each stage.
 assert len(CASES) == len(TOYS) + len(STAGES)

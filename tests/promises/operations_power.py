@@ -1,4 +1,4 @@
-"""What a kill or a loss of power leaves of a folder, at each call: told from the calls, without dying.
+"""Tell from the calls, without dying, what a kill or a loss of power leaves of a folder at each call.
 
 A kill leaves what the calls so far have made. After a loss of power there is the content that was fsynced, and the
 names in folders that were fsynced. Of what was written and not synced there may be all, a part, zeros or nothing; a
@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 import random
 from dataclasses import dataclass, field
-from os import lstat  # as it is before a shim replaces it, like the next one
+from os import lstat  # Imported before a shim replaces it, like the next one.
 from pathlib import Path
 
 from tests.promises.operations_tree import File, State
@@ -28,14 +28,14 @@ class _Node:
     content: bytes
     sure: bytes
     mode: int = 0o644
-    torn: bytes | None = None  # after a write: with half of what that wrote
+    torn: bytes | None = None  # The content after a write, with half of what that wrote.
 
 
 @dataclass
 class _Change:
     """A change of names: what it did, to which, and what the names stood for before."""
 
-    what: str
+    operation: str
     path: str
     source: str
     before: dict[str, _Node | None]
@@ -53,29 +53,29 @@ class Disk:
     root: str
     names: dict[str, _Node] = field(default_factory=dict)
     folders: set[str] = field(default_factory=set)
-    unsynced: list[_Change] = field(default_factory=list)  # of names, since their folder was synced
+    unsynced: list[_Change] = field(default_factory=list)  # Changes of names since their folder was synced.
 
     @classmethod
-    def of(cls, root: Path, state: State) -> Disk:
+    def from_state(cls, root: Path, state: State) -> Disk:
         """Return a disk that holds a state, all of it synced."""
         nodes = {file.node: _Node(file.content, file.content, file.mode) for file in state.files.values()}
         return cls(str(root), {path: nodes[file.node] for path, file in state.files.items()}, set(state.folders))
 
-    def made(self, what: str, path: str, source: str = "") -> None:
+    def record_call(self, operation: str, path: str, source: str = "") -> None:
         """Take note of a call that was made, by absolute paths."""
-        path, source = self._within(path), self._within(source) if source else ""
-        if what == "create" and path in self.names:
+        path, source = self._relative(path), self._relative(source) if source else ""
+        if operation == "create" and path in self.names:
             self._read(path)  # it may have been cut
-        elif what in NAMES:
-            self._rename(what, path, source)
-        elif what in _WRITES:
+        elif operation in NAMES:
+            self._rename(operation, path, source)
+        elif operation in _WRITES:
             self._read(path)
-        elif what in ("fsync", "fdatasync"):
+        elif operation in ("fsync", "fdatasync"):
             if path in self.folders or not path:
                 self.unsynced = [change for change in self.unsynced if change.folder != path]
             elif path in self.names:
                 self.names[path].sure = self.names[path].content
-        elif what in ("chmod", "fchmod") and path in self.names:
+        elif operation in ("chmod", "fchmod") and path in self.names:
             self.names[path].mode = lstat(f"{self.root}/{path}").st_mode & 0o777
 
     def killed(self) -> State:
@@ -84,7 +84,7 @@ class Disk:
 
     def torn(self, path: str) -> State | None:
         """Return what is left by a kill in the midst of the write that was noted last."""
-        node = self.names.get(self._within(path))
+        node = self.names.get(self._relative(path))
         return (
             None if node is None or node.torn is None else self._state(self.names, self.folders, {id(node): node.torn})
         )
@@ -94,9 +94,9 @@ class Disk:
         chance = random.Random(seed)
         names, folders = dict(self.names), set(self.folders)
         for change in reversed(self._undone(seed, chance)):
-            if change.what == "mkdir":
+            if change.operation == "mkdir":
                 folders -= set(change.folders)
-            elif change.what == "rmdir":
+            elif change.operation == "rmdir":
                 folders |= set(change.folders)
             for path, node in change.before.items():
                 if node is None:
@@ -105,8 +105,10 @@ class Disk:
                     names[path] = node
         names = {path: node for path, node in names.items() if _parents(path) <= folders}
         folders = {path for path in folders if _parents(path) <= folders}
-        left = {id(node): _left(node, seed, chance) for node in names.values() if node.content != node.sure}
-        return self._state(names, folders, left)
+        lost_contents = {
+            id(node): _choose_content(node, seed, chance) for node in names.values() if node.content != node.sure
+        }
+        return self._state(names, folders, lost_contents)
 
     def _undone(self, seed: int, chance: random.Random) -> list[_Change]:
         staying: dict[str, int] = {}
@@ -120,25 +122,25 @@ class Disk:
                 undone.append(change)
         return undone
 
-    def _rename(self, what: str, path: str, source: str) -> None:
+    def _rename(self, operation: str, path: str, source: str) -> None:
         before = {name: self.names.get(name) for name in (path, source) if name}
         folders: tuple[str, ...] = ()
-        if what == "create":
+        if operation == "create":
             self.names[path] = _Node(b"", b"", lstat(f"{self.root}/{path}").st_mode & 0o777)
-        elif what == "link":
+        elif operation == "link":
             self.names[path] = self.names[source]
             before.pop(source)
-        elif what == "unlink":
+        elif operation == "unlink":
             del self.names[path]
-        elif what in ("replace", "rename"):
+        elif operation in ("replace", "rename"):
             self.names[path] = self.names.pop(source)
-        elif what == "mkdir":
+        elif operation == "mkdir":
             folders = (path,)
             self.folders.add(path)
-        elif what == "rmdir":
+        elif operation == "rmdir":
             folders = (path,)
             self.folders.discard(path)
-        self.unsynced.append(_Change(what, path, source, before, folders))
+        self.unsynced.append(_Change(operation, path, source, before, folders))
 
     def _read(self, path: str) -> None:
         node = self.names.get(path)
@@ -149,7 +151,7 @@ class Disk:
         cut = len(was) if node.content.startswith(was) else 0
         node.torn = node.content[: cut + (len(node.content) - cut) // 2]
 
-    def _within(self, path: str) -> str:
+    def _relative(self, path: str) -> str:
         return path[len(self.root) + 1 :]
 
     @staticmethod
@@ -158,7 +160,7 @@ class Disk:
         return State(files, frozenset(folders))
 
 
-def _left(node: _Node, seed: int, chance: random.Random) -> bytes:
+def _choose_content(node: _Node, seed: int, chance: random.Random) -> bytes:
     """Return of a file's content what is sure, or a part of the rest, zeros behind it or nothing."""
     if seed < 2 or chance.random() < 0.3:
         return node.sure

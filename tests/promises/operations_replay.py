@@ -23,9 +23,9 @@ class Replay:
     def __init__(self) -> None:
         self.listening = True
         self._identity = ""
-        self._read: Callable[[str, str], bytes] = _nothing
+        self._read: Callable[[str, str], bytes] = _refuse_read
         self._events: list[tuple[Any, ...]] = []
-        self._known: dict[str, tuple[list[tuple[Any, ...]], Any]] = {}
+        self._recorded: dict[str, tuple[list[tuple[Any, ...]], Any]] = {}
         self._parquet: dict[int, tuple[Any, bytes]] = {}
 
     def install(self) -> None:
@@ -36,12 +36,12 @@ class Replay:
         execute, reader, stage, to_parquet = execution.execute, execution.reader, Stage.__call__, parquet.to_parquet
         self._save, self._resume = checkpoint.write, checkpoint.read
 
-        def executing(task: Any, *given: Any, **named: Any) -> Any:
+        def executing(task: Any, *arguments: Any, **options: Any) -> Any:
             self._identity = digest([task.name, task.identity, task.recording])
-            return execute(task, *given, **named)
+            return execute(task, *arguments, **options)
 
-        def reading(*given: Any, **named: Any) -> Callable[[str, str], bytes]:
-            read = reader(*given, **named)
+        def reading(*arguments: Any, **options: Any) -> Callable[[str, str], bytes]:
+            read = reader(*arguments, **options)
 
             def noted(name: str, path: str) -> bytes:
                 content = read(name, path)
@@ -59,8 +59,8 @@ class Replay:
             self._events.append(("resume",))
             return self._resume(folder)
 
-        def calling(found: AnyStage, params: Any, **arguments: Any) -> Any:
-            return self._call(found, arguments, lambda: stage(found, params, **arguments))
+        def calling(called_stage: AnyStage, params: Any, **arguments: Any) -> Any:
+            return self._call(called_stage, arguments, lambda: stage(called_stage, params, **arguments))
 
         def packing(table: Any) -> bytes:
             if id(table) not in self._parquet:
@@ -72,21 +72,21 @@ class Replay:
 
     def _call(self, stage: AnyStage, arguments: dict[str, Any], run: Callable[[], Any]) -> Any:
         workspace = next((arguments[name] for name, kind in stage.arguments.items() if kind == "Workspace"), None)
-        known = self._known.get(self._identity)
-        if known is None or self.listening or (workspace is not None and any(workspace.iterdir())):
+        recorded = self._recorded.get(self._identity)
+        if recorded is None or self.listening or (workspace is not None and any(workspace.iterdir())):
             start, identity = len(self._events), self._identity
             returned = run()
             if self.listening and not stage.source:
                 returned = _repeatable(returned)
-                self._known[identity] = self._events[start:], returned
+                self._recorded[identity] = self._events[start:], returned
             return returned
-        events, returned = known
+        events, returned = recorded
         place = workspace or Path()
-        for what, *told in events:
-            if what == "read":
-                self._read(*told)
-            elif what == "save":
-                self._save(place, *told)
+        for kind, *details in events:
+            if kind == "read":
+                self._read(*details)
+            elif kind == "save":
+                self._save(place, *details)
             else:
                 self._resume(place)
         return returned
@@ -101,15 +101,15 @@ def _repeatable(returned: Any) -> Any:
         sink = io.BytesIO()
         write(sink)
         contents[name] = sink.getvalue()
-    written = {name: functools.partial(_write, content) for name, content in contents.items()}
-    return dataclasses.replace(returned, written=written)
+    writers = {name: functools.partial(_write, content) for name, content in contents.items()}
+    return dataclasses.replace(returned, written=writers)
 
 
 def _write(content: bytes, sink: Any) -> None:
     sink.write(content)
 
 
-def _nothing(name: str, path: str) -> bytes:
+def _refuse_read(name: str, path: str) -> bytes:
     raise AssertionError("no stage has been given anything to read")
 
 

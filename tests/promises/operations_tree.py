@@ -1,4 +1,4 @@
-"""What lies in a folder, as a value: looked at, told apart from other such values, and put there again."""
+"""Read the content of a folder as a value, compare such values, and restore them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from typing import Any
 PAST_NS = 1_500_000_000 * 10**9  # when everything was written at first, so that whatever is written since stands out
 _CHANCE = re.compile(
     r"[0-9a-f]{32}(?![0-9a-f])|\d{19}|(?<=\.)[0-9a-f]{12}(?=\.draft)"
-)  # in names: what differs from run to run
+)  # This differs from run to run in names.
 _Traits = tuple[int, int, int, int]  # inode, size, mode, time
 
 
@@ -37,14 +37,14 @@ class State:
 
     def described(self, before: State) -> str:
         """Return a digest of how this differs from ``before``, apart from what differs between any two runs."""
-        told: list[list[str]] = [["folder", path] for path in self.folders ^ before.folders]
+        changes: list[list[str]] = [["folder", path] for path in self.folders ^ before.folders]
         for path in {*self.files, *before.files}:
             now, was = self.files.get(path), before.files.get(path)
             if now is None:
-                told.append(["gone", path])
+                changes.append(["gone", path])
             elif was is None or now.content != was.content:
-                told.append([_CHANCE.sub("?", path), sha256(_lasting(path, now.content)).hexdigest()])
-        return sha256(json.dumps(sorted(told)).encode()).hexdigest()
+                changes.append([_CHANCE.sub("?", path), sha256(_lasting(path, now.content)).hexdigest()])
+        return sha256(json.dumps(sorted(changes)).encode()).hexdigest()
 
 
 class Place:
@@ -55,7 +55,7 @@ class Place:
         for path, traits in _scan(root).items():
             if traits is not None:
                 os.utime(root / path, ns=(PAST_NS, PAST_NS))
-        self._known: dict[str, tuple[_Traits, File]] = {}  # as a file was when it was read or written last
+        self._read_files: dict[str, tuple[_Traits, File]] = {}  # Each file as it was when it was read or written last.
         self.before = self.look()
 
     def look(self) -> State:
@@ -65,14 +65,14 @@ class Place:
             if traits is None:
                 folders.add(path)
                 continue
-            known = self._known.get(path)
-            if known is None or known[0] != traits:
-                found = File(traits[0], (self.root / path).read_bytes(), traits[2] & 0o777)
+            read_before = self._read_files.get(path)
+            if read_before is None or read_before[0] != traits:
+                file = File(traits[0], (self.root / path).read_bytes(), traits[2] & 0o777)
                 if not hasattr(self, "before"):
-                    self._known[path] = traits, found
+                    self._read_files[path] = traits, file
             else:
-                found = known[1]
-            files[path] = found
+                file = read_before[1]
+            files[path] = file
         return State(files, frozenset(folders))
 
     def restore(self) -> None:
@@ -82,11 +82,11 @@ class Place:
             self._remove(path)
         for path in sorted(self.before.folders):
             (self.root / path).mkdir(exist_ok=True)
-        for paths in _together(self.before).values():
-            if any(now.get(path) != self._known[path][0] for path in paths):
+        for paths in _paths_by_node(self.before).values():
+            if any(now.get(path) != self._read_files[path][0] for path in paths):
                 self._write(paths)
 
-    def put(self, state: State) -> None:
+    def restore_state(self, state: State) -> None:
         """Bring the folder to a state."""
         self.restore()
         for path in sorted(set(self.before.files) - set(state.files)):
@@ -95,7 +95,7 @@ class Place:
             self._remove(path)
         for path in sorted(state.folders):
             (self.root / path).mkdir(exist_ok=True)
-        for paths in _together(state).values():
+        for paths in _paths_by_node(state).values():
             stays = [path for path in paths if self.before.files.get(path) == state.files[path]]
             for path in paths:
                 if path not in stays:
@@ -118,44 +118,44 @@ class Place:
 
     def _write(self, paths: list[str]) -> None:
         """Write a file of the first state anew, under all of its names."""
-        first, *others = [self.root / path for path in paths]
+        first, *other_paths = [self.root / path for path in paths]
         for name in paths:
             self._remove(name)
         was = self.before.files[paths[0]]
         first.write_bytes(was.content)
         first.chmod(was.mode)
         os.utime(first, ns=(PAST_NS, PAST_NS))
-        for path in others:
+        for path in other_paths:
             os.link(first, path)
-        there = os.lstat(first)
+        stat = os.lstat(first)
         for name in paths:
-            traits = (there.st_ino, there.st_size, there.st_mode, there.st_mtime_ns)
-            self._known[name] = traits, self.before.files[name]
+            traits = (stat.st_ino, stat.st_size, stat.st_mode, stat.st_mtime_ns)
+            self._read_files[name] = traits, self.before.files[name]
 
 
-def _together(state: State) -> dict[int, list[str]]:
+def _paths_by_node(state: State) -> dict[int, list[str]]:
     """Return the paths of each file."""
-    found: dict[int, list[str]] = {}
+    paths_by_node: dict[int, list[str]] = {}
     for path, file in state.files.items():
-        found.setdefault(file.node, []).append(path)
-    return found
+        paths_by_node.setdefault(file.node, []).append(path)
+    return paths_by_node
 
 
 def _scan(root: Path) -> dict[str, _Traits | None]:
     """Return what tells files apart, by path; None for folders."""
-    found: dict[str, _Traits | None] = {}
+    traits_by_path: dict[str, _Traits | None] = {}
     start = len(str(root)) + 1
     folders = [str(root)]
     while folders:
         with os.scandir(folders.pop()) as entries:
             for entry in entries:
                 if entry.is_dir(follow_symlinks=False):
-                    found[entry.path[start:]] = None
+                    traits_by_path[entry.path[start:]] = None
                     folders.append(entry.path)
                 else:
-                    there = entry.stat(follow_symlinks=False)
-                    found[entry.path[start:]] = (there.st_ino, there.st_size, there.st_mode, there.st_mtime_ns)
-    return found
+                    stat = entry.stat(follow_symlinks=False)
+                    traits_by_path[entry.path[start:]] = (stat.st_ino, stat.st_size, stat.st_mode, stat.st_mtime_ns)
+    return traits_by_path
 
 
 def _lasting(path: str, content: bytes) -> bytes:
@@ -171,6 +171,8 @@ def _without(content: bytes, *names: str) -> bytes:
     """Return JSON with the values of these names left out; that they are there still counts."""
     try:
         value: Any = json.loads(content)
-        return json.dumps({name: name not in names and held for name, held in value.items()}, sort_keys=True).encode()
+        return json.dumps(
+            {name: name not in names and member for name, member in value.items()}, sort_keys=True
+        ).encode()
     except (ValueError, AttributeError):
         return content

@@ -37,13 +37,13 @@ from tests.promises.operations_survey import Killer, Left, Survey
 from tests.promises.operations_tree import Place, State
 
 CODES = (0, 1, 2, 3, 4, 5, 6, 130)
-LIMIT_S = 600  # for one trial, which takes seconds on a quiet computer: only one that hangs meets it
+LIMIT_S = 600  # Limit of one trial, which takes seconds on a quiet computer: only one that hangs meets it.
 DEATHS = 4  # how many kills of each command happen in earnest, about
 
 
 @dataclass(frozen=True)
 class Ran:
-    """What a command printed, and how it ended."""
+    """Exit code and output of a command."""
 
     code: int
     out: str
@@ -52,7 +52,7 @@ class Ran:
 
 @dataclass
 class Tried:
-    """What became of all trials of a case."""
+    """Results of all trials of a case."""
 
     case: str
     calls: int = 0
@@ -67,17 +67,20 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("cases", nargs="+")
     parser.add_argument("--every", default="1", help="K/N: try each Nth call from the Kth; N: from the first")
-    given = parser.parse_args()
+    options = parser.parse_args()
     os.environ.pop("TACPIPE_STORE", None)
     os.environ["TACPIPE_LOCK_TIMEOUT_S"] = "10"
-    os.environ |= {"ZARR_ASYNC__CONCURRENCY": "1", "ZARR_THREADING__MAX_WORKERS": "1"}  # nor on which thread is first
+    os.environ |= {
+        "ZARR_ASYNC__CONCURRENCY": "1",
+        "ZARR_THREADING__MAX_WORKERS": "1",
+    }  # Calls must not depend on which thread is first.
     hashing.SETTLED_NS = 0  # calls must not depend on what time it is
-    projects.new_id = lambda: "ab" * 16  # nor what is written on chance
+    projects.new_id = lambda: "ab" * 16  # Identities must not depend on chance.
     os.fsync = os.fdatasync = lambda handle: None  # type: ignore[assignment]  # nobody takes the power away here
-    first, _, every = given.every.rpartition("/")
-    chosen = range(int(first or 1), sys.maxsize, int(every))
-    for name in given.cases:
-        lab = given.folder.absolute() / name.replace(" ", "-")
+    first, _, step = options.every.rpartition("/")
+    chosen = range(int(first or 1), sys.maxsize, int(step))
+    for name in options.cases:
+        lab = options.folder.absolute() / name.replace(" ", "-")
         print(json.dumps(asdict(Trials(CASES[name], lab).run(chosen))), flush=True)
 
 
@@ -97,15 +100,15 @@ class Trials:
         replay = Replay()
         replay.install()
         self.place = Place(lab)
-        self.before = self._shown(self.place.before)
+        self.before = self._files_outside_stores(self.place.before)
         _succeed(case.command)
         replay.listening = False
-        self.shown, self.kept = self._shown(self.place.look()), self._kept()
+        self.clean_files, self.clean_store = self._files_outside_stores(self.place.look()), self._store_content()
 
     def run(self, chosen: range) -> Tried:
         """Try every fault at the calls of the ``chosen`` numbers, and a loss of power at the end."""
         self.place.restore()
-        survey = Survey(Disk.of(self.lab, self.place.before), chosen)
+        survey = Survey(Disk.from_state(self.lab, self.place.before), chosen)
         with Shim(self.lab, watch=survey) as shim:
             ran = call(self.case.command)
         assert ran.code == 0, f"{self.case.command}: {ran.err}"
@@ -114,23 +117,23 @@ class Trials:
         survey.end()
         self.tried.calls = len(shim.calls)
         self._die(survey)
-        for left in survey.left:
-            self._evaluate(left, [])
+        for remaining in survey.remains:
+            self._evaluate(remaining, [])
         for number in range(chosen.start, len(shim.calls) + 1, chosen.step):
             for fault in shim.calls[number - 1].errors:
                 self._fail(number, shim.calls[number - 1], fault)
         self.tried.states = len(self._proven)
         return self.tried
 
-    def _fail(self, number: int, wanted: Call, fault: str) -> None:
+    def _fail(self, number: int, expected: Call, fault: str) -> None:
         """Run the command with one call failing."""
         self.place.restore()
         with Shim(self.lab, at=number, fault=fault) as shim:
             ran = call(self.case.command)
         met = shim.calls[number - 1] if len(shim.calls) >= number else Call("none", "")
-        assert met.name == wanted.name, f"call {number} is {met} now, and was {wanted}"
-        told = f"{fault} at call {number}, {met.name} {met.path.removeprefix(f'{self.lab}/')}"
-        self._evaluate(Left(self.place.look(), told, "failed" if ran.code else "done"), _wrong(ran))
+        assert met.name == expected.name, f"call {number} is {met} now, and was {expected}"
+        description = f"{fault} at call {number}, {met.name} {met.path.removeprefix(f'{self.lab}/')}"
+        self._evaluate(Left(self.place.look(), description, "failed" if ran.code else "done"), _wrong(ran))
 
     def _die(self, survey: Survey) -> None:
         """Kill the command in earnest at some calls, and see that this leaves what the survey says."""
@@ -144,66 +147,76 @@ class Trials:
                 os._exit(0)
             _, status = os.waitpid(child, 0)
             assert os.WIFSIGNALED(status), f"call {number} was not reached"
-            told = [state.described(self.place.before) for state in (self.place.look(), survey.kills[number])]
-            assert told[0] == told[1], f"a kill at call {number} leaves something else than the calls before it made"
+            descriptions = [state.described(self.place.before) for state in (self.place.look(), survey.kills[number])]
+            assert descriptions[0] == descriptions[1], (
+                f"a kill at call {number} leaves something else than the calls before it made"
+            )
 
-    def _evaluate(self, left: Left, problems: list[str]) -> None:
+    def _evaluate(self, remaining: Left, problems: list[str]) -> None:
         self.tried.failed += 1
-        key = left.state.described(self.place.before), left.ended
+        key = remaining.state.described(self.place.before), remaining.outcome
         if key not in self._proven:
-            self._proven[key] = self._disproved(left)
-        self.tried.problems += [f"{left.fault}: {problem}" for problem in [*problems, *self._proven[key]]]
+            self._proven[key] = self._disproved(remaining)
+        self.tried.problems += [f"{remaining.fault}: {problem}" for problem in [*problems, *self._proven[key]]]
 
-    def _disproved(self, left: Left) -> list[str]:
+    def _disproved(self, remaining: Left) -> list[str]:
         """Return which promises do not hold for what a fault left behind."""
         store, problems = Store(self.lab / ".tacpipe"), []
-        shown = self._shown(left.state)
-        wanted = {path: content for path, content in self.before.items() if not self._ours(path)}
-        problems += [f"the input {path} changed" for path, was in wanted.items() if shown.get(path) != was]
-        if not left.dark:
-            known = {path: (self.before.get(path), self.shown.get(path)) for path in shown if not _draft(path)}
-            problems += [f"{path} is half written" for path, either in known.items() if shown[path] not in either]
-        if left.ended == "done" or (left.ended == "done, dark" and self.case.durable):
-            problems += _differences("what was reported as done", self.shown, shown)
-        self.place.put(left.state)
-        if self.case.sound and (not left.dark or (left.ended.startswith("done") and self.case.durable)):
+        files_now = self._files_outside_stores(remaining.state)
+        inputs = {path: content for path, content in self.before.items() if not self._ours(path)}
+        problems += [f"the input {path} changed" for path, was in inputs.items() if files_now.get(path) != was]
+        if not remaining.dark:
+            versions = {
+                path: (self.before.get(path), self.clean_files.get(path)) for path in files_now if not _draft(path)
+            }
+            problems += [
+                f"{path} is half written" for path, either in versions.items() if files_now[path] not in either
+            ]
+        if remaining.outcome == "done" or (remaining.outcome == "done, dark" and self.case.durable):
+            problems += _differences("what was reported as done", self.clean_files, files_now)
+        self.place.restore_state(remaining.state)
+        if self.case.sound and (not remaining.dark or (remaining.outcome.startswith("done") and self.case.durable)):
             problems += _unsound("the store", store)
-        again = call(self.case.command)
-        if again.code:
-            return [*problems, f"the rerun ended with {again.code}: {again.err[-900:]}"]
-        problems += _differences("the output of the rerun", self.shown, self._shown(self.place.look()))
+        rerun = call(self.case.command)
+        if rerun.code:
+            return [*problems, f"the rerun ended with {rerun.code}: {rerun.err[-900:]}"]
+        problems += _differences(
+            "the output of the rerun", self.clean_files, self._files_outside_stores(self.place.look())
+        )
         problems += _unsound("the store after the rerun", store)
-        return problems + _differences("the store after the rerun", self.kept, self._kept())
+        return problems + _differences("the store after the rerun", self.clean_store, self._store_content())
 
     # ---- what there is to see
 
     def _ours(self, path: str) -> bool:
-        return any(path == output or path.startswith(f"{output}/") for output in self.case.written)
+        return any(path == output or path.startswith(f"{output}/") for output in self.case.output_paths)
 
-    def _shown(self, state: State) -> dict[str, bytes]:
+    def _files_outside_stores(self, state: State) -> dict[str, bytes]:
         """Return every file outside of stores by path."""
         stores = (".tacpipe/", "remote/")
         return {path: file.content for path, file in state.files.items() if not path.startswith(stores)}
 
-    def _kept(self) -> dict[str, Any]:
+    def _store_content(self) -> dict[str, Any]:
         """Return all that the stores know, apart from where and when it was made."""
-        known: dict[str, Any] = {}
+        contents: dict[str, Any] = {}
         for root in (self.lab / ".tacpipe", self.lab / "remote"):
             if not root.exists():
                 continue
             store = Store(root)
-            known |= {f"{root.name} object {path.name}": True for path in root.glob("objects/*/*")}
-            known |= {f"{root.name} record {key}": record["result"] for key, record in store.records()}
-            known |= {f"{root.name} root {found['path']}": found["manifest"] for found in store.roots.all()}
-            known |= {f"{root.name} spool {path.parent.name}": True for path in root.glob("spool/*/header.json")}
+            contents |= {f"{root.name} object {path.name}": True for path in root.glob("objects/*/*")}
+            contents |= {f"{root.name} record {key}": record["result"] for key, record in store.records()}
+            contents |= {
+                f"{root.name} root {root_entry['path']}": root_entry["manifest"] for root_entry in store.roots.all()
+            }
+            contents |= {f"{root.name} spool {path.parent.name}": True for path in root.glob("spool/*/header.json")}
             checkpoints = (path.name for path in root.glob("checkpoints/*"))  # gc removes those of keys that are made
-            known |= {f"{root.name} checkpoint {key}": True for key in checkpoints if store.record(key) is None}
-        return known
+            contents |= {f"{root.name} checkpoint {key}": True for key in checkpoints if store.record(key) is None}
+        return contents
 
 
 def call(command: str) -> Ran:
     """Run a command as the program does."""
-    hashing._remembered.clear()  # as in a new process
+    hashing._remembered.clear()  # A new process has nothing in memory.
     execution._known.clear()
     out, err = io.StringIO(), io.StringIO()
     sys.argv = ["tacpipe", *shlex.split(command)]
@@ -242,12 +255,12 @@ def _wrong(ran: Ran) -> list[str]:
     return []
 
 
-def _unsound(where: str, store: Store) -> list[str]:
+def _unsound(place: str, store: Store) -> list[str]:
     try:
-        found = repair.verify(store)
+        soundness = repair.verify(store)
     except TacpipeError as error:  # it is a store no more
-        return [f"{where} is damaged: {error}"]
-    return [] if found.clean else [f"{where} is damaged: {found.to_text()}"]
+        return [f"{place} is damaged: {error}"]
+    return [] if soundness.clean else [f"{place} is damaged: {soundness.to_text()}"]
 
 
 def _draft(path: str) -> bool:
@@ -258,12 +271,12 @@ def _plain(state: State) -> dict[str, Any]:
     return {**{path: file.content for path, file in state.files.items()}, **dict.fromkeys(state.folders)}
 
 
-def _differences(where: str, wanted: Mapping[str, Any], found: Mapping[str, Any]) -> list[str]:
-    lost = sorted(set(wanted) - set(found))
-    more = sorted(set(found) - set(wanted))
-    other = sorted(name for name in set(wanted) & set(found) if wanted[name] != found[name])
-    told = (("lacks", lost), ("has besides", more), ("has other content in", other))
-    return [f"{where} {what} {', '.join(names[:3])}" for what, names in told if names]
+def _differences(place: str, expected: Mapping[str, Any], actual: Mapping[str, Any]) -> list[str]:
+    lost = sorted(set(expected) - set(actual))
+    unexpected = sorted(set(actual) - set(expected))
+    changed = sorted(name for name in set(expected) & set(actual) if expected[name] != actual[name])
+    kinds = (("lacks", lost), ("has besides", unexpected), ("has other content in", changed))
+    return [f"{place} {problem} {', '.join(names[:3])}" for problem, names in kinds if names]
 
 
 if __name__ == "__main__":

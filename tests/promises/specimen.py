@@ -32,7 +32,7 @@ CHAIN = (
     "centre data/scaled --split data/split -o data/centred --jobs 1",
     "total data/scaled -o data/total --jobs 1",
 )
-LABEL = "label data/recordings a --set material=foam"  # by hand: no rerun would know it
+LABEL = "label data/recordings a --set material=foam"  # The label is set by hand: no rerun would compute it.
 Contents = dict[str, Any]  # path within a dataset to bits of a table, or to bytes of a file
 
 
@@ -68,35 +68,35 @@ class Specimen:
 
     def object(self, dataset: str, path: str) -> Path:
         """Return the object that a dataset names at a path; its own manifest's if the path is empty."""
-        named = dict(self.manifests[dataset].objects())
-        name = named[path] if path else bytes_digest(self.sound[f"{dataset}/{NAME}"])
+        names_by_path = dict(self.manifests[dataset].objects())
+        name = names_by_path[path] if path else bytes_digest(self.sound[f"{dataset}/{NAME}"])
         return self.store / "objects" / name[:2] / name
 
     def needed(self) -> set[str]:
         """Return the digests of all that the datasets are made of, their manifests included."""
-        named = {name for manifest in self.manifests.values() for _, name in manifest.objects()}
-        return named | {bytes_digest(manifest.content) for manifest in self.manifests.values()}
+        names = {name for manifest in self.manifests.values() for _, name in manifest.objects()}
+        return names | {bytes_digest(manifest.content) for manifest in self.manifests.values()}
 
-    def records(self, stage: str, of: str = "stage") -> list[Path]:
+    def records(self, stage: str, identity_key: str = "stage") -> list[Path]:
         """Return the records of what a stage made (of its runs: ``of="run"``), by name."""
-        found = [
+        paths = [
             self.store / "records" / key[:2] / f"{key}.json"
             for key, record in self.lab.store.records()
-            if record["identity"].get(of) == stage
+            if record["identity"].get(identity_key) == stage
         ]
-        assert found, stage
-        return found
+        assert paths, stage
+        return paths
 
     def expected(self, dataset: str) -> Contents:
         """Return what a dataset held."""
         paths = [path for path, _ in self.manifests[dataset].objects() if not path.startswith(PAGE)]
-        return {path: stated(self.sound[f"{dataset}/{path}"], path) for path in paths}
+        return {path: parse_content(self.sound[f"{dataset}/{path}"], path) for path in paths}
 
     def rerun(self) -> list[Ran]:
         """Run the chain again, whatever its commands say."""
         return [self.lab.call(command) for command in CHAIN]
 
-    def shown(self) -> dict[str, bytes]:
+    def data_files(self) -> dict[str, bytes]:
         """Return every file beneath data/ as it is now."""
         return files(self.folder / "data")
 
@@ -109,49 +109,49 @@ class Specimen:
 
     def _served(self, dataset: str) -> bool:
         try:
-            found = held(self.folder / "data" / dataset)
+            content = read_content(self.folder / "data" / dataset)
         except TacpipeError as error:
             sentence = str(error)
             usage = isinstance(error, UsageError) and ("no manifest.json" in sentence or "manifest format" in sentence)
             assert error.exit_code == DAMAGED or usage
             assert sentence.endswith(".") and "\n" not in sentence, sentence
             return False
-        assert found == self.expected(dataset), f"{dataset} holds what nobody put there"
+        assert content == self.expected(dataset), f"{dataset} holds what nobody put there"
         return True
 
 
-def held(path: Path) -> Contents:
+def read_content(path: Path) -> Contents:
     """Return all that a dataset gives to whoever opens it."""
     dataset = tacpipe.open(path)
-    found: Contents = {}
+    contents: Contents = {}
     for name, shard in dataset.recordings.items():
         for stream in shard.streams:
-            found[f"{name}/{stream}.parquet" if stream else f"{name}.parquet"] = bits(shard.table(stream))
-    return {**found, **dict(dataset.files)}
+            contents[f"{name}/{stream}.parquet" if stream else f"{name}.parquet"] = bits(shard.table(stream))
+    return {**contents, **dict(dataset.files)}
 
 
-def stated(content: bytes, path: str) -> Any:
+def parse_content(content: bytes, path: str) -> Any:
     """Return what a file of a dataset says, read by other means."""
     return bits(pq.read_table(pa.BufferReader(owned(content)))) if path.endswith(".parquet") else content
 
 
-def copy(made: Path, lab: Lab) -> Specimen:
+def copy(original: Path, lab: Lab) -> Specimen:
     """Return a copy of a project that was made, its hard links kept, in place of what is in the folder of ``lab``."""
     for path in lab.folder.iterdir():
         shutil.rmtree(path)
-    clone(made, lab.folder)
-    sound = files(made / "data")
+    clone(original, lab.folder)
+    sound = files(original / "data")
     manifests = {
-        name.parent.name: Found(made / "data" / name.parent, sound[str(name)]).manifest
+        name.parent.name: Found(original / "data" / name.parent, sound[str(name)]).manifest
         for name in map(Path, sound)
         if name.name == NAME
     }
     return Specimen(lab, sound, manifests)
 
 
-def clone(made: Path, folder: Path) -> None:
+def clone(original: Path, folder: Path) -> None:
     """Copy a project with times, modes and hard links."""
-    subprocess.run(["cp", "-a", f"{made}/.", str(folder)], check=True)
+    subprocess.run(["cp", "-a", f"{original}/.", str(folder)], check=True)
 
 
 def files(folder: Path) -> dict[str, bytes]:

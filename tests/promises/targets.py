@@ -57,13 +57,13 @@ class Target:
 
     name: str
     run: Callable[[bytes], object]  # raises a TacpipeError for what it cannot read
-    examples: Callable[[], Sequence[bytes]]  # that it can
+    examples: Callable[[], Sequence[bytes]]  # Examples that it can read.
     slow: bool = False  # a try takes more than a few milliseconds
 
 
 def targets() -> dict[str, Target]:
     """Return all of them by name."""
-    found = [
+    all_targets = [
         Target("parquet", from_parquet, _parquets),
         Target("manifest", lambda data: manifest.parse(data, "given"), _manifests),
         Target("params", _params, lambda: [(HERE / "params.yaml").read_bytes(), b"synchronize: {rate_hz: 50}\n"]),
@@ -75,11 +75,15 @@ def targets() -> dict[str, Target]:
         Target("report-descriptor", hid.parse_report_descriptor, _descriptors),
         Target("codec", _codec, lambda: _parts(_codec_files())),
     ]
-    of = functools.partial
-    found += [Target(f"cloud{end}", of(_cloud, end), of(_clouds, end), True) for end in cloud_files.SUFFIXES]
-    found += [Target(f"format {name}", of(_format, name), of(_trees, name), True) for name in TREES]
-    found += [Target(f"sensor {case}", of(decoding.run, case), of(decoding.examples, case)) for case in CASES]
-    return {re.sub(r"[^a-z0-9.]+", "-", target.name): target for target in found}
+    partial = functools.partial
+    all_targets += [
+        Target(f"cloud{end}", partial(_cloud, end), partial(_clouds, end), True) for end in cloud_files.SUFFIXES
+    ]
+    all_targets += [Target(f"format {name}", partial(_format, name), partial(_trees, name), True) for name in TREES]
+    all_targets += [
+        Target(f"sensor {case}", partial(decoding.run, case), partial(decoding.examples, case)) for case in CASES
+    ]
+    return {re.sub(r"[^a-z0-9.]+", "-", target.name): target for target in all_targets}
 
 
 @functools.cache
@@ -95,7 +99,7 @@ def _temporary(name: str) -> Path:
     return Path(folder)
 
 
-def _written(name: str, data: bytes) -> Path:
+def _write_input(name: str, data: bytes) -> Path:
     path = _folder() / name
     path.parent.mkdir(exist_ok=True)
     path.write_bytes(data)
@@ -126,20 +130,20 @@ CHAIN = [{"stage": "ingest.xela-flat", "version": 1, "params": {}, "fitted": Non
 def _manifests() -> list[bytes]:
     shard = {"digest": digest("a"), "rows": 5, "bytes": 500}
     entry = {"attributes": {"material": "cork", "trial": 3}, "shards": {"xela1": shard, "robot": shard}}
-    whole = manifest.Manifest(
+    full_manifest = manifest.Manifest(
         "synchronize", 2, {"rate_hz": 50.0}, recordings={"trial-01": entry}, files={"codec.json": shard}, chain=CHAIN
     )
-    return [whole.content, manifest.Manifest("split", 1).content]
+    return [full_manifest.content, manifest.Manifest("split", 1).content]
 
 
 def _params(data: bytes) -> object:
     stage = registry.load("synchronize")
-    return given_params.build("synchronize", stage, file=_written("params.yaml", data))
+    return given_params.build("synchronize", stage, file=_write_input("params.yaml", data))
 
 
 def _rig(data: bytes) -> object:
-    found = rig.read(_written("rig.toml", data))
-    return [stream.sensor.fields() for stream in found.streams.values()]
+    parsed = rig.read(_write_input("rig.toml", data))
+    return [stream.sensor.fields() for stream in parsed.streams.values()]
 
 
 HEADER = {"output": "o", "recording": "r", "attributes": {}, "rig": "", "streams": ["a", "b"]}
@@ -149,27 +153,27 @@ HEADER |= {"clock": {"monotonic_ns": 1, "utc_ns": 2}}
 def _spool(data: bytes) -> object:
     """Read a spool whose header, or whose blocks are ``data``, as its first byte tells."""
     headed = data[:1] == b"\1"
-    _written("spool/header.json", data[1:] if headed else json.dumps(HEADER).encode())
-    _written("spool/bytes", _spools()[0][1:] if headed else data[1:])
-    found = spooled.Spooled(_folder() / "spool")
-    read = list(found.blocks())
+    _write_input("spool/header.json", data[1:] if headed else json.dumps(HEADER).encode())
+    _write_input("spool/bytes", _spools()[0][1:] if headed else data[1:])
+    read_spool = spooled.Spooled(_folder() / "spool")
+    read = list(read_spool.blocks())
     for _, block in read:
         if isinstance(block, Chunks):
             assert sum(map(len, block.packets())) == len(block.data)
-    assert sum(damage.bytes for damage in found.damage) <= len(data) + len(_spools()[0])
-    spool_folders.check_header(found.header, ["a", "b"])
-    return found.tallied()
+    assert sum(damage.bytes for damage in read_spool.damage) <= len(data) + len(_spools()[0])
+    spool_folders.check_header(read_spool.header, ["a", "b"])
+    return read_spool.tallied()
 
 
 @functools.cache
 def _spools() -> list[bytes]:
-    made = spool.Spool(_folder(), HEADER, ["a", "b"])
+    written_spool = spool.Spool(_folder(), HEADER, ["a", "b"])
     for number in range(5):
-        made.append("ab"[number % 2], Chunks.of([(number, bytes([number] * 9)), (number + 1, b"xy")]))
-        made.note(spool_blocks.Note(number, "a", "lost", "unplugged"))
-    made.write()
-    content = (made.folder / "bytes").read_bytes()
-    made.close()
+        written_spool.append("ab"[number % 2], Chunks.of([(number, bytes([number] * 9)), (number + 1, b"xy")]))
+        written_spool.note(spool_blocks.Note(number, "a", "lost", "unplugged"))
+    written_spool.write()
+    content = (written_spool.folder / "bytes").read_bytes()
+    written_spool.close()
     return [b"\0" + content, b"\1" + json.dumps(HEADER).encode()]
 
 
@@ -177,17 +181,17 @@ def _spools() -> list[bytes]:
 def _pcds() -> list[bytes]:
     points, colours = grasp_files.points_m(count=8), grasp_files.colours(count=8)
     rows = "".join(f"{x:g} {y:g} {z:g} 4.2e+06\n" for x, y, z in points.tolist())
-    whole = grasp_files.header(8).encode() + grasp_files.packed(points, colours)
-    return [whole, whole + bytes(64), (grasp_files.header(8, "ascii") + rows).encode()]
+    full_file = grasp_files.header(8).encode() + grasp_files.packed(points, colours)
+    return [full_file, full_file + bytes(64), (grasp_files.header(8, "ascii") + rows).encode()]
 
 
 @functools.cache
 def _plys() -> list[bytes]:
     points, colours = grasp_files.points_m(count=8), grasp_files.colours(count=8)
-    whole = ply.packed(points, colours)
-    text = whole[: whole.index(b"end_header")].replace(b"binary_little_endian", b"ascii") + b"end_header\n"
+    full_file = ply.packed(points, colours)
+    text = full_file[: full_file.index(b"end_header")].replace(b"binary_little_endian", b"ascii") + b"end_header\n"
     rows = "".join(f"{x:g} {y:g} {z:g} {r} {g} {b}\n" for (x, y, z), (r, g, b) in zip(points, colours, strict=True))
-    return [whole, ply.packed(points, None), text + rows.encode()]
+    return [full_file, ply.packed(points, None), text + rows.encode()]
 
 
 @functools.cache
@@ -225,7 +229,7 @@ def _parts(files: dict[str, bytes]) -> list[bytes]:
 
 
 def _cloud(suffix: str, data: bytes) -> object:
-    return cloud_files.read(_written(f"cloud{suffix}", data))
+    return cloud_files.read(_write_input(f"cloud{suffix}", data))
 
 
 @functools.cache
@@ -298,11 +302,11 @@ def _session(folder: Path) -> None:
 
 def _bags(folder: Path) -> None:
     types, types1 = writers.store(), writers.store(ros1=True)
-    for name, made in (("a", types), ("b", types), ("c.bag", types1)):
-        values = {"header": writers.header(made, writers.START_NS), "name": ["j"], "position": [1.5]}
-        message = writers.build(made, "sensor_msgs/msg/JointState", **values)
+    for name, typestore in (("a", types), ("b", types), ("c.bag", types1)):
+        values = {"header": writers.header(typestore, writers.START_NS), "name": ["j"], "position": [1.5]}
+        message = writers.build(typestore, "sensor_msgs/msg/JointState", **values)
         sent = [("/j", "sensor_msgs/msg/JointState", writers.START_NS + step, message) for step in range(3)]
-        if made is types1:
+        if typestore is types1:
             writers.ros1(folder / name, sent)
         else:
             writers.ros2(folder / name, sent, "mcap" if name == "a" else "sqlite3")
@@ -317,11 +321,11 @@ def _mcap(folder: Path) -> None:
 
 
 RATE = '[streams.data]\nsource = "data"\ntime = { rate_hz = 60 }\n'
-PARAMS = {  # of formats that need some
+PARAMS = {  # Params of formats that need some.
     "table": {"layout": json.dumps(tomllib.loads(LAYOUT))},
     "zarr": {"layout": json.dumps(tomllib.loads(RATE))},
 }
-TREES: dict[str, Callable[[Path], object]] = {  # what writes a valid source of each format
+TREES: dict[str, Callable[[Path], object]] = {  # Functions that write a valid source of each format.
     "biotac-slide": _biotac,
     "hdf5": _arrays,
     "lerobot": _episodes,
@@ -349,27 +353,29 @@ def _format(name: str, data: bytes) -> object:
     """Ingest a source one of whose files, as the first byte tells, holds the rest of ``data``."""
     folder, paths = tree(name)
     path = paths[data[0] % len(paths) if data else 0]
-    whole = path.read_bytes()
+    original = path.read_bytes()
     path.write_bytes(data[1:])
     try:
         return ingested(name, folder)
     finally:
-        path.write_bytes(whole)
+        path.write_bytes(original)
 
 
 def ingested(name: str, folder: Path) -> list[Any]:
     """Return the recordings that a format reads in a folder."""
     stage = registry.load(f"ingest.{name}")
     assert stage.discover is not None
-    given = stage.params(**PARAMS.get(name, {}))
-    found = []
-    for one in list(stage.discover(given, folder).values())[:3]:
-        source = one if isinstance(one, Source) else Source(one)
+    params = stage.params(**PARAMS.get(name, {}))
+    recordings = []
+    for discovered in list(stage.discover(params, folder).values())[:3]:
+        source = discovered if isinstance(discovered, Source) else Source(discovered)
         values = {"values": source.values} if stage.argument("Values") else {}
-        made = stage(given, files=source.files, **values)
-        whole = {name: rows if isinstance(rows, pa.Table) else rows.read_all() for name, rows in made.streams.items()}
-        found.append(replace(made, tables=whole))
-    return found
+        recording = stage(params, files=source.files, **values)
+        tables = {
+            name: rows if isinstance(rows, pa.Table) else rows.read_all() for name, rows in recording.streams.items()
+        }
+        recordings.append(replace(recording, tables=tables))
+    return recordings
 
 
 def ingest(lab: Lab, name: str) -> Ran:

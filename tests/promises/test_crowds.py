@@ -52,20 +52,20 @@ def outcomes(scene: Scene, commands: Sequence[str]) -> list[dict[str, int]]:
     collecting, collections = scene.start("store gc --grace-days 0"), 1
     while any(running.poll() is None for running in crowd):
         if collecting.poll() is not None:
-            assert kills.ended(collecting) == 0, collecting.out.read_text()
+            assert kills.wait_for_exit(collecting) == 0, collecting.out.read_text()
             kills.aged(scene.project)  # nothing is spared for its youth
             collecting = scene.start("store gc --grace-days 0")
             collections += 1
         time.sleep(0.01)
-    assert kills.ended(collecting) == 0, collecting.out.read_text()
+    assert kills.wait_for_exit(collecting) == 0, collecting.out.read_text()
     assert collections > 1
-    told = []
+    reports = []
     for running in crowd:
-        said = running.out.read_text()
-        assert kills.ended(running) == 0, said
-        told.append(json.loads(said.splitlines()[-1]))
+        printed = running.out.read_text()
+        assert kills.wait_for_exit(running) == 0, printed
+        reports.append(json.loads(printed.splitlines()[-1]))
     count("processes in crowds", len(crowd) + collections)
-    return told
+    return reports
 
 
 def tidy(store: Store) -> None:
@@ -81,9 +81,9 @@ def test_processes_that_ask_for_the_same_keys_make_each_once_while_garbage_is_co
     scene: Scene, size: int
 ) -> None:
     scene.run("simulate toy --trials 50 --rows 4 -o data/r")
-    told = outcomes(scene, [f"scale data/r -o data/s{number}" for number in range(size)])
-    assert sum(one["ran"] for one in told) == 50
-    assert all(one["ran"] + one["reused"] == 50 for one in told)
+    reports = outcomes(scene, [f"scale data/r -o data/s{number}" for number in range(size)])
+    assert sum(outcome["ran"] for outcome in reports) == 50
+    assert all(outcome["ran"] + outcome["reused"] == 50 for outcome in reports)
     assert len({(scene.project / f"data/s{number}/manifest.json").read_bytes() for number in range(size)}) == 1
     tidy(Store(scene.project / ".tacpipe"))
 
@@ -94,11 +94,11 @@ def test_processes_that_ask_for_different_keys_all_get_theirs_while_garbage_is_c
     scene: Scene, size: int
 ) -> None:
     scene.run("simulate toy --trials 6 --rows 4 -o data/r")
-    told = outcomes(scene, [f"scale data/r -o data/s{factor} --factor {factor}" for factor in range(size)])
-    assert [one["ran"] for one in told] == [6] * size
+    reports = outcomes(scene, [f"scale data/r -o data/s{factor} --factor {factor}" for factor in range(size)])
+    assert [outcome["ran"] for outcome in reports] == [6] * size
     for factor in range(size):
-        again = scene.start(f"scale data/r -o data/s{factor} --factor {factor} --check --quiet")
-        assert kills.ended(again) == 0, again.out.read_text()
+        check = scene.start(f"scale data/r -o data/s{factor} --factor {factor} --check --quiet")
+        assert kills.wait_for_exit(check) == 0, check.out.read_text()
     tidy(Store(scene.project / ".tacpipe"))
 
 
@@ -113,12 +113,12 @@ def test_killed_processes_leave_no_lock_that_anybody_waits_for(scene: Scene, siz
         with contextlib.suppress(ProcessLookupError):  # it ended already
             os.killpg(running.pid, signal.SIGKILL)
     for running in crowd:
-        assert kills.ended(running) in (0, -signal.SIGKILL)
+        assert kills.wait_for_exit(running) in (0, -signal.SIGKILL)
     assert list(scene.project.glob(".tacpipe/leases/*")), "none of them held a lease"
     (scene.project / "gate").touch()
     for words in (*commands, "label data/r trial-000 --label material=foam", "store gc", "store repair"):
         at_once = scene.start(words, TACPIPE_LOCK_TIMEOUT_S="0")
-        assert kills.ended(at_once) == 0, at_once.out.read_text()
+        assert kills.wait_for_exit(at_once) == 0, at_once.out.read_text()
     kills.aged(scene.project)
     scene.run("store gc")
     tidy(Store(scene.project / ".tacpipe"))
@@ -132,16 +132,16 @@ def test_who_waits_for_a_stopped_process_is_told_whom_and_gives_up(scene: Scene)
     awaited(lambda: [path for path in scene.project.glob(".tacpipe/leases/*") if not path.name.startswith("run-")])
     os.killpg(first.pid, signal.SIGSTOP)
     second = scene.start(f"{words}2", TACPIPE_LOCK_TIMEOUT_S="3")
-    code, said = kills.ended(second), second.out.read_text()
+    code, printed = kills.wait_for_exit(second), second.out.read_text()
     os.killpg(first.pid, signal.SIGCONT)
     (scene.project / "gate").touch()
     assert code == 6
-    waiting, gave_up = said.splitlines()
+    waiting, gave_up = printed.splitlines()
     assert waiting.startswith(f"tacpipe: waiting for process {first.pid} on {os.uname().nodename} (tacpipe {words})")
     assert gave_up.startswith(
         f"tacpipe: Process {first.pid} on {os.uname().nodename} (tacpipe {words}), which is stopped"
     )
-    assert kills.ended(first) == 0
+    assert kills.wait_for_exit(first) == 0
     assert scene.run(f"{words}2")
     tidy(Store(scene.project / ".tacpipe"))
 
@@ -153,13 +153,13 @@ def test_garbage_that_is_collected_beside_a_stopped_process_is_not_what_it_needs
     scene: Scene, words: str, times: int
 ) -> None:
     scene.run("simulate toy --trials 6 --rows 4 -o data/r")
-    scene.run("scale data/r -o data/s --factor 7")  # whose shards are garbage once it is replaced
+    scene.run("scale data/r -o data/s --factor 7")  # Its shards are garbage once it is replaced.
     kills.aged(scene.project)
     scene.keep()
-    lasts_s, wanted = scene.run(words), kills.State.of(scene.project).files
+    lasts_s, expected = scene.run(words), kills.State.from_project(scene.project).files
     rng = random.Random(words)
     for trial in range(times):
-        scene.again()
+        scene.restore()
         after_s = lasts_s * (trial + rng.random()) / times
         running = scene.start(words)
         time.sleep(after_s)
@@ -167,11 +167,11 @@ def test_garbage_that_is_collected_beside_a_stopped_process_is_not_what_it_needs
         kills.aged(scene.project)
         scene.run("store gc --grace-days 0")
         os.kill(running.pid, signal.SIGCONT)
-        told = f"stopped after {after_s:.4f} of {lasts_s:.4f} s: "
-        assert kills.ended(running) == 0, told + running.out.read_text()
-        found = repair.verify(Store(scene.project / ".tacpipe"))
-        assert found.clean, told + found.to_text()
-        assert kills.State.of(scene.project).files == wanted, told
+        moment = f"stopped after {after_s:.4f} of {lasts_s:.4f} s: "
+        assert kills.wait_for_exit(running) == 0, moment + running.out.read_text()
+        soundness = repair.verify(Store(scene.project / ".tacpipe"))
+        assert soundness.clean, moment + soundness.to_text()
+        assert kills.State.from_project(scene.project).files == expected, moment
         count("kills survived")
 
 
@@ -180,13 +180,13 @@ def unshares() -> bool:
 
 
 def waited(processes: Sequence[subprocess.Popen[str]]) -> list[dict[str, int]]:
-    told = []
+    reports = []
     for process in processes:
         out, err = process.communicate()
         assert process.returncode == 0, err
-        told.append(json.loads(out))
+        reports.append(json.loads(out))
     count("processes in crowds", len(processes))
-    return told
+    return reports
 
 
 @pytest.mark.long
@@ -195,21 +195,24 @@ def waited(processes: Sequence[subprocess.Popen[str]]) -> list[dict[str, int]]:
 def test_two_hosts_that_share_a_store_make_each_key_once(scene: Scene, tmp_path: Path, size: int) -> None:
     scene.run("simulate toy --trials 12 --rows 4 -o data/r")
     shutil.copytree(scene.project / "data", tmp_path / "other/data")
-    store, seen = scene.project / ".tacpipe", tmp_path / "seen"
-    here = [sys.executable, "-m", "tacpipe"]
-    there = [*UNSHARED, "sh", "-c", ELSEWHERE, "sh", str(seen), str(store), *here]
+    store, mounted_store = scene.project / ".tacpipe", tmp_path / "seen"
+    local_command = [sys.executable, "-m", "tacpipe"]
+    remote_command = [*UNSHARED, "sh", "-c", ELSEWHERE, "sh", str(mounted_store), str(store), *local_command]
     processes = [
         subprocess.Popen(
-            [*(there if number % 2 else here), *f"scale data/r -o data/s{number} --pause-s 0.02 --json".split()],
+            [
+                *(remote_command if number % 2 else local_command),
+                *f"scale data/r -o data/s{number} --pause-s 0.02 --json".split(),
+            ],
             cwd=tmp_path / ("other" if number % 2 else "project"),
-            env={**os.environ, **scene.environment, "TACPIPE_STORE": str(seen if number % 2 else store)},
+            env={**os.environ, **scene.environment, "TACPIPE_STORE": str(mounted_store if number % 2 else store)},
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
         )
         for number in range(size)
     ]
-    assert sum(one["ran"] for one in waited(processes)) == 12
+    assert sum(outcome["ran"] for outcome in waited(processes)) == 12
     tidy(Store(store))
 
 
@@ -234,8 +237,8 @@ def shared(scene: Scene) -> Iterator[Scene]:
     ]
     probe = [sys.executable, "-c", PROBE, *commands]
     environment = {**os.environ, **scene.environment}
-    done = subprocess.run(probe, cwd=scene.project, env=environment, capture_output=True, text=True, check=True)
-    modules = json.loads(done.stdout.splitlines()[-1])
+    process = subprocess.run(probe, cwd=scene.project, env=environment, capture_output=True, text=True, check=True)
+    modules = json.loads(process.stdout.splitlines()[-1])
     with tempfile.TemporaryDirectory(prefix="tacpipe-group-") as name, serving(*modules) as server:
         lab = Path(name)
         shutil.copytree(Path(scene.environment["PYTHONPATH"].split(os.pathsep)[0]), lab / "plugin")
@@ -252,22 +255,24 @@ def shared(scene: Scene) -> Iterator[Scene]:
 @pytest.mark.skipif(not ROOT, reason="only root can be several users")
 @pytest.mark.parametrize("size", [4, pytest.param(16, marks=pytest.mark.faults)])
 def test_two_users_of_a_group_share_a_store(shared: Scene, size: int) -> None:
-    def done(*commands: str, first: int = 0) -> list[str]:
+    def run_by_users(*commands: str, first: int = 0) -> list[str]:
         """Run commands of the users in turn, all at once; return the last line that each printed."""
         users = [USERS[(first + number) % 2] for number in range(len(commands))]
         crowd = [shared.start(words, TEST_USER=str(user)) for words, user in zip(commands, users, strict=True)]
         for running in crowd:
-            assert kills.ended(running) == 0, running.out.read_text()
+            assert kills.wait_for_exit(running) == 0, running.out.read_text()
         count("processes in crowds", len(crowd))
         return [running.out.read_text().splitlines()[-1] for running in crowd]
 
-    done("simulate toy --jobs 1 --trials 12 --rows 4 -o data/r")
-    told = done(*(f"scale data/r --json --jobs 1 --quiet -o data/s{number}" for number in range(size)))
-    assert sum(json.loads(one)["ran"] for one in told) == 12
-    told = done(*(f"scale data/r --factor 9 --json --quiet --jobs 1 -o data/s{n}" for n in range(size)), first=1)
-    assert sum(json.loads(one)["ran"] for one in told) == 12  # each wrote over what was the other's
+    run_by_users("simulate toy --jobs 1 --trials 12 --rows 4 -o data/r")
+    lines = run_by_users(*(f"scale data/r --json --jobs 1 --quiet -o data/s{number}" for number in range(size)))
+    assert sum(json.loads(line)["ran"] for line in lines) == 12
+    lines = run_by_users(
+        *(f"scale data/r --factor 9 --json --quiet --jobs 1 -o data/s{n}" for n in range(size)), first=1
+    )
+    assert sum(json.loads(line)["ran"] for line in lines) == 12  # each wrote over what was the other's
     for first in (0, 1):
-        done(f"label data/r trial-000 --label material=foam{first}", first=first)
+        run_by_users(f"label data/r trial-000 --label material=foam{first}", first=first)
         kills.aged(shared.project)
-        done("store gc", first=first)
+        run_by_users("store gc", first=first)
     tidy(Store(shared.project / ".tacpipe"))

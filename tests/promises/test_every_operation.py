@@ -29,11 +29,11 @@ from tests.promises.operations import Call, Shim
 from tests.promises.operations_cases import CASES, PART, STAGES, TOYS
 from tests.test_garbage import age
 
-MEMORY = Path("/dev/shm")  # where thousands of folders come and go in no time
+MEMORY = Path("/dev/shm")  # Thousands of folders come and go there quickly.
 PROJECT = Path(__file__).parents[2]
 QUICK = (TOYS[:5], TOYS[5:11], TOYS[11:])
-# Of commands that touch the store each call is tried. Stages make the same calls there, so of a stage each third is tried,
-# from the first, the second or the third: what all stages do is tried whole by three of them.
+# Each call of commands that touch the store is tried. Stages make the same calls there, so each third of a stage is tried,
+# starting with the first, the second or the third: together three stages try all that stages do.
 EVERY = {case.name: "1" for case in TOYS} | {case.name: f"{1 + n % PART}/{PART}" for n, case in enumerate(STAGES)}
 
 
@@ -42,7 +42,7 @@ def tried(plugin: Path, folder: Path, *words: str, script: str = "") -> list[dic
     call = ["-m", "tests.promises.operations_trials"] if not script else ["-c", script]
     path = os.pathsep.join([str(plugin), os.environ.get("PYTHONPATH", "")])
     with tempfile.TemporaryDirectory(dir=MEMORY if MEMORY.is_dir() else folder) as place:
-        done = subprocess.run(
+        process = subprocess.run(
             [sys.executable, *call, place, *words],
             cwd=PROJECT,
             env={**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1"},
@@ -50,11 +50,11 @@ def tried(plugin: Path, folder: Path, *words: str, script: str = "") -> list[dic
             text=True,
             check=False,
         )
-    assert done.returncode == 0, done.stderr[-3000:]
-    found = [json.loads(line) for line in done.stdout.splitlines()]
-    for one in found:
-        count("operations failed", one["failed"])
-    return found
+    assert process.returncode == 0, process.stderr[-3000:]
+    trials = [json.loads(line) for line in process.stdout.splitlines()]
+    for trial in trials:
+        count("operations failed", trial["failed"])
+    return trials
 
 
 @pytest.mark.faults
@@ -62,16 +62,16 @@ def tried(plugin: Path, folder: Path, *words: str, script: str = "") -> list[dic
 def test_whatever_fails_nothing_is_torn_and_the_rerun_equals_a_clean_run(
     name: str, plugin: Path, tmp_path: Path
 ) -> None:
-    (one,) = tried(plugin, tmp_path, name, "--every", EVERY[name])
-    assert one["failed"] * int(EVERY[name].rpartition("/")[2]) > one["calls"] > 0
-    assert one["problems"] == []
+    (trial,) = tried(plugin, tmp_path, name, "--every", EVERY[name])
+    assert trial["failed"] * int(EVERY[name].rpartition("/")[2]) > trial["calls"] > 0
+    assert trial["problems"] == []
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("cases", QUICK, ids=lambda cases: cases[0].name)
 def test_whatever_fails_of_small_commands_nothing_is_torn(cases: Any, plugin: Path, tmp_path: Path) -> None:
-    found = tried(plugin, tmp_path, *(case.name for case in cases), "--every", "29")
-    assert {one["case"]: one["problems"] for one in found} == {case.name: [] for case in cases}
+    trials = tried(plugin, tmp_path, *(case.name for case in cases), "--every", "29")
+    assert {trial["case"]: trial["problems"] for trial in trials} == {case.name: [] for case in cases}
 
 
 BREAKS = {
@@ -98,8 +98,8 @@ def test_a_store_that_takes_less_care_is_found_out(broken: str, plugin: Path, tm
         f"{BREAKS[broken]}"
         "from tests.promises import operations_trials; operations_trials.main()"
     )
-    (one,) = tried(plugin, tmp_path, "ingest.numbers", "--every", "29", script=script)
-    assert one["problems"]
+    (trial,) = tried(plugin, tmp_path, "ingest.numbers", "--every", "29", script=script)
+    assert trial["problems"]
 
 
 def test_a_rerun_changes_nothing_on_the_disk_and_so_needs_none_that_can_be_written(lab: Lab) -> None:
@@ -115,7 +115,7 @@ def test_a_rerun_reads_no_shard_and_a_byte_that_changed_in_place_is_found_by_who
     lab.run("simulate toy -o data/r")
     lab.run("scale data/r -o data/s")
     name = lab.manifest("data/s").recordings["trial-001"]["shards"][""]["digest"]
-    damages.unseen(Path(lab.store.object_path(name)))  # beside the manifest too: it is a link
+    damages.unseen(Path(lab.store.object_path(name)))  # The file next to the manifest is damaged too: it is a link.
     shards = {shard for path in ("data/r", "data/s") for _, shard in lab.manifest(path).objects()}
 
     def read(command: str) -> list[str]:
@@ -127,7 +127,7 @@ def test_a_rerun_reads_no_shard_and_a_byte_that_changed_in_place_is_found_by_who
         return [path.name for path in opened if path.name in shards or path.suffix == ".parquet"]
 
     assert read("scale data/r -o data/s --jobs 1") == []
-    assert name in read("total data/s -o data/t --jobs 1")  # which recomputes it
+    assert name in read("total data/s -o data/t --jobs 1")  # The command recomputes it.
     assert bytes_digest(Path(lab.store.object_path(name)).read_bytes()) == name
     damages.unseen(Path(lab.store.object_path(name)))
     assert name in lab.call("store verify").out
@@ -140,12 +140,12 @@ def test_garbage_is_not_collected_where_a_folder_cannot_be_listed(lab: Lab, fold
     age(lab)
     with Shim(lab.folder) as shim:
         lab.run("store gc")
-    there = sorted(lab.store.root.glob("objects/*/*"))
+    before = sorted(lab.store.root.glob("objects/*/*"))
     number = 1 + shim.calls.index(Call("scandir", str(lab.store.root / folder)))
     with Shim(lab.folder, at=number, fault="EACCES"):
         ran = lab.call("store gc")
     assert ran.code == 1 and ran.err.startswith("tacpipe: ") and ran.err.count("\n") == 1
-    assert sorted(lab.store.root.glob("objects/*/*")) == there
+    assert sorted(lab.store.root.glob("objects/*/*")) == before
     assert repair.verify(lab.store).clean
 
 

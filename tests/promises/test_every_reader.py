@@ -78,9 +78,9 @@ def every_case(cases: dict[str, list[Case] | str]) -> list[Any]:
     """Return the cases of all readers as params; a reader without one has a text that states why."""
     return [
         pytest.param(reader, case, id=f"{reader}-{number}")
-        for reader, several in cases.items()
-        if not isinstance(several, str)
-        for number, case in enumerate(several)
+        for reader, reader_cases in cases.items()
+        if not isinstance(reader_cases, str)
+        for number, case in enumerate(reader_cases)
     ]
 
 
@@ -109,9 +109,9 @@ def _channel_twice(folder: Path) -> None:
     writers.mcap_json(folder / "a.mcap", {"/a": [(1, {"v": 1})], "/b": [(2, {"v": 2})]}, use_chunking=False)
     content = (folder / "a.mcap").read_bytes()
     channel = struct.pack("<HH", 2, 2) + struct.pack("<I", 2) + b"/b"
-    assert content.count(channel) == 2  # before the messages, and in the summary
-    other = struct.pack("<HH", 1, 2) + struct.pack("<I", 2) + b"/b"
-    (folder / "a.mcap").write_bytes(content.replace(channel, other))
+    assert content.count(channel) == 2  # It stands before the messages, and in the summary.
+    renumbered = struct.pack("<HH", 1, 2) + struct.pack("<I", 2) + b"/b"
+    (folder / "a.mcap").write_bytes(content.replace(channel, renumbered))
 
 
 def _undescribed(folder: Path) -> None:
@@ -203,14 +203,14 @@ def _parquet_twice(folder: Path) -> None:
     pq.write_table(table, folder / "a.parquet")
 
 
-def _twice(write: Callable[[Path], object]) -> Callable[[Path], None]:
+def _write_twice(write: Callable[[Path], object]) -> Callable[[Path], None]:
     """Return a function that writes the same trial into two folders."""
 
-    def both(folder: Path) -> None:
+    def write_two_folders(folder: Path) -> None:
         for place in ("one", "two"):
             write(folder / place)
 
-    return both
+    return write_two_folders
 
 
 def _nested(folder: Path) -> None:
@@ -248,13 +248,16 @@ NAMED_TWICE: dict[str, list[Case] | str] = {
             LAYOUT % "jsonl",
         ),
     ],
-    "biotac-slide": [Case(_twice(slide_files.write_biotac), "are the same slide")],
+    "biotac-slide": [Case(_write_twice(slide_files.write_biotac), "are the same slide")],
     "roboskin": [
-        Case(_twice(lambda place: slide_files.write_roboskin(place, slide_files.touched(1, 20))), "are the same block")
+        Case(
+            _write_twice(lambda place: slide_files.write_roboskin(place, slide_files.touched(1, 20))),
+            "are the same block",
+        )
     ],
-    "vision2tactile": [Case(_twice(grasp_files.write_grasp), "would both be named bleach")],
-    "xela-flat": [Case(_twice(lambda place: xela_files.write_flat(place / "trial")), 2), Case(_nested, 2)],
-    "xela-psc": [Case(_twice(lambda place: xela_files.write_psc(place / "trial")), 2)],
+    "vision2tactile": [Case(_write_twice(grasp_files.write_grasp), "would both be named bleach")],
+    "xela-flat": [Case(_write_twice(lambda place: xela_files.write_flat(place / "trial")), 2), Case(_nested, 2)],
+    "xela-psc": [Case(_write_twice(lambda place: xela_files.write_psc(place / "trial")), 2)],
 }
 
 
@@ -268,13 +271,13 @@ def test_of_two_parts_with_one_name_none_is_lost_without_a_word(lab: Lab, reader
 
 def _without_check_sums(content: bytes) -> bytes:
     """Return an MCAP file whose chunks have no check sums."""
-    found, at = bytearray(content), 8
-    while at + 9 < len(found):
-        kind, length = struct.unpack_from("<BQ", found, at)
+    changed, at = bytearray(content), 8
+    while at + 9 < len(changed):
+        kind, length = struct.unpack_from("<BQ", changed, at)
         if kind == 6:
-            found[at + 9 + 24 : at + 9 + 28] = bytes(4)
+            changed[at + 9 + 24 : at + 9 + 28] = bytes(4)
         at += 9 + length
-    return bytes(found)
+    return bytes(changed)
 
 
 def _chunk_damaged(
@@ -286,11 +289,11 @@ def _chunk_damaged(
         sent = {"/a": [(writers.START_NS + n, {"v": n}) for n in range(4000)]}
         path = writers.mcap_json(folder / "a.mcap", sent, chunk_size=20_000, compression=compression)
         content = bytearray(_without_check_sums(path.read_bytes()))
-        at, seen = 8, 0
+        at, chunks_passed = 8, 0
         while True:
             kind, length = struct.unpack_from("<BQ", content, at)
-            seen += kind == 6
-            if seen == 3:
+            chunks_passed += kind == 6
+            if chunks_passed == 3:
                 break
             at += 9 + length
         change(content, at + 9, length)
@@ -308,7 +311,7 @@ def _declare_less(content: bytearray, at: int, length: int) -> None:
 
 
 def _overlong_record(content: bytearray, at: int, length: int) -> None:
-    end, at = at + length, at + 40  # behind the header of a chunk that is not compressed
+    end, at = at + length, at + 40  # The records begin after the header of a chunk that is not compressed.
     while at < end - 200:
         at += 9 + int(struct.unpack_from("<Q", content, at + 1)[0])
     content[at + 1 : at + 9] = struct.pack("<Q", 1 << 40)
@@ -548,7 +551,7 @@ def test_links_are_followed_where_their_user_allows_it(lab: Lab, monkeypatch: py
 
 
 class Runs:
-    """What leaves a file behind where a pickle of it is opened."""
+    """Object that creates a file if its pickle is opened."""
 
     def __reduce__(self) -> Any:
         return Path.touch, (Path("ran"),)
@@ -581,11 +584,13 @@ def _filtered(folder: Path) -> None:
         file["demo_0/t_s"] = np.arange(5.0)
         file.create_dataset("demo_0/a", data=np.arange(5.0), chunks=(5,), shuffle=True)
     content = (folder / "a.hdf5").read_bytes()
-    named = (
+    filter_description = (
         struct.pack("<HH", 2, 8) + struct.pack("<HH", 1, 1) + b"shuffle\0"
     )  # number, length of the name, flags, values
-    assert content.count(named) == 1
-    (folder / "a.hdf5").write_bytes(content.replace(named, struct.pack("<H", 31999) + named[2:]))
+    assert content.count(filter_description) == 1
+    (folder / "a.hdf5").write_bytes(
+        content.replace(filter_description, struct.pack("<H", 31999) + filter_description[2:])
+    )
 
 
 def _mcap_compressed(folder: Path) -> None:
@@ -838,10 +843,10 @@ DECLARED: dict[str, list[Case] | str] = {
 def test_a_declared_size_takes_no_memory(lab: Lab, reader: str, case: Case) -> None:
     def call(command: str) -> Ran:
         words = [sys.executable, "-c", peaks.PROGRAM, "{}", *shlex.split(command)]
-        done = subprocess.run(words, capture_output=True, text=True)
-        out, _, peak_kb = done.stdout.rpartition("peak ")
+        process = subprocess.run(words, capture_output=True, text=True)
+        out, _, peak_kb = process.stdout.rpartition("peak ")
         assert int(peak_kb) < 500_000
-        return Ran(done.returncode, out, done.stderr)
+        return Ran(process.returncode, out, process.stderr)
 
     ask(replace(lab, call=call), reader, case, "a declared size")
 

@@ -27,8 +27,8 @@ def tried(case: str, examples: int) -> None:
     def attempt(data: bytes, sizes: list[int], at_once: int) -> None:
         nonlocal ran
         ran += 1
-        whole = decoding.samples(case, decoding.chunks(case, data, (len(data) or 1,)))
-        assert decoding.samples(case, decoding.chunks(case, data, sizes), at_once) == whole
+        expected = decoding.samples(case, decoding.chunks(case, data, (len(data) or 1,)))
+        assert decoding.samples(case, decoding.chunks(case, data, sizes), at_once) == expected
 
     with bounded():
         attempt()

@@ -25,7 +25,7 @@ from tacpipe.io.parquet import from_parquet, to_parquet
 from tests.conftest import Lab, without_created_store
 from tests.promises import targets
 from tests.promises.counts import count
-from tests.promises.limits import GIB, bounded, is_sentence, some
+from tests.promises.limits import GIB, bounded, is_sentence, sample_cases
 
 SMALL = GIB // 2  # memory that refusing a file may take, libraries that it loads included
 XYZ = "property float x\nproperty float y\nproperty float z\n"
@@ -41,10 +41,10 @@ def refused(read: Callable[[], object], match: str | None = None, kind: type[Tac
 
 def varint(number: int) -> bytes:
     """Return a whole number as Thrift's compact protocol writes it."""
-    number, found = number << 1, b""
+    number, encoded = number << 1, b""
     while number >= 128:
-        found, number = found + bytes([number & 127 | 128]), number >> 7
-    return found + bytes([number])
+        encoded, number = encoded + bytes([number & 127 | 128]), number >> 7
+    return encoded + bytes([number])
 
 
 def with_footer(content: bytes, footer: bytes) -> bytes:
@@ -64,23 +64,27 @@ def footer_of(content: bytes) -> bytes:
 def test_rows_that_a_parquet_file_only_claims_are_not_believed(rows: int) -> None:
     content = to_parquet(pa.table({"t_ns": np.arange(77)}))
     footer = footer_of(content)
-    told = b"\x16" + varint(77)  # of the file, its group, and the column's values
-    assert footer.count(told) >= 3
+    row_count = b"\x16" + varint(77)  # The count of the file, its group, and the column's values.
+    assert footer.count(row_count) >= 3
     refused(
-        lambda: from_parquet(with_footer(content, footer.replace(told, b"\x16" + varint(rows)))), "77", DamagedError
+        lambda: from_parquet(with_footer(content, footer.replace(row_count, b"\x16" + varint(rows)))),
+        "77",
+        DamagedError,
     )
 
 
 @pytest.mark.parametrize("rows", [-1, -(10**12)])
 def test_a_negative_number_of_rows_is_refused(rows: int) -> None:
     content = to_parquet(pa.table({"t_ns": np.arange(77)}))
-    told = b"\x16" + varint(77)
+    row_count = b"\x16" + varint(77)
     number = (rows << 1) ^ -1
-    found = b""
+    encoded = b""
     while number >= 128:
-        found, number = found + bytes([number & 127 | 128]), number >> 7
+        encoded, number = encoded + bytes([number & 127 | 128]), number >> 7
     refused(
-        lambda: from_parquet(with_footer(content, footer_of(content).replace(told, b"\x16" + found + bytes([number])))),
+        lambda: from_parquet(
+            with_footer(content, footer_of(content).replace(row_count, b"\x16" + encoded + bytes([number])))
+        ),
         kind=DamagedError,
     )
 
@@ -94,9 +98,9 @@ def test_a_page_that_claims_to_unpack_to_gigabytes_is_held_against_the_memory(
     assert header is not None
     bomb = content[: header.start(1)] + varint(size) + content[header.end(1) :]
     shift = len(varint(size)) - len(header[1])
-    told = b"\x16" + varint(_size(content))  # the column's size in the file
-    assert told in footer_of(content)
-    bomb = with_footer(bomb, footer_of(content).replace(told, b"\x16" + varint(_size(content) + shift)))
+    column_size = b"\x16" + varint(_size(content))  # the column's size in the file
+    assert column_size in footer_of(content)
+    bomb = with_footer(bomb, footer_of(content).replace(column_size, b"\x16" + varint(_size(content) + shift)))
     monkeypatch.setattr(memory, "available", lambda: 10**8)
     refused(lambda: from_parquet(bomb), "declares", ShortageError)
 
@@ -111,12 +115,12 @@ BOMB_ROWS = 80_000_000
 @pytest.fixture(scope="module")
 def bomb() -> bytes:
     """Some hundred kilobytes that are 640 MB once it is read: zeros, as a sensor that holds still gives them."""
-    one = io.BytesIO()
+    sink = io.BytesIO()
     table = pa.table({"t_ns": pa.array(np.zeros(1 << 20, np.int64))})
-    with pq.ParquetWriter(one, table.schema, use_dictionary=False, compression="zstd") as writer:
+    with pq.ParquetWriter(sink, table.schema, use_dictionary=False, compression="zstd") as writer:
         for _ in range(BOMB_ROWS >> 20):
             writer.write_table(table)
-    return one.getvalue()
+    return sink.getvalue()
 
 
 def test_a_file_that_unpacks_to_more_than_the_memory_is_refused_before_it_is_unpacked(bomb: bytes) -> None:
@@ -125,13 +129,13 @@ def test_a_file_that_unpacks_to_more_than_the_memory_is_refused_before_it_is_unp
 
 
 def test_a_long_recording_that_held_still_is_read_where_there_is_memory_for_it(bomb: bytes) -> None:
-    held = to_parquet(pa.table({"t_ns": np.arange(2_000_000), "taxel": np.full(2_000_000, 7, np.uint16)}))
-    assert len(held) < 40_000
+    content = to_parquet(pa.table({"t_ns": np.arange(2_000_000), "taxel": np.full(2_000_000, 7, np.uint16)}))
+    assert len(content) < 40_000
     with bounded(GIB):
-        assert from_parquet(held).column("taxel").to_numpy().sum() == 14_000_000
+        assert from_parquet(content).column("taxel").to_numpy().sum() == 14_000_000
 
 
-@pytest.mark.parametrize("encoding", some(["PLAIN_DICTIONARY", "DELTA_BYTE_ARRAY"], 1))
+@pytest.mark.parametrize("encoding", sample_cases(["PLAIN_DICTIONARY", "DELTA_BYTE_ARRAY"], 1))
 def test_texts_that_stand_for_a_million_long_ones_are_refused(encoding: str) -> None:
     text, rows, sink = "x" * 1_000_000, 100_000, io.BytesIO()
     array = pa.DictionaryArray.from_arrays(pa.array(np.zeros(rows, np.int32)), pa.array([text]))
@@ -147,7 +151,7 @@ def test_texts_that_stand_for_a_million_long_ones_are_refused(encoding: str) -> 
 
 
 @pytest.mark.parametrize(
-    "how",
+    "options",
     [
         {},
         {"compression": "snappy", "data_page_version": "2.0"},
@@ -155,7 +159,7 @@ def test_texts_that_stand_for_a_million_long_ones_are_refused(encoding: str) -> 
         {"use_dictionary": False, "write_page_checksum": True, "compression": "none"},
     ],
 )
-def test_files_of_other_programs_are_read_as_they_are(how: dict[str, Any]) -> None:
+def test_files_of_other_programs_are_read_as_they_are(options: dict[str, Any]) -> None:
     rng = np.random.default_rng(0)
     columns = {
         "number": rng.normal(size=3000),
@@ -166,7 +170,7 @@ def test_files_of_other_programs_are_read_as_they_are(how: dict[str, Any]) -> No
         "four": pa.array([b"abcd"] * 3000, pa.binary(4)),
     }
     table, sink = pa.table(columns), io.BytesIO()
-    pq.write_table(table, sink, **how)
+    pq.write_table(table, sink, **options)
     assert from_parquet(sink.getvalue()).equals(table)
     assert from_parquet(sink.getvalue(), ["text"]).equals(table.select(["text"]))
 
@@ -229,9 +233,9 @@ def test_headers_that_overran_the_memory_of_open3d_are_refused(tmp_path: Path) -
         refused(cloud(tmp_path, "a.ply", content.encode()), r"a\.ply")
 
 
-@pytest.mark.parametrize("told", ["1000000000000", "100000000", "9" * 5000])
-def test_points_that_a_pts_file_only_claims_are_refused(tmp_path: Path, told: str) -> None:
-    refused(cloud(tmp_path, "a.pts", f"{told}\n1 2 3\n".encode()), r"a\.pts")
+@pytest.mark.parametrize("count", ["1000000000000", "100000000", "9" * 5000])
+def test_points_that_a_pts_file_only_claims_are_refused(tmp_path: Path, count: str) -> None:
+    refused(cloud(tmp_path, "a.pts", f"{count}\n1 2 3\n".encode()), r"a\.pts")
 
 
 def test_one_long_number_among_many_does_not_take_its_length_for_each() -> None:
@@ -271,14 +275,14 @@ ARRAYS = {
 
 
 @pytest.mark.parametrize("case", ARRAYS)
-@pytest.mark.parametrize("which", ["icub_fold_0.npy", "labels_fold_0.npy"])
+@pytest.mark.parametrize("name", ["icub_fold_0.npy", "labels_fold_0.npy"])
 def test_arrays_whose_heads_lie_are_refused(
-    tmp_path: Path, case: str, which: str, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, case: str, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     targets.TREES["roboskin"](tmp_path)
-    (tmp_path / which).write_bytes(ARRAYS[case])
-    refused(lambda: targets.ingested("roboskin", tmp_path), which)
+    (tmp_path / name).write_bytes(ARRAYS[case])
+    refused(lambda: targets.ingested("roboskin", tmp_path), name)
     assert not (tmp_path / "opened").exists()
 
 
@@ -292,20 +296,20 @@ class Opened:
         return (os.mkdir, (str(self.trace),))
 
 
-@pytest.mark.parametrize("which", ["icub_fold_0.npy", "labels_fold_0.npy"])
-@pytest.mark.parametrize("how", ["bare", "as an array of objects"])
-def test_a_pickle_in_place_of_an_array_is_never_opened(tmp_path: Path, which: str, how: str) -> None:
+@pytest.mark.parametrize("name", ["icub_fold_0.npy", "labels_fold_0.npy"])
+@pytest.mark.parametrize("form", ["bare", "as an array of objects"])
+def test_a_pickle_in_place_of_an_array_is_never_opened(tmp_path: Path, name: str, form: str) -> None:
     targets.TREES["roboskin"](tmp_path)
     trace = tmp_path / "opened"
-    if how == "bare":
-        (tmp_path / which).write_bytes(pickle.dumps(Opened(trace)))
+    if form == "bare":
+        (tmp_path / name).write_bytes(pickle.dumps(Opened(trace)))
     else:
         value = np.empty(1, dtype=object)
         value[0] = Opened(trace)
-        np.save(tmp_path / which, value, allow_pickle=True)
-    refused(lambda: targets.ingested("roboskin", tmp_path), which)
+        np.save(tmp_path / name, value, allow_pickle=True)
+    refused(lambda: targets.ingested("roboskin", tmp_path), name)
     assert not trace.exists()
-    np.load(tmp_path / which, allow_pickle=True)  # what a careless reader does
+    np.load(tmp_path / name, allow_pickle=True)  # A careless reader does this.
     assert trace.exists()
 
 
@@ -335,18 +339,20 @@ TEXTS: dict[str, bytes] = {
 
 
 @pytest.mark.parametrize("name", TEXTS)
-@pytest.mark.parametrize("how", some([{}, {"integers": pa.uint16()}, {"trailing_comma": True}, {"seconds": "a"}], 1))
-def test_text_that_is_no_table_is_refused(tmp_path: Path, name: str, how: dict[str, Any]) -> None:
+@pytest.mark.parametrize(
+    "options", sample_cases([{}, {"integers": pa.uint16()}, {"trailing_comma": True}, {"seconds": "a"}], 1)
+)
+def test_text_that_is_no_table_is_refused(tmp_path: Path, name: str, options: dict[str, Any]) -> None:
     path = tmp_path / "a.csv"
     path.write_bytes(TEXTS[name])
-    columns = ["b", "c"] if "seconds" in how else ["a", "b", "c"]
-    refused(lambda: csv_table.read_csv(path, columns, **how), r"a\.csv")
+    columns = ["b", "c"] if "seconds" in options else ["a", "b", "c"]
+    refused(lambda: csv_table.read_csv(path, columns, **options), r"a\.csv")
 
 
 # ---- what is no file
 
 
-def put(kind: str, path: Path) -> None:
+def replace_by(kind: str, path: Path) -> None:
     """Put something else in the place of a file."""
     path.unlink()
     if kind == "folder":
@@ -362,8 +368,8 @@ def ingested_with(lab: Lab, name: str, kind: str) -> None:
     """Each file of a source in turn is something else; what is ingested is refused, or leaves that recording out."""
     (lab.folder / "source").mkdir()
     targets.TREES[name](lab.folder / "source")
-    path = sorted(one for one in (lab.folder / "source").rglob("*") if one.is_file())[0]
-    put(kind, path)
+    path = sorted(file for file in (lab.folder / "source").rglob("*") if file.is_file())[0]
+    replace_by(kind, path)
     with bounded(4 * GIB):
         ran = targets.ingest(lab, name)
     assert ran.code in (1, 2)

@@ -40,7 +40,7 @@ NAMES = {
 }
 
 
-def whole(**changed: Any) -> Tree:
+def manifest_tree(**changed: Any) -> Tree:
     """A manifest with a recording and a file, its digest right whatever is in it."""
     tree: Tree = {
         "format": 1,
@@ -64,13 +64,13 @@ def signed(tree: Tree) -> Tree:
     try:
         recordings = {
             name: {
-                "attributes": one["attributes"],
-                "shards": {key: shard["digest"] for key, shard in one["shards"].items()},
+                "attributes": entry["attributes"],
+                "shards": {key: shard["digest"] for key, shard in entry["shards"].items()},
             }
-            for name, one in tree["recordings"].items()
+            for name, entry in tree["recordings"].items()
         }
         tree["digest"] = digest(
-            {"recordings": recordings, "files": {name: one["digest"] for name, one in tree["files"].items()}}
+            {"recordings": recordings, "files": {name: file["digest"] for name, file in tree["files"].items()}}
         )
     except (TacpipeError, KeyError, TypeError, AttributeError):
         tree["digest"] = "0" * 64
@@ -78,7 +78,7 @@ def signed(tree: Tree) -> Tree:
 
 
 def with_recording(name: str, stream: str = "a", shard: Any = None) -> Tree:
-    return whole(recordings={name: {"attributes": {}, "shards": {stream: SHARD if shard is None else shard}}})
+    return manifest_tree(recordings={name: {"attributes": {}, "shards": {stream: SHARD if shard is None else shard}}})
 
 
 def content(tree: Any) -> bytes:
@@ -88,13 +88,17 @@ def content(tree: Any) -> bytes:
 DIGESTS: tuple[Any, ...] = ("../../victim", "", "A" * 64, "0" * 63, "../" * 21 + "a", 5, None, [], "0" * 64 + "\n")
 NUMBERS: tuple[Any, ...] = (-1, 1.5, "3", None, True, [], -(10**30), float("nan"))
 HOSTILE: dict[str, bytes] = {
-    **{f"a recording: {why}": content(with_recording(name)) for why, name in NAMES.items() if name != "manifest.json"},
     **{
-        f"a stream: {why}": content(with_recording("r", name))
-        for why, name in NAMES.items()
+        f"a recording: {reason}": content(with_recording(name))
+        for reason, name in NAMES.items()
+        if name != "manifest.json"
+    },
+    **{
+        f"a stream: {reason}": content(with_recording("r", name))
+        for reason, name in NAMES.items()
         if name not in ("", "manifest.json")
     },
-    **{f"a file: {why}": content(whole(files={name: SHARD})) for why, name in NAMES.items()},
+    **{f"a file: {reason}": content(manifest_tree(files={name: SHARD})) for reason, name in NAMES.items()},
     **{f"a digest: {name!r:.20}": content(with_recording("r", "a", {**SHARD, "digest": name})) for name in DIGESTS},
     **{
         f"{key} {number!r:.20}": content(with_recording("r", "a", {**SHARD, key: number}))
@@ -102,13 +106,13 @@ HOSTILE: dict[str, bytes] = {
         for number in NUMBERS
     },
     "brackets": b"[" * 10_000,
-    "brackets within": content(whole()).replace(b'"params": {}', b'"params": ' + b"[" * 10_000 + b"]" * 10_000),
-    "a format to come": content(whole(format=99)),
-    "a format that is a text": content(whole(format="x" * 100_000)),
-    "two paths that are one": content(whole(files={"r/a.parquet": SHARD})),
-    "no digest": content({key: value for key, value in whole().items() if key != "digest"}),
-    "a digest that is a list": content({**whole(), "digest": [1]}),
-    "an unknown key": content({**whole(), "x" * 100_000: 1}),
+    "brackets within": content(manifest_tree()).replace(b'"params": {}', b'"params": ' + b"[" * 10_000 + b"]" * 10_000),
+    "a format to come": content(manifest_tree(format=99)),
+    "a format that is a text": content(manifest_tree(format="x" * 100_000)),
+    "two paths that are one": content(manifest_tree(files={"r/a.parquet": SHARD})),
+    "no digest": content({key: value for key, value in manifest_tree().items() if key != "digest"}),
+    "a digest that is a list": content({**manifest_tree(), "digest": [1]}),
+    "an unknown key": content({**manifest_tree(), "x" * 100_000: 1}),
     "nothing": b"",
     "a number": b"5",
     "no text": b"\xff\xfe{}",
@@ -118,7 +122,7 @@ WRONG: tuple[Any, ...] = (None, 5, "x", [], [1], {"x": 1}, {"x": []}, True, 1.5)
 
 
 def test_the_manifest_that_these_are_made_of_is_one() -> None:
-    assert parse(content(whole()), "given").rows == 6
+    assert parse(content(manifest_tree()), "given").rows == 6
 
 
 @pytest.mark.parametrize("case", HOSTILE)
@@ -129,12 +133,12 @@ def test_a_hostile_manifest_is_refused_with_a_sentence(case: str) -> None:
     count("hostile inputs refused")
 
 
-@pytest.mark.parametrize("key", [key for key in whole() if key != "digest"])
+@pytest.mark.parametrize("key", [key for key in manifest_tree() if key != "digest"])
 def test_another_type_in_a_manifest_gives_a_sentence_or_a_manifest(key: str) -> None:
     for value in WRONG:
         try:
-            found = parse(content(whole(**{key: value})), "given")
-            assert isinstance(found.rows, int) and list(found.objects()) is not None and found.content
+            parsed = parse(content(manifest_tree(**{key: value})), "given")
+            assert isinstance(parsed.rows, int) and list(parsed.objects()) is not None and parsed.content
         except TacpipeError as error:
             assert is_sentence(str(error)), str(error)
     count("hostile inputs refused", len(WRONG))
@@ -151,8 +155,8 @@ def test_of_two_keys_that_are_the_same_nothing_is_taken_unseen() -> None:
 def test_very_many_recordings_are_read_or_refused_within_bounds() -> None:
     entry = {"attributes": {}, "shards": {"": SHARD}}
     with bounded(6 * GIB):
-        found = parse(content(whole(recordings={f"r{number}": entry for number in range(200_000)})), "given")
-        assert found.rows == 600_000
+        parsed = parse(content(manifest_tree(recordings={f"r{number}": entry for number in range(200_000)})), "given")
+        assert parsed.rows == 600_000
 
 
 # ---- as commands
@@ -167,14 +171,16 @@ class Place:
         self.victim.mkdir()
         for name in ("x", "x.parquet", "a.parquet", "f.json", "manifest"):
             (self.victim / name).write_text("precious\n")
-        self.given = lab.folder / "given"
-        self.given.mkdir()
+        self.dataset = lab.folder / "given"
+        self.dataset.mkdir()
 
     def outside(self) -> dict[str, tuple[bytes, int]]:
         """Return all that is no store and not the dataset."""
-        found = [path for path in self.project.rglob("*") if path.is_file() and not path.is_symlink()]
-        apart = [path for path in found if not {".tacpipe", "given"} & set(path.relative_to(self.project).parts)]
-        return {str(path): (path.read_bytes(), path.stat().st_mtime_ns) for path in apart}
+        files = [path for path in self.project.rglob("*") if path.is_file() and not path.is_symlink()]
+        outside_dataset = [
+            path for path in files if not {".tacpipe", "given"} & set(path.relative_to(self.project).parts)
+        ]
+        return {str(path): (path.read_bytes(), path.stat().st_mtime_ns) for path in outside_dataset}
 
 
 @pytest.fixture
@@ -209,12 +215,12 @@ def kept_out(place: Place, content: bytes) -> None:
     (place.lab.folder / "remote").mkdir(exist_ok=True)
     before = place.outside()
     for command in COMMANDS:
-        (place.given / "manifest.json").write_bytes(content)
+        (place.dataset / "manifest.json").write_bytes(content)
         with bounded(4 * GIB):
             ran = place.lab.call(command)
         assert "Traceback" not in ran.err
         assert ran.code in (0, 1, 2, 4), f"{command}: {ran.err}"
-        after = {path: held for path, held in place.outside().items() if path in before or "victim" in path}
+        after = {path: state for path, state in place.outside().items() if path in before or "victim" in path}
         assert after == before, command
         assert not Path("/tmp/victim-of-tacpipe").exists() and not (place.project / "opened").exists()
     count("hostile inputs refused", len(COMMANDS))
@@ -232,30 +238,30 @@ def test_no_command_follows_any_hostile_manifest_out_of_its_directory(place: Pla
 
 
 LINKS: dict[str, Callable[[Place], None]] = {
-    "the folder of a recording": lambda place: (place.given / "r").symlink_to(place.victim),
+    "the folder of a recording": lambda place: (place.dataset / "r").symlink_to(place.victim),
     "a shard": lambda place: _shard(place, "x"),
     "a shard that is not there": lambda place: _shard(place, "new"),
-    "the manifest": lambda place: (place.given / "manifest.json").symlink_to(place.victim / "manifest"),
-    "a draft": lambda place: (place.given / ".manifest.json.draft").symlink_to(place.victim / "new"),
+    "the manifest": lambda place: (place.dataset / "manifest.json").symlink_to(place.victim / "manifest"),
+    "a draft": lambda place: (place.dataset / ".manifest.json.draft").symlink_to(place.victim / "new"),
 }
 
 
 def _shard(place: Place, name: str) -> None:
-    (place.given / "r").mkdir()
-    (place.given / "r" / "a.parquet").symlink_to(place.victim / name)
+    (place.dataset / "r").mkdir()
+    (place.dataset / "r" / "a.parquet").symlink_to(place.victim / name)
 
 
 @pytest.mark.parametrize("case", LINKS)
 @pytest.mark.parametrize("command", ["scale made -o given", "store link given", "show given"])
 def test_nothing_is_written_or_removed_through_a_link_out_of_the_dataset(place: Place, case: str, command: str) -> None:
-    (place.given / "manifest.json").write_bytes(content(whole()))
+    (place.dataset / "manifest.json").write_bytes(content(manifest_tree()))
     if case == "the manifest":
-        (place.given / "manifest.json").unlink()
+        (place.dataset / "manifest.json").unlink()
     LINKS[case](place)
     before = place.outside()
     ran = place.lab.call(command)
     assert "Traceback" not in ran.err
-    assert {path: held for path, held in place.outside().items() if path in before or "victim" in path} == before
+    assert {path: state for path, state in place.outside().items() if path in before or "victim" in path} == before
     count("hostile inputs refused")
 
 
@@ -268,6 +274,6 @@ def test_a_remote_store_cannot_name_a_file_that_lies_elsewhere(place: Place) -> 
             path.write_bytes(HOSTILE["a recording: the folder above"])
     ran = place.lab.call("store pull remote made --ancestors")
     assert "Traceback" not in ran.err
-    after = {path: held for path, held in place.outside().items() if "/remote/" not in path}
-    assert after == {path: held for path, held in before.items() if "/remote/" not in path}
+    after = {path: state for path, state in place.outside().items() if "/remote/" not in path}
+    assert after == {path: state for path, state in before.items() if "/remote/" not in path}
     count("hostile inputs refused")

@@ -25,7 +25,7 @@ from tests import chain
 from tests.conftest import tacpipe as ran
 from tests.fake_recordings import FakeDataset
 from tests.promises.counts import count
-from tests.promises.limits import GIB, bounded, is_sentence, some
+from tests.promises.limits import GIB, bounded, is_sentence, sample_cases
 from tests.promises.mutations import mutated
 from tests.tasks.forward import trials
 from tests.tasks.material import textures
@@ -55,7 +55,7 @@ def _folder() -> Path:
 
 
 @functools.cache
-def made(kind: str) -> Files:
+def model_files(kind: str) -> Files:
     """Return the files of a small model."""
     task, _, architecture = kind.partition(" ")
     folder = _folder() / kind.replace(" ", "-")
@@ -80,22 +80,24 @@ def evaluated(kind: str, files: Mapping[str, bytes]) -> Any:
     """Evaluate a model on a recording that fits it."""
     task = kind.partition(" ")[0]
     if task == "forward":
-        one = trials.motion(11)
-        latents = made(kind)  # of the codec as it was
-        given = trials.compressed(one, files=latents) if "codec.json" in latents else trials.dataset(one)
+        recording = trials.motion(11)
+        latents = model_files(kind)  # The codec is unchanged.
+        recordings = (
+            trials.compressed(recording, files=latents) if "codec.json" in latents else trials.dataset(recording)
+        )
     else:
-        given = textures.slides(8, 1) if task == "material" else handmade.recordings(6, 1)
+        recordings = textures.slides(8, 1) if task == "material" else handmade.recordings(6, 1)
     stage: Any = registry.load("evaluate")
-    return stage(stage.params(), model=FakeDataset(files=files), recordings=given)
+    return stage(stage.params(), model=FakeDataset(files=files), recordings=recordings)
 
 
 @pytest.fixture(autouse=True)
 def _models_are_trained_before_memory_is_bounded(request: pytest.FixtureRequest) -> None:
-    told = getattr(getattr(request.node, "callspec", None), "params", {})
-    for kind in [told["kind"]] if "kind" in told else ["forward recurrent", "touch strong"]:
-        made(kind)
-    if "size" in told:
-        made(SIZES[told["case"]][0])
+    arguments = getattr(getattr(request.node, "callspec", None), "params", {})
+    for kind in [arguments["kind"]] if "kind" in arguments else ["forward recurrent", "touch strong"]:
+        model_files(kind)
+    if "size" in arguments:
+        model_files(SIZES[arguments["case"]][0])
 
 
 def refused(read: Callable[[], object], match: str | None = None) -> None:
@@ -120,7 +122,7 @@ def leaves(tree: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
         yield from leaves(value, (*path, key))
 
 
-def put(tree: Any, path: tuple[Any, ...], value: Any) -> None:
+def set_value(tree: Any, path: tuple[Any, ...], value: Any) -> None:
     for key in path[:-1]:
         tree = tree[key]
     if value is DROPPED:
@@ -149,24 +151,25 @@ VALUES: tuple[Any, ...] = (
 )
 
 
-@pytest.mark.parametrize("kind", some(KINDS, 2))
+@pytest.mark.parametrize("kind", sample_cases(KINDS, 2))
 def test_a_model_that_nobody_changed_is_loaded_and_judged(kind: str) -> None:
     with bounded(2 * SMALL):
-        assert loaded(kind, made(kind)) is not None
-        assert "metrics.json" in evaluated(kind, made(kind)).files
+        assert loaded(kind, model_files(kind)) is not None
+        assert "metrics.json" in evaluated(kind, model_files(kind)).files
 
 
 def try_config(kind: str, name: str, share: float) -> None:
     """Change each value of a JSON file in several ways: the model is refused, or judges as it should."""
     random = Random(0)
-    tree = json.loads(made(kind)[name])
+    tree = json.loads(model_files(kind)[name])
     tried = 0
     with bounded(2 * SMALL):
         for path in leaves(tree):
             for value in VALUES:
                 if random.random() > share:
                     continue
-                files = with_config(made(kind), lambda config, at=path, new=value: put(config, at, new), name)  # type: ignore[misc]
+                change = functools.partial(set_value, path=path, value=value)
+                files = with_config(model_files(kind), change, name)
                 tried += 1
                 try:
                     with np.errstate(all="ignore"):
@@ -176,7 +179,7 @@ def try_config(kind: str, name: str, share: float) -> None:
     count("hostile inputs refused", tried)
 
 
-@pytest.mark.parametrize("kind", some(KINDS, 1))
+@pytest.mark.parametrize("kind", sample_cases(KINDS, 1))
 def test_a_configuration_that_was_changed_gives_a_sentence_or_a_result(kind: str) -> None:
     try_config(kind, "config.json", 0.02)
 
@@ -192,12 +195,12 @@ def test_a_codec_that_was_changed_anyhow_gives_a_sentence_or_a_result() -> None:
     try_config("forward recurrent", "codec.json", 1.0)
 
 
-@pytest.mark.parametrize("kind", some(KINDS, 2))
+@pytest.mark.parametrize("kind", sample_cases(KINDS, 2))
 @pytest.mark.parametrize(
     "content", [b"", b"{", b"[]", b"null", b'{"task": []}', b"[" * 100_000, b"\xff\xfe", b'{"task": "os"}']
 )
 def test_a_configuration_that_is_none_is_refused(kind: str, content: bytes) -> None:
-    refused(lambda: loaded(kind, made(kind) | {"config.json": content}))
+    refused(lambda: loaded(kind, model_files(kind) | {"config.json": content}))
 
 
 SIZES: dict[str, tuple[str, tuple[Any, ...]]] = {
@@ -213,11 +216,11 @@ SIZES: dict[str, tuple[str, tuple[Any, ...]]] = {
 }
 
 
-@pytest.mark.parametrize("case", some(sorted(SIZES, key=lambda case: SIZES[case][0] not in KINDS[:2]), 1))
+@pytest.mark.parametrize("case", sample_cases(sorted(SIZES, key=lambda case: SIZES[case][0] not in KINDS[:2]), 1))
 @pytest.mark.parametrize("size", [10**7, 10**9, 10**12, 1 << 70])
 def test_a_size_that_the_weights_do_not_have_is_refused_before_memory_is_taken(case: str, size: int) -> None:
     kind, path = SIZES[case]
-    refused(lambda: loaded(kind, with_config(made(kind), lambda config: put(config, path, size))))
+    refused(lambda: loaded(kind, with_config(model_files(kind), lambda config: set_value(config, path, size))))
 
 
 def weights(files: Files, change: Callable[[dict[str, torch.Tensor]], Any], name: str = "model.safetensors") -> Files:
@@ -226,34 +229,36 @@ def weights(files: Files, change: Callable[[dict[str, torch.Tensor]], Any], name
     return files | {name: save(tensors)}
 
 
-@pytest.mark.parametrize("kind", some(KINDS, 2))
+@pytest.mark.parametrize("kind", sample_cases(KINDS, 2))
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
 def test_weights_that_are_not_finite_are_refused(kind: str, value: float) -> None:
     def spoil(tensors: dict[str, torch.Tensor]) -> None:
-        name = next(key for key, one in sorted(tensors.items()) if one.is_floating_point() and "chosen" not in key)
+        name = next(
+            key for key, tensor in sorted(tensors.items()) if tensor.is_floating_point() and "chosen" not in key
+        )
         tensors[name].view(-1)[0] = value
 
-    refused(lambda: loaded(kind, weights(made(kind), spoil)))
+    refused(lambda: loaded(kind, weights(model_files(kind), spoil)))
 
 
-@pytest.mark.parametrize("kind", some(KINDS, 2))
-@pytest.mark.parametrize("how", ["lost", "another shape", "transposed", "one more axis", "empty", "whole numbers"])
-def test_weights_of_other_shapes_are_refused(kind: str, how: str) -> None:
+@pytest.mark.parametrize("kind", sample_cases(KINDS, 2))
+@pytest.mark.parametrize("change", ["lost", "another shape", "transposed", "one more axis", "empty", "whole numbers"])
+def test_weights_of_other_shapes_are_refused(kind: str, change: str) -> None:
     def spoil(tensors: dict[str, torch.Tensor]) -> None:
         name = max(tensors, key=lambda key: (tensors[key].dim(), tensors[key].numel()))
-        one = tensors.pop(name)
-        if how != "lost":
+        tensor = tensors.pop(name)
+        if change != "lost":
             tensors[name] = {
-                "another shape": torch.cat([one, one]),
-                "transposed": one.flatten()[: one.numel() - 1],
-                "one more axis": one[None].clone(),
-                "empty": one[:0].clone(),
-                "whole numbers": (one.flatten() * 0 + 1 << 20).to(torch.int64)
-                if not one.is_floating_point()
-                else one[..., :-1],
-            }[how].contiguous()
+                "another shape": torch.cat([tensor, tensor]),
+                "transposed": tensor.flatten()[: tensor.numel() - 1],
+                "one more axis": tensor[None].clone(),
+                "empty": tensor[:0].clone(),
+                "whole numbers": (tensor.flatten() * 0 + 1 << 20).to(torch.int64)
+                if not tensor.is_floating_point()
+                else tensor[..., :-1],
+            }[change].contiguous()
 
-    refused(lambda: evaluated(kind, weights(made(kind), spoil)))
+    refused(lambda: evaluated(kind, weights(model_files(kind), spoil)))
 
 
 def safetensors(header: Any, body: bytes = b"", length: int | None = None) -> bytes:
@@ -282,23 +287,23 @@ HEADERS = {
 }
 
 
-@pytest.mark.parametrize("kind", some(KINDS, 2))
+@pytest.mark.parametrize("kind", sample_cases(KINDS, 2))
 @pytest.mark.parametrize("case", HEADERS)
 def test_weights_whose_header_lies_are_refused(kind: str, case: str) -> None:
-    refused(lambda: loaded(kind, made(kind) | {"model.safetensors": HEADERS[case]}), "safetensors")
+    refused(lambda: loaded(kind, model_files(kind) | {"model.safetensors": HEADERS[case]}), "safetensors")
 
 
 @pytest.mark.parametrize("case", HEADERS)
 @pytest.mark.parametrize("name", ["codec.safetensors", "baselines.safetensors"])
 def test_codecs_and_baselines_whose_header_lies_are_refused(case: str, name: str) -> None:
-    files = made("forward recurrent")
+    files = model_files("forward recurrent")
     refused(lambda: loaded("forward recurrent", files | {name: HEADERS[case]}), "safetensors")
 
 
 @pytest.mark.faults
 @pytest.mark.parametrize("kind", KINDS)
 def test_files_of_a_model_changed_in_hundreds_of_ways_give_a_sentence_or_a_result(kind: str) -> None:
-    files, random = made(kind), Random(0)
+    files, random = model_files(kind), Random(0)
     with bounded(2 * SMALL):
         for _ in range(150):
             name = random.choice(list(files))
@@ -315,7 +320,7 @@ def test_trees_whose_nodes_lead_back_are_refused_and_not_gone_round_for_ever() -
         name = next(key for key in tensors if key.endswith("children"))
         tensors[name][3] = torch.tensor([0, 0], dtype=tensors[name].dtype)
 
-    refused(lambda: loaded("touch strong", weights(made("touch strong"), spoil)), "children of a forest")
+    refused(lambda: loaded("touch strong", weights(model_files("touch strong"), spoil)), "children of a forest")
 
 
 @pytest.mark.parametrize("part", ["roots", "children", "features"])
@@ -325,7 +330,7 @@ def test_trees_that_point_beyond_their_nodes_are_refused(part: str, value: int) 
         name = next(key for key in tensors if key.endswith(part))
         tensors[name].view(-1)[0] = value
 
-    refused(lambda: loaded("touch strong", weights(made("touch strong"), spoil)), "forest")
+    refused(lambda: loaded("touch strong", weights(model_files("touch strong"), spoil)), "forest")
 
 
 def test_a_forest_as_it_was_grown_is_one() -> None:
@@ -376,10 +381,10 @@ def test_programs_beside_a_model_are_never_opened(chained: Path) -> None:
         "report results/forward -o again.html",
         f"{chain.TRAIN} --epochs 1 --init models/forward -o models/on",
     ):
-        done = ran(chained, command)
-        assert done.returncode == 0, done.stderr
+        process = ran(chained, command)
+        assert process.returncode == 0, process.stderr
     assert tacpipe.load(chained / "models/forward") is not None
     assert not trace.exists()
-    pickle.loads((chained / "models/forward/model.pkl").read_bytes())  # what a careless reader does
+    pickle.loads((chained / "models/forward/model.pkl").read_bytes())  # A careless reader does this.
     assert trace.exists()
     count("hostile inputs refused", 4 * (len(EVIL) + 1))

@@ -18,7 +18,7 @@ from tacpipe.report.blocks import Chart, Section
 from tacpipe.report.charts import Line
 from tests.fake_recordings import FakeDataset, FakeRecording, FakeShard
 from tests.promises.counts import count
-from tests.promises.limits import some
+from tests.promises.limits import sample_cases
 from tests.report.test_page import check, other
 from tests.tasks.forward.report import result_fakes
 from tests.tasks.material.report import material_fakes
@@ -54,9 +54,9 @@ def renamed(value: Any, words: Words) -> Any:
             if value == word or value.startswith(f"{word}-") or value == f"object of {word}":
                 return value.replace(word, new)
     if isinstance(value, Mapping):
-        return {renamed(key, words): renamed(one, words) for key, one in value.items()}
+        return {renamed(key, words): renamed(item, words) for key, item in value.items()}
     if isinstance(value, list):
-        return [renamed(one, words) for one in value]
+        return [renamed(item, words) for item in value]
     return value
 
 
@@ -78,21 +78,23 @@ def file(name: str, content: bytes, words: Words) -> bytes:
     return binary.getvalue()
 
 
-def shard(one: Any, words: Words) -> Any:
+def shard(recording: Any, words: Words) -> Any:
     name, attributes = (
-        renamed(one.name, words),
-        {**renamed(one.attributes, words), "note": words[NOTE], "object": words[NOTE]},
+        renamed(recording.name, words),
+        {**renamed(recording.attributes, words), "note": words[NOTE], "object": words[NOTE]},
     )
-    if isinstance(one, FakeRecording):
-        return FakeRecording({stream: table(one.table(stream), words) for stream in one.streams}, name, attributes)
-    return FakeShard(name, one.content, attributes)
+    if isinstance(recording, FakeRecording):
+        return FakeRecording(
+            {stream: table(recording.table(stream), words) for stream in recording.streams}, name, attributes
+        )
+    return FakeShard(name, recording.content, attributes)
 
 
 def poisoned(result: Any, words: Words) -> Any:
     """Return a result in which these words are others; its recordings get labels of the same."""
-    shards = [shard(one, words) for one in result.recordings.values()]
+    shards = [shard(recording, words) for recording in result.recordings.values()]
     files = {name: file(name, content, words) for name, content in result.files.items()}
-    return FakeDataset({one.name: one for one in shards}, files, renamed(result.manifest, words))
+    return FakeDataset({recording.name: recording for recording in shards}, files, renamed(result.manifest, words))
 
 
 @pytest.fixture(autouse=True)
@@ -128,27 +130,27 @@ RESULTS: dict[str, tuple[Callable[[], list[Any]], tuple[str, ...]]] = {  # resul
 def rendered(case: str, new: str) -> Tags:
     make, names = RESULTS[case]
     words = {name: f"{new}{place}" for place, name in enumerate(names)} | {NOTE: new}
-    text = page.render([poisoned(one, words) for one in make()], title=new).decode()
+    text = page.render([poisoned(result, words) for result in make()], title=new).decode()
     check(text.replace(" nan", "").encode())
-    found = Tags()
-    found.feed(text)
-    return found
+    tags = Tags()
+    tags.feed(text)
+    return tags
 
 
 @pytest.mark.filterwarnings("ignore:Glyph")
-@pytest.mark.parametrize("case", some(sorted(RESULTS, key=lambda case: case != "of another task"), 2))
+@pytest.mark.parametrize("case", sample_cases(sorted(RESULTS, key=lambda case: case != "of another task"), 2))
 def test_nothing_that_a_label_holds_becomes_an_element_of_the_page(case: str) -> None:
-    found, harmless = rendered(case, HOSTILE), rendered(case, "harmless")
-    assert (found.tags, found.scripts) == (harmless.tags, harmless.scripts)
-    assert found.runs == []
-    assert HOSTILE in found.text
+    hostile, harmless = rendered(case, HOSTILE), rendered(case, "harmless")
+    assert (hostile.tags, hostile.scripts) == (harmless.tags, harmless.scripts)
+    assert hostile.runs == []
+    assert HOSTILE in hostile.text
     count("hostile inputs refused", len(RESULTS[case][1]))
 
 
 def test_the_words_of_a_chart_are_text_too() -> None:
     spec = charts.lines([Line(HOSTILE, [1.0, 2.0], [0.1, 0.2])], HOSTILE, HOSTILE)
-    found = Tags()
-    found.feed(page.page([Section("t", "t", "", chart=Chart(HOSTILE, spec, HOSTILE))], "t").decode())
-    assert "img" not in found.tags and found.runs == []
-    assert found.scripts == ["application/json", "", ""]  # a chart, the library, the page's own
-    assert "alert('x')" in found.text
+    tags = Tags()
+    tags.feed(page.page([Section("t", "t", "", chart=Chart(HOSTILE, spec, HOSTILE))], "t").decode())
+    assert "img" not in tags.tags and tags.runs == []
+    assert tags.scripts == ["application/json", "", ""]  # a chart, the library, the page's own
+    assert "alert('x')" in tags.text

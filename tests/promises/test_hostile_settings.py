@@ -14,7 +14,7 @@ from tacpipe.plugins import given_params, registry
 from tacpipe.recording import rig
 from tests.conftest import Lab, without_created_store
 from tests.promises.counts import count
-from tests.promises.limits import GIB, bounded, is_sentence, some
+from tests.promises.limits import GIB, bounded, is_sentence, sample_cases
 
 SMALL = GIB // 2
 COMMANDS = (
@@ -47,21 +47,21 @@ def quoted(text: str) -> str:
     return '"' + "".join(c if c.isprintable() and c not in '"\\' else f"\\u{ord(c):04x}" for c in text) + '"'
 
 
-def a_rig(name: str = "xela1", sensor: str = "xela", transport: str = "ws:127.0.0.1:1", more: str = "") -> str:
-    told = {"name": name, "sensor": sensor, "transport": transport}
-    return "[[stream]]\n" + "".join(f"{key} = {quoted(value)}\n" for key, value in told.items()) + more
+def a_rig(name: str = "xela1", sensor: str = "xela", transport: str = "ws:127.0.0.1:1", further_lines: str = "") -> str:
+    values = {"name": name, "sensor": sensor, "transport": transport}
+    return "[[stream]]\n" + "".join(f"{key} = {quoted(value)}\n" for key, value in values.items()) + further_lines
 
 
-@pytest.mark.parametrize("command", some(COMMANDS, 1))
+@pytest.mark.parametrize("command", sample_cases(COMMANDS, 1))
 @pytest.mark.parametrize(
-    "scheme", some(["", "exec:", "shell:", "sh:", "file:", "http:", "socket:", "spy:", "loop:"], 2)
+    "scheme", sample_cases(["", "exec:", "shell:", "sh:", "file:", "http:", "socket:", "spy:", "loop:"], 2)
 )
 def test_an_address_that_is_a_command_or_of_no_known_kind_is_refused(lab: Lab, command: str, scheme: str) -> None:
     (lab.folder / "rig.toml").write_text(a_rig(transport=f"{scheme}{command}"))
     refused(lab, "acquire rig.toml -o data --duration-s 1")
 
 
-@pytest.mark.parametrize("command", some(COMMANDS[:-1], 0))
+@pytest.mark.parametrize("command", sample_cases(COMMANDS[:-1], 0))
 @pytest.mark.parametrize(
     ("scheme", "sensor", "options"),
     [
@@ -82,21 +82,21 @@ def test_a_command_behind_a_known_scheme_is_a_place_that_is_not_there(
     refused(lab, "acquire rig.toml -o data --duration-s 1")
 
 
-@pytest.mark.parametrize("name", some([*PATHS, *COMMANDS], 3))
+@pytest.mark.parametrize("name", sample_cases([*PATHS, *COMMANDS], 3))
 def test_a_stream_cannot_be_named_so_that_it_lies_elsewhere(lab: Lab, name: str) -> None:
     if name == "A":
         name = "Xela"
-    (lab.folder / "rig.toml").write_text(a_rig(name, more="options = { sensor = 1 }\n"))
+    (lab.folder / "rig.toml").write_text(a_rig(name, further_lines="options = { sensor = 1 }\n"))
     refused(lab, "acquire rig.toml -o data --duration-s 1")
 
 
 @pytest.mark.parametrize(
-    "name", some([one for one in (*PATHS, *COMMANDS) if "\0" not in one and one not in ("A", "")], 3)
+    "name", sample_cases([path for path in (*PATHS, *COMMANDS) if "\0" not in path and path not in ("A", "")], 3)
 )
 def test_a_recording_cannot_be_named_so_that_it_lies_elsewhere(lab: Lab, name: str) -> None:
     import shlex
 
-    (lab.folder / "rig.toml").write_text(a_rig(more="options = { sensor = 1 }\n"))
+    (lab.folder / "rig.toml").write_text(a_rig(further_lines="options = { sensor = 1 }\n"))
     refused(lab, f"acquire rig.toml -o data --duration-s 1 --name {shlex.quote(name)}")
 
 
@@ -105,14 +105,14 @@ RIGS = {
     "a number of many digits": "master = " + "9" * 5000,
     "a long name": a_rig("x" * 1_000_000),
     "no text": "\udcff",
-    "an option that is a command": a_rig(more='options = { sensor = "$(touch opened)" }\n'),
-    "an option that is none": a_rig(more='options = { "$(touch opened)" = 1 }\n'),
-    "options within options": a_rig(more="options = { sensor = " + "{ a = " * 400 + "1" + " }" * 400 + " }\n"),
+    "an option that is a command": a_rig(further_lines='options = { sensor = "$(touch opened)" }\n'),
+    "an option that is none": a_rig(further_lines='options = { "$(touch opened)" = 1 }\n'),
+    "options within options": a_rig(further_lines="options = { sensor = " + "{ a = " * 400 + "1" + " }" * 400 + " }\n"),
     "a label that is a list": a_rig() + "[labels]\nx = [1, 2]\n",
     "a sensor that is a module": a_rig(sensor="os:system"),
     "a terminal's commands": a_rig(sensor="\x1b[2J\x1b]0;x\x07"),
     "absurd sizes": a_rig(
-        sensor="justfloat", transport="serial:/dev/null", more="options = { channels = 100000000000 }\n"
+        sensor="justfloat", transport="serial:/dev/null", further_lines="options = { channels = 100000000000 }\n"
     ),
 }
 
@@ -142,8 +142,10 @@ def test_what_is_no_file_is_no_rig_and_no_params(lab: Lab, kind: str, name: str)
 
 
 def test_labels_of_a_rig_are_text_and_nothing_else() -> None:
-    found = rig.parse(a_rig(more="options = { sensor = 1 }\n") + f"[labels]\nnote = {quoted('$(touch opened)')}\n")
-    assert found.labels == {"note": "$(touch opened)"}
+    parsed = rig.parse(
+        a_rig(further_lines="options = { sensor = 1 }\n") + f"[labels]\nnote = {quoted('$(touch opened)')}\n"
+    )
+    assert parsed.labels == {"note": "$(touch opened)"}
 
 
 def test_an_address_is_no_expression_of_another_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -225,13 +227,13 @@ def test_anchors_that_a_person_writes_are_read() -> None:
 
 
 def test_what_aliases_stand_for_is_counted_by_what_they_name() -> None:
-    few = "a: &a [" + ", ".join("1" * 1 for _ in range(999)) + "]\n"
-    assert len(yaml_text.load(few + "b: [" + ", ".join(["*a"] * 90) + "]")["b"]) == 90  # 90,000 values
+    thousand = "a: &a [" + ", ".join("1" * 1 for _ in range(999)) + "]\n"
+    assert len(yaml_text.load(thousand + "b: [" + ", ".join(["*a"] * 90) + "]")["b"]) == 90  # 90,000 values
     with pytest.raises(ValueError, match="100000"):
-        yaml_text.load(few + "b: [" + ", ".join(["*a"] * 110) + "]")
+        yaml_text.load(thousand + "b: [" + ", ".join(["*a"] * 110) + "]")
 
 
 def test_a_sentence_stays_one_line_whatever_untrusted_text_is_in_it() -> None:
     assert str(UsageError("There is no sensor xela; there are a, b.")) == "There is no sensor xela; there are a, b."
-    told = str(UsageError(f"The sensor {'x' * 10_000} says \x1b[2J and \udcff."))
-    assert is_sentence(told) and told.endswith(r"says \x1b[2J and \udcff.") and len(told) < 300
+    sentence = str(UsageError(f"The sensor {'x' * 10_000} says \x1b[2J and \udcff."))
+    assert is_sentence(sentence) and sentence.endswith(r"says \x1b[2J and \udcff.") and len(sentence) < 300

@@ -66,7 +66,7 @@ def test_a_pull_ends_with_a_sentence_whatever_lies_in_the_place_of_a_file(
 ) -> None:
     file = target(lab, remote, kind)
     for record in remote.root.glob("records/*/*") if kind != "record" else ():
-        record.unlink()  # or what is missing is computed
+        record.unlink()  # Otherwise the missing object is computed again.
     file.unlink()
     ATTACKS[attack](file)
     with bounded(GIB):
@@ -239,8 +239,8 @@ def test_a_lease_of_three_terabytes_is_refused(tmp_path: Path) -> None:
     store.prepare()
     path = store.root / "leases" / f"run-{'a' * 32}.lock"
     sparse(path)
-    with path.open() as held, bounded(GIB):
-        fcntl.flock(held, fcntl.LOCK_EX)
+    with path.open() as lease, bounded(GIB):
+        fcntl.flock(lease, fcntl.LOCK_EX)
         with pytest.raises(TacpipeError, match="3,000,000,000,000 bytes"):
             store.leases.runs()
 

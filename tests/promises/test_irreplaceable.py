@@ -1,4 +1,4 @@
-"""What marks a recording as one that cannot be made again outlasts any one file of the store."""
+"""A recording that cannot be made again stays marked as such after the loss of any one file of the store."""
 
 from __future__ import annotations
 
@@ -19,56 +19,56 @@ from tests.test_replacing import source
 
 COLLECT = "store gc --grace-days 0"
 QUICK = ("it is gone", "a bit is flipped")
-BROAD = (*QUICK, "it is empty", "its second half is lost")  # of each kind: bytes, size, all of it
+BROAD = (*QUICK, "it is empty", "its second half is lost")  # Damages of each kind: to bytes, to the size, to all of it.
 
 
 @pytest.fixture(scope="module")
-def held() -> list[Manifest]:
+def manifests() -> list[Manifest]:
     """The manifests of all recordings of the project, labels included."""
     return []
 
 
 @pytest.fixture
-def project(lab: Lab, held: list[Manifest], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def project(lab: Lab, manifests: list[Manifest], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A copy of a project whose recordings are at their path, deleted, replaced, in no dataset, acquired and deleted."""
-    held.clear()
+    manifests.clear()
     source("monday", a="1 2", b="3 4")
     lab.run("ingest numbers monday -o data/here")
     lab.run("label data/here a --set material=foam")
-    held.append(lab.manifest("data/here"))
+    manifests.append(lab.manifest("data/here"))
     lab.run("scale data/here -o data/scaled --factor 7")
     source("tuesday", c="5 6", d="7 8")
     lab.run("ingest numbers tuesday -o data/gone")
     lab.run("label data/gone c --exclude dropped")
-    held.append(lab.manifest("data/gone"))
+    manifests.append(lab.manifest("data/gone"))
     shutil.rmtree("data/gone")
     source("wednesday", e="9 1")
     lab.run("ingest numbers wednesday -o data/over")
     lab.run("label data/over e --set material=cork")
-    held.append(lab.manifest("data/over"))
+    manifests.append(lab.manifest("data/over"))
     source("thursday", f="2 2")
     lab.run("ingest numbers thursday -o data/over --replace")
-    held.append(lab.manifest("data/over"))
+    manifests.append(lab.manifest("data/over"))
     source("friday", g="3 3", h="none")
     assert lab.call("ingest numbers friday -o data/bad").code == 1  # one of them is good, and is kept
-    held.append(_read_alone(lab, "g"))
+    manifests.append(_read_alone(lab, "g"))
     spooled(lab)
     lab.run("acquire --recover")
     lab.run("label rec one --set material=cork")
-    held.append(lab.manifest("rec"))
+    manifests.append(lab.manifest("rec"))
     shutil.rmtree("rec")
-    made = tmp_path_factory.mktemp("made")
-    specimen.clone(lab.folder, made)
-    return made
+    original = tmp_path_factory.mktemp("made")
+    specimen.clone(lab.folder, original)
+    return original
 
 
 def _read_alone(lab: Lab, name: str) -> Manifest:
     """Return the manifest of a recording that no dataset holds."""
     for path in specimen.beneath(lab.store.root / "objects"):
         if path.read_bytes().startswith(b"{\n"):
-            found = parse(path.read_bytes(), path.name)
-            if list(found.recordings) == [name]:
-                return found
+            parsed = parse(path.read_bytes(), path.name)
+            if list(parsed.recordings) == [name]:
+                return parsed
     raise AssertionError(name)
 
 
@@ -76,18 +76,22 @@ def files(store: Path) -> Iterator[Path]:
     return (path for path in sorted(specimen.beneath(store)) if path.stat().st_size)
 
 
-def lost(lab: Lab, held: list[Manifest], spoiled: Path) -> list[str]:
+def lost(lab: Lab, manifests: list[Manifest], spoiled: Path) -> list[str]:
     """Return what of the recordings and their labels is not in the store; what was spoiled itself is not looked for."""
-    found = {path.name: path.read_bytes() for path in specimen.beneath(lab.store.root / "objects")}
-    objects = {name: content for name, content in found.items() if bytes_digest(content) == name}
-    there = [parse(content, name) for name, content in objects.items() if content.startswith(b"{\n") and _is(content)]
+    contents = {path.name: path.read_bytes() for path in specimen.beneath(lab.store.root / "objects")}
+    objects = {name: content for name, content in contents.items() if bytes_digest(content) == name}
+    stored_manifests = [
+        parse(content, name) for name, content in objects.items() if content.startswith(b"{\n") and _is(content)
+    ]
     missing = []
-    for manifest in held:
+    for manifest in manifests:
         for path, name in manifest.objects():
             if name != spoiled.name and name not in objects:
                 missing.append(path)
-        known = any(one.labels == manifest.labels and one.recordings == manifest.recordings for one in there)
-        if not known and spoiled.name != bytes_digest(manifest.content):
+        is_stored = any(
+            stored.labels == manifest.labels and stored.recordings == manifest.recordings for stored in stored_manifests
+        )
+        if not is_stored and spoiled.name != bytes_digest(manifest.content):
             missing.append(f"labels {manifest.labels}")
     return missing
 
@@ -96,10 +100,10 @@ def _is(content: bytes) -> bool:
     return b'"recordings"' in content and b'"digest"' in content
 
 
-def fresh(made: Path, lab: Lab) -> None:
+def fresh(original: Path, lab: Lab) -> None:
     for path in lab.folder.iterdir():
         shutil.rmtree(path)
-    specimen.clone(made, lab.folder)
+    specimen.clone(original, lab.folder)
 
 
 LOOKS = [
@@ -116,7 +120,7 @@ LOOKS = [
 @pytest.mark.long
 @pytest.mark.parametrize(("damage", "look"), LOOKS)
 def test_no_recording_is_collected_whichever_one_file_of_the_store_is_damaged_or_gone(
-    project: Path, lab: Lab, held: list[Manifest], damage: str, look: str
+    project: Path, lab: Lab, manifests: list[Manifest], damage: str, look: str
 ) -> None:
     tried = 0
     for spoiled in [path.relative_to(project) for path in files(project / ".tacpipe")]:
@@ -125,7 +129,7 @@ def test_no_recording_is_collected_whichever_one_file_of_the_store_is_damaged_or
         for command in (look, COLLECT, COLLECT, COLLECT):
             specimen.age(lab.store.root)
             lab.call(command)
-        assert lost(lab, held, spoiled) == [], spoiled
+        assert lost(lab, manifests, spoiled) == [], spoiled
         tried += 1
     assert tried > 30
     count("corruptions found", tried)
@@ -133,7 +137,7 @@ def test_no_recording_is_collected_whichever_one_file_of_the_store_is_damaged_or
 
 @pytest.mark.long
 def test_a_bit_flipped_anywhere_in_a_record_of_a_recording_costs_no_recording(
-    project: Path, lab: Lab, held: list[Manifest]
+    project: Path, lab: Lab, manifests: list[Manifest]
 ) -> None:
     fresh(project, lab)
     keys = [key for key, record in lab.store.records() if record["provenance"].get("irreplaceable")]
@@ -145,42 +149,42 @@ def test_a_bit_flipped_anywhere_in_a_record_of_a_recording_costs_no_recording(
         for command in ("store verify", COLLECT, COLLECT, COLLECT):
             specimen.age(lab.store.root)
             lab.call(command)
-        assert lost(lab, held, path) == []
+        assert lost(lab, manifests, path) == []
 
 
-@pytest.mark.parametrize("left", ["records", "roots", "objects"])
+@pytest.mark.parametrize("folder", ["records", "roots", "objects"])
 def test_records_roots_or_manifests_alone_keep_every_recording(
-    project: Path, lab: Lab, held: list[Manifest], left: str
+    project: Path, lab: Lab, manifests: list[Manifest], folder: str
 ) -> None:
     fresh(project, lab)
     shutil.rmtree(lab.folder / "data")
-    if left != "records":
+    if folder != "records":
         shutil.rmtree(lab.store.root / "records")
-    if left != "roots":
+    if folder != "roots":
         shutil.rmtree(lab.store.root / "roots")
-    if left == "records":
+    if folder == "records":
         for path in specimen.beneath(lab.store.root / "objects"):
             if path.read_bytes().startswith(b"{\n"):
                 path.unlink()
     for _ in range(3):
         specimen.age(lab.store.root)
         lab.run(COLLECT)
-    missing = lost(lab, held, Path())
-    assert [one for one in missing if left != "records" or not one.startswith("labels")] == []
+    missing = lost(lab, manifests, Path())
+    assert [path for path in missing if folder != "records" or not path.startswith("labels")] == []
     specimen.age(lab.store.root)
     lab.run(f"{COLLECT} --recordings")  # asked for by name, all of it goes
-    assert list(specimen.beneath(lab.store.root / "objects")) == [] or left == "roots"
+    assert list(specimen.beneath(lab.store.root / "objects")) == [] or folder == "roots"
 
 
 @pytest.mark.parametrize(
-    ("only", "gone", "before", "after"),
+    ("only", "removed", "before", "after"),
     [
         ("records", "objects", b'"irreplaceable"', b'"irreplaceablf"'),
         ("objects", "records", b'"recordings"', b'"recordingz"'),
     ],
 )
 def test_a_damaged_record_or_manifest_holds_from_quarantine_what_nothing_else_names(
-    lab: Lab, only: str, gone: str, before: bytes, after: bytes
+    lab: Lab, only: str, removed: str, before: bytes, after: bytes
 ) -> None:
     source("src", a="1 2", b="3 4")
     lab.run("ingest numbers src -o data/rec")
@@ -189,7 +193,7 @@ def test_a_damaged_record_or_manifest_holds_from_quarantine_what_nothing_else_na
     for folder in ("data", ".tacpipe/roots"):
         shutil.rmtree(folder)
     damaged = [path for path in specimen.beneath(lab.store.root / only) if before in path.read_bytes()]
-    for path in specimen.beneath(lab.store.root / gone):
+    for path in specimen.beneath(lab.store.root / removed):
         if path.name not in shards:
             path.unlink()
     for path in damaged:
@@ -232,7 +236,7 @@ def test_quarantine_is_kept_for_the_grace_since_it_was_filled(lab: Lab) -> None:
     specimen.age(lab.store.root)  # the shard was written long ago
     lab.call("store verify")
     lab.run("store gc")
-    (kept,) = (lab.store.root / "quarantine").iterdir()
+    (quarantined,) = (lab.store.root / "quarantine").iterdir()
     lab.run("store gc --grace-days 0")
-    assert not kept.exists()
+    assert not quarantined.exists()
     assert list((lab.store.root / "quarantine").iterdir()) == []

@@ -63,17 +63,17 @@ def stubborn_plugin(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def scene(tmp_path: Path, plugin: Path, stubborn_plugin: Path, warm: Warm) -> Scene:
     """An empty project whose commands begin at once."""
-    return made(tmp_path, warm, plugin, stubborn_plugin)
+    return make_scene(tmp_path, warm, plugin, stubborn_plugin)
 
 
-def made(folder: Path, server: Warm, *plugins: Path) -> Scene:
+def make_scene(folder: Path, server: Warm, *plugins: Path) -> Scene:
     (folder / "project/.tacpipe").mkdir(parents=True)
     return Scene(
         folder, server, {"PYTHONPATH": os.pathsep.join([*map(str, plugins), os.environ.get("PYTHONPATH", "")])}
     )
 
 
-def begun(scene: Scene, case: Case) -> Scene:
+def prepare_case(scene: Scene, case: Case) -> Scene:
     """Do what comes before the command of a case."""
     case.sources(scene.project)
     for command in case.before:
@@ -85,28 +85,28 @@ def begun(scene: Scene, case: Case) -> Scene:
 
 def computing(scene: Scene) -> bool:
     """Return whether somebody makes a key, who has had the time to come as far as its stage."""
-    held = [path for path in scene.project.glob(".tacpipe/leases/*.lock") if not path.name.startswith("run-")]
-    return bool(held) and all(time.time() - path.stat().st_mtime > 0.3 for path in held)
+    leases = [path for path in scene.project.glob(".tacpipe/leases/*.lock") if not path.name.startswith("run-")]
+    return bool(leases) and all(time.time() - path.stat().st_mtime > 0.3 for path in leases)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", ["scale", "label", "store gc"])
 def test_a_command_that_is_killed_at_a_random_moment_leaves_what_a_rerun_makes_whole(scene: Scene, name: str) -> None:
     case = next(case for case in TOYS if case.name == name)
-    kills.survive(begun(scene, case), case.command, kills.KILLS, len(kills.KILLS))
+    kills.survive(prepare_case(scene, case), case.command, kills.KILLS, len(kills.KILLS))
 
 
 @pytest.mark.faults
 @pytest.mark.parametrize("case", TOYS, ids=lambda case: case.name)
 def test_every_small_command_survives_kills_at_all_of_its_moments(scene: Scene, case: Case) -> None:
-    kills.survive(begun(scene, case), case.command, kills.KILLS, 2 * len(kills.KILLS), sound=case.sound)
+    kills.survive(prepare_case(scene, case), case.command, kills.KILLS, 2 * len(kills.KILLS), sound=case.sound)
 
 
 @pytest.mark.faults
 @pytest.mark.parametrize("name", KINDS if PART > 1 else [case.name for case in STAGES])
 def test_a_stage_of_each_kind_survives_kills_at_all_of_its_moments(tmp_path: Path, learned: Warm, name: str) -> None:
     case = CASES[name]
-    scene = begun(made(tmp_path, learned), case)
+    scene = prepare_case(make_scene(tmp_path, learned), case)
     kills.survive(scene, case.command, kills.KILLS, len(kills.KILLS))
 
 
@@ -126,8 +126,8 @@ def test_a_call_in_c_that_takes_minutes_ends_with_the_command(scene: Scene, name
     awaited(lambda: computing(scene))
     assert len(kills.session(running.pid)) >= jobs
     kills.KILLS[name](running)
-    code = kills.ended(running)
-    kills.gone(running.pid)
+    code = kills.wait_for_exit(running)
+    kills.wait_until_gone(running.pid)
     assert code == (-signal.SIGKILL if name == "SIGKILL" else 130)
     kills.orderly(running.out.read_text(), code)
     assert scene.run("scale data/r -o data/s")
@@ -141,29 +141,29 @@ def test_a_worker_that_dies_is_a_sentence_and_what_was_finished_is_kept(scene: S
     running = scene.start(f"{POOL} --pause-s 0.1", fresh=True)
     awaited(lambda: len(list(scene.project.glob(".tacpipe/records/*/*"))) > 45)
     kills.WORKERS[name](running)
-    code, said = kills.ended(running), running.out.read_text()
-    kills.gone(running.pid)
-    kills.orderly(said, code)
+    code, printed = kills.wait_for_exit(running), running.out.read_text()
+    kills.wait_until_gone(running.pid)
+    kills.orderly(printed, code)
     if "worker" in name:
-        assert code == 1 and "tacpipe: A worker process died, most likely for lack of memory." in said
+        assert code == 1 and "tacpipe: A worker process died, most likely for lack of memory." in printed
     else:
         assert code == 0  # workers that are there need it no more
     count("kills survived")
     rerun = scene.start(f"{POOL} --pause-s 0.1 --json")
-    assert kills.ended(rerun) == 0
-    told = json.loads(rerun.out.read_text().splitlines()[-1])
-    assert told["reused"] >= 4 and told["ran"] + told["reused"] == 40
+    assert kills.wait_for_exit(rerun) == 0
+    outcome = json.loads(rerun.out.read_text().splitlines()[-1])
+    assert outcome["reused"] >= 4 and outcome["ran"] + outcome["reused"] == 40
 
 
 def test_a_mistake_in_a_stage_shows_the_frames_of_its_own_code_alone(scene: Scene) -> None:
     scene.run("simulate toy --trials 9 --rows 4 -o data/r")
     for jobs in (1, 2):
         running = scene.start(f"mistaken data/r -o data/s --jobs {jobs}", fresh=True)
-        assert kills.ended(running) == 1
-        said = running.out.read_text()
-        assert "tacpipe: The code of stage mistaken raised ZeroDivisionError on recording trial-" in said
-        assert "ZeroDivisionError: trial-" in said and "stubborn.py" in said
-        assert said.count('  File "') == 1 and len(said.splitlines()) < 10, said
+        assert kills.wait_for_exit(running) == 1
+        printed = running.out.read_text()
+        assert "tacpipe: The code of stage mistaken raised ZeroDivisionError on recording trial-" in printed
+        assert "ZeroDivisionError: trial-" in printed and "stubborn.py" in printed
+        assert printed.count('  File "') == 1 and len(printed.splitlines()) < 10, printed
 
 
 def test_an_interrupt_ends_the_wait_for_a_lock(scene: Scene) -> None:
@@ -174,7 +174,7 @@ def test_an_interrupt_ends_the_wait_for_a_lock(scene: Scene) -> None:
     awaited(lambda: len(list(scene.project.glob(".tacpipe/leases/run-*"))) == 2)
     for running in (second, first):
         os.killpg(running.pid, signal.SIGINT)
-        assert kills.ended(running) == 130
+        assert kills.wait_for_exit(running) == 130
         assert running.out.read_text() == f"{SENTENCE}\n"
 
 
@@ -199,6 +199,6 @@ def test_the_demo_ends_with_the_command_that_it_runs(scene: Scene, name: str) ->
     running = scene.start("demo -o demo", fresh=True)
     awaited(lambda: list(scene.project.glob(".tacpipe/records/*/*")))
     kills.KILLS[name](running)
-    assert kills.ended(running) == 130
-    kills.gone(running.pid)
+    assert kills.wait_for_exit(running) == 130
+    kills.wait_until_gone(running.pid)
     kills.orderly(running.out.read_text(), 130)

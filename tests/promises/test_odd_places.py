@@ -34,14 +34,14 @@ def seldom(*values: Any) -> list[Any]:
     return [pytest.param(value, marks=pytest.mark.faults) for value in values]
 
 
-def healed(one: Specimen) -> None:
+def healed(project: Specimen) -> None:
     """Look whether reruns bring everything back, and whether the store is sound then."""
-    for ran in one.rerun():
+    for ran in project.rerun():
         assert ran.code == 0, ran
-    shown = one.shown()
-    assert {path: shown.get(path) for path in one.sound} == dict(one.sound)
-    assert one.lab.call("store repair").code == 0
-    verified = one.lab.call("store verify")
+    files_now = project.data_files()
+    assert {path: files_now.get(path) for path in project.sound} == dict(project.sound)
+    assert project.lab.call("store repair").code == 0
+    verified = project.lab.call("store verify")
     assert verified.code == 0, verified
 
 
@@ -49,151 +49,155 @@ def healed(one: Specimen) -> None:
 
 
 @pytest.mark.parametrize("folders", [FOLDERS, ("objects",), *seldom(*((name,) for name in FOLDERS[1:]))])
-def test_folders_that_are_gone_are_made_again(one: Specimen, folders: tuple[str, ...]) -> None:
+def test_folders_that_are_gone_are_made_again(project: Specimen, folders: tuple[str, ...]) -> None:
     for name in folders:
-        shutil.rmtree(one.store / name)
-    assert all(one.served().values())
+        shutil.rmtree(project.store / name)
+    assert all(project.served().values())
     for command in ("status", "verify", "gc --dry-run", "repair"):
-        assert one.lab.call(f"store {command}").code in (0, DAMAGED), command
-    healed(one)
+        assert project.lab.call(f"store {command}").code in (0, DAMAGED), command
+    healed(project)
 
 
-def test_a_copy_without_empty_folders_is_a_store(one: Specimen) -> None:
-    for place in [path for path in one.store.rglob("*") if path.is_dir()][::-1]:
+def test_a_copy_without_empty_folders_is_a_store(project: Specimen) -> None:
+    for place in [path for path in project.store.rglob("*") if path.is_dir()][::-1]:
         if not any(place.iterdir()):
             place.rmdir()
-    assert not (one.store / "quarantine").exists()
-    damages.flip(one.object("scaled", "b.parquet"))
-    assert all(one.served().values())
-    healed(one)
+    assert not (project.store / "quarantine").exists()
+    damages.flip(project.object("scaled", "b.parquet"))
+    assert all(project.served().values())
+    healed(project)
 
 
-def test_a_lost_shelf_of_objects_is_filled_again(one: Specimen) -> None:
-    for shelf in sorted((one.store / "objects").iterdir())[::2]:
+def test_a_lost_shelf_of_objects_is_filled_again(project: Specimen) -> None:
+    for shelf in sorted((project.store / "objects").iterdir())[::2]:
         shutil.rmtree(shelf)
-    assert all(one.served().values())
-    healed(one)
+    assert all(project.served().values())
+    healed(project)
 
 
 @pytest.mark.parametrize("content", [b"", b"7\n", *seldom(b"\xff\xfe", b"1\n2\n")])
-def test_a_store_whose_mark_is_another_is_left_alone(one: Specimen, content: bytes) -> None:
-    before = specimen.files(one.store)
-    (one.store / "format").write_bytes(content)
+def test_a_store_whose_mark_is_another_is_left_alone(project: Specimen, content: bytes) -> None:
+    before = specimen.files(project.store)
+    (project.store / "format").write_bytes(content)
     for command in ("scale data/recordings -o data/other --factor 9", "store repair"):
-        failed = one.lab.call(command)
+        failed = project.lab.call(command)
         assert failed.code == USAGE and "reads format 1" in failed.err, failed
-    after = specimen.files(one.store)
+    after = specimen.files(project.store)
     assert {path: text for path, text in after.items() if path != "format"} == {
         path: text for path, text in before.items() if path != "format"
     }
-    (one.store / "format").unlink()  # as when a copier left it out
-    failed = one.lab.call("store verify")
-    assert failed.code == USAGE and f"`echo 1 > {one.store / 'format'}`" in failed.err
-    (one.store / "format").write_text("1\n")
-    healed(one)
+    (project.store / "format").unlink()  # A copier may leave it out.
+    failed = project.lab.call("store verify")
+    assert failed.code == USAGE and f"`echo 1 > {project.store / 'format'}`" in failed.err
+    (project.store / "format").write_text("1\n")
+    healed(project)
 
 
-def test_leases_that_somebody_left_or_that_hold_anything_are_in_nobodys_way(one: Specimen) -> None:
+def test_leases_that_somebody_left_or_that_hold_anything_are_in_nobodys_way(project: Specimen) -> None:
     for name in ("ab" * 32 + ".lock", "run-0123.lock", "gc.lock", "run-.lock"):
-        (one.store / "leases" / name).write_bytes(b"\xff\x00{]" + os.urandom(50))
+        (project.store / "leases" / name).write_bytes(b"\xff\x00{]" + os.urandom(50))
     for command in ("status", "gc", "verify"):
-        assert one.lab.call(f"store {command}").code == 0
-    healed(one)
+        assert project.lab.call(f"store {command}").code == 0
+    healed(project)
 
 
-def test_two_objects_that_changed_places_are_both_found(one: Specimen) -> None:
-    left, right = one.object("scaled", "a.parquet"), one.object("centred", "b.parquet")
-    aside = left.with_suffix(".aside")
-    left.rename(aside)
-    right.rename(left)
-    aside.rename(right)
-    found = one.lab.call("store verify")
-    assert found.code == DAMAGED and left.name in found.out and right.name in found.out
+def test_two_objects_that_changed_places_are_both_found(project: Specimen) -> None:
+    first, right = project.object("scaled", "a.parquet"), project.object("centred", "b.parquet")
+    temporary = first.with_suffix(".aside")
+    first.rename(temporary)
+    right.rename(first)
+    temporary.rename(right)
+    verified = project.lab.call("store verify")
+    assert verified.code == DAMAGED and first.name in verified.out and right.name in verified.out
     count("corruptions found", 2)
-    healed(one)
+    healed(project)
 
 
-def test_a_record_in_the_place_of_another_is_none(one: Specimen) -> None:
-    ours, theirs = one.records("scale")[:2]
+def test_a_record_in_the_place_of_another_is_none(project: Specimen) -> None:
+    ours, theirs = project.records("scale")[:2]
     damages.overwrite(ours, theirs.read_bytes())
-    assert one.lab.store.record(ours.stem) is None
+    assert project.lab.store.record(ours.stem) is None
     count("corruptions found")
-    healed(one)
+    healed(project)
 
 
-def test_a_manifest_of_a_later_format_is_refused_and_left_as_it_is(one: Specimen) -> None:
-    path = one.folder / "data/recordings/manifest.json"
+def test_a_manifest_of_a_later_format_is_refused_and_left_as_it_is(project: Specimen) -> None:
+    path = project.folder / "data/recordings/manifest.json"
     later = path.read_bytes().replace(b'"format": 1', b'"format": 3')
     damages.overwrite(path, later)
     for command in ("scale data/recordings -o data/other", "show data/recordings", "store gc"):
-        failed = one.lab.call(command)
+        failed = project.lab.call(command)
         assert failed.code in (2, DAMAGED) and "manifest format 3" in failed.err, failed
     assert path.read_bytes() == later
 
 
-def test_recordings_that_are_lost_everywhere_are_asked_for_and_come_back_from_another_store(one: Specimen) -> None:
-    one.lab.run("store push backup data/recordings data/scaled --ancestors")
-    shutil.rmtree(one.folder / "src")
-    for path in (one.object("recordings", "b/left.parquet"), one.folder / "data/recordings/b/left.parquet"):
+def test_recordings_that_are_lost_everywhere_are_asked_for_and_come_back_from_another_store(project: Specimen) -> None:
+    project.lab.run("store push backup data/recordings data/scaled --ancestors")
+    shutil.rmtree(project.folder / "src")
+    for path in (project.object("recordings", "b/left.parquet"), project.folder / "data/recordings/b/left.parquet"):
         damages.unseen(path)
     for command in ("scale data/recordings -o data/other --factor 9 --jobs 1", "store repair"):
-        failed = one.lab.call(command)
+        failed = project.lab.call(command)
         assert failed.code == DAMAGED, failed
         assert "b/left.parquet, which cannot be recomputed: restore it" in failed.err + failed.out, failed
-    assert not (one.folder / "data/other").exists()
+    assert not (project.folder / "data/other").exists()
     count("corruptions found", 2)
-    one.lab.run("store pull backup data/recordings")
-    assert all(one.served().values())
+    project.lab.run("store pull backup data/recordings")
+    assert all(project.served().values())
 
 
 # ---- other places
 
 
 def test_a_project_that_is_moved_keeps_everything_and_a_collection_after_a_month_takes_nothing(
-    one: Specimen, monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory
+    project: Specimen, monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     moved = tmp_path_factory.mktemp("moved") / "project"
-    shutil.move(one.folder, moved)
+    shutil.move(project.folder, moved)
     monkeypatch.chdir(moved)
-    here = Specimen(Lab(moved, one.lab.call), one.sound, one.manifests)
+    moved_project = Specimen(Lab(moved, project.lab.call), project.sound, project.manifests)
     specimen.age(moved)
     for options in ("", "--recordings --grace-days 0"):
-        here.lab.run(f"store gc {options}")
-        assert here.needed() <= {path.name for path in specimen.beneath(here.store / "objects")}
-    assert all(here.served().values())
-    told = here.lab.run("explain data/centred").out
-    assert "data/scaled" in told and "no longer at a path" not in told and "not in this store" not in told
-    healed(here)
+        moved_project.lab.run(f"store gc {options}")
+        assert moved_project.needed() <= {path.name for path in specimen.beneath(moved_project.store / "objects")}
+    assert all(moved_project.served().values())
+    explanation = moved_project.lab.run("explain data/centred").out
+    assert (
+        "data/scaled" in explanation
+        and "no longer at a path" not in explanation
+        and "not in this store" not in explanation
+    )
+    healed(moved_project)
 
 
 def test_a_store_that_is_moved_away_from_its_project_still_serves_it(
-    one: Specimen, monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory
+    project: Specimen, monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     elsewhere = tmp_path_factory.mktemp("elsewhere") / "store"
-    shutil.move(one.store, elsewhere)
+    shutil.move(project.store, elsewhere)
     monkeypatch.setenv("TACPIPE_STORE", str(elsewhere))
-    assert all(one.served().values())
+    assert all(project.served().values())
     specimen.age(elsewhere)
-    one.lab.run("store gc --recordings")  # its datasets are out of reach for less than fourteen days
-    assert one.needed() <= {path.name for path in specimen.beneath(elsewhere / "objects")}
-    for ran in one.rerun():
+    project.lab.run("store gc --recordings")  # its datasets are out of reach for less than fourteen days
+    assert project.needed() <= {path.name for path in specimen.beneath(elsewhere / "objects")}
+    for ran in project.rerun():
         assert ran.code == 0, ran
     specimen.age(elsewhere)
-    one.lab.run("store gc --recordings --grace-days 0")  # now they are known where they are
-    assert one.needed() <= {path.name for path in specimen.beneath(elsewhere / "objects")}
-    assert one.shown() == dict(one.sound)
+    project.lab.run("store gc --recordings --grace-days 0")  # now they are known where they are
+    assert project.needed() <= {path.name for path in specimen.beneath(elsewhere / "objects")}
+    assert project.data_files() == dict(project.sound)
 
 
 @pytest.mark.parametrize("mode", [0o644, *seldom(0o600, 0o777)])
-def test_a_copy_without_modes_times_and_links_is_as_good(one: Specimen, mode: int) -> None:
-    copy = one.folder.with_name(f"{one.folder.name}-copy")
-    shutil.copytree(one.store, copy, copy_function=shutil.copyfile)
-    shutil.rmtree(one.store)
-    copy.rename(one.store)
-    for path in specimen.beneath(one.store):
+def test_a_copy_without_modes_times_and_links_is_as_good(project: Specimen, mode: int) -> None:
+    copy = project.folder.with_name(f"{project.folder.name}-copy")
+    shutil.copytree(project.store, copy, copy_function=shutil.copyfile)
+    shutil.rmtree(project.store)
+    copy.rename(project.store)
+    for path in specimen.beneath(project.store):
         path.chmod(mode)
-    assert all(one.served().values())
-    healed(one)
+    assert all(project.served().values())
+    healed(project)
 
 
 # ---- rights
@@ -208,10 +212,10 @@ def ordinary() -> None:
                 raise OSError(ctypes.get_errno(), "prctl")
 
 
-def as_ordinary_user(one: Specimen, words: str, program: str = "tacpipe") -> subprocess.CompletedProcess[str]:
+def as_ordinary_user(project: Specimen, words: str, program: str = "tacpipe") -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [sys.executable, "-m", program, *words.split()],
-        cwd=one.folder,
+        cwd=project.folder,
         preexec_fn=ordinary,
         capture_output=True,
         text=True,
@@ -220,23 +224,23 @@ def as_ordinary_user(one: Specimen, words: str, program: str = "tacpipe") -> sub
 
 
 @pytest.fixture(params=["read-only", *seldom("of another user")])
-def locked(one: Specimen, request: pytest.FixtureRequest) -> Any:
+def locked(project: Specimen, request: pytest.FixtureRequest) -> Any:
     """A project whose store may be read and not written."""
     try:
         subprocess.run(["true"], preexec_fn=ordinary, check=True)
     except (OSError, subprocess.SubprocessError):
         pytest.skip("this system does not let root give up its rights")
-    every = [one.store, *one.store.rglob("*")]
+    paths = [project.store, *project.store.rglob("*")]
     if request.param == "of another user":
         if os.getuid():
             pytest.skip("only root can give files to another user")
-        for path in every:
+        for path in paths:
             os.chown(path, 12345, 12345)
     else:
-        for path in every:
+        for path in paths:
             path.chmod(0o555 if path.is_dir() else 0o444)
-    yield one
-    for path in every:
+    yield project
+    for path in paths:
         path.chmod(0o755)
 
 
@@ -250,7 +254,7 @@ def test_a_store_that_may_only_be_read_answers_and_says_in_a_sentence_what_it_ca
         assert failed.returncode == FAILED and "cannot be written" in failed.stderr, (command, failed)
         assert failed.stderr.count("\n") == 1 and "TACPIPE_STORE" in failed.stderr
     assert specimen.files(locked.store) == before
-    assert locked.shown() == dict(locked.sound)
+    assert locked.data_files() == dict(locked.sound)
 
 
 def test_a_store_that_may_only_be_read_is_pushed_from(
@@ -272,20 +276,20 @@ def test_a_store_that_may_only_be_read_is_pushed_from(
 
 
 def test_damage_in_a_store_that_may_only_be_read_is_found_and_never_served(locked: Specimen) -> None:
-    path, beside = locked.object("total", "metrics.json"), locked.folder / "data/total/metrics.json"
+    path, copy = locked.object("total", "metrics.json"), locked.folder / "data/total/metrics.json"
     content = path.read_bytes()
     path.chmod(0o644)
     path.write_bytes(content.replace(b"9", b"8"))
     path.chmod(0o444)
     (locked.folder / "look.py").write_text("import tacpipe\nprint(dict(tacpipe.open('data/total').files))")
-    beside.unlink()
+    copy.unlink()
     failed = as_ordinary_user(locked, "", "look")
     assert failed.returncode and "damaged" in failed.stderr and "cannot be written" in failed.stderr
     assert "80" not in failed.stdout
-    beside.write_bytes(content)  # a sound copy beside the manifest is as good as the object
+    copy.write_bytes(content)  # a sound copy beside the manifest is as good as the object
     assert as_ordinary_user(locked, "", "look").stdout == f"{ {'metrics.json': content} }\n"
-    found = as_ordinary_user(locked, "store verify")
-    assert found.returncode == DAMAGED and path.name in found.stdout, found
+    verified = as_ordinary_user(locked, "store verify")
+    assert verified.returncode == DAMAGED and path.name in verified.stdout, verified
     count("corruptions found")
 
 
@@ -301,66 +305,66 @@ def refuse(number: int) -> Callable[..., Any]:
 
 @pytest.mark.parametrize("number", [errno.EPERM, *seldom(errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK, errno.EXDEV)])
 def test_without_hard_links_and_reflinks_all_is_as_with_them(
-    one: Specimen, monkeypatch: pytest.MonkeyPatch, number: int
+    project: Specimen, monkeypatch: pytest.MonkeyPatch, number: int
 ) -> None:
-    fresh(one)
+    fresh(project)
     monkeypatch.setattr(os, "link", refuse(number))
     monkeypatch.setattr(fcntl, "ioctl", refuse(errno.ENOTTY))
-    made_again(one)
-    assert {path.stat().st_nlink for path in specimen.beneath(one.folder / "data")} == {1}
+    made_again(project)
+    assert {path.stat().st_nlink for path in specimen.beneath(project.folder / "data")} == {1}
 
 
 @pytest.mark.parametrize("number", [errno.ENOLCK, *seldom(errno.ENOSYS, errno.EOPNOTSUPP)])
-def test_without_locks_all_is_as_with_them(one: Specimen, monkeypatch: pytest.MonkeyPatch, number: int) -> None:
-    fresh(one)
+def test_without_locks_all_is_as_with_them(project: Specimen, monkeypatch: pytest.MonkeyPatch, number: int) -> None:
+    fresh(project)
     monkeypatch.setattr(fcntl, "flock", refuse(number))
-    made_again(one)
+    made_again(project)
 
 
-def fresh(one: Specimen) -> None:
-    shutil.rmtree(one.store)
-    shutil.rmtree(one.folder / "data")
-    one.store.mkdir()
+def fresh(project: Specimen) -> None:
+    shutil.rmtree(project.store)
+    shutil.rmtree(project.folder / "data")
+    project.store.mkdir()
 
 
-def made_again(one: Specimen) -> None:
-    one.lab.run(CHAIN[0])
-    one.lab.run(specimen.LABEL)
-    healed(one)
-    specimen.age(one.store)
-    one.lab.run("store gc --recordings --grace-days 0")
-    assert all(one.served().values())
+def made_again(project: Specimen) -> None:
+    project.lab.run(CHAIN[0])
+    project.lab.run(specimen.LABEL)
+    healed(project)
+    specimen.age(project.store)
+    project.lab.run("store gc --recordings --grace-days 0")
+    assert all(project.served().values())
 
 
 @pytest.mark.parametrize("ahead_s", [YEARS_S, -YEARS_S])
 def test_a_clock_that_was_set_changes_no_result_and_what_is_collected(
-    one: Specimen, monkeypatch: pytest.MonkeyPatch, ahead_s: float
+    project: Specimen, monkeypatch: pytest.MonkeyPatch, ahead_s: float
 ) -> None:
     honest, honest_ns = time.time, time.time_ns
     monkeypatch.setattr(time, "time", lambda: honest() + ahead_s)
     monkeypatch.setattr(time, "time_ns", lambda: honest_ns() + int(ahead_s * 1e9))
-    one.lab.run("scale data/recordings -o data/other --factor 9 --jobs 1")
-    garbage = {name for _, name in one.lab.manifest("data/other").objects()}
-    shutil.rmtree(one.folder / "data/other")
+    project.lab.run("scale data/recordings -o data/other --factor 9 --jobs 1")
+    garbage = {name for _, name in project.lab.manifest("data/other").objects()}
+    shutil.rmtree(project.folder / "data/other")
     monkeypatch.undo()
-    monkeypatch.chdir(one.folder)
-    with one.lab.store.at_work([]):
-        one.lab.store.announce(one.needed())
-        one.lab.run("store gc --recordings --grace-days 0")
-    there = {path.name for path in specimen.beneath(one.store / "objects")}
-    assert one.needed() <= there
-    specimen.age(one.store, days=-ahead_s / 86400)
-    one.lab.run("store gc --recordings --grace-days 0")
-    there = {path.name for path in specimen.beneath(one.store / "objects")}
-    assert one.needed() <= there and not garbage & (there - one.needed())
-    healed(one)
+    monkeypatch.chdir(project.folder)
+    with project.lab.store.at_work([]):
+        project.lab.store.announce(project.needed())
+        project.lab.run("store gc --recordings --grace-days 0")
+    remaining = {path.name for path in specimen.beneath(project.store / "objects")}
+    assert project.needed() <= remaining
+    specimen.age(project.store, days=-ahead_s / 86400)
+    project.lab.run("store gc --recordings --grace-days 0")
+    remaining = {path.name for path in specimen.beneath(project.store / "objects")}
+    assert project.needed() <= remaining and not garbage & (remaining - project.needed())
+    healed(project)
 
 
 @pytest.mark.parametrize("number", [errno.EIO, *seldom(errno.EACCES, errno.ESTALE)])
 def test_an_object_that_cannot_be_read_is_made_again_or_told_in_a_sentence(
-    one: Specimen, monkeypatch: pytest.MonkeyPatch, number: int
+    project: Specimen, monkeypatch: pytest.MonkeyPatch, number: int
 ) -> None:
-    bad = {str(one.object("recordings", "b/left.parquet")), str(one.object("scaled", "a.parquet"))}
+    bad = {str(project.object("recordings", "b/left.parquet")), str(project.object("scaled", "a.parquet"))}
     honest = builtins.open
 
     def opened(file: Any, *args: Any, **kwargs: Any) -> Any:
@@ -369,16 +373,16 @@ def test_an_object_that_cannot_be_read_is_made_again_or_told_in_a_sentence(
         return honest(file, *args, **kwargs)
 
     monkeypatch.setattr(builtins, "open", opened)
-    ran = one.lab.call("scale data/recordings -o data/other --factor 9 --jobs 1")
+    ran = project.lab.call("scale data/recordings -o data/other --factor 9 --jobs 1")
     assert ran.code in (0, DAMAGED) and "Traceback" not in ran.err, ran
-    failed = one.lab.call("total data/scaled -o data/other2")
+    failed = project.lab.call("total data/scaled -o data/other2")
     assert failed.code in (0, DAMAGED) and "Traceback" not in failed.err, failed
     if failed.code == 0:
-        assert one.lab.manifest("data/other2").digest == one.manifests["total"].digest
+        assert project.lab.manifest("data/other2").digest == project.manifests["total"].digest
     else:
         assert os.strerror(number) in failed.err
-    verified = one.lab.call("store verify")
+    verified = project.lab.call("store verify")
     assert "Traceback" not in verified.err
-    bad.clear()  # as after another cable
-    assert all(one.served().values())
-    healed(one)
+    bad.clear()  # Another cable may end the errors.
+    assert all(project.served().values())
+    healed(project)

@@ -22,7 +22,7 @@ pytestmark = [
 ENDS = (errors.FAILED, errors.USAGE, errors.DAMAGED, errors.LOCKED)
 
 
-def nothing(lab: Lab) -> None:
+def leave_as_is(lab: Lab) -> None:
     """Take the project as it is."""
 
 
@@ -54,7 +54,7 @@ class Case:
     """A command, and what comes before it."""
 
     command: str
-    before: Callable[[Lab], None] = nothing
+    before: Callable[[Lab], None] = leave_as_is
 
 
 CASES = {
@@ -69,28 +69,28 @@ CASES = {
 
 @dataclass(frozen=True)
 class Clean:
-    """What a case is before its command, and what the command does where nothing fails."""
+    """Project of a case before its command, and what the command does where nothing fails."""
 
     before: Path
-    shown: dict[str, bytes]  # the files of datasets, and the objects of a store that was pushed to
+    written_files: dict[str, bytes]  # the files of datasets, and the objects of a store that was pushed to
     calls: list[tracing.Call]
 
 
-def shown(folder: Path) -> dict[str, bytes]:
+def read_written_files(folder: Path) -> dict[str, bytes]:
     """Return all that a command should have written, whatever its store's records say of the way there."""
-    found = specimen.files(folder / "data")
+    written = specimen.files(folder / "data")
     remote = specimen.files(folder / "remote/objects") if (folder / "remote").exists() else {}
-    return {**found, **{f"remote/{name}": content for name, content in remote.items()}}
+    return {**written, **{f"remote/{name}": content for name, content in remote.items()}}
 
 
 @pytest.fixture
-def clean(request: pytest.FixtureRequest, made: Path, lab: Lab, tmp_path_factory: pytest.TempPathFactory) -> Clean:
-    """What the case that a test names is where nothing fails."""
+def clean(request: pytest.FixtureRequest, original: Path, lab: Lab, tmp_path_factory: pytest.TempPathFactory) -> Clean:
+    """Run the case that a test names where nothing fails."""
     name: str = request.param
     case = CASES[name]
 
     def make(folder: Path) -> None:
-        restore(lab, made)
+        restore(lab, original)
         case.before(lab)
         specimen.clone(lab.folder, folder)
 
@@ -98,14 +98,14 @@ def clean(request: pytest.FixtureRequest, made: Path, lab: Lab, tmp_path_factory
     restore(lab, before)
     ran = tracing.run(lab.folder, shlex.split(case.command), tmp_path_factory.mktemp("trace") / "log")
     assert ran.code == 0, ran.err
-    return Clean(before, shown(lab.folder), ran.calls)
+    return Clean(before, read_written_files(lab.folder), ran.calls)
 
 
-def restore(lab: Lab, kept: Path) -> None:
+def restore(lab: Lab, source: Path) -> None:
     """Put a kept project in place of what is there."""
     for path in lab.folder.iterdir():
         shutil.rmtree(path)
-    specimen.clone(kept, lab.folder)
+    specimen.clone(source, lab.folder)
 
 
 def struck(calls: list[tracing.Call], name: str) -> Iterator[tuple[tracing.Call, str, bool]]:
@@ -130,14 +130,14 @@ def test_whatever_a_system_call_answers_nothing_is_wrong_and_a_rerun_gives_the_s
         ran = tracing.run(lab.folder, shlex.split(case.command), log, expression)
         if not ran.struck:  # it met a call of the interpreter's own, because one came more or less than before
             continue
-        about = f"{case.command} with {expression} at {call.what}: {ran.code} {ran.err}"
+        about = f"{case.command} with {expression} at {call.description}: {ran.code} {ran.err}"
         assert ran.code in (0, *ENDS), about
         assert "Traceback" not in ran.err, about
         if ran.code == 0:
-            assert shown(lab.folder) == clean.shown, about
+            assert read_written_files(lab.folder) == clean.written_files, about
         verified = lab.call("store verify")
         assert verified.code == 0, f"{about}; verify: {verified}"
-        again = lab.call(case.command)
-        assert again.code == 0, f"{about}; rerun: {again}"
-        assert shown(lab.folder) == clean.shown, about
+        rerun = lab.call(case.command)
+        assert rerun.code == 0, f"{about}; rerun: {rerun}"
+        assert read_written_files(lab.folder) == clean.written_files, about
         count("system calls failed")

@@ -20,21 +20,21 @@ PROJECT = Path(__file__).parents[2]
 @NEEDS_DVC
 @pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="processes are told apart by /proc")
 def test_tacpipe_holds_under_each_fault_that_is_done_to_dvc_and_joblib_too() -> None:
-    kept = {name: value for name, value in os.environ.items() if not name.startswith(("GIT_", "DVC_", "TACPIPE_"))}
-    done = subprocess.run(
+    inherited = {name: value for name, value in os.environ.items() if not name.startswith(("GIT_", "DVC_", "TACPIPE_"))}
+    process = subprocess.run(
         [sys.executable, "-m", "tests.promises.trust.table", "--json"],
         cwd=PROJECT,
-        env=kept,
+        env=inherited,
         capture_output=True,
         text=True,
         check=False,
     )
-    assert done.stdout, done.stderr
-    table = json.loads(done.stdout)
+    assert process.stdout, process.stderr
+    table = json.loads(process.stdout)
     assert len(table) == 11
     assert all(set(row) == {"tacpipe", "dvc repro", "joblib.Memory"} for row in table.values())
     failed = {fault: row["tacpipe"][0] for fault, row in table.items() if row["tacpipe"][1] is False}
     assert failed == {}
-    assert done.returncode == 0
-    others = [row[tool][1] for row in table.values() for tool in ("dvc repro", "joblib.Memory")]
-    assert False in others, "a table in which nothing ever fails has looked at nothing"
+    assert process.returncode == 0
+    other_tools = [row[tool][1] for row in table.values() for tool in ("dvc repro", "joblib.Memory")]
+    assert False in other_tools, "a table in which nothing ever fails has looked at nothing"

@@ -33,7 +33,7 @@ UNCERTAIN = {
 
 
 @pytest.fixture
-def uncertain(one: Specimen, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Specimen:
+def uncertain(project: Specimen, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Specimen:
     """A project in which a plug-in with stages that are not deterministic is installed."""
     folder = tmp_path_factory.mktemp("uncertain")
     shutil.copy(Path(__file__).parent / "plugin" / "uncertain_stages.py", folder)
@@ -42,7 +42,7 @@ def uncertain(one: Specimen, tmp_path_factory: pytest.TempPathFactory, monkeypat
     monkeypatch.syspath_prepend(folder)
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(folder), os.environ.get("PYTHONPATH", "")]))
     forget()
-    return one
+    return project
 
 
 @pytest.mark.parametrize("command", UNCERTAIN)
@@ -52,10 +52,10 @@ def test_a_stage_that_gives_something_else_is_found_and_what_differs_is_named(
     lab = uncertain.lab
     lab.run(f"{command} -o data/u --jobs 1")
     before = specimen.files(lab.folder / "data/u")
-    found = lab.call(f"{command} -o data/u --jobs 1 --recompute-and-compare")
-    assert found.code == FAILED and "Traceback" not in found.err, found
-    told = found.err.partition("differ from what is stored: ")[2].strip()
-    assert told.startswith(UNCERTAIN[command]), found
+    compared = lab.call(f"{command} -o data/u --jobs 1 --recompute-and-compare")
+    assert compared.code == FAILED and "Traceback" not in compared.err, compared
+    differences = compared.err.partition("differ from what is stored: ")[2].strip()
+    assert differences.startswith(UNCERTAIN[command]), compared
     assert specimen.files(lab.folder / "data/u") == before
     count("corruptions found")
 
@@ -65,15 +65,15 @@ def test_an_order_that_depends_on_the_process_is_found(uncertain: Specimen) -> N
     assert tacpipe(uncertain.folder, command, PYTHONHASHSEED="1").returncode == 0
     same = tacpipe(uncertain.folder, f"{command} --recompute-and-compare", PYTHONHASHSEED="1")
     assert same.returncode == 0, same.stderr
-    other = tacpipe(uncertain.folder, f"{command} --recompute-and-compare", PYTHONHASHSEED="2")
-    assert other.returncode == FAILED and "names.json" in other.stderr
+    other_seed = tacpipe(uncertain.folder, f"{command} --recompute-and-compare", PYTHONHASHSEED="2")
+    assert other_seed.returncode == FAILED and "names.json" in other_seed.stderr
 
 
 @pytest.mark.parametrize("command", CHAIN)
-def test_deterministic_stages_pass(one: Specimen, command: str) -> None:
-    ran = one.lab.call(f"{command} --recompute-and-compare")
+def test_deterministic_stages_pass(project: Specimen, command: str) -> None:
+    ran = project.lab.call(f"{command} --recompute-and-compare")
     assert ran.code == 0 and "differ" not in ran.err
-    assert one.shown() == dict(one.sound)
+    assert project.data_files() == dict(project.sound)
 
 
 def test_a_lost_shard_that_cannot_be_made_as_it_was_is_said_so_and_a_rerun_makes_new_ones(uncertain: Specimen) -> None:
@@ -93,7 +93,7 @@ def test_a_lost_shard_that_cannot_be_made_as_it_was_is_said_so_and_a_rerun_makes
 # ---- inputs that change while they are read
 
 
-def meanwhile(monkeypatch: pytest.MonkeyPatch, happens: Callable[[], None], times: int = 1) -> None:
+def after_stage_call(monkeypatch: pytest.MonkeyPatch, happens: Callable[[], None], times: int = 1) -> None:
     """Let something happen once a stage has been called, right after it returned."""
     honest = execution.stage_of
 
@@ -127,57 +127,57 @@ class _Calling:
 
 
 def test_a_file_that_changes_while_it_is_ingested_is_not_taken_and_a_rerun_is_right(
-    one: Specimen, monkeypatch: pytest.MonkeyPatch
+    project: Specimen, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    file = one.folder / "src" / "b.txt"
+    file = project.folder / "src" / "b.txt"
     file.write_text("1 2 3 4")
     with monkeypatch.context() as patch:
-        meanwhile(patch, lambda: damages.overwrite(file, b"5 6 7 8"))
-        failed = one.lab.call(f"{CHAIN[0]} --replace")
+        after_stage_call(patch, lambda: damages.overwrite(file, b"5 6 7 8"))
+        failed = project.lab.call(f"{CHAIN[0]} --replace")
     assert failed.code == FAILED and "src/b.txt changed while it was read" in failed.err, failed
-    assert one.shown() == dict(one.sound)
-    one.lab.run(f"{CHAIN[0]} --replace")
-    assert specimen.held(one.folder / "data/recordings")["b/left.parquet"][0][-1] == [5, 6, 7, 8]
+    assert project.data_files() == dict(project.sound)
+    project.lab.run(f"{CHAIN[0]} --replace")
+    assert specimen.read_content(project.folder / "data/recordings")["b/left.parquet"][0][-1] == [5, 6, 7, 8]
 
 
 def test_a_file_that_vanishes_while_it_is_ingested_is_a_sentence(
-    one: Specimen, monkeypatch: pytest.MonkeyPatch
+    project: Specimen, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    file = one.folder / "src" / "b.txt"
+    file = project.folder / "src" / "b.txt"
     file.write_text("1 2 3 4")
     with monkeypatch.context() as patch:
-        meanwhile(patch, file.unlink)
-        failed = one.lab.call(f"{CHAIN[0]} --replace")
+        after_stage_call(patch, file.unlink)
+        failed = project.lab.call(f"{CHAIN[0]} --replace")
     assert failed.code == FAILED and "src/b.txt" in failed.err and "Traceback" not in failed.err, failed
-    assert one.shown() == dict(one.sound)
+    assert project.data_files() == dict(project.sound)
 
 
-def test_objects_damaged_between_two_reads_are_never_served(one: Specimen, monkeypatch: pytest.MonkeyPatch) -> None:
-    objects = [one.object("recordings", f"{name}/left.parquet") for name in "abc"]
+def test_objects_damaged_between_two_reads_are_never_served(project: Specimen, monkeypatch: pytest.MonkeyPatch) -> None:
+    objects = [project.object("recordings", f"{name}/left.parquet") for name in "abc"]
 
     def damage() -> None:
         for path in objects:
             damages.flip(path)
 
-    meanwhile(monkeypatch, damage)
-    one.lab.run("scale data/recordings -o data/other --factor 9 --jobs 1")
-    found = specimen.held(one.folder / "data/other")
-    assert [found[f"{name}.parquet"][0][-1][1] for name in "abc"] == [9, 54, 99]
+    after_stage_call(monkeypatch, damage)
+    project.lab.run("scale data/recordings -o data/other --factor 9 --jobs 1")
+    contents = specimen.read_content(project.folder / "data/other")
+    assert [contents[f"{name}.parquet"][0][-1][1] for name in "abc"] == [9, 54, 99]
 
 
 def test_a_dataset_that_is_relinked_while_it_is_read_is_read_as_it_was_at_first(
-    one: Specimen, monkeypatch: pytest.MonkeyPatch
+    project: Specimen, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def relink() -> None:
-        manifest = one.folder / "data/scaled/manifest.json"
-        damages.overwrite(manifest, one.sound["named/manifest.json"])
+        manifest = project.folder / "data/scaled/manifest.json"
+        damages.overwrite(manifest, project.sound["named/manifest.json"])
 
-    meanwhile(monkeypatch, relink)
-    one.lab.run("total data/scaled -o data/other")
-    assert one.lab.manifest("data/other").digest == one.manifests["total"].digest
-    assert one.lab.call("store verify").code == 0
+    after_stage_call(monkeypatch, relink)
+    project.lab.run("total data/scaled -o data/other")
+    assert project.lab.manifest("data/other").digest == project.manifests["total"].digest
+    assert project.lab.call("store verify").code == 0
 
 
 def test_a_fit_of_which_nothing_is_stored_cannot_be_compared(uncertain: Specimen) -> None:
-    found = uncertain.lab.call("fitted data/scaled --split data/split -o data/u --recompute-and-compare")
-    assert found.code == 2 and "Nothing is stored of fitted.fit" in found.err and not Path("data/u").exists()
+    compared = uncertain.lab.call("fitted data/scaled --split data/split -o data/u --recompute-and-compare")
+    assert compared.code == 2 and "Nothing is stored of fitted.fit" in compared.err and not Path("data/u").exists()

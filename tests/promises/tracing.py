@@ -45,7 +45,7 @@ LASTING = (
     "link",
     "unlink",
     "mkdir",
-)  # that also fail from then on
+)  # Faults of these calls also last from then on.
 _LINE = re.compile(r"^(\d+) +(\w+)\((.*)")
 _RELATIVE = re.compile(r'^(?:AT_FDCWD<[^>]*>, )?"([^"]*)"')
 SLOW_US = 300_000
@@ -66,7 +66,7 @@ class Call:
 
     name: str
     number: int
-    what: str
+    description: str
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class Traced:
     code: int
     err: str
     calls: list[Call]  # below the folder, of its main process
-    struck: bool  # whether a fault met a call below the folder
+    struck: bool  # Whether a fault met a call below the folder.
 
 
 def run(folder: Path, words: Sequence[str], log: Path, inject: str = "", names: Sequence[str] = ()) -> Traced:
@@ -110,24 +110,24 @@ def run(folder: Path, words: Sequence[str], log: Path, inject: str = "", names: 
 
 def injected(call: Call, fault: str, *, lasting: bool = False) -> str:
     """Return strace's expression for a fault of one call, or of it and all that follow."""
-    what = {"short": "retval=0", "slow": f"delay_enter={SLOW_US}"}.get(fault, f"error={fault}")
-    return f"{call.name}:{what}:when={call.number}{'+' if lasting else ''}"
+    effect = {"short": "retval=0", "slow": f"delay_enter={SLOW_US}"}.get(fault, f"error={fault}")
+    return f"{call.name}:{effect}:when={call.number}{'+' if lasting else ''}"
 
 
 def _read(log: Path, folder: str) -> tuple[list[Call], bool]:
     """Return the calls of a log that meet a path below ``folder``, and whether one of them was tampered with."""
     counts: dict[tuple[str, str], int] = {}
-    found, struck, main = [], False, ""
+    calls, struck, main = [], False, ""
     for line in log.read_text(errors="replace").splitlines():
         match = _LINE.match(line)
         if match is None:
             continue
-        thread, name, rest = match.groups()
+        thread, name, arguments = match.groups()
         main = main or thread
         number = counts[thread, name] = counts.get((thread, name), 0) + 1
-        relative = _RELATIVE.match(rest)
-        ours = folder in re.sub(r"AT_FDCWD<[^>]*>", "", rest) or (relative and not relative[1].startswith("/"))
+        relative = _RELATIVE.match(arguments)
+        ours = folder in re.sub(r"AT_FDCWD<[^>]*>", "", arguments) or (relative and not relative[1].startswith("/"))
         if ours and thread == main:
-            found.append(Call(name, number, rest[:200]))
+            calls.append(Call(name, number, arguments[:200]))
             struck |= "(INJECTED)" in line or "(DELAYED)" in line
-    return found, struck
+    return calls, struck

@@ -27,13 +27,13 @@ class Warm:
 
     def start(self, folder: Path, words: str, out: Path, environment: Mapping[str, str]) -> int:
         """Return the id of a new process, and of its session, that runs ``tacpipe words`` and prints to ``out``."""
-        asked = {"folder": str(folder), "words": words, "out": str(out), "environment": dict(environment)}
-        return int(self._ask(asked))
+        request = {"folder": str(folder), "words": words, "out": str(out), "environment": dict(environment)}
+        return int(self._ask(request))
 
     def poll(self, pid: int) -> int | None:
         """Return how a process ended, as `subprocess` gives it, or None while it runs."""
-        found: int | None = self._ask({"pid": pid})
-        return found
+        exit_code: int | None = self._ask({"pid": pid})
+        return exit_code
 
     def _ask(self, request: Mapping[str, Any]) -> Any:
         assert self._process.stdin is not None and self._process.stdout is not None
@@ -84,7 +84,7 @@ def _become(folder: str, words: str, out: str, environment: Mapping[str, str]) -
     for handle, source in ((0, os.open(os.devnull, os.O_RDONLY)), (1, printed), (2, printed)):
         os.dup2(source, handle)
     sys.path[:0] = [path for path in environment.get("PYTHONPATH", "").split(os.pathsep) if path]
-    if "TEST_USER" in environment:  # and group, who share what they write
+    if "TEST_USER" in environment:  # Users of a group share what they write.
         os.setgroups([])
         os.setgid(int(environment["TEST_GROUP"]))
         os.setuid(int(environment["TEST_USER"]))

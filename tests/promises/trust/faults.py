@@ -28,22 +28,26 @@ def edited_output(tool: Tool, folder: Path) -> Cell:
     if not isinstance(tool, Dvc):
         return _edited_output(tool, folder)
     plain, linked = _edited_output(tool, folder), _edited_output(Dvc("hardlink"), folder.with_name("hardlink"))
-    return Cell(f"{plain.told}; with cache.type hardlink: {linked.told}", bool(plain.good and linked.good))
+    return Cell(f"{plain.outcome}; with cache.type hardlink: {linked.outcome}", bool(plain.good and linked.good))
 
 
 def _edited_output(tool: Tool, folder: Path) -> Cell:
     lab = tool.lab(folder)
     up_to(tool, lab, "scale")
-    place = tool.shown(lab, "scale")
+    place = tool.output_folder(lab, "scale")
     victim = tool.stored(lab, "scale") if place is None else next(place.glob(f"{VICTIM}.*"))
     edited(victim)
-    done = lab.run(tool.words(lab, "total"))
-    where = "it has no workspace, so its cached file was edited; " if place is None else ""
+    summed = lab.run(tool.words(lab, "total"))
+    note = "it has no workspace, so its cached file was edited; " if place is None else ""
     if tool.values(lab, "total") == lab.right("total"):
-        again = len(lab.computed("scale")) > len(RECORDINGS)
-        return Cell(f"{where}the sum is right{', the edited recording was made again' if again else ''}", True)
-    told = f"found (exit code {done.code}), not repaired" if done.code else "the edited numbers are summed, exit code 0"
-    return Cell(f"{where}{told}", False)
+        made_again = len(lab.computed("scale")) > len(RECORDINGS)
+        return Cell(f"{note}the sum is right{', the edited recording was made again' if made_again else ''}", True)
+    outcome = (
+        f"found (exit code {summed.code}), not repaired"
+        if summed.code
+        else "the edited numbers are summed, exit code 0"
+    )
+    return Cell(f"{note}{outcome}", False)
 
 
 def damaged(harm: Callable[[Path], None]) -> Fault:
@@ -54,15 +58,15 @@ def damaged(harm: Callable[[Path], None]) -> Fault:
         up_to(tool, lab, "scale")
         harm(tool.stored(lab, "scale"))
         removed(tool, lab, "scale")
-        done = tool.bring_back(lab, "scale")
+        brought_back = tool.bring_back(lab, "scale")
         served = tool.values(lab, "scale")
         summed = lab.run(tool.words(lab, "total"))
         if served == lab.right("scale") and tool.values(lab, "total") == lab.right("total"):
-            more = len(lab.computed("scale")) - len(RECORDINGS)
-            told = {0: "the output is right", 1: "found, the recording alone is made again"}
-            return Cell(told.get(more, "found, all recordings are made again"), True)
-        if done.code:
-            return Cell(f"found (exit code {done.code}), not repaired", False)
+            recomputed = len(lab.computed("scale")) - len(RECORDINGS)
+            outcomes = {0: "the output is right", 1: "found, the recording alone is made again"}
+            return Cell(outcomes.get(recomputed, "found, all recordings are made again"), True)
+        if brought_back.code:
+            return Cell(f"found (exit code {brought_back.code}), not repaired", False)
         after = "the next stage fails on it" if summed.code else "the next stage sums it"
         return Cell(f"brought back as it is, exit code 0; {after}", False)
 
@@ -80,21 +84,21 @@ def killed(tool: Tool, folder: Path) -> Cell:
     process.kill()
     process.wait()
     _close(process)
-    goes_on = not lab.still(SOON_S)
-    done = lab.run(tool.words(lab, "scale", 3))
+    goes_on = not lab.wait_until_still(SOON_S)
+    next_run = lab.run(tool.words(lab, "scale", 3))
     lab.open_gate()
-    lab.still(SOON_S)
+    lab.wait_until_still(SOON_S)
     served = tool.values(lab, "scale", 3)
-    again = lab.run(tool.words(lab, "scale", 3))
-    right, right_again = (found == lab.right("scale", 3) for found in (served, tool.values(lab, "scale", 3)))
-    told = [
+    third_run = lab.run(tool.words(lab, "scale", 3))
+    right, right_again = (values == lab.right("scale", 3) for values in (served, tool.values(lab, "scale", 3)))
+    outcomes = [
         "what it started goes on" if goes_on else "what it started ends with it",
-        f"the next run ends with {done.code}",
+        f"the next run ends with {next_run.code}",
         "and is right" if right else "and what the old one writes ends up in its output",
     ]
     if not right:
-        told.append(f"the run after that ({again.code}) {'mends it' if right_again else 'leaves it so'}")
-    return Cell(", ".join(told), done.code == again.code == 0 and right and right_again)
+        outcomes.append(f"the run after that ({third_run.code}) {'mends it' if right_again else 'leaves it so'}")
+    return Cell(", ".join(outcomes), next_run.code == third_run.code == 0 and right and right_again)
 
 
 def interrupted(tool: Tool, folder: Path) -> Cell:
@@ -102,24 +106,24 @@ def interrupted(tool: Tool, folder: Path) -> Cell:
     lab = tool.lab(folder)
     up_to(tool, lab, "load")
     process = lab.start_gated(tool.words(lab, "scale"), "scale")
-    begun = time.monotonic()
+    interrupted_s = time.monotonic()
     os.killpg(process.pid, signal.SIGINT)
-    done = finished(process)
-    soon = time.monotonic() - begun < SOON_S
-    still = lab.still(SOON_S)
-    place = tool.shown(lab, "scale")
+    completed = finished(process)
+    soon = time.monotonic() - interrupted_s < SOON_S
+    all_ended = lab.wait_until_still(SOON_S)
+    place = tool.output_folder(lab, "scale")
     partial = place is not None and any(place.glob("rec-*"))
     lab.must(tool.words(lab, "scale"))
     right = tool.values(lab, "scale") == lab.right("scale")
-    told = [
-        f"exit code {done.code} {'at once' if soon else 'late'}",
-        "a traceback" if "Traceback" in done.said else "no traceback",
+    outcomes = [
+        f"exit code {completed.code} {'at once' if soon else 'late'}",
+        "a traceback" if "Traceback" in completed.printed else "no traceback",
         "a partial output stays in the workspace" if partial else "no partial output",
         "the rerun is right" if right else "the rerun is wrong",
     ]
-    if not still:
-        told.append("processes stay")
-    return Cell(", ".join(told), done.code != 0 and soon and still and right and not partial)
+    if not all_ended:
+        outcomes.append("processes stay")
+    return Cell(", ".join(outcomes), completed.code != 0 and soon and all_ended and right and not partial)
 
 
 # ---- company
@@ -135,22 +139,22 @@ def crowd(tool: Tool, folder: Path) -> Cell:
     times = Counter(lab.computed("scale")).values()
     right = tool.values(lab, "scale") == lab.right("scale")
     failed = CROWD - codes[0]
-    told = [
+    outcomes = [
         f"some fail (exit code {', '.join(str(code) for code in sorted(codes) if code)})" if failed else "all succeed",
         "each recording is computed once" if max(times) == 1 else "recordings are computed several times",
         "the result is right" if right else "the result is wrong",
     ]
-    return Cell(", ".join(told), not failed and max(times) == 1 and right)
+    return Cell(", ".join(outcomes), not failed and max(times) == 1 and right)
 
 
 def collected(tool: Tool, folder: Path) -> Cell:
-    """What is not needed is removed while a stage runs; then the outputs are brought back and read on."""
+    """Unneeded results are removed while a stage runs; then the outputs are brought back and read on."""
     lab = tool.lab(folder)
     up_to(tool, lab, "load")
     process = lab.start_gated(tool.words(lab, "scale"), "scale")
     cleaned = lab.run(tool.cleaning())
     lab.open_gate()
-    done = finished(process)
+    completed = finished(process)
     before = len(lab.computed("scale"))
     for step in ("load", "scale"):
         removed(tool, lab, step)
@@ -158,13 +162,15 @@ def collected(tool: Tool, folder: Path) -> Cell:
     summed = lab.run(tool.words(lab, "total"))
     right = tool.values(lab, "scale") == lab.right("scale") and tool.values(lab, "total") == lab.right("total")
     lost = len(lab.computed("scale")) - before
-    knows = tool.shown(lab, "scale") is not None  # what is needed; the other kind frees what it is told to, here all
-    told = [
-        f"the collection ends with {cleaned.code}, the run with {done.code}",
+    knows = (
+        tool.output_folder(lab, "scale") is not None
+    )  # Some tools know what is needed; the others free what they are told to, here all.
+    outcomes = [
+        f"the collection ends with {cleaned.code}, the run with {completed.code}",
         "results of the run were removed and are made again" if lost else "nothing needed is removed",
         "all is right" if right else f"what comes next is wrong (exit code {summed.code})",
     ]
-    return Cell(", ".join(told), done.code == 0 and right and not (lost and knows))
+    return Cell(", ".join(outcomes), completed.code == 0 and right and not (lost and knows))
 
 
 def changed_input(tool: Tool, folder: Path) -> Cell:
@@ -173,7 +179,7 @@ def changed_input(tool: Tool, folder: Path) -> Cell:
     if cells[0] == cells[1]:
         return cells[0]
     return Cell(
-        "; ".join(f"{when} it was read: {cell.told}" for when, cell in zip(("before", "after"), cells, strict=True)),
+        "; ".join(f"{when} it was read: {cell.outcome}" for when, cell in zip(("before", "after"), cells, strict=True)),
         all(cell.good for cell in cells),
     )
 
@@ -184,16 +190,16 @@ def _changed_input(tool: Tool, folder: Path, when: str) -> Cell:
     old = lab.raw[VICTIM]
     lab.write_raw(VICTIM, old + 7)
     lab.open_gate()
-    done = finished(process)
+    completed = finished(process)
     lab.run(tool.words(lab, "load"))
     under_new = tool.values(lab, "load") == lab.right("load")
     lab.write_raw(VICTIM, old)
     lab.run(tool.words(lab, "load"))
     under_old = tool.values(lab, "load") == lab.right("load")
     if under_new and under_old:
-        return Cell("the run is refused, the next is right" if done.code else "each content has its result", True)
-    which = "new" if not under_new else "old"
-    return Cell(f"a wrong result is kept under the {which} content, exit code {done.code}", False)
+        return Cell("the run is refused, the next is right" if completed.code else "each content has its result", True)
+    version = "new" if not under_new else "old"
+    return Cell(f"a wrong result is kept under the {version} content, exit code {completed.code}", False)
 
 
 def undetermined(tool: Tool, folder: Path) -> Cell:
@@ -203,8 +209,8 @@ def undetermined(tool: Tool, folder: Path) -> Cell:
     false_alarm, _ = tool.comparing(lab, "scale")
     lab.environment[NOISE] = "1"
     lab.must(tool.words(lab, "scale", 3))
-    tells, how = tool.comparing(lab, "scale", 3)
-    return Cell(f"{how}{', and so it is of a good stage' if false_alarm else ''}", tells and not false_alarm)
+    tells, answer = tool.comparing(lab, "scale", 3)
+    return Cell(f"{answer}{', and so it is of a good stage' if false_alarm else ''}", tells and not false_alarm)
 
 
 # ---- room
@@ -221,19 +227,23 @@ def full(tool: Tool, folder: Path) -> Cell:
     disk = os.statvfs(folder)
     with ballast.open("wb") as file:
         os.posix_fallocate(file.fileno(), 0, int(disk.f_bavail * disk.f_frsize - tool.room * size))
-    done = lab.run(tool.words(lab, "scale"))
-    left = [path for path in lab.files() - before if "tmp" in path.parts or path.suffix in (".tmp", ".draft")]
+    completed = lab.run(tool.words(lab, "scale"))
+    drafts = [path for path in lab.files() - before if "tmp" in path.parts or path.suffix in (".tmp", ".draft")]
     ballast.unlink()
     lab.run(tool.words(lab, "scale"))
     right = tool.values(lab, "scale") == lab.right("scale")
-    told = [
-        f"exit code {done.code}",
-        "a traceback" if "Traceback" in done.said else "a warning" if "Warning" in done.said else "a sentence",
-        "drafts stay in its cache" if left else "no draft stays",
+    outcomes = [
+        f"exit code {completed.code}",
+        "a traceback"
+        if "Traceback" in completed.printed
+        else "a warning"
+        if "Warning" in completed.printed
+        else "a sentence",
+        "drafts stay in its cache" if drafts else "no draft stays",
         "with room again the rerun is right" if right else "with room again the rerun is wrong",
     ]
-    delivered = done.code == 0 and "rec-" in done.out
-    return Cell(", ".join(told), (done.code != 0 or delivered) and right and not left)
+    delivered = completed.code == 0 and "rec-" in completed.out
+    return Cell(", ".join(outcomes), (completed.code != 0 or delivered) and right and not drafts)
 
 
 FAULTS: Mapping[str, tuple[str, Fault]] = {

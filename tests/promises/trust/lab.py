@@ -23,14 +23,14 @@ VICTIM = RECORDINGS[3]
 
 @dataclass(frozen=True)
 class Cell:
-    """What became of a tool under a fault; ``good`` is None where the fault does not apply."""
+    """Outcome of a tool under a fault; ``good`` is None where the fault does not apply."""
 
-    told: str
+    outcome: str
     good: bool | None
 
     def to_text(self) -> str:
         """Return the cell of the table."""
-        return f"{ {True: 'holds', False: '**fails**', None: 'does not apply'}[self.good] }: {self.told}"
+        return f"{ {True: 'holds', False: '**fails**', None: 'does not apply'}[self.good] }: {self.outcome}"
 
 
 @dataclass(frozen=True)
@@ -42,8 +42,8 @@ class Done:
     err: str
 
     @property
-    def said(self) -> str:
-        """What it printed, on either stream."""
+    def printed(self) -> str:
+        """Return its output of both streams."""
         return self.out + self.err
 
 
@@ -77,12 +77,12 @@ class Lab:
 
     # ---- commands
 
-    def start(self, words: Sequence[str], **more: str) -> subprocess.Popen[str]:
+    def start(self, words: Sequence[str], **variables: str) -> subprocess.Popen[str]:
         """Start a command, alone in its group of processes as a shell would."""
         return subprocess.Popen(
             list(words),
             cwd=self.folder,
-            env={**self.environment, **more},
+            env={**self.environment, **variables},
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
@@ -91,16 +91,16 @@ class Lab:
             preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
         )
 
-    def run(self, words: Sequence[str], **more: str) -> Done:
+    def run(self, words: Sequence[str], **variables: str) -> Done:
         """Run a command to its end."""
-        return finished(self.start(words, **more))
+        return finished(self.start(words, **variables))
 
-    def must(self, words: Sequence[str], **more: str) -> Done:
+    def must(self, words: Sequence[str], **variables: str) -> Done:
         """Run a command that has no reason to fail."""
-        done = self.run(words, **more)
-        if done.code:
-            raise RuntimeError(f"{' '.join(words)} ended with {done.code}: {done.said}")
-        return done
+        completed = self.run(words, **variables)
+        if completed.code:
+            raise RuntimeError(f"{' '.join(words)} completed with {completed.code}: {completed.printed}")
+        return completed
 
     # ---- what the steps noted
 
@@ -131,16 +131,16 @@ class Lab:
 
     def alive(self) -> list[int]:
         """Return the processes that work in this lab."""
-        mark, found = f"{steps.LOG}={self.log_path}".encode(), []
+        mark, processes = f"{steps.LOG}={self.log_path}".encode(), []
         for place in Path("/proc").glob("[0-9]*"):
             try:
                 if mark in (place / "environ").read_bytes().split(b"\0"):
-                    found.append(int(place.name))
+                    processes.append(int(place.name))
             except OSError:  # it ended, or is another user's
                 continue
-        return found
+        return processes
 
-    def still(self, within_s: float) -> bool:
+    def wait_until_still(self, within_s: float) -> bool:
         """Return whether no process of this lab is left after so long."""
         deadline = time.monotonic() + within_s
         while self.alive() and time.monotonic() < deadline:
@@ -163,11 +163,11 @@ def finished(process: subprocess.Popen[str]) -> Done:
     return Done(process.returncode, out, err)
 
 
-def environment_of(**more: str) -> dict[str, str]:
+def environment_of(**variables: str) -> dict[str, str]:
     """Return the environment of this process without a named store, with this Python's programs first."""
     inherited = {name: value for name, value in os.environ.items() if name != "TACPIPE_STORE"}
     programs = f"{Path(sys.executable).parent}{os.pathsep}{inherited.get('PATH', '')}"
-    return {**inherited, "PATH": programs, **more}
+    return {**inherited, "PATH": programs, **variables}
 
 
 def python(module: str, *words: str) -> list[str]:

@@ -23,9 +23,9 @@ class Nothing:
 
 @dataclass(frozen=True)
 class Factor:
-    """What to scale by."""
+    """Params of the stage that scales."""
 
-    factor: int = 2  # that every number is multiplied by
+    factor: int = 2  # Every number is multiplied by this.
 
 
 def discover(params: Nothing, source: Path) -> dict[str, dict[str, Path]]:
@@ -39,7 +39,7 @@ def load(params: Nothing, files: Files) -> pa.Table:
     import pyarrow as pa
 
     (path,) = files.values()
-    steps.begun("load", path.stem)
+    steps.note_begin("load", path.stem)
     return pa.table({"x": steps.parsed(path.stem, path.read_text())})
 
 
@@ -48,7 +48,7 @@ def scale(params: Factor, recording: Recording) -> pa.Table:
     """Scale a table."""
     import pyarrow as pa
 
-    steps.begun("scale", recording.name)
+    steps.note_begin("scale", recording.name)
     values = recording.table()["x"].to_numpy()
     return pa.table({"x": steps.scaled(recording.name, values, params.factor)})
 
@@ -56,7 +56,7 @@ def scale(params: Factor, recording: Recording) -> pa.Table:
 @stage(version=1)
 def total(params: Nothing, recordings: Dataset) -> Result:
     """Sum tables."""
-    steps.begun("total", "all")
+    steps.note_begin("total", "all")
     sums = {name: int(shard.table()["x"].to_numpy().sum()) for name, shard in recordings.recordings.items()}
     return Result(files={"total.json": json.dumps(sums).encode()})
 

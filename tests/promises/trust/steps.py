@@ -25,7 +25,7 @@ NOISE = "TRUST_NOISE"  # if set, scaling is not deterministic
 PATIENCE_S = 60.0
 
 
-def begun(step: str, recording: str) -> None:
+def note_begin(step: str, recording: str) -> None:
     """Note that a step works on a recording, before it reads it."""
     with open(os.environ[LOG], "a") as file:
         file.write(f"{step} {recording or 'unnamed'}\n")  # tacpipe makes lost content again without its name
@@ -62,20 +62,20 @@ def _wait(step: str, when: str, recording: str) -> None:
 def load() -> None:
     """Turn texts into arrays."""
     for path in sorted(Path("raw").glob("*.txt")):
-        begun("load", path.stem)
+        note_begin("load", path.stem)
         np.save(Path("load") / path.stem, parsed(path.stem, path.read_text()))
 
 
 def scale(factor: int) -> None:
     """Scale arrays."""
     for path in sorted(Path("load").glob("*.npy")):
-        begun("scale", path.stem)
+        note_begin("scale", path.stem)
         np.save(Path("scale") / path.stem, scaled(path.stem, np.load(path), factor))
 
 
 def total() -> None:
     """Sum arrays."""
-    begun("total", "all")
+    note_begin("total", "all")
     sums = {path.stem: int(np.load(path).sum()) for path in sorted(Path("scale").glob("*.npy"))}
     Path("total.json").write_text(json.dumps(sums))
 
@@ -93,19 +93,19 @@ def _by_dvc(step: str, factor: int) -> None:
 
 def load_one(recording: str, text: str) -> np.ndarray:
     """Turn a text into an array."""
-    begun("load", recording)
+    note_begin("load", recording)
     return parsed(recording, text)
 
 
 def scale_one(recording: str, values: np.ndarray, factor: int) -> np.ndarray:
     """Scale an array."""
-    begun("scale", recording)
+    note_begin("scale", recording)
     return scaled(recording, values, factor)
 
 
 def total_all(values: dict[str, np.ndarray]) -> dict[str, int]:
     """Sum arrays."""
-    begun("total", "all")
+    note_begin("total", "all")
     return {name: int(array.sum()) for name, array in values.items()}
 
 
@@ -130,13 +130,13 @@ def _by_joblib(step: str, factor: int) -> object:
 
 def main() -> None:
     """Do as the command line says."""
-    tool, *rest = sys.argv[1:]
+    tool, *arguments = sys.argv[1:]
     if tool == "clean":
         from joblib import Memory
 
         Memory("cache", verbose=0).reduce_size(bytes_limit=0)
         return
-    step, factor = rest[0], int(rest[1]) if len(rest) > 1 else 2
+    step, factor = arguments[0], int(arguments[1]) if len(arguments) > 1 else 2
     if tool == "dvc":
         _by_dvc(step, factor)
     else:

@@ -28,7 +28,7 @@ NAMESPACE = ("unshare", "--user", "--map-root-user", "--mount")
 Table = dict[str, dict[str, Cell]]  # fault, tool
 
 
-def found(faults: list[str], tools: list[str]) -> Table:
+def try_faults(faults: list[str], tools: list[str]) -> Table:
     """Return what became of each tool under each fault; the tools go on side by side."""
     with tempfile.TemporaryDirectory(prefix="tacpipe-trust-") as folder, ThreadPoolExecutor(len(tools)) as pool:
         columns = pool.map(lambda tool: {fault: _cell(fault, tool, Path(folder)) for fault in faults}, tools)
@@ -43,11 +43,11 @@ def _cell(fault: str, tool: str, folder: Path) -> Cell:
         return Cell("not tried: nothing can be mounted here", None)
     program = [*NAMESPACE, sys.executable, "-m", "tests.promises.trust.table"]
     words = [*program, "--only", fault, "--tools", tool, "--inside", str(folder)]
-    done = subprocess.run(words, capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise RuntimeError(f"{fault} with {tool} ended with {done.returncode}: {done.stderr}")
-    told, good = json.loads(done.stdout)
-    return Cell(told, good)
+    process = subprocess.run(words, capture_output=True, text=True, check=False)
+    if process.returncode:
+        raise RuntimeError(f"{fault} with {tool} ended with {process.returncode}: {process.stderr}")
+    outcome, good = json.loads(process.stdout)
+    return Cell(outcome, good)
 
 
 def to_text(table: Table) -> str:
@@ -58,9 +58,9 @@ def to_text(table: Table) -> str:
         f"| {FAULTS[fault][0]} | {' | '.join(cells[tool].to_text() for tool in tools)} |"
         for fault, cells in table.items()
     ]
-    held = {tool: [cells[tool].good for cells in table.values()] for tool in tools}
+    verdicts = {tool: [cells[tool].good for cells in table.values()] for tool in tools}
     sums = " | ".join(
-        f"{sum(good is True for good in held[tool])} of {sum(good is not None for good in held[tool])} hold"
+        f"{sum(good is True for good in verdicts[tool])} of {sum(good is not None for good in verdicts[tool])} hold"
         for tool in tools
     )
     return "\n".join([*rows, f"| **in all** | {sums} |"])
@@ -73,16 +73,16 @@ def main() -> None:
     parser.add_argument("--tools", nargs="+", choices=list(TOOLS), default=list(TOOLS))
     parser.add_argument("--json", action="store_true", help="print {fault: {tool: [told, good]}}")
     parser.add_argument("--inside", type=Path, help=argparse.SUPPRESS)
-    given = parser.parse_args()
-    if given.inside is not None:
-        cell = trust_faults.met(given.only[0], given.tools[0], given.inside)
-        print(json.dumps([cell.told, cell.good]))
+    options = parser.parse_args()
+    if options.inside is not None:
+        cell = trust_faults.met(options.only[0], options.tools[0], options.inside)
+        print(json.dumps([cell.outcome, cell.good]))
         return
-    table = found(given.only, given.tools)
-    if given.json:
+    table = try_faults(options.only, options.tools)
+    if options.json:
         print(
             json.dumps(
-                {fault: {tool: [cell.told, cell.good] for tool, cell in row.items()} for fault, row in table.items()}
+                {fault: {tool: [cell.outcome, cell.good] for tool, cell in row.items()} for fault, row in table.items()}
             )
         )
     else:

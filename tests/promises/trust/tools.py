@@ -42,7 +42,7 @@ class Tool(Protocol):
     def stored(self, lab: Lab, step: str) -> Path:
         """Return the cached file of the victim's output."""
 
-    def shown(self, lab: Lab, step: str) -> Path | None:
+    def output_folder(self, lab: Lab, step: str) -> Path | None:
         """Return where the output of a step lies in the workspace, if the tool has one."""
 
     def bring_back(self, lab: Lab, step: str) -> Done:
@@ -57,8 +57,8 @@ class Tool(Protocol):
 
 def up_to(tool: Tool, lab: Lab, step: str, factor: int = 2) -> None:
     """Run the chain up to a step."""
-    for one in STEPS[: STEPS.index(step) + 1]:
-        lab.must(tool.words(lab, one, factor))
+    for chain_step in STEPS[: STEPS.index(step) + 1]:
+        lab.must(tool.words(lab, chain_step, factor))
 
 
 class Tacpipe:
@@ -93,7 +93,7 @@ class Tacpipe:
         digest: str = manifest["recordings"][VICTIM]["shards"][""]["digest"]
         return lab.folder / ".tacpipe" / "objects" / digest[:2] / digest
 
-    def shown(self, lab: Lab, step: str) -> Path | None:
+    def output_folder(self, lab: Lab, step: str) -> Path | None:
         return lab.folder / "data" / step
 
     def bring_back(self, lab: Lab, step: str) -> Done:
@@ -103,11 +103,11 @@ class Tacpipe:
         return ["tacpipe", "store", "gc"]
 
     def comparing(self, lab: Lab, step: str, factor: int = 2) -> tuple[bool, str]:
-        done = lab.run([*self.words(lab, step, factor), "--recompute-and-compare"])
-        named = sum(name in done.said for name in RECORDINGS)
+        compared = lab.run([*self.words(lab, step, factor), "--recompute-and-compare"])
+        named_count = sum(name in compared.printed for name in RECORDINGS)
         return (
-            done.code == 1 and named > 0,
-            f"--recompute-and-compare ends with {done.code} and names {named} recordings",
+            compared.code == 1 and named_count > 0,
+            f"--recompute-and-compare ends with {compared.code} and names {named_count} recordings",
         )
 
 
@@ -155,10 +155,10 @@ class Dvc:
         cache = lab.folder / ".dvc" / "cache" / "files" / "md5"
         folder = lock["stages"][step]["outs"][0]["md5"]
         listed = json.loads((cache / folder[:2] / folder[2:]).read_text())
-        md5: str = next(one["md5"] for one in listed if one["relpath"] == f"{VICTIM}.npy")
+        md5: str = next(entry["md5"] for entry in listed if entry["relpath"] == f"{VICTIM}.npy")
         return cache / md5[:2] / md5[2:]
 
-    def shown(self, lab: Lab, step: str) -> Path | None:
+    def output_folder(self, lab: Lab, step: str) -> Path | None:
         return lab.folder / step
 
     def bring_back(self, lab: Lab, step: str) -> Done:
@@ -170,10 +170,13 @@ class Dvc:
 
     def comparing(self, lab: Lab, step: str, factor: int = 2) -> tuple[bool, str]:
         before = (lab.folder / "dvc.lock").read_text()
-        done = lab.run(["dvc", "repro", "--force", "--single-item", step])
+        repeated = lab.run(["dvc", "repro", "--force", "--single-item", step])
         changed = (lab.folder / "dvc.lock").read_text() != before
-        told = "has replaced the result" if changed else "has changed nothing"
-        return done.code != 0, f"repro --force ends with {done.code} and {told}; only a diff of dvc.lock tells"
+        effect = "has replaced the result" if changed else "has changed nothing"
+        return (
+            repeated.code != 0,
+            f"repro --force ends with {repeated.code} and {effect}; only a diff of dvc.lock tells",
+        )
 
 
 _DVC_PLACES = ("GLOBAL_CONFIG", "SYSTEM_CONFIG", "SITE_CACHE")
@@ -200,7 +203,7 @@ class Joblib:
                 return path
         raise RuntimeError(f"joblib has no output of {step}.")
 
-    def shown(self, lab: Lab, step: str) -> Path | None:
+    def output_folder(self, lab: Lab, step: str) -> Path | None:
         return None
 
     def bring_back(self, lab: Lab, step: str) -> Done:
@@ -215,7 +218,7 @@ class Joblib:
 
 def removed(tool: Tool, lab: Lab, step: str) -> None:
     """Remove the output of a step from the workspace."""
-    place = tool.shown(lab, step)
+    place = tool.output_folder(lab, step)
     if place is not None:
         shutil.rmtree(place)
 
