@@ -10,6 +10,7 @@ whose recordings are slides or single grasps read recordings of their own simula
 from __future__ import annotations
 
 import argparse
+import re
 import shlex
 import shutil
 import tempfile
@@ -56,6 +57,7 @@ STEPS = {  # name: libraries, and what runs; M is the folder of the recording of
 }
 COLUMN = "taxel04_x"
 KEPT = ("rec", "synced", "segments", "split")
+OUTSIDE = re.compile("tacpipe (show|export) ")  # commands that never answer from the store
 
 
 def main() -> None:
@@ -115,11 +117,13 @@ def words(command: str, minutes: int) -> list[str]:
         read = f"tacpipe.open('{minutes}m/synced')['trial-000'].table('xela1', ['{COLUMN}'])"
         return [timing.PYTHON, "-c", f"import tacpipe; {read}"]
     text = command.replace("M/", f"{minutes}m/").replace("SECONDS", str(minutes * 60))
-    return shlex.split(text) + ([] if " show " in text else ["--jobs", "1"])
+    return (
+        shlex.split(text) + ([] if " show " in text else ["--jobs", "1"]) + ([] if OUTSIDE.match(text) else ["--rerun"])
+    )
 
 
 def clean(folder: Path, minutes: int) -> None:
-    """Remove what a step wrote, so that the disk holds one result at a time and nothing is a hit."""
+    """Remove what a step wrote, so that the disk holds one result at a time."""
     for path in (folder / f"{minutes}m").iterdir():
         if path.name not in KEPT:
             shutil.rmtree(path) if path.is_dir() else path.unlink()
