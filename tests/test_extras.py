@@ -259,7 +259,7 @@ except ImportError as error:
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("call", "needed_by"),
-    [('tacpipe.load("models/forward")', "forward"), ('tacpipe.open("data/split").to_torch()', "to_torch")],
+    [('tacpipe.load("models/forward")', "A model"), ('tacpipe.open("data/split").to_torch()', "to_torch")],
 )
 def test_python_gets_the_same_sentence(chained: Path, tmp_path: Path, call: str, needed_by: str) -> None:
     process = subprocess.run(

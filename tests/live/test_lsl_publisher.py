@@ -48,6 +48,7 @@ def test_materials_come_with_their_probabilities_and_how_much_was_seen(tmp_path:
     found = heard(tmp_path, "material")
     assert found["type"] == "Material" and found["labels"][-2:] == ["probability_cork", "probability_felt"]
     rows = np.array(found["rows"], np.float32)
-    wanted = np.array([message.columns() for message in material()[1]])
+    description, messages = material()
+    wanted = np.array([message.numbers(description) for message in messages])
     assert len(rows) == COUNT and np.array_equal(rows, wanted, equal_nan=True)
     assert rows[0, 0] == -1 and np.isnan(rows[0, -1]) and rows[1, 0] == 1
