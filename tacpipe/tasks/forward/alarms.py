@@ -1,4 +1,4 @@
-"""Whether predictors warn of a change of load before it begins: alarms set on one part, counted on another."""
+"""Measure whether predictors warn of a change of load before it begins."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Loads:
     def begin(self, track: Track) -> None:
         """Add the rows of a recording, without predictions yet."""
         truth = loads(track.tactile, self.layout)
-        offset = max((int(one[-1]) + 1 for one in self.groups if len(one)), default=0)
+        offset = max((int(groups[-1]) + 1 for groups in self.groups if len(groups)), default=0)
         self.truth.append(np.where(track.usable[:, None], truth, np.nan))
         self.groups.append(track.groups + offset)
         if len(track.t_ns) > 1:
@@ -44,10 +44,10 @@ class Loads:
         for name in WATCHED:
             self.ahead.setdefault(name, []).append(np.full_like(truth, np.nan))
 
-    def add(self, some: Predicted) -> None:
+    def add(self, windows: Predicted) -> None:
         """Add the predictions for some windows of the recording that was begun last."""
-        for name, prediction in some.predictions.items():
-            self.add_one(name, some.now, prediction)
+        for name, prediction in windows.predictions.items():
+            self.add_one(name, windows.now, prediction)
 
     def add_one(self, name: str, now: Int64s, prediction: Prediction) -> None:
         """Add the predictions of one predictor for windows whose last rows are ``now``, as `add` does."""
@@ -64,7 +64,7 @@ class Loads:
             name: anticipation.calibrate(
                 truth, ahead, groups, horizon=self.horizon, sd=sd, rate_hz=self.rate_hz
             ).tolist()
-            for name, ahead in self._said()
+            for name, ahead in self._with_forecasts()
         }
         # JSON holds no infinity: null stands in its place
         levels = {name: [value if math.isfinite(value) else None for value in values] for name, values in theta.items()}
@@ -75,8 +75,8 @@ class Loads:
         if not levels or not self.truth:
             return {}
         truth, groups, sd = np.concatenate(self.truth), np.concatenate(self.groups), np.array(levels["sd"])
-        found = {}
-        for name, ahead in self._said():
+        scores = {}
+        for name, ahead in self._with_forecasts():
             if name not in levels["theta"]:
                 continue
             theta = np.array([math.inf if value is None else value for value in levels["theta"][name]])
@@ -88,12 +88,12 @@ class Loads:
                 sd=sd,
                 theta=theta,
                 rate_hz=self.rate_hz,
-                held=holds.held(truth),
+                repeated=holds.held(truth),
             )
-            found[name] = {key: _number(value) for key, value in asdict(score).items()}
-        return found
+            scores[name] = {key: _number(value) for key, value in asdict(score).items()}
+        return scores
 
-    def _said(self) -> list[tuple[str, AnyFloats]]:
+    def _with_forecasts(self) -> list[tuple[str, AnyFloats]]:
         joined = {name: np.concatenate(parts) for name, parts in self.ahead.items()}
         return [(name, values) for name, values in joined.items() if np.isfinite(values).any()]
 

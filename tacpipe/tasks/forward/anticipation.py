@@ -1,4 +1,4 @@
-"""Whether a forecast warns of a change before it begins, and how often it warns of nothing.
+"""Measure whether a forecast warns of a change before it begins, and how often it warns of nothing.
 
 A curve of forecasts drawn at the time they are made always looks early if it is any good, and also if it overshoots;
 so warnings are counted. ``truth`` is (time, feature), and ``ahead`` (time, feature) in row t the forecast, made at t, of
@@ -31,10 +31,10 @@ from tacpipe.arrays import AnyArray, AnyFloats, Bools, Indices
 from tacpipe.errors import TacpipeError
 from tacpipe.signals.runs import latched, runs
 
-ON_SD, OFF_SD = 3.0, 1.5  # of the differences, between which a change begins and ends
-ONSET_FRACTION = 0.05  # of a change, up to which it has not begun
-EARLY_FRACTION = 0.2  # of the horizon, by which an alarm may come too early and still not be false
-FALSE_ALARMS_PER_MINUTE = 1.0  # of each feature, where nothing happens
+ON_SD, OFF_SD = 3.0, 1.5  # differences at which a change begins and ends, in standard deviations
+ONSET_FRACTION = 0.05  # fraction of a change up to which it has not begun
+EARLY_FRACTION = 0.2  # fraction of the horizon by which an alarm may be early and still not be false
+FALSE_ALARMS_PER_MINUTE = 1.0  # rate for each feature, where nothing happens
 
 
 @dataclass(frozen=True)
@@ -43,21 +43,21 @@ class Anticipation:
 
     events: int
     recall: float  # fraction of the events that an alarm leads
-    median_lead_rows: float  # of the events that an alarm leads
+    median_lead_rows: float  # rows from alarm to event
     median_lead_frames: float  # new frames from alarm to event, the event's own included
-    false_alarms_per_minute: float  # and feature, in rows free of events
+    false_alarms_per_minute: float  # rate for each feature, in rows free of events
 
 
 def difference_sd(truth: AnyFloats, groups: AnyArray, *, horizon: int) -> AnyFloats:
     """Return the standard deviation of z_t - z_{t-k} of each feature (feature,), over the rows that have one; else 0."""
     _check(truth, horizon, groups=groups)
     moved = _moved(truth.astype(np.float64), _stretches(groups), horizon)
-    known = np.isfinite(moved)
-    count = np.maximum(known.sum(axis=0), 1)
-    moved = np.where(known, moved, 0)
+    finite = np.isfinite(moved)
+    count = np.maximum(finite.sum(axis=0), 1)
+    moved = np.where(finite, moved, 0)
     mean = moved.sum(axis=0) / count
-    found: AnyFloats = np.sqrt(np.square(np.where(known, moved - mean, 0)).sum(axis=0) / count)
-    return found
+    deviations: AnyFloats = np.sqrt(np.square(np.where(finite, moved - mean, 0)).sum(axis=0) / count)
+    return deviations
 
 
 def changes(truth: AnyFloats, groups: AnyArray, *, horizon: int, sd: AnyFloats) -> list[Indices]:
@@ -93,12 +93,12 @@ def calibrate(
     _check(truth, horizon, groups=groups, ahead=ahead, sd=sd)
     stretches = _stretches(groups)
     spaced = _spaced(stretches, horizon)
-    found = np.full(truth.shape[1], np.inf)
-    for feature, those in enumerate(changes(truth, groups, horizon=horizon, sd=sd)):
+    theta = np.full(truth.shape[1], np.inf)
+    for feature, spans in enumerate(changes(truth, groups, horizon=horizon, sd=sd)):
         deviation = np.abs(ahead[:, feature] - truth[:, feature])
-        free = _free(deviation, those, stretches, horizon)
-        found[feature] = _least(deviation, free, spaced, horizon, per_minute * _minutes(free, rate_hz))
-    return found
+        free = _free(deviation, spans, stretches, horizon)
+        theta[feature] = _lowest_level(deviation, free, spaced, horizon, per_minute * _minutes(free, rate_hz))
+    return theta
 
 
 def level(
@@ -115,10 +115,10 @@ def level(
     """
     counted = free & np.isfinite(scores)
     spaced = _spaced(_stretches(groups), horizon)
-    return _least(scores, counted, spaced, horizon, per_minute * _minutes(counted, rate_hz))
+    return _lowest_level(scores, counted, spaced, horizon, per_minute * _minutes(counted, rate_hz))
 
 
-def _least(deviation: AnyFloats, free: Bools, spaced: Indices, horizon: int, allowed: float) -> float:
+def _lowest_level(deviation: AnyFloats, free: Bools, spaced: Indices, horizon: int, allowed: float) -> float:
     """Return the least level that ``deviation`` (time,) passes in no more than ``allowed`` alarms; infinite without rows."""
     if not free.any():
         return float("inf")
@@ -142,22 +142,22 @@ def score(
     sd: AnyFloats,
     theta: AnyFloats,
     rate_hz: float,
-    held: Bools | None = None,
+    repeated: Bools | None = None,
 ) -> Anticipation:
     """Return how well ``ahead`` predicts the changes of ``truth`` with alarms beyond ``theta`` (feature,).
 
-    ``held`` (time,) marks rows that repeat the frame before; None: every row is a new frame.
+    ``repeated`` (time,) marks rows that repeat the frame before; None: every row is a new frame.
     """
     _check(truth, horizon, groups=groups, ahead=ahead, sd=sd, theta=theta)
     stretches = _stretches(groups)
     spaced = _spaced(stretches, horizon)
-    fresh_so_far = np.cumsum(np.ones(len(truth), dtype=bool) if held is None else ~held)
+    fresh_so_far = np.cumsum(np.ones(len(truth), dtype=bool) if repeated is None else ~repeated)
     events, false_alarms, minutes = 0, 0, 0.0
-    leads: list[tuple[int, int]] = []  # in rows and in frames
-    for feature, those in enumerate(changes(truth, groups, horizon=horizon, sd=sd)):
+    leads: list[tuple[int, int]] = []  # leads in rows and in frames
+    for feature, spans in enumerate(changes(truth, groups, horizon=horizon, sd=sd)):
         deviation = np.abs(ahead[:, feature] - truth[:, feature])
         alarm = deviation > theta[feature]
-        for onset in those[:, 0]:
+        for onset in spans[:, 0]:
             first = onset - horizon
             if first < 0 or stretches[first] != stretches[onset] or not np.isfinite(deviation[first:onset]).all():
                 continue
@@ -165,10 +165,10 @@ def score(
             if alarm[first:onset].any():
                 row = first + int(alarm[first:onset].argmax())
                 leads.append((int(onset - row), int(fresh_so_far[onset] - fresh_so_far[row])))
-        free = _free(deviation, those, stretches, horizon)
+        free = _free(deviation, spans, stretches, horizon)
         false_alarms += _count(spaced[free & alarm], horizon)
         minutes += _minutes(free, rate_hz)
-    rows, frames = (float(one) for one in np.median(leads, axis=0)) if leads else (np.nan, np.nan)
+    rows, frames = (float(median) for median in np.median(leads, axis=0)) if leads else (np.nan, np.nan)
     return Anticipation(
         events,
         len(leads) / events if events else np.nan,
@@ -193,8 +193,8 @@ def _spaced(stretches: Indices, horizon: int) -> Indices:
 def _moved(truth: AnyFloats, stretches: Indices, horizon: int) -> AnyFloats:
     """Return z_t - z_{t-k} (time, feature), NaN in the first k rows of each group."""
     moved = np.full(truth.shape, np.nan)
-    within = stretches[horizon:] == stretches[:-horizon]
-    moved[horizon:][within] = (truth[horizon:] - truth[:-horizon])[within]
+    same_stretch = stretches[horizon:] == stretches[:-horizon]
+    moved[horizon:][same_stretch] = (truth[horizon:] - truth[:-horizon])[same_stretch]
     return moved
 
 
@@ -202,24 +202,24 @@ def _changes_of(truth: AnyFloats, moved: AnyFloats, spaced: Indices, horizon: in
     """Return onset and end of the changes (change, 2) of one feature, ``truth`` and ``moved`` each (time,)."""
     size = np.abs(moved)
     on = (size > ON_SD * sd) & (sd > 0)
-    starts, stops = runs(latched(on, ~(size >= OFF_SD * sd)))  # where nothing is known, nothing continues
+    starts, stops = runs(latched(on, ~(size >= OFF_SD * sd)))  # a change ends where a value is missing
     if not len(starts):
         return np.zeros((0, 2), dtype=np.intp)
-    apart = spaced[starts[1:]] - spaced[stops[:-1] - 1] > 2 * horizon
-    starts, stops = starts[np.append(True, apart)], stops[np.append(apart, True)]
+    separate = spaced[starts[1:]] - spaced[stops[:-1] - 1] > 2 * horizon
+    starts, stops = starts[np.append(True, separate)], stops[np.append(separate, True)]
     before = starts[:, None] + np.arange(-horizon, 0)  # (change, row)
-    begun = np.abs(truth[before] - truth[starts - horizon][:, None]) > ONSET_FRACTION * size[starts][:, None]
-    lasts = np.argmin(begun[:, ::-1], axis=1)  # rows that had begun, without a gap up to the start
+    has_begun = np.abs(truth[before] - truth[starts - horizon][:, None]) > ONSET_FRACTION * size[starts][:, None]
+    lasts = np.argmin(has_begun[:, ::-1], axis=1)  # rows that had begun, without a gap up to the start
     return np.stack([starts - lasts, stops], axis=1)
 
 
-def _free(deviation: AnyFloats, those: Indices, stretches: Indices, horizon: int) -> Bools:
-    """Return which rows (time,) have a forecast that its group holds and are not near a change of ``those``."""
+def _free(deviation: AnyFloats, spans: Indices, stretches: Indices, horizon: int) -> Bools:
+    """Return which rows (time,) have a forecast that its group holds and are not near a change of ``spans``."""
     free: Bools = np.isfinite(deviation)
     free[max(len(free) - horizon, 0) :] = False
     free[:-horizon] &= stretches[horizon:] == stretches[:-horizon]
     early = horizon + round(EARLY_FRACTION * horizon)
-    for onset, stop in those:
+    for onset, stop in spans:
         near = slice(max(onset - early, 0), stop)
         free[near] &= stretches[near] != stretches[onset]
     return free
@@ -242,7 +242,7 @@ def _minutes(rows: Bools, rate_hz: float) -> float:
     return float(rows.sum()) / rate_hz / 60
 
 
-def _check(truth: AnyFloats, horizon: int, *, groups: AnyArray, **others: AnyFloats) -> None:
+def _check(truth: AnyFloats, horizon: int, *, groups: AnyArray, **arrays: AnyFloats) -> None:
     """Refuse what cannot be evaluated."""
     if horizon < 1:
         raise TacpipeError(f"A forecast of {horizon} rows predicts nothing; the horizon must be 1 or more.")
@@ -250,7 +250,7 @@ def _check(truth: AnyFloats, horizon: int, *, groups: AnyArray, **others: AnyFlo
         raise TacpipeError(
             f"Features of {truth.shape} and {len(groups)} group numbers do not fit; there must be one a row."
         )
-    for name, values in others.items():
+    for name, values in arrays.items():
         expected = truth.shape if name == "ahead" else truth.shape[1:]
         if values.shape != expected:
             raise TacpipeError(f"{name} of {values.shape} does not fit features of {truth.shape}; give {expected}.")

@@ -26,7 +26,7 @@ UNCONDITIONAL = (
 )
 COVERAGE, EXAMPLES = "coverage.parquet", "bands.json"
 SHOWN = 2  # recordings whose forecast is drawn with its band
-MOST_ROWS = 600  # of each
+MOST_ROWS = 600  # rows of each
 STEP = 10  # ahead, that is drawn; the last one where the model predicts fewer
 
 
@@ -45,19 +45,19 @@ class Bands:
         if uncertainty is None:
             return
         drawn = _Drawn(forecaster, track) if not trial.seen and len(self.examples) < SHOWN else None
-        found: dict[str, Sums] = {}
-        for some in forecasts(forecaster, track, track.starts(forecaster.context, forecaster.horizon)):
-            for part in _parts(len(some.count)):
-                truth = track.tactile[some.future[part]]
-                for name, predicted in _predicted(forecaster, uncertainty, track, some, part):
+        sums: dict[str, Sums] = {}
+        for forecast in forecasts(forecaster, track, track.starts(forecaster.context, forecaster.horizon)):
+            for part in _parts(len(forecast.count)):
+                truth = track.tactile[forecast.future[part]]
+                for name, predicted in _predicted(forecaster, uncertainty, track, forecast, part):
                     flat = predicted.transpose(0, 2, 1, 3).reshape(-1, truth.shape[1], len(uncertainty.percents))
                     true = truth.transpose(0, 2, 1).reshape(-1, truth.shape[1])
-                    own = Sums.from_predictions(true, flat, uncertainty.errors.levels)
-                    found[name] = found[name] + own if name in found else own
+                    part_sums = Sums.from_predictions(true, flat, uncertainty.errors.levels)
+                    sums[name] = sums[name] + part_sums if name in sums else part_sums
                     if drawn is not None and name == MODEL:
-                        drawn.add(some.now[part], truth, predicted)
-        if found:
-            self.sums[trial.name] = found
+                        drawn.add(forecast.now[part], truth, predicted)
+        if sums:
+            self.sums[trial.name] = sums
             if drawn is not None:
                 self.examples.append(drawn.example(uncertainty.percents))
 
@@ -66,14 +66,17 @@ class Bands:
         uncertainty = self.forecaster.uncertainty
         if uncertainty is None:
             return {}
-        fresh = [one for one in trials if not one.seen and one.name in self.sums]
-        parts = {"known": [one for one in fresh if one.known], "unseen": [one for one in fresh if not one.known]}
+        fresh = [trial for trial in trials if not trial.seen and trial.name in self.sums]
+        parts = {
+            "known": [trial for trial in fresh if trial.known],
+            "unseen": [trial for trial in fresh if not trial.known],
+        }
         if not all(parts.values()):
             parts = {}
-        parts["seen"] = [one for one in trials if one.seen and one.name in self.sums]
-        stated = {"levels": list(uncertainty.percents), **self.forecaster.config.get("quantiles", {})}
+        parts["seen"] = [trial for trial in trials if trial.seen and trial.name in self.sums]
+        described = {"levels": list(uncertainty.percents), **self.forecaster.config.get("quantiles", {})}
         trees = {name: self._tree(part, uncertainty.percents) for name, part in parts.items() if part}
-        return {**stated, **(self._tree(fresh, uncertainty.percents) if fresh else {}), **trees}
+        return {**described, **(self._tree(fresh, uncertainty.percents) if fresh else {}), **trees}
 
     def _tree(self, trials: Sequence[Trial], percents: tuple[int, ...]) -> dict[str, Any]:
         sums_by_unit: dict[
@@ -117,22 +120,22 @@ _COLUMNS = pa.schema(
 )
 
 
-def band(forecaster: Forecaster, track: Track, some: Forecast, part: slice) -> Float32s:
+def band(forecaster: Forecaster, track: Track, forecast: Forecast, part: slice) -> Float32s:
     """Return the model's quantiles (window, step, channel, level) of some of a forecast's windows.
 
     The model must have quantiles.
     """
-    windows = type(some.windows)(*(one[:, part] for one in some.windows))
-    return forecaster.band(windows, track.tactile[some.past[part]], some.count[part])
+    windows = type(forecast.windows)(*(tensor[:, part] for tensor in forecast.windows))
+    return forecaster.band(windows, track.tactile[forecast.past[part]], forecast.count[part])
 
 
 def _predicted(
-    forecaster: Forecaster, uncertainty: Uncertainty, track: Track, some: Forecast, part: slice
+    forecaster: Forecaster, uncertainty: Uncertainty, track: Track, forecast: Forecast, part: slice
 ) -> Iterator[tuple[str, AnyFloats]]:
     """Yield the quantiles (window, step, channel, level) of each predictor."""
-    yield MODEL, band(forecaster, track, some, part)
-    yield UNCONDITIONAL, some.count[part][..., None] + uncertainty.unconditional.transpose(2, 1, 0)
-    last = track.tactile[some.now[part]]
+    yield MODEL, band(forecaster, track, forecast, part)
+    yield UNCONDITIONAL, forecast.count[part][..., None] + uncertainty.unconditional.transpose(2, 1, 0)
+    last = track.tactile[forecast.now[part]]
     yield BASELINE, last[:, None, :, None] + uncertainty.persistence.transpose(2, 1, 0)
 
 
@@ -159,5 +162,8 @@ class _Drawn:
     def example(self, percents: Sequence[int]) -> dict[str, Any]:
         """Return the curves: time in s, what was measured, and each quantile."""
         columns = np.array(self._rows[:MOST_ROWS]).T
-        names = ("t_s", "measured", *(f"q{one}" for one in percents))
-        return {**self._about, **{name: np.round(one, 4).tolist() for name, one in zip(names, columns, strict=True)}}
+        names = ("t_s", "measured", *(f"q{values}" for values in percents))
+        return {
+            **self._about,
+            **{name: np.round(values, 4).tolist() for name, values in zip(names, columns, strict=True)},
+        }

@@ -72,21 +72,21 @@ def _check_unused(forecaster: Forecaster, calibration: Dataset) -> None:
         )
 
 
-def errors_of(forecaster: Forecaster, recordings: Dataset, most: int) -> Errors:
-    """Return the model's errors on at most ``most`` windows of each recording, evenly spread."""
+def errors_of(forecaster: Forecaster, recordings: Dataset, limit: int) -> Errors:
+    """Return the model's errors on at most ``limit`` windows of each recording, evenly spread."""
     check_codec(forecaster.codec_files, recordings.files)
     parts: list[tuple[Any, ...]] = []
     with progress.bar("calibrate", len(recordings.recordings)) as advance:
         for number, (name, shard) in enumerate(sorted(recordings.recordings.items())):
             track = tracks.track(shard, forecaster.codec, forecaster.pose)
             check_rate(track, forecaster)
-            starts = fewer(track.starts(forecaster.context, forecaster.horizon), most)
-            for some in forecasts(forecaster, track, starts):
-                past, truth = track.tactile[some.past], track.tactile[some.future]
+            starts = fewer(track.starts(forecaster.context, forecaster.horizon), limit)
+            for forecast in forecasts(forecaster, track, starts):
+                past, truth = track.tactile[forecast.past], track.tactile[forecast.future]
                 parts.append(
                     (
-                        forecaster.signs(some.windows, past, some.count),
-                        (truth - some.count).transpose(0, 2, 1).astype(np.float32),
+                        forecaster.signs(forecast.windows, past, forecast.count),
+                        (truth - forecast.count).transpose(0, 2, 1).astype(np.float32),
                         (truth - past[:, -1:]).transpose(0, 2, 1).astype(np.float32),
                         np.full(len(past), number),
                     )

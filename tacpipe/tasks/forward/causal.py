@@ -16,7 +16,9 @@ from tacpipe.signals import kinematics
 from tacpipe.tasks.forward import tracks
 from tacpipe.tasks.forward.forecaster import Forecaster
 
-JOINED = 2 * 3 * kinematics.TOOL_SPREAD_M  # by which a hand on the last link may leave its first place on it
+JOINED = (
+    2 * 3 * kinematics.TOOL_SPREAD_M
+)  # largest distance from its first place of a hand that is fixed to the last link
 
 
 class Arm:
@@ -53,8 +55,8 @@ class Arm:
         row = np.concatenate([placed, moved]).astype(np.float32)[None]
         if not self._decided and np.isfinite(row).all():
             self._opposite, self._decided = tracks.is_opposite(row, self._reference), True
-        found: Float32s = (tracks.negated(row) if self._opposite else row)[0]
-        return found
+        aligned: Float32s = (tracks.negated(row) if self._opposite else row)[0]
+        return aligned
 
     def _continuous(self, quaternion: Floats) -> Floats:
         """Return the quaternion (4,) as `rotations.continuous` has it in the whole series."""
@@ -63,16 +65,16 @@ class Arm:
         if self._unit is not None and (unit * self._unit).sum(axis=1)[0] < 0:
             self._sign = -self._sign
         self._unit = unit
-        found: Floats = unit[0] * self._sign + 0.0
-        return found
+        continuous: Floats = unit[0] * self._sign + 0.0
+        return continuous
 
     def _by_differences(self, t_ns: int, placed: Floats) -> Floats:
         if self._before is None:
             return np.zeros(6)
         before_ns, before = self._before
-        both = np.stack([before, placed])
-        found: Floats = kinematics.differences(np.array([before_ns, t_ns]), both[:, :3], both[:, 3:])[1]
-        return found
+        rows = np.stack([before, placed])
+        velocity: Floats = kinematics.differences(np.array([before_ns, t_ns]), rows[:, :3], rows[:, 3:])[1]
+        return velocity
 
     def _by_joints(self, angles: Floats, speeds: Floats, hand_m: Floats) -> Floats | None:
         if not self._carried:
@@ -85,8 +87,8 @@ class Arm:
             self._carried = bool((np.abs(tool_m - self._tool_m) < JOINED).all())
             if not self._carried:
                 return None
-        found: Floats = kinematics.velocity_in(frames, speeds[None], hand_m[None])[0]
-        return found
+        velocity: Floats = kinematics.velocity_in(frames, speeds[None], hand_m[None])[0]
+        return velocity
 
 
 class Rolling:
@@ -113,18 +115,18 @@ class Rolling:
     @property
     def now(self) -> Floats:
         """The levels above rest (channel,) of the newest row."""
-        found: Floats = self._levels[-1]
-        return found
+        levels: Floats = self._levels[-1]
+        return levels
 
     @property
     def arm(self) -> Float32s:
         """The arm (13,) in the newest row."""
-        found: Float32s = self._arm[-1]
-        return found
+        row: Float32s = self._arm[-1]
+        return row
 
     @property
     def is_ready(self) -> bool:
-        """Whether there are as many usable rows in a row as the model reads."""
+        """True if the newest rows are usable, as many as the model reads."""
         return self._run >= self._forecaster.context
 
     def add(self, level: Floats, arm: Float32s, finger: float, *, follows: bool, encodes: bool, usable: bool) -> bool:
@@ -137,35 +139,35 @@ class Rolling:
         self._levels[-1], self._begins[-1] = level, not encodes
         self._past[:-1] = self._past[1:]
         self._past[-1:] = level
-        kept = min(self._rows + 1, len(self._levels))
+        count = min(self._rows + 1, len(self._levels))
         self._rows += 1
         codec = self._forecaster.codec
-        begins = self._begins[-kept:].copy()
+        begins = self._begins[-count:].copy()
         begins[0] = True
-        latent = codec.encode(self._levels[-kept:], codec.channels, begins)[-1]
+        latent = codec.encode(self._levels[-count:], codec.channels, begins)[-1]
         for kept_rows, newest in ((self._latent, latent), (self._arm, arm), (self._finger, finger)):
             kept_rows[:-1] = kept_rows[1:]
             kept_rows[-1] = newest
         finite = bool(np.isfinite(level).all() and np.isfinite(latent).all() and np.isfinite(arm).all())
         finite = finite and bool(np.isfinite(finger))
-        known = self._rows > self._unknown
-        self._run = (self._run + 1 if follows else 1) if usable and finite and known else 0
+        is_decided = self._rows > self._unknown
+        self._run = (self._run + 1 if follows else 1) if usable and finite and is_decided else 0
         return finite
 
     def predict(self, plan: AnyFloats) -> Float32s:
         """Return the levels above rest (horizon, channel) that are predicted with the arm's planned rows (horizon, 13)."""
         features = self._forecaster.single.features(self._windows(plan))
         levels = self._forecaster.decoded(features, self._levels[None, -1], self._latent[None, -1])
-        found: Float32s = levels[0].astype(np.float32)
-        return found
+        predicted: Float32s = levels[0].astype(np.float32)
+        return predicted
 
     def band(self, plan: AnyFloats, ahead: Float32s) -> Float32s:
         """Return all quantiles (horizon, channel, level) of what `predict` returned for the same ``plan``.
 
         The model must have quantiles.
         """
-        found: Float32s = self._forecaster.band(self._windows(plan), self._past[None], ahead[None])[0]
-        return found
+        quantiles: Float32s = self._forecaster.band(self._windows(plan), self._past[None], ahead[None])[0]
+        return quantiles
 
     def _windows(self, plan: AnyFloats) -> Windows:
         """Return the rows that are read, and the arm's planned ones, as one window."""

@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
 
 
-KEPT_BYTES = 1 << 24  # of predictions in memory, before they are put aside on disk
-STORED_STEPS = (1, 3, 5, 10)  # whose predictions are stored; 3, 5 and 10 are those of the paper's figures
+KEPT_BYTES = 1 << 24  # size of predictions in memory; larger ones go to disk
+STORED_STEPS = (1, 3, 5, 10)  # steps whose predictions are stored; 3, 5 and 10 are those of the paper's figures
 
 
 def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
@@ -46,22 +46,24 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
     """
     forecaster = Forecaster.load(model)
     check_codec(model, recordings.files)
-    known, objects = set(forecaster.config["trained_on"].values()), set(forecaster.config["objects"])
-    trials, kept = [], {}
+    seen_digests, objects = set(forecaster.config["trained_on"].values()), set(forecaster.config["objects"])
+    trials, outputs = [], {}
     loads, bands = Loads(forecaster.codec.layout, forecaster.horizon), Bands(forecaster)
     slipping = SlipAlarms.of(forecaster)
-    apart, spill = BySituation(forecaster.horizon, len(forecaster.codec.channels)), Spill(KEPT_BYTES)
+    by_situation, spill = BySituation(forecaster.horizon, len(forecaster.codec.channels)), Spill(KEPT_BYTES)
     with progress.bar("evaluate", len(recordings.recordings)) as advance:
         for name, shard in sorted(recordings.recordings.items()):
             track = tracks.track(shard, forecaster.codec, forecaster.pose)
             check_rate(track, forecaster)
-            trial = Trial(name, shard.digest in known, track.object, track.object is None or track.object in objects)
+            trial = Trial(
+                name, shard.digest in seen_digests, track.object, track.object is None or track.object in objects
+            )
             attributes = {**shard.attributes, "seen": trial.seen}
             if not trial.seen:
                 loads.begin(track)
                 slipping.begin(track)
-            rows = _predictions(forecaster, track, trial, (loads, slipping), apart, spill)
-            kept[name] = RecordingOutput(rows, attributes)
+            rows = _predictions(forecaster, track, trial, (loads, slipping), by_situation, spill)
+            outputs[name] = RecordingOutput(rows, attributes)
             trials.append(trial)
             bands.add(track, trial)
             del track
@@ -72,10 +74,10 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
         tree["anticipation"] = warned
     if led := slipping.scored():
         tree["slips"] = led
-    if found := apart.summary():
-        tree["situations"] = found
-    if stated := bands.summary(trials):
-        tree["quantiles"] = stated
+    if situations_tree := by_situation.summary():
+        tree["situations"] = situations_tree
+    if quantiles := bands.summary(trials):
+        tree["quantiles"] = quantiles
     method = f"{forecaster.config['architecture']} · {forecaster.config['codec']['name']}"
     files = {
         headline.FILE: headline.write(
@@ -88,7 +90,7 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
         **bands.files(trials),
         **{name: model[name] for name in (CONFIG, HISTORY, codecs.DESCRIPTION) if name in model},
     }
-    return Result(kept, files, look_ahead_notes(forecaster.config))
+    return Result(outputs, files, look_ahead_notes(forecaster.config))
 
 
 def _predictions(
@@ -96,34 +98,34 @@ def _predictions(
     track: Track,
     trial: Trial,
     alarms: tuple[Loads, SlipAlarms],
-    apart: BySituation,
+    by_situation: BySituation,
     spill: Spill,
 ) -> pa.Table | pa.RecordBatchReader:
     """Return the predictions for all windows of a recording, put aside in ``spill``; its errors are added to ``trial``.
 
     Where the model has not seen it, what alarms look at is added to ``alarms``, which the recording was begun in, and its
-    errors by situation to ``apart``. Some windows are in memory at a time, and of each one of the predictors.
+    errors by situation to ``by_situation``. Some windows are in memory at a time, and of each one of the predictors.
     """
     loads, slipping = alarms
     starts = track.starts(forecaster.context, forecaster.horizon)
     steps = [step for step in STORED_STEPS if step <= forecaster.horizon]
     none = np.zeros((len(steps), len(forecaster.codec.latents), 0), np.float32)
     gathered = Gathered(spill, _prediction_table(forecaster, track, starts[:0], steps, none))
-    for some in predicted(forecaster, track, starts):
-        trial.windows += len(some.now)
-        doing = situations.of_windows(track, some.now, forecaster.horizon)
+    for windows in predicted(forecaster, track, starts):
+        trial.windows += len(windows.now)
+        doing = situations.of_windows(track, windows.now, forecaster.horizon)
         if not trial.seen:
-            apart.count(trial.name, doing)
-        present = track.tactile[some.now]
-        for name, prediction in some.predictions.items():
-            trial.add_errors(name, prediction, some.truth, forecaster.feature_half)
+            by_situation.count(trial.name, doing)
+        present = track.tactile[windows.now]
+        for name, prediction in windows.predictions.items():
+            trial.add_errors(name, prediction, windows.truth, forecaster.feature_half)
             if not trial.seen:
-                loads.add_one(name, some.now, prediction)
-                slipping.add_one(name, some.now, present, prediction.count)
-                apart.add(trial.name, doing, name, prediction, some.truth)
-        stored = some.features[:, [step - 1 for step in steps]].transpose(1, 2, 0).astype(np.float32)
-        gathered.add(_prediction_table(forecaster, track, some.now, steps, np.ascontiguousarray(stored)))
-        del some, stored  # before the next ones are made
+                loads.add_one(name, windows.now, prediction)
+                slipping.add_one(name, windows.now, present, prediction.count)
+                by_situation.add(trial.name, doing, name, prediction, windows.truth)
+        stored = windows.features[:, [step - 1 for step in steps]].transpose(1, 2, 0).astype(np.float32)
+        gathered.add(_prediction_table(forecaster, track, windows.now, steps, np.ascontiguousarray(stored)))
+        del windows, stored  # frees the memory for the next windows
     return gathered.rows()
 
 
@@ -158,9 +160,9 @@ def check_rate(track: Track, forecaster: Forecaster) -> None:
             f"{track.name} has a {track.timeline} grid and the model was trained on a {trained} one, so a step is "
             f"another time. Synchronize it with {option}."
         )
-    found = tracks.rate_hz([track]) if trained == "uniform" else 0.0
-    if found and rate_hz and abs(found - rate_hz) > 0.01 * rate_hz:
+    track_rate_hz = tracks.rate_hz([track]) if trained == "uniform" else 0.0
+    if track_rate_hz and rate_hz and abs(track_rate_hz - rate_hz) > 0.01 * rate_hz:
         raise TacpipeError(
-            f"{track.name} has {found:g} rows a second and the model was trained at {rate_hz:g}. "
+            f"{track.name} has {track_rate_hz:g} rows a second and the model was trained at {rate_hz:g}. "
             f"Synchronize it with {option}."
         )

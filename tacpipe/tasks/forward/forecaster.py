@@ -49,7 +49,7 @@ NEEDED: dict[str, model_files.Kind] = {
     **dict.fromkeys(("scaling.feature_half", "scaling.channel_count"), list),
     **dict.fromkeys(("params", "trained_on"), dict),
     "rate_hz": float,
-    "largest_level": (float, model_files.NONE),  # which older models lack
+    "largest_level": (float, model_files.NONE),  # absent from older models
 }
 CONFIG, WEIGHTS, BASELINES = "config.json", "model.safetensors", "baselines.safetensors"
 SHRINKAGE = "shrinkage"  # tensor of the weights file, (horizon,): see `Shrunk`; models of levels and older ones lack it
@@ -69,12 +69,12 @@ class Forecaster:
 
     model: nn.Module
     params: Params
-    config: Config  # as it is stored
+    config: Config  # the stored configuration
     codec: codecs.Codec
     baselines: Baselines | None
     codec_files: Mapping[str, bytes] = field(default_factory=dict)
     chain: Chain | None = None  # the stages that it was trained behind; None: unknown
-    uncertainty: Uncertainty | None = None  # of a model that `tacpipe calibrate` made
+    uncertainty: Uncertainty | None = None  # present if `tacpipe calibrate` made the model
 
     @property
     def context(self) -> int:
@@ -88,7 +88,7 @@ class Forecaster:
 
     @property
     def actions(self) -> str:
-        """What it reads of the plan: planned, none or shuffled."""
+        """The part of the plan that it reads: planned, none or shuffled."""
         return self.params.actions
 
     @property
@@ -99,8 +99,8 @@ class Forecaster:
     @property
     def pose(self) -> Pose:
         """The columns of the arm that it was trained on; none where it was trained without one."""
-        found = self.config["inputs"].get("pose")
-        return NAMED if found is None else Pose(tuple(found["position"]), tuple(found["orientation"]))
+        stored_pose = self.config["inputs"].get("pose")
+        return NAMED if stored_pose is None else Pose(tuple(stored_pose["position"]), tuple(stored_pose["orientation"]))
 
     @property
     def window_columns(self) -> tuple[str, ...]:
@@ -140,12 +140,12 @@ class Forecaster:
 
     @property
     def predicts_change(self) -> bool:
-        """Whether it predicts what is added to the last row, rather than levels."""
+        """True if it predicts the change since the last row, rather than levels."""
         return bool(self.model.change_only)
 
     @property
     def lossy(self) -> bool:
-        """Whether its features are levels that a codec made, so that the last row too comes back as another."""
+        """True if its features are levels from a codec, which changes the last row too."""
         return self.codec.kind != "raw" and self.codec.representation != INCREMENTS
 
     @property
@@ -161,8 +161,8 @@ class Forecaster:
     @property
     def largest_level(self) -> float | None:
         """The largest 95th percentile over channels of counts from rest, over training rows; None in an older model."""
-        found = self.config.get("largest_level")
-        return None if found is None else float(found)
+        level = self.config.get("largest_level")
+        return None if level is None else float(level)
 
     @classmethod
     def load(cls, files: Mapping[str, bytes], chain: Chain | None = None) -> Self:
@@ -184,16 +184,16 @@ class Forecaster:
         model = model_files.filled(lambda: networks.build(params, codec), tensors)
         with model_files.validated("the model"):
             model = model if shrinkage is None else Shrunk(model, shrinkage)
-            found = model_files.arrays(files[BASELINES], BASELINES) if BASELINES in files else None
+            baseline_arrays = model_files.arrays(files[BASELINES], BASELINES) if BASELINES in files else None
             codec_files = (
                 {} if codec.kind == "raw" else {name: files[name] for name in (codecs.DESCRIPTION, codecs.TENSORS)}
             )
-            baselines = None if found is None else Baselines.from_tensors(found)
+            baselines = None if baseline_arrays is None else Baselines.from_tensors(baseline_arrays)
             sizes = len(codec.channels), params.horizon
             uncertainty = Uncertainty.load(files[QUANTILES], *sizes) if QUANTILES in files else None
-            made = cls(model.eval(), params, config, codec, baselines, codec_files, chain, uncertainty)
-            made._try()
-        return made
+            forecaster = cls(model.eval(), params, config, codec, baselines, codec_files, chain, uncertainty)
+            forecaster._try()
+        return forecaster
 
     def _try(self) -> None:
         """Predict a window of zeros, and raise where a part does not fit another."""
@@ -214,7 +214,7 @@ class Forecaster:
             parts = (np.zeros((self.context, 1, 1)), np.zeros((arm.shape[1], 1, ARM)), np.zeros((self.context, 1)))
             moved = motion(Windows(*(torch.from_numpy(part.astype(np.float32)) for part in parts)))[0]
             predicted = self.baselines.predict(touch, moved.transpose(0, 1).numpy())
-            if any(one.shape != (1, self.horizon, touch.shape[2]) for one in predicted.values()):
+            if any(values.shape != (1, self.horizon, touch.shape[2]) for values in predicted.values()):
                 raise ValueError("the baselines predict another number of steps or channels")
 
     def predict_windows(self, window: AnyFloats, plan: AnyFloats) -> AnyFloats:
@@ -238,9 +238,9 @@ class Forecaster:
         touch, arm, finger = self._parts(*((window[None], plan[None]) if single else (window, plan)))
         self._check_levels(touch)
         ahead = self._of_arrays(touch, arm, finger)
-        read = Windows(*(torch.from_numpy(one.swapaxes(0, 1)) for one in (touch, arm, finger)))
-        found = self.band(read, touch[:, -self.context :], ahead)[..., at]
-        return found[0] if single else found
+        read = Windows(*(torch.from_numpy(array.swapaxes(0, 1)) for array in (touch, arm, finger)))
+        quantiles = self.band(read, touch[:, -self.context :], ahead)[..., at]
+        return quantiles[0] if single else quantiles
 
     def signs(self, windows: Windows, past: AnyFloats, ahead: AnyFloats) -> Float32s:
         """Return what states how uncertain the forecast ``ahead`` (window, step, channel) is: `uncertainty.window_signs`
@@ -259,7 +259,9 @@ class Forecaster:
         """Return the future tactile signals (window, horizon, channel) of what `_parts` returns."""
         flat = self.codec.encode(touch.reshape(-1, touch.shape[-1]), self.codec.channels, _begins(touch))
         latent = flat.reshape(*touch.shape[:2], -1)
-        read = Windows(*(torch.from_numpy(np.ascontiguousarray(one.swapaxes(0, 1))) for one in (latent, arm, finger)))
+        read = Windows(
+            *(torch.from_numpy(np.ascontiguousarray(array.swapaxes(0, 1))) for array in (latent, arm, finger))
+        )
         return self.decoded(self.features(read), touch[:, -1], latent[:, -1])
 
     def _check_levels(self, touch: AnyFloats) -> None:
@@ -271,11 +273,12 @@ class Forecaster:
                 stacklevel=4,
             )
             return
-        found = np.median(np.abs(touch), axis=(1, 2))  # (window,)
-        wrong = np.flatnonzero(found > FARTHEST * largest)
+        medians = np.median(np.abs(touch), axis=(1, 2))  # (window,)
+        wrong = np.flatnonzero(medians > FARTHEST * largest)
         if largest > 0 and len(wrong):
             raise TacpipeError(
-                f"Window {wrong[0]} holds counts of {found[wrong[0]]:.0f} in the median of its channels; in training hardly "
+                f"Window {wrong[0]} holds counts of {medians[wrong[0]]:.0f} in the median of its channels; in "
+                f"training hardly "
                 f"a channel was further from rest than {largest:.0f}. Subtract each channel's level at rest, as "
                 f"model.windows(recording) does."
             )
@@ -327,19 +330,19 @@ class Forecaster:
             raise TacpipeError(
                 f"There are {len(window)} windows and {len(plan)} plans; each window needs its own plan."
             )
-        whole = window.shape[2] == channels + posed + derived + 1
-        if derived and whole != (plan.shape[2] == posed + derived):
+        has_velocities = window.shape[2] == channels + posed + derived + 1
+        if derived and has_velocities != (plan.shape[2] == posed + derived):
             raise TacpipeError("Window and plan must both hold velocities, or neither.")
-        finger = window[..., -1] if whole else np.zeros(window.shape[:2])
+        finger = window[..., -1] if has_velocities else np.zeros(window.shape[:2])
         arm = np.concatenate([window[..., channels : channels + plan.shape[2]], plan], axis=1)
-        arm = np.stack([self._arm(_posed(one, posed), whole and derived > 0) for one in arm])
+        arm = np.stack([self._arm(_posed(rows, posed), has_velocities and derived > 0) for rows in arm])
         touch = np.ascontiguousarray(window[..., :channels], dtype=np.float32)
         return touch, arm.astype(np.float32), finger.astype(np.float32)
 
-    def _arm(self, rows: AnyFloats, whole: bool) -> AnyFloats:
+    def _arm(self, rows: AnyFloats, has_velocities: bool) -> AnyFloats:
         """Return the arm's rows (row, 13) with velocities, and quaternions of the sign that the model was trained on."""
         rows = np.hstack([rows[:, :3], continuous(rows[:, 3:POSE].astype(np.float64)), rows[:, POSE:]])
-        if not whole:
+        if not has_velocities:
             t_ns = np.rint(np.arange(len(rows)) * 1e9 / self.config["rate_hz"]).astype(np.int64)
             rows = np.hstack([rows, kinematics.differences(t_ns, rows[:, :3], rows[:, 3:])])
         return tracks.aligned(rows, self.orientation)
@@ -349,9 +352,9 @@ def _posed(rows: AnyFloats, columns: int) -> AnyFloats:
     """Return the rows of an arm with the 7 columns of a pose, where the first ``columns`` are those that are there."""
     if columns == POSE:
         return rows
-    rest = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (len(rows), 1))
-    rest[:, :columns] = rows[:, :columns]
-    return np.hstack([rest, rows[:, columns:]])
+    pose = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (len(rows), 1))
+    pose[:, :columns] = rows[:, :columns]
+    return np.hstack([pose, rows[:, columns:]])
 
 
 def layout(codec: codecs.Codec) -> Sequence[Mapping[str, str]]:

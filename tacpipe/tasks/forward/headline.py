@@ -114,7 +114,7 @@ def headline(
 
     ``unit`` is that of the mean absolute errors. The interval is over ``objects``, by recording, where these are given.
     """
-    compared = {name: one for name, one in baselines.items() if legitimate(name)}
+    compared = {name: sums_of_baseline for name, sums_of_baseline in baselines.items() if legitimate(name)}
     cluster = OBJECTS if objects else RECORDINGS
     return pairing.headline(
         TASK, method, measure(steps, unit, cluster), model, compared, part=PARTS[part], clusters=objects, runs=runs
@@ -125,11 +125,11 @@ def measure(steps: Sequence[int], unit: str = COUNTS, cluster: str = RECORDINGS)
     """Return how `sums` at some steps become errors; ``unit`` is that of the mean absolute ones."""
     ahead = [f"t+{step}" for step in steps]
 
-    def error(found: AnyFloats) -> AnyFloats:
-        return 1 - Parts.of_sums(found).mean_skill
+    def error(sums: AnyFloats) -> AnyFloats:
+        return 1 - Parts.of_sums(sums).mean_skill
 
-    def values(found: AnyFloats) -> tuple[float, ...]:
-        parts = Parts.of_sums(found)
+    def values(sums: AnyFloats) -> tuple[float, ...]:
+        parts = Parts.of_sums(sums)
         mae = parts.absolute / parts.values if parts.values else np.full(len(steps), np.nan)
         return (*map(float, mae), float(parts.squared_skill), float(parts.mean_skill))
 
@@ -145,7 +145,7 @@ def measure(steps: Sequence[int], unit: str = COUNTS, cluster: str = RECORDINGS)
         error,
         intervals.skill,
         values,
-        lambda found: 1 - found,
+        lambda errors: 1 - errors,
         "skill over persistence",
         rises=True,
         weight=lambda draws: Parts.of_sums(draws).counted.sum(axis=1),

@@ -22,11 +22,11 @@ def loads(counts: Any, layout: Sequence[Mapping[str, str]]) -> AnyFloats:
     >>> loads(np.array([[1.0, 3.0, 7.0]]), layout).tolist()
     [[2.0, 7.0]]
     """
-    places = [_axis(one) for one in layout]
+    places = [_axis(channel) for channel in layout]
     return np.stack(
         [
-            counts[:, [index for index, place in enumerate(places) if place == wanted]].mean(axis=1)
-            for wanted in axes(layout)
+            counts[:, [index for index, place in enumerate(places) if place == load_axis]].mean(axis=1)
+            for load_axis in axes(layout)
         ],
         axis=1,
     )

@@ -52,7 +52,7 @@ class Errors:
     count_absolute: AnyFloats
 
     @classmethod
-    def of(cls, predicted: Prediction, truth: Prediction, feature_half: AnyFloats) -> Errors:
+    def from_predictions(cls, predicted: Prediction, truth: Prediction, feature_half: AnyFloats) -> Errors:
         """Return the errors of ``predicted``; ``feature_half`` (feature,) is what the paper's scaling divides by."""
         latent = feature = None
         if predicted.latent is not None and truth.latent is not None:
@@ -65,12 +65,12 @@ class Errors:
             forecast.absolute_sums(predicted.count, truth.count),
         )
 
-    def __add__(self, other: Errors) -> Errors:
+    def __add__(self, further: Errors) -> Errors:
         """Return the errors over the windows of both."""
 
         def summed(name: str) -> Any:
-            one, another = getattr(self, name), getattr(other, name)
-            return None if one is None else one + another
+            first, second = getattr(self, name), getattr(further, name)
+            return None if first is None else first + second
 
         return Errors(*(summed(name) for name in self.__dataclass_fields__))
 
@@ -80,9 +80,9 @@ class Trial:
     """The errors on one recording by predictor; empty where it holds no window."""
 
     name: str
-    seen: bool  # in training or validation of the model
+    seen: bool  # True if the model was trained or validated on the recording
     object: str | None = None
-    known: bool = True  # whether the model was trained on recordings of the same object, or no label names the object
+    known: bool = True  # True if the model was trained on the same object, or no label names the object
     windows: int = 0
     errors: dict[str, Errors] = field(default_factory=dict)
 
@@ -94,18 +94,18 @@ class Trial:
 
     def add_errors(self, name: str, predicted: Prediction, truth: Prediction, feature_half: AnyFloats) -> None:
         """Add the errors of one predictor on some windows, which are counted apart."""
-        found = Errors.of(predicted, truth, feature_half)
-        self.errors[name] = self.errors[name] + found if name in self.errors else found
+        errors = Errors.from_predictions(predicted, truth, feature_half)
+        self.errors[name] = self.errors[name] + errors if name in self.errors else errors
 
 
 def channel_groups(layout: Sequence[Mapping[str, str]]) -> dict[str, Bools]:
     """Return masks (channel,) for both sensors together, each sensor (``sensor1``… in order of columns) and each axis."""
     groups = {"both": np.ones(len(layout), dtype=bool)}
-    streams = list(dict.fromkeys(one["stream"] for one in layout if "stream" in one))
+    streams = list(dict.fromkeys(channel["stream"] for channel in layout if "stream" in channel))
     for number, stream in enumerate(streams, 1):
-        groups[f"sensor{number}"] = np.array([one.get("stream") == stream for one in layout])
-    for axis in sorted({one["axis"] for one in layout if "axis" in one}):
-        groups[axis] = np.array([one.get("axis") == axis for one in layout])
+        groups[f"sensor{number}"] = np.array([channel.get("stream") == stream for channel in layout])
+    for axis in sorted({channel["axis"] for channel in layout if "axis" in channel}):
+        groups[axis] = np.array([channel.get("axis") == axis for channel in layout])
     return groups
 
 
@@ -115,11 +115,14 @@ def summary(trials: Sequence[Trial], groups: Masks, horizon: int, channel_scale:
     Recordings that the model has not seen are at the top, and under ``known`` and ``unseen`` once more those of objects
     that it was trained on and of others, where there are both; those that it has seen are under ``seen``.
     """
-    fresh = [one for one in trials if not one.seen]
-    parts = {"known": [one for one in fresh if one.known], "unseen": [one for one in fresh if not one.known]}
+    fresh = [trial for trial in trials if not trial.seen]
+    parts = {
+        "known": [trial for trial in fresh if trial.known],
+        "unseen": [trial for trial in fresh if not trial.known],
+    }
     if not all(parts.values()):
         parts = {}
-    parts["seen"] = [one for one in trials if one.seen]
+    parts["seen"] = [trial for trial in trials if trial.seen]
     tree = _summary(fresh, groups, horizon, channel_scale)
     return tree | {name: _summary(part, groups, horizon, channel_scale) for name, part in parts.items() if part}
 
@@ -129,31 +132,31 @@ def headline(method: str, trials: Sequence[Trial], horizon: int, unit: str = COU
 
     Where nobody named an object, all are taken together.
     """
-    fresh = [one for one in trials if not one.seen and one.windows]
+    fresh = [trial for trial in trials if not trial.seen and trial.windows]
     steps = headlines.shown(range(1, horizon + 1))
     at = [step - 1 for step in steps]
 
     def sums(predictor: str, chosen: Sequence[Trial]) -> dict[tuple[Any, str], AnyFloats]:
-        found: dict[tuple[Any, str], AnyFloats] = {}
-        for one in chosen:
+        sums_by_recording: dict[tuple[Any, str], AnyFloats] = {}
+        for trial in chosen:
             errors, persistence = (
                 (sums.count_squared.sum(axis=1)[at], sums.count_absolute.sum(axis=1)[at])
-                for sums in (one.errors[predictor], one.errors[BASELINE])
+                for sums in (trial.errors[predictor], trial.errors[BASELINE])
             )
-            channels = one.errors[predictor].count_squared.shape[1]
-            found[0, one.name] = headlines.sums(errors, persistence, one.windows * channels)
-        return found
+            channels = trial.errors[predictor].count_squared.shape[1]
+            sums_by_recording[0, trial.name] = headlines.sums(errors, persistence, trial.windows * channels)
+        return sums_by_recording
 
-    named = any(one.object is not None for one in fresh)
-    found = []
-    for part in (True, False) if named else (None,):
-        chosen = [one for one in fresh if part is None or one.known == part]
+    has_objects = any(trial.object is not None for trial in fresh)
+    headlines_found = []
+    for part in (True, False) if has_objects else (None,):
+        chosen = [trial for trial in fresh if part is None or trial.known == part]
         names = [name for name in (chosen[0].errors if chosen else ()) if name != MODEL]
-        others = {name: sums(name, chosen) for name in names}
+        baselines = {name: sums(name, chosen) for name in names}
         objects = {trial.name: str(trial.object) for trial in chosen} if part is False else None
-        result = headlines.headline(method, steps, sums(MODEL, chosen), others, part, unit=unit, objects=objects)
-        found += [result] if result else []
-    return found
+        result = headlines.headline(method, steps, sums(MODEL, chosen), baselines, part, unit=unit, objects=objects)
+        headlines_found += [result] if result else []
+    return headlines_found
 
 
 def horizons_csv(tree: Tree, rate_hz: float) -> bytes:
@@ -181,15 +184,15 @@ def errors_parquet(trials: Sequence[Trial], groups: Masks, channel_scale: AnyFlo
     training; ``feature`` and ``latent``, the representation's own, scaled as the paper does and not.
     """
     columns: dict[str, list[Any]] = {name: [] for name in _COLUMNS.names}
-    for one in trials:
-        for predictor, errors in one.errors.items():
+    for trial in trials:
+        for predictor, errors in trial.errors.items():
             for group, squared, absolute, channels in _pooled(errors, groups, channel_scale):
                 steps = len(squared)
-                row = (one.name, one.object, one.known, one.seen, predictor, group)
+                row = (trial.name, trial.object, trial.known, trial.seen, predictor, group)
                 for name, value in zip(columns, row, strict=False):
                     columns[name] += [value] * steps
                 columns["step"] += range(1, steps + 1)
-                columns["windows"] += [one.windows] * steps
+                columns["windows"] += [trial.windows] * steps
                 columns["channels"] += [channels] * steps
                 columns["squared"] += [_rounded(value) for value in squared]
                 columns["absolute"] += [None if value is None else _rounded(value) for value in absolute]
@@ -215,15 +218,21 @@ def _pooled(errors: Errors, groups: Masks, channel_scale: AnyFloats) -> Iterator
 def trials_csv(trials: Sequence[Trial]) -> bytes:
     """Return one line a recording: windows, mean absolute error of model and persistence in counts, and skill."""
     rows = []
-    for one in trials:
+    for trial in trials:
         errors: list[float | str] = ["", "", ""]
-        if one.windows:
-            model, baseline = (float(one.errors[name].count_absolute.mean()) for name in (MODEL, BASELINE))
+        if trial.windows:
+            model, baseline = (float(trial.errors[name].count_absolute.mean()) for name in (MODEL, BASELINE))
             gain = float(intervals.skill(np.array([model]), np.array([baseline]))[0])
-            values = (model / one.windows, baseline / one.windows, gain)
+            values = (model / trial.windows, baseline / trial.windows, gain)
             errors = [_rounded(value) if math.isfinite(value) else "" for value in values]
         rows.append(
-            (one.name, one.object or "", *(str(flag).lower() for flag in (one.known, one.seen)), one.windows, *errors)
+            (
+                trial.name,
+                trial.object or "",
+                *(str(flag).lower() for flag in (trial.known, trial.seen)),
+                trial.windows,
+                *errors,
+            )
         )
     return _csv(
         ("recording", "object", "known", "seen", "windows", "mae_counts_model", "mae_counts_persistence", "skill"), rows
@@ -232,34 +241,34 @@ def trials_csv(trials: Sequence[Trial]) -> bytes:
 
 def _summary(trials: Sequence[Trial], groups: Masks, horizon: int, channel_scale: AnyFloats) -> Tree:
     """Return errors of each predictor, skill and counts over the recordings that hold windows."""
-    held = [one for one in trials if one.windows]
-    windows = np.array([one.windows for one in held], dtype=np.int64)
+    evaluated = [item for item in trials if item.windows]
+    windows = np.array([item.windows for item in evaluated], dtype=np.int64)
     counts = {
         "windows": int(windows.sum()),
-        "recordings": len(held),
-        "recordings_without_window": len(trials) - len(held),
-        "effective_windows": int(windows.sum()) // horizon,  # as many would fit without overlap of their horizons
+        "recordings": len(evaluated),
+        "recordings_without_window": len(trials) - len(evaluated),
+        "effective_windows": int(windows.sum()) // horizon,  # number that fits without overlap of their horizons
     }
     tree: Tree = {"counts": counts}
-    for name in held[0].errors if held else ():
-        errors = [one.errors[name] for one in held]
-        squared = np.stack([one.count_squared for one in errors])  # (recording, step, channel)
+    for name in evaluated[0].errors if evaluated else ():
+        errors = [item.errors[name] for item in evaluated]
+        squared = np.stack([item.count_squared for item in errors])  # (recording, step, channel)
         tree[name] = {
             "mse_counts": _grouped(squared, windows, groups),
-            "mae_counts": _grouped(np.stack([one.count_absolute for one in errors]), windows, groups),
+            "mae_counts": _grouped(np.stack([item.count_absolute for item in errors]), windows, groups),
             "mse_standard": _steps(squared / channel_scale**2, windows),
         }
-        for name_of, kept in (("mse_latent", "latent_squared"), ("mse_feature", "feature_squared")):
-            if getattr(errors[0], kept) is not None:
-                tree[name][name_of] = _steps(np.stack([getattr(one, kept) for one in errors]), windows)
-    if held:
-        units = np.array([trial.name if trial.known else trial.object for trial in held])
+        for name_of, attribute in (("mse_latent", "latent_squared"), ("mse_feature", "feature_squared")):
+            if getattr(errors[0], attribute) is not None:
+                tree[name][name_of] = _steps(np.stack([getattr(item, attribute) for item in errors]), windows)
+    if evaluated:
+        units = np.array([trial.name if trial.known else trial.object for trial in evaluated])
         kinds = {"mse_counts": "count_squared", "mae_counts": "count_absolute", "mse_feature": "feature_squared"}
         tree["skill"] = {
-            name_of: _intervals(_by_step(held, MODEL, kept), _by_step(held, BASELINE, kept), units)
-            for name_of, kept in kinds.items()
+            name_of: _intervals(_by_step(evaluated, MODEL, attribute), _by_step(evaluated, BASELINE, attribute), units)
+            for name_of, attribute in kinds.items()
         }
-        model, persistence = (_by_step(held, name, "count_absolute") for name in (MODEL, BASELINE))
+        model, persistence = (_by_step(evaluated, name, "count_absolute") for name in (MODEL, BASELINE))
         tree["skill"][headlines.GEOMETRIC] = _geometric_skill(model, persistence, units)
     return tree
 
@@ -275,31 +284,31 @@ def _grouped(sums: AnyFloats, windows: Int64s, groups: Masks) -> Tree:
     return {name: _steps(sums[:, :, mask], windows) for name, mask in groups.items()}
 
 
-def _by_step(trials: Sequence[Trial], predictor: str, kept: str) -> AnyFloats:
+def _by_step(trials: Sequence[Trial], predictor: str, attribute: str) -> AnyFloats:
     """Return one kind of a predictor's error sums over all channels, shape (recording, step)."""
-    return np.stack([getattr(one.errors[predictor], kept).sum(axis=1) for one in trials])
+    return np.stack([getattr(trial.errors[predictor], attribute).sum(axis=1) for trial in trials])
 
 
 def _intervals(model: AnyFloats, baseline: AnyFloats, clusters: AnyArray) -> Tree:
     """Return skill with its interval over clusters by step and over all, from sums (recording, step); undefined left out."""
     wide = [np.hstack([sums, sums.sum(axis=1, keepdims=True)]) for sums in (model, baseline)]  # (recording, step + 1)
-    return _named(intervals.skill_interval(wide[0], wide[1], clusters))
+    return _intervals_by_step(intervals.skill_interval(wide[0], wide[1], clusters))
 
 
 def _geometric_skill(model: AnyFloats, baseline: AnyFloats, clusters: AnyArray) -> Tree:
     """Return skill by the geometric mean of ratios of absolute errors (recording, step), as `_named` does."""
     wide = [np.hstack([sums, sums.sum(axis=1, keepdims=True)]) for sums in (model, baseline)]
-    return _named(intervals.geometric_skill_interval(wide[0], wide[1], clusters))
+    return _intervals_by_step(intervals.geometric_skill_interval(wide[0], wide[1], clusters))
 
 
-def _named(interval: Interval) -> Tree:
+def _intervals_by_step(interval: Interval) -> Tree:
     """Return values with their intervals by step and over all; what is not defined is left out."""
     names = [f"t{step}" for step in range(1, len(interval.mean))] + ["mean"]
     tree: Tree = {}
     for index, name in enumerate(names):
         ends = {part: float(getattr(interval, part)[index]) for part in ("mean", "low", "high")}
         tree[name] = {part: _rounded(value) for part, value in ends.items() if math.isfinite(value)}
-    return {name: one for name, one in tree.items() if one}
+    return {name: ends for name, ends in tree.items() if ends}
 
 
 def _rounded(value: float) -> float:

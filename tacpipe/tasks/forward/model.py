@@ -1,4 +1,4 @@
-"""What `tacpipe.load` returns for a model of the task ``forward``: it predicts for recordings and for arrays."""
+"""Predict for recordings and for arrays: the model of the task ``forward`` that `tacpipe.load` returns."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class ForwardModel(Forecaster):
 
     def predict(
         self,
-        given: Dataset | Recording | AnyFloats,
+        data: Dataset | Recording | AnyFloats,
         plan: AnyFloats | None = None,
         /,
         *,
@@ -62,9 +62,9 @@ class ForwardModel(Forecaster):
         `largest_level` goes unnoticed. A model without `largest_level` skips this check with a warning.
         """
         if plan is not None:
-            window = cast("AnyFloats", given)
+            window = cast("AnyFloats", data)
             return self.predict_quantiles(window, plan, quantiles) if quantiles else self.predict_windows(window, plan)
-        recordings = opened(cast("Dataset | Recording", given), self.chain)
+        recordings = opened(cast("Dataset | Recording", data), self.chain)
         return one_after_another(prediction.tables(self, recordings, sorted(set(steps)), sorted(set(quantiles))))
 
     def windows(self, recording: Recording) -> WindowArrays:

@@ -14,15 +14,15 @@ from tacpipe.models.ensemble import Ensemble
 from tacpipe.models.windows import Shape, Windows
 from tacpipe.tasks.forward.params import Forward
 
-METHODS = ("calibrate", "loss")  # of a network that scales itself
+METHODS = ("calibrate", "loss")  # methods of a network that scales itself
 TRIED = 2  # windows
 
 
 def shape(params: Forward, codec: codecs.Codec) -> Shape:
     """Return what a network for the codec's features reads and predicts."""
-    where = codec.layout if codec.kind == "raw" else ()
+    places = codec.layout if codec.kind == "raw" else ()
     changes = codec.representation == INCREMENTS
-    return Shape(len(codec.latents), params.context, params.horizon, tuple(where), changes)
+    return Shape(len(codec.latents), params.context, params.horizon, tuple(places), changes)
 
 
 def build(params: Forward, codec: codecs.Codec) -> nn.Module:
@@ -36,35 +36,38 @@ def build(params: Forward, codec: codecs.Codec) -> nn.Module:
 
 def _member(params: Forward, codec: codecs.Codec) -> nn.Module:
     """Return one network that scales itself; a plain one is put between scales."""
-    given = shape(params, codec)
-    made = params.build(given)
-    if not isinstance(made, nn.Module):
+    sizes = shape(params, codec)
+    network = params.build(sizes)
+    if not isinstance(network, nn.Module):
         raise TacpipeError(
-            f"The architecture {params.architecture} built {type(made).__name__}; it must build a torch.nn.Module."
+            f"The architecture {params.architecture} built {type(network).__name__}; it must build a torch.nn.Module."
         )
-    own = [name for name in METHODS if hasattr(made, name)]
-    if not own:
-        return PlainForecast(made, given, loss=forecasts.resolved_loss("auto", changes=given.increments))
-    lacking = [name for name in (*METHODS, "change_only") if not hasattr(made, name)]
+    scaling_methods = [name for name in METHODS if hasattr(network, name)]
+    if not scaling_methods:
+        return PlainForecast(network, sizes, loss=forecasts.resolved_loss("auto", changes=sizes.increments))
+    lacking = [name for name in (*METHODS, "change_only") if not hasattr(network, name)]
     if lacking:
         raise TacpipeError(
-            f"The network of the architecture {params.architecture} has {own[0]} and no {lacking[0]}: one that scales "
+            f"The network of the architecture {params.architecture} has {scaling_methods[0]} and no "
+            f"{lacking[0]}: one that scales "
             f"itself needs {', '.join(METHODS)} and change_only, a plain network none of them but change_only."
         )
-    return made
+    return network
 
 
 @torch.no_grad()
 def check(network: nn.Module, params: Forward, windows: Windows, features: int) -> None:
     """Raise `TacpipeError` where a network returns something else than features to come for a few ``windows``."""
-    some = Windows(*(part[:, :TRIED] for part in windows))
+    sample = Windows(*(part[:, :TRIED] for part in windows))
     training = network.training
-    found = network.eval()(some)
+    features_ahead = network.eval()(sample)
     network.train(training)
-    wanted = (params.horizon, some.touch.shape[1], features)
-    if not isinstance(found, Tensor) or tuple(found.shape) != wanted:
-        returned = str(tuple(found.shape)) if isinstance(found, Tensor) else type(found).__name__
+    expected = (params.horizon, sample.touch.shape[1], features)
+    if not isinstance(features_ahead, Tensor) or tuple(features_ahead.shape) != expected:
+        returned = (
+            str(tuple(features_ahead.shape)) if isinstance(features_ahead, Tensor) else type(features_ahead).__name__
+        )
         raise TacpipeError(
-            f"The network of the architecture {params.architecture} returns {returned} for {wanted[1]} windows; it must "
-            f"return (horizon, window, feature), here {wanted}."
+            f"The network of the architecture {params.architecture} returns {returned} for {expected[1]} windows; it must "
+            f"return (horizon, window, feature), here {expected}."
         )

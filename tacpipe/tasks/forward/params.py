@@ -33,12 +33,12 @@ class Forward(ABC):
 
     ARCHITECTURES: ClassVar[str] = "forward"  # the task, as entry points name it
     architecture: str = "auto"
-    # what the model reads of the planned motion: planned, none, or shuffled (another window's, a negative control)
+    # part of the planned motion that the model reads: planned, none, or shuffled (another window's, a negative control)
     actions: Literal["planned", "none", "shuffled"] = "planned"
     hidden: PositiveInt = 128  # units per layer
     epochs: PositiveInt = 16  # maximum number of passes over the training windows
     batch: PositiveInt = 128  # windows per step of the optimiser
-    learning_rate: PositiveFloat = 2e-3  # of Adam; the peak if it goes through a cycle
+    learning_rate: PositiveFloat = 2e-3  # learning rate of Adam; the peak if it goes through a cycle
     cycle: bool = True  # raise and lower the learning rate once over all epochs
     patience: PositiveInt = 16  # epochs without a lower validation error after which training ends
     gradient_clip: PositiveFloat = 1.0  # largest norm of the gradient
@@ -48,7 +48,7 @@ class Forward(ABC):
     context: PositiveInt = 10  # past rows that the model reads
     horizon: PositiveInt = 10  # future rows that it predicts
     baselines: bool = True  # fit the linear baselines too, for evaluate to compare with
-    # of products in training; bfloat16 takes half the memory and rounds to 3 digits, weights stay in float32
+    # precision of products in training; bfloat16 takes half the memory and rounds to 3 digits, weights stay in float32
     precision: Precision = added("float32")
     # networks of random weights of their own that are trained, and whose forecasts are averaged
     members: PositiveInt = added(1)
@@ -145,4 +145,4 @@ class Recurrent(Forward):
         return RecurrentForecast(shape.features, self.hidden)
 
 
-Params = Forward  # of any architecture
+Params = Forward  # params of any architecture

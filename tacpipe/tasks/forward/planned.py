@@ -14,7 +14,7 @@ from tacpipe.signals.rotations import quaternions_of_vectors
 
 
 class Plan(NamedTuple):
-    """Where the hand is to be: times, and positions in m with quaternions x, y, z, w."""
+    """Planned poses of the hand: times, and positions in m with quaternions x, y, z, w."""
 
     t_ns: Times  # (point,), ascending
     poses: Floats  # (point, 7); a quaternion that is not finite: the hand does not turn

@@ -34,16 +34,16 @@ def predict(
     Raises `TacpipeError` for a step that the model does not reach, for quantiles that it does not have, and where the
     recordings are not what it reads.
     """
-    found = _gathered(Forecaster.load(model), recordings, steps, quantiles)
-    return Result({name: RecordingOutput(one.rows()) for name, one in found.items()})
+    tables = _gathered(Forecaster.load(model), recordings, steps, quantiles)
+    return Result({name: RecordingOutput(gathered.rows()) for name, gathered in tables.items()})
 
 
 def tables(
     forecaster: Forecaster, recordings: Dataset, steps: Sequence[int], quantiles: Sequence[int] = ()
 ) -> dict[str, pa.Table]:
     """Return the table of each recording's predictions; steps and errors are those of `predict`."""
-    rows = {name: one.rows() for name, one in _gathered(forecaster, recordings, steps, quantiles).items()}
-    return {name: one if isinstance(one, pa.Table) else one.read_all() for name, one in rows.items()}
+    rows = {name: table.rows() for name, table in _gathered(forecaster, recordings, steps, quantiles).items()}
+    return {name: table if isinstance(table, pa.Table) else table.read_all() for name, table in rows.items()}
 
 
 def _gathered(
@@ -53,28 +53,32 @@ def _gathered(
     check_steps(steps, forecaster.horizon)
     levels = forecaster.quantiles_of(quantiles)[1] if quantiles else []
     check_codec(forecaster.codec_files, recordings.files)
-    wanted, channels = [step - 1 for step in steps], len(forecaster.codec.channels)
-    spill, found = Spill(KEPT_BYTES), {}
+    columns, channels = [step - 1 for step in steps], len(forecaster.codec.channels)
+    spill, gathered = Spill(KEPT_BYTES), {}
     none = np.zeros((len(steps), channels, 0), np.float32)
     empty = prediction_table(forecaster, np.zeros(0, np.int64), none, steps, dict.fromkeys(quantiles, none))
     for name, shard in sorted(recordings.recordings.items()):
         track = tracks.track(shard, forecaster.codec, forecaster.pose)
         check_rate(track, forecaster)
         starts = track.starts(forecaster.context, forecaster.horizon)
-        found[name] = Gathered(spill, empty)
-        for some in forecasts(forecaster, track, starts):
-            counts = some.count[:, wanted].transpose(1, 2, 0).astype(np.float32, order="C")  # (step, channel, window)
+        gathered[name] = Gathered(spill, empty)
+        for forecast in forecasts(forecaster, track, starts):
+            counts = (
+                forecast.count[:, columns].transpose(1, 2, 0).astype(np.float32, order="C")
+            )  # (step, channel, window)
             bands = np.empty((len(levels), *counts.shape), np.float32)
-            for first in range(0, len(some.count) if levels else 0, CHUNK):
-                part = slice(first, min(first + CHUNK, len(some.count)))
-                own = band(forecaster, track, some, part)[:, wanted][..., levels].transpose(3, 1, 2, 0)
-                bands[..., part] = own
-            t_ns = track.t_ns[some.now]
+            for first in range(0, len(forecast.count) if levels else 0, CHUNK):
+                part = slice(first, min(first + CHUNK, len(forecast.count)))
+                quantiles_of_part = band(forecaster, track, forecast, part)[:, columns][..., levels].transpose(
+                    3, 1, 2, 0
+                )
+                bands[..., part] = quantiles_of_part
+            t_ns = track.t_ns[forecast.now]
             rows = prediction_table(forecaster, t_ns, counts, steps, dict(zip(quantiles, bands, strict=True)))
-            found[name].add(rows)
-            del some, counts, bands, rows  # before the next ones are made
+            gathered[name].add(rows)
+            del forecast, counts, bands, rows  # frees the memory for the next windows
         del track
-    return found
+    return gathered
 
 
 def check_steps(steps: Sequence[int], horizon: int) -> None:

@@ -65,12 +65,12 @@ def forecasts(forecaster: Forecaster, track: Track, starts: Int64s) -> Iterator[
         yield _forecast(forecaster, track, starts[first : first + CHUNK])
 
 
-def _forecast(forecaster: Forecaster, track: Track, some: Int64s) -> Forecast:
-    """Return the model's predictions for some windows, those that begin at ``some``, in order."""
+def _forecast(forecaster: Forecaster, track: Track, starts: Int64s) -> Forecast:
+    """Return the model's predictions for some windows, those that begin at ``starts``, in order."""
     context, horizon = forecaster.context, forecaster.horizon
-    past, future = (some[:, None] + np.arange(*ends) for ends in ((0, context), (context, context + horizon)))
-    block = track.between(int(some[0]), int(some[-1]) + context + horizon)
-    block_rows = rows([block], [some - some[0]], context, horizon)
+    past, future = (starts[:, None] + np.arange(*ends) for ends in ((0, context), (context, context + horizon)))
+    block = track.between(int(starts[0]), int(starts[-1]) + context + horizon)
+    block_rows = rows([block], [starts - starts[0]], context, horizon)
     windows = block_rows.pick(block_rows.starts)[0]
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)  # a control is evaluated with the same shuffled plans each time
@@ -81,43 +81,43 @@ def _forecast(forecaster: Forecaster, track: Track, some: Int64s) -> Forecast:
 
 def predicted(forecaster: Forecaster, track: Track, starts: Int64s) -> Iterator[Predicted]:
     """Yield what all predictors predict for the windows of ``track`` that begin at ``starts``, some windows at a time."""
-    for some in forecasts(forecaster, track, starts):
-        truth = Prediction(track.latent[some.future], track.tactile[some.future])
-        yield Predicted(some.now, some.features, truth, _Predictions(forecaster, track, some))
-        del some, truth  # before the next ones are made
+    for forecast in forecasts(forecaster, track, starts):
+        truth = Prediction(track.latent[forecast.future], track.tactile[forecast.future])
+        yield Predicted(forecast.now, forecast.features, truth, _Predictions(forecaster, track, forecast))
+        del forecast, truth  # frees the memory for the next windows
 
 
 class _Predictions(Mapping[str, Prediction]):
-    """The predictions of each predictor for some windows, computed each time that they are asked for."""
+    """The predictions of each predictor for some windows, computed at each access."""
 
-    def __init__(self, forecaster: Forecaster, track: Track, some: Forecast) -> None:
-        self._forecaster, self._track, self._some = forecaster, track, some
+    def __init__(self, forecaster: Forecaster, track: Track, forecast: Forecast) -> None:
+        self._forecaster, self._track, self._forecast = forecaster, track, forecast
 
     def items(self) -> ItemsView[str, Prediction]:
-        """Return names and predictions, each made when the iteration arrives at it."""
+        """Return names and predictions, each computed as the iteration reaches it."""
         return _Items(self)
 
     def __getitem__(self, name: str) -> Prediction:
-        for one, prediction in self.made():
-            if one == name:
+        for predictor, prediction in self.each_prediction():
+            if predictor == name:
                 return prediction
         raise KeyError(name)
 
     def __iter__(self) -> Iterator[str]:
-        return (name for name, _ in self.made())
+        return (name for name, _ in self.each_prediction())
 
     def __len__(self) -> int:
         return sum(1 for _ in self)
 
-    def made(self) -> Iterator[tuple[str, Prediction]]:
+    def each_prediction(self) -> Iterator[tuple[str, Prediction]]:
         """Yield what each predictor predicts."""
-        forecaster, track, some = self._forecaster, self._track, self._some
-        yield from _of_model(forecaster, track, some)
-        yield from _of_codec(forecaster, track, some)
-        past = track.tactile[some.past]
-        yield "context_mean", Prediction(None, _held(past.mean(axis=1), forecaster.horizon))
+        forecaster, track, forecast = self._forecaster, self._track, self._forecast
+        yield from _of_model(forecaster, track, forecast)
+        yield from _of_codec(forecaster, track, forecast)
+        past = track.tactile[forecast.past]
+        yield "context_mean", Prediction(None, _repeat_over_steps(past.mean(axis=1), forecaster.horizon))
         if forecaster.baselines is not None:
-            moved = motion(some.windows)[0].transpose(0, 1).numpy()
+            moved = motion(forecast.windows)[0].transpose(0, 1).numpy()
             past = past.astype(np.float32)
             for name, counts in forecaster.baselines.forecasts(past, moved):
                 yield name, Prediction(None, counts)
@@ -128,36 +128,36 @@ class _Items(ItemsView[str, Prediction]):
 
     def __init__(self, predictions: _Predictions) -> None:
         super().__init__(predictions)
-        self._made = predictions.made
+        self._each_prediction = predictions.each_prediction
 
     def __iter__(self) -> Iterator[tuple[str, Prediction]]:
-        return self._made()
+        return self._each_prediction()
 
 
-def _of_model(forecaster: Forecaster, track: Track, some: Forecast) -> Iterator[tuple[str, Prediction]]:
+def _of_model(forecaster: Forecaster, track: Track, forecast: Forecast) -> Iterator[tuple[str, Prediction]]:
     """Yield the model's prediction, and persistence."""
     codec, horizon = forecaster.codec, forecaster.horizon
-    last, last_feature = track.tactile[some.now], track.latent[some.now]
-    still = np.zeros_like(last_feature) if codec.representation == INCREMENTS else last_feature
-    yield MODEL, Prediction(some.features, some.count)
-    yield BASELINE, Prediction(_held(still, horizon), _held(last, horizon))
+    last, last_feature = track.tactile[forecast.now], track.latent[forecast.now]
+    unchanged = np.zeros_like(last_feature) if codec.representation == INCREMENTS else last_feature
+    yield MODEL, Prediction(forecast.features, forecast.count)
+    yield BASELINE, Prediction(_repeat_over_steps(unchanged, horizon), _repeat_over_steps(last, horizon))
     if forecaster.lossy and not forecaster.predicts_change:
-        yield "model_anchored", Prediction(None, forecaster.anchored(some.count, last, last_feature))
+        yield "model_anchored", Prediction(None, forecaster.anchored(forecast.count, last, last_feature))
 
 
-def _of_codec(forecaster: Forecaster, track: Track, some: Forecast) -> Iterator[tuple[str, Prediction]]:
+def _of_codec(forecaster: Forecaster, track: Track, forecast: Forecast) -> Iterator[tuple[str, Prediction]]:
     """Yield what the codec alone loses of the true features to come."""
     codec = forecaster.codec
     if codec.kind == "raw":
         return
-    last, last_feature, ahead = track.tactile[some.now], track.latent[some.now], track.latent[some.future]
+    last, last_feature, ahead = track.tactile[forecast.now], track.latent[forecast.now], track.latent[forecast.future]
     decoded = codecs.decode_ahead(codec, ahead, last)
     yield "codec", Prediction(ahead, decoded)
     if forecaster.lossy:
-        yield "codec_persistence", Prediction(None, _held(codec.decode(last_feature), forecaster.horizon))
+        yield "codec_persistence", Prediction(None, _repeat_over_steps(codec.decode(last_feature), forecaster.horizon))
         yield "codec_anchored", Prediction(None, forecaster.anchored(decoded, last, last_feature))
 
 
-def _held(values: AnyFloats, horizon: int) -> AnyFloats:
+def _repeat_over_steps(values: AnyFloats, horizon: int) -> AnyFloats:
     """Return ``values`` (window, channel) at every step, (window, step, channel)."""
     return np.repeat(values[:, None], horizon, axis=1)

@@ -1,4 +1,4 @@
-"""What recordings must hold for the task ``forward``."""
+"""State the streams and labels that recordings need for the task ``forward``."""
 
 from __future__ import annotations
 

@@ -27,16 +27,16 @@ class Rows:
     touch: Tensor  # (time, feature)
     arm: Tensor  # (time, 13)
     finger: Tensor  # (time,)
-    tracks: Sequence[Track]  # that they are the rows of
+    tracks: Sequence[Track]  # the tracks that the rows come from
     starts: Tensor  # (window,)
     context: int
     horizon: int
     actions: str = "planned"
-    aside: MappedArrays | None = None  # what the rows lie in
+    mapped: MappedArrays | None = None  # files that hold the rows; None: memory
 
     @property
     def part(self) -> loop.Part:
-        """What the training loop reads."""
+        """The windows and the loss for the training loop."""
         return loop.Part(len(self.starts), self.loss)
 
     def pick(self, starts: Tensor) -> tuple[Windows, Tensor]:
@@ -44,9 +44,9 @@ class Rows:
         feature)."""
         steps = torch.arange(self.context + self.horizon, device=starts.device)
         rows = steps[:, None] + starts  # (row, window)
-        touch, arm = (one.index_select(0, rows.flatten()).view(*rows.shape, -1) for one in (self.touch, self.arm))
-        if self.aside is not None:
-            self.aside.read(touch.nbytes + arm.nbytes)
+        touch, arm = (values.index_select(0, rows.flatten()).view(*rows.shape, -1) for values in (self.touch, self.arm))
+        if self.mapped is not None:
+            self.mapped.read(touch.nbytes + arm.nbytes)
         return Windows(touch[: self.context], arm, self.finger[rows[: self.context]]), touch[self.context :]
 
     def loss(self, model: nn.Module, indices: Tensor) -> Tensor:
@@ -62,19 +62,19 @@ class Rows:
 
     def tactile(self, rows: Int64s) -> AnyFloats:
         """Return the counts above rest (window, row, channel) of windows of ``rows`` (window, row), each of one track."""
-        ends = np.cumsum([len(one.t_ns) for one in self.tracks])
-        among = np.searchsorted(ends, rows[:, 0], side="right")  # (window,)
-        found = np.empty((*rows.shape, self.tracks[0].tactile.shape[1] if self.tracks else 0))
-        for number in np.unique(among):
-            track, of_track = self.tracks[number], among == number
-            found[of_track] = track.tactile[rows[of_track] - (ends[number] - len(track.t_ns))]
-            if self.aside is not None:
-                self.aside.release()
-        return found
+        ends = np.cumsum([len(track.t_ns) for track in self.tracks])
+        track_numbers = np.searchsorted(ends, rows[:, 0], side="right")  # (window,)
+        levels = np.empty((*rows.shape, self.tracks[0].tactile.shape[1] if self.tracks else 0))
+        for number in np.unique(track_numbers):
+            track, of_track = self.tracks[number], track_numbers == number
+            levels[of_track] = track.tactile[rows[of_track] - (ends[number] - len(track.t_ns))]
+            if self.mapped is not None:
+                self.mapped.release()
+        return levels
 
-    def some(self, most: int) -> Tensor:
-        """Return at most ``most`` starts, evenly spread."""
-        return self.starts[:: max(1, -(-len(self.starts) // most))]
+    def evenly_spread(self, limit: int) -> Tensor:
+        """Return at most ``limit`` starts, evenly spread."""
+        return self.starts[:: max(1, -(-len(self.starts) // limit))]
 
 
 def rows(
@@ -85,35 +85,35 @@ def rows(
     *,
     actions: str = "planned",
     device: str = "cpu",
-    aside: MappedArrays | None = None,
+    mapped: MappedArrays | None = None,
 ) -> Rows:
     """Return the rows of all tracks and the windows that begin at ``starts``, counted within each track.
 
-    The rows lie in ``aside`` where it is given. Raises `StorageError` where its disk is full.
+    The rows lie in files of ``mapped``; None: in memory. Raises `StorageError` where its disk is full.
     """
     if actions not in ACTIONS:
         raise TacpipeError(f"There are no actions {actions!r}; there are {', '.join(ACTIONS)}.")
-    offsets = np.cumsum([0] + [len(one.t_ns) for one in tracks])
+    offsets = np.cumsum([0] + [len(track.t_ns) for track in tracks])
 
     def stacked(name: str, width: tuple[int, ...]) -> AnyFloats:
-        if len(tracks) == 1 and aside is None:
+        if len(tracks) == 1 and mapped is None:
             return np.ascontiguousarray(getattr(tracks[0], name)[:], dtype=np.float32)
         shape = (int(offsets[-1]), *width)
-        made: AnyFloats = np.empty(shape, np.float32) if aside is None else aside.empty(shape, np.float32)
-        for one, first in zip(tracks, offsets, strict=False):
-            made[first : first + len(one.t_ns)] = getattr(one, name)[:]
-            if aside is not None:
-                aside.release()
-        return made
+        stacked_rows: AnyFloats = np.empty(shape, np.float32) if mapped is None else mapped.empty(shape, np.float32)
+        for track, first in zip(tracks, offsets, strict=False):
+            stacked_rows[first : first + len(track.t_ns)] = getattr(track, name)[:]
+            if mapped is not None:
+                mapped.release()
+        return stacked_rows
 
     features = tracks[0].latent.shape[1:] if tracks else (0,)
-    begins = [one + offset for one, offset in zip(starts, offsets, strict=False)]
+    begins = [track + offset for track, offset in zip(starts, offsets, strict=False)]
     touch, arm, finger = (
         torch.from_numpy(values).to(device)
         for values in (stacked("latent", features), stacked("arm", (windows_of.ARM,)), stacked("finger", ()))
     )
     first = torch.from_numpy(np.concatenate([np.zeros(0, np.int64), *begins])).to(device)
-    return Rows(touch, arm, finger, tracks, first, context, horizon, actions, aside)
+    return Rows(touch, arm, finger, tracks, first, context, horizon, actions, mapped)
 
 
 def acted(windows: Windows, actions: str) -> Windows:

@@ -32,7 +32,7 @@ def skins(layout: Layout) -> tuple[str, ...]:
     >>> skins([{"stream": "left", "axis": "x"}, {"stream": "pad", "axis": "z"}, {"stream": "left", "axis": "z"}])
     ('left',)
     """
-    return tuple(dict.fromkeys(one.get("stream", "") for one in layout if one.get("axis") in ALONG))
+    return tuple(dict.fromkeys(channel.get("stream", "") for channel in layout if channel.get("axis") in ALONG))
 
 
 def shear(levels: AnyFloats, layout: Layout) -> Floats:
@@ -43,13 +43,13 @@ def shear(levels: AnyFloats, layout: Layout) -> Floats:
     [[5.0]]
     """
     parts = [[_mean(levels, layout, skin, axis) for axis in ALONG] for skin in skins(layout)]
-    return np.stack([np.hypot(*each) for each in parts], axis=-1) if parts else np.zeros((*levels.shape[:-1], 0))
+    return np.stack([np.hypot(*axes) for axes in parts], axis=-1) if parts else np.zeros((*levels.shape[:-1], 0))
 
 
 def pressing(levels: AnyFloats, layout: Layout) -> Floats:
     """Return the load that presses on each skin (…, skin), 0 where a sensor does not measure it."""
-    found = [np.abs(_mean(levels, layout, skin, PRESSING)) for skin in skins(layout)]
-    return np.stack(found, axis=-1) if found else np.zeros((*levels.shape[:-1], 0))
+    loads = [np.abs(_mean(levels, layout, skin, PRESSING)) for skin in skins(layout)]
+    return np.stack(loads, axis=-1) if loads else np.zeros((*levels.shape[:-1], 0))
 
 
 def floors(spread: AnyFloats, layout: Layout) -> Floats:
@@ -61,36 +61,40 @@ def floors(spread: AnyFloats, layout: Layout) -> Floats:
     >>> floors(np.array([1.0, 3.0, 10.0, 30.0]), layout).tolist(), floors(np.array([1.0, 3.0]), layout[:2]).tolist()
     ([20.0], [2.0])
     """
-    found = []
+    divisors = []
     for skin in skins(layout):
-        own = [(one.get("axis"), float(size)) for one, size in zip(layout, spread, strict=True) if _on(one, skin)]
-        presses = [size for axis, size in own if axis == PRESSING]
-        found.append(np.mean(presses or [size for axis, size in own if axis in ALONG]))
-    return np.array(found, dtype=np.float64)
+        sizes = [
+            (channel.get("axis"), float(size))
+            for channel, size in zip(layout, spread, strict=True)
+            if _on(channel, skin)
+        ]
+        presses = [size for axis, size in sizes if axis == PRESSING]
+        divisors.append(np.mean(presses or [size for axis, size in sizes if axis in ALONG]))
+    return np.array(divisors, dtype=np.float64)
 
 
-def rise_and_fall(ahead: AnyFloats, now: AnyFloats, layout: Layout, least: AnyFloats) -> Floats:
+def rise_and_fall(ahead: AnyFloats, now: AnyFloats, layout: Layout, divisors: AnyFloats) -> Floats:
     """Return the score (window,) of forecasts ``ahead`` (window, step, channel) at levels ``now`` (window, channel).
 
-    The largest of all skins counts; ``least`` (skin,) is what `floors` gives. NaN where a forecast is not finite, and for
+    The largest of all skins counts; ``divisors`` (skin,) is what `floors` gives. NaN where a forecast is not finite, and for
     channels none of which lies along a skin.
     """
     if not skins(layout):
         return np.full(len(now), np.nan)
     predicted, present = shear(ahead, layout), shear(now, layout)[:, None]  # (window, step, skin)
-    lowest = np.minimum.accumulate(predicted[:, ::-1], axis=1)[:, ::-1]  # from each step on
+    lowest = np.minimum.accumulate(predicted[:, ::-1], axis=1)[:, ::-1]  # least of each step and those after it
     moved = ((predicted - present) + (predicted - lowest)).max(axis=1)
-    score: Floats = (moved / np.maximum(pressing(now, layout), least)).max(axis=1)
+    score: Floats = (moved / np.maximum(pressing(now, layout), divisors)).max(axis=1)
     return np.maximum(score, 0.0)
 
 
 def _mean(levels: Any, layout: Layout, skin: str, axis: str) -> Floats:
     """Return the mean (…,) of the channels of a skin along an axis, 0 where it has none."""
-    chosen = [index for index, one in enumerate(layout) if _on(one, skin) and one.get("axis") == axis]
+    chosen = [index for index, channel in enumerate(layout) if _on(channel, skin) and channel.get("axis") == axis]
     if not chosen:
         return np.zeros(levels.shape[:-1])
-    found: Floats = np.asarray(levels[..., chosen], dtype=np.float64).mean(axis=-1)
-    return found
+    mean: Floats = np.asarray(levels[..., chosen], dtype=np.float64).mean(axis=-1)
+    return mean
 
 
 def _on(channel: Mapping[str, str], skin: str) -> bool:

@@ -1,4 +1,4 @@
-"""What a forecast and its inputs show of how uncertain it is: cheap features of each channel of a window."""
+"""Compute features of each channel of a window that show how uncertain its forecast is."""
 
 from __future__ import annotations
 
@@ -27,28 +27,28 @@ def signs(past: AnyFloats, ahead: AnyFloats, arm: AnyFloats, finger: AnyFloats, 
     level = past / scale
     last = level[:, -1]
     steps: AnyFloats = np.diff(level, axis=1)
-    still: Bools = (steps == 0) if context > 1 else np.ones((windows, 1, channels), bool)
-    own = [
+    repeated: Bools = (steps == 0) if context > 1 else np.ones((windows, 1, channels), bool)
+    by_channel = [
         np.log1p(np.abs(last) * 10),
         np.log1p(level.std(axis=1) * 100),
         np.arcsinh((last - level[:, 0]) * 100),
         np.arcsinh((last - level[:, -min(LATEST, context)]) * 100),
         np.log1p(np.abs(steps).mean(axis=1) * 100) if context > 1 else np.zeros_like(last),
-        still.mean(axis=1),
+        repeated.mean(axis=1),
         *np.arcsinh((ahead / scale - last[:, None]) * 100).transpose(1, 0, 2),
     ]
     speed = np.abs(arm[..., POSE:])
     moved, planned = speed[:, :context], speed[:, context:]
-    repeats = np.cumprod(np.asarray(still.all(axis=2))[:, ::-1], axis=1).sum(axis=1)
+    repeats = np.cumprod(np.asarray(repeated.all(axis=2))[:, ::-1], axis=1).sum(axis=1)
     shared = [
         np.log1p(level.std(axis=1).mean(axis=1) * 100),
         repeats,
         *(
-            np.log1p(part[..., some].max(axis=(1, 2), initial=0) * unit)
+            np.log1p(part[..., axes].max(axis=(1, 2), initial=0) * unit)
             for part in (moved, planned)
-            for some, unit in ((slice(0, 3), 100), (slice(3, 6), 10))
+            for axes, unit in ((slice(0, 3), 100), (slice(3, 6), 10))
         ),
         np.log1p(np.abs(finger[:, -1] - finger[:, 0]) * 1000),
     ]
-    whole = np.repeat(np.stack(shared, axis=-1)[:, None], channels, axis=1)
-    return np.concatenate([np.stack(own, axis=-1), whole], axis=-1, dtype=np.float32)
+    by_window = np.repeat(np.stack(shared, axis=-1)[:, None], channels, axis=1)
+    return np.concatenate([np.stack(by_channel, axis=-1), by_window], axis=-1, dtype=np.float32)

@@ -1,4 +1,4 @@
-"""What the hand does in a window, and the errors of forecasts by that.
+"""Name the situation of the hand in a window, and sum errors of forecasts by situation.
 
 A window is named by its last row read and the rows to come, so names describe what was measured; no model reads them.
 """
@@ -21,25 +21,25 @@ if TYPE_CHECKING:  # these import torch, and a report names situations without i
     from tacpipe.tasks.forward.tracks import Track
 
 SITUATIONS = ("no contact", "closing", "releasing", "slipping", "holding in motion", "holding still")
-WIDTH_M = 0.0005  # by which the gripper's width changes over the rows to come where it closes or opens
+WIDTH_M = 0.0005  # least change of the gripper's width where it closes or opens
 LOST = 0.05  # fraction of the load that is lost over the rows to come where an object slips
-PACE_M_S, TURNING_RAD_S = 0.02, 0.1  # from which on the hand moves
+PACE_M_S, TURNING_RAD_S = 0.02, 0.1  # least speeds of a moving hand
 Tree = dict[str, Any]
 
 
 class Motion(NamedTuple):
-    """What names a window: of its last row read (now) and its last row to come (then), each (window,)."""
+    """Values that decide the situation: at the last row read (now) and the last row to come (then), each (window,)."""
 
-    touched_now: AnyFloats  # whether anything is touched, 0 or 1
+    touched_now: AnyFloats  # 1 in contact, else 0
     touched_then: AnyFloats
     load_now: AnyFloats  # mean of absolute levels over channels
     load_then: AnyFloats
-    wider_m: AnyFloats  # by how much the gripper is wider then
+    wider_m: AnyFloats  # growth of the gripper's width
     pace_m_s: AnyFloats  # the hand's fastest from now to then
     turning_rad_s: AnyFloats
 
 
-def named(motion: Motion) -> Int64s:
+def situation_numbers(motion: Motion) -> Int64s:
     """Return the situation of each window (window,), a place in `SITUATIONS`; the first one that holds.
 
     - no contact: nothing is touched now or then;
@@ -49,15 +49,16 @@ def named(motion: Motion) -> Int64s:
     - holding in motion: the hand is faster than ``PACE_M_S`` or ``TURNING_RAD_S``;
     - holding still: all else.
 
-    >>> one = Motion(*(np.array([value]) for value in (1, 1, 100.0, 99.0, 0.0001, 0.3, 0.0)))
-    >>> SITUATIONS[named(one)[0]], SITUATIONS[named(one._replace(load_then=np.array([90.0])))[0]]
+    >>> motion = Motion(*(np.array([value]) for value in (1, 1, 100.0, 99.0, 0.0001, 0.3, 0.0)))
+    >>> lighter = motion._replace(load_then=np.array([90.0]))
+    >>> SITUATIONS[situation_numbers(motion)[0]], SITUATIONS[situation_numbers(lighter)[0]]
     ('holding in motion', 'slipping')
     """
-    now, then = motion.touched_now > 0, motion.touched_then > 0
+    now, touched_ahead = motion.touched_now > 0, motion.touched_then > 0
     conditions = [
-        ~now & ~then & (np.abs(motion.wider_m) <= WIDTH_M),
-        (motion.wider_m < -WIDTH_M) | (~now & then),
-        (motion.wider_m > WIDTH_M) | (now & ~then),
+        ~now & ~touched_ahead & (np.abs(motion.wider_m) <= WIDTH_M),
+        (motion.wider_m < -WIDTH_M) | (~now & touched_ahead),
+        (motion.wider_m > WIDTH_M) | (now & ~touched_ahead),
         motion.load_then < (1 - LOST) * motion.load_now,
         (motion.pace_m_s > PACE_M_S) | (motion.turning_rad_s > TURNING_RAD_S),
     ]
@@ -68,15 +69,15 @@ def of_windows(track: Track, now: Int64s, horizon: int) -> Int64s:
     """Return the situation of the windows of a recording whose last row read is ``now`` (window,)."""
     if not len(now):
         return np.zeros(0, np.int64)
-    then, ahead = now + horizon, now[:, None] + np.arange(horizon + 1)
+    end, ahead = now + horizon, now[:, None] + np.arange(horizon + 1)
     speeds = track.arm[ahead][..., 7:].astype(np.float64)  # (window, row, 6)
-    return named(
+    return situation_numbers(
         Motion(
             (track.contact[now] >= 0).astype(np.float64),
-            (track.contact[then] >= 0).astype(np.float64),
+            (track.contact[end] >= 0).astype(np.float64),
             np.abs(track.tactile[now]).mean(axis=1),
-            np.abs(track.tactile[then]).mean(axis=1),
-            (track.finger[then] - track.finger[now]).astype(np.float64),
+            np.abs(track.tactile[end]).mean(axis=1),
+            (track.finger[end] - track.finger[now]).astype(np.float64),
             np.linalg.norm(speeds[..., :3], axis=-1).max(axis=1),
             np.linalg.norm(speeds[..., 3:], axis=-1).max(axis=1),
         )
@@ -89,15 +90,15 @@ class BySituation:
 
     horizon: int
     channels: int
-    windows: dict[str, Int64s] = field(default_factory=dict)  # by recording, (situation,)
+    windows: dict[str, Int64s] = field(default_factory=dict)  # windows by recording, (situation,)
     absolute: dict[tuple[str, str], AnyFloats] = field(
         default_factory=dict
     )  # (situation, step), by recording, predictor
 
     def count(self, recording: str, situations: Int64s) -> None:
         """Count windows of a recording."""
-        found = np.bincount(situations, minlength=len(SITUATIONS))
-        self.windows[recording] = self.windows.get(recording, np.zeros(len(SITUATIONS), np.int64)) + found
+        counts = np.bincount(situations, minlength=len(SITUATIONS))
+        self.windows[recording] = self.windows.get(recording, np.zeros(len(SITUATIONS), np.int64)) + counts
 
     def add(self, recording: str, situations: Int64s, name: str, predicted: Prediction, truth: Prediction) -> None:
         """Add the errors of one predictor on these windows."""
@@ -112,21 +113,21 @@ class BySituation:
         Skill is 1 - mean absolute error / that of persistence, the geometric mean of the ratios of recordings, by step and
         over all, with its interval over recordings.
         """
-        return {name: self._of(at) for at, name in enumerate(SITUATIONS) if self._recordings(at)}
+        return {name: self._measures(at) for at, name in enumerate(SITUATIONS) if self._recordings(at)}
 
     def _recordings(self, situation: int) -> list[str]:
         return [name for name, windows in self.windows.items() if windows[situation]]
 
-    def _of(self, at: int) -> Tree:
+    def _measures(self, at: int) -> Tree:
         recordings = self._recordings(at)
         count = sum(int(self.windows[name][at]) for name in recordings)
         predictors = list(dict.fromkeys(name for _, name in self.absolute))
         errors = {name: self._sums(self.absolute, recordings, name, at).sum(axis=0) for name in predictors}
-        model, still = (
+        model, persistence = (
             np.hstack([sums, sums.sum(axis=1, keepdims=True)])
             for sums in (self._sums(self.absolute, recordings, name, at) for name in (MODEL, BASELINE))
         )
-        interval = intervals.geometric_skill_interval(model, still)
+        interval = intervals.geometric_skill_interval(model, persistence)
         skill = {
             step: {
                 part: _rounded(value)
@@ -138,12 +139,12 @@ class BySituation:
         return {
             "windows": count,
             "recordings": len(recordings),
-            "mae_counts": {name: _steps(one / (count * self.channels)) for name, one in errors.items()},
-            "skill": {step: one for step, one in skill.items() if one},
+            "mae_counts": {name: _steps(values / (count * self.channels)) for name, values in errors.items()},
+            "skill": {step: values for step, values in skill.items() if values},
         }
 
     def _sums(self, sums: dict[tuple[str, str], AnyFloats], recordings: Sequence[str], name: str, at: int) -> AnyFloats:
-        return np.stack([sums[one, name][at] for one in recordings])
+        return np.stack([sums[recording, name][at] for recording in recordings])
 
 
 def _steps(errors: AnyFloats) -> Tree:

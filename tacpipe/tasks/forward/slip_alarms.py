@@ -1,4 +1,4 @@
-"""Whether forecasts warn of a slip before it begins: the slip alarm's score, its level, and what it is worth."""
+"""Measure whether forecasts warn of a slip before it begins, with the score and the level of the slip alarm."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from tacpipe.tasks.forward.forecaster import Forecaster
 
 PER_HOUR = 60.0  # false alarms that `evaluate` sets levels for
-PARTS = 5  # of the recordings; each has the level that was set on the others
+PARTS = 5  # parts of the recordings; each has the level that was set on the others
 
 
 @dataclass(frozen=True)
@@ -70,23 +70,23 @@ class SlipAlarms:
             scores = last.scores.setdefault(name, np.full(len(last.t_ns), np.nan))
             scores[now] = rise_and_fall(counts, present, self.layout, self.floors)
 
-    def level(self, name: str, per_hour: float, some: Sequence[int] | None = None) -> float:
+    def level(self, name: str, per_hour: float, selected: Sequence[int] | None = None) -> float:
         """Return the level of a predictor's score for so many false alarms an hour, set on all or some recordings.
 
         An alarm is false where it is not near a slip. Of a recording that does not state where it slips every alarm
         counts as false. Infinite where there is no forecast.
         """
-        chosen = [self.recordings[place] for place in (range(len(self.recordings)) if some is None else some)]
-        chosen = [one for one in chosen if name in one.scores]
+        chosen = [self.recordings[place] for place in (range(len(self.recordings)) if selected is None else selected)]
+        chosen = [recording for recording in chosen if name in recording.scores]
         if not chosen:
             return math.inf
-        free = [~near(one.t_ns, one.events(), self.horizon * one.period_ns) for one in chosen]
+        free = [~near(recording.t_ns, recording.events(), self.horizon * recording.period_ns) for recording in chosen]
         return anticipation.level(
-            np.concatenate([one.scores[name] for one in chosen]),
+            np.concatenate([recording.scores[name] for recording in chosen]),
             np.concatenate(free),
-            np.repeat(np.arange(len(chosen)), [len(one.t_ns) for one in chosen]),
+            np.repeat(np.arange(len(chosen)), [len(recording.t_ns) for recording in chosen]),
             horizon=self.horizon,
-            rate_hz=1e9 / float(np.median([one.period_ns for one in chosen])),
+            rate_hz=1e9 / float(np.median([recording.period_ns for recording in chosen])),
             per_minute=per_hour / 60,
         )
 
@@ -96,22 +96,26 @@ class SlipAlarms:
         Levels are set for ``per_hour`` false alarms: for each fifth of the recordings on the others, so that no recording
         sets its own. Nothing where fewer than two recordings state it, or none slips.
         """
-        known = [place for place, one in enumerate(self.recordings) if one.slips is not None]
-        if len(known) < 2 or not any(one.slips is not None and one.slips.any() for one in self.recordings):
+        labelled = [place for place, recording in enumerate(self.recordings) if recording.slips is not None]
+        if len(labelled) < 2 or not any(
+            recording.slips is not None and recording.slips.any() for recording in self.recordings
+        ):
             return {}
-        parts = [part for part in (known[first::PARTS] for first in range(PARTS)) if part]
-        found: dict[str, dict[str, Any]] = {}
-        for name in dict.fromkeys(name for place in known for name in self.recordings[place].scores):
-            several: list[Leads] = []
+        parts = [part for part in (labelled[first::PARTS] for first in range(PARTS)) if part]
+        scores: dict[str, dict[str, Any]] = {}
+        for name in dict.fromkeys(name for place in labelled for name in self.recordings[place].scores):
+            lead_parts: list[Leads] = []
             for part in parts:
-                level = self.level(name, per_hour, [place for place in known if place not in part])
-                several += [self._worth(self.recordings[place], name, level) for place in part]
-            worth = summed(several)
-            found[name] = {**worth, "recall": round(worth["led"] / worth["events"], 9) if worth["events"] else None}
-        return found
+                level = self.level(name, per_hour, [place for place in labelled if place not in part])
+                lead_parts += [self._worth(self.recordings[place], name, level) for place in part]
+            worth = summed(lead_parts)
+            scores[name] = {**worth, "recall": round(worth["led"] / worth["events"], 9) if worth["events"] else None}
+        return scores
 
-    def _worth(self, one: Rows, name: str, level: float) -> Leads:
-        scores = one.scores.get(name, np.full(len(one.t_ns), np.nan))
-        known = np.isfinite(scores) & math.isfinite(level)
-        states = np.where(known, (scores > level).astype(np.int64), -1)
-        return leads(one.t_ns, states, one.events(), self.horizon * one.period_ns, one.period_ns)
+    def _worth(self, recording: Rows, name: str, level: float) -> Leads:
+        scores = recording.scores.get(name, np.full(len(recording.t_ns), np.nan))
+        has_state = np.isfinite(scores) & math.isfinite(level)
+        states = np.where(has_state, (scores > level).astype(np.int64), -1)
+        return leads(
+            recording.t_ns, states, recording.events(), self.horizon * recording.period_ns, recording.period_ns
+        )

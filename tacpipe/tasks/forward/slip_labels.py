@@ -1,4 +1,4 @@
-"""Where a held object slips, as a recording states it."""
+"""Read where an object slips in the gripper, as a recording states it."""
 
 from __future__ import annotations
 

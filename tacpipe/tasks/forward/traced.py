@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from tacpipe.tasks.forward.forecaster import Forecaster
 
 TRIED = 12  # windows that both must agree on; the first calls of a recording profile and optimize it
-WALK, STEP = 20.0, 0.002  # of tried windows from row to row: features in their training ranges' hundredths, m
+WALK, STEP = 20.0, 0.002  # random steps between rows of tried windows: hundredths of a feature's training range, m
 
 
 class Network:
@@ -35,7 +35,7 @@ class Network:
 
     @property
     def is_recorded(self) -> bool:
-        """Whether the recording is used."""
+        """True if the traced network is used."""
         return self._recorded is not None
 
     @torch.no_grad()
@@ -43,8 +43,8 @@ class Network:
         """Return the features to come (window, horizon, feature), as `Forecaster.features`; ``windows`` holds one."""
         if self._recorded is None:
             return self._forecaster.features(windows)
-        found: Tensor = self._recorded(*windows)
-        features: AnyFloats = found.transpose(0, 1).numpy()
+        predicted: Tensor = self._recorded(*windows)
+        features: AnyFloats = predicted.transpose(0, 1).numpy()
         return features
 
 
@@ -56,41 +56,41 @@ class _Parts(nn.Module):
         self.network, self.actions = forecaster.model, forecaster.actions
 
     def forward(self, touch: Tensor, arm: Tensor, finger: Tensor) -> Tensor:
-        found: Tensor = self.network(acted(Windows(touch, arm, finger), self.actions))
-        return found
+        predicted: Tensor = self.network(acted(Windows(touch, arm, finger), self.actions))
+        return predicted
 
 
 @torch.no_grad()
 def _recorded(forecaster: Forecaster) -> torch.jit.ScriptModule | None:
     """Return the recording, None where there is none that gives the same bits."""
-    whole = _Parts(forecaster).eval()
-    several = _tried(forecaster)
+    parts = _Parts(forecaster).eval()
+    examples = _tried(forecaster)
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of shapes that are constants of the recording, as they are here
-            traced = torch.jit.trace(whole, tuple(several[0]), check_trace=False)  # type: ignore[no-untyped-call]
-            made: torch.jit.ScriptModule = torch.jit.freeze(traced)
+            warnings.simplefilter("ignore")  # warns of shapes that become constants, as they are here
+            traced = torch.jit.trace(parts, tuple(examples[0]), check_trace=False)  # type: ignore[no-untyped-call]
+            frozen: torch.jit.ScriptModule = torch.jit.freeze(traced)
             for _ in range(2):  # once while it is optimized, and as it stays
-                if not all(torch.equal(made(*windows), whole(*windows)) for windows in several):
+                if not all(torch.equal(frozen(*windows), parts(*windows)) for windows in examples):
                     return None
-    except Exception:  # of an architecture of another package: anything
+    except Exception:  # an architecture of another package may raise anything
         return None
-    return made
+    return frozen
 
 
 def _tried(forecaster: Forecaster) -> list[Windows]:
     """Return windows (one each) that walk, rest, jump and hold still."""
     rng = np.random.default_rng(0)
     context, rows = forecaster.context, forecaster.context + forecaster.horizon
-    found = []
+    examples = []
     for number in range(TRIED):
         size = 0.0 if number == 0 else float(rng.lognormal(0, 1))
-        moved = rng.random((context, 1, 1)) < rng.random()  # where not, the row repeats the one before
+        moved = rng.random((context, 1, 1)) < rng.random()  # other rows repeat the one before
         walk = WALK * rng.normal(0, size, (context, 1, len(forecaster.codec.latents))) * moved
         touch = walk.cumsum(axis=0) * forecaster.feature_half / 100
         arm = rng.normal(0, STEP * size, (rows, 1, ARM)).cumsum(axis=0)
         arm[..., 3:POSE] += forecaster.orientation
         arm[..., 3:POSE] /= np.linalg.norm(arm[..., 3:POSE], axis=-1, keepdims=True)
         finger = 0.04 + rng.normal(0, STEP * size, (context, 1)) * moved[:, 0]
-        found.append(Windows(*(torch.from_numpy(part.astype(np.float32)) for part in (touch, arm, finger))))
-    return found
+        examples.append(Windows(*(torch.from_numpy(part.astype(np.float32)) for part in (touch, arm, finger))))
+    return examples

@@ -37,7 +37,7 @@ POSE = poses.NAMED.columns
 VELOCITY = tuple(f"robot_velocity_{axis}_m_s" for axis in "xyz")
 TURNING = tuple(f"robot_turning_{axis}_rad_s" for axis in "xyz")
 ARM = POSE + VELOCITY + TURNING
-TURNED = slice(3, 7)  # of ``ARM``: the quaternion
+TURNED = slice(3, 7)  # columns of ``ARM`` with the quaternion
 FINGER = "robot_finger_m"
 JOINTS = 7
 TRUTH = "gt_"  # how the simulator's ground truth begins, which no model may see
@@ -67,7 +67,7 @@ class Track:
     def between(self, first: int, last: int) -> Track:
         """Return the rows from ``first`` to before ``last``."""
 
-        def of(values: AnyFloats | Levels) -> AnyFloats | Levels:
+        def part_of(values: AnyFloats | Levels) -> AnyFloats | Levels:
             return values.between(first, last) if isinstance(values, Levels) else values[first:last]
 
         cut = {
@@ -75,22 +75,22 @@ class Track:
         }
         if self.slips is not None:
             cut["slips"] = self.slips[first:last]
-        return replace(self, latent=of(self.latent), tactile=of(self.tactile), **cut)
+        return replace(self, latent=part_of(self.latent), tactile=part_of(self.tactile), **cut)
 
-    def put_aside(self, aside: MappedArrays) -> Track:
-        """Return the same track, whose rows lie in ``aside``."""
-        tactile = self.tactile.put_aside(aside) if isinstance(self.tactile, Levels) else aside.kept(self.tactile)
+    def put_aside(self, mapped: MappedArrays) -> Track:
+        """Return the same track, whose rows lie in ``mapped``."""
+        tactile = self.tactile.put_aside(mapped) if isinstance(self.tactile, Levels) else mapped.kept(self.tactile)
         latent: AnyFloats | Levels
         if not isinstance(self.latent, Levels):
-            latent = aside.kept(self.latent)
+            latent = mapped.kept(self.latent)
         elif isinstance(self.tactile, Levels) and self.latent.stored is self.tactile.stored:
             assert isinstance(tactile, Levels)
             latent = tactile.of_type(self.latent.dtype)
         else:
-            latent = self.latent.put_aside(aside)
+            latent = self.latent.put_aside(mapped)
         names = ("t_ns", "contact", "groups", "usable", "arm", "finger")
-        others: dict[str, Any] = {name: aside.kept(getattr(self, name)) for name in names}
-        return replace(self, tactile=tactile, latent=latent, **others)
+        arrays: dict[str, Any] = {name: mapped.kept(getattr(self, name)) for name in names}
+        return replace(self, tactile=tactile, latent=latent, **arrays)
 
     def contact_starts(self, context: int, horizon: int, stride: int) -> Int64s:
         """Return the first rows of the windows that lie within one contact (window,)."""
@@ -160,14 +160,14 @@ def pose_of(shard: Recording, actions: str, arm: str = "") -> Pose:
     """
     schema = shard.columns().schema
     try:
-        found = poses.pose(schema, arm, needed=actions != "none")
+        pose = poses.pose(schema, arm, needed=actions != "none")
     except UsageError as error:
         raise UsageError(f"{shard.name}: {error}") from error
     except TacpipeError as error:
         raise TacpipeError(f"{shard.name}: {error}") from error
-    if not found.position and actions != "none":
+    if not pose.position and actions != "none":
         raise poses.no_arm(shard.name, schema)
-    return found
+    return pose
 
 
 def track(shard: Recording, codec: codecs.Codec, pose: Pose = poses.NAMED) -> Track:
@@ -199,7 +199,7 @@ def track(shard: Recording, codec: codecs.Codec, pose: Pose = poses.NAMED) -> Tr
     columns.release()
     finite &= np.isfinite(arm).all(axis=1)
     timeline = str(shard.attributes.get("grid", "uniform"))
-    held = shard.attributes.get("object")
+    labelled_object = shard.attributes.get("object")
     return Track(
         shard.name,
         t_ns,
@@ -211,7 +211,7 @@ def track(shard: Recording, codec: codecs.Codec, pose: Pose = poses.NAMED) -> Tr
         finger.astype(np.float32),
         above_rest,
         timeline,
-        None if held is None else str(held),
+        None if labelled_object is None else str(labelled_object),
         slips,
     )
 
@@ -220,9 +220,9 @@ def _position(table: pa.Table | Columns, pose: Pose) -> AnyFloats:
     """Return where the arm is (time, 3), m; the origin without an arm."""
     if not pose.position:
         return np.zeros((table.num_rows, 3))
-    found = inputs(table, pose.position)
+    position = inputs(table, pose.position)
     scale = np.array([poses.metres(table.schema.field(name)) for name in pose.position])
-    return found if (scale == 1.0).all() else found * scale
+    return position if (scale == 1.0).all() else position * scale
 
 
 def _orientation(table: pa.Table | Columns, pose: Pose) -> AnyFloats:
@@ -238,18 +238,18 @@ def _orientation(table: pa.Table | Columns, pose: Pose) -> AnyFloats:
 
 def _opening(table: pa.Table | Columns) -> AnyFloats:
     """Return the width between the fingers (time,), m; 0 where none is recorded, or several."""
-    found = opening(table.schema)
-    if not found:
+    column = opening(table.schema)
+    if not column:
         return np.zeros(table.num_rows)
-    scale = poses.metres(table.schema.field(found))
-    width = inputs(table, [found])[:, 0]
+    scale = poses.metres(table.schema.field(column))
+    width = inputs(table, [column])[:, 0]
     return width if scale == 1.0 else width * scale
 
 
 def opening(schema: pa.Schema) -> str:
     """Return the column of the width between the fingers; the empty text where there is none, or several."""
-    found = (FINGER,) if FINGER in schema.names else tactile.columns(schema, poses.WIDTH)
-    return found[0] if len(found) == 1 else ""
+    columns = (FINGER,) if FINGER in schema.names else tactile.columns(schema, poses.WIDTH)
+    return columns[0] if len(columns) == 1 else ""
 
 
 def _velocity(table: pa.Table | Columns, pose: Pose, t_ns: Times, placed: AnyFloats) -> AnyFloats:
@@ -265,9 +265,9 @@ def _velocity(table: pa.Table | Columns, pose: Pose, t_ns: Times, placed: AnyFlo
 def joints(schema: pa.Schema, pose: Pose) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the columns of the angles and speeds of the arm's joints, empty where it has none."""
     if pose == poses.NAMED:
-        each = range(1, JOINTS + 1)
-        found = tuple(f"robot_joint{n}_rad" for n in each), tuple(f"robot_joint{n}_velocity_rad_s" for n in each)
-        return found if set(found[0] + found[1]) <= set(schema.names) else ((), ())
+        numbers = range(1, JOINTS + 1)
+        names = tuple(f"robot_joint{n}_rad" for n in numbers), tuple(f"robot_joint{n}_velocity_rad_s" for n in numbers)
+        return names if set(names[0] + names[1]) <= set(schema.names) else ((), ())
     if not pose.position:
         return (), ()
     stream = tactile.metadata(schema.field(pose.position[0])).get("stream")
@@ -315,11 +315,11 @@ def rate_hz(tracks: Sequence[Track]) -> float:
     On rows as logged or fresh a step is a row, however long it takes; so rates may differ there. Else raises
     `TacpipeError` where they do by more than 1 %, and where the tracks are not of one timeline.
     """
-    if len({one.timeline for one in tracks}) > 1:
-        found = {one.timeline: one.name for one in tracks}
-        grids = ", ".join(f"{name} is {timeline}" for timeline, name in sorted(found.items()))
+    if len({track.timeline for track in tracks}) > 1:
+        names_by_timeline = {track.timeline: track.name for track in tracks}
+        grids = ", ".join(f"{name} is {timeline}" for timeline, name in sorted(names_by_timeline.items()))
         raise TacpipeError(f"The recordings are not of one grid: {grids}. Synchronize all with one --grid.")
-    rates = {one.name: 1e9 / float(np.median(np.diff(one.t_ns))) for one in tracks if len(one.t_ns) > 1}
+    rates = {track.name: 1e9 / float(np.median(np.diff(track.t_ns))) for track in tracks if len(track.t_ns) > 1}
     if not rates:
         return 0.0
     slow, fast = min(rates, key=lambda name: rates[name]), max(rates, key=lambda name: rates[name])

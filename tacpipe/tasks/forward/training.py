@@ -55,7 +55,7 @@ if TYPE_CHECKING:
 
 HISTORY = "history.jsonl"
 CALIBRATED = 16_384  # windows that scales are fitted on, evenly spread: they overlap, so hardly a row is left out
-BLOCK_ROWS = 1 << 14  # that are looked at at once
+BLOCK_ROWS = 1 << 14  # rows that are read at once
 IN_MEMORY = 1 << 27  # bytes of rows of recordings, before they lie on disk
 LINEAR = 20_000  # windows that the linear baselines are fitted on
 SHRINKING = 3000  # validation windows that the weights of the forecast are fitted on at most, evenly spread
@@ -86,26 +86,28 @@ def train(
     if init and start:
         _check_start(start, init, params, codec, training.files)
         _check_pose(start, pose)
-    aside = MappedArrays(IN_MEMORY)
+    mapped = MappedArrays(IN_MEMORY)
     parts = [
-        [tracks.track(shard, codec, pose).put_aside(aside) for _, shard in sorted(dataset.recordings.items())]
+        [tracks.track(shard, codec, pose).put_aside(mapped) for _, shard in sorted(dataset.recordings.items())]
         for dataset in (training, validation)
     ]
-    rate_hz = tracks.rate_hz([one for part in parts for one in part])
-    reference = start.orientation if start else _reference(one.arm[one.usable, 3:7] for one in parts[0])
-    parts = [[_aligned(one, reference, aside) for one in part] for part in parts]
+    rate_hz = tracks.rate_hz([track for part in parts for track in part])
+    reference = start.orientation if start else _reference(track.arm[track.usable, 3:7] for track in parts[0])
+    parts = [[_aligned(track, reference, mapped) for track in part] for part in parts]
     device = devices.kind()
-    known, watched = (
-        _windows(part, params, stride, device, aside) for part, stride in zip(parts, (params.stride, 1), strict=True)
+    training_rows, validation_rows = (
+        _windows(part, params, stride, device, mapped) for part, stride in zip(parts, (params.stride, 1), strict=True)
     )
-    for role, dataset, windows in (("training", training, known), ("validation", validation, watched)):
+    for role, dataset, windows in (("training", training, training_rows), ("validation", validation, validation_rows)):
         if not len(windows.starts):
             raise tracks.no_window(f"The {role} recordings hold", dataset, params.context, params.horizon)
     _check_channels(codec, parts[0])
-    build = partial(_built, params, codec, known, start, device)
+    build = partial(_built, params, codec, training_rows, start, device)
     schedule = loop.Schedule.from_params(params, params.seed, params.gradient_clip)
-    trained = loop.train(build, loop.Windows(known.part, watched.part, params.batch), schedule, workspace)
-    weights = trained.weights | _shrinkage(trained.weights, params, codec, watched)
+    trained = loop.train(
+        build, loop.Windows(training_rows.part, validation_rows.part, params.batch), schedule, workspace
+    )
+    weights = trained.weights | _shrinkage(trained.weights, params, codec, validation_rows)
     best = min(trained.history, key=lambda line: line["val_loss"])
     config: Config = {
         **_description(params, codec, pose, unit, reference),
@@ -113,37 +115,41 @@ def train(
         "gap_ms": _gap_ms(training),
         **_look_ahead(training),
         "timeline": parts[0][0].timeline,
-        "scaling": _scaling(parts[0], aside),
-        "largest_level": max(largest_level(one.tactile[some]) for one, some in _usable(parts[0], aside)),
+        "scaling": _scaling(parts[0], mapped),
+        "largest_level": max(largest_level(track.tactile[usable]) for track, usable in _usable(parts[0], mapped)),
         "validation": {"loss": best["val_loss"], "epoch": best["epoch"]},
         "trained_on": trained_on.add_earlier(
             trained_on.of_datasets(training, validation), start.config["trained_on"] if start else {}
         ),
-        "objects": sorted({one.object for one in parts[0] if one.object is not None}),
+        "objects": sorted({track.object for track in parts[0] if track.object is not None}),
         "counts": {
-            name: {"recordings": len(part), "windows": len(one.starts)}
-            for name, part, one in zip(("train", "val"), parts, (known, watched), strict=True)
+            name: {"recordings": len(part), "windows": len(track.starts)}
+            for name, part, track in zip(("train", "val"), parts, (training_rows, validation_rows), strict=True)
         },
     }
     files = {} if codec.kind == "raw" else {name: training.files[name] for name in (codecs.DESCRIPTION, codecs.TENSORS)}
     if params.baselines:
-        linear = Baselines.fit(_linear(known), _linear(watched))
+        linear = Baselines.fit(_linear(training_rows), _linear(validation_rows))
         config["baselines"] = linear.chosen
-        files[BASELINES] = save_arrays({name: np.ascontiguousarray(one) for name, one in linear.to_tensors().items()})
+        files[BASELINES] = save_arrays(
+            {name: np.ascontiguousarray(track) for name, track in linear.to_tensors().items()}
+        )
     files |= {WEIGHTS: save_tensors(weights), CONFIG: model_files.to_json(config)}
     if params.baselines:
         config["anticipation"] = _alarms(Forecaster.load(files), parts[1])
     return {**files, CONFIG: model_files.to_json(config), HISTORY: trained.history_lines}
 
 
-def _built(params: Params, codec: codecs.Codec, known: Rows, start: Forecaster | None, device: str) -> nn.Module:
+def _built(
+    params: Params, codec: codecs.Codec, training_rows: Rows, start: Forecaster | None, device: str
+) -> nn.Module:
     """Return the network as training begins: with the scales of some training windows, or with all of ``start``."""
     model = networks.build(params, codec).to(device)
-    if len(known.starts):
-        some = known.pick(known.some(CALIBRATED))
-        networks.check(model, params, some[0], len(codec.latents))
+    if len(training_rows.starts):
+        sample = training_rows.pick(training_rows.evenly_spread(CALIBRATED))
+        networks.check(model, params, sample[0], len(codec.latents))
         if not start:
-            model.calibrate(*some)  # type: ignore[operator]
+            model.calibrate(*sample)  # type: ignore[operator]
     if start:
         _take_over(model, start)
     return model
@@ -156,7 +162,7 @@ def _shrinkage(weights: dict[str, Tensor], params: Params, codec: codecs.Codec, 
     if not model.change_only:
         return {}
     model.load_state_dict(weights)
-    starts = watched.some(SHRINKING)
+    starts = watched.evenly_spread(SHRINKING)
     windows, ahead = watched.pick(starts)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(params.seed)  # plans may be shuffled
@@ -176,7 +182,7 @@ def _description(params: Params, codec: codecs.Codec, pose: Pose, unit: str, ref
         "horizon": params.horizon,
         "inputs": {
             "tactile": list(codec.channels),
-            "layout": [dict(one) for one in codec.layout],
+            "layout": [dict(channel) for channel in codec.layout],
             "orientation_reference": reference.tolist(),
             **({} if unit == units.COUNT else {"unit": unit}),
             **({} if pose == NAMED else {"pose": {"position": pose.position, "orientation": pose.orientation}}),
@@ -215,9 +221,9 @@ def _alarms(forecaster: Forecaster, part: Sequence[Track]) -> dict[str, Any]:
     loads = Loads(forecaster.codec.layout, forecaster.horizon)
     for track in part:
         loads.begin(track)
-        for some in predicted(forecaster, track, track.starts(forecaster.context, forecaster.horizon)):
-            loads.add(some)
-            del some  # before the next one is made
+        for windows in predicted(forecaster, track, track.starts(forecaster.context, forecaster.horizon)):
+            loads.add(windows)
+            del windows  # frees the memory for the next windows
     return loads.calibrated()
 
 
@@ -231,22 +237,24 @@ def check_codec(model: Mapping[str, bytes], recordings: Mapping[str, bytes]) -> 
         )
 
 
-def _aligned(track: Track, reference: AnyFloats, aside: MappedArrays) -> Track:
-    """Return a track whose quaternions have the sign of ``reference``; where they had the other one, in ``aside``."""
+def _aligned(track: Track, reference: AnyFloats, mapped: MappedArrays) -> Track:
+    """Return a track whose quaternions have the sign of ``reference``; where they had the other one, in ``mapped``."""
     arm = tracks.aligned(track.arm, reference)
-    return track if arm is track.arm else dataclasses.replace(track, arm=aside.kept(arm))
+    return track if arm is track.arm else dataclasses.replace(track, arm=mapped.kept(arm))
 
 
-def _windows(part: Sequence[Track], params: Params, stride: int, device: str, aside: MappedArrays) -> Rows:
+def _windows(part: Sequence[Track], params: Params, stride: int, device: str, mapped: MappedArrays) -> Rows:
     """Return the rows of a part and its windows, all or those in contact."""
     context, horizon = params.context, params.horizon
-    starts = [(one.starts if params.windows == "all" else one.contact_starts)(context, horizon, stride) for one in part]
-    return rows(part, starts, context, horizon, actions=params.actions, device=device, aside=aside)
+    starts = [
+        (track.starts if params.windows == "all" else track.contact_starts)(context, horizon, stride) for track in part
+    ]
+    return rows(part, starts, context, horizon, actions=params.actions, device=device, mapped=mapped)
 
 
 def _linear(part: Rows) -> tuple[AnyFloats, AnyFloats, AnyFloats]:
     """Return past touch (window, context, channel), motion (window, row, 12) and future touch, for the baselines."""
-    starts = part.some(LINEAR)
+    starts = part.evenly_spread(LINEAR)
     at = starts.cpu().numpy()[:, None]
     past, ahead = at + np.arange(part.context), at + np.arange(part.context, part.context + part.horizon)
     moved = motion(part.pick(starts)[0])[0].transpose(0, 1).cpu().numpy()
@@ -255,47 +263,47 @@ def _linear(part: Rows) -> tuple[AnyFloats, AnyFloats, AnyFloats]:
 
 def _check_channels(codec: codecs.Codec, part: Sequence[Track]) -> None:
     """Refuse training recordings in which no channel ever moves: there is nothing to predict."""
-    if any(one.usable.any() for one in part) and all(not one.tactile[one.usable].any() for one in part):
+    if any(track.usable.any() for track in part) and all(not track.tactile[track.usable].any() for track in part):
         raise TacpipeError(
             f"None of the {len(codec.channels)} tactile channels ever moves in {len(part)} training recordings. "
             "Check the sensor, and that the recordings hold contact."
         )
 
 
-def _scaling(part: Sequence[Track], aside: MappedArrays) -> dict[str, list[float]]:
+def _scaling(part: Sequence[Track], mapped: MappedArrays) -> dict[str, list[float]]:
     """Return half the range of each feature and the standard deviation of each channel over usable training rows."""
-    ranges = [scaling.fit(one.latent[some]) for one, some in _usable(part, aside)]
+    ranges = [scaling.fit(track.latent[usable]) for track, usable in _usable(part, mapped)]
     if not ranges:
         scaling.fit(part[0].latent[:0])  # states what to do
     total: AnyFloats = np.zeros(0)
     count = 0
-    for one, some in _usable(part, aside):
-        total, count = _summed(total, one.tactile[some]), count + len(some)
+    for track, usable in _usable(part, mapped):
+        total, count = _summed(total, track.tactile[usable]), count + len(usable)
     mean = total / count
     squares: AnyFloats = np.zeros(0)
-    for one, some in _usable(part, aside):
-        squares = _summed(squares, (one.tactile[some] - mean) ** 2)
+    for track, usable in _usable(part, mapped):
+        squares = _summed(squares, (track.tactile[usable] - mean) ** 2)
     spread = np.sqrt(squares / count)
-    low, high = np.min([one.low for one in ranges], axis=0), np.max([one.high for one in ranges], axis=0)
+    low, high = np.min([track.low for track in ranges], axis=0), np.max([track.high for track in ranges], axis=0)
     return {
         "feature_half": scaling.MinMax(low, high).half.tolist(),
         "channel_count": np.where(spread > 0, spread, 1.0).tolist(),
     }
 
 
-def _usable(part: Sequence[Track], aside: MappedArrays) -> Iterator[tuple[Track, Int64s]]:
+def _usable(part: Sequence[Track], mapped: MappedArrays) -> Iterator[tuple[Track, Int64s]]:
     """Yield each recording with its usable rows, some at a time."""
-    for one in part:
-        rows = np.flatnonzero(one.usable)
+    for track in part:
+        rows = np.flatnonzero(track.usable)
         for first in range(0, len(rows), BLOCK_ROWS):
-            yield one, rows[first : first + BLOCK_ROWS]
-        aside.release()
+            yield track, rows[first : first + BLOCK_ROWS]
+        mapped.release()
 
 
-def _summed(total: AnyFloats, more: AnyFloats) -> AnyFloats:
+def _summed(total: AnyFloats, rows: AnyFloats) -> AnyFloats:
     """Return the sum of rows (row, channel) and of those before them (channel,), to the bit as numpy adds all at once."""
-    found: AnyFloats = np.add.reduce(np.concatenate([total[None], more]) if total.size else more, axis=0)
-    return found
+    sums: AnyFloats = np.add.reduce(np.concatenate([total[None], rows]) if total.size else rows, axis=0)
+    return sums
 
 
 def _described(codec: codecs.Codec) -> dict[str, Any]:
@@ -309,7 +317,7 @@ def _described(codec: codecs.Codec) -> dict[str, Any]:
 
 def _reference(quaternions: Iterable[AnyFloats]) -> AnyFloats:
     """Return the first usable quaternion of the training recordings (4,): the sign that all are given."""
-    return next((one[0].astype(np.float64) for one in quaternions if len(one)), np.array([0.0, 0.0, 0.0, 1.0]))
+    return next((rows[0].astype(np.float64) for rows in quaternions if len(rows)), np.array([0.0, 0.0, 0.0, 1.0]))
 
 
 def _resolved(params: Params, codec: codecs.Codec, start: Forecaster | None) -> Params:
@@ -319,12 +327,14 @@ def _resolved(params: Params, codec: codecs.Codec, start: Forecaster | None) -> 
     """
     if not isinstance(params, Change):
         return params
-    asked = params.architecture
-    if asked == forecasts.AUTO and start and isinstance(start.params, Change):
-        asked = start.params.architecture
+    architecture = params.architecture
+    if architecture == forecasts.AUTO and start and isinstance(start.params, Change):
+        architecture = start.params.architecture
     return dataclasses.replace(
         params,
-        architecture=cast("Literal['taxelwise', 'gru', 'lstm', 'tcn']", forecasts.resolved(asked, layout(codec))),
+        architecture=cast(
+            "Literal['taxelwise', 'gru', 'lstm', 'tcn']", forecasts.resolved(architecture, layout(codec))
+        ),
         loss=forecasts.resolved_loss(params.loss, changes=codec.representation == INCREMENTS),
     )
 
@@ -338,16 +348,16 @@ def _check_start(
 ) -> None:
     """Raise `TacpipeError` where the model to begin with does not fit what is to be trained."""
     for name in ("architecture", "members", "hidden", "context", "horizon"):
-        found, wanted = getattr(start.params, name), getattr(params, name)
-        if found != wanted:
+        started_with, requested = getattr(start.params, name), getattr(params, name)
+        if started_with != requested:
             raise TacpipeError(
-                f"The model of --init has {name} {found} and the one to train {wanted}; they must be equal. "
-                f"Give --{name} {found}, or begin without --init."
+                f"The model of --init has {name} {started_with} and the one to train {requested}; they must be equal. "
+                f"Give --{name} {started_with}, or begin without --init."
             )
-    read, held = start.config["codec"]["name"], _described(codec)["name"]
-    if read != held:
+    read, recorded = start.config["codec"]["name"], _described(codec)["name"]
+    if read != recorded:
         raise TacpipeError(
-            f"The model of --init reads {read} and the recordings hold {held}, so its weights mean something else. "
+            f"The model of --init reads {read} and the recordings hold {recorded}, so its weights mean something else. "
             "Give recordings of the same representation, or begin without --init."
         )
     check_codec(init, recordings)
@@ -370,21 +380,21 @@ def _take_over(model: nn.Module, start: Forecaster) -> None:
 
 
 def notes(params: Params, files: Mapping[str, bytes]) -> list[str]:
-    """Return what a user should know of a trained model, its ``files`` given: an architecture that is not the best known."""
+    """Return notes on a trained model, from its ``files``: step, look-ahead, and an architecture that is not the best."""
     config = json.loads(files[CONFIG])
     rows = [f"A step is {1e3 / config['rate_hz']:.4g} ms."] if config["rate_hz"] else []
     rows += look_ahead_notes(config)
     raw, channels = config["codec"]["kind"] == "raw", config["inputs"]["layout"]
     if params.architecture == forecasts.AUTO and raw and config["architecture"] != forecasts.TAXELWISE:
-        named = sum("taxel" in one for one in channels)
-        why = (
-            f"{named} of {len(channels)} channels state their taxel"
-            if named < len(channels)
+        stated = sum("taxel" in channel for channel in channels)
+        reason = (
+            f"{stated} of {len(channels)} channels state their taxel"
+            if stated < len(channels)
             else "sensors differ in size"
         )
         return [
             *rows,
-            f"{why}, so the architecture is {config['architecture']} and not {forecasts.TAXELWISE}. Write {{taxel}} in "
+            f"{reason}, so the architecture is {config['architecture']} and not {forecasts.TAXELWISE}. Write {{taxel}} in "
             f"match of [streams.…] columns of the layout file where channels are taxels.",
         ]
     return rows
@@ -393,8 +403,9 @@ def notes(params: Params, files: Mapping[str, bytes]) -> list[str]:
 def _check_pose(start: Forecaster, pose: Pose) -> None:
     """Raise `TacpipeError` where the model to begin with reads another arm than the recordings have."""
     if start.pose != pose:
-        read, there = (", ".join(one.columns) or "no arm" for one in (start.pose, pose))
+        read, recorded = (", ".join(pose_read.columns) or "no arm" for pose_read in (start.pose, pose))
         raise TacpipeError(
-            f"The model of --init reads {read} and the recordings hold {there}. Give recordings of the same arm, or begin "
+            f"The model of --init reads {read} and the recordings hold {recorded}. Give recordings of the same "
+            f"arm, or begin "
             f"without --init."
         )

@@ -40,16 +40,16 @@ class Uncertainty:
     def quantiles(self, read: Float32s, ahead: AnyFloats) -> Float32s:
         """Return quantiles in counts above rest (window, step, channel, level), ascending, of the forecast ``ahead``
         (window, step, channel) and its ``signs`` (window, channel, feature)."""
-        found = self.errors.predict(read)  # (window, channel, step, level)
+        quantiles = self.errors.predict(read)  # (window, channel, step, level)
         middle, unit = len(self.percents) // 2, self.errors.unit[None]
         for at in range(len(self.percents)):
             if at != middle:
                 outwards = unit * self.moved[at].astype(np.float32)
-                found[..., at] += outwards if at > middle else -outwards
-        np.maximum.accumulate(found[..., middle:], axis=-1, out=found[..., middle:])
-        down = found[..., : middle + 1][..., ::-1]
+                quantiles[..., at] += outwards if at > middle else -outwards
+        np.maximum.accumulate(quantiles[..., middle:], axis=-1, out=quantiles[..., middle:])
+        down = quantiles[..., : middle + 1][..., ::-1]
         np.minimum.accumulate(down, axis=-1, out=down)
-        return found.transpose(0, 2, 1, 3) + ahead[..., None].astype(np.float32)
+        return quantiles.transpose(0, 2, 1, 3) + ahead[..., None].astype(np.float32)
 
     @classmethod
     def fit(
@@ -83,18 +83,24 @@ class Uncertainty:
     @classmethod
     def load(cls, content: bytes, channels: int, horizon: int) -> Self:
         """Return what `to_bytes` wrote. Raises `TacpipeError` for another file, `ValueError` where shapes do not fit."""
-        found = model_files.arrays(content, FILE)
-        made = cls(
-            ResidualQuantiles.from_tensors(under(ERRORS, found)),
-            *(found[name] for name in ("moved", "unconditional", "persistence")),
+        arrays = model_files.arrays(content, FILE)
+        uncertainty = cls(
+            ResidualQuantiles.from_tensors(under(ERRORS, arrays)),
+            *(arrays[name] for name in ("moved", "unconditional", "persistence")),
         )
-        levels = len(made.percents)
-        shapes = {(levels, channels, horizon)} | {one.shape for one in (made.unconditional, made.persistence)}
-        if len(shapes) > 1 or made.moved.shape != (levels, horizon) or made.errors.unit.shape != (channels, horizon):
+        levels = len(uncertainty.percents)
+        shapes = {(levels, channels, horizon)} | {
+            array.shape for array in (uncertainty.unconditional, uncertainty.persistence)
+        }
+        if (
+            len(shapes) > 1
+            or uncertainty.moved.shape != (levels, horizon)
+            or uncertainty.errors.unit.shape != (channels, horizon)
+        ):
             raise ValueError("the quantiles are of other channels or steps")
-        if made.errors.centre.shape != (SIGNS + horizon,):
-            raise ValueError(f"the quantiles read {made.errors.centre.shape} features, not {SIGNS + horizon}")
-        return made
+        if uncertainty.errors.centre.shape != (SIGNS + horizon,):
+            raise ValueError(f"the quantiles read {uncertainty.errors.centre.shape} features, not {SIGNS + horizon}")
+        return uncertainty
 
 
 @dataclass(frozen=True)
@@ -131,8 +137,8 @@ def _moved(errors: ResidualQuantiles, predicted: Float32s, calibration: Errors, 
             high, level = len(levels) - 1 - low, float(levels[-1 - low])
             sides = {low: -beyond[..., low].ravel(), high: beyond[..., high].ravel()}
             if promised:
-                both = np.maximum(*sides.values())
-                moved[[low, high], step] = _promise(both, groups, 2 * level - 1)
+                larger = np.maximum(*sides.values())
+                moved[[low, high], step] = _promise(larger, groups, 2 * level - 1)
             else:
                 for at, scores in sides.items():
                     moved[at, step] = conformal.quantile(scores, groups, level)
@@ -140,15 +146,15 @@ def _moved(errors: ResidualQuantiles, predicted: Float32s, calibration: Errors, 
 
 
 def _promise(scores: AnyFloats, groups: Int64s, level: float) -> float:
-    found = conformal.quantile(scores, groups, level, promised=True)
-    if not np.isfinite(found):
+    bound = conformal.quantile(scores, groups, level, promised=True)
+    if not np.isfinite(bound):
         count = len(np.unique(groups))
         raise TacpipeError(
             f"{count} calibration recordings can promise a band that holds {100 * conformal.most_promised(count):.0f} % at "
             f"most, not {100 * level:.0f} %. Split with more of them (`tacpipe split --val`), give quantiles nearer to 50, "
             f"or leave out --promise."
         )
-    return found
+    return bound
 
 
 def _empirical(errors: Float32s, levels: AnyFloats) -> Float32s:
@@ -156,6 +162,6 @@ def _empirical(errors: Float32s, levels: AnyFloats) -> Float32s:
     return np.quantile(errors, levels, axis=0).astype(np.float32)
 
 
-def fewer(starts: Int64s, most: int) -> Int64s:
-    """Return at most ``most`` of a recording's windows, evenly spread."""
-    return starts[:: max(1, -(-len(starts) // most))]
+def fewer(starts: Int64s, limit: int) -> Int64s:
+    """Return at most ``limit`` of a recording's windows, evenly spread."""
+    return starts[:: max(1, -(-len(starts) // limit))]

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     import pyarrow as pa
 
-COUNT, COUNTS = "count", "counts"  # as columns have it, and as texts do
-MIXED = "own units"  # of channels, or of models, that differ
+COUNT, COUNTS = "count", "counts"  # the unit in columns and in texts
+MIXED = "own units"  # unit of channels, or of models, that differ
 
 
 def of_channels(schema: pa.Schema, channels: Sequence[str]) -> str:
     """Return the unit of tactile columns, `MIXED` where they have several."""
-    found = {(schema.field(name).metadata or {}).get(b"unit", b"").decode() or COUNT for name in channels}
-    return found.pop() if len(found) == 1 else MIXED
+    units = {(schema.field(name).metadata or {}).get(b"unit", b"").decode() or COUNT for name in channels}
+    return units.pop() if len(units) == 1 else MIXED
 
 
 def of_model(config: Mapping[str, Any]) -> str:
@@ -29,5 +29,5 @@ def of_model(config: Mapping[str, Any]) -> str:
 
 def common(configs: Iterable[Mapping[str, Any]]) -> str:
     """Return the unit that models have in common, `MIXED` where they differ."""
-    found = {of_model(config) for config in configs} or {COUNTS}
-    return found.pop() if len(found) == 1 else MIXED
+    units = {of_model(config) for config in configs} or {COUNTS}
+    return units.pop() if len(units) == 1 else MIXED

@@ -59,7 +59,7 @@ def score(
     """Evaluate one feature against a noise of 1 count and alarms beyond 1 count."""
     groups = np.zeros(len(truth)) if groups is None else groups
     one = np.ones(truth.shape[1])
-    return anticipation.score(truth, ahead, groups, horizon=HORIZON, sd=one, theta=one, rate_hz=RATE_HZ, held=held)
+    return anticipation.score(truth, ahead, groups, horizon=HORIZON, sd=one, theta=one, rate_hz=RATE_HZ, repeated=held)
 
 
 def trained(forecast: str, lasts: tuple[int, int] = (1, 1)) -> Anticipation:
@@ -141,7 +141,7 @@ def test_a_lead_counts_from_the_first_alarm_in_the_horizon_before_the_onset() ->
     for alarm, lead in ((99, 1), (96, 4), (91, 9), (90, 10)):
         ahead = truth.copy()
         ahead[[alarm, 99]] += 5
-        found = score(truth, ahead, held=held)
+        found = score(truth, ahead, repeated=held)
         assert (found.events, found.recall, found.median_lead_rows) == (1, 1, lead)
         assert found.median_lead_frames == sum(row % 4 == 0 for row in range(alarm + 1, 101))
         assert found.false_alarms_per_minute == 0

@@ -35,9 +35,9 @@ def test_windows_are_rows_of_one_recording_each() -> None:
 
 def test_some_are_spread_evenly_and_no_more_than_asked_for() -> None:
     found = joined()
-    assert torch.equal(found.some(100), found.starts)
-    assert found.some(10).tolist() == found.starts[::4].tolist()
-    assert len(found.some(10)) <= 10
+    assert torch.equal(found.evenly_spread(100), found.starts)
+    assert found.evenly_spread(10).tolist() == found.starts[::4].tolist()
+    assert len(found.evenly_spread(10)) <= 10
 
 
 def test_no_recordings_and_no_windows_make_no_rows() -> None:
