@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
-from tacpipe.models.recurrent_forward import RecurrentForward
+from tacpipe.models.forecasts import RecurrentForward
 from tacpipe.training import loop
 
 CONTEXT, HORIZON, STATES, HIDDEN, WINDOWS = 10, 10, 7, 200, 8192

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils.data import DataLoader, Dataset
 
-from tacpipe.models.minirocket_classifier import MinirocketClassifier
+from tacpipe.models.minirocket import MinirocketClassifier
 from tacpipe.models.recurrent_autoencoder import RecurrentAutoencoder, Shape
 from tacpipe.tasks.material.losses import JointWork, ScaledSlides, Weights
 from tacpipe.tasks.material.pairs import Pairs

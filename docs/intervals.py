@@ -19,8 +19,8 @@ from scipy.stats import t as student
 from tacpipe.arrays import AnyFloats, Floats
 from tacpipe.metrics import intervals, pairing
 from tacpipe.metrics.headline import FEWEST
+from tacpipe.metrics.intervals import wilson
 from tacpipe.metrics.pairing import Measure
-from tacpipe.metrics.proportions import wilson
 from tacpipe.tasks.forward import headline as forward
 from tacpipe.tasks.touch import headline as touch
 

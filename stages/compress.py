@@ -113,9 +113,9 @@ def pca(params: Params, recording: Recording, codec: Fitted) -> pa.Table:
 
     Example: tacpipe compress pca data/segments --split data/split -o data/latents
     """
-    from tacpipe.codecs import latents
+    from tacpipe.codecs import tactile
 
-    return latents.added(recording, codec)
+    return tactile.added(recording, codec)
 
 
 @stage(version=1, fit=fit_autoencoder)
@@ -128,9 +128,9 @@ def autoencoder(params: AutoencoderParams, recording: Recording, codec: Fitted) 
 
     Example: tacpipe compress autoencoder data/segments --split data/split -o data/latents
     """
-    from tacpipe.codecs import latents
+    from tacpipe.codecs import tactile
 
-    return latents.added(recording, codec)
+    return tactile.added(recording, codec)
 
 
 def _kept(components: int, channels: int) -> tuple[int, list[str]]:

@@ -18,7 +18,7 @@ import dataclasses
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from tacpipe.metrics import headline, summary
+from tacpipe.metrics import headline
 from tacpipe.plugins.params import added
 from tacpipe.plugins.stage import stage
 
@@ -55,8 +55,8 @@ def evaluate(params: Params, model: Model, recordings: Dataset) -> Result:
             result = task.evaluate(model, recordings)
     if headline.FILE not in result.files:  # of a task of another package that has none
         return result
-    summarized = summary.write(headline.read(result.files[headline.FILE]), task.short_names)
-    return dataclasses.replace(result, files={**result.files, summary.FILE: summarized})
+    summarized = headline.write_summary(headline.read(result.files[headline.FILE]), task.short_names)
+    return dataclasses.replace(result, files={**result.files, headline.SUMMARY: summarized})
 
 
 def _evaluate_sessions(task: Task, model: Model, recordings: Dataset) -> Result:

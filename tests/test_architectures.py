@@ -415,10 +415,10 @@ def test_an_architecture_that_extends_none_of_the_two_is_trained_by_its_own_fit(
 
 
 def test_a_codec_that_is_not_installed_is_named_with_its_package() -> None:
-    from tacpipe.codecs import stored
+    from tacpipe.codecs import codec
 
     files = {"codec.json": b'{"kind": "wavelet", "plugin": "lab-codecs 2.0"}', "codec.safetensors": b""}
     with pytest.raises(TacpipeError, match=r"'wavelet' comes from the package lab-codecs 2\.0.*autoencoder, pca"):
-        stored.load(files)
+        codec.load(files)
     assert registry.codecs() == ["autoencoder", "pca"]
     assert architectures.task(dict) is None

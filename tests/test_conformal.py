@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tacpipe.errors import TacpipeError
-from tacpipe.metrics.conformal import most_promised, quantile
+from tacpipe.metrics.quantiles import conformal_quantile, most_promised
 
 SCORES = st.floats(-1e6, 1e6, allow_nan=False)
 GROUPS = st.lists(st.lists(SCORES, min_size=1, max_size=6), min_size=2, max_size=8)
@@ -31,7 +31,7 @@ def test_a_group_left_out_lies_below_the_promised_quantile_of_the_others_as_ofte
     below = []
     for at, group in enumerate(groups):
         scores, numbers = joined(groups[:at] + groups[at + 1 :])
-        below.append(np.mean(np.array(group) <= quantile(scores, numbers, level, promised=True)))
+        below.append(np.mean(np.array(group) <= conformal_quantile(scores, numbers, level, promised=True)))
     assert np.mean(below) >= level - 1e-9
 
 
@@ -39,26 +39,26 @@ def test_a_group_left_out_lies_below_the_promised_quantile_of_the_others_as_ofte
 def test_with_one_score_a_group_it_is_split_conformal_prediction(scores: list[float], level: float) -> None:
     rank = math.ceil(level * (len(scores) + 1) - 1e-6)
     expected = sorted(scores)[rank - 1] if rank <= len(scores) else math.inf
-    assert quantile(np.array(scores), np.arange(len(scores)), level, promised=True) == expected
+    assert conformal_quantile(np.array(scores), np.arange(len(scores)), level, promised=True) == expected
 
 
 @given(st.lists(SCORES, min_size=1, max_size=40), LEVELS)
 def test_pooled_scores_of_one_group_have_the_quantile_of_numpy(scores: list[float], level: float) -> None:
-    estimate = quantile(np.array(scores), np.zeros(len(scores), int), level)
+    estimate = conformal_quantile(np.array(scores), np.zeros(len(scores), int), level)
     near = [level - 1e-7, level, level + 1e-7]  # Either is right if the level falls between two scores.
     assert estimate in {float(np.quantile(scores, min(near_level, 1), method="inverted_cdf")) for near_level in near}
 
 
 def test_a_long_recording_weighs_as_much_as_a_short_one() -> None:
     scores, groups = joined([[0.0] * 98, [1.0, 2.0]])
-    assert quantile(scores, groups, 0.75) == 1.0
+    assert conformal_quantile(scores, groups, 0.75) == 1.0
 
 
 def test_four_recordings_promise_eighty_percent_and_no_more() -> None:
     scores, groups = joined([[1.0], [2.0], [3.0], [4.0]])
     assert most_promised(4) == 0.8
-    assert quantile(scores, groups, 0.8, promised=True) == 4.0
-    assert quantile(scores, groups, 0.81, promised=True) == math.inf
+    assert conformal_quantile(scores, groups, 0.8, promised=True) == 4.0
+    assert conformal_quantile(scores, groups, 0.81, promised=True) == math.inf
 
 
 def test_bands_of_simulated_recordings_hold_as_often_as_promised() -> None:
@@ -70,16 +70,16 @@ def test_bands_of_simulated_recordings_hold_as_often_as_promised() -> None:
     covered = []
     for _ in range(2000):
         scores, groups = joined([list(recording()) for _ in range(9)])
-        covered.append(np.mean(recording() <= quantile(scores, groups, 0.8, promised=True)))
+        covered.append(np.mean(recording() <= conformal_quantile(scores, groups, 0.8, promised=True)))
     assert 0.79 < np.mean(covered) < 0.95
 
 
 @pytest.mark.parametrize("level", [0.0, 1.0, -0.1])
 def test_a_level_outside_of_zero_and_one_is_refused(level: float) -> None:
     with pytest.raises(TacpipeError, match="not between 0 and 1"):
-        quantile(np.ones(2), np.arange(2), level)
+        conformal_quantile(np.ones(2), np.arange(2), level)
 
 
 def test_scores_without_groups_are_refused() -> None:
     with pytest.raises(TacpipeError, match="no quantile"):
-        quantile(np.ones(2), np.arange(3), 0.5)
+        conformal_quantile(np.ones(2), np.arange(3), 0.5)

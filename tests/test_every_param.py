@@ -18,8 +18,7 @@ from tacpipe.clouds.normalisation import NORMALISATIONS
 from tacpipe.codecs.autoencoder_fit import FRAMES, MOST
 from tacpipe.datasets.splits import SCHEMES
 from tacpipe.errors import UsageError
-from tacpipe.models.patches import BACKBONES
-from tacpipe.models.pointnet import HEADS
+from tacpipe.models.point_networks import BACKBONES, HEADS
 from tacpipe.models.recurrent_autoencoder import DECODERS
 from tacpipe.plugins import fields, given_params, registry
 from tacpipe.plugins import params as params_of

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tacpipe.errors import TacpipeError
-from tacpipe.metrics.proportions import mcnemar, paired_t, wilson
+from tacpipe.metrics.intervals import mcnemar, paired_t, wilson
 
 NORMAL_975 = 1.959963984540054  # quantile of the normal distribution, from a table
 

@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from safetensors.numpy import save as save_tensors
 
-from tacpipe.codecs import frame_stacking, measures
+from tacpipe.arrays import AnyFloats, Bools
+from tacpipe.codecs import codec, measures
 from tacpipe.codecs.codec import (
     DESCRIPTION,
     TENSORS,
@@ -27,9 +28,7 @@ from tacpipe.codecs.codec import (
 from tacpipe.datasets import model_files
 
 if TYPE_CHECKING:
-    Floats = np.ndarray[Any, np.dtype[np.floating[Any]]]
-    Flags = np.ndarray[Any, np.dtype[np.bool_]]
-    Layers = tuple[tuple[Floats, Floats], ...]  # weight (out, in) and bias (out,) of each
+    Layers = tuple[tuple[AnyFloats, AnyFloats], ...]  # weight (out, in) and bias (out,) of each
 
 CHUNK = 16384  # rows worked on at once, so that the widths of hidden layers do not count in memory
 
@@ -40,12 +39,12 @@ class Autoencoder:
 
     channels: tuple[str, ...]
     layout: tuple[Mapping[str, str], ...]
-    mean_count: Floats  # (channel,)
-    scale_count: Floats  # (channel,)
+    mean_count: AnyFloats  # (channel,)
+    scale_count: AnyFloats  # (channel,)
     encoder: Layers
     decoder: Layers
     frames: int = 1  # rows in a row that it reads
-    representation: str = frame_stacking.LEVELS
+    representation: str = codec.LEVELS
     measured: Mapping[str, Any] = field(default_factory=dict)  # see `tacpipe.codecs.measures`
     kind: str = "autoencoder"
 
@@ -54,25 +53,25 @@ class Autoencoder:
         """The names of the latents, which are in no order."""
         return latent_names(len(self.encoder[-1][1]))
 
-    def encode(self, values: Floats, channels: Sequence[str], begins: Flags | None = None) -> Floats:
+    def encode(self, values: AnyFloats, channels: Sequence[str], begins: Bools | None = None) -> AnyFloats:
         """Return the latents of counts above rest as float32, (time, channel) to (time, latent).
 
         Raises `TacpipeError` unless ``channels`` are those of the fit, in their order.
         """
         check_channels(self.channels, channels)
-        inputs = frame_stacking.inputs(values, begins, self.representation, self.frames)
+        inputs = codec.inputs(values, begins, self.representation, self.frames)
         return encode_finite(self.project, inputs, len(self.latents))
 
-    def project(self, inputs: Floats) -> Floats:
+    def project(self, inputs: AnyFloats) -> AnyFloats:
         """Return the latents (row, latent), float32, of finite rows (row, frames * channel), newest frame last."""
         return _through(self.encoder, scaled(inputs, self.mean_count, self.scale_count))
 
-    def decode(self, latents: Floats) -> Floats:
+    def decode(self, latents: AnyFloats) -> AnyFloats:
         """Return the newest frame's counts that latents decode to as float64, (…, latent) to (…, channel)."""
         *first, (weight, bias) = self.decoder
         newest = (*first, (weight[-len(self.channels) :], bias[-len(self.channels) :]))
         decoded = _through(newest, latents.reshape(-1, latents.shape[-1]).astype(np.float32))
-        counts: Floats = decoded * self.scale_count + self.mean_count
+        counts: AnyFloats = decoded * self.scale_count + self.mean_count
         return counts.reshape(*latents.shape[:-1], len(self.channels))
 
     def to_files(self) -> dict[str, bytes]:
@@ -115,14 +114,16 @@ class Autoencoder:
         )
 
 
-def scaled(inputs: Floats, mean_count: Floats, scale_count: Floats) -> Floats:
+def scaled(inputs: AnyFloats, mean_count: AnyFloats, scale_count: AnyFloats) -> AnyFloats:
     """Return rows (row, frames * channel) as float32 with every frame's channels in units of their scale."""
     frames = inputs.shape[1] // len(mean_count)
-    inputs_scaled: Floats = ((inputs - np.tile(mean_count, frames)) / np.tile(scale_count, frames)).astype(np.float32)
+    inputs_scaled: AnyFloats = ((inputs - np.tile(mean_count, frames)) / np.tile(scale_count, frames)).astype(
+        np.float32
+    )
     return inputs_scaled
 
 
-def _through(layers: Layers, rows: Floats) -> Floats:
+def _through(layers: Layers, rows: AnyFloats) -> AnyFloats:
     """Return what ``layers`` make of ``rows`` (row, in), shape (row, out)."""
     outputs = np.empty((len(rows), len(layers[-1][1])), dtype=np.float32)
     for first in range(0, len(rows), CHUNK):

@@ -14,21 +14,20 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from tacpipe.codecs import frame_stacking, measures
+from tacpipe.arrays import AnyFloats
+from tacpipe.codecs import codec as codecs
+from tacpipe.codecs import measures
 from tacpipe.codecs.autoencoder import Autoencoder, scaled
-from tacpipe.codecs.standard import standard
+from tacpipe.codecs.measures import standard
 from tacpipe.codecs.training_rows import TrainingRows
 from tacpipe.errors import TacpipeError
 from tacpipe.training import devices, loop
-
-if TYPE_CHECKING:
-    Floats = np.ndarray[Any, np.dtype[np.floating[Any]]]
 
 FRAMES = (1, 2, 3)  # widths for the classes C1, C2 and C3
 HIDDEN = {1: (64, 32), 2: (128, 64), 3: (192, 96)}  # layers between input and latent, by frames
@@ -83,7 +82,7 @@ def fit(
     workspace: Path,
     *,
     components: int,
-    representation: str = frame_stacking.LEVELS,
+    representation: str = codecs.LEVELS,
 ) -> Autoencoder:
     """Return the codec of ``components`` latents whose network, of those ``tried``, gives held-out rows back best.
 
@@ -169,7 +168,7 @@ def _trained(
         return loop.Part(len(rows), loss)
 
     return loop.train(
-        lambda: _Mirrored(widths, bias=representation == frame_stacking.LEVELS).to(learned.device),
+        lambda: _Mirrored(widths, bias=representation == codecs.LEVELS).to(learned.device),
         loop.Windows(part(learned), part(watched), schedule.batch),
         replace(schedule, learning_rate=network.learning_rate),
         workspace / f"{index:02d}",
@@ -196,7 +195,7 @@ def _record(network: Network, trained: loop.Trained) -> dict[str, Any]:
     }
 
 
-def _layers(weights: dict[str, Tensor], part: str) -> tuple[tuple[Floats, Floats], ...]:
+def _layers(weights: dict[str, Tensor], part: str) -> tuple[tuple[AnyFloats, AnyFloats], ...]:
     """Return weight and bias of each layer of ``encoder`` or ``decoder``; a layer without bias has zeros."""
     tensors = {name: value.numpy() for name, value in weights.items() if name.startswith(f"{part}.")}
     places = sorted({int(name.split(".")[1]) for name in tensors})

@@ -11,12 +11,14 @@ import functools
 import json
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from safetensors.numpy import save as save_tensors
 
-from tacpipe.codecs import frame_stacking, measures
+from tacpipe.arrays import AnyFloats, Bools
+from tacpipe.codecs import codec as codecs
+from tacpipe.codecs import measures
 from tacpipe.codecs.codec import (
     DESCRIPTION,
     TENSORS,
@@ -25,14 +27,10 @@ from tacpipe.codecs.codec import (
     encode_finite,
     latent_names,
 )
-from tacpipe.codecs.moments import Moments
+from tacpipe.codecs.measures import Moments
 from tacpipe.codecs.training_rows import Rows, held_out, warn_of_still
 from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError
-
-if TYPE_CHECKING:
-    Floats = np.ndarray[Any, np.dtype[np.floating[Any]]]
-    Flags = np.ndarray[Any, np.dtype[np.bool_]]
 
 
 @dataclass(frozen=True)
@@ -41,11 +39,11 @@ class PCA:
 
     channels: tuple[str, ...]
     layout: tuple[Mapping[str, str], ...]
-    mean_count: Floats  # (channel,)
-    scale_count: Floats  # (channel,)
-    components: Floats  # (latent, channel)
-    explained_ratio: Floats  # (component,), of all components, kept or not
-    representation: str = frame_stacking.LEVELS
+    mean_count: AnyFloats  # (channel,)
+    scale_count: AnyFloats  # (channel,)
+    components: AnyFloats  # (latent, channel)
+    explained_ratio: AnyFloats  # (component,), of all components, kept or not
+    representation: str = codecs.LEVELS
     measured: Mapping[str, Any] = field(default_factory=dict)  # see `tacpipe.codecs.measures`
     kind: str = "pca"
 
@@ -57,23 +55,21 @@ class PCA:
     @property
     def reads(self) -> int:
         """How many rows up to each its latents depend on."""
-        return 2 if self.representation == frame_stacking.INCREMENTS else 1
+        return 2 if self.representation == codecs.INCREMENTS else 1
 
-    def encode(self, values: Floats, channels: Sequence[str], begins: Flags | None = None) -> Floats:
+    def encode(self, values: AnyFloats, channels: Sequence[str], begins: Bools | None = None) -> AnyFloats:
         """Return the latents of counts above rest as float32, (time, channel) to (time, latent).
 
         Raises `TacpipeError` unless ``channels`` are those of the fit, in their order.
         """
         check_channels(self.channels, channels)
-        return encode_finite(
-            self.project, frame_stacking.inputs(values, begins, self.representation, 1), len(self.components)
-        )
+        return encode_finite(self.project, codecs.inputs(values, begins, self.representation, 1), len(self.components))
 
-    def project(self, inputs: Floats) -> Floats:
+    def project(self, inputs: AnyFloats) -> AnyFloats:
         """Return the latents (row, latent) of finite rows (row, channel) of the codec's ``representation``."""
         return ((inputs - self.mean_count) / self.scale_count) @ self.components.T
 
-    def decode(self, latents: Floats) -> Floats:
+    def decode(self, latents: AnyFloats) -> AnyFloats:
         """Return the counts that latents decode to as float64, (…, latent) to (…, channel)."""
         return (latents @ self.components) * self.scale_count + self.mean_count
 
@@ -119,7 +115,7 @@ def fit(
     *,
     components: int = 20,
     variance: float = 0.0,
-    representation: str = frame_stacking.LEVELS,
+    representation: str = codecs.LEVELS,
 ) -> PCA:
     """Return the codec fitted on training rows, counts above rest or their increments (``representation``).
 
@@ -159,7 +155,7 @@ def fit(
 
 
 def fit_and_measure(
-    rows: Rows, *, components: int = 20, variance: float = 0.0, representation: str = frame_stacking.LEVELS
+    rows: Rows, *, components: int = 20, variance: float = 0.0, representation: str = codecs.LEVELS
 ) -> PCA:
     """Return the codec fitted on ``rows`` of all recordings, with its measures; they are read twice, in pieces.
 

@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pyarrow as pa
 
+from tacpipe.arrays import AnyFloats, Bools
 from tacpipe.channels.masks import gaps as gaps
 from tacpipe.channels.masks import times as times
+from tacpipe.codecs import codec as codecs
 from tacpipe.errors import TacpipeError
+from tacpipe.io.parquet import SOME_ROWS
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    Floats = np.ndarray[Any, np.dtype[np.floating[Any]]]
+    from tacpipe.datasets.dataset import Recording
+    from tacpipe.io.columns import Columns
+    from tacpipe.plugins.stage import Fitted
+
 
 LAYOUT = ("stream", "taxel", "axis")  # field metadata that describes where a channel lies
 
@@ -38,7 +46,7 @@ def layout(schema: pa.Schema, channels: Sequence[str]) -> list[dict[str, str]]:
     ]
 
 
-def rest_counts(schema: pa.Schema, channels: Sequence[str]) -> Floats:
+def rest_counts(schema: pa.Schema, channels: Sequence[str]) -> AnyFloats:
     """Return each channel's level without load in counts, shape (channel,), from its field metadata ``levels``.
 
     Raises `TacpipeError` where a channel has none.
@@ -55,7 +63,7 @@ def rest_counts(schema: pa.Schema, channels: Sequence[str]) -> Floats:
     return np.array(levels, dtype=np.float64)
 
 
-def matrix(table: pa.Table, names: Sequence[str]) -> Floats:
+def matrix(table: pa.Table, names: Sequence[str]) -> AnyFloats:
     """Return the named columns side by side as float64, shape (time, column)."""
     values = np.empty((table.num_rows, len(names)))
     for index, name in enumerate(names):
@@ -63,6 +71,64 @@ def matrix(table: pa.Table, names: Sequence[str]) -> Floats:
     return values
 
 
-def above_rest(table: pa.Table, channels: Sequence[str]) -> Floats:
+def above_rest(table: pa.Table, channels: Sequence[str]) -> AnyFloats:
     """Return the channels' counts above their rest level as float64, shape (time, channel)."""
     return matrix(table, channels) - rest_counts(table.schema, channels)
+
+
+def added(recording: Recording, fitted: Fitted) -> pa.Table | pa.RecordBatchReader:
+    """Return the recording's table with its latents, float32 columns, by the codec whose files were ``fitted``.
+
+    A codec with ``reads``, the number of rows up to each that its latents depend on, encodes a long recording in pieces,
+    and these are returned as they are made; any other encodes it as a whole. Raises `TacpipeError` where the recording's
+    channels are not those the codec was fitted on.
+    """
+    codec, stored_columns = codecs.load(fitted), recording.columns()
+    channels = columns(stored_columns.schema, "tactile")
+    with _errors_naming(recording.name):
+        codecs.check_channels(codec.channels, channels)
+        begins = codecs.breaks(times(stored_columns))
+        stored_columns.forget()
+        if getattr(codec, "reads", 0) and stored_columns.num_rows > SOME_ROWS:
+            return _in_pieces(recording.name, stored_columns, codec, begins)
+        table = recording.table()
+        latents = codec.encode(above_rest(table, channels), channels, begins)  # (time, latent)
+        return _with(table, codec, latents)
+
+
+@contextmanager
+def _errors_naming(name: str) -> Iterator[None]:
+    """Have an error of encoding name the recording."""
+    try:
+        yield
+    except TacpipeError as error:
+        raise TacpipeError(f"{name}: {error}") from error
+
+
+def _in_pieces(name: str, stored_columns: Columns, codec: Any, begins: Bools) -> pa.RecordBatchReader:
+    """Return the rows of a recording with their latents, each piece encoded behind the rows before it that it reads."""
+    before = codec.reads - 1
+
+    def batches() -> Iterator[pa.RecordBatch]:
+        counts: AnyFloats = np.zeros((0, len(codec.channels)))
+        row = 0
+        for table in stored_columns.batches():
+            lead = min(row, before)
+            counts = np.concatenate([counts[len(counts) - lead :], above_rest(table, codec.channels)])
+            with _errors_naming(name):
+                latents = codec.encode(counts, codec.channels, begins[row - lead : row + table.num_rows])[lead:]
+                piece = _with(table, codec, latents)
+            yield from piece.combine_chunks().to_batches()
+            row += table.num_rows
+
+    return pa.RecordBatchReader.from_batches(_with(stored_columns.schema.empty_table(), codec, None).schema, batches())
+
+
+def _with(table: pa.Table, codec: codecs.FittedCodec, latents: AnyFloats | None) -> pa.Table:
+    """Return a table with its latents (time, latent), or with none for a table without rows."""
+    values = np.zeros((0, len(codec.latents)), np.float32) if latents is None else latents
+    codecs.check_latents(codec, values, table.num_rows)
+    for index, name in enumerate(codec.latents):
+        field = pa.field(name, pa.float32(), metadata={"quantity": "latent", "unit": "1"})
+        table = table.append_column(field, pa.array(values[:, index], pa.float32()))
+    return table

@@ -5,11 +5,12 @@ from __future__ import annotations
 import logging
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from tacpipe.codecs import frame_stacking, standard, tactile
+from tacpipe.arrays import AnyFloats
+from tacpipe.codecs import codec, measures, tactile
 from tacpipe.codecs.codec import check_channels
 from tacpipe.datasets import splits
 from tacpipe.errors import TacpipeError
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Recording
     from tacpipe.io.columns import Columns
 
-    Floats = np.ndarray[Any, np.dtype[np.floating[Any]]]
 
 HELD_OUT = 0.15  # fraction of the training recordings that a codec is measured on
 log = logging.getLogger(__name__)
@@ -39,7 +39,7 @@ class Rows(Protocol):
     def names(self) -> Collection[str]:
         """The names of all recordings."""
 
-    def pieces(self, names: Collection[str]) -> Iterator[Floats]:
+    def pieces(self, names: Collection[str]) -> Iterator[AnyFloats]:
         """Yield the rows (row, frames * channel) of some recordings, in the order of their names and of time, in pieces."""
 
 
@@ -49,7 +49,7 @@ class TrainingRows:
 
     channels: tuple[str, ...]
     layout: tuple[Mapping[str, str], ...]
-    inputs: Mapping[str, Floats]  # (row, frames * channel), in counts, newest frame last
+    inputs: Mapping[str, AnyFloats]  # (row, frames * channel), in counts, newest frame last
 
     @property
     def names(self) -> Collection[str]:
@@ -62,16 +62,16 @@ class TrainingRows:
         return held_out(self.names)
 
     @property
-    def parts(self) -> tuple[Floats, Floats]:
+    def parts(self) -> tuple[AnyFloats, AnyFloats]:
         """The rows of the recordings that are not held out, and of those that are."""
         return self.of(self.inputs.keys() - self.held_out), self.of(self.held_out)
 
-    def of(self, names: Collection[str]) -> Floats:
+    def of(self, names: Collection[str]) -> AnyFloats:
         """Return the rows (row, frames * channel) of some recordings, in the order of their names."""
         width = max(rows.shape[1] for rows in self.inputs.values())
         return np.concatenate([np.zeros((0, width)), *self.pieces(names)])
 
-    def pieces(self, names: Collection[str]) -> Iterator[Floats]:
+    def pieces(self, names: Collection[str]) -> Iterator[AnyFloats]:
         """Yield the rows of each of some recordings, in the order of their names."""
         return (self.inputs[name] for name in sorted(names))
 
@@ -91,7 +91,7 @@ class StoredRows:
         """The names of all recordings."""
         return self.recordings.keys()
 
-    def pieces(self, names: Collection[str]) -> Iterator[Floats]:
+    def pieces(self, names: Collection[str]) -> Iterator[AnyFloats]:
         """Yield the rows of some recordings, in the order of their names and of time, in pieces.
 
         Raises `TacpipeError` naming the recording whose channels are others.
@@ -108,22 +108,22 @@ class StoredRows:
         rows = TrainingRows(self.channels, self.layout, inputs)
         newest = rows.of(rows.names)[:, -len(self.channels) :]
         if len(newest) > 1:
-            warn_of_still(standard.unmoving_channels(newest, self.channels), len(self.channels))
+            warn_of_still(measures.unmoving_channels(newest, self.channels), len(self.channels))
         return rows
 
     @property
-    def _none(self) -> Floats:
+    def _none(self) -> AnyFloats:
         return np.zeros((0, self.frames * len(self.channels)))
 
-    def _pieces(self, stored: Columns) -> Iterator[Floats]:
+    def _pieces(self, stored: Columns) -> Iterator[AnyFloats]:
         """Yield the rows of a recording that a codec may be fitted on."""
         check_channels(self.channels, tactile.columns(stored.schema, "tactile"))
-        begins, gaps = frame_stacking.breaks(tactile.times(stored)), tactile.gaps(stored)
+        begins, gaps = codec.breaks(tactile.times(stored)), tactile.gaps(stored)
         in_contact = np.ones(len(begins), dtype=bool)
         if "contact" in stored.column_names:
             in_contact = stored.column("contact").to_numpy() >= 0
         stored.forget()
-        stacking, row = frame_stacking.Stacking(self.representation, self.frames), 0
+        stacking, row = codec.Stacking(self.representation, self.frames), 0
         for table in stored.batches(self.channels):
             now = slice(row, row + table.num_rows)
             counts = tactile.above_rest(table, self.channels)
@@ -151,7 +151,7 @@ def stored(recordings: Mapping[str, Recording], representation: str, frames: int
     A row counts where it lies in contact and all frames that it is made of are finite and outside of gaps. Raises
     `TacpipeError` where there is no recording or no tactile channel.
     """
-    frame_stacking.check(representation)
+    codec.check_representation(representation)
     if not recordings:
         raise TacpipeError("There is no training recording to fit a codec on. Make a split that has some.")
     schema = recordings[min(recordings)].columns().schema

@@ -14,9 +14,8 @@ from tacpipe.comparison.runs import MODEL, Method, Question, Run, Settings, grou
 from tacpipe.comparison.specification import Kind, TaskReport, by_task, report_on
 from tacpipe.metrics import pairing
 from tacpipe.metrics.headline import Headline
-from tacpipe.metrics.intervals import Estimate
+from tacpipe.metrics.intervals import Estimate, paired_t
 from tacpipe.metrics.pairing import Gain, Measure, Pair, Sums
-from tacpipe.metrics.proportions import paired_t
 
 if TYPE_CHECKING:
     import pandas as pd

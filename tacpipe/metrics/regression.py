@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tacpipe.arrays import AnyArray, AnyFloats
+from tacpipe.arrays import AnyArray, AnyFloats, Ints
 from tacpipe.errors import TacpipeError
 from tacpipe.metrics import intervals
 from tacpipe.metrics.intervals import Estimate
@@ -118,3 +118,26 @@ def _sums_by_value(true: AnyFloats, predicted: AnyFloats) -> tuple[AnyFloats, An
 
 def _explained(error: float, spread: float) -> float:
     return float(1 - error / spread) if spread > 0 else float("nan")
+
+
+def squared_error_sums(predicted: AnyFloats, truth: AnyFloats) -> AnyFloats:
+    """Return the sum over windows of the squared error, (window, step, channel) to (step, channel), as float64."""
+    error = predicted.astype(np.float64) - truth
+    total: AnyFloats = np.einsum("wsc,wsc->sc", error, error)
+    return total
+
+
+def absolute_error_sums(predicted: AnyFloats, truth: AnyFloats) -> AnyFloats:
+    """Return the sum over windows of the absolute error, (window, step, channel) to (step, channel), as float64."""
+    total: AnyFloats = np.abs(predicted.astype(np.float64) - truth).sum(axis=0)
+    return total
+
+
+def mean_error(sums: AnyFloats, windows: Ints) -> AnyFloats:
+    """Return the error of each step, averaged over all windows and channels, shape (step,).
+
+    ``sums`` is (recording, step, channel) as summed above, ``windows`` is (recording,). NaN without windows.
+    """
+    count = windows.sum() * sums.shape[2]
+    total: AnyFloats = sums.sum(axis=(0, 2))
+    return total / count if count else np.full(sums.shape[1], np.nan)

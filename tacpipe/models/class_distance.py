@@ -1,6 +1,6 @@
 """The score of how much a slide is like one of the learned classes, independent of the classifier.
 
-Slides are described by statistics of each channel (`tacpipe.models.statistics_classifier`) and by how often patterns occur
+Slides are described by statistics of each channel (`tacpipe.models.readout`) and by how often patterns occur
 in them (`tacpipe.models.minirocket`), standardised and reduced to their principal components. The slides of each class
 spread around its mean with one covariance, shrunk as by Ledoit and Wolf (2004). The score of a class is the logarithm of
 
@@ -28,9 +28,8 @@ import numpy as np
 
 from tacpipe.arrays import AnyArray, Float32s, Floats, Int32s, Ints
 from tacpipe.errors import TacpipeError
-from tacpipe.models.minirocket import Rocket
-from tacpipe.models.minirocket_classifier import with_profile
-from tacpipe.models.statistics_classifier import statistics
+from tacpipe.models.minirocket import Rocket, with_profile
+from tacpipe.models.readout import statistics
 from tacpipe.models.tensors import under
 
 COMPONENTS = 300  # upper limit

@@ -9,10 +9,120 @@ import torch
 from torch import Tensor, nn
 
 from tacpipe.errors import TacpipeError
-from tacpipe.models.change import CELLS, ChangeForecast, SequenceForecast
-from tacpipe.models.recurrent_forward import RecurrentForward
-from tacpipe.models.taxelwise import TaxelwiseForecast, grid
+from tacpipe.models.change import CELLS, ChangeForecast, SequenceForecast, TaxelwiseForecast, grid
+from tacpipe.models.lstm import lstm
 from tacpipe.models.windows import POSE, Windows
+
+TRIED = torch.linspace(0, 1, 21)  # weights of which the best is taken at each step
+DOUBT = 0.05  # fraction of persistence's error that one more recording is imagined to lose by the full forecast
+
+
+class Ensemble(nn.Module):
+    """The mean of networks, each with weights of its own.
+
+    The mean of networks errs less than one of them does on average (Krogh and Vedelsby, Neural network ensembles, cross
+    validation, and active learning, 1995).
+    """
+
+    def __init__(self, members: Sequence[nn.Module]) -> None:
+        """Take networks that scale themselves."""
+        super().__init__()
+        self.members = nn.ModuleList(members)
+        self.change_only = members[0].change_only
+
+    def calibrate(self, windows: Windows, ahead: Tensor) -> None:
+        """Fit the scales of all members on training windows; ``ahead`` is (horizon, window, feature)."""
+        for member in self.members:
+            member.calibrate(windows, ahead)  # type: ignore[operator]
+
+    def loss(self, windows: Windows, ahead: Tensor) -> Tensor:
+        """Return the mean of the members' losses; the gradient of a member depends on its own loss only."""
+        losses = [member.loss(windows, ahead) for member in self.members]  # type: ignore[operator]
+        return torch.stack(losses).mean()
+
+    def forward(self, windows: Windows) -> Tensor:
+        """Return the features to come (horizon, window, feature)."""
+        return torch.stack([member(windows) for member in self.members]).mean(0)
+
+
+class Shrunk(nn.Module):
+    """A trained network whose predicted change is multiplied by a weight from 0 (persistence) to 1 at each step."""
+
+    weight: Tensor  # (horizon,)
+
+    def __init__(self, network: nn.Module, weight: Tensor) -> None:
+        """Take a network of change and the weights. Raises `ValueError` for weights below 0 or above 1."""
+        super().__init__()
+        if not ((weight >= 0) & (weight <= 1)).all():
+            raise ValueError("a weight of the forecast is not between 0 and 1")
+        self.network, self.change_only = network, True
+        self.register_buffer("weight", weight)
+
+    def forward(self, windows: Windows) -> Tensor:
+        """Return the features to come (horizon, window, feature)."""
+        now = windows.touch[-1]
+        ahead: Tensor = now + self.weight[:, None, None] * (self.network(windows) - now)
+        return ahead
+
+
+def persistence_weights(changes: Tensor, measured: Tensor, recording: Tensor) -> Tensor:
+    """Return the weight (horizon,) of predicted ``changes`` (horizon, window, feature), from 0 to 1.
+
+    ``recording`` (window,) is the number of each window's recording. The weight has the least mean over recordings of the
+    mean absolute error of the ``measured`` changes divided by that of persistence, next to one more recording on which the
+    forecast is `DOUBT` worse: the fewer recordings there are, the closer it is to persistence. As the error is convex in
+    the weight, that mean is at most 1 at every step.
+
+    >>> changes, measured = torch.full((1, 1, 2), 2.0), torch.ones(1, 1, 2)
+    >>> persistence_weights(changes, measured, torch.zeros(1, dtype=torch.int64))
+    tensor([0.5000])
+    """
+    total = DOUBT * TRIED[:, None].double().expand(-1, len(changes)).clone()  # (weight, horizon)
+    for number in torch.unique(recording):
+        windows = recording == number
+        predicted, truth = changes[:, windows].double(), measured[:, windows].double()
+        errors = torch.stack([(truth - weight * predicted).abs().mean((1, 2)) for weight in TRIED])
+        total += errors / errors[0].clamp_min(torch.finfo(torch.float64).tiny)
+    return TRIED[total.argmin(0)]
+
+
+class RecurrentForward(nn.Module):
+    """Encoder and decoder LSTM of one layer each and a linear head; always free running, in training too.
+
+    After Nazari, Mandil, Hanheide and Ghalamzan Esfahani, Tactile Dynamic Behaviour Prediction Based on Robot Action
+    (TAROS 2021): the encoder reads [tactile features ; robot state] step by step, and its (h, c) start the decoder,
+    whose input at each step is [tactile features it predicted last ; planned robot state]. The paper gives no layer
+    sizes: one layer of 200 is what its authors' later models have, and the linear head is our choice.
+    """
+
+    def __init__(self, latents: int, states: int, hidden: int = 200) -> None:
+        """Make a model of random weights; sizes are numbers of features and of recurrent units."""
+        super().__init__()
+        self.latents, self.states, self.hidden = latents, states, hidden
+        self.encoder = nn.LSTM(latents + states, hidden)
+        self.decoder = nn.LSTM(latents + states, hidden)
+        self.head = nn.Linear(hidden, latents)
+
+    def forward(self, past: Tensor, plan: Tensor) -> Tensor:
+        """Return the predicted tactile features, shape (horizon, window, latent).
+
+        ``past`` is (context, window, latent + state), tactile features first; ``plan`` is (horizon, window, state).
+
+        Feeding the head's output z = V h + b back into the gates, U z + W h, is the same as a recurrent weight
+        W + U V and a bias U b. So the decoder is an ordinary LSTM over the plan, which one call computes for all
+        steps; only its first step differs, because what is fed back there is measured and not predicted.
+        """
+        from_input, from_state, *biases = self.encoder.parameters()
+        _, state = lstm(past, None, (from_input, from_state, biases[0] + biases[1]))
+        from_input, from_state, *biases = self.decoder.parameters()
+        feedback, from_plan = from_input.tensor_split([self.latents], dim=1)  # (gate, latent), (gate, state)
+        measured = past[-1, :, : self.latents] - self.head(state[0])  # (window, latent)
+        recurrent = torch.addmm(from_state, feedback, self.head.weight)
+        bias = biases[0] + biases[1] + feedback @ self.head.bias
+        states, _ = lstm(plan, state, (from_plan, recurrent, bias), (measured, feedback))
+        predicted: Tensor = self.head(states)
+        return predicted
+
 
 AUTO, TAXELWISE = "auto", "taxelwise"
 ELSE = "gru"  # the meaning of auto where the taxelwise model cannot read the channels

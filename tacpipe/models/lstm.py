@@ -1,4 +1,4 @@
-"""An LSTM layer whose backward pass on a processor is written by hand; elsewhere it is torch's own.
+"""Recurrent layers: an LSTM whose backward pass on a processor is written by hand, and float32 on a GPU.
 
 Hochreiter and Schmidhuber, Long Short-Term Memory (Neural Computation 1997), with the forget gate of Gers, Schmidhuber
 and Cummins, Learning to Forget (Neural Computation 2000), in torch's order of gates i, f, g, o:
@@ -21,7 +21,8 @@ from __future__ import annotations
 import math
 import warnings
 from collections import deque
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import torch
@@ -29,7 +30,33 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from tacpipe.arrays import Bytes
-from tacpipe.models import recurrent_layer
+
+T = TypeVar("T")
+
+
+def through(layer: Callable[..., T], inputs: Tensor, *tensors: Any) -> T:
+    """Return what a layer returns for ``inputs`` and more tensors, tuples of tensors or None; on a GPU in float32.
+
+    Under `torch.autocast` cuDNN computes recurrent layers in float16 whatever type was asked for. Gradients below 6e-8
+    are zero there, and no loss is scaled to keep them from it.
+    """
+    if not in_float16(inputs):
+        return layer(inputs, *tensors)
+    with torch.autocast(inputs.device.type, enabled=False):
+        return layer(inputs.float(), *map(_to_float32, tensors))
+
+
+def in_float16(inputs: Tensor) -> bool:
+    """Return whether a recurrent layer would be computed in float16 for such inputs."""
+    return inputs.device.type == "cuda" and torch.is_autocast_enabled("cuda")
+
+
+def _to_float32(value: Any) -> Any:
+    """Return tensors, and those of tuples, in float32."""
+    if isinstance(value, tuple):
+        return tuple(map(_to_float32, value))
+    return value if value is None else value.float()
+
 
 # weights that are computed lie apart, so cuDNN copies them together in every call
 warnings.filterwarnings("ignore", message="RNN module weights are not part of single contiguous chunk")
@@ -45,7 +72,7 @@ def lstm(inputs: Tensor, state: State | None, weights: Weights, lead: Lead | Non
     The state before the first step is zero where none is given. ``lead`` adds inputs that exist in the first step only.
     """
     if inputs.device.type != "cpu" or not torch.is_grad_enabled():
-        return recurrent_layer.through(_of_torch, inputs, state, weights, lead)
+        return through(_of_torch, inputs, state, weights, lead)
     first = None if lead is None else lead[0] @ lead[1].t()
     hidden, cell = (None, None) if state is None else state
     from_input, from_state, bias = weights

@@ -14,7 +14,7 @@ from typing import Any
 from tacpipe.datasets.manifest import Manifest
 from tacpipe.errors import TacpipeError
 from tacpipe.io import progress
-from tacpipe.metrics import headline, summary
+from tacpipe.metrics import headline
 from tacpipe.plugins import extras, registry
 from tacpipe.store.store import Store
 from tacpipe.trackers import tracker
@@ -49,7 +49,7 @@ def name_of(output: Path, key: str) -> str:
 
 def files(manifest: Manifest, store: Store) -> dict[str, bytes]:
     """Return those files of a dataset that a run is given figures and epochs from."""
-    names = (CONFIG, HISTORY, headline.FILE, summary.FILE)
+    names = (CONFIG, HISTORY, headline.FILE, headline.SUMMARY)
     return {name: store.read(manifest.files[name]["digest"]) for name in names if name in manifest.files}
 
 
@@ -107,19 +107,19 @@ class Tracking:
             self.params = {**tracker.params(config.get("params", {})), **self.params}
         self.start()
         self.replay(files.get(HISTORY, b""), config.get("params", {}))
-        figures = tracker.figures(config.get("validation") or {}, "best/")
+        values = tracker.figures(config.get("validation") or {}, "best/")
         if headline.FILE in files:  # a result: those of an older version have no summary
-            stored = _tree(files.get(summary.FILE, b"{}"))
-            figures = tracker.figures(stored or summary.from_headlines(headline.read(files[headline.FILE])))
+            stored = _tree(files.get(headline.SUMMARY, b"{}"))
+            values = tracker.figures(stored or headline.summarize(headline.read(files[headline.FILE])))
         for option, tracker_client in list(self.trackers.items()):
-            self._call(option, functools.partial(tracker_client.end, path, figures))
+            self._call(option, functools.partial(tracker_client.end, path, values))
 
-    def replay(self, history: bytes, params: Mapping[str, Any]) -> None:
-        """Add the epochs of a stored history that were not added yet; ``params`` are the model's, for the learning rate."""
+    def replay(self, history: bytes, model_params: Mapping[str, Any]) -> None:
+        """Add the epochs of a stored history that were not added yet; ``model_params`` state the learning rate."""
         lines = [json.loads(line) for line in history.splitlines() if line.strip()]
         self._labelled = tracker.has_several_networks(lines)
         for line in lines[self._lines :]:
-            self._add(line, _rate(params, line["epoch"]))
+            self._add(line, _rate(model_params, line["epoch"]))
 
     def abandon(self) -> None:
         """End a run whose result was not made."""
@@ -129,9 +129,9 @@ class Tracking:
 
     def _add(self, line: Line, additions: Mapping[str, float]) -> None:
         self._lines += 1
-        metrics = tracker.metrics({**line, **additions}, labelled=self._labelled)
+        values = tracker.metrics({**line, **additions}, labelled=self._labelled)
         for option, tracker_client in list(self.trackers.items()):
-            self._call(option, functools.partial(tracker_client.line, int(line["epoch"]), metrics))
+            self._call(option, functools.partial(tracker_client.line, int(line["epoch"]), values))
 
     def _call(self, option: str, call: Callable[[], Any]) -> Any:
         """Return what the call returns; None where it fails, which ends the tracker. Standard output is the command's."""
@@ -148,12 +148,12 @@ class Tracking:
             return None
 
 
-def _rate(params: Mapping[str, Any], epoch: int) -> dict[str, float]:
+def _rate(model_params: Mapping[str, Any], epoch: int) -> dict[str, float]:
     """Return the learning rate of an epoch of a stored model; nothing where its params do not state it."""
-    peak, epochs = params.get("learning_rate"), params.get("epochs")
+    peak, epochs = model_params.get("learning_rate"), model_params.get("epochs")
     if not isinstance(peak, int | float) or not isinstance(epochs, int) or epochs < 1:
         return {}
-    return {LEARNING_RATE: learning_rate(peak, (epoch - 1) / epochs, cycle=bool(params.get("cycle")))}
+    return {LEARNING_RATE: learning_rate(peak, (epoch - 1) / epochs, cycle=bool(model_params.get("cycle")))}
 
 
 def _tree(content: bytes) -> dict[str, Any]:

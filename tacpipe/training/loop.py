@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import json
+import logging
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,15 +19,130 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import torch
+from safetensors import SafetensorError
+from safetensors.torch import load, save
 from torch import Tensor, nn
+from torch.optim.adam import adam
 
 from tacpipe.errors import TacpipeError
+from tacpipe.io import regular
+from tacpipe.io.files import readable_errors, sync_folder, write_whole
+from tacpipe.io.hashing import bytes_digest
 from tacpipe.models.tensors import under
-from tacpipe.training import checkpoint, following
-from tacpipe.training.adam import Adam
+from tacpipe.training import following
 from tacpipe.training.following import Followers, Network
 from tacpipe.training.following import Line as Line
 from tacpipe.training.schedule import Schedule as Schedule
+
+BETAS, EPSILON = (0.9, 0.999), 1e-8  # those of the paper, and torch's defaults
+
+
+class Adam:
+    """Steps along the gradients of weights; ``weight_decay`` of each weight is added to its gradient.
+
+    Adam (Kingma and Ba, Adam: A Method for Stochastic Optimization, 2015), to the bit as `torch.optim.Adam` computes it.
+
+    The first `torch.optim.Adam` of a process imports torch's compiler, which takes as long as torch itself: 1.2 s of
+    processor time, of some 6 s that a short training of one epoch takes. The function that it calls at each step needs
+    none of that.
+    """
+
+    def __init__(self, weights: Iterable[Tensor], learning_rate: float, weight_decay: float = 0.0) -> None:
+        self.weights = list(weights)
+        self.learning_rate, self.weight_decay = learning_rate, weight_decay
+        self._state: dict[int, dict[str, Tensor]] = {}
+
+    def zero_grad(self) -> None:
+        """Forget all gradients."""
+        for weight in self.weights:
+            weight.grad = None
+
+    def step(self) -> None:
+        """Change each weight that has a gradient; others stay, and so does what is known of them."""
+        changed = [(number, weight) for number, weight in enumerate(self.weights) if weight.grad is not None]
+        state = [self._moments(number) for number, _ in changed]
+        with torch.no_grad():
+            adam(
+                [weight for _, weight in changed],
+                [weight.grad for _, weight in changed if weight.grad is not None],
+                [moments["exp_avg"] for moments in state],
+                [moments["exp_avg_sq"] for moments in state],
+                [],
+                [moments["step"] for moments in state],
+                fused=True,
+                amsgrad=False,
+                beta1=BETAS[0],
+                beta2=BETAS[1],
+                lr=self.learning_rate,
+                weight_decay=self.weight_decay,
+                eps=EPSILON,
+                maximize=False,
+            )
+
+    def state(self) -> dict[int, dict[str, Tensor]]:
+        """Return what is known of each weight that had a gradient, by its number: ``step``, ``exp_avg``, ``exp_avg_sq``."""
+        return self._state
+
+    def load(self, state: Mapping[int, Mapping[str, Tensor]]) -> None:
+        """Take over what `state` returned of weights in the same order, maybe on another device."""
+        self._state = {
+            number: {name: value.to(self.weights[number].device) for name, value in moments.items()}
+            for number, moments in state.items()
+        }
+
+    def _moments(self, number: int) -> dict[str, Tensor]:
+        if number not in self._state:
+            weight = self.weights[number]
+            self._state[number] = {
+                "step": torch.zeros((), dtype=torch.float32, device=weight.device),
+                "exp_avg": torch.zeros_like(weight, memory_format=torch.preserve_format),
+                "exp_avg_sq": torch.zeros_like(weight, memory_format=torch.preserve_format),
+            }
+        return self._state[number]
+
+
+FILE = "checkpoint"
+log = logging.getLogger(__name__)
+
+
+def write_checkpoint(folder: Path, tensors: Mapping[str, Tensor], state: Mapping[str, Any]) -> None:
+    """Replace the checkpoint in ``folder``; after return it is on disk, and before it the old one is whole.
+
+    Its first line is the digest of the rest, a safetensors file with the state as JSON in its header: two files could be
+    torn apart by a crash between them, and training must not resume from a weight that a disk has changed.
+    """
+    content = save({name: tensor.cpu().contiguous() for name, tensor in tensors.items()}, {"state": json.dumps(state)})
+    signed = bytes_digest(content).encode() + b"\n" + content
+    with readable_errors(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        draft = folder / f"{FILE}.draft"
+        draft.unlink(missing_ok=True)  # left by a run that was killed
+        write_whole(str(folder / FILE), signed, str(draft))
+        sync_folder(str(folder))
+
+
+def read_checkpoint(folder: Path) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
+    """Return tensors and state of the checkpoint in ``folder``; None where there is none or it is damaged."""
+    path = folder / FILE
+    try:
+        signed = regular.content(path, follow=False)
+    except FileNotFoundError:
+        return None
+    except (OSError, TacpipeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        log.warning("The checkpoint %s cannot be read (%s); training starts over.", path, reason)
+        return None
+    stored, _, content = signed.partition(b"\n")
+    try:
+        if bytes_digest(content).encode() != stored:
+            raise ValueError("its bytes do not give its digest")
+        size = int.from_bytes(content[:8], "little")
+        state = json.loads(json.loads(content[8 : 8 + size])["__metadata__"]["state"])
+        return load(content), state
+    except (SafetensorError, KeyError, TypeError, ValueError) as error:
+        log.warning("The checkpoint %s cannot be read (%s); training starts over.", path, error)
+        return None
+
 
 Loss = Callable[[nn.Module, Tensor], Tensor]  # mean loss of the windows with these indices
 
@@ -123,10 +239,10 @@ class _Run:
         tensors |= {f"best.{name}": value for name, value in self.best.items()}
         tensors |= {f"adam.{slot}.{name}": value for slot, moments in slots.items() for name, value in moments.items()}
         tensors["random"] = torch.get_rng_state()
-        checkpoint.write(folder, tensors, {"history": self.history})
+        write_checkpoint(folder, tensors, {"history": self.history})
 
     def resume(self, folder: Path) -> None:
-        saved = checkpoint.read(folder)
+        saved = read_checkpoint(folder)
         if saved is None:
             return
         tensors, state = saved

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import nn
 
-from tacpipe.codecs import autoencoder_fit, frame_stacking, pca, stored
+from tacpipe.codecs import autoencoder_fit, codec, pca
 from tacpipe.codecs.autoencoder import Autoencoder
 from tacpipe.codecs.training_rows import TrainingRows
 from tacpipe.errors import TacpipeError
@@ -32,9 +32,7 @@ WALKS = {f"trial-{seed}": walk(seed) for seed in range(5)}
 
 
 def training(of: str = "levels", frames: int = 1) -> TrainingRows:
-    return TrainingRows(
-        CHANNELS, LAYOUT, {name: frame_stacking.inputs(each, None, of, frames) for name, each in WALKS.items()}
-    )
+    return TrainingRows(CHANNELS, LAYOUT, {name: codec.inputs(each, None, of, frames) for name, each in WALKS.items()})
 
 
 def fit(folder: Path, of: str = "levels", frames: int = 1, hidden: str = "16,8", search: int = 0) -> Autoencoder:
@@ -55,7 +53,7 @@ def in_torch(layers: tuple[tuple[np.ndarray, np.ndarray], ...]) -> nn.Sequential
 @pytest.mark.parametrize("frames", [1, 2, 3])
 def test_encoding_and_decoding_are_what_torch_makes_of_the_same_weights(tmp_path: Path, frames: int) -> None:
     fitted = fit(tmp_path, frames=frames)
-    rows = frame_stacking.inputs(WALKS["trial-0"], None, "levels", frames)
+    rows = codec.inputs(WALKS["trial-0"], None, "levels", frames)
     scaled = (rows.reshape(-1, frames, 12) - fitted.mean_count) / fitted.scale_count
     with torch.no_grad():
         latents = in_torch(fitted.encoder)(torch.from_numpy(scaled.reshape(len(rows), -1)).float())
@@ -116,7 +114,7 @@ def test_of_increments_a_row_that_does_not_move_has_latents_0_and_comes_back_as_
 def test_a_codec_read_back_gives_the_same_bytes_and_latents(tmp_path: Path) -> None:
     fitted = fit(tmp_path / "a", frames=2)
     files = fitted.to_files()
-    read = stored.load(files)
+    read = codec.load(files)
     assert isinstance(read, Autoencoder)
     assert read.to_files() == files == fit(tmp_path / "b", frames=2).to_files()
     assert np.array_equal(read.encode(WALKS["trial-0"], CHANNELS), fitted.encode(WALKS["trial-0"], CHANNELS))

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 
 from tacpipe.codecs import codec, pca
-from tacpipe.codecs.moments import Moments
+from tacpipe.codecs.measures import Moments
 
 CHANNELS = [f"c{index}" for index in range(6)]
 WALKS = np.cumsum(np.random.default_rng(2).normal(size=(4, 30, 6)), axis=1) * 20  # (window, time, channel)

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tacpipe.codecs import frame_stacking
+from tacpipe.codecs import codec
 from tacpipe.errors import TacpipeError
 
 
@@ -33,7 +33,7 @@ def test_inputs_are_those_of_a_reader_that_walks_row_by_row(seed: int, of: str, 
     values = rng.normal(size=(12, 2))
     begins = rng.random(12) < 0.3
     begins[0] = True
-    assert np.allclose(frame_stacking.inputs(values, begins, of, frames), by_hand(values, begins, of, frames))
+    assert np.allclose(codec.inputs(values, begins, of, frames), by_hand(values, begins, of, frames))
 
 
 @given(st.integers(0, 2**16), st.sampled_from(["levels", "increments"]), st.integers(1, 3))
@@ -44,9 +44,9 @@ def test_rows_in_pieces_give_the_inputs_of_the_whole(seed: int, of: str, frames:
     values[rng.random((12, 2)) < 0.1] = np.nan
     begins = rng.random(12) < 0.3
     cuts = [0, *sorted(rng.integers(0, 13, 4).tolist()), 12]
-    stacking = frame_stacking.Stacking(of, frames)
+    stacking = codec.Stacking(of, frames)
     pieces = [stacking.next(values[start:stop], begins[start:stop]) for start, stop in itertools.pairwise(cuts)]
-    whole = frame_stacking.inputs(values, begins, of, frames)
+    whole = codec.inputs(values, begins, of, frames)
     assert np.array_equal(np.concatenate(pieces), whole, equal_nan=True)
 
 
@@ -56,22 +56,22 @@ def test_later_rows_change_nothing_before_them() -> None:
     other[6:] += 100
     for of in ("levels", "increments"):
         for frames in (1, 2, 3):
-            one, two = (frame_stacking.inputs(each, None, of, frames) for each in (values, other))
+            one, two = (codec.inputs(each, None, of, frames) for each in (values, other))
             assert np.array_equal(one[:6], two[:6])
             assert not np.array_equal(one[6:], two[6:])
 
 
 def test_a_stretch_begins_after_a_step_of_more_than_one_and_a_half_times_the_median() -> None:
     t_ns = np.cumsum([0, 20, 20, 29, 20, 31, 20]).astype(np.int64) * 1_000_000
-    assert frame_stacking.breaks(t_ns).nonzero()[0].tolist() == [0, 5]
-    assert frame_stacking.breaks(t_ns[:1]).tolist() == [True]
-    assert frame_stacking.breaks(t_ns[:0]).tolist() == []
+    assert codec.breaks(t_ns).nonzero()[0].tolist() == [0, 5]
+    assert codec.breaks(t_ns[:1]).tolist() == [True]
+    assert codec.breaks(t_ns[:0]).tolist() == []
 
 
 def test_no_rows_give_no_inputs_of_the_right_width() -> None:
-    assert frame_stacking.inputs(np.zeros((0, 4)), None, "increments", 3).shape == (0, 12)
+    assert codec.inputs(np.zeros((0, 4)), None, "increments", 3).shape == (0, 12)
 
 
 def test_another_kind_of_value_is_refused() -> None:
     with pytest.raises(TacpipeError, match="representation is 'speed'"):
-        frame_stacking.inputs(np.zeros((2, 1)), None, "speed", 1)
+        codec.inputs(np.zeros((2, 1)), None, "speed", 1)

@@ -6,8 +6,8 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from tacpipe.codecs import latents, pca, stored, tactile
-from tacpipe.codecs.moments import Moments
+from tacpipe.codecs import codec, pca, tactile
+from tacpipe.codecs.measures import Moments
 from tacpipe.errors import TacpipeError
 from tests.any_table import bits
 from tests.fake_recordings import FakeShard, decode_few_rows_at_a_time
@@ -41,13 +41,13 @@ def test_a_long_recording_gets_the_latents_of_the_whole(
         components=3,
         representation=representation,
     )
-    files = stored.to_files(fitted)
-    whole = latents.added(shard, files)  # type: ignore[arg-type]
+    files = codec.to_files(fitted)
+    whole = tactile.added(shard, files)  # type: ignore[arg-type]
     assert isinstance(whole, pa.Table) and np.isnan(whole.column("z00").to_numpy()[300])
 
-    monkeypatch.setattr(latents, "SOME_ROWS", 100)
+    monkeypatch.setattr(tactile, "SOME_ROWS", 100)
     decode_few_rows_at_a_time(monkeypatch, rows)
-    pieces = latents.added(shard, files)  # type: ignore[arg-type]
+    pieces = tactile.added(shard, files)  # type: ignore[arg-type]
     assert isinstance(pieces, pa.RecordBatchReader)
     found = pieces.read_all()
     assert found.schema.equals(whole.schema, check_metadata=True)
@@ -61,4 +61,4 @@ def test_latents_of_other_channels_are_refused_with_the_name_of_the_recording() 
     counts = tactile.above_rest(recording().content, tuple(CHANNELS))
     fitted = pca.fit(Moments.from_pieces([counts[:300, :5]], 5), CHANNELS[:5], [{}] * 5, components=3)
     with pytest.raises(TacpipeError, match="a: The codec does not fit this table"):
-        latents.added(recording(), stored.to_files(fitted))  # type: ignore[arg-type]
+        tactile.added(recording(), codec.to_files(fitted))  # type: ignore[arg-type]

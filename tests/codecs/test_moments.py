@@ -9,9 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tacpipe.codecs.frame_stacking import INCREMENTS, LEVELS
-from tacpipe.codecs.moments import Moments
-from tacpipe.codecs.standard import standard
+from tacpipe.codecs.codec import INCREMENTS, LEVELS
+from tacpipe.codecs.measures import Moments, standard
 from tacpipe.errors import TacpipeError
 
 

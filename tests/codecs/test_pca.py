@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn import decomposition
 
-from tacpipe.codecs import pca, stored
-from tacpipe.codecs.moments import Moments
+from tacpipe.codecs import codec, pca
+from tacpipe.codecs.measures import Moments
 from tacpipe.codecs.training_rows import TrainingRows
 from tacpipe.errors import TacpipeError
 
@@ -121,7 +121,7 @@ def test_measures_are_those_of_a_fit_without_the_recordings_held_out() -> None:
     covariance = np.array(found.measured["latent_covariance"])
     latents = found.encode(everything, CHANNELS)
     assert np.allclose(covariance, np.cov(latents, rowvar=False), atol=1e-4)
-    assert stored.load(found.to_files()).to_files() == found.to_files()
+    assert codec.load(found.to_files()).to_files() == found.to_files()
 
 
 def test_a_single_recording_is_measured_on_itself_alone() -> None:
@@ -161,7 +161,7 @@ def test_a_channel_that_never_moves_comes_back_as_it_was() -> None:
 def test_a_codec_read_back_gives_the_same_bytes_and_latents() -> None:
     fitted = fit(values(), components=3)
     files = fitted.to_files()
-    read = stored.load(files)
+    read = codec.load(files)
     assert isinstance(read, pca.PCA)
     assert read.to_files() == files == fit(values(), components=3).to_files()
     assert np.array_equal(read.encode(values(1), CHANNELS), fitted.encode(values(1), CHANNELS))
@@ -204,6 +204,6 @@ def test_what_the_data_cannot_give_is_refused(rows: int, how: dict[str, float], 
 
 def test_an_unknown_kind_and_missing_files_are_refused() -> None:
     with pytest.raises(TacpipeError, match=r"no codec\.safetensors"):
-        stored.load({"codec.json": b"{}"})
+        codec.load({"codec.json": b"{}"})
     with pytest.raises(TacpipeError, match=r"kind 'magic' is not installed.*autoencoder, pca"):
-        stored.load({"codec.json": b'{"kind": "magic"}', "codec.safetensors": b""})
+        codec.load({"codec.json": b'{"kind": "magic"}', "codec.safetensors": b""})

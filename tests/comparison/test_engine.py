@@ -11,7 +11,7 @@ from scipy import stats
 from tacpipe.comparison import engine
 from tacpipe.comparison.runs import grouped, separate
 from tacpipe.comparison.specification import report_on
-from tacpipe.metrics import pairing, proportions
+from tacpipe.metrics import intervals, pairing
 from tests.comparison.comparison_fakes import MEAN, QUESTION, run, sums
 
 RNG = np.random.default_rng(5)
@@ -112,7 +112,7 @@ def test_the_paired_test_is_scipys_permutation_test() -> None:
 def test_of_right_and_wrong_answers_the_paired_test_is_mcnemars() -> None:
     first, second = np.array([[1.0] * 11, [0.0] * 2 + [1.0] * 2 + [0.0] * 7])
     one, other = (np.column_stack([wrong, np.ones(11)]) for wrong in (first, second))
-    assert pairing.swap_test(MEAN, one, other) == pytest.approx(proportions.mcnemar(first == 0, second == 0))
+    assert pairing.swap_test(MEAN, one, other) == pytest.approx(intervals.mcnemar(first == 0, second == 0))
     assert math.isnan(pairing.swap_test(MEAN, one[:1], other[:1]))
     assert pairing.swap_test(MEAN, one, one) == 1.0
 

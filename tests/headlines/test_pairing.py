@@ -11,7 +11,7 @@ from scipy import stats
 
 from tacpipe.cli import headline_table
 from tacpipe.metrics import headline as headlines
-from tacpipe.metrics import pairing, regression, summary
+from tacpipe.metrics import pairing, regression
 from tacpipe.tasks.forward import headline as forward
 from tacpipe.tasks.material import headline as material
 from tacpipe.tasks.touch import headline as touch
@@ -151,7 +151,7 @@ def test_the_row_of_persistence_is_shown_where_another_baseline_is_better() -> N
     row = next(line.split() for line in table.splitlines() if line.startswith("  persistence"))
     assert row[-2:] == ["0", "0"]
     assert "vs ridge" in table and "\n  persistence" in table and "mean " not in table.split("n: recordings")[0]
-    summary_values = summary.from_headlines([result])
+    summary_values = headlines.summarize([result])
     assert (summary_values["mae_t_1"], summary_values["persistence_mae_t_1"]) == (0.5, 1.0)
 
 

@@ -8,7 +8,7 @@ import math
 
 import pytest
 
-from tacpipe.metrics import summary
+from tacpipe.metrics import headline
 from tacpipe.metrics.headline import Headline, Row
 from tests.test_headline import ONE
 
@@ -20,7 +20,7 @@ def headline_of_part(gain: float, part: str = "", target: str = "", error: float
 
 
 def test_the_gain_is_that_of_the_part_where_it_is_least() -> None:
-    values = summary.from_headlines(
+    values = headline.summarize(
         [
             headline_of_part(0.3, "known objects"),
             headline_of_part(0.1, "unseen objects", error=9.0),
@@ -37,20 +37,20 @@ def test_names_are_those_that_differ_and_may_be_given() -> None:
         headline_of_part(0.1, "novel objects", target) for target in ("PDC thumb", "electrodes thumb")
     ]
 
-    assert list(summary.from_headlines(headlines_of_targets))[4:] == ["pdc_thumb", "electrodes_thumb"]
-    assert list(summary.from_headlines(headlines_of_targets, {"PDC thumb": "pdc_th"}))[4:] == [
+    assert list(headline.summarize(headlines_of_targets))[4:] == ["pdc_thumb", "electrodes_thumb"]
+    assert list(headline.summarize(headlines_of_targets, {"PDC thumb": "pdc_th"}))[4:] == [
         "pdc_th",
         "electrodes_thumb",
     ]
-    assert list(summary.from_headlines([headline_of_part(0.1)]))[4:] == ["mae_t_1"]
+    assert list(headline.summarize([headline_of_part(0.1)]))[4:] == ["mae_t_1"]
 
 
 def test_what_is_not_defined_is_left_out_and_there_are_fewer_than_thirty() -> None:
-    assert summary.from_headlines([]) == {}
+    assert headline.summarize([]) == {}
     assert (
-        "gain" not in summary.from_headlines([headline_of_part(math.nan)])
-        and summary.from_headlines([headline_of_part(math.nan)])["n"] == 12
+        "gain" not in headline.summarize([headline_of_part(math.nan)])
+        and headline.summarize([headline_of_part(math.nan)])["n"] == 12
     )
     headlines_of_parts = [headline_of_part(0.1, f"part {number}") for number in range(100)]
-    assert len(summary.from_headlines(headlines_of_parts)) < 30
-    assert json.loads(summary.write([headline_of_part(1 / 3)]))["gain"] == pytest.approx(1 / 3, rel=1e-5)
+    assert len(headline.summarize(headlines_of_parts)) < 30
+    assert json.loads(headline.write_summary([headline_of_part(1 / 3)]))["gain"] == pytest.approx(1 / 3, rel=1e-5)

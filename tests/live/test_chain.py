@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tacpipe.codecs import tactile
-from tacpipe.codecs.frame_stacking import breaks
+from tacpipe.codecs.codec import breaks
 from tacpipe.errors import TacpipeError
 from tacpipe.tasks.forward import prediction, tracks
 from tacpipe.tasks.forward import training as forward_training

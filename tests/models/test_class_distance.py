@@ -8,8 +8,8 @@ import pytest
 from tacpipe.errors import TacpipeError
 from tacpipe.metrics import calibration
 from tacpipe.models.class_distance import ClassDistance
-from tacpipe.models.minirocket_classifier import with_profile
-from tacpipe.models.statistics_classifier import statistics
+from tacpipe.models.minirocket import with_profile
+from tacpipe.models.readout import statistics
 
 
 def slides(kinds: tuple[int, ...], count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:

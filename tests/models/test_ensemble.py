@@ -8,8 +8,7 @@ from hypothesis import given as each
 from hypothesis import strategies as st
 from torch import nn
 
-from tacpipe.models.ensemble import Ensemble, Shrunk, persistence_weights
-from tacpipe.models.forecasts import build
+from tacpipe.models.forecasts import Ensemble, Shrunk, build, persistence_weights
 from tacpipe.models.windows import Windows
 from tests.models.window_fakes import CONTEXT, HORIZON, LAYOUT, ahead, windows
 

@@ -9,9 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from tacpipe.errors import TacpipeError
-from tacpipe.models.change import ChangeForecast
+from tacpipe.models.change import ChangeForecast, grid
 from tacpipe.models.forecasts import RecurrentForecast, build
-from tacpipe.models.taxelwise import grid
 from tacpipe.models.windows import ARM, POSE, Windows
 from tacpipe.plugins import registry
 from tests.models.window_fakes import CONTEXT, HORIZON, LAYOUT, ahead, windows

@@ -7,7 +7,7 @@ import pytest
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
 from tacpipe.errors import TacpipeError
-from tacpipe.models.level import Level
+from tacpipe.models.readout import Level
 
 
 def slides(count: int = 60, classes: int = 3, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:

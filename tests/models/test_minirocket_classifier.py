@@ -7,8 +7,8 @@ import pytest
 from safetensors.numpy import load, save
 
 from tacpipe.errors import TacpipeError
-from tacpipe.models.level import Level
-from tacpipe.models.minirocket_classifier import MinirocketClassifier
+from tacpipe.models.minirocket import MinirocketClassifier
+from tacpipe.models.readout import Level
 
 PATTERNS = 84 * 6
 

@@ -7,7 +7,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
-from tacpipe.models.patches import BACKBONES, NEIGHBOURS, WIDTHS, EdgeBackbone, PatchNetwork
+from tacpipe.models.point_networks import BACKBONES, NEIGHBOURS, WIDTHS, EdgeBackbone, PatchNetwork
 
 
 def network(channels: int = 3, numbers: int = 1, outputs: int = 50, backbone: str = "points") -> PatchNetwork:

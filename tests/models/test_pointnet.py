@@ -6,8 +6,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from tacpipe.models.pointnet import HEADS, PointFeatures, PointNet
-from tacpipe.models.pooling import NormalisedLinear
+from tacpipe.models.point_networks import HEADS, NormalisedLinear, PointFeatures, PointNet
 
 
 class Trunk(nn.Module):

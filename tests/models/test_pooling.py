@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor, nn
 
-from tacpipe.models import pooling
-from tacpipe.models.pooling import LargestOverPoints, NormalisedLinear, largest
+from tacpipe.models import point_networks
+from tacpipe.models.point_networks import LargestOverPoints, NormalisedLinear, largest
 
 Sizes = tuple[int, int, int, int]  # clouds, points, inputs, outputs
 SIZES = st.tuples(st.integers(1, 4), st.integers(2, 40), st.integers(1, 9), st.integers(1, 12))
@@ -127,15 +127,15 @@ def test_one_cloud_at_a_time_gives_what_all_at_once_give(sizes: Sizes, seed: int
     layer, points = layer_and_points(sizes, seed)
     with torch.no_grad():
         (values, places), (known, at) = (
-            way(points, layer.weight) for way in (pooling._largest_cached, pooling._largest)
+            way(points, layer.weight) for way in (point_networks._largest_cached, point_networks._largest)
         )
     torch.testing.assert_close(values, known)
     assert torch.equal(places, at)
 
 
-@pytest.mark.parametrize("way", [pooling._largest_cached, pooling._largest])
+@pytest.mark.parametrize("way", [point_networks._largest_cached, point_networks._largest])
 def test_of_points_equally_large_one_alone_takes_the_gradient(way: object, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pooling, "_largest_cached", way)
+    monkeypatch.setattr(point_networks, "_largest_cached", way)
     points = torch.tensor([[[1.0, 0.0], [2.0, 5.0], [2.0, -5.0], [2.0, 1.0]]]).requires_grad_()
     weight = torch.tensor([[1.0, 0.0]]).requires_grad_()
     found = LargestOverPoints.apply(points, weight, torch.tensor([0.5]))  # type: ignore[no-untyped-call]
@@ -163,9 +163,9 @@ def test_points_that_are_not_finite_are_not_passed_over() -> None:
     assert torch.isnan(found[1]).all()
 
 
-@pytest.mark.parametrize("clouds", [1, 2, pooling.FEW, pooling.FEW + 1, 40])
+@pytest.mark.parametrize("clouds", [1, 2, point_networks.FEW, point_networks.FEW + 1, 40])
 def test_rows_of_few_clouds_and_of_many_are_weighed_and_added_up(clouds: int) -> None:
     torch.manual_seed(clouds)
     weights, rows = torch.randn(clouds, 50), torch.randn(clouds, 50, 7)
     wanted = torch.einsum("co,coi->oi", weights.double(), rows.double())
-    torch.testing.assert_close(pooling._weighed(weights, rows).double(), wanted, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(point_networks._weighed(weights, rows).double(), wanted, rtol=1e-5, atol=1e-5)

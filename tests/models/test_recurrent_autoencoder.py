@@ -7,7 +7,7 @@ import torch
 from torch import nn
 
 from tacpipe.errors import TacpipeError
-from tacpipe.models import headers
+from tacpipe.models import recurrent_autoencoder
 from tacpipe.models.recurrent_autoencoder import (
     RecurrentAutoencoder,
     RecurrentClassifier,
@@ -88,7 +88,7 @@ def test_a_network_says_what_the_same_one_of_plain_layers_says(header: str, chan
 
 
 def test_unpooling_as_published_uses_the_places_of_the_last_frame() -> None:
-    header = headers.Convolution(60, "last")
+    header = recurrent_autoencoder.Convolution(60, "last")
     frames = torch.rand(5, 2, 60)
     features = header.encode(frames)
     _, indices = nn.functional.max_pool2d(header.encoder(frames[-1].view(2, 1, 6, 10)), 2, return_indices=True)
@@ -128,4 +128,4 @@ def test_what_cannot_be_built_is_refused_with_what_can() -> None:
     with pytest.raises(TacpipeError, match="no header 'fft'"):
         RecurrentAutoencoder(Shape(19, 20, header="fft"))
     with pytest.raises(TacpipeError, match="the sensor digit; the recordings have biotac"):
-        headers.chosen("digit=mlp", {"biotac": 19})
+        recurrent_autoencoder.chosen("digit=mlp", {"biotac": 19})

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from tacpipe.models.recurrent_forward import RecurrentForward
+from tacpipe.models.forecasts import RecurrentForward
 
 LATENTS, STATES, CONTEXT, HORIZON, WINDOWS = 3, 2, 5, 4, 6
 

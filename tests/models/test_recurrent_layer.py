@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import nn
 
-from tacpipe.models import recurrent_layer
+from tacpipe.models import lstm as lstm_layers
 from tacpipe.models.lstm import lstm
 
 
@@ -17,17 +17,17 @@ def test_where_a_layer_would_be_in_float16_it_is_in_float32(
     layer, inputs = kind(3, 5), torch.randn(7, 2, 3)
     state = torch.randn(1, 2, 5)
     given = (state, state) if kind is nn.LSTM else state
-    expected, _ = recurrent_layer.through(layer, inputs, given)
+    expected, _ = lstm_layers.through(layer, inputs, given)
     with torch.autocast("cpu", torch.bfloat16):
-        reduced, _ = recurrent_layer.through(layer, inputs, given)
-        monkeypatch.setattr(recurrent_layer, "in_float16", lambda _: True)
-        found, _ = recurrent_layer.through(layer, inputs, given)
+        reduced, _ = lstm_layers.through(layer, inputs, given)
+        monkeypatch.setattr(lstm_layers, "in_float16", lambda _: True)
+        found, _ = lstm_layers.through(layer, inputs, given)
     assert torch.equal(found, expected) and found.dtype == torch.float32
     assert not torch.equal(reduced, expected)
 
 
 def test_so_is_a_layer_of_weights_that_were_computed_in_fewer_digits(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(recurrent_layer, "in_float16", lambda _: True)
+    monkeypatch.setattr(lstm_layers, "in_float16", lambda _: True)
     weights = torch.randn(20, 3), torch.randn(20, 5).bfloat16(), torch.randn(20)
     state = torch.randn(2, 5).bfloat16(), torch.randn(2, 5)
     with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):

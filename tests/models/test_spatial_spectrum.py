@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tacpipe.errors import TacpipeError
-from tacpipe.models.spatial_spectrum import BANDS, Bands, Sampling
+from tacpipe.models.transfer import BANDS, Bands, Sampling
 
 FINGER, FOREARM = Sampling(400, 100.0, 0.025), Sampling(75, 50.0, 0.05)
 COMMON = Bands.common([FINGER, FOREARM])

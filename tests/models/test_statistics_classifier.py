@@ -9,7 +9,7 @@ import pytest
 from safetensors.numpy import load, save
 
 from tacpipe.errors import TacpipeError
-from tacpipe.models.statistics_classifier import CHUNK, VIEWS, StatisticsClassifier, View, read, statistics
+from tacpipe.models.readout import CHUNK, VIEWS, StatisticsClassifier, View, read, statistics
 
 ACROSS = 6  # channels that describe all others at one moment
 

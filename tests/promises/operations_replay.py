@@ -31,10 +31,10 @@ class Replay:
     def install(self) -> None:
         """Replace what executes stages, for the rest of this process."""
         from tacpipe.io import parquet
-        from tacpipe.training import checkpoint
+        from tacpipe.training import loop
 
         execute, reader, stage, to_parquet = execution.execute, execution.reader, Stage.__call__, parquet.to_parquet
-        self._save, self._resume = checkpoint.write, checkpoint.read
+        self._save, self._resume = loop.write_checkpoint, loop.read_checkpoint
 
         def executing(task: Any, *arguments: Any, **options: Any) -> Any:
             self._identity = digest([task.name, task.identity, task.recording])
@@ -68,7 +68,7 @@ class Replay:
             return self._parquet[id(table)][1]
 
         execution.execute, execution.reader, Stage.__call__ = executing, reading, calling  # type: ignore
-        checkpoint.write, checkpoint.read, parquet.to_parquet = saving, resuming, packing
+        loop.write_checkpoint, loop.read_checkpoint, parquet.to_parquet = saving, resuming, packing
 
     def _call(self, stage: AnyStage, arguments: dict[str, Any], run: Callable[[], Any]) -> Any:
         workspace = next((arguments[name] for name, kind in stage.arguments.items() if kind == "Workspace"), None)

@@ -28,8 +28,8 @@ import pyarrow.parquet as pq
 from tacpipe.clouds import files as cloud_files
 from tacpipe.clouds import pcd, ply
 from tacpipe.clouds.depth_frame import DepthFrame
-from tacpipe.codecs import stored
-from tacpipe.codecs.moments import Moments
+from tacpipe.codecs import codec
+from tacpipe.codecs.measures import Moments
 from tacpipe.codecs.pca import fit
 from tacpipe.datasets import manifest
 from tacpipe.io.hashing import digest
@@ -215,7 +215,7 @@ def _codec_files() -> dict[str, bytes]:
 
 
 def _codec(data: bytes) -> object:
-    return stored.load(replaced(_codec_files(), data))
+    return codec.load(replaced(_codec_files(), data))
 
 
 def replaced(files: dict[str, bytes], data: bytes) -> dict[str, bytes]:

@@ -247,8 +247,8 @@ def test_a_lease_of_three_terabytes_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("attack", ATTACKS)
 def test_a_checkpoint_that_is_not_a_file_of_its_own_is_as_none(tmp_path: Path, attack: str) -> None:
-    from tacpipe.training import checkpoint
+    from tacpipe.training import loop
 
-    ATTACKS[attack](tmp_path / checkpoint.FILE)
+    ATTACKS[attack](tmp_path / loop.FILE)
     with bounded(4 * GIB):
-        assert checkpoint.read(tmp_path) is None
+        assert loop.read_checkpoint(tmp_path) is None

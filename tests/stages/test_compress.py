@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from tacpipe.codecs import stored
+from tacpipe.codecs import codec
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins import registry
 from tests.fake_recordings import FakeShard, dataset
@@ -56,9 +56,9 @@ def test_the_rest_level_of_each_recording_is_taken_off() -> None:
 def test_decoding_gives_back_counts_above_rest() -> None:
     files = fitted(*RECORDINGS, components=len(CHANNELS))
     found = compressed(RECORDINGS[0], files)
-    latents = np.column_stack([found[name].to_numpy() for name in stored.load(files).latents])
+    latents = np.column_stack([found[name].to_numpy() for name in codec.load(files).latents])
     counts = np.column_stack([RECORDINGS[0].content[name].to_numpy() for name in CHANNELS]) - 16000
-    assert np.allclose(stored.load(files).decode(latents), counts, atol=0.01)
+    assert np.allclose(codec.load(files).decode(latents), counts, atol=0.01)
 
 
 def test_the_codec_does_not_depend_on_the_order_of_recordings_nor_on_rows_in_gaps() -> None:
@@ -134,7 +134,7 @@ def test_an_autoencoder_adds_its_latents_and_everything_else_stays(tmp_path: Pat
     found = AUTOENCODER(AUTOENCODER.params(), RECORDINGS[0], files)
     assert found.column_names == [*RECORDINGS[0].content.column_names, "z00", "z01", "z02"]
     counts = np.column_stack([RECORDINGS[0].content[name].to_numpy() for name in CHANNELS]) - 16000
-    expected = stored.load(files).encode(counts, CHANNELS)
+    expected = codec.load(files).encode(counts, CHANNELS)
     assert np.allclose(np.column_stack([found[name].to_numpy() for name in ("z00", "z01", "z02")]), expected, atol=1e-5)
     told = json.loads(files["codec.json"])
     assert (told["kind"], told["frames"], len(told["search"])) == ("autoencoder", frames, 1)

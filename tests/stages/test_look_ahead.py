@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tacpipe.codecs import stored
+from tacpipe.codecs import codec as codecs
 from tacpipe.plugins.registry import load, stages
 from tacpipe.plugins.stage import RecordingOutput
 from tacpipe.signals.contact import contact_intervals
@@ -154,7 +154,7 @@ def test_latents_and_what_a_forecaster_reads_are_those_of_a_recording_that_is_cu
     compressed: list[Any] = [
         FakeShard(each.name, stage(codec_params(name), each, files), each.attributes) for each in (part, whole)
     ]
-    short, full = (tracks.track(each, stored.load(files)) for each in compressed)
+    short, full = (tracks.track(each, codecs.load(files)) for each in compressed)
     scale = np.abs(full.latent).max()
     np.testing.assert_allclose(short.latent, full.latent[:rows], rtol=1e-5, atol=1e-5 * scale)
     for field in ("arm", "finger", "usable", "groups"):

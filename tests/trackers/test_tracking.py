@@ -16,7 +16,7 @@ from tacpipe.metrics import headline
 from tacpipe.plugins import registry
 from tacpipe.trackers import tracking
 from tacpipe.trackers.tracking import Tracking
-from tacpipe.training import checkpoint, following
+from tacpipe.training import following, loop
 from tacpipe.training.loop import Trained
 from tests.chain import TRAIN
 from tests.conftest import Lab
@@ -209,7 +209,7 @@ def test_a_training_that_fails_ends_its_run_without_a_model(tracked: Lab, monkey
     def full(*_: object) -> None:
         raise StorageError("no space is left")
 
-    monkeypatch.setattr(checkpoint, "write", full)
+    monkeypatch.setattr(loop, "write_checkpoint", full)
     failed = tracked.call(f"{TRAIN} --epochs 3 -o models/x --track keeping")
     calls = [json.loads(line) for line in (tracked.folder / "kept.jsonl").read_text().splitlines()]
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import nn
 
-from tacpipe.training.adam import Adam
+from tacpipe.training.loop import Adam
 
 
 def _network() -> nn.Sequential:
@@ -68,7 +68,7 @@ def test_an_optimiser_that_takes_over_the_state_of_another_continues_with_the_sa
 def test_a_training_imports_no_compiler() -> None:
     program = (
         "import sys, torch\n"
-        "from tacpipe.training.adam import Adam\n"
+        "from tacpipe.training.loop import Adam\n"
         "weight = torch.ones(3, requires_grad=True)\n"
         "weight.square().sum().backward()\n"
         "Adam([weight], 0.1).step()\n"

@@ -10,7 +10,7 @@ import torch
 import yaml
 from torch import nn
 
-from tacpipe.models import recurrent_layer
+from tacpipe.models import lstm
 from tacpipe.store.store import Store
 from tacpipe.training.devices import chosen
 from tests.conftest import tacpipe
@@ -64,9 +64,9 @@ def test_a_model_of_a_gpu_is_evaluated_alike_where_there_is_none(project: Path) 
 @pytest.mark.parametrize("kind", [nn.GRU, nn.LSTM])
 def test_recurrent_layers_stay_in_float32_under_autocast(kind: type[nn.GRU | nn.LSTM]) -> None:
     layer, inputs = kind(3, 5).cuda(), torch.randn(7, 2, 3, device="cuda")
-    expected, _ = recurrent_layer.through(layer, inputs)
+    expected, _ = lstm.through(layer, inputs)
     with torch.autocast("cuda", torch.bfloat16):
-        found, _ = recurrent_layer.through(layer, inputs)
+        found, _ = lstm.through(layer, inputs)
     assert torch.equal(found, expected)
 
 

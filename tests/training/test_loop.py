@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from tacpipe.errors import TacpipeError
-from tacpipe.training import checkpoint
+from tacpipe.training import loop
 from tacpipe.training.loop import Loss, Part, Schedule, Trained, Windows, train
 
 SCHEDULE = Schedule(epochs=6, batch=8, learning_rate=0.01, patience=3, gradient_clip=1.0, seed=4)
@@ -74,7 +74,7 @@ def test_a_damaged_checkpoint_starts_over(tmp_path: Path, caplog: pytest.LogCapt
     whole = run(tmp_path / "whole")
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path / "damaged", interrupted_after(9))
-    file = tmp_path / "damaged" / checkpoint.FILE
+    file = tmp_path / "damaged" / loop.FILE
     content = file.read_bytes()
     file.write_bytes(content[:-10] if damage == "cut" else content[:-10] + bytes([content[-10] ^ 1]) + content[-9:])
     assert same(run(tmp_path / "damaged"), whole)
@@ -82,15 +82,15 @@ def test_a_damaged_checkpoint_starts_over(tmp_path: Path, caplog: pytest.LogCapt
 
 
 def test_a_checkpoint_is_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    checkpoint.write(tmp_path, {"a": torch.zeros(2)}, {"epoch": 1})
+    loop.write_checkpoint(tmp_path, {"a": torch.zeros(2)}, {"epoch": 1})
 
     def dies(*_: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr("os.fsync", dies)
     with pytest.raises(KeyboardInterrupt):
-        checkpoint.write(tmp_path, {"a": torch.ones(2)}, {"epoch": 2})
-    found = checkpoint.read(tmp_path)
+        loop.write_checkpoint(tmp_path, {"a": torch.ones(2)}, {"epoch": 2})
+    found = loop.read_checkpoint(tmp_path)
     assert found is not None
     assert found[1] == {"epoch": 1}
     assert torch.equal(found[0]["a"], torch.zeros(2))

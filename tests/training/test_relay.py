@@ -5,27 +5,27 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from tacpipe.training import relay
+from tacpipe.training import following
 from tacpipe.training.following import Network
 from tests.training.test_following import Seen, followed
 
 NETWORK = Network(4, number=2, count=3, labels={"member": 1})
 
 
-def line(epoch: int) -> relay.Message:
+def line(epoch: int) -> following.Message:
     return {"line": {"epoch": epoch, "val_loss": 0.5}, "learning_rate": 0.25}
 
 
-def begin(*epochs: int, network: Network = NETWORK) -> relay.Message:
-    found: list[relay.Message] = []
-    relay.Sender(found.append).begin(network, [{"epoch": epoch} for epoch in epochs])
+def begin(*epochs: int, network: Network = NETWORK) -> following.Message:
+    found: list[following.Message] = []
+    following.Sender(found.append).begin(network, [{"epoch": epoch} for epoch in epochs])
     return json.loads(json.dumps(found[0]))  # type: ignore[no-any-return]
 
 
 def test_followers_elsewhere_see_what_followers_in_the_process_see(tmp_path: Path) -> None:
     here, there = Seen(), Seen()
-    receiver = relay.Receiver([there])
-    followed(tmp_path, here, relay.Sender(lambda message: receiver.take(json.loads(json.dumps(message)))))
+    receiver = following.Receiver([there])
+    followed(tmp_path, here, following.Sender(lambda message: receiver.take(json.loads(json.dumps(message)))))
 
     assert there.networks == here.networks
     assert there.lines == here.lines
@@ -34,20 +34,20 @@ def test_followers_elsewhere_see_what_followers_in_the_process_see(tmp_path: Pat
 
 
 def test_messages_about_batches_are_at_least_half_a_second_apart() -> None:
-    sent: list[relay.Message] = []
-    sender = relay.Sender(sent.append)
+    sent: list[following.Message] = []
+    sender = following.Sender(sent.append)
     for number in range(1000):
         sender.batch(number / 1000, lambda: 1.0)
     assert len(sent) <= 1
 
-    sender._sent_s -= relay.BATCH_S
+    sender._sent_s -= following.BATCH_S
     sender.batch(0.5, lambda: 0.125)
     assert sent[-1] == {"batch": 0.5, "loss": 0.125}
 
 
 def test_epochs_that_another_worker_repeats_or_takes_over_are_given_once() -> None:
     seen = Seen()
-    receiver = relay.Receiver([seen])
+    receiver = following.Receiver([seen])
     for message in (begin(), line(1), line(2), {"end": False}):
         receiver.take(message)
     for message in (begin(1, 2, 3), line(4), {"end": True}):  # one epoch's message was lost with the worker
@@ -60,7 +60,7 @@ def test_epochs_that_another_worker_repeats_or_takes_over_are_given_once() -> No
 
 def test_a_network_that_is_trained_from_its_beginning_by_another_worker_gives_no_epoch_twice() -> None:
     seen = Seen()
-    receiver = relay.Receiver([seen])
+    receiver = following.Receiver([seen])
     for message in (begin(), line(1), line(2), begin(), line(1), line(2), line(3)):
         receiver.take(message)
 
@@ -69,7 +69,7 @@ def test_a_network_that_is_trained_from_its_beginning_by_another_worker_gives_no
 
 def test_a_network_whose_worker_never_came_back_ends_untrained() -> None:
     seen = Seen()
-    receiver = relay.Receiver([seen])
+    receiver = following.Receiver([seen])
     receiver.take(begin())
     receiver.take(line(1))
     receiver.close()
@@ -80,7 +80,7 @@ def test_a_network_whose_worker_never_came_back_ends_untrained() -> None:
 
 def test_the_next_network_is_begun_once_the_one_before_has_ended() -> None:
     seen = Seen()
-    receiver = relay.Receiver([seen])
+    receiver = following.Receiver([seen])
     other = Network(4, number=3, count=3, labels={"member": 2})
     for message in (begin(), line(1), {"end": True}, begin(network=other), line(1), {"end": True}):
         receiver.take(message)

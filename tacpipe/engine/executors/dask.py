@@ -35,7 +35,7 @@ from tacpipe.plugins import extras
 from tacpipe.store import records
 from tacpipe.store.location import opened
 from tacpipe.store.store import Store
-from tacpipe.training import following, relay
+from tacpipe.training import following
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -139,7 +139,7 @@ class Dask:
                 yield ""
                 return
             topic = f"tacpipe-{uuid.uuid4().hex}"
-            came: Queue[relay.Message | None] = Queue()
+            came: Queue[following.Message | None] = Queue()
             thread = threading.Thread(target=_passed_on, args=(came, followers), daemon=True)
             thread.start()
             self.client.subscribe_topic(topic, lambda event: came.put(event[1]))  # type: ignore[no-untyped-call]
@@ -284,9 +284,9 @@ def _absolute(task: Task) -> Task:
     return replace(task, files={name: str(Path(path).absolute()) for name, path in task.files.items()})
 
 
-def _passed_on(came: Queue[relay.Message | None], followers: Sequence[following.Follower]) -> None:
+def _passed_on(came: Queue[following.Message | None], followers: Sequence[following.Follower]) -> None:
     """Call followers with what comes, until None does."""
-    receiver = relay.Receiver(followers)
+    receiver = following.Receiver(followers)
     while (message := came.get()) is not None:
         receiver.take(message)
     receiver.close()
@@ -306,7 +306,7 @@ def _work(
 
     worker = get_worker()
     name = str(worker.name)
-    senders = [relay.Sender(functools.partial(worker.log_event, topic))] if topic else []
+    senders = [following.Sender(functools.partial(worker.log_event, topic))] if topic else []
     with _alone, progress.showing_progress(False), provenance.worker(name), following.tracked(senders):
         try:
             _check(name, wanted, tasks[0])

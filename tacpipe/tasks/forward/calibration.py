@@ -10,7 +10,7 @@ import numpy as np
 from tacpipe.datasets import model_files
 from tacpipe.errors import UsageError
 from tacpipe.io import progress
-from tacpipe.metrics import conformal
+from tacpipe.metrics import quantiles
 from tacpipe.metrics.quantiles import check_levels
 from tacpipe.tasks import trained_on
 from tacpipe.tasks.forward import tracks
@@ -49,7 +49,7 @@ def calibrate(
         "levels": list(request.quantiles),
         "method": "promised" if request.promise else "pooled",
         "recordings": {"fitted": len(np.unique(training_errors.recordings)), "corrected": count},
-        "most_promised": conformal.most_promised(count),
+        "most_promised": quantiles.most_promised(count),
     }
     config["trained_on"] = trained_on.add_calibration(
         config["trained_on"], trained_on.of_datasets(training, calibration)

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from tacpipe.arrays import AnyFloats, Bools, Float32s, Floats
-from tacpipe.codecs.frame_stacking import INCREMENTS
+from tacpipe.codecs.codec import INCREMENTS
 from tacpipe.models.windows import ARM, Windows
 from tacpipe.signals import kinematics
 from tacpipe.tasks.forward import tracks

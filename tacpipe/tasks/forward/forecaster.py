@@ -15,11 +15,10 @@ from torch import Tensor, nn
 from tacpipe.arrays import AnyFloats, Bools, Float32s, Times
 from tacpipe.channels.pose import NAMED, Pose
 from tacpipe.codecs import codec as codecs
-from tacpipe.codecs import stored
-from tacpipe.codecs.frame_stacking import INCREMENTS
+from tacpipe.codecs.codec import INCREMENTS
 from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError
-from tacpipe.models.ensemble import Shrunk
+from tacpipe.models.forecasts import Shrunk
 from tacpipe.models.linear import Baselines
 from tacpipe.models.windows import ARM, POSE, Windows, motion
 from tacpipe.plugins import params as params_of
@@ -178,7 +177,7 @@ class Forecaster:
         params = params_of.read(Params, config["params"], f"{CONFIG}, params")
         inputs = config["inputs"]
         raw = codecs.Raw(tuple(inputs["tactile"]), tuple(inputs["layout"]))
-        codec: codecs.Codec = raw if config["codec"]["kind"] == "raw" else stored.load(files)
+        codec: codecs.Codec = raw if config["codec"]["kind"] == "raw" else codecs.load(files)
         tensors = model_files.tensors(files[WEIGHTS], WEIGHTS)
         shrinkage = tensors.pop(SHRINKAGE, None)
         model = model_files.filled(lambda: networks.build(params, codec), tensors)

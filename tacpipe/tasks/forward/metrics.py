@@ -14,7 +14,7 @@ import pyarrow as pa
 
 from tacpipe.arrays import AnyArray, AnyFloats, Bools, Int64s
 from tacpipe.io.parquet import to_parquet
-from tacpipe.metrics import forecast, intervals
+from tacpipe.metrics import intervals, regression
 from tacpipe.metrics.headline import Headline
 from tacpipe.metrics.intervals import Interval
 from tacpipe.tasks.forward import headline as headlines
@@ -56,13 +56,13 @@ class Errors:
         """Return the errors of ``predicted``; ``feature_half`` (feature,) is what the paper's scaling divides by."""
         latent = feature = None
         if predicted.latent is not None and truth.latent is not None:
-            latent = forecast.squared_sums(predicted.latent, truth.latent)
+            latent = regression.squared_error_sums(predicted.latent, truth.latent)
             feature = latent / feature_half**2
         return cls(
             latent,
             feature,
-            forecast.squared_sums(predicted.count, truth.count),
-            forecast.absolute_sums(predicted.count, truth.count),
+            regression.squared_error_sums(predicted.count, truth.count),
+            regression.absolute_error_sums(predicted.count, truth.count),
         )
 
     def __add__(self, further: Errors) -> Errors:
@@ -275,7 +275,7 @@ def _summary(trials: Sequence[Trial], groups: Masks, horizon: int, channel_scale
 
 def _steps(sums: AnyFloats, windows: Int64s) -> Tree:
     """Return the mean error by step and over all steps; ``sums`` is (recording, step, channel)."""
-    error = forecast.mean_error(sums, windows)
+    error = regression.mean_error(sums, windows)
     return {f"t{step}": _rounded(value) for step, value in enumerate(error, 1)} | {"mean": _rounded(error.mean())}
 
 

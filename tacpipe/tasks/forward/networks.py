@@ -6,11 +6,11 @@ import torch
 from torch import Tensor, nn
 
 from tacpipe.codecs import codec as codecs
-from tacpipe.codecs.frame_stacking import INCREMENTS
+from tacpipe.codecs.codec import INCREMENTS
 from tacpipe.errors import TacpipeError
 from tacpipe.models import forecasts
 from tacpipe.models.change import PlainForecast
-from tacpipe.models.ensemble import Ensemble
+from tacpipe.models.forecasts import Ensemble
 from tacpipe.models.windows import Shape, Windows
 from tacpipe.tasks.forward.params import Forward
 

@@ -10,7 +10,7 @@ import torch
 
 from tacpipe.arrays import AnyFloats, Int64s
 from tacpipe.codecs import codec as codecs
-from tacpipe.codecs.frame_stacking import INCREMENTS
+from tacpipe.codecs.codec import INCREMENTS
 from tacpipe.models.windows import Windows, motion
 from tacpipe.tasks.forward import tracks
 from tacpipe.tasks.forward.forecaster import Forecaster

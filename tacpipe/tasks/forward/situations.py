@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from tacpipe.arrays import AnyFloats, Int64s
-from tacpipe.metrics import forecast, intervals
+from tacpipe.metrics import intervals, regression
 from tacpipe.tasks.forward.headline import BASELINE, MODEL
 
 if TYPE_CHECKING:  # these import torch, and a report names situations without it
@@ -105,7 +105,9 @@ class BySituation:
         before = self.absolute.setdefault((recording, name), np.zeros((len(SITUATIONS), self.horizon)))
         for situation in np.unique(situations):
             chosen = situations == situation
-            before[situation] += forecast.absolute_sums(predicted.count[chosen], truth.count[chosen]).sum(axis=1)
+            before[situation] += regression.absolute_error_sums(predicted.count[chosen], truth.count[chosen]).sum(
+                axis=1
+            )
 
     def summary(self) -> Tree:
         """Return by situation the windows, recordings, mean absolute errors by predictor and step, and the model's skill.

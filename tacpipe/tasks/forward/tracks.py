@@ -14,8 +14,8 @@ from tacpipe.channels import pose as poses
 from tacpipe.channels.absent import absent
 from tacpipe.channels.pose import Pose
 from tacpipe.codecs import codec as codecs
-from tacpipe.codecs import stored, tactile
-from tacpipe.codecs.frame_stacking import breaks
+from tacpipe.codecs import tactile
+from tacpipe.codecs.codec import breaks
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.io import columns
 from tacpipe.signals import kinematics
@@ -117,7 +117,7 @@ def codec_of(table: pa.Table, files: Mapping[str, bytes], name: str = "") -> cod
     """
     latents = tactile.columns(table.schema, "latent")
     if codecs.DESCRIPTION in files:
-        codec = stored.load(files)
+        codec = codecs.load(files)
         if latents != codec.latents:
             raise TacpipeError(
                 f"The table has {len(latents)} latent columns where its codec makes {len(codec.latents)}. "

@@ -19,12 +19,12 @@ from tacpipe.arrays import AnyFloats, Int64s
 from tacpipe.channels import masks
 from tacpipe.channels.pose import NAMED, Pose
 from tacpipe.codecs import codec as codecs
-from tacpipe.codecs.frame_stacking import INCREMENTS
+from tacpipe.codecs.codec import INCREMENTS
 from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError
 from tacpipe.io.mapped import MappedArrays
 from tacpipe.models import forecasts
-from tacpipe.models.ensemble import Shrunk, persistence_weights
+from tacpipe.models.forecasts import Shrunk, persistence_weights
 from tacpipe.models.linear import Baselines
 from tacpipe.models.windows import Windows, motion
 from tacpipe.plugins import params as params_of

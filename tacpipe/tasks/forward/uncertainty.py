@@ -11,7 +11,7 @@ from safetensors.numpy import save
 from tacpipe.arrays import AnyArray, AnyFloats, Float32s, Int64s
 from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError
-from tacpipe.metrics import conformal
+from tacpipe.metrics.quantiles import conformal_quantile, most_promised
 from tacpipe.models.residual_quantiles import ResidualQuantiles
 from tacpipe.models.tensors import under
 from tacpipe.models.windows import Windows, without_plan
@@ -65,7 +65,7 @@ class Uncertainty:
 
         Each quantile is moved until, of the calibration recordings, each weighing the same, as many values lie at or below
         it as its level states: conformalized quantile regression (Romano, Patterson and Candès, NeurIPS 2019), each
-        side for itself, with the CDFs of recordings pooled (`tacpipe.metrics.conformal`). ``promised``: pairs of
+        side for itself, with the CDFs of recordings pooled (`tacpipe.metrics.quantiles`). ``promised``: pairs of
         quantiles are moved together so far that the band between them holds in a new recording with at least its level;
         raises `TacpipeError` with too few recordings for that.
         """
@@ -141,16 +141,16 @@ def _moved(errors: ResidualQuantiles, predicted: Float32s, calibration: Errors, 
                 moved[[low, high], step] = _promise(larger, groups, 2 * level - 1)
             else:
                 for at, scores in sides.items():
-                    moved[at, step] = conformal.quantile(scores, groups, level)
+                    moved[at, step] = conformal_quantile(scores, groups, level)
     return moved
 
 
 def _promise(scores: AnyFloats, groups: Int64s, level: float) -> float:
-    bound = conformal.quantile(scores, groups, level, promised=True)
+    bound = conformal_quantile(scores, groups, level, promised=True)
     if not np.isfinite(bound):
         count = len(np.unique(groups))
         raise TacpipeError(
-            f"{count} calibration recordings can promise a band that holds {100 * conformal.most_promised(count):.0f} % at "
+            f"{count} calibration recordings can promise a band that holds {100 * most_promised(count):.0f} % at "
             f"most, not {100 * level:.0f} %. Split with more of them (`tacpipe split --val`), give quantiles nearer to 50, "
             f"or leave out --promise."
         )

@@ -15,13 +15,11 @@ from tacpipe.datasets import model_files
 from tacpipe.datasets.dataset import Dataset
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.metrics import calibration
-from tacpipe.models.level import Level
-from tacpipe.models.minirocket_classifier import MinirocketClassifier
+from tacpipe.models.minirocket import MinirocketClassifier
+from tacpipe.models.readout import Level, StatisticsClassifier, View
 from tacpipe.models.recurrent_autoencoder import Shape
-from tacpipe.models.spatial_spectrum import Bands
-from tacpipe.models.statistics_classifier import StatisticsClassifier, View
 from tacpipe.models.tensors import under
-from tacpipe.models.transfer import Transfer
+from tacpipe.models.transfer import Bands, Transfer
 from tacpipe.plugins import params as params_of
 from tacpipe.printable import plain
 from tacpipe.tasks.material import estimators, known, networks

@@ -13,7 +13,7 @@ from scipy.special import logsumexp
 from tacpipe.arrays import AnyArray, AnyFloats, Float32s, Floats, Int64s, Ints
 from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError
-from tacpipe.metrics import calibration, conformal
+from tacpipe.metrics import calibration, quantiles
 from tacpipe.models.class_distance import ClassDistance
 from tacpipe.models.tensors import under
 
@@ -87,7 +87,7 @@ def fit(
     Raises `TacpipeError` with too few slides for that.
     """
     count = len(validation.labels)
-    if conformal.most_promised(count) < 1 - false_unknown:
+    if quantiles.most_promised(count) < 1 - false_unknown:
         raise TacpipeError(
             f"{count} validation slides cannot set a threshold that at most {100 * false_unknown:g} % of known slides fall "
             f"below; it takes {int(np.ceil(1 / false_unknown - 1 - 1e-9))} or more. Split with more of them "
@@ -105,7 +105,7 @@ def fit(
     }
     areas = {rule: calibration.auroc(scores[rule], scores_without_class[rule]) for rule in RULES}
     rule = max(RULES, key=lambda candidate: areas[candidate])
-    threshold = -conformal.quantile(-scores[rule], np.arange(count), 1 - false_unknown, promised=True)
+    threshold = -quantiles.conformal_quantile(-scores[rule], np.arange(count), 1 - false_unknown, promised=True)
     return SensorCalibration(temperature, rule, threshold, unset.distance), areas
 
 

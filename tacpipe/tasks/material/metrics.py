@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from tacpipe.arrays import Bools
-from tacpipe.metrics.proportions import mcnemar, wilson
+from tacpipe.metrics.intervals import mcnemar, wilson
 from tacpipe.tasks.material.classifier import MEAN_LEVEL
 
 MODEL, SWAPPED, LAST_EPOCH = "model", "swapped", "last_epoch"

@@ -14,8 +14,8 @@ from torch import nn
 
 from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.models import headers
-from tacpipe.models.level import Level
+from tacpipe.models import recurrent_autoencoder
+from tacpipe.models.readout import Level
 from tacpipe.models.recurrent_autoencoder import Shape
 from tacpipe.printable import listed
 from tacpipe.tasks import trained_on
@@ -68,7 +68,7 @@ def train(
     mapped_to = params.aligned_sensor
     if joint:
         _same_materials(training_slides, Naming.from_json(config))
-    kinds = headers.chosen(
+    kinds = recurrent_autoencoder.chosen(
         params.headers, {name: len(sensor_slides.layout.channels) for name, sensor_slides in training_slides.items()}
     )
     shapes = {

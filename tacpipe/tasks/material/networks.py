@@ -8,8 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from tacpipe.errors import TacpipeError
-from tacpipe.models.plain_classifier import PlainClassifier
-from tacpipe.models.recurrent_autoencoder import Shape
+from tacpipe.models.recurrent_autoencoder import PlainClassifier, Shape
 from tacpipe.tasks.material.losses import Network
 from tacpipe.tasks.material.params import Material
 from tacpipe.tasks.material.params import Network as NetworkParams

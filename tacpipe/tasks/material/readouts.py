@@ -10,11 +10,9 @@ from safetensors.numpy import save
 from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.models import transfer
-from tacpipe.models.level import Level
-from tacpipe.models.minirocket_classifier import MinirocketClassifier
-from tacpipe.models.spatial_spectrum import Bands, Sampling
-from tacpipe.models.statistics_classifier import StatisticsClassifier
-from tacpipe.models.transfer import Transfer
+from tacpipe.models.minirocket import MinirocketClassifier
+from tacpipe.models.readout import Level, StatisticsClassifier
+from tacpipe.models.transfer import Bands, Sampling, Transfer
 from tacpipe.plugins.constraints import Assignments
 from tacpipe.tasks.material.classifier import (
     BASELINES,

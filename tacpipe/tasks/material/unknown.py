@@ -13,8 +13,7 @@ import numpy as np
 from tacpipe.arrays import AnyArray, Bools, Float32s
 from tacpipe.metrics import calibration
 from tacpipe.metrics.headline import FEWEST
-from tacpipe.metrics.intervals import share_interval
-from tacpipe.metrics.proportions import wilson
+from tacpipe.metrics.intervals import share_interval, wilson
 from tacpipe.tasks.material.classifier import UNKNOWN_ANSWER, Classifier
 from tacpipe.tasks.material.slides import Slides
 

@@ -14,7 +14,7 @@ from tacpipe.channels import biotac_sp
 from tacpipe.clouds import geometry
 from tacpipe.errors import TacpipeError
 from tacpipe.models.forest import Forest
-from tacpipe.models.patches import Shape
+from tacpipe.models.point_networks import Shape
 from tacpipe.tasks.touch import params as params_of
 from tacpipe.tasks.touch.grasps import Grasps
 from tacpipe.tasks.touch.inputs import Inputs, Sources

@@ -27,7 +27,7 @@ from tacpipe.training.devices import Precision
 if TYPE_CHECKING:
     from torch import nn
 
-    from tacpipe.models.patches import Shape
+    from tacpipe.models.point_networks import Shape
     from tacpipe.tasks.touch.training import FittedModel, TrainingGrasps
 
 Presets = Mapping[str, Mapping[str, object]]
@@ -135,7 +135,7 @@ class PointNetwork(Touch, ABC):
 
     @abstractmethod
     def build(self, shape: Shape) -> nn.Module:
-        """Return the network, of random weights, for what it reads and predicts (`tacpipe.models.patches.Shape`).
+        """Return the network, of random weights, for what it reads and predicts (`tacpipe.models.point_networks.Shape`).
 
         It is called as ``network(points, numbers)`` and returns scaled values (cloud, ``shape.values``), those of the
         targets side by side.
@@ -172,7 +172,7 @@ class Patches(PointNetwork):
 
     def build(self, shape: Shape) -> nn.Module:
         """Return the network of patches."""
-        from tacpipe.models.patches import PatchNetwork
+        from tacpipe.models.point_networks import PatchNetwork
 
         return PatchNetwork(
             shape.channels,
@@ -223,7 +223,7 @@ class Pointnet(PointNetwork):
 
     def build(self, shape: Shape) -> nn.Module:
         """Return the paper's network."""
-        from tacpipe.models.pointnet import HEADS, PointNet
+        from tacpipe.models.point_networks import HEADS, PointNet
 
         return PointNet(shape.channels, shape.numbers, shape.values, head=HEADS[self.head], transform=self.transform)
 

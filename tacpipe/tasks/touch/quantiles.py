@@ -3,7 +3,7 @@
 Grasps are few, so that no spread can be learned for each: a value's error is measured in units of its own standard
 deviation over training grasps, and of these units the quantiles are those of all values of a target together, each
 calibration grasp weighing the same: split conformal prediction with normalised errors (Papadopoulos, Gammerman and Vovk,
-2008), over groups (`tacpipe.metrics.conformal`).
+2008), over groups (`tacpipe.metrics.quantiles`).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from tacpipe.channels import biotac_sp
 from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError
 from tacpipe.io.parquet import to_parquet
-from tacpipe.metrics import conformal, quantiles
+from tacpipe.metrics import quantiles
 from tacpipe.metrics.quantiles import Sums
 from tacpipe.models.tensors import under
 from tacpipe.tasks import calibrated
@@ -180,16 +180,16 @@ def _quantiles(errors: Floats, levels: Floats, promised: bool) -> Floats:
     offsets = np.zeros(len(levels))
     for at, level in enumerate(levels):
         if not promised or at == middle:
-            offsets[at] = conformal.quantile(flat, groups, float(level))
+            offsets[at] = quantiles.conformal_quantile(flat, groups, float(level))
     if promised:
         away = np.abs(flat - offsets[middle])
         for low in range(middle):
             level = float(levels[-1 - low] - levels[low])
-            far = conformal.quantile(away, groups, level, promised=True)
+            far = quantiles.conformal_quantile(away, groups, level, promised=True)
             if not np.isfinite(far):
                 raise TacpipeError(
                     f"{len(errors)} calibration grasps can promise a band that holds "
-                    f"{100 * conformal.most_promised(len(errors)):.0f} % at most, not {100 * level:.0f} %. Split with more "
+                    f"{100 * quantiles.most_promised(len(errors)):.0f} % at most, not {100 * level:.0f} %. Split with more "
                     f"of them (`tacpipe split --val`), give quantiles nearer to 50, or leave out --promise."
                 )
             offsets[low], offsets[-1 - low] = offsets[middle] - far, offsets[middle] + far

@@ -42,7 +42,9 @@ REST = {
     ],
 )
 def test_a_window_has_the_first_name_that_fits(changed: dict[str, float], wanted: str) -> None:
-    found = situations.situation_numbers(Motion(**{name: np.array([value]) for name, value in {**REST, **changed}.items()}))
+    found = situations.situation_numbers(
+        Motion(**{name: np.array([value]) for name, value in {**REST, **changed}.items()})
+    )
     assert SITUATIONS[found[0]] == wanted
 
 

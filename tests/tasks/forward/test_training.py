@@ -18,7 +18,7 @@ from tacpipe.plugins import registry
 from tacpipe.plugins.params import to_json
 from tacpipe.tasks.forward import training
 from tacpipe.tasks.forward import training as forward_training
-from tacpipe.training import checkpoint
+from tacpipe.training import loop
 from tests.fake_recordings import FakeShard, dataset
 from tests.stages.learning_fakes import CHANNELS, motion, table
 from tests.tasks.forward.trials import HORIZON, compressed, evaluated, params, trained
@@ -206,17 +206,17 @@ def test_an_interrupted_training_goes_on_where_it_was(
         "hidden": 8,
     }
     whole = trained(tmp_path / "whole", **asked)
-    written, write = iter(range(2)), checkpoint.write
+    written, write = iter(range(2)), loop.write_checkpoint
 
     def killed(*args: Any) -> None:
         write(*args)
         if next(written, None) is None:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(checkpoint, "write", killed)
+    monkeypatch.setattr(loop, "write_checkpoint", killed)
     with pytest.raises(KeyboardInterrupt):
         trained(tmp_path / "killed", **asked)
-    monkeypatch.setattr(checkpoint, "write", write)
+    monkeypatch.setattr(loop, "write_checkpoint", write)
     assert trained(tmp_path / "killed", **asked) == whole
 
 

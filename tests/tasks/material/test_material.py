@@ -15,8 +15,8 @@ from safetensors.torch import load as load_tensors
 
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.metrics import headline
-from tacpipe.metrics.proportions import wilson
-from tacpipe.models.statistics_classifier import StatisticsClassifier, View
+from tacpipe.metrics.intervals import wilson
+from tacpipe.models.readout import StatisticsClassifier, View
 from tacpipe.plugins import given_params, registry
 from tacpipe.tasks.material import evaluation as material_evaluation
 from tacpipe.tasks.material import headline as headlines

@@ -17,7 +17,7 @@ from tacpipe.tasks.touch import training
 from tacpipe.tasks.touch import training as touch_training
 from tacpipe.tasks.touch.model import TouchModel
 from tacpipe.tasks.touch.predictor import BASELINES, CONFIG, HISTORY, WEIGHTS
-from tacpipe.training import checkpoint
+from tacpipe.training import loop
 from tests.tasks.touch.handmade import (
     OBJECTS,
     POINTNET,
@@ -81,7 +81,7 @@ def test_an_interrupted_training_goes_on_where_it_was(
 ) -> None:
     asked = {**changed, "epochs": 2}
     whole = trained(tmp_path / "whole", **asked)
-    written, write = iter(range(epochs)), checkpoint.write
+    written, write = iter(range(epochs)), loop.write_checkpoint
 
     def killed(*args: Any) -> None:
         write(*args)
@@ -89,7 +89,7 @@ def test_an_interrupted_training_goes_on_where_it_was(
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
-        patched.setattr(checkpoint, "write", killed)
+        patched.setattr(loop, "write_checkpoint", killed)
         trained(tmp_path / "killed", **asked)
     assert trained(tmp_path / "killed", **asked) == whole
 

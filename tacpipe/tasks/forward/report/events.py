@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from tacpipe.comparison.runs import MODEL, Method, Run
-from tacpipe.metrics.proportions import wilson
+from tacpipe.metrics.intervals import wilson
 from tacpipe.report.blocks import NONE, Cell, Fold, Table, fixed, fold, number, table
 from tacpipe.report.context import Context
 from tacpipe.tasks.forward.report.figures import predictor_title

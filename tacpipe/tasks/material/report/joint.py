@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tacpipe.comparison.runs import Method, Run
-from tacpipe.metrics.proportions import wilson
+from tacpipe.metrics.intervals import wilson
 from tacpipe.report import blocks
 from tacpipe.report.blocks import NONE, Cell, Fold, Note, Table, number, p_value, signed
 from tacpipe.report.context import Tree

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 from tacpipe.comparison import engine
 from tacpipe.comparison.engine import PairedRuns, observations, paired_runs
 from tacpipe.comparison.runs import Method, Question, Run
+from tacpipe.metrics.intervals import mcnemar, wilson
 from tacpipe.metrics.pairing import Gain
-from tacpipe.metrics.proportions import mcnemar, wilson
 from tacpipe.report import context
 from tacpipe.report.blocks import NONE, Cell, fixed
 from tacpipe.tasks.material.report import methods

@@ -11,8 +11,7 @@ import numpy as np
 from tacpipe.arrays import AnyFloats, Floats
 from tacpipe.comparison.runs import Method
 from tacpipe.metrics import calibration, headline
-from tacpipe.metrics.intervals import share_interval
-from tacpipe.metrics.proportions import wilson
+from tacpipe.metrics.intervals import share_interval, wilson
 from tacpipe.report import blocks, charts
 from tacpipe.report.blocks import NONE, Block, Cell, Chart, Charts, Fold, fold, number, table
 from tacpipe.report.charts import Line

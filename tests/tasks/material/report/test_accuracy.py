@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from tacpipe.comparison.runs import Run
-from tacpipe.metrics.proportions import wilson
+from tacpipe.metrics.intervals import wilson
 from tacpipe.tasks.material.report import methods, scores
 from tests.tasks.material.report.material_fakes import result
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from tacpipe.comparison import engine
 from tacpipe.comparison.runs import Method
-from tacpipe.metrics.proportions import wilson
+from tacpipe.metrics.intervals import wilson
 from tacpipe.tasks.material.report.joint import difference_table, reduction_tables, swap_table, zero_shot_folds
 from tests.report import parts
 from tests.tasks.material.report.material_fakes import result

@@ -1,0 +1,295 @@
+"""Networks that read points: patches about the contacts, PointNet, and the fast layers that both use.
+
+Normalising a batch needs mean and variance of what a linear layer gives. Both follow from mean and covariance of what
+it is given, which is an order of magnitude smaller, so the layer and its normalisation become one affine map and nothing
+is passed over twice. The largest value of a channel over a cloud depends on one point alone, so going back through it
+costs a row a channel instead of a product over all points. The maths is that of `torch.nn.Linear`,
+`torch.nn.BatchNorm1d` and `torch.max`, down to rounding; of points equally large the first takes all the gradient.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+EPSILON = 1e-5  # added to a variance, as in torch
+MOMENTUM = 0.1  # weight of a batch in the running mean and variance, as in torch
+FEW = 16  # clouds, which a plain sum adds up in the order of einsum
+
+
+class NormalisedLinear(nn.Module):
+    """A linear layer with batch normalisation behind it, over points: what `torch.nn.BatchNorm1d` of a linear gives.
+
+    In training it is normalised by the batch at hand and keeps running means, by which it is normalised otherwise.
+    """
+
+    mean: Tensor
+    variance: Tensor
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.empty(outputs, inputs))
+        self.scale = nn.Parameter(torch.ones(outputs))
+        self.shift = nn.Parameter(torch.zeros(outputs))
+        self.register_buffer("mean", torch.zeros(outputs))
+        self.register_buffer("variance", torch.ones(outputs))
+        nn.init.kaiming_uniform_(self.weight, a=5**0.5)  # the initial weights of torch.nn.Linear
+
+    def affine(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
+        """Return weight (output, input) and bias (output,) of the layer for these inputs (…, input)."""
+        if self.training:
+            with torch.autocast(inputs.device.type, enabled=False):  # small differences of sums over many points
+                mean, variance = self._moments(inputs.reshape(-1, inputs.shape[-1]).to(self.weight.dtype))
+        else:
+            mean, variance = self.mean, self.variance
+        gain = self.scale * torch.rsqrt(variance + EPSILON)
+        return self.weight * gain[:, None], self.shift - mean * gain
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        """Return the normalised outputs (…, output) of inputs (…, input)."""
+        return nn.functional.linear(inputs, *self.affine(inputs))
+
+    def _moments(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
+        """Return mean and variance (output,) over rows (row, input), and let the running ones follow."""
+        centre, rows = inputs.mean(dim=0), len(inputs)
+        centred = inputs - centre
+        covariance = centred.T @ centred / rows  # (input, input)
+        mean = self.weight @ centre
+        variance = ((self.weight @ covariance) * self.weight).sum(dim=1).clamp_min(0)
+        with torch.no_grad():
+            unbiased = variance * (rows / max(rows - 1, 1))
+            self.mean.lerp_(mean, MOMENTUM)
+            self.variance.lerp_(unbiased, MOMENTUM)
+        return mean, variance
+
+
+class LargestOverPoints(torch.autograd.Function):
+    """The largest value over points (cloud, output) of an affine map of points (cloud, point, input)."""
+
+    @staticmethod
+    def forward(ctx: Any, points: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+        """Return the largest values."""
+        largest, places = (_largest_cached if points.device.type == "cpu" else _largest)(points, weight)
+        ctx.save_for_backward(points, weight, places)
+        return largest + bias
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the gradients: each reaches the one point that was largest."""
+        points, weight, places = ctx.saved_tensors
+        (gradient,) = gradients
+        at = (places + torch.arange(len(places), device=places.device)[:, None] * points.shape[1]).ravel()
+        rows = points.reshape(-1, points.shape[2])  # (cloud and point, input)
+        to_points = torch.zeros_like(rows)
+        to_points.index_add_(0, at, (gradient[:, :, None] * weight).view(len(at), -1))
+        to_weight = _weighed(gradient, rows.index_select(0, at).view(*places.shape, -1))
+        return to_points.view_as(points), to_weight, gradient.sum(dim=0)
+
+
+def _weighed(weights: Tensor, rows: Tensor) -> Tensor:
+    """Return the sums over clouds (output, input) of rows (cloud, output, input) by weights (cloud, output).
+
+    Of few clouds a product of matrices per output, which is what einsum makes of it, takes six times as long.
+    """
+    if len(rows) > FEW or rows.device.type != "cpu":
+        return torch.einsum("co,coi->oi", weights, rows)
+    return (weights[:, :, None] * rows).sum(dim=0)
+
+
+def _largest(points: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the largest products over points (cloud, output), and which point gives each."""
+    maxima = torch.max(weight @ points.transpose(1, 2), dim=2)
+    return maxima.values, maxima.indices
+
+
+def _largest_cached(points: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Return what `_largest` does; a cloud at a time, whose products stay in the cache, and by numpy's faster argmax."""
+    products = points.new_empty(len(weight), points.shape[1])  # (output, point)
+    largest = points.new_empty(len(points), len(weight))
+    places = torch.empty(largest.shape, dtype=torch.long)
+    for cloud, at in enumerate(places):
+        torch.mm(weight, points[cloud].T, out=products)
+        at.copy_(torch.from_numpy(products.numpy().argmax(axis=1)))
+        torch.gather(products, 1, at[:, None], out=largest[cloud][:, None])
+    return largest, places
+
+
+def largest(layer: NormalisedLinear, points: Tensor) -> Tensor:
+    """Return the largest value over points (cloud, output) of the layer on clouds (cloud, point, input)."""
+    weight, bias = layer.affine(points)
+    with torch.autocast(points.device.type, enabled=False):
+        maxima: Tensor = LargestOverPoints.apply(points.to(weight.dtype), weight, bias)  # type: ignore[no-untyped-call]
+    return maxima
+
+
+BACKBONES = ("points", "edges")
+NEIGHBOURS = 12
+WIDTHS = (64, 128, 256)
+
+
+@dataclass(frozen=True)
+class Shape:
+    """Sizes of what a network of touch reads and predicts."""
+
+    channels: int  # numbers per point
+    numbers: int  # numbers that describe the grasp
+    values: int  # predicted values, those of all targets side by side
+
+
+class PatchNetwork(nn.Module):
+    """Map patches (cloud, patch, point, channel) and the grasp's numbers (cloud, number) to touch (cloud, value).
+
+    Touch from what lies under the fingertips: patches about both contacts and a coarse view of the object, in metres.
+
+    Contact depends on the surface about the contact, its curvature, slope and edges, and on sizes in metres. So points
+    are read in the axes of the grasp, those about each contact through layers of their own, and the grasp's own sizes
+    beside them. Moving object, hand and wrist together changes nothing of what is read. Two backbones describe a patch:
+
+    - ``points``: every point alone, as in PointNet;
+    - ``edges``: every point with its nearest neighbours (EdgeConv; Wang et al., Dynamic graph CNN, 2019).
+    """
+
+    def __init__(
+        self, channels: int, numbers: int, outputs: int, *, backbone: str, hidden: int, dropout: float
+    ) -> None:
+        super().__init__()
+        backbones = {"points": PointBackbone, "edges": EdgeBackbone}
+        self.near: nn.Module = backbones[backbone](channels)  # the same for both contacts
+        self.whole: nn.Module = backbones[backbone](channels)
+        self.head = nn.Sequential(
+            nn.Linear(3 * 2 * WIDTHS[-1] + numbers, hidden),
+            nn.LayerNorm(hidden),
+            nn.ReLU(),
+            nn.Dropout(dropout),
+            nn.Linear(hidden, hidden // 2),
+            nn.ReLU(),
+            nn.Dropout(dropout),
+            nn.Linear(hidden // 2, outputs),
+        )
+
+    def forward(self, patches: Tensor, numbers: Tensor) -> Tensor:
+        """Return the values of touch; the patches are those about g1, about g2, and the whole cloud."""
+        clouds, _, points, channels = patches.shape
+        near = self.near(patches[:, :2].reshape(-1, points, channels)).view(clouds, -1)
+        values: Tensor = self.head(torch.cat([near, self.whole(patches[:, 2]), numbers], dim=1))
+        return values
+
+
+class PointBackbone(nn.Module):
+    """Largest and mean value of each channel over points, (cloud, point, channel) to (cloud, 512)."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        first, second, last = WIDTHS
+        self.layers = nn.Sequential(
+            nn.Linear(channels, first), nn.ReLU(), nn.Linear(first, second), nn.ReLU(), nn.Linear(second, last)
+        )
+
+    def forward(self, points: Tensor) -> Tensor:
+        """Return the features."""
+        return _pooled(self.layers(points))
+
+
+class EdgeBackbone(nn.Module):
+    """The same behind one layer that reads each point with its 12 nearest ones: how they lie about it."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        first, second, last = WIDTHS
+        self.edges = nn.Sequential(nn.Linear(2 * channels, first), nn.ReLU(), nn.Linear(first, first))
+        self.layers = nn.Sequential(nn.ReLU(), nn.Linear(first, second), nn.ReLU(), nn.Linear(second, last))
+
+    def forward(self, points: Tensor) -> Tensor:
+        """Return the features; neighbours are those in space, which comes first among the channels."""
+        clouds, count, channels = points.shape
+        distances = torch.cdist(points[:, :, :3], points[:, :, :3])
+        nearest = distances.topk(min(NEIGHBOURS, count), largest=False).indices  # (cloud, point, neighbour)
+        rows = torch.arange(clouds, device=points.device)[:, None, None]
+        around = points[rows, nearest] - points[:, :, None]  # (cloud, point, neighbour, channel)
+        centre = points[:, :, None].expand(clouds, count, nearest.shape[2], channels)
+        return _pooled(self.layers(self.edges(torch.cat([centre, around], dim=3)).amax(dim=2)))
+
+
+def _pooled(values: Tensor) -> Tensor:
+    return torch.cat([values.amax(dim=1), values.mean(dim=1)], dim=1)
+
+
+FEATURES = 1024
+POINT_LAYERS = (64, 128)
+TRANSFORM_LAYERS = (512, 256)
+HEADS = {f"fc{depth}": (1024, 512, 256, 128, 64, 32)[:depth] for depth in range(1, 7)}  # Table I of the letter
+
+
+class PointNet(nn.Module):
+    """Map points (cloud, point, channel) and numbers of the grasp (cloud, number) to values of touch (cloud, value).
+
+    PointNet for touch (Zapata-Impata et al., Generation of tactile data from 3D vision and target robotic grasps, 2020).
+
+    Every point goes through the same layers, the largest value of each of 1,024 channels over the cloud describes the
+    whole, and fully connected layers make touch of it and of the grasp (Qi et al., PointNet, CVPR 2017). The trunk is
+    that of the group's published code: one learned transform of all input channels, and no loss that keeps it
+    orthogonal.
+    """
+
+    def __init__(
+        self, channels: int, grasp: int, outputs: int, *, head: Sequence[int] = HEADS["fc3"], transform: bool = True
+    ) -> None:
+        super().__init__()
+        self.transform = PointTransform(channels) if transform else None
+        self.points = PointFeatures(channels)
+        self.head = _connected(FEATURES + grasp, head, outputs)
+
+    def forward(self, points: Tensor, grasp: Tensor) -> Tensor:
+        """Return the values of touch."""
+        if self.transform is not None:
+            points = points @ self.transform(points)
+        values: Tensor = self.head(torch.cat([self.points(points), grasp], dim=1))
+        return values
+
+
+class PointFeatures(nn.Module):
+    """The largest value of each channel over a cloud, (cloud, point, channel) to (cloud, 1024)."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        sizes = (channels, *POINT_LAYERS)
+        self.layers = nn.ModuleList(NormalisedLinear(*pair) for pair in pairwise(sizes))
+        self.last = NormalisedLinear(sizes[-1], FEATURES)
+
+    def forward(self, points: Tensor) -> Tensor:
+        """Return the features; there is no ReLU behind the last layer."""
+        for layer in self.layers:
+            points = torch.relu(layer(points))
+        return largest(self.last, points)
+
+
+class PointTransform(nn.Module):
+    """A learned map of a cloud's channels, (cloud, point, channel) to (cloud, channel, channel).
+
+    It is the identity and what is learned beside it, which begins at random, as in the group's published code.
+    """
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.channels = channels
+        self.points = PointFeatures(channels)
+        self.head = _connected(FEATURES, TRANSFORM_LAYERS, channels * channels)
+
+    def forward(self, points: Tensor) -> Tensor:
+        """Return the map to multiply points with from the right."""
+        transform: Tensor = self.head(torch.relu(self.points(points))).view(-1, self.channels, self.channels)
+        return transform + torch.eye(self.channels, device=points.device)
+
+
+def _connected(inputs: int, hidden: Sequence[int], outputs: int) -> nn.Sequential:
+    """Return fully connected layers with batch normalisation and ReLU, and a plain one at the end."""
+    layers: list[nn.Module] = []
+    for width in hidden:
+        layers += [nn.Linear(inputs, width), nn.BatchNorm1d(width), nn.ReLU()]
+        inputs = width
+    return nn.Sequential(*layers, nn.Linear(inputs, outputs))
