@@ -22,22 +22,28 @@ SCHEDULE = Schedule(epochs=4, batch=32, learning_rate=1e-3, patience=10, gradien
 
 def walk(seed: int, rows: int = 60) -> np.ndarray:
     rng = np.random.default_rng(seed)
-    found: np.ndarray = (
+    counts: np.ndarray = (
         np.cumsum(rng.normal(size=(rows, 3)), axis=0) @ np.random.default_rng(0).normal(size=(3, 12)) * 50
     )
-    return found + rng.normal(size=found.shape) + 20
+    return counts + rng.normal(size=counts.shape) + 20
 
 
 WALKS = {f"trial-{seed}": walk(seed) for seed in range(5)}
 
 
-def training(of: str = "levels", frames: int = 1) -> TrainingRows:
-    return TrainingRows(CHANNELS, LAYOUT, {name: codec.inputs(each, None, of, frames) for name, each in WALKS.items()})
+def training(representation: str = "levels", frames: int = 1) -> TrainingRows:
+    return TrainingRows(
+        CHANNELS, LAYOUT, {name: codec.inputs(counts, None, representation, frames) for name, counts in WALKS.items()}
+    )
 
 
-def fit(folder: Path, of: str = "levels", frames: int = 1, hidden: str = "16,8", search: int = 0) -> Autoencoder:
+def fit(
+    folder: Path, representation: str = "levels", frames: int = 1, hidden: str = "16,8", search: int = 0
+) -> Autoencoder:
     tried = autoencoder_fit.networks(frames, hidden, search)
-    return autoencoder_fit.fit(training(of, frames), tried, SCHEDULE, folder, components=4, representation=of)
+    return autoencoder_fit.fit(
+        training(representation, frames), tried, SCHEDULE, folder, components=4, representation=representation
+    )
 
 
 def in_torch(layers: tuple[tuple[np.ndarray, np.ndarray], ...]) -> nn.Sequential:
@@ -73,20 +79,20 @@ def test_widths_are_those_asked_for_and_mirrored(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("frames", "hidden"), [(1, (64, 32)), (2, (128, 64)), (3, (192, 96))])
 def test_each_class_has_hidden_layers_of_its_own(frames: int, hidden: tuple[int, ...]) -> None:
-    assert [one.hidden for one in autoencoder_fit.networks(frames, "", 0)] == [hidden]
+    assert [network.hidden for network in autoencoder_fit.networks(frames, "", 0)] == [hidden]
 
 
 def test_a_row_depends_on_the_frames_before_it_and_not_across_a_break(tmp_path: Path) -> None:
     fitted = fit(tmp_path, frames=3)
     values = WALKS["trial-1"]
     begins = np.arange(60) == 30
-    other = values.copy()
-    other[29] += 500
-    one, two = (fitted.encode(each, CHANNELS) for each in (values, other))
-    assert np.flatnonzero((one != two).any(axis=1)).tolist() == [29, 30, 31]
-    one, two = (fitted.encode(each, CHANNELS, begins) for each in (values, other))
-    assert np.flatnonzero((one != two).any(axis=1)).tolist() == [29]
-    assert np.allclose(two[30:], fitted.encode(other[30:], CHANNELS), atol=1e-5)
+    changed = values.copy()
+    changed[29] += 500
+    first_latents, second_latents = (fitted.encode(counts, CHANNELS) for counts in (values, changed))
+    assert np.flatnonzero((first_latents != second_latents).any(axis=1)).tolist() == [29, 30, 31]
+    first_latents, second_latents = (fitted.encode(counts, CHANNELS, begins) for counts in (values, changed))
+    assert np.flatnonzero((first_latents != second_latents).any(axis=1)).tolist() == [29]
+    assert np.allclose(second_latents[30:], fitted.encode(changed[30:], CHANNELS), atol=1e-5)
 
 
 def test_rows_that_are_not_finite_have_no_latents_and_long_ones_are_done_in_pieces(
@@ -94,13 +100,13 @@ def test_rows_that_are_not_finite_have_no_latents_and_long_ones_are_done_in_piec
 ) -> None:
     fitted = fit(tmp_path, frames=2)
     values = WALKS["trial-2"].copy()
-    whole = fitted.encode(values, CHANNELS)
+    expected = fitted.encode(values, CHANNELS)
     values[7, 2] = np.nan
     monkeypatch.setattr("tacpipe.codecs.autoencoder.CHUNK", 7)
     torn = fitted.encode(values, CHANNELS)
     assert np.flatnonzero(np.isnan(torn).all(axis=1)).tolist() == [7, 8]
-    others = [row for row in range(60) if row not in (7, 8)]
-    assert np.allclose(torn[others], whole[others], atol=1e-5)
+    intact = [row for row in range(60) if row not in (7, 8)]
+    assert np.allclose(torn[intact], expected[intact], atol=1e-5)
     assert fitted.encode(values[:0], CHANNELS).shape == (0, 4)
 
 
@@ -118,23 +124,28 @@ def test_a_codec_read_back_gives_the_same_bytes_and_latents(tmp_path: Path) -> N
     assert isinstance(read, Autoencoder)
     assert read.to_files() == files == fit(tmp_path / "b", frames=2).to_files()
     assert np.array_equal(read.encode(WALKS["trial-0"], CHANNELS), fitted.encode(WALKS["trial-0"], CHANNELS))
-    told = json.loads(files["codec.json"])
-    assert (told["kind"], told["of"], told["frames"], told["latents"]) == ("autoencoder", "levels", 2, 4)
+    description = json.loads(files["codec.json"])
+    assert (description["kind"], description["of"], description["frames"], description["latents"]) == (
+        "autoencoder",
+        "levels",
+        2,
+        4,
+    )
 
 
 def test_errors_told_are_those_of_encoding_and_decoding_the_newest_frame(tmp_path: Path) -> None:
     fitted, rows = fit(tmp_path, frames=2), training(frames=2)
-    for name, held in (("train", False), ("val", True)):
+    for name, is_validation in (("train", False), ("val", True)):
         back, true = [], []
         for recording, values in WALKS.items():
-            if (recording in rows.held_out) == held:
+            if (recording in rows.held_out) == is_validation:
                 back.append(fitted.decode(fitted.encode(values, CHANNELS)))
                 true.append(values)
         error = np.concatenate(back) - np.concatenate(true)
-        told = fitted.measured["reconstruction"][name]
-        assert told["rows"] == len(error)
-        assert told["mae_counts"] == pytest.approx(np.abs(error).mean(), rel=1e-4)
-        assert told["mse_standardised"] == pytest.approx(np.square(error / fitted.scale_count).mean(), rel=1e-4)
+        measured = fitted.measured["reconstruction"][name]
+        assert measured["rows"] == len(error)
+        assert measured["mae_counts"] == pytest.approx(np.abs(error).mean(), rel=1e-4)
+        assert measured["mse_standardised"] == pytest.approx(np.square(error / fitted.scale_count).mean(), rel=1e-4)
     learned = np.concatenate([fitted.encode(WALKS[name], CHANNELS) for name in sorted(set(WALKS) - rows.held_out)])
     assert np.allclose(fitted.measured["latent_covariance"], np.cov(learned, rowvar=False), atol=1e-4)
 
@@ -142,16 +153,16 @@ def test_errors_told_are_those_of_encoding_and_decoding_the_newest_frame(tmp_pat
 def test_a_search_tries_twelve_networks_and_keeps_the_best(tmp_path: Path) -> None:
     tried = autoencoder_fit.networks(3, "", 12)
     assert len(set(tried)) == 12
-    assert {one.hidden for one in tried} == {(192, 96), (384, 192, 96), (384, 192)}
+    assert {network.hidden for network in tried} == {(192, 96), (384, 192, 96), (384, 192)}
     fitted = fit(tmp_path, hidden="", search=6)
-    told = fitted.measured["search"]
-    assert [one["hidden"] for one in told] == [[64, 32], [128, 64, 32], [128, 64]] * 2
-    assert [one["learning_rate"] for one in told] == [0.001] * 3 + [0.003] * 3
-    (kept,) = (one for one in told if one["kept"])
-    assert kept["val_loss"] == min(one["val_loss"] for one in told)
-    assert [len(weight) for weight, _ in fitted.encoder[:-1]] == kept["hidden"]
+    records = fitted.measured["search"]
+    assert [network["hidden"] for network in records] == [[64, 32], [128, 64, 32], [128, 64]] * 2
+    assert [network["learning_rate"] for network in records] == [0.001] * 3 + [0.003] * 3
+    (best,) = (network for network in records if network["kept"])
+    assert best["val_loss"] == min(network["val_loss"] for network in records)
+    assert [len(weight) for weight, _ in fitted.encoder[:-1]] == best["hidden"]
     weights = sum(weight.size + bias.size for weight, bias in fitted.encoder + fitted.decoder)
-    assert kept["parameters"] == weights
+    assert best["parameters"] == weights
 
 
 def test_weights_that_decay_are_smaller(tmp_path: Path) -> None:
@@ -166,18 +177,18 @@ def test_weights_that_decay_are_smaller(tmp_path: Path) -> None:
 def test_a_search_that_was_interrupted_goes_on_to_the_same_codec(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole = fit(tmp_path / "whole", hidden="", search=3)
-    real, left = loop.train, iter([1, 2])
+    uninterrupted = fit(tmp_path / "whole", hidden="", search=3)
+    real, remaining = loop.train, iter([1, 2])
 
     def dies(*args: object, **kwargs: object) -> object:
-        if next(left, None) is None:
+        if next(remaining, None) is None:
             raise KeyboardInterrupt
         return real(*args, **kwargs)  # type: ignore[arg-type]
 
     with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
         patched.setattr(loop, "train", dies)
         fit(tmp_path / "torn", hidden="", search=3)
-    assert fit(tmp_path / "torn", hidden="", search=3).to_files() == whole.to_files()
+    assert fit(tmp_path / "torn", hidden="", search=3).to_files() == uninterrupted.to_files()
 
 
 @pytest.mark.long
@@ -194,14 +205,14 @@ def test_as_many_latents_as_the_data_have_dimensions_lose_no_more_than_principal
     network = autoencoder_fit.fit(rows, tried, schedule, tmp_path, components=8)
     linear = pca.fit_and_measure(rows, components=6)
     mse = {
-        name: one.measured["reconstruction"]["val"]["mse_standardised"]
-        for name, one in (("network", network), ("linear", linear))
+        name: fitted.measured["reconstruction"]["val"]["mse_standardised"]
+        for name, fitted in (("network", network), ("linear", linear))
     }
     assert mse["network"] <= 1.1 * mse["linear"]
 
 
 @pytest.mark.parametrize(
-    ("how", "told"),
+    ("options", "reason"),
     [
         ({"frames": 4}, "frames is 4; an autoencoder reads 1, 2 or 3 frames"),
         ({"frames": 0}, "frames is 0"),
@@ -214,13 +225,13 @@ def test_as_many_latents_as_the_data_have_dimensions_lose_no_more_than_principal
         ({"weight_decay": float("nan")}, "weight_decay is nan"),
     ],
 )
-def test_what_makes_no_network_is_refused(how: dict[str, object], told: str) -> None:
-    with pytest.raises(TacpipeError, match=told):
-        autoencoder_fit.networks(**({"frames": 1, "hidden": "", "search": 0} | how))  # type: ignore[arg-type]
+def test_what_makes_no_network_is_refused(options: dict[str, object], reason: str) -> None:
+    with pytest.raises(TacpipeError, match=reason):
+        autoencoder_fit.networks(**({"frames": 1, "hidden": "", "search": 0} | options))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
-    ("recordings", "components", "told"),
+    ("recordings", "components", "reason"),
     [
         ({"a": 60, "b": 60}, 13, "components is 13; 12 channels give 1 to 12"),
         ({"a": 60, "b": 60}, 0, "components is 0"),
@@ -230,8 +241,8 @@ def test_what_makes_no_network_is_refused(how: dict[str, object], told: str) -> 
     ],
 )
 def test_what_the_recordings_cannot_give_is_refused(
-    tmp_path: Path, recordings: dict[str, int], components: int, told: str
+    tmp_path: Path, recordings: dict[str, int], components: int, reason: str
 ) -> None:
     rows = TrainingRows(CHANNELS, LAYOUT, {name: walk(1, count) for name, count in recordings.items()})
-    with pytest.raises(TacpipeError, match=told):
+    with pytest.raises(TacpipeError, match=reason):
         autoencoder_fit.fit(rows, autoencoder_fit.networks(1, "", 0), SCHEDULE, tmp_path, components=components)

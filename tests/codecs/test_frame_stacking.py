@@ -11,54 +11,58 @@ from tacpipe.codecs import codec
 from tacpipe.errors import TacpipeError
 
 
-def by_hand(values: np.ndarray, begins: np.ndarray, of: str, frames: int) -> np.ndarray:
+def by_hand(values: np.ndarray, begins: np.ndarray, representation: str, frames: int) -> np.ndarray:
     """Walk row by row with what a live reader would remember."""
-    told = []
-    held: list[np.ndarray] = []
+    inputs = []
+    frames_kept: list[np.ndarray] = []
     before = values[0]
     for row, begin in zip(values, begins, strict=True):
         if begin:
-            held, before = [], row
-        now = row - before if of == "increments" else row
-        held = [*(held or [now] * frames), now][-frames:]
+            frames_kept, before = [], row
+        now = row - before if representation == "increments" else row
+        frames_kept = [*(frames_kept or [now] * frames), now][-frames:]
         before = row
-        told.append(np.concatenate(held))
-    return np.array(told)
+        inputs.append(np.concatenate(frames_kept))
+    return np.array(inputs)
 
 
 @given(st.integers(0, 2**16), st.sampled_from(["levels", "increments"]), st.integers(1, 3))
 @settings(max_examples=40, deadline=None)
-def test_inputs_are_those_of_a_reader_that_walks_row_by_row(seed: int, of: str, frames: int) -> None:
+def test_inputs_are_those_of_a_reader_that_walks_row_by_row(seed: int, representation: str, frames: int) -> None:
     rng = np.random.default_rng(seed)
     values = rng.normal(size=(12, 2))
     begins = rng.random(12) < 0.3
     begins[0] = True
-    assert np.allclose(codec.inputs(values, begins, of, frames), by_hand(values, begins, of, frames))
+    assert np.allclose(
+        codec.inputs(values, begins, representation, frames), by_hand(values, begins, representation, frames)
+    )
 
 
 @given(st.integers(0, 2**16), st.sampled_from(["levels", "increments"]), st.integers(1, 3))
 @settings(max_examples=40, deadline=None)
-def test_rows_in_pieces_give_the_inputs_of_the_whole(seed: int, of: str, frames: int) -> None:
+def test_rows_in_pieces_give_the_inputs_of_the_whole(seed: int, representation: str, frames: int) -> None:
     rng = np.random.default_rng(seed)
     values = rng.normal(size=(12, 2))
     values[rng.random((12, 2)) < 0.1] = np.nan
     begins = rng.random(12) < 0.3
     cuts = [0, *sorted(rng.integers(0, 13, 4).tolist()), 12]
-    stacking = codec.Stacking(of, frames)
+    stacking = codec.Stacking(representation, frames)
     pieces = [stacking.next(values[start:stop], begins[start:stop]) for start, stop in itertools.pairwise(cuts)]
-    whole = codec.inputs(values, begins, of, frames)
-    assert np.array_equal(np.concatenate(pieces), whole, equal_nan=True)
+    expected = codec.inputs(values, begins, representation, frames)
+    assert np.array_equal(np.concatenate(pieces), expected, equal_nan=True)
 
 
 def test_later_rows_change_nothing_before_them() -> None:
     values = np.random.default_rng(0).normal(size=(10, 3))
-    other = values.copy()
-    other[6:] += 100
-    for of in ("levels", "increments"):
+    changed = values.copy()
+    changed[6:] += 100
+    for representation in ("levels", "increments"):
         for frames in (1, 2, 3):
-            one, two = (codec.inputs(each, None, of, frames) for each in (values, other))
-            assert np.array_equal(one[:6], two[:6])
-            assert not np.array_equal(one[6:], two[6:])
+            first_inputs, second_inputs = (
+                codec.inputs(counts, None, representation, frames) for counts in (values, changed)
+            )
+            assert np.array_equal(first_inputs[:6], second_inputs[:6])
+            assert not np.array_equal(first_inputs[6:], second_inputs[6:])
 
 
 def test_a_stretch_begins_after_a_step_of_more_than_one_and_a_half_times_the_median() -> None:

@@ -21,10 +21,10 @@ def recording() -> FakeShard:
     rng = np.random.default_rng(0)
     values = np.cumsum(rng.normal(size=(ROWS, len(CHANNELS))), axis=0) * 10
     values[300, 2] = np.nan
-    made = table(values)
-    t_ns = made.column("t_ns").to_numpy().copy()
+    columns = table(values)
+    t_ns = columns.column("t_ns").to_numpy().copy()
     t_ns[640:] += 10**9
-    return FakeShard("a", made.set_column(0, made.schema.field("t_ns"), pa.array(t_ns)))
+    return FakeShard("a", columns.set_column(0, columns.schema.field("t_ns"), pa.array(t_ns)))
 
 
 @pytest.mark.parametrize("representation", ["levels", "increments"])
@@ -42,18 +42,18 @@ def test_a_long_recording_gets_the_latents_of_the_whole(
         representation=representation,
     )
     files = codec.to_files(fitted)
-    whole = tactile.added(shard, files)  # type: ignore[arg-type]
-    assert isinstance(whole, pa.Table) and np.isnan(whole.column("z00").to_numpy()[300])
+    expected = tactile.added(shard, files)  # type: ignore[arg-type]
+    assert isinstance(expected, pa.Table) and np.isnan(expected.column("z00").to_numpy()[300])
 
     monkeypatch.setattr(tactile, "SOME_ROWS", 100)
     decode_few_rows_at_a_time(monkeypatch, rows)
     pieces = tactile.added(shard, files)  # type: ignore[arg-type]
     assert isinstance(pieces, pa.RecordBatchReader)
-    found = pieces.read_all()
-    assert found.schema.equals(whole.schema, check_metadata=True)
-    assert bits(found.drop_columns(list(fitted.latents))) == bits(whole.drop_columns(list(fitted.latents)))
+    streamed = pieces.read_all()
+    assert streamed.schema.equals(expected.schema, check_metadata=True)
+    assert bits(streamed.drop_columns(list(fitted.latents))) == bits(expected.drop_columns(list(fitted.latents)))
     for name in fitted.latents:
-        ours, theirs = found.column(name).to_numpy(), whole.column(name).to_numpy()
+        ours, theirs = streamed.column(name).to_numpy(), expected.column(name).to_numpy()
         np.testing.assert_allclose(ours, theirs, rtol=1e-6, atol=1e-6, equal_nan=True)
 
 

@@ -17,32 +17,32 @@ from tacpipe.errors import TacpipeError
 def rows(seed: int, count: int = 200) -> np.ndarray:
     """Return rows of five channels: of unlike levels and spreads, two of them alike, and one that never moves."""
     rng = np.random.default_rng(seed)
-    found = rng.normal(size=(count, 5)) * [1, 1000, 1e-3, 30, 0] + [0, 20_000, 5, -300, 7]
-    found[:, 3] = found[:, 1] * 2 + rng.normal(size=count)
-    return np.asarray(found)
+    values = rng.normal(size=(count, 5)) * [1, 1000, 1e-3, 30, 0] + [0, 20_000, 5, -300, 7]
+    values[:, 3] = values[:, 1] * 2 + rng.normal(size=count)
+    return np.asarray(values)
 
 
 @given(st.integers(0, 2**16), st.sampled_from([LEVELS, INCREMENTS]))
 @settings(max_examples=40, deadline=None)
-def test_moments_of_pieces_are_those_of_all_rows(seed: int, of: str) -> None:
-    whole, rng = rows(seed), np.random.default_rng(seed)
+def test_moments_of_pieces_are_those_of_all_rows(seed: int, representation: str) -> None:
+    values, rng = rows(seed), np.random.default_rng(seed)
     cuts = [0, *sorted(rng.integers(0, 201, 5).tolist()), 200]
-    found = Moments.from_pieces((whole[start:stop] for start, stop in itertools.pairwise(cuts)), 5)
+    moments = Moments.from_pieces((values[start:stop] for start, stop in itertools.pairwise(cuts)), 5)
 
-    mean, scale = standard(whole, of)
-    assert found.count == 200
-    assert found.moves.tolist() == [True, True, True, True, False]
-    for ours, theirs in zip(found.standard(of), (mean, scale), strict=True):
+    mean, scale = standard(values, representation)
+    assert moments.count == 200
+    assert moments.moves.tolist() == [True, True, True, True, False]
+    for ours, theirs in zip(moments.standard(representation), (mean, scale), strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=1e-11)
-    triangle, scaled = found.standardised(of), (whole - mean) / scale
-    np.testing.assert_allclose(triangle.T @ triangle, scaled.T @ scaled, rtol=1e-9, atol=1e-9 * len(whole))
+    triangle, scaled = moments.standardised(representation), (values - mean) / scale
+    np.testing.assert_allclose(triangle.T @ triangle, scaled.T @ scaled, rtol=1e-9, atol=1e-9 * len(values))
 
 
 def test_moments_of_two_parts_are_those_of_both_together() -> None:
-    whole = rows(1)
-    merged = Moments.from_pieces([whole[:50]], 5).merged(Moments.from_pieces([whole[50:]], 5))
+    values = rows(1)
+    merged = Moments.from_pieces([values[:50]], 5).merged(Moments.from_pieces([values[50:]], 5))
     np.testing.assert_allclose(
-        np.abs(merged.centred), np.abs(Moments.from_pieces([whole], 5).centred), rtol=1e-9, atol=1e-9
+        np.abs(merged.centred), np.abs(Moments.from_pieces([values], 5).centred), rtol=1e-9, atol=1e-9
     )
     assert merged.merged(Moments(5)).count == 200
 

@@ -23,8 +23,8 @@ def values(seed: int = 0, rows: int = 60) -> np.ndarray:
     return rng.normal(size=(rows, 3)) @ rng.normal(size=(3, 6)) * 100 + rng.normal(size=(rows, 6)) + 20
 
 
-def fit(content: np.ndarray, **how: float | str) -> pca.PCA:
-    return pca.fit(Moments.from_pieces([content], len(CHANNELS)), CHANNELS, LAYOUT, **how)  # type: ignore[arg-type]
+def fit(content: np.ndarray, **options: float | str) -> pca.PCA:
+    return pca.fit(Moments.from_pieces([content], len(CHANNELS)), CHANNELS, LAYOUT, **options)  # type: ignore[arg-type]
 
 
 def standardised(content: np.ndarray) -> np.ndarray:
@@ -50,11 +50,13 @@ def test_a_share_of_variance_keeps_as_few_latents_as_hold_it() -> None:
     content = values()
     ratios = fit(content, components=6).explained_ratio.cumsum()
     fitted = fit(content, variance=0.9)
-    kept = len(fitted.components)
+    count = len(fitted.components)
     assert (
-        kept == int(np.searchsorted(ratios, 0.9)) + 1 == decomposition.PCA(0.9).fit(standardised(content)).n_components_
+        count
+        == int(np.searchsorted(ratios, 0.9)) + 1
+        == decomposition.PCA(0.9).fit(standardised(content)).n_components_
     )
-    assert fitted.explained_ratio[:kept].sum() >= 0.9
+    assert fitted.explained_ratio[:count].sum() >= 0.9
 
 
 def test_the_ratios_are_those_of_all_components_and_not_only_of_those_kept() -> None:
@@ -105,23 +107,23 @@ def test_channels_that_all_stand_still_are_refused() -> None:
 def test_measures_are_those_of_a_fit_without_the_recordings_held_out() -> None:
     parts = {f"trial-{index}": values(index) for index in range(8)}
     rows = TrainingRows(tuple(CHANNELS), tuple(LAYOUT), parts)
-    found = pca.fit_and_measure(rows, components=3)
-    everything = np.concatenate([parts[name] for name in sorted(parts)])
-    assert np.allclose(found.components, fit(everything, components=3).components, rtol=1e-9)
+    fitted = pca.fit_and_measure(rows, components=3)
+    all_rows = np.concatenate([parts[name] for name in sorted(parts)])
+    assert np.allclose(fitted.components, fit(all_rows, components=3).components, rtol=1e-9)
     train, val = rows.parts
     scale = train.std(axis=0)
     oracle = decomposition.PCA(3).fit((train - train.mean(axis=0)) / scale)
     for name, part in (("train", train), ("val", val)):
         scaled = (part - train.mean(axis=0)) / scale
         error = oracle.inverse_transform(oracle.transform(scaled)) - scaled
-        told = found.measured["reconstruction"][name]
-        assert told["rows"] == len(part)
-        assert told["mse_standardised"] == pytest.approx(np.square(error).mean(), rel=1e-4)
-        assert told["mae_counts"] == pytest.approx(np.abs(error * scale).mean(), rel=1e-4)
-    covariance = np.array(found.measured["latent_covariance"])
-    latents = found.encode(everything, CHANNELS)
+        measured = fitted.measured["reconstruction"][name]
+        assert measured["rows"] == len(part)
+        assert measured["mse_standardised"] == pytest.approx(np.square(error).mean(), rel=1e-4)
+        assert measured["mae_counts"] == pytest.approx(np.abs(error * scale).mean(), rel=1e-4)
+    covariance = np.array(fitted.measured["latent_covariance"])
+    latents = fitted.encode(all_rows, CHANNELS)
     assert np.allclose(covariance, np.cov(latents, rowvar=False), atol=1e-4)
-    assert codec.load(found.to_files()).to_files() == found.to_files()
+    assert codec.load(fitted.to_files()).to_files() == fitted.to_files()
 
 
 def test_a_single_recording_is_measured_on_itself_alone() -> None:
@@ -134,7 +136,7 @@ def test_six_components_hold_data_of_rank_six_and_the_error_falls_with_their_num
     content = rng.normal(size=(2000, 6)) @ rng.normal(size=(6, 96)) * 300
     channels = [f"c{index}" for index in range(96)]
     fitted = [pca.fit(Moments.from_pieces([content], 96), channels, [], components=count) for count in range(1, 7)]
-    errors = [float(np.square(one.decode(one.encode(content, channels)) - content).mean()) for one in fitted]
+    errors = [float(np.square(codec.decode(codec.encode(content, channels)) - content).mean()) for codec in fitted]
     assert fitted[-1].explained_ratio[:6].sum() >= 0.99
     assert all(before > after for before, after in itertools.pairwise(errors))
     assert errors[-1] < 1e-6 * content.var()
@@ -145,10 +147,10 @@ def test_six_components_hold_data_of_rank_six_and_the_error_falls_with_their_num
 def test_decoding_is_a_projection(seed: int, components: int) -> None:
     content = values(seed)
     fitted = fit(content, components=components)
-    once = fitted.decode(fitted.encode(content, CHANNELS))
-    assert np.allclose(fitted.decode(fitted.encode(once, CHANNELS)), once, atol=1e-2)
+    projected = fitted.decode(fitted.encode(content, CHANNELS))
+    assert np.allclose(fitted.decode(fitted.encode(projected, CHANNELS)), projected, atol=1e-2)
     if components == 6:
-        assert np.allclose(once, content, atol=1e-2)
+        assert np.allclose(projected, content, atol=1e-2)
 
 
 def test_a_channel_that_never_moves_comes_back_as_it_was() -> None:
@@ -170,26 +172,26 @@ def test_a_codec_read_back_gives_the_same_bytes_and_latents() -> None:
 
 
 def test_latents_are_float32_and_no_rows_give_no_latents() -> None:
-    found = fit(values(), components=3).encode(np.zeros((0, 6)), CHANNELS)
-    assert found.shape == (0, 3)
-    assert found.dtype.name == "float32"
+    latents = fit(values(), components=3).encode(np.zeros((0, 6)), CHANNELS)
+    assert latents.shape == (0, 3)
+    assert latents.dtype.name == "float32"
 
 
 @pytest.mark.parametrize(
-    ("given", "told"),
+    ("channels", "reason"),
     [
         ([*CHANNELS[:5], "other"], "channel 6 is other where it was fitted on c5"),
         (CHANNELS[:4], "fitted on 6 channels and is given 4"),
         ([CHANNELS[1], CHANNELS[0], *CHANNELS[2:]], "channel 1 is c1 where it was fitted on c0"),
     ],
 )
-def test_other_channels_are_refused_by_name(given: list[str], told: str) -> None:
-    with pytest.raises(TacpipeError, match=told):
-        fit(values(), components=3).encode(np.zeros((2, len(given))), given)
+def test_other_channels_are_refused_by_name(channels: list[str], reason: str) -> None:
+    with pytest.raises(TacpipeError, match=reason):
+        fit(values(), components=3).encode(np.zeros((2, len(channels))), channels)
 
 
 @pytest.mark.parametrize(
-    ("rows", "how", "told"),
+    ("rows", "options", "reason"),
     [
         (60, {"components": 7}, "components is 7; 60 rows of 6 channels give 1 to 6"),
         (60, {"components": 0}, "components is 0"),
@@ -197,9 +199,9 @@ def test_other_channels_are_refused_by_name(given: list[str], told: str) -> None
         (1, {"components": 1}, "cannot be fitted on 1 rows"),
     ],
 )
-def test_what_the_data_cannot_give_is_refused(rows: int, how: dict[str, float], told: str) -> None:
-    with pytest.raises(TacpipeError, match=told):
-        fit(values(rows=rows), **how)
+def test_what_the_data_cannot_give_is_refused(rows: int, options: dict[str, float], reason: str) -> None:
+    with pytest.raises(TacpipeError, match=reason):
+        fit(values(rows=rows), **options)
 
 
 def test_an_unknown_kind_and_missing_files_are_refused() -> None:

@@ -14,8 +14,8 @@ from tacpipe.metrics.pairing import Measure
 QUESTION = Question("known")
 
 
-def _mean(found: AnyFloats) -> AnyFloats:
-    return np.where(found[:, 1] > 0, found[:, 0] / np.where(found[:, 1] > 0, found[:, 1], 1), np.nan)
+def _mean(sums: AnyFloats) -> AnyFloats:
+    return np.where(sums[:, 1] > 0, sums[:, 0] / np.where(sums[:, 1] > 0, sums[:, 1], 1), np.nan)
 
 
 MEAN = Measure(
@@ -25,8 +25,8 @@ MEAN = Measure(
     "skill",
     "recordings",
     _mean,
-    lambda one, other: 1 - one / other,
-    lambda found: (float(found[0] / found[1]),),
+    lambda error, reference: 1 - error / reference,
+    lambda sums: (float(sums[0] / sums[1]),),
 )
 
 
@@ -45,6 +45,6 @@ def run(
     **about: Any,
 ) -> Run:
     """A run of predictors with these errors by recording."""
-    held = Errors(MEAN, {name: sums(one) for name, one in errors.items()}, clusters)
+    measured = Errors(MEAN, {name: sums(values) for name, values in errors.items()}, clusters)
     settings = about.pop("settings", {})
-    return Run(about.pop("dataset", None), "weighing", method, settings, {question: held}, seed=seed, **about)
+    return Run(about.pop("dataset", None), "weighing", method, settings, {question: measured}, seed=seed, **about)

@@ -1,4 +1,4 @@
-"""What ``tacpipe compare`` prints: a row a method or run, columns for what differs, the best first."""
+"""Check the output of ``tacpipe compare``: one row per method or run, columns for what differs, the best first."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ def weighed(errors: list[float], path: str, data: str = "d" * 64, **about: Any) 
     return path, run({"model": errors, "mean": BASE}, dataset=dataset(data), **about)
 
 
-def compared(*given: tuple[str, Run], pool: bool = True) -> Compared:
-    task, every = report_on("weighing"), [one for _, one in given]
-    methods = runs.grouped(every) if pool else runs.separate(every)
-    return Compared({path: one.dataset for path, one in given}, engine.comparisons(task, methods), pool)
+def compared(*named_results: tuple[str, Run], pool: bool = True) -> Compared:
+    task, all_runs = report_on("weighing"), [result for _, result in named_results]
+    methods = runs.grouped(all_runs) if pool else runs.separate(all_runs)
+    return Compared({path: result.dataset for path, result in named_results}, engine.comparisons(task, methods), pool)
 
 
-def lines(found: Compared, width: int = 120) -> list[list[str]]:
-    (table,) = found.tables()
+def lines(comparison: Compared, width: int = 120) -> list[list[str]]:
+    (table,) = comparison.tables()
     return [line.split() for line in table.text(width).splitlines()]
 
 
@@ -74,37 +74,44 @@ def test_without_pooling_each_result_is_a_row_named_by_its_path_with_its_seed() 
 
 def test_data_is_a_column_where_results_are_of_other_data() -> None:
     alike = compared(weighed(LARGE, "a", "1" * 64), weighed(SMALL, "b", "1" * 64, method="other"))
-    other = compared(weighed(LARGE, "a", "1" * 64), weighed(SMALL, "b", "2" * 64, method="other"))
+    other_data = compared(weighed(LARGE, "a", "1" * 64), weighed(SMALL, "b", "2" * 64, method="other"))
 
     assert "data" not in lines(alike)[0]
-    assert lines(other)[0][0] == "data" and lines(other)[2][1] == "2" * 8
-    placed = dataclasses.replace(other, places={"2" * 64: "data/fresh"})
+    assert lines(other_data)[0][0] == "data" and lines(other_data)[2][1] == "2" * 8
+    placed = dataclasses.replace(other_data, places={"2" * 64: "data/fresh"})
     assert lines(placed)[2][1] == "data/fresh" and lines(placed)[3][1] == "1" * 8  # one that is gone
 
 
 def test_parts_are_below_their_names_and_the_widest_table_keeps_gain_and_interval() -> None:
-    some = [
+    named_results = [
         weighed(LARGE, "a", question=Question("known")),
         weighed(SMALL, "b", question=Question("unseen")),
     ]
-    found = compared(*some)
+    comparison = compared(*named_results)
 
-    assert [line for line in lines(found) if line in (["known"], ["unseen"])] == [["known"], ["unseen"]]
-    (table,) = found.tables()
+    assert [line for line in lines(comparison) if line in (["known"], ["unseen"])] == [["known"], ["unseen"]]
+    (table,) = comparison.tables()
     assert all(len(line) <= 80 for line in table.text(80).splitlines())
     assert "95 % interval" in table.text(40).splitlines()[0]
 
 
 def test_too_few_recordings_for_a_verdict_are_stated() -> None:
-    few = compared(weighed(SMALL[:3], "a"))
-    assert f"below {headline.FEWEST}" in few.tables()[0].caption
+    comparison = compared(weighed(SMALL[:3], "a"))
+    assert f"below {headline.FEWEST}" in comparison.tables()[0].caption
     assert "below" not in compared(*WIDTHS).tables()[0].caption
 
 
 def test_json_holds_every_row_with_its_results_and_csv_a_line_for_each() -> None:
-    found = compared(*WIDTHS)
-    ((one,), rows) = (found.to_json()["comparisons"], list(csv.DictReader(io.StringIO(found.to_csv()))))
-    first, second, third = one["rows"] if one["rows"][-1]["kind"] == "baseline" else sorted(one["rows"], key=str)
+    comparison = compared(*WIDTHS)
+    ((compared_json,), rows) = (
+        comparison.to_json()["comparisons"],
+        list(csv.DictReader(io.StringIO(comparison.to_csv()))),
+    )
+    first, second, third = (
+        compared_json["rows"]
+        if compared_json["rows"][-1]["kind"] == "baseline"
+        else sorted(compared_json["rows"], key=str)
+    )
 
     assert (first["settings"], first["results"]) == ({"width": 4}, ["r/small/0"])
     assert second["results"] == ["r/large/0", "r/large/1"] and second["runs"] == 2
@@ -122,11 +129,11 @@ def test_a_result_of_an_older_version_compares_by_the_sums_that_it_holds(
 ) -> None:
     older.unpack(tmp_path)
     monkeypatch.chdir(tmp_path)
-    done = call("compare results/forward --json")
-    assert done.code == 0, done.err
-    (one,) = json.loads(done.out)["comparisons"]
+    called = call("compare results/forward --json")
+    assert called.code == 0, called.err
+    (comparison,) = json.loads(called.out)["comparisons"]
     (stored,) = json.loads((tmp_path / "results/forward/headline.json").read_text())["headlines"]
-    (model,) = [row for row in one["rows"] if row["kind"] == "model"]
+    (model,) = [row for row in comparison["rows"] if row["kind"] == "model"]
 
     pooled = list(model["errors"].values())[:-1]  # the skill that is not pooled is newer than the result
     assert pooled == pytest.approx(stored["model"]["values"], rel=1e-5)
@@ -138,15 +145,15 @@ def test_a_result_of_an_older_version_compares_by_the_sums_that_it_holds(
 def test_a_result_without_errors_of_recordings_is_left_out_by_name(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    given = compared(*WIDTHS)
-    opened = {**given.results, "r/old": dataset()}
-    for one in opened.values():
-        one.files = {compare.METRICS: b"{}"}
+    named = compared(*WIDTHS)
+    opened = {**named.results, "r/old": dataset()}
+    for result in opened.values():
+        result.files = {compare.METRICS: b"{}"}
     monkeypatch.setattr(pipeline, "open_dataset", lambda path: opened[str(path)])
-    monkeypatch.setattr(engine, "compare", lambda results, pool: given.comparisons)
+    monkeypatch.setattr(engine, "compare", lambda results, pool: named.comparisons)
 
-    found = compare.run([Path(path) for path in opened], pool=True)
-    assert found.unused() == ["r/old"]
+    comparison = compare.run([Path(path) for path in opened], pool=True)
+    assert comparison.unused() == ["r/old"]
     assert "left out r/old" in capsys.readouterr().err
 
 
@@ -161,11 +168,11 @@ def test_errors_in_other_units_are_other_comparisons_with_their_own_unit() -> No
             newton, questions={question: dataclasses.replace(of_question, measure=measure)}
         )
 
-    both = compared(weighed(SMALL, "r/n"), in_millinewton("r/mn", [10 * error for error in SMALL]))
-    first, second = both.tables()
+    comparison = compared(weighed(SMALL, "r/n"), in_millinewton("r/mn", [10 * error for error in SMALL]))
+    first, second = comparison.tables()
     assert "Units: N." in first.caption and "Units: mN." in second.caption
     assert [[float(row.cells[1]) for row in table.groups[0].rows] for table in (first, second)] == [
         [1.25, 4.0],
         [12.5, 4.0],
     ]
-    assert [one["unit"] for one in both.to_json()["comparisons"]] == ["N", "mN"]
+    assert [compared_json["unit"] for compared_json in comparison.to_json()["comparisons"]] == ["N", "mN"]

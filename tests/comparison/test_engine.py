@@ -24,19 +24,19 @@ def compared(*runs: object) -> engine.Comparison:
 
 
 def test_the_rows_are_the_methods_and_baselines_with_their_errors_the_best_first() -> None:
-    found = compared(run({"model": GOOD, "still": BASE, "far": 3 * BASE}), run({"model": 2 * GOOD}, "wide"))
-    assert [(one.name, one.kind) for one in found.rows] == [
+    comparison = compared(run({"model": GOOD, "still": BASE, "far": 3 * BASE}), run({"model": 2 * GOOD}, "wide"))
+    assert [(row.name, row.kind) for row in comparison.rows] == [
         ("net", "model"), ("still", "baseline"), ("wide", "model"), ("far", "baseline")
     ]  # fmt: skip
-    assert [one.values[0] for one in found.rows] == pytest.approx(
+    assert [row.values[0] for row in comparison.rows] == pytest.approx(
         [GOOD.mean(), BASE.mean(), 2 * GOOD.mean(), 3 * BASE.mean()]
     )
-    best = found.best
+    best = comparison.best
     assert best is not None and best.baseline == "still"
     assert best.gain.mean == pytest.approx(1 - GOOD.mean() / BASE.mean())
     assert (best.n, best.recordings, best.runs, best.seeds) == (20, 20, 1, 1)
-    wide = found.models[1]
-    assert wide.baseline == "still"  # of the other method's runs, because its own hold none
+    wide = comparison.models[1]
+    assert wide.baseline == "still"  # the clusters of the other method, because its own runs state none
     assert wide.gain.mean == pytest.approx(1 - 2 * GOOD.mean() / BASE.mean())
 
 
@@ -76,23 +76,23 @@ def test_seeds_and_folds_of_a_method_are_one_row_whose_spread_is_over_runs() -> 
 
 
 def test_a_method_that_shows_an_effect_does_not_compete() -> None:
-    found = compared(run({"model": GOOD, "still": BASE}), run({"model": GOOD / 2}, "cheat", control=True))
-    assert found.best is not None and found.best.name == "net"
-    assert [one.name for one in found.of("control")] == ["cheat"]
+    comparison = compared(run({"model": GOOD, "still": BASE}), run({"model": GOOD / 2}, "cheat", control=True))
+    assert comparison.best is not None and comparison.best.name == "net"
+    assert [row.name for row in comparison.of("control")] == ["cheat"]
 
 
 def test_settings_that_differ_name_a_method_and_are_the_columns_of_a_frame() -> None:
     runs = [run({"model": GOOD * (1 + wide), "still": BASE}, settings={"wide": wide, "deep": 3}) for wide in (0, 1)]
-    found = compared(*runs)
-    assert [one.name for one in found.models] == ["net · wide 0", "net · wide 1"]
-    frame = found.frame()
+    comparison = compared(*runs)
+    assert [row.name for row in comparison.models] == ["net · wide 0", "net · wide 1"]
+    frame = comparison.frame()
     assert frame.set_index("name").loc["net · wide 1", "wide"] == 1 and "deep" not in frame
     assert frame["kind"].tolist() == ["model", "baseline", "model"]
 
 
 def test_separate_runs_are_rows_that_state_seed_and_fold() -> None:
     runs = [run({"model": GOOD}, seed=seed, fold=1) for seed in (3, 4)]
-    assert [(one.name, dict(one.differing)) for one in separate(runs)] == [
+    assert [(method.name, dict(method.differing)) for method in separate(runs)] == [
         ("net · seed 3 · fold 1", {"seed": 3, "fold": 1}),
         ("net · seed 4 · fold 1", {"seed": 4, "fold": 1}),
     ]
@@ -100,21 +100,23 @@ def test_separate_runs_are_rows_that_state_seed_and_fold() -> None:
 
 def test_the_paired_test_is_scipys_permutation_test() -> None:
     for count in (8, 20):
-        one, other = (np.array(list(sums(part[:count]).values())) for part in (GOOD, BASE * 0.8))
+        first_sums, second_sums = (np.array(list(sums(part[:count]).values())) for part in (GOOD, BASE * 0.8))
         test = stats.permutation_test(
-            (one[:, 0], other[:, 0]),
+            (first_sums[:, 0], second_sums[:, 0]),
             lambda a, b, axis: np.mean(a, axis=axis) - np.mean(b, axis=axis),
             permutation_type="samples", n_resamples=20_000, rng=3, vectorized=True,
         )  # fmt: skip
-        assert pairing.swap_test(MEAN, one, other) == pytest.approx(test.pvalue, abs=0.01 if count > 12 else 1e-12)
+        assert pairing.swap_test(MEAN, first_sums, second_sums) == pytest.approx(
+            test.pvalue, abs=0.01 if count > 12 else 1e-12
+        )
 
 
 def test_of_right_and_wrong_answers_the_paired_test_is_mcnemars() -> None:
     first, second = np.array([[1.0] * 11, [0.0] * 2 + [1.0] * 2 + [0.0] * 7])
-    one, other = (np.column_stack([wrong, np.ones(11)]) for wrong in (first, second))
-    assert pairing.swap_test(MEAN, one, other) == pytest.approx(intervals.mcnemar(first == 0, second == 0))
-    assert math.isnan(pairing.swap_test(MEAN, one[:1], other[:1]))
-    assert pairing.swap_test(MEAN, one, one) == 1.0
+    first_sums, second_sums = (np.column_stack([wrong, np.ones(11)]) for wrong in (first, second))
+    assert pairing.swap_test(MEAN, first_sums, second_sums) == pytest.approx(intervals.mcnemar(first == 0, second == 0))
+    assert math.isnan(pairing.swap_test(MEAN, first_sums[:1], second_sums[:1]))
+    assert pairing.swap_test(MEAN, first_sums, first_sums) == 1.0
 
 
 def test_the_difference_of_two_methods_is_on_the_recordings_of_both() -> None:

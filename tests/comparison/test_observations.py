@@ -1,4 +1,4 @@
-"""What runs err as a table, and runs of two methods paired, held to scipy."""
+"""Compare the table of errors and paired runs of two methods with scipy."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ def runs(*means: float, **about: list[int]) -> list[Run]:
 
 
 def test_a_row_is_a_run_and_recording_with_the_parts_of_its_sums() -> None:
-    found = observations(runs(1.0, 3.0, seed=[0, 1]), QUESTION)
-    assert found[["run", "seed", "recording"]].values.tolist() == [
+    frame = observations(runs(1.0, 3.0, seed=[0, 1]), QUESTION)
+    assert frame[["run", "seed", "recording"]].values.tolist() == [
         [0, 0, "r00"],
         [0, 0, "r01"],
         [1, 1, "r00"],
         [1, 1, "r01"],
     ]
-    assert found["s0"].tolist() == [0.5, 1.5, 2.5, 3.5] and set(found["s1"]) == {1.0}
+    assert frame["s0"].tolist() == [0.5, 1.5, 2.5, 3.5] and set(frame["s1"]) == {1.0}
     assert observations(runs(1.0), QUESTION, "nobody").empty
 
 
@@ -39,14 +39,14 @@ def test_a_row_is_a_run_and_recording_with_the_parts_of_its_sums() -> None:
 def test_runs_are_paired_by_fold_or_by_seed_where_there_is_one_fold(name: str, unit: str) -> None:
     values = {name: [3, 1, 2]}
     first, second = runs(*ONE, **values), runs(*OTHER, **values)
-    found = paired_runs(first, second[::-1], QUESTION)
-    assert (found.unit, found.units) == (unit, 3)
-    assert found.p == pytest.approx(stats.ttest_rel(ONE, OTHER).pvalue)
+    paired = paired_runs(first, second[::-1], QUESTION)
+    assert (paired.unit, paired.units) == (unit, 3)
+    assert paired.p == pytest.approx(stats.ttest_rel(ONE, OTHER).pvalue)
 
 
 def test_a_fold_that_one_method_lacks_is_left_out() -> None:
-    found = paired_runs(runs(*ONE, fold=[0, 1, 2]), runs(*OTHER[:2], fold=[0, 1]), QUESTION)
-    assert found.units == 2 and found.p == pytest.approx(stats.ttest_rel(ONE[:2], OTHER[:2]).pvalue)
+    paired = paired_runs(runs(*ONE, fold=[0, 1, 2]), runs(*OTHER[:2], fold=[0, 1]), QUESTION)
+    assert paired.units == 2 and paired.p == pytest.approx(stats.ttest_rel(ONE[:2], OTHER[:2]).pvalue)
 
 
 def test_single_runs_and_equal_gains_have_no_test() -> None:

@@ -25,8 +25,8 @@ def test_the_nearest_class_is_the_slides_own_and_other_textures_are_far() -> Non
     frames, labels = slides((0, 2, 5), 20, 1)
     scores = fitted.scores(frames)
     assert (fitted.classes[scores.argmax(axis=1)] == labels).mean() > 0.95
-    others, _ = slides((12,), 20, 2)
-    assert calibration.auroc(scores.max(axis=1), fitted.scores(others).max(axis=1)) > 0.95
+    far_slides, _ = slides((12,), 20, 2)
+    assert calibration.auroc(scores.max(axis=1), fitted.scores(far_slides).max(axis=1)) > 0.95
 
 
 def test_a_slide_far_from_all_training_slides_scores_lower_than_each_slide_of_a_learned_class() -> None:

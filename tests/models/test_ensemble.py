@@ -40,10 +40,10 @@ def test_the_forecast_of_an_ensemble_is_the_mean_of_its_members() -> None:
 def test_each_member_gets_the_gradient_that_it_would_get_alone() -> None:
     members, ensemble, inputs = calibrated(2)
     ensemble.loss(inputs, ahead(inputs)).backward()  # type: ignore[no-untyped-call]
-    together = [weight.grad for weight in members[1].parameters()]
+    ensemble_gradients = [weight.grad for weight in members[1].parameters()]
     members[1].zero_grad()
     members[1].loss(inputs, ahead(inputs)).backward()  # type: ignore[operator]
-    for weight, half in zip(members[1].parameters(), together, strict=True):
+    for weight, half in zip(members[1].parameters(), ensemble_gradients, strict=True):
         if weight.grad is not None:
             assert half is not None
             torch.testing.assert_close(weight.grad / 2, half)
@@ -67,7 +67,7 @@ def test_weights_never_raise_the_mean_over_recordings_of_the_error_beside_persis
     seed: int, recordings: int, gain: float
 ) -> None:
     generator = np.random.default_rng(seed)
-    scales = 10.0 ** generator.normal(size=(1, 6, 1))  # of windows: one large recording decides nothing
+    scales = 10.0 ** generator.normal(size=(1, 6, 1))  # counts of windows: one large recording decides nothing
     measured = torch.from_numpy(scales * generator.normal(size=(3, 6, 4)))
     changes = gain * measured + torch.from_numpy(scales * generator.normal(size=(3, 6, 4)))
     recording = torch.from_numpy(generator.integers(0, recordings, 6))
@@ -87,9 +87,13 @@ def test_a_small_gain_counts_the_more_the_more_recordings_show_it() -> None:
     generator = torch.Generator().manual_seed(0)
     changes = torch.randn(1, 400, 30, generator=generator)
     measured = 0.05 * changes + torch.randn(1, 400, 30, generator=generator)
-    few, many = (persistence_weights(changes, measured, torch.arange(400) % count) for count in (1, 40))
-    assert few < many
-    assert persistence_weights(measured, measured, torch.zeros(400)) == 1  # of a perfect forecast one shows enough
+    one_recording, forty_recordings = (
+        persistence_weights(changes, measured, torch.arange(400) % count) for count in (1, 40)
+    )
+    assert one_recording < forty_recordings
+    assert (
+        persistence_weights(measured, measured, torch.zeros(400)) == 1
+    )  # one recording of a perfect forecast shows enough
 
 
 def test_recordings_in_which_nothing_changes_decide_nothing() -> None:

@@ -33,28 +33,28 @@ def built(architecture: str, *, changes: bool = False, **changed: Any) -> Any:
 def model(architecture: str, *, changes: bool = False, trained: bool = False, **changed: Any) -> nn.Module:
     """A calibrated model in evaluation mode; one that was ``trained`` no longer has a head of zeros."""
     torch.manual_seed(0)
-    made = built(architecture, changes=changes, **changed)
-    given = windows()
-    made.calibrate(given, ahead(given))
+    network = built(architecture, changes=changes, **changed)
+    inputs = windows()
+    network.calibrate(inputs, ahead(inputs))
     if trained:
-        for weight in made.parameters():
+        for weight in network.parameters():
             nn.init.normal_(weight, std=0.3)
-    evaluated: nn.Module = made.eval()
+    evaluated: nn.Module = network.eval()
     return evaluated
 
 
-def change(made: nn.Module, given: Windows) -> Tensor:
+def change(network: nn.Module, inputs: Windows) -> Tensor:
     with torch.no_grad():
-        predicted: Tensor = made(given)
-    return predicted - given.touch[-1]
+        predicted: Tensor = network(inputs)
+    return predicted - inputs.touch[-1]
 
 
 @pytest.mark.parametrize("architecture", CHANGE)
 def test_an_untrained_model_is_persistence(architecture: str) -> None:
-    given = windows()
+    inputs = windows()
     with torch.no_grad():
-        found = model(architecture)(given)
-    assert torch.equal(found, given.touch[-1].expand(HORIZON, -1, -1))
+        predicted = model(architecture)(inputs)
+    assert torch.equal(predicted, inputs.touch[-1].expand(HORIZON, -1, -1))
 
 
 @pytest.mark.parametrize("architecture", [name for name in CHANGE if name != "taxelwise"])
@@ -65,122 +65,122 @@ def test_an_untrained_model_of_increments_tells_none(architecture: str) -> None:
 
 @pytest.mark.parametrize("architecture", ARCHITECTURES)
 def test_the_plan_of_a_step_changes_only_it_and_later_ones(architecture: str) -> None:
-    made, given = model(architecture, trained=True), windows()
-    before = change(made, given)
+    network, inputs = model(architecture, trained=True), windows()
+    before = change(network, inputs)
     for step in range(HORIZON):
-        arm = given.arm.clone()
+        arm = inputs.arm.clone()
         arm[CONTEXT + step, :, :3] += 0.02
         arm[CONTEXT + step, :, POSE:] += 0.3
-        after = change(made, given._replace(arm=arm))
+        after = change(network, inputs._replace(arm=arm))
         assert torch.equal(after[:step], before[:step])
         assert ((after - before)[step:].abs().amax(dim=(1, 2)) > 0).all()
 
 
 @pytest.mark.parametrize("architecture", ARCHITECTURES)
 def test_windows_of_a_batch_do_not_see_each_other(architecture: str) -> None:
-    made, given = model(architecture, trained=True), windows()
-    before, order = change(made, given), torch.tensor([4, 2, 0, 5, 1, 3])
-    dealt = Windows(given.touch[:, order], given.arm[:, order], given.finger[:, order])
-    assert torch.allclose(change(made, dealt), before[:, order], atol=1e-3)
-    touch = given.touch.clone()
+    network, inputs = model(architecture, trained=True), windows()
+    before, order = change(network, inputs), torch.tensor([4, 2, 0, 5, 1, 3])
+    dealt = Windows(inputs.touch[:, order], inputs.arm[:, order], inputs.finger[:, order])
+    assert torch.allclose(change(network, dealt), before[:, order], atol=1e-3)
+    touch = inputs.touch.clone()
     touch[:-1, 0] += 50
-    after = change(made, given._replace(touch=touch))
+    after = change(network, inputs._replace(touch=touch))
     assert torch.allclose(after[:, 1:], before[:, 1:], atol=1e-3)
     assert not torch.allclose(after[:, 0], before[:, 0], atol=1e-2)
 
 
 @pytest.mark.parametrize("architecture", ARCHITECTURES)
 def test_all_weights_learn_once_the_head_has_left_zero(architecture: str) -> None:
-    made, given = model(architecture, trained=True), windows()
-    made.loss(given, ahead(given)).backward()  # type: ignore[operator]
-    for name, weight in made.named_parameters():
+    network, inputs = model(architecture, trained=True), windows()
+    network.loss(inputs, ahead(inputs)).backward()  # type: ignore[operator]
+    for name, weight in network.named_parameters():
         assert weight.grad is not None, name
         assert weight.grad.isfinite().all() and weight.grad.abs().max() > 0, name
 
 
 @pytest.mark.parametrize("architecture", CHANGE)
 def test_the_first_step_of_training_leaves_persistence(architecture: str) -> None:
-    made, given = model(architecture), windows()
-    optimiser = torch.optim.SGD(made.parameters(), lr=0.1)
-    made.loss(given, ahead(given)).backward()  # type: ignore[operator]
+    network, inputs = model(architecture), windows()
+    optimiser = torch.optim.SGD(network.parameters(), lr=0.1)
+    network.loss(inputs, ahead(inputs)).backward()  # type: ignore[operator]
     optimiser.step()
-    assert change(made, given).abs().max() > 0
+    assert change(network, inputs).abs().max() > 0
 
 
 @pytest.mark.parametrize("architecture", ARCHITECTURES)
 def test_channels_that_never_move_do_not_divide_by_zero(architecture: str) -> None:
-    given = windows()
-    touch = given.touch.clone()
+    inputs = windows()
+    touch = inputs.touch.clone()
     touch[..., 3] = 7.0
-    arm = given.arm[:1].expand(CONTEXT + HORIZON, -1, -1)
-    still = given._replace(touch=touch, arm=arm, finger=torch.zeros_like(given.finger))
-    made = built(architecture)
-    for target in (ahead(still), still.touch[-1].expand(HORIZON, -1, -1)):
-        made.calibrate(still, target)
-        assert all(value.isfinite().all() for value in made.state_dict().values())
-        assert made(still).isfinite().all()
-        assert made.loss(still, target).isfinite()
+    arm = inputs.arm[:1].expand(CONTEXT + HORIZON, -1, -1)
+    unmoving = inputs._replace(touch=touch, arm=arm, finger=torch.zeros_like(inputs.finger))
+    network = built(architecture)
+    for target in (ahead(unmoving), unmoving.touch[-1].expand(HORIZON, -1, -1)):
+        network.calibrate(unmoving, target)
+        assert all(value.isfinite().all() for value in network.state_dict().values())
+        assert network(unmoving).isfinite().all()
+        assert network.loss(unmoving, target).isfinite()
 
 
 @pytest.mark.parametrize("architecture", ARCHITECTURES)
 @pytest.mark.parametrize(("count", "context", "horizon"), [(1, 1, 1), (1, 5, 4), (3, 1, 2), (2, 2, 1)])
 def test_the_smallest_windows_and_batches_work(architecture: str, count: int, context: int, horizon: int) -> None:
-    given = windows(count, context=context, horizon=horizon)
-    made = built(architecture, context=context, horizon=horizon)
-    made.calibrate(given, ahead(given))
-    found = made(given)
-    assert found.shape == (horizon, count, len(LAYOUT))
-    assert found.isfinite().all()
+    inputs = windows(count, context=context, horizon=horizon)
+    network = built(architecture, context=context, horizon=horizon)
+    network.calibrate(inputs, ahead(inputs))
+    predicted = network(inputs)
+    assert predicted.shape == (horizon, count, len(LAYOUT))
+    assert predicted.isfinite().all()
 
 
-@pytest.mark.parametrize(("loss", "wanted"), [("absolute", 2.0), ("squared", 4.0), ("huber", 1.5)])
-def test_the_loss_is_in_units_of_the_usual_change(loss: str, wanted: float) -> None:
-    made, given = model("gru", loss=loss), windows()
-    assert isinstance(made, ChangeForecast)
-    usual = (ahead(given) - given.touch[-1]).square().mean().sqrt()
-    assert torch.allclose(made.change_scale, usual)
-    found = made.loss(given, given.touch[-1] + 2 * usual.expand(HORIZON, 1, 1) * torch.ones(len(LAYOUT)))
-    assert float(found.detach()) == pytest.approx(wanted, rel=1e-4)
+@pytest.mark.parametrize(("loss", "expected"), [("absolute", 2.0), ("squared", 4.0), ("huber", 1.5)])
+def test_the_loss_is_in_units_of_the_usual_change(loss: str, expected: float) -> None:
+    network, inputs = model("gru", loss=loss), windows()
+    assert isinstance(network, ChangeForecast)
+    usual = (ahead(inputs) - inputs.touch[-1]).square().mean().sqrt()
+    assert torch.allclose(network.change_scale, usual)
+    loss_value = network.loss(inputs, inputs.touch[-1] + 2 * usual.expand(HORIZON, 1, 1) * torch.ones(len(LAYOUT)))
+    assert float(loss_value.detach()) == pytest.approx(expected, rel=1e-4)
 
 
 def test_scales_of_the_recurrent_model_map_the_training_range_to_one() -> None:
-    made, given = model("recurrent"), windows()
-    values = torch.cat([given.touch, ahead(given)]).flatten(0, 1)
-    scaled = (values - made.touch_centre) / made.touch_half  # type: ignore[operator]
+    network, inputs = model("recurrent"), windows()
+    values = torch.cat([inputs.touch, ahead(inputs)]).flatten(0, 1)
+    scaled = (values - network.touch_centre) / network.touch_half  # type: ignore[operator]
     assert torch.allclose(scaled.amax(0), torch.ones(len(LAYOUT)), atol=1e-5)
     assert torch.allclose(scaled.amin(0), -torch.ones(len(LAYOUT)), atol=1e-5)
 
 
 @pytest.mark.parametrize(("features", "hidden"), [(20, 200), (12, 16), (96, 8)])
 def test_the_recurrent_model_has_as_many_parameters_as_its_equations(features: int, hidden: int) -> None:
-    made = RecurrentForecast(features, hidden)
+    network = RecurrentForecast(features, hidden)
     inputs = features + POSE
     lstm = 4 * hidden * (inputs + hidden) + 2 * 4 * hidden
-    assert sum(weight.numel() for weight in made.parameters()) == 2 * lstm + features * hidden + features
+    assert sum(weight.numel() for weight in network.parameters()) == 2 * lstm + features * hidden + features
 
 
 def test_velocities_are_nothing_that_the_recurrent_model_reads() -> None:
-    made, given = model("recurrent", trained=True), windows()
-    arm = torch.cat([given.arm[..., :POSE], torch.full((CONTEXT + HORIZON, 6, ARM - POSE), 9.0)], -1)
-    assert torch.equal(change(made, given._replace(arm=arm)), change(made, given))
+    network, inputs = model("recurrent", trained=True), windows()
+    arm = torch.cat([inputs.arm[..., :POSE], torch.full((CONTEXT + HORIZON, 6, ARM - POSE), 9.0)], -1)
+    assert torch.equal(change(network, inputs._replace(arm=arm)), change(network, inputs))
 
 
 @pytest.mark.parametrize("architecture", CHANGE)
 def test_neither_place_nor_heading_of_the_arm_changes_a_forecast(architecture: str) -> None:
-    made, given = model(architecture, trained=True), windows()
-    arm = given.arm.clone()
+    network, inputs = model(architecture, trained=True), windows()
+    arm = inputs.arm.clone()
     arm[..., :3] += 3.0
-    assert torch.allclose(change(made, given._replace(arm=arm)), change(made, given), atol=1e-2)
+    assert torch.allclose(change(network, inputs._replace(arm=arm)), change(network, inputs), atol=1e-2)
 
 
 @pytest.mark.parametrize(
-    ("architecture", "features", "layout", "named"),
+    ("architecture", "features", "layout", "reason"),
     [("transformer", 12, LAYOUT, "'transformer'; there are taxelwise, gru"), ("taxelwise", 6, (), "latents")],
 )
 def test_an_architecture_that_is_unknown_or_cannot_read_the_channels_is_refused(
-    architecture: str, features: int, layout: Any, named: str
+    architecture: str, features: int, layout: Any, reason: str
 ) -> None:
-    with pytest.raises(TacpipeError, match=named):
+    with pytest.raises(TacpipeError, match=reason):
         build(architecture, features, layout, **SIZES)
 
 
@@ -192,8 +192,8 @@ def test_every_loss_is_known_to_every_change_model() -> None:
 
 def test_the_grid_of_a_layout_is_read_off_it() -> None:
     assert grid(LAYOUT) == (2, 2, 3)
-    assert grid([one for one in LAYOUT if one["stream"] == "xela1"]) == (1, 2, 3)
-    assert grid([one for one in LAYOUT if one["axis"] == "z"]) == (2, 2, 1)
+    assert grid([channel for channel in LAYOUT if channel["stream"] == "xela1"]) == (1, 2, 3)
+    assert grid([channel for channel in LAYOUT if channel["axis"] == "z"]) == (2, 2, 1)
     assert grid([{"taxel": str(taxel), "axis": "z"} for taxel in range(16)]) == (1, 16, 1)
 
 
@@ -205,9 +205,12 @@ def test_the_grid_of_a_layout_is_read_off_it() -> None:
         LAYOUT[1:],  # a taxel lacks an axis
         LAYOUT[:9],  # a sensor lacks a taxel
         LAYOUT[:3],  # a single taxel
-        sorted(LAYOUT, key=lambda one: one["axis"]),
-        sorted(LAYOUT, key=lambda one: one["taxel"]),
-        [*LAYOUT[:6], *({**one, "taxel": str(int(one["taxel"]) + 8)} for one in LAYOUT[6:])],  # named differently
+        sorted(LAYOUT, key=lambda channel: channel["axis"]),
+        sorted(LAYOUT, key=lambda channel: channel["taxel"]),
+        [
+            *LAYOUT[:6],
+            *({**channel, "taxel": str(int(channel["taxel"]) + 8)} for channel in LAYOUT[6:]),
+        ],  # named differently
         [*LAYOUT, *LAYOUT],
     ],
 )
@@ -217,12 +220,12 @@ def test_channels_that_do_not_lie_taxel_by_taxel_are_refused(layout: list[dict[s
 
 
 def test_taxels_share_one_network_so_that_a_swap_of_their_traits_swaps_what_is_told() -> None:
-    made, given = model("taxelwise", trained=True), windows()
+    network, inputs = model("taxelwise", trained=True), windows()
     order = torch.tensor([3, 4, 5, 0, 1, 2, 6, 7, 8, 9, 10, 11])  # the taxels of the first sensor change places
-    before = change(made, given)
+    before = change(network, inputs)
     with torch.no_grad():
-        traits = made.traits
+        traits = network.traits
         assert isinstance(traits, Tensor)
         traits.copy_(traits[[1, 0, 2, 3]])
-    after = change(made, given._replace(touch=given.touch[..., order]))
+    after = change(network, inputs._replace(touch=inputs.touch[..., order]))
     assert torch.allclose(after, before[..., order], atol=1e-2)

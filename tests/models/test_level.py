@@ -22,15 +22,15 @@ def slides(count: int = 60, classes: int = 3, seed: int = 0) -> tuple[np.ndarray
 def test_predictions_are_those_of_scikit_learn_on_standardised_levels(classes: int) -> None:
     x, labels = slides(classes=classes)
     level = x.mean(axis=1, dtype=np.float64)
-    known = (level - level.mean(axis=0)) / level.std(axis=0)
-    analysis = LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto").fit(known, labels)
+    standardised = (level - level.mean(axis=0)) / level.std(axis=0)
+    analysis = LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto").fit(standardised, labels)
     fitted = Level.fit(x, labels)
-    assert np.array_equal(fitted.predict(x), analysis.predict(known))
+    assert np.array_equal(fitted.predict(x), analysis.predict(standardised))
     scores = fitted.scores(x)
-    expected = analysis.predict_log_proba(known)
-    found = scores - np.log(np.exp(scores - scores.max(axis=1, keepdims=True)).sum(axis=1, keepdims=True))
-    found -= scores.max(axis=1, keepdims=True)
-    np.testing.assert_allclose(found, expected, atol=1e-4)
+    expected = analysis.predict_log_proba(standardised)
+    log_probabilities = scores - np.log(np.exp(scores - scores.max(axis=1, keepdims=True)).sum(axis=1, keepdims=True))
+    log_probabilities -= scores.max(axis=1, keepdims=True)
+    np.testing.assert_allclose(log_probabilities, expected, atol=1e-4)
 
 
 def test_it_sees_no_order_in_time_and_no_channel_that_never_changes() -> None:
@@ -38,16 +38,16 @@ def test_it_sees_no_order_in_time_and_no_channel_that_never_changes() -> None:
     shuffled = x[:, np.random.default_rng(1).permutation(x.shape[1])]
     fitted = Level.fit(x, labels)
     assert np.array_equal(fitted.predict(shuffled), fitted.predict(x))
-    still = np.concatenate([x, np.full((*x.shape[:2], 1), 3, np.float32)], axis=2)
-    with_still = Level.fit(still, labels)
-    np.testing.assert_allclose(with_still.scores(still), fitted.scores(x), atol=1e-3)
+    with_constant = np.concatenate([x, np.full((*x.shape[:2], 1), 3, np.float32)], axis=2)
+    with_still = Level.fit(with_constant, labels)
+    np.testing.assert_allclose(with_still.scores(with_constant), fitted.scores(x), atol=1e-3)
     assert (with_still.weight[-1] == 0).all()
 
 
 def test_a_class_of_one_slide_is_learned_without_a_warning() -> None:
     x, labels = slides()
-    kept = np.r_[np.flatnonzero(labels != 9), np.flatnonzero(labels == 9)[:1]]
-    fitted = Level.fit(x[kept], labels[kept])
+    chosen = np.r_[np.flatnonzero(labels != 9), np.flatnonzero(labels == 9)[:1]]
+    fitted = Level.fit(x[chosen], labels[chosen])
     assert fitted.classes.tolist() == [7, 8, 9]
     assert np.isfinite(fitted.scores(x)).all()
 

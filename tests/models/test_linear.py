@@ -43,14 +43,14 @@ def fitted() -> Baselines:
 
 
 def features(part: Windows, plan: bool) -> np.ndarray:
-    past, motion, _ = (one.astype(np.float64) for one in part)
+    past, motion, _ = (array.astype(np.float64) for array in part)
     changes = [past[:, step] - past[:, -1] for step in range(past.shape[1] - 1)]
-    seen = motion if plan else motion[:, : past.shape[1]]
-    return np.hstack([*changes, *(seen[:, step] for step in range(seen.shape[1]))])
+    states = motion if plan else motion[:, : past.shape[1]]
+    return np.hstack([*changes, *(states[:, step] for step in range(states.shape[1]))])
 
 
 def increments(part: Windows) -> np.ndarray:
-    past, _, ahead = (one.astype(np.float64) for one in part)
+    past, _, ahead = (array.astype(np.float64) for array in part)
     return (ahead - past[:, -1:]).reshape(len(past), -1)
 
 
@@ -76,7 +76,7 @@ def test_a_ridge_is_that_of_scikit_learn_at_the_alpha_that_validates_best(
 def test_the_trend_is_that_of_the_phi_and_lag_that_err_least_of_all_in_the_grid(repeats: int) -> None:
     frames = walk(1)[0][:, -1].repeat(repeats, axis=0)  # (time, channel), each frame held
     windows = cut(frames, np.zeros((len(frames), STATES)))
-    past, _, ahead = (one.astype(np.float64) for one in windows)
+    past, _, ahead = (array.astype(np.float64) for array in windows)
     fitted = Baselines.fit(windows, windows)
 
     def trend(phi: float, lag: int) -> np.ndarray:
@@ -84,7 +84,7 @@ def test_the_trend_is_that_of_the_phi_and_lag_that_err_least_of_all_in_the_grid(
         return np.stack([past[:, -1] + sum(phi**k for k in range(1, h + 1)) * slope for h in range(1, HORIZON + 1)], 1)
 
     grid = list(itertools.product(linear.PHIS, range(1, CONTEXT)))
-    phi, lag = min(grid, key=lambda one: float(np.square(trend(*one) - ahead).sum()))
+    phi, lag = min(grid, key=lambda array: float(np.square(trend(*array) - ahead).sum()))
     assert (fitted.chosen["damped_trend.phi"], fitted.chosen["damped_trend.lag"]) == (phi, lag)
     assert phi > 0
     assert (lag > 1) == (repeats > 1)
@@ -95,35 +95,37 @@ def test_a_trend_that_is_damped_by_0_6_a_step_is_predicted_exactly() -> None:
     steps = np.outer(0.6 ** np.arange(CONTEXT + HORIZON), [200.0, -100.0, 50.0])
     values = 1000 + np.cumsum(np.stack([steps, -2 * steps, 3 * steps]), axis=1)
     windows = values[:, :CONTEXT], np.zeros((3, CONTEXT + HORIZON, STATES)), values[:, CONTEXT:]
-    found = Baselines.fit(windows, windows)
-    assert (found.phi, found.lag) == (0.6, 1)
-    np.testing.assert_allclose(found.predict(*windows[:2])["damped_trend"], windows[2], rtol=1e-5)
+    baselines = Baselines.fit(windows, windows)
+    assert (baselines.phi, baselines.lag) == (0.6, 1)
+    np.testing.assert_allclose(baselines.predict(*windows[:2])["damped_trend"], windows[2], rtol=1e-5)
 
 
 def test_where_nothing_goes_on_the_trend_is_persistence() -> None:
     rng = np.random.default_rng(3)
     noise = cut(rng.normal(size=(400, CHANNELS)), np.zeros((400, STATES)))
-    found = Baselines.fit(noise, noise)
-    assert (found.phi, found.lag) == (0.0, 1)
-    assert np.array_equal(found.predict(*noise[:2])["damped_trend"], np.repeat(noise[0][:, -1:], HORIZON, axis=1))
+    baselines = Baselines.fit(noise, noise)
+    assert (baselines.phi, baselines.lag) == (0.0, 1)
+    assert np.array_equal(baselines.predict(*noise[:2])["damped_trend"], np.repeat(noise[0][:, -1:], HORIZON, axis=1))
 
 
 def test_the_last_value_map_is_least_squares_over_the_windows_of_all_channels(fitted: Baselines) -> None:
-    past, _, ahead = (one.astype(np.float64) for one in walk(1))
+    past, _, ahead = (array.astype(np.float64) for array in walk(1))
     x = np.concatenate([past[:, :-1, channel] - past[:, -1:, channel] for channel in range(CHANNELS)])
     y = np.concatenate([ahead[:, :, channel] - past[:, -1:, channel] for channel in range(CHANNELS)])
     weight = np.linalg.lstsq(np.hstack([x, np.ones((len(x), 1))]), y, rcond=None)[0]
-    other = walk(2)
-    changes = other[0][:, :-1].astype(np.float64) - other[0][:, -1:]
+    other_windows = walk(2)
+    changes = other_windows[0][:, :-1].astype(np.float64) - other_windows[0][:, -1:]
     for channel in range(CHANNELS):
-        expected = other[0][:, -1:, channel] + changes[:, :, channel] @ weight[:-1] + weight[-1]
-        np.testing.assert_allclose(fitted.predict(*other[:2])["last_value_linear"][:, :, channel], expected, atol=0.01)
+        expected = other_windows[0][:, -1:, channel] + changes[:, :, channel] @ weight[:-1] + weight[-1]
+        np.testing.assert_allclose(
+            fitted.predict(*other_windows[:2])["last_value_linear"][:, :, channel], expected, atol=0.01
+        )
 
 
 def test_the_mean_is_that_of_what_was_to_be_predicted_in_training(fitted: Baselines) -> None:
-    found = fitted.predict(*walk(2)[:2])["train_mean"]
-    np.testing.assert_allclose(found[7, 3], walk(1)[2].astype(np.float64).mean(axis=(0, 1)), rtol=1e-6)
-    assert (found == found[0, 0]).all()
+    predicted = fitted.predict(*walk(2)[:2])["train_mean"]
+    np.testing.assert_allclose(predicted[7, 3], walk(1)[2].astype(np.float64).mean(axis=(0, 1)), rtol=1e-6)
+    assert (predicted == predicted[0, 0]).all()
 
 
 def test_a_load_that_the_plan_decides_is_predicted_only_with_the_plan() -> None:
@@ -132,10 +134,10 @@ def test_a_load_that_the_plan_decides_is_predicted_only_with_the_plan() -> None:
         acceleration = np.random.default_rng(seed).normal(size=(600, 1))
         return cut(2 * 300 * acceleration * [[1.0, 0.5, -0.2]], np.hstack([acceleration, np.zeros_like(acceleration)]))
 
-    found = Baselines.fit(held_mass(1), held_mass(2))
+    baselines = Baselines.fit(held_mass(1), held_mass(2))
     past, motion, ahead = held_mass(3)
-    predicted = found.predict(past, motion)
-    error = {name: float(np.square(one - ahead).mean()) for name, one in predicted.items()}
+    predicted = baselines.predict(past, motion)
+    error = {name: float(np.square(values - ahead).mean()) for name, values in predicted.items()}
     assert error["ridge_actions"] < 0.01 * error["train_mean"]
     assert error["ridge"] > 0.9 * error["train_mean"]
     assert error["damped_trend"] > error["train_mean"]
@@ -160,46 +162,46 @@ def test_a_forecast_does_not_depend_on_the_windows_beside_it_nor_the_fit_on_its_
     fitted: Baselines, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     past, motion, _ = walk(2)
-    together, alone = fitted.predict(past, motion), fitted.predict(past[9:10], motion[9:10])
+    batched, single = fitted.predict(past, motion), fitted.predict(past[9:10], motion[9:10])
     for name in linear.NAMES:
-        np.testing.assert_allclose(alone[name][0], together[name][9], rtol=1e-5)
+        np.testing.assert_allclose(single[name][0], batched[name][9], rtol=1e-5)
     monkeypatch.setattr(linear, "CHUNK", 7)
     pieces = Baselines.fit(walk(1), walk(2)).predict(past, motion)
     for name in linear.NAMES:
-        np.testing.assert_allclose(pieces[name], together[name], rtol=1e-5)
+        np.testing.assert_allclose(pieces[name], batched[name], rtol=1e-5)
 
 
 def test_channels_and_states_that_stand_still_in_training_are_left_where_they_are() -> None:
-    def still(seed: int) -> Windows:
-        rng, (past, motion, ahead) = np.random.default_rng(seed), (one.copy() for one in walk(seed))
+    def constant_windows(seed: int) -> Windows:
+        rng, (past, motion, ahead) = np.random.default_rng(seed), (array.copy() for array in walk(seed))
         past[:, :, 1] = ahead[:, :, 1] = 77.1
         sides = rng.integers(2, size=motion.shape[:2]).astype(np.float32)
         motion[:, :, 0] = np.nextafter(np.float32(0.3), sides)  # still but for the last bit
         return past, motion, ahead
 
-    found = Baselines.fit(still(1), still(2))
-    past, motion, _ = still(3)
+    baselines = Baselines.fit(constant_windows(1), constant_windows(2))
+    past, motion, _ = constant_windows(3)
     stirred = motion.copy()
     stirred[:, :, 0] += 1
-    predicted = found.predict(past, motion)
+    predicted = baselines.predict(past, motion)
     for name in ("train_mean", "damped_trend", "ridge", "ridge_actions"):
         np.testing.assert_allclose(predicted[name][:, :, 1], 77.1, rtol=1e-5)
         assert np.isfinite(predicted[name]).all()
-        assert np.array_equal(found.predict(past, stirred)[name], predicted[name])
+        assert np.array_equal(baselines.predict(past, stirred)[name], predicted[name])
 
 
 def test_windows_in_which_nothing_moves_give_persistence() -> None:
-    still = cut(np.full((30, CHANNELS), 5.0), np.full((30, STATES), 0.3))
-    found = Baselines.fit(still, still)
-    for one in found.predict(*still[:2]).values():
-        np.testing.assert_allclose(one, 5.0)
+    constant_windows = cut(np.full((30, CHANNELS), 5.0), np.full((30, STATES), 0.3))
+    baselines = Baselines.fit(constant_windows, constant_windows)
+    for values in baselines.predict(*constant_windows[:2]).values():
+        np.testing.assert_allclose(values, 5.0)
 
 
 def test_a_single_past_frame_has_no_trend_but_a_motion() -> None:
-    found = Baselines.fit(walk(1, context=1), walk(2, context=1))
+    baselines = Baselines.fit(walk(1, context=1), walk(2, context=1))
     past, motion, _ = walk(3, context=1)
-    predicted = found.predict(past, motion)
-    assert found.chosen["damped_trend.lag"] == 0
+    predicted = baselines.predict(past, motion)
+    assert baselines.chosen["damped_trend.lag"] == 0
     assert np.array_equal(predicted["damped_trend"], np.repeat(past, HORIZON, axis=1))
     assert np.ptp(predicted["ridge"] - past) > 1
 

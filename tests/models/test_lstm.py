@@ -43,18 +43,18 @@ def reference(
 
 @pytest.mark.parametrize(("steps", "windows"), [(1, 1), (1, 4), (4, 1), (4, 3)])
 def test_outputs_and_all_gradients_are_those_of_torch(steps: int, windows: int) -> None:
-    given = arguments(steps, windows)[:6]
-    ours, (layer, theirs) = outputs(*given), reference(*given)
+    values = arguments(steps, windows)[:6]
+    ours, (layer, theirs) = outputs(*values), reference(*values)
     weights = list(layer.parameters())[:3]
-    seeds = [numbers(*one.shape, seed=9).detach() for one in ours]
-    for one, other in zip(ours, theirs, strict=True):
-        assert torch.allclose(one, other, atol=1e-12)
-    for one, other in zip(
-        torch.autograd.grad(ours, given, seeds),
-        torch.autograd.grad(theirs, [*given[:3], *weights], seeds),
+    seeds = [numbers(*ours_part.shape, seed=9).detach() for ours_part in ours]
+    for ours_part, theirs_part in zip(ours, theirs, strict=True):
+        assert torch.allclose(ours_part, theirs_part, atol=1e-12)
+    for ours_part, theirs_part in zip(
+        torch.autograd.grad(ours, values, seeds),
+        torch.autograd.grad(theirs, [*values[:3], *weights], seeds),
         strict=True,
     ):
-        assert torch.allclose(one, other, atol=1e-10)
+        assert torch.allclose(ours_part, theirs_part, atol=1e-10)
 
 
 @pytest.mark.parametrize("steps", [1, 3])
@@ -65,54 +65,57 @@ def test_gradients_are_those_of_finite_differences(steps: int) -> None:
 def test_a_layer_that_begins_at_zero_is_one_given_zeros() -> None:
     inputs, h, c, *weights = arguments(3, 2)[:6]
     zero = torch.zeros_like(h).requires_grad_(), torch.zeros_like(c).requires_grad_()
-    found = [lstm(inputs, state, (weights[0], weights[1], weights[2]))[1] for state in (None, zero)]
-    for one, other in zip(*found, strict=True):
-        assert torch.equal(one, other)
-    for one, other in zip(*(torch.autograd.grad(torch.stack(last).sum(), weights) for last in found), strict=True):
-        assert torch.equal(one, other)
+    last_states = [lstm(inputs, state, (weights[0], weights[1], weights[2]))[1] for state in (None, zero)]
+    for implicit, explicit in zip(*last_states, strict=True):
+        assert torch.equal(implicit, explicit)
+    for implicit, explicit in zip(
+        *(torch.autograd.grad(torch.stack(last).sum(), weights) for last in last_states), strict=True
+    ):
+        assert torch.equal(implicit, explicit)
 
 
 def test_without_gradients_the_outputs_are_the_same() -> None:
-    given = arguments(4, 3)
+    values = arguments(4, 3)
     with torch.no_grad():
-        plain = outputs(*given)
-    for one, other in zip(outputs(*given), plain, strict=True):
-        assert torch.allclose(one, other, atol=1e-12)
+        plain = outputs(*values)
+    for without, with_gradients in zip(outputs(*values), plain, strict=True):
+        assert torch.allclose(without, with_gradients, atol=1e-12)
 
 
 def test_single_precision_differs_by_rounding_alone() -> None:
-    given = arguments(10, 8)
-    single = [one.detach().float().requires_grad_() for one in given]
-    double = outputs(*given)
-    found = outputs(*single)
-    for one, other in zip(found, double, strict=True):
-        assert torch.allclose(one.double(), other, atol=1e-6)
+    values = arguments(10, 8)
+    single = [narrow.detach().float().requires_grad_() for narrow in values]
+    double = outputs(*values)
+    rounded = outputs(*single)
+    for narrow, wide in zip(rounded, double, strict=True):
+        assert torch.allclose(narrow.double(), wide, atol=1e-6)
     gradients = (
-        torch.autograd.grad(many[0].square().mean(), some) for many, some in ((found, single), (double, given))
+        torch.autograd.grad(results[0].square().mean(), weights)
+        for results, weights in ((rounded, single), (double, values))
     )
-    for one, other in zip(*gradients, strict=True):
-        assert torch.allclose(one.double(), other, atol=1e-6)
+    for narrow, wide in zip(*gradients, strict=True):
+        assert torch.allclose(narrow.double(), wide, atol=1e-6)
 
 
 def test_the_same_batch_twice_gives_the_same_bits() -> None:
-    given = arguments(6, 4, torch.float32)
-    first, second = (torch.autograd.grad(outputs(*given)[0].square().mean(), given) for _ in range(2))
-    for one, other in zip(first, second, strict=True):
-        assert torch.equal(one, other)
+    values = arguments(6, 4, torch.float32)
+    first, second = (torch.autograd.grad(outputs(*values)[0].square().mean(), values) for _ in range(2))
+    for gradient, repeated in zip(first, second, strict=True):
+        assert torch.equal(gradient, repeated)
 
 
 def test_memory_is_lent_again_only_once_nobody_looks_at_it() -> None:
-    given = arguments(6, 4)
-    states = outputs(*given)[0]
-    kept, before = states[2:], states.clone()
+    values = arguments(6, 4)
+    states = outputs(*values)[0]
+    view, before = states[2:], states.clone()
     loss = states.square().mean()
     del states
     for seed in range(20):
-        outputs(*(one + seed for one in given))[0].square().mean().backward()  # type: ignore[no-untyped-call]
-    assert torch.equal(kept, before[2:])
-    fresh = outputs(*given)[0].square().mean()
-    for one, other in zip(torch.autograd.grad(loss, given), torch.autograd.grad(fresh, given), strict=True):
-        assert torch.equal(one, other)
+        outputs(*(value + seed for value in values))[0].square().mean().backward()  # type: ignore[no-untyped-call]
+    assert torch.equal(view, before[2:])
+    fresh = outputs(*values)[0].square().mean()
+    for value, fresh_value in zip(torch.autograd.grad(loss, values), torch.autograd.grad(fresh, values), strict=True):
+        assert torch.equal(value, fresh_value)
 
 
 def test_little_memory_is_kept() -> None:
@@ -124,11 +127,14 @@ def test_little_memory_is_kept() -> None:
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 def test_on_a_gpu_outputs_and_gradients_are_those_of_the_processor() -> None:
-    given = arguments(4, 3)
-    there = [one.detach().cuda().requires_grad_() for one in given]
-    ours, theirs = outputs(*given), outputs(*there)
-    for one, other in zip(ours, theirs, strict=True):
-        assert torch.allclose(one, other.cpu(), atol=1e-10)
-    gradients = (torch.autograd.grad(many[0].square().mean(), some) for many, some in ((ours, given), (theirs, there)))
-    for one, other in zip(*gradients, strict=True):
-        assert torch.allclose(one, other.cpu(), atol=1e-10)
+    values = arguments(4, 3)
+    on_gpu = [local.detach().cuda().requires_grad_() for local in values]
+    ours, theirs = outputs(*values), outputs(*on_gpu)
+    for local, remote in zip(ours, theirs, strict=True):
+        assert torch.allclose(local, remote.cpu(), atol=1e-10)
+    gradients = (
+        torch.autograd.grad(results[0].square().mean(), weights)
+        for results, weights in ((ours, values), (theirs, on_gpu))
+    )
+    for local, remote in zip(*gradients, strict=True):
+        assert torch.allclose(local, remote.cpu(), atol=1e-10)

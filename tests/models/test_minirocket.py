@@ -43,49 +43,51 @@ def answer(slide: np.ndarray, rocket: Rocket, index: int, kernel: int) -> list[f
         if not padded and not all(inside):
             continue
         total = 0.0
-        for weight, place, known in zip(weights(kernel), places, inside, strict=True):
-            total += weight * sum(float(slide[place, c]) for c in channels) if known else 0.0
+        for weight, place, is_inside in zip(weights(kernel), places, inside, strict=True):
+            total += weight * sum(float(slide[place, c]) for c in channels) if is_inside else 0.0
         answers.append(total)
     return answers
 
 
 def test_features_are_the_shares_of_answers_above_each_bias(fitted: Rocket) -> None:
     x = slides(4, seed=9)
-    found = fitted.transform(x)
-    assert found.shape == (4, 84 * 12)
-    assert found.dtype == np.float32
-    expected, at = np.zeros(found.shape), 0
-    for index, each in enumerate(fitted.counts):
+    features = fitted.transform(x)
+    assert features.shape == (4, 84 * 12)
+    assert features.dtype == np.float32
+    expected, at = np.zeros(features.shape), 0
+    for index, count in enumerate(fitted.counts):
         for kernel in range(84):
             answers = [answer(slide, fitted, index, kernel) for slide in x]
-            for _ in range(each):
-                expected[:, at] = [np.mean([value > fitted.biases[at] for value in one]) for one in answers]
+            for _ in range(count):
+                expected[:, at] = [
+                    np.mean([value > fitted.biases[at] for value in answer_values]) for answer_values in answers
+                ]
                 at += 1
-    assert at == found.shape[1]
-    np.testing.assert_allclose(found, expected, atol=1e-6)
+    assert at == features.shape[1]
+    np.testing.assert_allclose(features, expected, atol=1e-6)
 
 
 def test_dilations_are_powers_of_two_evenly_up_to_the_slide_and_share_the_features(fitted: Rocket) -> None:
     longest = np.log2((FRAMES - 1) / 8)
-    wanted = [int(2 ** (longest * step / 11)) for step in range(12)]
-    assert fitted.dilations.tolist() == sorted(set(wanted))
-    assert fitted.counts.tolist() == [wanted.count(dilation) for dilation in sorted(set(wanted))]
-    many = Rocket.fit(slides(3, 400), features=10_000)
-    assert 8 * many.dilations[-1] <= 399
-    assert many.counts.sum() == 10_000 // 84
-    assert len(many.biases) == 84 * many.counts.sum()
+    powers = [int(2 ** (longest * step / 11)) for step in range(12)]
+    assert fitted.dilations.tolist() == sorted(set(powers))
+    assert fitted.counts.tolist() == [powers.count(dilation) for dilation in sorted(set(powers))]
+    large = Rocket.fit(slides(3, 400), features=10_000)
+    assert 8 * large.dilations[-1] <= 399
+    assert large.counts.sum() == 10_000 // 84
+    assert len(large.biases) == 84 * large.counts.sum()
 
 
 def test_biases_are_quantiles_of_one_training_slides_answers_at_multiples_of_the_golden_ratio() -> None:
     x = slides(1, seed=5)  # a single slide, so that biases can be of it alone
     rocket = Rocket.fit(x, features=84 * 4, seed=1)
     at = 0
-    for index, each in enumerate(rocket.counts):
+    for index, count in enumerate(rocket.counts):
         for kernel in range(84):
-            quantiles = [(n * (1 + 5**0.5) / 2) % 1 for n in range(at + 1, at + 1 + int(each))]
+            quantiles = [(n * (1 + 5**0.5) / 2) % 1 for n in range(at + 1, at + 1 + int(count))]
             expected = np.quantile(answer(x[0], rocket, index, kernel), quantiles)
-            np.testing.assert_allclose(rocket.biases[at : at + each], expected, rtol=1e-5, atol=1e-3)
-            at += int(each)
+            np.testing.assert_allclose(rocket.biases[at : at + count], expected, rtol=1e-5, atol=1e-3)
+            at += int(count)
 
 
 def test_every_kernel_sums_one_to_nine_channels_and_small_sums_are_the_most_frequent() -> None:
@@ -99,10 +101,10 @@ def test_every_kernel_sums_one_to_nine_channels_and_small_sums_are_the_most_freq
 
 def test_slides_are_transformed_alike_alone_and_among_others(fitted: Rocket, monkeypatch: pytest.MonkeyPatch) -> None:
     x = slides(40)
-    together = fitted.transform(x)
+    batched = fitted.transform(x)
     monkeypatch.setattr(minirocket, "BLOCK_BYTES", 1)  # blocks of sixteen
-    assert np.array_equal(fitted.transform(x), together)
-    assert np.array_equal(fitted.transform(x[7:8]), together[7:8])
+    assert np.array_equal(fitted.transform(x), batched)
+    assert np.array_equal(fitted.transform(x[7:8]), batched[7:8])
 
 
 def test_positions_beyond_what_a_byte_counts_are_counted() -> None:
@@ -114,9 +116,9 @@ def test_positions_beyond_what_a_byte_counts_are_counted() -> None:
 
 def test_the_seed_decides_and_tensors_hold_everything(fitted: Rocket) -> None:
     x = slides(12)
-    again, other = Rocket.fit(x, features=84 * 12, seed=3), Rocket.fit(x, features=84 * 12, seed=4)
-    assert np.array_equal(again.transform(x), fitted.transform(x))
-    assert not np.array_equal(other.transform(x), fitted.transform(x))
+    repeated, reseeded = Rocket.fit(x, features=84 * 12, seed=3), Rocket.fit(x, features=84 * 12, seed=4)
+    assert np.array_equal(repeated.transform(x), fitted.transform(x))
+    assert not np.array_equal(reseeded.transform(x), fitted.transform(x))
     assert np.array_equal(Rocket.from_tensors(fitted.to_tensors()).transform(x), fitted.transform(x))
 
 

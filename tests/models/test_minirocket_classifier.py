@@ -28,8 +28,8 @@ def pressed(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Return slides of noise alone whose pressure on five channels tells the class."""
     rng = np.random.default_rng(seed)
     labels = np.arange(count) % 4
-    where = np.array([[1, 1, 0, 0, 0], [0, 1, 1, 0, 0], [0, 0, 1, 1, 0], [0, 0, 0, 1, 1]])[labels]
-    root = 5 + 3 * where[:, None] + rng.normal(size=(count, 1, 5)) + 3 * rng.normal(size=(count, 60, 5))
+    contact = np.array([[1, 1, 0, 0, 0], [0, 1, 1, 0, 0], [0, 0, 1, 1, 0], [0, 0, 0, 1, 1]])[labels]
+    root = 5 + 3 * contact[:, None] + rng.normal(size=(count, 1, 5)) + 3 * rng.normal(size=(count, 60, 5))
     x = np.square(root)
     return x.astype(np.float32), labels
 
@@ -57,20 +57,20 @@ def test_shuffled_labels_are_learned_from_the_same_patterns_and_tell_nothing() -
     new, truth = textured(300, seed=1)
     shuffled = np.random.default_rng(0).permutation(labels)
     fitted = MinirocketClassifier.fit(x, labels, features=PATTERNS)
-    other = fitted.relabelled(x, shuffled)
-    assert np.mean(other.predict(new) == truth) < 0.6
-    again = MinirocketClassifier.fit(x, shuffled, features=PATTERNS)
-    assert np.array_equal(other.scores(new), again.scores(new))
+    relabelled = fitted.relabelled(x, shuffled)
+    assert np.mean(relabelled.predict(new) == truth) < 0.6
+    fitted_alone = MinirocketClassifier.fit(x, shuffled, features=PATTERNS)
+    assert np.array_equal(relabelled.scores(new), fitted_alone.scores(new))
 
 
 def test_the_seed_decides_and_tensors_hold_everything() -> None:
     x, labels = textured(30)
-    one, same, other = (MinirocketClassifier.fit(x, labels, features=PATTERNS, seed=seed) for seed in (1, 1, 2))
-    assert np.array_equal(one.scores(x), same.scores(x))
-    assert not np.array_equal(one.scores(x), other.scores(x))
-    again = MinirocketClassifier.from_tensors(load(save(one.to_tensors())))
-    assert np.array_equal(again.scores(x), one.scores(x))
-    assert again.share == one.share
+    first, same, reseeded = (MinirocketClassifier.fit(x, labels, features=PATTERNS, seed=seed) for seed in (1, 1, 2))
+    assert np.array_equal(first.scores(x), same.scores(x))
+    assert not np.array_equal(first.scores(x), reseeded.scores(x))
+    restored = MinirocketClassifier.from_tensors(load(save(first.to_tensors())))
+    assert np.array_equal(restored.scores(x), first.scores(x))
+    assert restored.share == first.share
 
 
 def test_readings_below_zero_and_other_slides_are_handled() -> None:

@@ -12,17 +12,17 @@ from tacpipe.models.point_networks import HEADS, NormalisedLinear, PointFeatures
 class Trunk(nn.Module):
     """Convolutions of one point at a time, as the group's published code has them."""
 
-    def __init__(self, of: PointFeatures) -> None:
+    def __init__(self, features: PointFeatures) -> None:
         super().__init__()
-        layers = [one for one in (*of.layers, of.last) if isinstance(one, NormalisedLinear)]
-        self.convolutions = nn.ModuleList(nn.Conv1d(one.weight.shape[1], len(one.weight), 1) for one in layers)
-        self.normals = nn.ModuleList(nn.BatchNorm1d(len(one.weight)) for one in layers)
+        layers = [layer for layer in (*features.layers, features.last) if isinstance(layer, NormalisedLinear)]
+        self.convolutions = nn.ModuleList(nn.Conv1d(layer.weight.shape[1], len(layer.weight), 1) for layer in layers)
+        self.normals = nn.ModuleList(nn.BatchNorm1d(len(layer.weight)) for layer in layers)
         with torch.no_grad():
-            for one, convolution, normal in zip(layers, self.convolutions, self.normals, strict=True):
+            for layer, convolution, normal in zip(layers, self.convolutions, self.normals, strict=True):
                 assert isinstance(convolution, nn.Conv1d) and isinstance(normal, nn.BatchNorm1d)
-                convolution.weight.copy_(one.weight[:, :, None])
-                normal.weight.copy_(one.scale)
-                normal.bias.copy_(one.shift)
+                convolution.weight.copy_(layer.weight[:, :, None])
+                normal.weight.copy_(layer.scale)
+                normal.bias.copy_(layer.shift)
 
     def forward(self, points: Tensor) -> Tensor:
         for index, (convolution, normal) in enumerate(zip(self.convolutions, self.normals, strict=True)):
@@ -34,19 +34,19 @@ class Trunk(nn.Module):
 class Plain(nn.Module):
     """PointNet with a transform, channels first."""
 
-    def __init__(self, of: PointNet) -> None:
+    def __init__(self, network: PointNet) -> None:
         super().__init__()
-        assert of.transform is not None
-        self.transform, self.points = Trunk(of.transform.points), Trunk(of.points)
-        self.transform_head, self.head = of.transform.head, of.head
+        assert network.transform is not None
+        self.transform, self.points = Trunk(network.transform.points), Trunk(network.points)
+        self.transform_head, self.head = network.transform.head, network.head
 
     def forward(self, points: Tensor, grasp: Tensor) -> Tensor:
         cloud = points.transpose(2, 1)
         channels = cloud.shape[1]
         turned = self.transform_head(torch.relu(self.transform(cloud))).view(-1, channels, channels)
         cloud = torch.bmm(cloud.transpose(2, 1), turned + torch.eye(channels)).transpose(2, 1)
-        found: Tensor = self.head(torch.cat([self.points(cloud), grasp], dim=1))
-        return found
+        values: Tensor = self.head(torch.cat([self.points(cloud), grasp], dim=1))
+        return values
 
 
 def clouds(channels: int = 6, count: int = 5, points: int = 40, numbers: int = 6) -> tuple[Tensor, Tensor]:
@@ -61,18 +61,18 @@ def test_loss_and_gradients_are_those_of_a_plain_pointnet() -> None:
     torch.manual_seed(0)
     network = PointNet(6, 6, 24, head=HEADS["fc2"])
     for layer in network.modules():
-        if isinstance(layer, NormalisedLinear):  # so that some channels' largest value lies below zero
+        if isinstance(layer, NormalisedLinear):  # puts the largest value of some channels below zero
             nn.init.normal_(layer.scale)
             nn.init.normal_(layer.shift, std=2)
     plain = Plain(network)
-    given, aim = clouds(), torch.rand(5, 24)
-    losses = [torch.sqrt(nn.functional.mse_loss(one(*given), aim)) for one in (network, plain)]
+    inputs, aim = clouds(), torch.rand(5, 24)
+    losses = [torch.sqrt(nn.functional.mse_loss(ours(*inputs), aim)) for ours in (network, plain)]
     assert losses[0].item() == pytest.approx(losses[1].item(), abs=1e-5)
-    one = torch.autograd.grad(losses[0], [network.points.last.weight, network.points.last.scale])
+    ours = torch.autograd.grad(losses[0], [network.points.last.weight, network.points.last.scale])
     last = plain.points.convolutions[-1].weight, plain.points.normals[-1].weight
-    other = torch.autograd.grad(losses[1], last)  # type: ignore[arg-type]
-    torch.testing.assert_close(one[0], other[0][:, :, 0], atol=1e-5, rtol=1e-3)
-    torch.testing.assert_close(one[1], other[1], atol=1e-5, rtol=1e-3)
+    theirs = torch.autograd.grad(losses[1], last)  # type: ignore[arg-type]
+    torch.testing.assert_close(ours[0], theirs[0][:, :, 0], atol=1e-5, rtol=1e-3)
+    torch.testing.assert_close(ours[1], theirs[1], atol=1e-5, rtol=1e-3)
 
 
 @pytest.mark.parametrize("transform", [False, True])
@@ -97,7 +97,7 @@ def test_a_point_twice_changes_nothing_once_training_is_over() -> None:
 
 @pytest.mark.parametrize(
     ("head", "weights"),
-    [  # of 1,030 inputs: a layer has its matrix, its bias, and a scale and a shift a value; the last has no two of these
+    [  # 1,030 inputs: a layer has its matrix, its bias, and a scale and a shift a value; the last has no two of these
         ("fc1", (1030 + 3) * 1024 + 1025),
         ("fc2", (1030 + 3) * 1024 + (1024 + 3) * 512 + 513),
         ("fc3", (1030 + 3) * 1024 + (1024 + 3) * 512 + (512 + 3) * 256 + 257),
@@ -108,13 +108,14 @@ def test_a_point_twice_changes_nothing_once_training_is_over() -> None:
 )
 def test_each_head_has_the_weights_counted_by_hand(head: str, weights: int) -> None:
     network = PointNet(6, 6, 1, head=HEADS[head], transform=False)
-    trunk = (6 + 2) * 64 + (64 + 2) * 128 + (128 + 2) * 1024  # without bias, which a normalisation takes off again
-    assert sum(one.numel() for one in network.parameters()) == trunk + weights
+    trunk = (6 + 2) * 64 + (64 + 2) * 128 + (128 + 2) * 1024  # no bias, because a normalisation removes it
+    assert sum(weight.numel() for weight in network.parameters()) == trunk + weights
 
 
 def test_the_transform_of_all_channels_has_the_weights_counted_by_hand() -> None:
     without, with_ = (
-        sum(one.numel() for one in PointNet(6, 6, 1, transform=transform).parameters()) for transform in (False, True)
+        sum(weight.numel() for weight in PointNet(6, 6, 1, transform=transform).parameters())
+        for transform in (False, True)
     )
     trunk = (6 + 2) * 64 + (64 + 2) * 128 + (128 + 2) * 1024
     assert with_ - without == trunk + (1024 + 3) * 512 + (512 + 3) * 256 + (256 + 1) * 36
@@ -125,12 +126,12 @@ def test_the_transform_is_the_identity_and_what_its_layers_say() -> None:
     network = PointNet(6, 0, 1)
     assert network.transform is not None
     points, _ = clouds()
-    found = network.transform(points)
-    off = found - torch.eye(6)
-    assert found.shape == (5, 6, 6)
+    transform = network.transform(points)
+    off = transform - torch.eye(6)
+    assert transform.shape == (5, 6, 6)
     assert 0 < off.abs().mean() < 0.6
-    assert found.diagonal(dim1=1, dim2=2).mean() > 0.7
-    assert abs(found.mean() - 1 / 6) < 0.2
+    assert transform.diagonal(dim1=1, dim2=2).mean() > 0.7
+    assert abs(transform.mean() - 1 / 6) < 0.2
     last = network.transform.head[-1]
     assert isinstance(last, nn.Linear)
     nn.init.zeros_(last.weight)

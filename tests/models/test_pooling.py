@@ -30,8 +30,8 @@ class Plain(nn.Module):
 
     def forward(self, points: Tensor) -> Tensor:
         values = self.linear(points)
-        found: Tensor = self.normal(values.flatten(0, 1)).view_as(values)
-        return found
+        normalised: Tensor = self.normal(values.flatten(0, 1)).view_as(values)
+        return normalised
 
 
 def layer_and_points(sizes: Sizes, seed: int) -> tuple[NormalisedLinear, Tensor]:
@@ -45,8 +45,8 @@ def layer_and_points(sizes: Sizes, seed: int) -> tuple[NormalisedLinear, Tensor]
     return layer, 3 + 2 * torch.randn(clouds, points, inputs, dtype=torch.float64)
 
 
-def gradients(loss: Tensor, *of: Tensor) -> list[Tensor]:
-    return list(torch.autograd.grad(loss, of))
+def gradients(loss: Tensor, *tensors: Tensor) -> list[Tensor]:
+    return list(torch.autograd.grad(loss, tensors))
 
 
 @settings(deadline=None, max_examples=40)
@@ -56,15 +56,17 @@ def test_values_statistics_and_all_gradients_are_those_of_torch(sizes: Sizes, se
     plain = Plain(layer)
     points.requires_grad_()
     for _ in range(2):  # the running statistics follow twice
-        found = largest(layer, points) if pooled else layer(points)
-        known = plain(points).amax(dim=1) if pooled else plain(points)
-        torch.testing.assert_close(found, known, rtol=1e-8, atol=1e-8)
+        ours_values = largest(layer, points) if pooled else layer(points)
+        torch_values = plain(points).amax(dim=1) if pooled else plain(points)
+        torch.testing.assert_close(ours_values, torch_values, rtol=1e-8, atol=1e-8)
     torch.testing.assert_close(layer.mean, plain.normal.running_mean, rtol=1e-10, atol=1e-10)
     torch.testing.assert_close(layer.variance, plain.normal.running_var, rtol=1e-8, atol=1e-10)
-    weights = torch.randn_like(found)
-    one = gradients((weights * found).sum(), points, layer.weight, layer.scale, layer.shift)
-    other = gradients((weights * known).sum(), points, plain.linear.weight, plain.normal.weight, plain.normal.bias)
-    for mine, theirs in zip(one, other, strict=True):
+    weights = torch.randn_like(ours_values)
+    our_gradients = gradients((weights * ours_values).sum(), points, layer.weight, layer.scale, layer.shift)
+    torch_gradients = gradients(
+        (weights * torch_values).sum(), points, plain.linear.weight, plain.normal.weight, plain.normal.bias
+    )
+    for mine, theirs in zip(our_gradients, torch_gradients, strict=True):
         torch.testing.assert_close(mine, theirs, rtol=1e-6, atol=1e-6)
 
 
@@ -77,12 +79,13 @@ def test_when_nothing_is_learned_the_running_statistics_normalise_as_in_torch(po
         plain(points + at)
     layer.eval(), plain.eval()
     before = layer.mean.clone()
-    found = largest(layer, points) if pooled else layer(points)
-    known = plain(points).amax(dim=1) if pooled else plain(points)
-    torch.testing.assert_close(found, known, rtol=1e-9, atol=1e-9)
+    ours_values = largest(layer, points) if pooled else layer(points)
+    torch_values = plain(points).amax(dim=1) if pooled else plain(points)
+    torch.testing.assert_close(ours_values, torch_values, rtol=1e-9, atol=1e-9)
     assert torch.equal(layer.mean, before)
     torch.testing.assert_close(
-        gradients(found.sum(), layer.weight, layer.scale)[0], gradients(known.sum(), plain.linear.weight)[0]
+        gradients(ours_values.sum(), layer.weight, layer.scale)[0],
+        gradients(torch_values.sum(), plain.linear.weight)[0],
     )
 
 
@@ -96,20 +99,22 @@ def test_a_batch_says_nothing_of_another_when_nothing_is_learned() -> None:
 def test_the_gradients_of_the_largest_value_are_those_of_small_differences() -> None:
     torch.manual_seed(3)
     points, weight, bias = (torch.randn(*size, dtype=torch.float64) for size in ((2, 6, 3), (5, 3), (5,)))
-    learned_from = tuple(one.requires_grad_() for one in (points, weight, bias))
+    learned_from = tuple(tensor.requires_grad_() for tensor in (points, weight, bias))
     assert torch.autograd.gradcheck(LargestOverPoints.apply, learned_from)
 
 
 def test_the_gradients_through_layer_and_largest_value_are_those_of_small_differences() -> None:
     layer, points = layer_and_points((2, 7, 3, 4), 4)
 
-    def of(points: Tensor, weight: Tensor, scale: Tensor, shift: Tensor) -> Tensor:
+    def pooled(points: Tensor, weight: Tensor, scale: Tensor, shift: Tensor) -> Tensor:
         changed = {"weight": weight, "scale": scale, "shift": shift}
-        found: Tensor = torch.func.functional_call(Pooled(layer), {f"layer.{k}": v for k, v in changed.items()}, points)
-        return found
+        pooled_values: Tensor = torch.func.functional_call(
+            Pooled(layer), {f"layer.{k}": v for k, v in changed.items()}, points
+        )
+        return pooled_values
 
-    learned = [one.detach().clone().requires_grad_() for one in (layer.weight, layer.scale, layer.shift)]
-    assert torch.autograd.gradcheck(of, (points.requires_grad_(), *learned))
+    learned = [weight.detach().clone().requires_grad_() for weight in (layer.weight, layer.scale, layer.shift)]
+    assert torch.autograd.gradcheck(pooled, (points.requires_grad_(), *learned))
 
 
 class Pooled(nn.Module):
@@ -126,10 +131,10 @@ class Pooled(nn.Module):
 def test_one_cloud_at_a_time_gives_what_all_at_once_give(sizes: Sizes, seed: int) -> None:
     layer, points = layer_and_points(sizes, seed)
     with torch.no_grad():
-        (values, places), (known, at) = (
+        (values, places), (batched_values, at) = (
             way(points, layer.weight) for way in (point_networks._largest_cached, point_networks._largest)
         )
-    torch.testing.assert_close(values, known)
+    torch.testing.assert_close(values, batched_values)
     assert torch.equal(places, at)
 
 
@@ -138,13 +143,13 @@ def test_of_points_equally_large_one_alone_takes_the_gradient(way: object, monke
     monkeypatch.setattr(point_networks, "_largest_cached", way)
     points = torch.tensor([[[1.0, 0.0], [2.0, 5.0], [2.0, -5.0], [2.0, 1.0]]]).requires_grad_()
     weight = torch.tensor([[1.0, 0.0]]).requires_grad_()
-    found = LargestOverPoints.apply(points, weight, torch.tensor([0.5]))  # type: ignore[no-untyped-call]
-    assert found.tolist() == [[2.5]]
-    to_points, to_weight = gradients(found.sum(), points, weight)
-    taken = [row for row in range(4) if to_points[0, row].any()]
-    assert len(taken) == 1 and taken[0] > 0
-    assert to_points[0, taken[0]].tolist() == [1.0, 0.0]
-    assert to_weight[0].tolist() == points[0, taken[0]].tolist()
+    maxima = LargestOverPoints.apply(points, weight, torch.tensor([0.5]))  # type: ignore[no-untyped-call]
+    assert maxima.tolist() == [[2.5]]
+    to_points, to_weight = gradients(maxima.sum(), points, weight)
+    chosen = [row for row in range(4) if to_points[0, row].any()]
+    assert len(chosen) == 1 and chosen[0] > 0
+    assert to_points[0, chosen[0]].tolist() == [1.0, 0.0]
+    assert to_weight[0].tolist() == points[0, chosen[0]].tolist()
 
 
 def test_a_channel_that_never_moves_becomes_its_shift() -> None:
@@ -158,14 +163,14 @@ def test_points_that_are_not_finite_are_not_passed_over() -> None:
     layer, points = layer_and_points((2, 5, 3, 4), 6)
     layer.eval()
     points[1, 3, 0] = torch.nan
-    found = largest(layer, points)
-    assert torch.isfinite(found[0]).all()
-    assert torch.isnan(found[1]).all()
+    maxima = largest(layer, points)
+    assert torch.isfinite(maxima[0]).all()
+    assert torch.isnan(maxima[1]).all()
 
 
 @pytest.mark.parametrize("clouds", [1, 2, point_networks.FEW, point_networks.FEW + 1, 40])
 def test_rows_of_few_clouds_and_of_many_are_weighed_and_added_up(clouds: int) -> None:
     torch.manual_seed(clouds)
     weights, rows = torch.randn(clouds, 50), torch.randn(clouds, 50, 7)
-    wanted = torch.einsum("co,coi->oi", weights.double(), rows.double())
-    torch.testing.assert_close(point_networks._weighed(weights, rows).double(), wanted, rtol=1e-5, atol=1e-5)
+    expected = torch.einsum("co,coi->oi", weights.double(), rows.double())
+    torch.testing.assert_close(point_networks._weighed(weights, rows).double(), expected, rtol=1e-5, atol=1e-5)

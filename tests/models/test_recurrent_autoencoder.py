@@ -45,24 +45,24 @@ class Plainly(nn.Module):
         header: Any = ours.header
         steps, slides, _ = frames.shape
         if shape.header == "cnn":
-            maps = [nn.functional.max_pool2d(header.encoder(one.view(slides, 1, 6, 10)), 2) for one in frames]
-            features = torch.stack([one.flatten(1) for one in maps])
+            maps = [nn.functional.max_pool2d(header.encoder(part.view(slides, 1, 6, 10)), 2) for part in frames]
+            features = torch.stack([part.flatten(1) for part in maps])
         elif shape.header == "mlp":
-            features = torch.stack([torch.tanh(header.encoder(one)) for one in frames])
+            features = torch.stack([torch.tanh(header.encoder(part)) for part in frames])
         else:
             features = frames
         _, (last, _) = ours.encoder(features)
         z = ours.to_latents(last[0])
-        begun = ours.from_latents(z)
+        initial = ours.from_latents(z)
         if shape.decoder == "D1":
-            state = begun[None], torch.zeros_like(begun)[None]
+            state = initial[None], torch.zeros_like(initial)[None]
             states, _ = ours.decoder(torch.zeros(steps, slides, 1), state)
         else:
-            states, _ = ours.decoder(torch.stack([begun] * steps))
+            states, _ = ours.decoder(torch.stack([initial] * steps))
         out = ours.to_features(states)
         if shape.header == "cnn":
-            ups = [one.view(slides, 3, 2, 3).repeat_interleave(2, 2).repeat_interleave(2, 3) for one in out]
-            out = torch.stack([torch.relu(header.decoder(one)).flatten(1) for one in ups])
+            ups = [part.view(slides, 3, 2, 3).repeat_interleave(2, 2).repeat_interleave(2, 3) for part in out]
+            out = torch.stack([torch.relu(header.decoder(part)).flatten(1) for part in ups])
         elif shape.header == "mlp":
             out = header.decoder(out)
         return z, ours.classifier(z), out
@@ -74,13 +74,15 @@ def test_a_network_says_what_the_same_one_of_plain_layers_says(header: str, chan
     torch.manual_seed(3)
     ours = RecurrentAutoencoder(Shape(channels, 5, header=header, decoder=decoder))
     frames = torch.rand(7, 4, channels)
-    wanted = Plainly(ours)(frames)
-    for found, one in zip(ours(frames), wanted, strict=True):
-        torch.testing.assert_close(found, one, atol=1e-5, rtol=1e-4)
-    grown = torch.autograd.grad(sum(one.square().mean() for one in wanted), list(ours.parameters()), allow_unused=True)
-    told = ours(frames)
+    expected = Plainly(ours)(frames)
+    for ours_part, plain_part in zip(ours(frames), expected, strict=True):
+        torch.testing.assert_close(ours_part, plain_part, atol=1e-5, rtol=1e-4)
+    grown = torch.autograd.grad(
+        sum(plain_part.square().mean() for plain_part in expected), list(ours.parameters()), allow_unused=True
+    )
+    output = ours(frames)
     ours.zero_grad()
-    sum(one.square().mean() for one in told).backward()
+    sum(plain_part.square().mean() for plain_part in output).backward()
     for weight, gradient in zip(ours.parameters(), grown, strict=True):
         wanted_gradient = torch.zeros_like(weight) if gradient is None else gradient
         found_gradient = torch.zeros_like(weight) if weight.grad is None else weight.grad
@@ -93,20 +95,20 @@ def test_unpooling_as_published_uses_the_places_of_the_last_frame() -> None:
     features = header.encode(frames)
     _, indices = nn.functional.max_pool2d(header.encoder(frames[-1].view(2, 1, 6, 10)), 2, return_indices=True)
     maps = nn.functional.max_unpool2d(features[0].view(2, 3, 2, 3), indices, [2, 2])
-    wanted = torch.relu(header.decoder(maps)).flatten(1)
-    torch.testing.assert_close(header.decode(features)[0], wanted)
+    expected = torch.relu(header.decoder(maps)).flatten(1)
+    torch.testing.assert_close(header.decode(features)[0], expected)
 
 
 def test_reconstructed_counts_of_the_convolution_are_never_negative() -> None:
-    told = RecurrentAutoencoder(ROBOSKIN)(torch.randn(6, 3, 60))
-    assert (told.frames >= 0).all()
+    output = RecurrentAutoencoder(ROBOSKIN)(torch.randn(6, 3, 60))
+    assert (output.frames >= 0).all()
 
 
 def test_the_classifier_alone_has_its_last_state_for_latents_and_makes_no_frames() -> None:
     network = RecurrentClassifier(BIOTAC)
-    told = network(torch.rand(6, 3, 19))
-    assert told.frames is None
-    torch.testing.assert_close(network.classifier(told.latents), told.scores)
+    output = network(torch.rand(6, 3, 19))
+    assert output.frames is None
+    torch.testing.assert_close(network.classifier(output.latents), output.scores)
     assert parameters(network) == 39_960 + 90 * 20 + 20
 
 

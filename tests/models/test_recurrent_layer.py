@@ -16,13 +16,13 @@ def test_where_a_layer_would_be_in_float16_it_is_in_float32(
 ) -> None:
     layer, inputs = kind(3, 5), torch.randn(7, 2, 3)
     state = torch.randn(1, 2, 5)
-    given = (state, state) if kind is nn.LSTM else state
-    expected, _ = lstm_layers.through(layer, inputs, given)
+    initial = (state, state) if kind is nn.LSTM else state
+    expected, _ = lstm_layers.through(layer, inputs, initial)
     with torch.autocast("cpu", torch.bfloat16):
-        reduced, _ = lstm_layers.through(layer, inputs, given)
+        reduced, _ = lstm_layers.through(layer, inputs, initial)
         monkeypatch.setattr(lstm_layers, "in_float16", lambda _: True)
-        found, _ = lstm_layers.through(layer, inputs, given)
-    assert torch.equal(found, expected) and found.dtype == torch.float32
+        widened, _ = lstm_layers.through(layer, inputs, initial)
+    assert torch.equal(widened, expected) and widened.dtype == torch.float32
     assert not torch.equal(reduced, expected)
 
 
@@ -31,5 +31,5 @@ def test_so_is_a_layer_of_weights_that_were_computed_in_fewer_digits(monkeypatch
     weights = torch.randn(20, 3), torch.randn(20, 5).bfloat16(), torch.randn(20)
     state = torch.randn(2, 5).bfloat16(), torch.randn(2, 5)
     with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
-        found, _ = lstm(torch.randn(4, 2, 3), state, weights)
-    assert found.dtype == torch.float32
+        states, _ = lstm(torch.randn(4, 2, 3), state, weights)
+    assert states.dtype == torch.float32

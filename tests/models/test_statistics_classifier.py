@@ -32,13 +32,13 @@ def pressed(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
 def test_every_statistic_of_a_channel_is_that_of_its_root() -> None:
     x = np.array([[[0, 1], [4, 1], [9, 1], [-16, 1], [0, 1], [25, 1]]], np.float32)  # (slide, time, channel)
     root = np.array([0, 2, 3, -4, 0, 5.0])
-    steps = np.array([2, 1, 7, 4, 5])  # between successive roots, without their sign
+    steps = np.array([2, 1, 7, 4, 5])  # steps between successive roots, without their sign
     turns = np.array([1, 8, 11, 1])  # +2 +1 -7 +4 +5: changes of the step, without their sign
-    wanted = [
+    expected = [
         root.mean(),
         np.sqrt(np.mean((root - root.mean()) ** 2)),
         steps.mean(),
-        -2.0,  # of the sorted -4 0 0 2 3 5, half-way from the first to the second: 0.1 of five steps
+        -2.0,  # quantile of the sorted -4 0 0 2 3 5, half-way from the first to the second: 0.1 of five steps
         0.0,
         1.0,
         2.75,
@@ -51,9 +51,9 @@ def test_every_statistic_of_a_channel_is_that_of_its_root() -> None:
         -0.5,
         2.5,
     ]
-    found = statistics(x)[0].reshape(len(wanted), 2 + ACROSS)
-    np.testing.assert_allclose(found[:, 0], wanted, rtol=1e-6, atol=1e-7)
-    np.testing.assert_allclose(found[:, 1], [1, 0, 0, 1, 1, 1, 1, 1, 1, 1, 0, 0, 1, 1, 1], atol=1e-7)
+    values = statistics(x)[0].reshape(len(expected), 2 + ACROSS)
+    np.testing.assert_allclose(values[:, 0], expected, rtol=1e-6, atol=1e-7)
+    np.testing.assert_allclose(values[:, 1], [1, 0, 0, 1, 1, 1, 1, 1, 1, 1, 0, 0, 1, 1, 1], atol=1e-7)
 
 
 def test_six_channels_describe_all_others_at_each_moment() -> None:

@@ -9,11 +9,11 @@ from tacpipe.models.threads import one_thread
 
 
 def test_products_of_matrices_have_one_thread_in_the_block_and_as_many_as_before_after_it() -> None:
-    several = ThreadpoolController().select(user_api="blas")  # which round otherwise with another number of threads
-    with several.limit(limits=2):
+    libraries = ThreadpoolController().select(user_api="blas")  # their rounding depends on the number of threads
+    with libraries.limit(limits=2):
         with one_thread():
-            assert [one["num_threads"] for one in several.info()] == [1] * len(several) != []
-        assert [one["num_threads"] for one in several.info()] == [2] * len(several)
+            assert [library["num_threads"] for library in libraries.info()] == [1] * len(libraries) != []
+        assert [library["num_threads"] for library in libraries.info()] == [2] * len(libraries)
 
 
 def test_a_block_within_another_leaves_one_thread_until_the_outer_one_ends() -> None:

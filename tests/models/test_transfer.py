@@ -1,4 +1,4 @@
-"""What sensors tell one another of classes, against normal distributions and the rule of Bayes by another road."""
+"""Compare classes shared between sensors with normal distributions and the rule of Bayes by another road."""
 
 from __future__ import annotations
 
@@ -15,127 +15,133 @@ MEANS = 2 * np.random.default_rng(0).normal(size=(CLASSES, WIDE))
 
 
 def sided(
-    classes: object, each: int, gain: float = 1.0, offset: float = 0.0, noise: float = 0.3, seed: int = 1
+    classes: object, count: int, gain: float = 1.0, offset: float = 0.0, noise: float = 0.3, seed: int = 1
 ) -> Labelled:
     """Slides of some classes, as a sensor with this gain and offset in every feature feels them."""
-    labels = np.repeat(np.array(classes), each)
+    labels = np.repeat(np.array(classes), count)
     rng = np.random.default_rng(seed)
     return Labelled(offset + gain * MEANS[labels] + noise * rng.normal(size=(len(labels), WIDE)), labels)
 
 
-def named(of: Transfer, gaussians: Gaussians, slides: Labelled) -> float:
+def named(transfer: Transfer, gaussians: Gaussians, slides: Labelled) -> float:
     """The share of slides named rightly."""
-    return float((of.classes[gaussians.scores(slides.features).argmax(axis=1)] == slides.labels).mean())
+    return float((transfer.classes[gaussians.scores(slides.features).argmax(axis=1)] == slides.labels).mean())
 
 
 def test_classes_that_only_another_sensor_was_told_are_named() -> None:
-    found = Transfer.fit(sided(range(6), 8, 0.5, 3.0), [sided(range(CLASSES), 8, seed=2)])
+    transfer = Transfer.fit(sided(range(6), 8, 0.5, 3.0), [sided(range(CLASSES), 8, seed=2)])
     new = sided(range(6, CLASSES), 30, 0.5, 3.0, seed=3)
-    assert named(found, found.learned, new) > 0.9
-    assert named(found, found.expected, new) > 0.9
-    assert named(found, found.learned, sided(range(6), 30, 0.5, 3.0, seed=4)) > 0.95
+    assert named(transfer, transfer.learned, new) > 0.9
+    assert named(transfer, transfer.expected, new) > 0.9
+    assert named(transfer, transfer.learned, sided(range(6), 30, 0.5, 3.0, seed=4)) > 0.95
 
 
 def test_what_is_expected_is_the_other_sensors_mean_by_gain_and_offset() -> None:
-    own, other = sided(range(6), 400, -0.5, 3.0, 0.05), sided(range(CLASSES), 400, noise=0.05, seed=2)
-    found = Transfer.fit(own, [other])
-    np.testing.assert_allclose(found.learned.mean[6:], 3 - 0.5 * MEANS[6:], atol=0.05)
-    np.testing.assert_allclose(found.expected.mean, 3 - 0.5 * MEANS, atol=0.05)
+    slides, foreign = sided(range(6), 400, -0.5, 3.0, 0.05), sided(range(CLASSES), 400, noise=0.05, seed=2)
+    transfer = Transfer.fit(slides, [foreign])
+    np.testing.assert_allclose(transfer.learned.mean[6:], 3 - 0.5 * MEANS[6:], atol=0.05)
+    np.testing.assert_allclose(transfer.expected.mean, 3 - 0.5 * MEANS, atol=0.05)
 
 
 def test_sensors_that_have_nothing_in_common_expect_nothing_of_one_another() -> None:
     strange = np.random.default_rng(7).normal(size=(CLASSES, WIDE))
-    other = sided(range(CLASSES), 8, seed=2)
+    foreign = sided(range(CLASSES), 8, seed=2)
     right = []
     for seed in range(20):
         shuffled = np.random.default_rng(seed).permutation(strange)
-        own = Labelled(shuffled[np.repeat(np.arange(6), 8)], np.repeat(np.arange(6), 8))
+        slides = Labelled(shuffled[np.repeat(np.arange(6), 8)], np.repeat(np.arange(6), 8))
         rng = np.random.default_rng([seed, 1])
-        found = Transfer.fit(Labelled(own.features + 0.1 * rng.normal(size=own.features.shape), own.labels), [other])
-        right.append(named(found, found.expected, Labelled(shuffled[6:], np.arange(6, CLASSES))))
+        transfer = Transfer.fit(
+            Labelled(slides.features + 0.1 * rng.normal(size=slides.features.shape), slides.labels), [foreign]
+        )
+        right.append(named(transfer, transfer.expected, Labelled(shuffled[6:], np.arange(6, CLASSES))))
     assert np.mean(right) < 0.2  # chance is 0.1
 
 
 def test_a_few_slides_correct_what_is_expected_by_the_rule_of_bayes() -> None:
-    own, other = sided(np.r_[np.repeat(range(5), 6), 5, 5], 1, 0.5, 1.0), sided(range(CLASSES), 8, seed=2)
-    found = Transfer.fit(own, [other])
+    slides, foreign = sided(np.r_[np.repeat(range(5), 6), 5, 5], 1, 0.5, 1.0), sided(range(CLASSES), 8, seed=2)
+    transfer = Transfer.fit(slides, [foreign])
     number = 4  # a class of six slides
-    left = own.features - np.stack([own.features[own.labels == one].mean(axis=0) for one in own.labels])
-    scale = left.std(axis=0)
-    within = LedoitWolf(assume_centered=True).fit(left / scale).covariance_ * np.outer(scale, scale) * 32 / 26
-    prior = found.expected.covariance[number] - within
-    precise = np.linalg.inv(np.linalg.inv(prior) + 6 * np.linalg.inv(within))
+    residuals = slides.features - np.stack(
+        [slides.features[slides.labels == label].mean(axis=0) for label in slides.labels]
+    )
+    scale = residuals.std(axis=0)
+    covariance = LedoitWolf(assume_centered=True).fit(residuals / scale).covariance_ * np.outer(scale, scale) * 32 / 26
+    prior = transfer.expected.covariance[number] - covariance
+    precise = np.linalg.inv(np.linalg.inv(prior) + 6 * np.linalg.inv(covariance))
     mean = precise @ (
-        np.linalg.inv(prior) @ found.expected.mean[number]
-        + 6 * np.linalg.inv(within) @ own.features[own.labels == number].mean(axis=0)
+        np.linalg.inv(prior) @ transfer.expected.mean[number]
+        + 6 * np.linalg.inv(covariance) @ slides.features[slides.labels == number].mean(axis=0)
     )
     np.testing.assert_allclose(np.diag(np.diag(prior)), prior, atol=1e-12)
-    np.testing.assert_allclose(found.learned.mean[number], mean, rtol=1e-6)
-    np.testing.assert_allclose(found.learned.covariance[number], within + precise, rtol=1e-6)
+    np.testing.assert_allclose(transfer.learned.mean[number], mean, rtol=1e-6)
+    np.testing.assert_allclose(transfer.learned.covariance[number], covariance + precise, rtol=1e-6)
 
 
 def test_many_slides_of_its_own_outweigh_what_others_expect() -> None:
     wrong = sided(range(CLASSES), 8, seed=2)
     wrong = Labelled(np.random.default_rng(3).permutation(wrong.features), wrong.labels)
-    own = sided(range(CLASSES), 500)
-    found = Transfer.fit(own, [wrong])
-    means = np.stack([own.features[own.labels == one].mean(axis=0) for one in range(CLASSES)])
-    np.testing.assert_allclose(found.learned.mean, means, atol=0.01)
+    slides = sided(range(CLASSES), 500)
+    transfer = Transfer.fit(slides, [wrong])
+    means = np.stack([slides.features[slides.labels == label].mean(axis=0) for label in range(CLASSES)])
+    np.testing.assert_allclose(transfer.learned.mean, means, atol=0.01)
 
 
 def test_few_slides_are_told_better_with_another_sensor_than_without() -> None:
     new = sided(range(CLASSES), 40, 0.5, 3.0, 1.0, seed=3)
-    with_other, alone = [], []
+    with_other, without = [], []
     for seed in range(5):
-        own = sided(range(CLASSES), 2, 0.5, 3.0, 1.0, seed=10 + seed)
-        found = Transfer.fit(own, [sided(range(CLASSES), 50, noise=0.3, seed=2)])
-        with_other.append(named(found, found.learned, new))
-        found = Transfer.fit(own)
-        alone.append(named(found, found.learned, new))
-    assert np.mean(with_other) > np.mean(alone) + 0.05
+        slides = sided(range(CLASSES), 2, 0.5, 3.0, 1.0, seed=10 + seed)
+        transfer = Transfer.fit(slides, [sided(range(CLASSES), 50, noise=0.3, seed=2)])
+        with_other.append(named(transfer, transfer.learned, new))
+        transfer = Transfer.fit(slides)
+        without.append(named(transfer, transfer.learned, new))
+    assert np.mean(with_other) > np.mean(without) + 0.05
 
 
 def test_the_more_exact_of_two_sensors_counts_more() -> None:
     exact, vague = sided(range(CLASSES), 20, noise=0.01, seed=2), sided(range(CLASSES), 20, seed=3)
     rng = np.random.default_rng(4)
     vague = Labelled(vague.features + rng.normal(size=(CLASSES, WIDE))[vague.labels], vague.labels)
-    own = sided(range(6), 20, noise=0.01)
+    slides = sided(range(6), 20, noise=0.01)
     errors = {
-        name: np.abs(Transfer.fit(own, others).learned.mean[6:] - MEANS[6:]).mean()
-        for name, others in {"exact": [exact], "vague": [vague], "both": [vague, exact]}.items()
+        name: np.abs(Transfer.fit(slides, sensors).learned.mean[6:] - MEANS[6:]).mean()
+        for name, sensors in {"exact": [exact], "vague": [vague], "both": [vague, exact]}.items()
     }
     assert errors["both"] < 0.1 * errors["vague"]
     assert errors["both"] < 2 * errors["exact"]
 
 
 def test_scores_are_logarithms_of_normal_densities() -> None:
-    found, new = (
+    transfer, new = (
         Transfer.fit(sided(range(6), 8), [sided(range(CLASSES), 8, seed=2)]),
         sided(range(CLASSES), 3, seed=5),
     )
     expected = np.array(
         [
             multivariate_normal(mean, cov + STEADY * np.trace(cov) / WIDE * np.eye(WIDE)).logpdf(new.features)
-            for mean, cov in zip(found.learned.mean, found.learned.covariance, strict=True)
+            for mean, cov in zip(transfer.learned.mean, transfer.learned.covariance, strict=True)
         ]
     ).T
-    np.testing.assert_allclose(found.learned.scores(new.features), expected + WIDE / 2 * np.log(2 * np.pi), rtol=1e-5)
+    np.testing.assert_allclose(
+        transfer.learned.scores(new.features), expected + WIDE / 2 * np.log(2 * np.pi), rtol=1e-5
+    )
 
 
 def test_nothing_is_expected_of_classes_that_no_other_sensor_knows() -> None:
-    found = Transfer.fit(sided(range(CLASSES), 8), [sided(range(7), 8, seed=2)])
-    scores = found.expected.scores(MEANS)
+    transfer = Transfer.fit(sided(range(CLASSES), 8), [sided(range(7), 8, seed=2)])
+    scores = transfer.expected.scores(MEANS)
     assert np.isfinite(scores[:, :7]).all()
     assert np.isneginf(scores[:, 7:]).all()
-    assert named(found, found.learned, sided(range(CLASSES), 20, seed=3)) > 0.95
+    assert named(transfer, transfer.learned, sided(range(CLASSES), 20, seed=3)) > 0.95
 
 
 def test_tensors_hold_everything() -> None:
-    found = Transfer.fit(sided(range(6), 8), [sided(range(CLASSES), 8, seed=2)])
-    again = Transfer.from_tensors(found.to_tensors())
-    for one, other in ((found.learned, again.learned), (found.expected, again.expected)):
-        assert np.array_equal(one.scores(MEANS), other.scores(MEANS))
-    assert again.classes.tolist() == list(range(CLASSES))
+    transfer = Transfer.fit(sided(range(6), 8), [sided(range(CLASSES), 8, seed=2)])
+    restored = Transfer.from_tensors(transfer.to_tensors())
+    for stored, read_back in ((transfer.learned, restored.learned), (transfer.expected, restored.expected)):
+        assert np.array_equal(stored.scores(MEANS), read_back.scores(MEANS))
+    assert restored.classes.tolist() == list(range(CLASSES))
 
 
 def test_slides_that_teach_nothing_are_refused() -> None:

@@ -35,8 +35,8 @@ def windows(count: int = 6, features: int = len(LAYOUT), context: int = CONTEXT,
     return Windows(touch, arm, 0.04 + 0.001 * drawn(context, count))
 
 
-def ahead(given: Windows) -> Tensor:
+def ahead(inputs: Windows) -> Tensor:
     """Touch that moves on from the last row (horizon, window, feature)."""
     generator = torch.Generator().manual_seed(2)
-    shape = (given.horizon, *given.touch.shape[1:])
-    return given.touch[-1] + 10 * torch.randn(*shape, generator=generator).cumsum(0)
+    shape = (inputs.horizon, *inputs.touch.shape[1:])
+    return inputs.touch[-1] + 10 * torch.randn(*shape, generator=generator).cumsum(0)

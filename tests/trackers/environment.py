@@ -20,11 +20,11 @@ def make(folder: Path) -> Path:
     venv.create(folder, with_pip=True, clear=True)
     python = folder / "bin" / "python"
     script = "import sysconfig; print(sysconfig.get_path('purelib'))"
-    found = subprocess.run([str(python), "-c", script], capture_output=True, text=True, check=True)
+    process = subprocess.run([str(python), "-c", script], capture_output=True, text=True, check=True)
     install = [str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
     subprocess.run([*install, *NEEDED], check=True)
-    beside = f"import site; site.addsitedir({sysconfig.get_path('purelib')!r})\n"  # behind its own packages
-    (Path(found.stdout.strip()) / "tests.pth").write_text(beside)
+    path_line = f"import site; site.addsitedir({sysconfig.get_path('purelib')!r})\n"
+    (Path(process.stdout.strip()) / "tests.pth").write_text(path_line)
     return python
 
 

@@ -1,4 +1,4 @@
-"""What TensorBoard's own reader finds in the event files of a folder, as JSON: run in the environment of the trackers."""
+"""Print as JSON the content of event files that TensorBoard's own reader finds, in the environment of the trackers."""
 
 from __future__ import annotations
 
@@ -7,12 +7,13 @@ import sys
 
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-found = EventAccumulator(sys.argv[1])
-found.Reload()
-scalars = {tag: [(event.step, event.value) for event in found.Scalars(tag)] for tag in found.Tags()["scalars"]}
+events = EventAccumulator(sys.argv[1])
+events.Reload()
+scalars = {tag: [(event.step, event.value) for event in events.Scalars(tag)] for tag in events.Tags()["scalars"]}
 texts = {
-    tag: [value.tensor_proto.string_val[0].decode() for value in found.Tensors(tag)] for tag in found.Tags()["tensors"]
+    tag: [value.tensor_proto.string_val[0].decode() for value in events.Tensors(tag)]
+    for tag in events.Tags()["tensors"]
 }
-plugins = found.summary_metadata
-hyper = any(one.plugin_data.plugin_name == "hparams" for one in plugins.values())
+plugins = events.summary_metadata
+hyper = any(plugin.plugin_data.plugin_name == "hparams" for plugin in plugins.values())
 print(json.dumps({"scalars": scalars, "texts": texts, "hparams": hyper}))

@@ -23,7 +23,7 @@ from tests.chain import TRAIN
 from tests.conftest import Lab
 
 PYTHON = os.environ.get("TACPIPE_TRACKERS_PYTHON", "")
-PATIENCE_S = 300.0  # that no server takes to start unless it hangs
+PATIENCE_S = 300.0  # longest time for a server to start
 pytestmark = [
     pytest.mark.long,
     pytest.mark.skipif(not PYTHON, reason="needs MLflow and W&B in an environment of their own: make test-trackers"),
@@ -76,7 +76,7 @@ def server(tmp_path: Path) -> Iterator[str]:
         process.wait()
 
 
-def asked(address: str, path: str, value: Mapping[str, Any] | None = None) -> Any:
+def get_json(address: str, path: str, value: Mapping[str, Any] | None = None) -> Any:
     """Return what MLflow's REST API answers."""
     content = None if value is None else json.dumps(value).encode()
     request = urllib.request.Request(f"{address}/api/2.0/mlflow/{path}", content, {"Content-Type": "application/json"})
@@ -87,29 +87,29 @@ def asked(address: str, path: str, value: Mapping[str, Any] | None = None) -> An
 def test_each_product_has_the_params_the_epochs_and_the_figures(tracked: Lab, server: str) -> None:
     folder = tracked.folder
     options = f"--track tensorboard --track mlflow:{server} --track wandb --json"
-    done = tool(folder, f"-m tacpipe {TRAIN} --epochs 3 -o models/x {options}")
-    assert done.returncode == 0, done.stderr
-    name = f"models/x-{json.loads(done.stdout)['key'][:8]}"
+    process = tool(folder, f"-m tacpipe {TRAIN} --epochs 3 -o models/x {options}")
+    assert process.returncode == 0, process.stderr
+    name = f"models/x-{json.loads(process.stdout)['key'][:8]}"
     lines = history(folder, "models/x")
     best = min(line["val_loss"] for line in lines)
 
     read = tool(folder, f"{Path(__file__).with_name('reading.py')} runs/{name}")
     board = json.loads(read.stdout)
     for metric in ("train_loss", "val_loss"):
-        assert [tuple(one) for one in board["scalars"][metric]] == pairs(lines, metric)
+        assert [tuple(entry) for entry in board["scalars"][metric]] == pairs(lines, metric)
     assert [step for step, _ in board["scalars"]["learning_rate"]] == [1, 2, 3]
     assert board["scalars"]["best/loss"][0][1] == pytest.approx(best) and board["hparams"]
     assert "| hidden | 16 |" in board["texts"]["params/text_summary"][0]
     assert board["texts"]["path/text_summary"] == ["models/x"]
 
-    experiment = asked(server, "experiments/get-by-name?experiment_name=tacpipe")["experiment"]
-    (run,) = asked(server, "runs/search", {"experiment_ids": [experiment["experiment_id"]]})["runs"]
+    experiment = get_json(server, "experiments/get-by-name?experiment_name=tacpipe")["experiment"]
+    (run,) = get_json(server, "runs/search", {"experiment_ids": [experiment["experiment_id"]]})["runs"]
     assert (run["info"]["run_name"], run["info"]["status"]) == (name, "FINISHED")
-    params = {one["key"]: one["value"] for one in run["data"]["params"]}
+    params = {entry["key"]: entry["value"] for entry in run["data"]["params"]}
     assert (params["hidden"], params["epochs"], params["stage"]) == ("16", "3", "train.forward")
-    kept = asked(server, f"metrics/get-history?run_id={run['info']['run_id']}&metric_key=val_loss")["metrics"]
-    assert [(one["step"], one["value"]) for one in kept] == pairs(lines, "val_loss")
-    assert {one["key"]: one["value"] for one in run["data"]["tags"]}["tacpipe.path"] == "models/x"
+    stored = get_json(server, f"metrics/get-history?run_id={run['info']['run_id']}&metric_key=val_loss")["metrics"]
+    assert [(entry["step"], entry["value"]) for entry in stored] == pairs(lines, "val_loss")
+    assert {entry["key"]: entry["value"] for entry in run["data"]["tags"]}["tacpipe.path"] == "models/x"
 
     (offline,) = (folder / "wandb").glob("offline-run-*")
     content = next(offline.glob("*.wandb")).read_bytes()
@@ -119,25 +119,25 @@ def test_each_product_has_the_params_the_epochs_and_the_figures(tracked: Lab, se
 def test_a_run_that_is_tracked_again_is_the_same_run_with_each_epoch_once(tracked: Lab, server: str) -> None:
     folder = tracked.folder
     for _ in range(2):
-        done = tool(folder, f"-m tacpipe track models/forward results/forward --to mlflow:{server} --to tensorboard")
-        assert done.returncode == 0, done.stderr
-    first, second = done.stdout.split()
+        process = tool(folder, f"-m tacpipe track models/forward results/forward --to mlflow:{server} --to tensorboard")
+        assert process.returncode == 0, process.stderr
+    first, second = process.stdout.split()
     lines = history(folder, "models/forward")
 
-    experiment = asked(server, "experiments/get-by-name?experiment_name=tacpipe")["experiment"]
-    runs = asked(server, "runs/search", {"experiment_ids": [experiment["experiment_id"]]})["runs"]
+    experiment = get_json(server, "experiments/get-by-name?experiment_name=tacpipe")["experiment"]
+    runs = get_json(server, "runs/search", {"experiment_ids": [experiment["experiment_id"]]})["runs"]
     by_name = {run["info"]["run_name"]: run for run in runs}
     assert set(by_name) == {first, second} and len(runs) == 2
-    kept = asked(server, f"metrics/get-history?run_id={by_name[first]['info']['run_id']}&metric_key=val_loss")
-    assert [one["step"] for one in kept["metrics"]] == [line["epoch"] for line in lines]
-    assert "gain" in {one["key"] for one in by_name[second]["data"]["metrics"]}
+    stored = get_json(server, f"metrics/get-history?run_id={by_name[first]['info']['run_id']}&metric_key=val_loss")
+    assert [entry["step"] for entry in stored["metrics"]] == [line["epoch"] for line in lines]
+    assert "gain" in {entry["key"] for entry in by_name[second]["data"]["metrics"]}
     board = json.loads(tool(folder, f"{Path(__file__).with_name('reading.py')} runs/{first}").stdout)
-    assert [tuple(one) for one in board["scalars"]["val_loss"]] == pairs(lines, "val_loss")
+    assert [tuple(entry) for entry in board["scalars"]["val_loss"]] == pairs(lines, "val_loss")
 
 
 def test_a_server_that_does_not_answer_ends_no_training(tracked: Lab) -> None:
-    done = tool(tracked.folder, f"-m tacpipe {TRAIN} --epochs 3 -o models/y --track mlflow:http://127.0.0.1:9")
+    process = tool(tracked.folder, f"-m tacpipe {TRAIN} --epochs 3 -o models/y --track mlflow:http://127.0.0.1:9")
 
-    assert done.returncode == 0 and done.stdout == "models/y\n"
-    assert done.stderr.count("failed and is left out") == 1
+    assert process.returncode == 0 and process.stdout == "models/y\n"
+    assert process.stderr.count("failed and is left out") == 1
     assert len(history(tracked.folder, "models/y")) == 3

@@ -1,4 +1,4 @@
-"""What ``--track`` gives to trackers, and that none of them changes or ends a training."""
+"""Check the calls of trackers, and that no tracker changes or ends a training."""
 
 from __future__ import annotations
 
@@ -50,8 +50,8 @@ class Kept:
         self._keep("end", path, dict(figures))
 
 
-def training(folder: Path, *kept: Kept, loss_of: Any = loss) -> tuple[Trained, Tracking]:
-    tracked = Tracking({f"kept{number}": one for number, one in enumerate(kept)}, "m-1", {"a": 1})
+def training(folder: Path, *trackers: Kept, loss_of: Any = loss) -> tuple[Trained, Tracking]:
+    tracked = Tracking({f"kept{number}": tracker for number, tracker in enumerate(trackers)}, "m-1", {"a": 1})
     with following.tracked([tracked]), following.in_workspace(folder):
         return run(folder, loss_of), tracked
 
@@ -61,42 +61,42 @@ def history(lines: list[dict[str, Any]]) -> bytes:
 
 
 def test_a_tracker_gets_params_then_every_epoch_then_the_figures_and_the_path(tmp_path: Path) -> None:
-    kept = Kept()
-    trained, tracked = training(tmp_path, kept)
+    tracker = Kept()
+    trained, tracked = training(tmp_path, tracker)
     files = {"config.json": json.dumps(CONFIG).encode(), "history.jsonl": history(trained.history)}
     tracked.finish(Path("models/m"), files)  # no epoch of the history is given again
 
-    assert kept.calls[0] == ("start", "m-1", {"a": 1})
-    for call, line in zip(kept.calls[1:-1], trained.history, strict=True):
+    assert tracker.calls[0] == ("start", "m-1", {"a": 1})
+    for call, line in zip(tracker.calls[1:-1], trained.history, strict=True):
         losses = {name: line[name] for name in ("train_loss", "val_loss")}
         assert call == ("line", line["epoch"], {**losses, "learning_rate": SCHEDULE.learning_rate})
-    assert kept.calls[-1] == ("end", Path("models/m"), {"best/loss": 0.25, "best/epoch": 2.0})
+    assert tracker.calls[-1] == ("end", Path("models/m"), {"best/loss": 0.25, "best/epoch": 2.0})
 
 
 def test_epochs_whose_messages_did_not_come_are_given_at_the_end() -> None:
-    kept = Kept()
-    tracked, line = Tracking({"kept": kept}, "m-1", {}), {"train_loss": 0.5, "val_loss": 0.25}
+    tracker = Kept()
+    tracked, line = Tracking({"kept": tracker}, "m-1", {}), {"train_loss": 0.5, "val_loss": 0.25}
     tracked.begin(following.Network(3), [])
     tracked.line({"epoch": 1, **line}, 0.5)
     lines = [{"epoch": epoch, **line} for epoch in (1, 2, 3)]
     tracked.finish(Path("models/m"), {"config.json": json.dumps(CONFIG).encode(), "history.jsonl": history(lines)})
 
-    assert [call[1] for call in kept.calls if call[0] == "line"] == [1, 2, 3]
+    assert [call[1] for call in tracker.calls if call[0] == "line"] == [1, 2, 3]
 
 
-@pytest.mark.parametrize("where", ["start", "line", "end"])
+@pytest.mark.parametrize("method", ["start", "line", "end"])
 def test_a_tracker_that_fails_is_reported_once_and_changes_no_bit(
-    tmp_path: Path, where: str, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, method: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    alone = run(tmp_path / "alone")
-    failing, other = Kept(where), Kept()
-    trained, tracked = training(tmp_path / "tracked", failing, other)
+    untracked = run(tmp_path / "alone")
+    failing, working = Kept(method), Kept()
+    trained, tracked = training(tmp_path / "tracked", failing, working)
     tracked.finish(Path("m"), {})
 
-    assert same(trained, alone)
+    assert same(trained, untracked)
     assert capsys.readouterr().err.count("kept0 failed") == 1 == len(tracked.failures)
-    assert [call[0] for call in failing.calls].count(where) == 1 and failing.calls[-1][0] == where
-    assert [call[0] for call in other.calls] == ["start", *["line"] * len(alone.history), "end"]
+    assert [call[0] for call in failing.calls].count(method) == 1 and failing.calls[-1][0] == method
+    assert [call[0] for call in working.calls] == ["start", *["line"] * len(untracked.history), "end"]
 
 
 def test_a_resumed_training_gives_the_epochs_before_the_interruption_too(tmp_path: Path) -> None:
@@ -126,10 +126,10 @@ def test_lines_of_several_networks_are_told_apart_and_nested_figures_named_by_th
         {"epoch": 1, "val_loss": 0.5, "val": {"biotac": {"accuracy": 0.25}}, "best": True, "target": name, "network": 0}
         for name in ("pdc_th", "e_th")
     ]
-    kept = Kept()
-    Tracking({"kept": kept}, "m", {}).finish(Path("m"), {"history.jsonl": history(lines)})
+    tracker = Kept()
+    Tracking({"kept": tracker}, "m", {}).finish(Path("m"), {"history.jsonl": history(lines)})
 
-    assert [call[2] for call in kept.calls[1:-1]] == [
+    assert [call[2] for call in tracker.calls[1:-1]] == [
         {f"{name}/0/val_loss": 0.5, f"{name}/0/val/biotac/accuracy": 0.25} for name in ("pdc_th", "e_th")
     ]
 
@@ -139,9 +139,9 @@ def test_a_result_gives_its_summary_or_that_of_its_headlines_where_it_has_none()
         {"headline.json": headline.write([ONE])},
         {"headline.json": headline.write([ONE]), "summary.json": b'{"gain": 0.1, "mae_t_1": 7.5}'},
     ):
-        kept = Kept()
-        Tracking({"kept": kept}, "r", {}).finish(Path("r"), files)
-        (_, _, figures) = kept.calls[-1]
+        tracker = Kept()
+        Tracking({"kept": tracker}, "r", {}).finish(Path("r"), files)
+        (_, _, figures) = tracker.calls[-1]
         assert figures["gain"] == 0.1 and figures["mae_t_1"] == 7.5
 
 
@@ -161,11 +161,11 @@ def test_an_unknown_tracker_is_a_usage_error_before_anything_is_trained(lab: Lab
 
 
 def test_stages_that_train_or_evaluate_can_be_tracked_and_no_others() -> None:
-    found = {name for name in registry.stages() if registry.load(name).tracked}
+    tracked_stages = {name for name in registry.stages() if registry.load(name).tracked}
     built_in = {
         name for name, target in registry.stages().items() if target.startswith(("tacpipe.", "tacpipe_stages."))
     }
-    assert found & built_in == {
+    assert tracked_stages & built_in == {
         *("train.forward", "train.material", "train.touch", "compress.autoencoder", "evaluate"),
     }
 
@@ -177,7 +177,7 @@ def test_tracked_or_not_a_model_has_the_same_bytes_and_key(tracked: Lab) -> None
     options = "--track keeping --track failing:line --rerun --json"
     ran = tracked.run(f"{TRAIN} --epochs 3 -o models/tracked {options}")
 
-    assert json.loads(ran.out)["key"] == plain["key"]  # and standard output holds nothing else
+    assert json.loads(ran.out)["key"] == plain["key"]  # standard output holds nothing else
     assert tracked.manifest("models/tracked").content == tracked.manifest("models/plain").content
     assert ran.err.count("failing:line failed") == 1
     calls = [json.loads(line) for line in (tracked.folder / "kept.jsonl").read_text().splitlines()]
@@ -188,19 +188,19 @@ def test_tracked_or_not_a_model_has_the_same_bytes_and_key(tracked: Lab) -> None
 
 @pytest.mark.long
 def test_a_hit_gives_the_stored_history_and_a_result_its_figures(tracked: Lab) -> None:
-    again = tracked.run(f"{TRAIN} --epochs 2 -o models/forward --track keeping")
+    repeated = tracked.run(f"{TRAIN} --epochs 2 -o models/forward --track keeping")
     tracked.run("track models/forward --to keeping:stored.jsonl")
     tracked.run(
         "evaluate models/forward data/latents --split data/split -o results/forward --track keeping:figures.jsonl"
     )
-    one, other, figures = (
+    model_calls, result_calls, figures = (
         [json.loads(line) for line in (tracked.folder / f"{name}.jsonl").read_text().splitlines()]
         for name in ("kept", "stored", "figures")
     )
 
-    assert "0 ran, 1 reused" in again.err
-    assert [call[0] for call in one] == ["start", "line", "line", "end"]
-    assert [call[:2] for call in other] == [call[:2] for call in one]  # the same run, by its name
+    assert "0 ran, 1 reused" in repeated.err
+    assert [call[0] for call in model_calls] == ["start", "line", "line", "end"]
+    assert [call[:2] for call in result_calls] == [call[:2] for call in model_calls]  # the same run, by its name
     assert {"gain", "n"} <= set(figures[-1][2]) and figures[0][2]["hidden"] == 16
 
 

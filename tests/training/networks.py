@@ -15,7 +15,7 @@ from tests.tasks.forward import trials
 from tests.tasks.material import textures
 from tests.tasks.touch import handmade
 
-Trains = Callable[..., Mapping[str, bytes]]  # of a workspace and params: the files of a model
+Trains = Callable[..., Mapping[str, bytes]]  # functions of a workspace and params that return the files of a model
 RAEC: dict[str, Any] = {"architecture": "raec", "epochs": 3, "align_from": 1, "learning_rate": 1e-3}
 PATCHES: dict[str, Any] = {"architecture": "patches", "inputs": "xyz"}
 POINTNET: dict[str, Any] = dict(handmade.POINTNET)
@@ -46,5 +46,5 @@ def losses(files: Mapping[str, bytes]) -> list[float]:
 
 def weights(files: Mapping[str, bytes]) -> dict[str, Tensor]:
     """Return a model's tensors by name."""
-    found: dict[str, Tensor] = load(files["model.safetensors"])
-    return found
+    tensors: dict[str, Tensor] = load(files["model.safetensors"])
+    return tensors

@@ -20,8 +20,8 @@ def _network() -> nn.Sequential:
 def _gradients(network: nn.Sequential, step: int) -> None:
     """Compute gradients of a batch; in every third step the last layer is not reached."""
     rows = torch.randn(11, 5, generator=torch.Generator().manual_seed(step))
-    found = network[:3](rows) if step % 3 == 2 else network(rows)
-    found.square().mean().backward()
+    outputs = network[:3](rows) if step % 3 == 2 else network(rows)
+    outputs.square().mean().backward()
 
 
 @pytest.mark.parametrize("weight_decay", [0.0, 0.01])
@@ -29,40 +29,40 @@ def test_each_step_gives_the_bits_of_torch_optim_adam_also_where_some_weights_ha
     weight_decay: float,
 ) -> None:
     ours, theirs = _network(), _network()
-    own = Adam(ours.parameters(), 0.01, weight_decay)
+    optimiser = Adam(ours.parameters(), 0.01, weight_decay)
     torchs = torch.optim.Adam(theirs.parameters(), lr=0.01, weight_decay=weight_decay, fused=True)
 
     for step in range(12):
-        own.learning_rate = torchs.param_groups[0]["lr"] = 0.01 / (step + 1)
-        own.zero_grad()
+        optimiser.learning_rate = torchs.param_groups[0]["lr"] = 0.01 / (step + 1)
+        optimiser.zero_grad()
         torchs.zero_grad(set_to_none=True)
         _gradients(ours, step)
         _gradients(theirs, step)
-        own.step()
+        optimiser.step()
         torchs.step()
 
-    for one, other in zip(ours.parameters(), theirs.parameters(), strict=True):
-        assert torch.equal(one, other)
-    for number, known in torchs.state_dict()["state"].items():
-        assert {name: value.tolist() for name, value in known.items()} == {
-            name: value.tolist() for name, value in own.state()[number].items()
+    for our_weight, torch_weight in zip(ours.parameters(), theirs.parameters(), strict=True):
+        assert torch.equal(our_weight, torch_weight)
+    for number, torch_state in torchs.state_dict()["state"].items():
+        assert {name: value.tolist() for name, value in torch_state.items()} == {
+            name: value.tolist() for name, value in optimiser.state()[number].items()
         }
 
 
 def test_an_optimiser_that_takes_over_the_state_of_another_continues_with_the_same_bits() -> None:
-    whole, parts = _network(), _network()
-    one, first = Adam(whole.parameters(), 0.01), Adam(parts.parameters(), 0.01)
+    uninterrupted, parts = _network(), _network()
+    single, first = Adam(uninterrupted.parameters(), 0.01), Adam(parts.parameters(), 0.01)
     second = Adam(parts.parameters(), 0.01)
 
     for step in range(8):
         if step == 4:
-            second.load({number: {**known} for number, known in first.state().items()})
-        for network, optimiser in ((whole, one), (parts, first if step < 4 else second)):
+            second.load({number: {**moments} for number, moments in first.state().items()})
+        for network, optimiser in ((uninterrupted, single), (parts, first if step < 4 else second)):
             optimiser.zero_grad()
             _gradients(network, step)
             optimiser.step()
 
-    assert all(torch.equal(a, b) for a, b in zip(whole.parameters(), parts.parameters(), strict=True))
+    assert all(torch.equal(a, b) for a, b in zip(uninterrupted.parameters(), parts.parameters(), strict=True))
 
 
 def test_a_training_imports_no_compiler() -> None:
@@ -75,6 +75,6 @@ def test_a_training_imports_no_compiler() -> None:
         "print([name for name in ('torch._dynamo', 'torch._inductor') if name in sys.modules])\n"
     )
 
-    found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    process = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
 
-    assert found.stdout == "[]\n"
+    assert process.stdout == "[]\n"

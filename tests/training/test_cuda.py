@@ -18,7 +18,7 @@ from tests.training.networks import NETWORKS, losses
 
 pytestmark = [pytest.mark.long, pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")]
 NOISY = ("touch pointnet",)  # magnifies what is rounded
-CLOSE = 0.05  # of losses: a GPU draws other numbers for dropout
+CLOSE = 0.05  # tolerance of losses: a GPU draws other numbers for dropout
 PREPARE = """
 simulate forward -o data/rec --trials 6 --duration-s 6 --tactile-rate-hz 25 --robot-rate-hz 50
 synchronize data/rec -o data/synced --rate-hz 25
@@ -32,8 +32,8 @@ TRAIN = "train forward data/segments --split data/split --hidden 16"
 def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("cuda")
     for line in PREPARE.strip().splitlines():
-        done = tacpipe(folder, f"{line} --quiet")
-        assert done.returncode == 0, done.stderr
+        process = tacpipe(folder, f"{line} --quiet")
+        assert process.returncode == 0, process.stderr
     return folder
 
 
@@ -43,22 +43,22 @@ def test_a_gpu_learns_what_the_processor_does(name: str, precision: str, tmp_pat
     with chosen("cpu"):
         expected = losses(NETWORKS[name](tmp_path / "cpu"))
     with chosen("cuda"):
-        found = losses(NETWORKS[name](tmp_path / "cuda", precision=precision))
-    assert found != expected
+        losses_on_gpu = losses(NETWORKS[name](tmp_path / "cuda", precision=precision))
+    assert losses_on_gpu != expected
     compared = slice(1) if name in NOISY else slice(None)
-    assert found[compared] == pytest.approx(expected[compared], rel=CLOSE)
+    assert losses_on_gpu[compared] == pytest.approx(expected[compared], rel=CLOSE)
 
 
 def test_a_model_of_a_gpu_is_evaluated_alike_where_there_is_none(project: Path) -> None:
-    found = {}
-    done = tacpipe(project, f"{TRAIN} --epochs 2 -o models/gpu --device cuda")
-    assert done.returncode == 0, done.stderr
+    errors = {}
+    process = tacpipe(project, f"{TRAIN} --epochs 2 -o models/gpu --device cuda")
+    assert process.returncode == 0, process.stderr
     for name, hidden in (("here", {}), ("elsewhere", {"CUDA_VISIBLE_DEVICES": ""})):
         words = f"evaluate models/gpu data/segments --split data/split -o results/{name} --rerun"
-        done = tacpipe(project, words, **hidden)
-        assert done.returncode == 0, done.stderr
-        found[name] = json.loads((project / f"results/{name}/metrics.json").read_text())["model"]["mae_counts"]
-    assert found["here"]["both"] == pytest.approx(found["elsewhere"]["both"], rel=1e-4)
+        process = tacpipe(project, words, **hidden)
+        assert process.returncode == 0, process.stderr
+        errors[name] = json.loads((project / f"results/{name}/metrics.json").read_text())["model"]["mae_counts"]
+    assert errors["here"]["both"] == pytest.approx(errors["elsewhere"]["both"], rel=1e-4)
 
 
 @pytest.mark.parametrize("kind", [nn.GRU, nn.LSTM])
@@ -66,20 +66,20 @@ def test_recurrent_layers_stay_in_float32_under_autocast(kind: type[nn.GRU | nn.
     layer, inputs = kind(3, 5).cuda(), torch.randn(7, 2, 3, device="cuda")
     expected, _ = lstm.through(layer, inputs)
     with torch.autocast("cuda", torch.bfloat16):
-        found, _ = lstm.through(layer, inputs)
-    assert torch.equal(found, expected)
+        states, _ = lstm.through(layer, inputs)
+    assert torch.equal(states, expected)
 
 
 @pytest.mark.parametrize(("first", "second"), [("cpu", "cuda"), ("cuda", "cpu")])
 def test_a_checkpoint_of_one_device_is_resumed_on_the_other(first: str, second: str, tmp_path: Path) -> None:
     train = NETWORKS["forward gru"]
     with chosen("cpu"):
-        whole = losses(train(tmp_path / "whole", epochs=4))
+        uninterrupted = losses(train(tmp_path / "whole", epochs=4))
     with chosen(first):  # type: ignore[arg-type]
         train(tmp_path / "cut", epochs=2)
     with chosen(second):  # type: ignore[arg-type]
-        found = losses(train(tmp_path / "cut", epochs=4))
-    assert found == pytest.approx(whole, rel=CLOSE)
+        resumed = losses(train(tmp_path / "cut", epochs=4))
+    assert resumed == pytest.approx(uninterrupted, rel=CLOSE)
 
 
 def test_stages_of_a_chain_that_run_at_the_same_time_train_on_a_gpu_each(project: Path) -> None:
@@ -89,11 +89,11 @@ def test_stages_of_a_chain_that_run_at_the_same_time_train_on_a_gpu_each(project
         for seed in (1, 2, 3)
     }
     (project / "chain.yaml").write_text(yaml.safe_dump({"stages": stages}))
-    done = tacpipe(project, "run chain.yaml --jobs 3")
-    assert done.returncode == 0, done.stderr
+    process = tacpipe(project, "run chain.yaml --jobs 3")
+    assert process.returncode == 0, process.stderr
     devices = [
-        one["provenance"]["device"]
-        for _, one in Store(project / ".tacpipe").records()
-        if one["identity"].get("stage") == "train.forward" and one["identity"]["params"].get("seed") in (1, 2, 3)
+        record["provenance"]["device"]
+        for _, record in Store(project / ".tacpipe").records()
+        if record["identity"].get("stage") == "train.forward" and record["identity"]["params"].get("seed") in (1, 2, 3)
     ]
     assert devices == ["cuda"] * 3

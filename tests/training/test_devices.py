@@ -1,4 +1,4 @@
-"""What networks are trained on: found, refused where it is not there, stated in records, and no part of a key."""
+"""Check the device of trainings: found, refused if it is absent, stated in records, and no part of a key."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from tacpipe.training import devices
 from tests.conftest import Lab
 
 
-@pytest.mark.parametrize("found", [True, False])
-def test_auto_is_cuda_where_there_is_one(found: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: found)
-    assert devices.kind() == ("cuda" if found else "cpu")
+@pytest.mark.parametrize("available", [True, False])
+def test_auto_is_cuda_where_there_is_one(available: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: available)
+    assert devices.kind() == ("cuda" if available else "cpu")
     with devices.chosen("cpu"):
         assert devices.kind() == "cpu"
         assert provenance.of(0.0)["device"] == "cpu"
@@ -29,13 +29,13 @@ def test_without_torch_the_device_is_the_processor(monkeypatch: pytest.MonkeyPat
     assert devices.kind() == "cpu"
 
 
-@pytest.mark.parametrize("wanted", ["cuda", "mps"])
+@pytest.mark.parametrize("device", ["cuda", "mps"])
 def test_a_device_that_is_not_there_is_refused_with_those_that_are(
-    wanted: str, monkeypatch: pytest.MonkeyPatch
+    device: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(torch.backends.mps, "is_available", lambda: False)
-    with pytest.raises(UsageError, match=f"{wanted}.*it has cpu"), devices.chosen(wanted):  # type: ignore[arg-type]
+    with pytest.raises(UsageError, match=f"{device}.*it has cpu"), devices.chosen(device):  # type: ignore[arg-type]
         raise AssertionError
 
 
@@ -89,6 +89,8 @@ def test_a_record_states_the_device_and_the_key_does_not(lab: Lab) -> None:
     lab.run("split data/segments -o data/split")
     train = "train forward data/segments --split data/split --epochs 1 --hidden 8"
     lab.run(f"{train} -o models/one --device cpu")
-    made = [one["provenance"] for _, one in lab.store.records() if one["identity"].get("stage") == "train.forward"]
-    assert [one["device"] for one in made] == ["cpu"]
+    provenances = [
+        record["provenance"] for _, record in lab.store.records() if record["identity"].get("stage") == "train.forward"
+    ]
+    assert [record["device"] for record in provenances] == ["cpu"]
     assert "0 ran" in lab.run(f"{train} -o models/other --device auto").err

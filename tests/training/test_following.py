@@ -1,4 +1,4 @@
-"""Who follows a training: the file that grows, the lines and the bar, and what an interrupted one resumes from."""
+"""Follow a training: the growing file, the lines and the bar, and the sentence of an interrupt."""
 
 from __future__ import annotations
 
@@ -57,29 +57,29 @@ def lines(folder: Path) -> list[Line]:
 
 
 def test_a_follower_is_called_at_every_batch_and_every_epoch(tmp_path: Path) -> None:
-    seen = Seen()
-    trained = followed(tmp_path, seen)
+    follower = Seen()
+    trained = followed(tmp_path, follower)
 
     epochs = len(trained.history)
-    assert seen.passed == [0.25, 0.5, 0.75, 1.0] * epochs  # of 32 windows, 8 a batch
-    assert seen.losses[3] == pytest.approx(trained.history[0]["train_loss"])
-    assert [line for line, _ in seen.lines] == trained.history
-    assert {rate for _, rate in seen.lines} == {SCHEDULE.learning_rate}
-    assert seen.ends == [True]
+    assert follower.passed == [0.25, 0.5, 0.75, 1.0] * epochs  # four batches of 8 windows
+    assert follower.losses[3] == pytest.approx(trained.history[0]["train_loss"])
+    assert [line for line, _ in follower.lines] == trained.history
+    assert {rate for _, rate in follower.lines} == {SCHEDULE.learning_rate}
+    assert follower.ends == [True]
 
 
 def test_the_learning_rate_of_a_line_is_that_of_its_first_batch(tmp_path: Path) -> None:
-    seen, schedule = Seen(), dataclasses.replace(SCHEDULE, cycle=True, patience=9)
-    with following.in_workspace(tmp_path, seen):
+    follower, schedule = Seen(), dataclasses.replace(SCHEDULE, cycle=True, patience=9)
+    with following.in_workspace(tmp_path, follower):
         train(build, Windows(Part(32, loss), Part(40, loss), schedule.batch), schedule, tmp_path)
 
-    assert [rate for _, rate in seen.lines] == [schedule.rate(epoch / 6) for epoch in range(6)]
+    assert [rate for _, rate in follower.lines] == [schedule.rate(epoch / 6) for epoch in range(6)]
 
 
 def test_the_history_file_grows_with_every_epoch_and_ends_as_the_history(tmp_path: Path) -> None:
     counts: list[int] = []
-    seen = Seen(act=lambda: counts.append(len(lines(tmp_path))))
-    trained = followed(tmp_path, seen)
+    follower = Seen(act=lambda: counts.append(len(lines(tmp_path))))
+    trained = followed(tmp_path, follower)
 
     assert counts == list(range(1, len(trained.history) + 1))
     assert (tmp_path / following.HISTORY).read_bytes() == trained.history_lines
@@ -88,15 +88,15 @@ def test_the_history_file_grows_with_every_epoch_and_ends_as_the_history(tmp_pat
 def test_a_resumed_training_states_its_epoch_and_the_file_is_whole(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with pytest.raises(KeyboardInterrupt), display.on_stderr("train", tmp_path) as shown:
-        followed(tmp_path, *shown, training=interrupted_after(9))  # in the third epoch of four batches
+    with pytest.raises(KeyboardInterrupt), display.on_stderr("train", tmp_path) as displays:
+        followed(tmp_path, *displays, training=interrupted_after(9))  # the third epoch has four batches
     before = capsys.readouterr().err
-    kept = len(lines(tmp_path))
-    with display.on_stderr("train", tmp_path) as shown:
-        trained = followed(tmp_path, *shown)
+    epochs = len(lines(tmp_path))
+    with display.on_stderr("train", tmp_path) as displays:
+        trained = followed(tmp_path, *displays)
     after = capsys.readouterr().err
 
-    assert kept == 2
+    assert epochs == 2
     assert "epoch 2/6" in before and "epoch 3/6" not in before and "trained" not in before
     assert "resumes from epoch 3 of 6" in after and "epoch 2/6" not in after and "epoch 3/6" in after
     assert lines(tmp_path) == trained.history
@@ -120,14 +120,14 @@ def test_the_lines_of_several_networks_are_in_one_file_with_their_labels(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     work = Windows(Part(32, loss), Part(40, loss), SCHEDULE.batch)
-    with display.on_stderr("train", tmp_path) as shown, following.in_workspace(tmp_path, *shown):
-        several = [
+    with display.on_stderr("train", tmp_path) as displays, following.in_workspace(tmp_path, *displays):
+        trainings = [
             train(build, work, SCHEDULE, tmp_path / name, number=number, count=2, labels={"target": name})
             for number, name in enumerate(("a", "b"), 1)
         ]
 
     assert lines(tmp_path) == [
-        {**line, "target": name} for name, one in zip("ab", several, strict=True) for line in one.history
+        {**line, "target": name} for name, trained in zip("ab", trainings, strict=True) for line in trained.history
     ]
     err = capsys.readouterr().err
     assert err.count(following.HISTORY) == 1
@@ -135,22 +135,22 @@ def test_the_lines_of_several_networks_are_in_one_file_with_their_labels(
 
 
 def test_what_follows_changes_no_bit(tmp_path: Path) -> None:
-    alone = run(tmp_path / "alone")
+    unfollowed = run(tmp_path / "alone")
 
     def draw() -> None:
         torch.manual_seed(99)
 
     drawing = Seen(act=draw)
-    assert same(followed(tmp_path / "followed", drawing), alone)
+    assert same(followed(tmp_path / "followed", drawing), unfollowed)
 
 
 def test_a_file_that_cannot_be_written_is_reported_once_and_ends_no_training(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    alone = run(tmp_path / "alone")
+    unfollowed = run(tmp_path / "alone")
     (tmp_path / "followed").mkdir()
     (tmp_path / "followed" / following.HISTORY).symlink_to(tmp_path / "elsewhere")  # none is followed in a store
-    assert same(followed(tmp_path / "followed"), alone)
+    assert same(followed(tmp_path / "followed"), unfollowed)
     assert not (tmp_path / "elsewhere").exists()
     assert capsys.readouterr().err.count(following.HISTORY) == 1
 
@@ -178,24 +178,24 @@ def test_nothing_is_left_of_a_training_that_failed_in_its_first_epoch(tmp_path: 
 def test_without_a_terminal_a_line_an_epoch_holds_losses_best_and_seconds(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with display.on_stderr("train", tmp_path) as shown:
-        trained = followed(tmp_path, *shown)
-    found = re.findall(
+    with display.on_stderr("train", tmp_path) as displays:
+        trained = followed(tmp_path, *displays)
+    printed = re.findall(
         r"epoch (\d)/6  train ([\d.e-]+) +val ([\d.e-]+) +best ([\d.e-]+) \(epoch (\d)\)  \d+\.\d s  [\d:]+ left",
         capsys.readouterr().err,
     )
 
-    assert [int(one[0]) for one in found] == [line["epoch"] for line in trained.history]
-    for one, line in zip(found, trained.history, strict=True):
-        assert float(one[1]) == pytest.approx(line["train_loss"], rel=1e-3)
-        assert float(one[2]) == pytest.approx(line["val_loss"], rel=1e-3)
+    assert [int(fields[0]) for fields in printed] == [line["epoch"] for line in trained.history]
+    for fields, line in zip(printed, trained.history, strict=True):
+        assert float(fields[1]) == pytest.approx(line["train_loss"], rel=1e-3)
+        assert float(fields[2]) == pytest.approx(line["val_loss"], rel=1e-3)
     best = min(trained.history, key=lambda line: line["val_loss"])
-    assert int(found[-1][4]) == best["epoch"] and float(found[-1][3]) == pytest.approx(best["val_loss"], rel=1e-3)
+    assert int(printed[-1][4]) == best["epoch"] and float(printed[-1][3]) == pytest.approx(best["val_loss"], rel=1e-3)
 
 
 def test_quiet_prints_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with progress.showing_progress(False), display.on_stderr("train", tmp_path) as shown:
-        followed(tmp_path, *shown)
+    with progress.showing_progress(False), display.on_stderr("train", tmp_path) as displays:
+        followed(tmp_path, *displays)
     assert capsys.readouterr().err == ""
 
 
@@ -205,20 +205,20 @@ def test_on_a_terminal_the_bar_counts_batches_and_shows_loss_best_rate_and_remai
     monkeypatch.setattr(progress, "is_visible", lambda: True)
     monkeypatch.setattr(display, "REDRAW_S", 0.0)
     drawn: list[tuple[str, float, str]] = []
-    with display.on_stderr("train", tmp_path) as shown:
-        assert isinstance(shown[0], display.Bar)
-        tasks = shown[0].progress.tasks
+    with display.on_stderr("train", tmp_path) as displays:
+        assert isinstance(displays[0], display.Bar)
+        tasks = displays[0].progress.tasks
         pulsing = [tasks[0].total]
 
         class Look(Seen):
             def batch(self, passed: float, mean: Callable[[], float]) -> None:
-                (task,) = shown[0].progress.tasks  # type: ignore[attr-defined]
+                (task,) = displays[0].progress.tasks  # type: ignore[attr-defined]
                 drawn.append((task.description, task.completed, task.fields["note"]))
 
-        trained = followed(tmp_path, *shown, Look())
-        pulsing.append(shown[0].progress.tasks[0].total)
+        trained = followed(tmp_path, *displays, Look())
+        pulsing.append(displays[0].progress.tasks[0].total)
 
-    assert pulsing == [None, None]  # before the first epoch and after the last it moves too
+    assert pulsing == [None, None]  # it moves before the first epoch and after the last too
     assert [completed for _, completed, _ in drawn] == [n / 4 for n in range(1, 4 * len(trained.history) + 1)]
     assert drawn[4][0] == "epoch 2/6"
     best = f"{trained.history[0]['val_loss']:#.4g}"

@@ -30,31 +30,33 @@ def run(folder: Path, training_loss: Loss = loss, schedule: Schedule = SCHEDULE)
 
 
 def interrupted_after(calls: int) -> Loss:
-    left = iter(range(calls))
+    remaining = iter(range(calls))
 
-    def once(model: nn.Module, indices: Tensor) -> Tensor:
-        if next(left, None) is None:
+    def interrupt(model: nn.Module, indices: Tensor) -> Tensor:
+        if next(remaining, None) is None:
             raise KeyboardInterrupt
         return loss(model, indices)
 
-    return once
+    return interrupt
 
 
-def same(one: Trained, other: Trained) -> bool:
-    return one.history == other.history and all(torch.equal(one.weights[k], other.weights[k]) for k in one.weights)
+def same(first: Trained, second: Trained) -> bool:
+    return first.history == second.history and all(
+        torch.equal(first.weights[k], second.weights[k]) for k in first.weights
+    )
 
 
 @pytest.mark.parametrize("batches", [1, 4, 5, 11, 23])
 def test_a_run_that_was_killed_and_resumed_gives_the_same_bits(tmp_path: Path, batches: int) -> None:
-    whole = run(tmp_path / "whole")
+    uninterrupted = run(tmp_path / "whole")
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path / "killed", interrupted_after(batches))
-    assert same(run(tmp_path / "killed"), whole)
+    assert same(run(tmp_path / "killed"), uninterrupted)
 
 
 def test_a_finished_run_is_not_trained_again(tmp_path: Path) -> None:
-    whole = run(tmp_path)
-    assert same(run(tmp_path, interrupted_after(0)), whole)
+    uninterrupted = run(tmp_path)
+    assert same(run(tmp_path, interrupted_after(0)), uninterrupted)
 
 
 def test_the_same_seed_gives_the_same_bits_and_another_one_does_not(tmp_path: Path) -> None:
@@ -71,13 +73,13 @@ def test_training_leaves_the_random_generator_as_it_was(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("damage", ["cut", "a weight that a disk changed"])
 def test_a_damaged_checkpoint_starts_over(tmp_path: Path, caplog: pytest.LogCaptureFixture, damage: str) -> None:
-    whole = run(tmp_path / "whole")
+    uninterrupted = run(tmp_path / "whole")
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path / "damaged", interrupted_after(9))
     file = tmp_path / "damaged" / loop.FILE
     content = file.read_bytes()
     file.write_bytes(content[:-10] if damage == "cut" else content[:-10] + bytes([content[-10] ^ 1]) + content[-9:])
-    assert same(run(tmp_path / "damaged"), whole)
+    assert same(run(tmp_path / "damaged"), uninterrupted)
     assert "training starts over" in caplog.text
 
 
@@ -90,24 +92,24 @@ def test_a_checkpoint_is_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.
     monkeypatch.setattr("os.fsync", dies)
     with pytest.raises(KeyboardInterrupt):
         loop.write_checkpoint(tmp_path, {"a": torch.ones(2)}, {"epoch": 2})
-    found = loop.read_checkpoint(tmp_path)
-    assert found is not None
-    assert found[1] == {"epoch": 1}
-    assert torch.equal(found[0]["a"], torch.zeros(2))
+    checkpoint = loop.read_checkpoint(tmp_path)
+    assert checkpoint is not None
+    assert checkpoint[1] == {"epoch": 1}
+    assert torch.equal(checkpoint[0]["a"], torch.zeros(2))
 
 
 def test_training_stops_when_validation_no_longer_improves_and_keeps_the_best(tmp_path: Path) -> None:
     validation = iter([1.0, 0.5, 0.7, 0.6, 0.8, 0.1])
-    seen: list[dict[str, Tensor]] = []
+    states: list[dict[str, Tensor]] = []
 
     def scripted(model: nn.Module, indices: Tensor) -> Tensor:
-        seen.append({name: value.clone() for name, value in model.state_dict().items()})
+        states.append({name: value.clone() for name, value in model.state_dict().items()})
         return torch.tensor(next(validation))
 
     schedule = dataclasses.replace(SCHEDULE, epochs=50, batch=100)
-    found = train(build, Windows(Part(32, loss), Part(40, scripted), schedule.batch), schedule, tmp_path)
-    assert [line["best"] for line in found.history] == [True, True, False, False, False]
-    assert all(torch.equal(found.weights[name], seen[1][name]) for name in seen[1])
+    trained = train(build, Windows(Part(32, loss), Part(40, scripted), schedule.batch), schedule, tmp_path)
+    assert [line["best"] for line in trained.history] == [True, True, False, False, False]
+    assert all(torch.equal(trained.weights[name], states[1][name]) for name in states[1])
 
 
 def test_the_loss_of_an_epoch_is_the_mean_over_windows_and_not_over_batches(tmp_path: Path) -> None:
@@ -115,8 +117,8 @@ def test_the_loss_of_an_epoch_is_the_mean_over_windows_and_not_over_batches(tmp_
         return loss(model, indices) * 0 + len(indices)
 
     schedule = dataclasses.replace(SCHEDULE, epochs=1, batch=20)
-    found = train(build, Windows(Part(32, by_size), Part(32, by_size), schedule.batch), schedule, tmp_path)
-    assert found.history[0]["val_loss"] == found.history[0]["train_loss"] == (20 * 20 + 12 * 12) / 32
+    trained = train(build, Windows(Part(32, by_size), Part(32, by_size), schedule.batch), schedule, tmp_path)
+    assert trained.history[0]["val_loss"] == trained.history[0]["train_loss"] == (20 * 20 + 12 * 12) / 32
 
 
 def test_gradients_are_clipped(tmp_path: Path) -> None:
@@ -137,10 +139,10 @@ def test_the_rate_of_a_cycle_rises_and_falls_and_ends_at_nothing() -> None:
     rates = [schedule.rate(progress / 100) for progress in range(101)]
     assert rates[0] == pytest.approx(SCHEDULE.learning_rate / 25)
     assert rates[30] == pytest.approx(SCHEDULE.learning_rate) == max(rates)
-    assert all(one < other for one, other in pairwise(rates[:31]))
-    assert all(one > other for one, other in pairwise(rates[30:]))
+    assert all(rate < next_rate for rate, next_rate in pairwise(rates[:31]))
+    assert all(rate > next_rate for rate, next_rate in pairwise(rates[30:]))
     assert rates[-1] == pytest.approx(0, abs=1e-12)
-    assert max(abs(one - other) for one, other in pairwise(rates)) < 0.06 * SCHEDULE.learning_rate  # no jump
+    assert max(abs(rate - next_rate) for rate, next_rate in pairwise(rates)) < 0.06 * SCHEDULE.learning_rate  # no jump
 
 
 def test_the_rate_is_the_same_throughout_without_a_cycle() -> None:
@@ -148,25 +150,25 @@ def test_the_rate_is_the_same_throughout_without_a_cycle() -> None:
 
 
 def test_the_optimiser_steps_at_the_rate_of_all_epochs_passed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[float] = []
+    positions: list[float] = []
 
     def rate(schedule: Schedule, progress: float) -> float:
-        asked.append(progress)
+        positions.append(progress)
         return 0.0
 
     monkeypatch.setattr(Schedule, "rate", rate)
-    found = run(tmp_path, schedule=dataclasses.replace(SCHEDULE, epochs=3, batch=20, cycle=True))
-    assert asked == pytest.approx([0, 1 / 6, 2 / 6, 3 / 6, 4 / 6, 5 / 6])
-    assert len({line["val_loss"] for line in found.history}) == 1  # at a rate of 0 nothing is learned
+    trained = run(tmp_path, schedule=dataclasses.replace(SCHEDULE, epochs=3, batch=20, cycle=True))
+    assert positions == pytest.approx([0, 1 / 6, 2 / 6, 3 / 6, 4 / 6, 5 / 6])
+    assert len({line["val_loss"] for line in trained.history}) == 1  # nothing is learned at a rate of 0
 
 
 @pytest.mark.parametrize("batches", [3, 9])
 def test_a_cycle_goes_on_where_it_was_killed(tmp_path: Path, batches: int) -> None:
     schedule = dataclasses.replace(SCHEDULE, cycle=True)
-    whole = run(tmp_path / "whole", schedule=schedule)
+    uninterrupted = run(tmp_path / "whole", schedule=schedule)
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path / "killed", interrupted_after(batches), schedule)
-    assert same(run(tmp_path / "killed", schedule=schedule), whole)
+    assert same(run(tmp_path / "killed", schedule=schedule), uninterrupted)
 
 
 def test_a_loss_that_is_not_finite_ends_training_with_a_sentence(tmp_path: Path) -> None:
@@ -194,15 +196,15 @@ def test_each_part_of_a_model_keeps_the_weights_of_its_own_best_epoch(tmp_path: 
     def halves() -> nn.Module:
         return nn.ModuleDict({"a": nn.Linear(1, 1), "b": nn.Linear(1, 1)})
 
-    def kept(epochs: int) -> Trained:
+    def trained_for(epochs: int) -> Trained:
         schedule = dataclasses.replace(SCHEDULE, epochs=epochs, patience=9, gradient_clip=float("inf"))
         return train(halves, TwoHalves(), schedule, tmp_path / str(epochs))
 
-    whole, second, fourth = kept(6), kept(2), kept(4)
-    assert torch.equal(whole.weights["a.weight"], second.last["a.weight"])
-    assert torch.equal(whole.weights["b.weight"], fourth.last["b.weight"])
-    assert not torch.equal(whole.last["b.weight"], fourth.last["b.weight"])
-    assert [line["best"] for line in whole.history] == [True, True, True, True, False, False]
+    six_epochs, second, fourth = trained_for(6), trained_for(2), trained_for(4)
+    assert torch.equal(six_epochs.weights["a.weight"], second.last["a.weight"])
+    assert torch.equal(six_epochs.weights["b.weight"], fourth.last["b.weight"])
+    assert not torch.equal(six_epochs.last["b.weight"], fourth.last["b.weight"])
+    assert [line["best"] for line in six_epochs.history] == [True, True, True, True, False, False]
 
 
 def test_weights_that_need_no_gradient_stay_as_they_were(tmp_path: Path) -> None:

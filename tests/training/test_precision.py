@@ -15,7 +15,7 @@ from tests.training.networks import NETWORKS, losses, weights
 SENSITIVE = ("touch pointnet",)  # normalised by the spread of few grasps, which magnifies what is rounded
 
 
-@pytest.mark.parametrize("name", [pytest.param(one, marks=pytest.mark.long) for one in NETWORKS])
+@pytest.mark.parametrize("name", [pytest.param(network_name, marks=pytest.mark.long) for network_name in NETWORKS])
 def test_bfloat16_learns_what_float32_does_but_for_rounding(name: str, tmp_path: Path) -> None:
     exact = NETWORKS[name](tmp_path / "exact")
     rounded = NETWORKS[name](tmp_path / "rounded", precision="bfloat16")
@@ -26,8 +26,8 @@ def test_bfloat16_learns_what_float32_does_but_for_rounding(name: str, tmp_path:
 
 def test_weights_and_their_sums_stay_in_float32(tmp_path: Path) -> None:
     files = NETWORKS["forward gru"](tmp_path, precision="bfloat16")
-    assert {one.dtype for one in weights(files).values()} == {torch.float32}
-    assert any(not torch.equal(one, one.bfloat16().float()) for one in weights(files).values())
+    assert {weight.dtype for weight in weights(files).values()} == {torch.float32}
+    assert any(not torch.equal(weight, weight.bfloat16().float()) for weight in weights(files).values())
 
 
 @pytest.mark.parametrize("stage", ["train.forward", "train.material", "train.touch"])

@@ -17,20 +17,20 @@ def line(epoch: int) -> following.Message:
 
 
 def begin(*epochs: int, network: Network = NETWORK) -> following.Message:
-    found: list[following.Message] = []
-    following.Sender(found.append).begin(network, [{"epoch": epoch} for epoch in epochs])
-    return json.loads(json.dumps(found[0]))  # type: ignore[no-any-return]
+    messages: list[following.Message] = []
+    following.Sender(messages.append).begin(network, [{"epoch": epoch} for epoch in epochs])
+    return json.loads(json.dumps(messages[0]))  # type: ignore[no-any-return]
 
 
 def test_followers_elsewhere_see_what_followers_in_the_process_see(tmp_path: Path) -> None:
-    here, there = Seen(), Seen()
-    receiver = following.Receiver([there])
-    followed(tmp_path, here, following.Sender(lambda message: receiver.take(json.loads(json.dumps(message)))))
+    local, remote = Seen(), Seen()
+    receiver = following.Receiver([remote])
+    followed(tmp_path, local, following.Sender(lambda message: receiver.take(json.loads(json.dumps(message)))))
 
-    assert there.networks == here.networks
-    assert there.lines == here.lines
-    assert there.ends == here.ends == [True]
-    assert set(there.passed) <= set(here.passed)
+    assert remote.networks == local.networks
+    assert remote.lines == local.lines
+    assert remote.ends == local.ends == [True]
+    assert set(remote.passed) <= set(local.passed)
 
 
 def test_messages_about_batches_are_at_least_half_a_second_apart() -> None:
@@ -46,45 +46,45 @@ def test_messages_about_batches_are_at_least_half_a_second_apart() -> None:
 
 
 def test_epochs_that_another_worker_repeats_or_takes_over_are_given_once() -> None:
-    seen = Seen()
-    receiver = following.Receiver([seen])
+    follower = Seen()
+    receiver = following.Receiver([follower])
     for message in (begin(), line(1), line(2), {"end": False}):
         receiver.take(message)
     for message in (begin(1, 2, 3), line(4), {"end": True}):  # one epoch's message was lost with the worker
         receiver.take(message)
 
-    assert seen.networks == [(NETWORK, [])]
-    assert [one["epoch"] for one, _ in seen.lines] == [1, 2, 3, 4]
-    assert seen.ends == [True]
+    assert follower.networks == [(NETWORK, [])]
+    assert [line_received["epoch"] for line_received, _ in follower.lines] == [1, 2, 3, 4]
+    assert follower.ends == [True]
 
 
 def test_a_network_that_is_trained_from_its_beginning_by_another_worker_gives_no_epoch_twice() -> None:
-    seen = Seen()
-    receiver = following.Receiver([seen])
+    follower = Seen()
+    receiver = following.Receiver([follower])
     for message in (begin(), line(1), line(2), begin(), line(1), line(2), line(3)):
         receiver.take(message)
 
-    assert [one["epoch"] for one, _ in seen.lines] == [1, 2, 3]
+    assert [line_received["epoch"] for line_received, _ in follower.lines] == [1, 2, 3]
 
 
 def test_a_network_whose_worker_never_came_back_ends_untrained() -> None:
-    seen = Seen()
-    receiver = following.Receiver([seen])
+    follower = Seen()
+    receiver = following.Receiver([follower])
     receiver.take(begin())
     receiver.take(line(1))
     receiver.close()
     receiver.close()
 
-    assert seen.ends == [False]
+    assert follower.ends == [False]
 
 
 def test_the_next_network_is_begun_once_the_one_before_has_ended() -> None:
-    seen = Seen()
-    receiver = following.Receiver([seen])
-    other = Network(4, number=3, count=3, labels={"member": 2})
-    for message in (begin(), line(1), {"end": True}, begin(network=other), line(1), {"end": True}):
+    follower = Seen()
+    receiver = following.Receiver([follower])
+    next_network = Network(4, number=3, count=3, labels={"member": 2})
+    for message in (begin(), line(1), {"end": True}, begin(network=next_network), line(1), {"end": True}):
         receiver.take(message)
 
-    assert [network for network, _ in seen.networks] == [NETWORK, other]
-    assert len(seen.lines) == 2
-    assert seen.ends == [True, True]
+    assert [network for network, _ in follower.networks] == [NETWORK, next_network]
+    assert len(follower.lines) == 2
+    assert follower.ends == [True, True]

@@ -31,9 +31,9 @@ def test_the_ends_of_the_range_are_minus_one_and_one() -> None:
 
 def test_a_scaling_survives_json() -> None:
     fitted = scaling.fit(np.random.default_rng(0).normal(size=(5, 4)))
-    again = scaling.MinMax.from_json(json.loads(json.dumps(fitted.to_json())))
-    assert np.array_equal(again.low, fitted.low)
-    assert np.array_equal(again.high, fitted.high)
+    restored = scaling.MinMax.from_json(json.loads(json.dumps(fitted.to_json())))
+    assert np.array_equal(restored.low, fitted.low)
+    assert np.array_equal(restored.high, fitted.high)
 
 
 def test_no_rows_and_values_that_are_not_finite_are_refused() -> None:
@@ -52,8 +52,8 @@ def test_what_an_affine_scaling_applies_it_restores_in_float64(kind: str) -> Non
     back = fitted.restore(scaled)
     assert (str(scaled.dtype), str(back.dtype)) == ("float32", "float64")
     np.testing.assert_allclose(back, values, rtol=1e-5)
-    again = scaling.Affine.from_tensors(fitted.to_tensors())
-    np.testing.assert_array_equal(again.restore(scaled), back)
+    restored = scaling.Affine.from_tensors(fitted.to_tensors())
+    np.testing.assert_array_equal(restored.restore(scaled), back)
 
 
 def test_an_affine_scaling_restores_by_hand() -> None:

@@ -36,15 +36,15 @@ def touches(seed: int, minutes: int = 4, lasts: tuple[int, int] = (1, 1)) -> tup
     return truth, np.repeat(np.arange(minutes), MINUTE)
 
 
-def within(values: np.ndarray, groups: np.ndarray, rows: int) -> np.ndarray:
+def shift_in_groups(values: np.ndarray, groups: np.ndarray, rows: int) -> np.ndarray:
     """Return what each row's own group has ``rows`` later, before if negative; NaN beyond its ends."""
-    found = np.full(values.shape, np.nan)
+    shifted = np.full(values.shape, np.nan)
     for group in np.unique(groups):
-        own = np.flatnonzero(groups == group)
-        there = own + rows
-        inside = (there >= own[0]) & (there <= own[-1])
-        found[own[inside]] = values[there[inside]]
-    return found
+        rows_of_group = np.flatnonzero(groups == group)
+        targets = rows_of_group + rows
+        inside = (targets >= rows_of_group[0]) & (targets <= rows_of_group[-1])
+        shifted[rows_of_group[inside]] = values[targets[inside]]
+    return shifted
 
 
 def step(at: int, rows: int = 200, size: float = 10.0) -> np.ndarray:
@@ -54,12 +54,14 @@ def step(at: int, rows: int = 200, size: float = 10.0) -> np.ndarray:
 
 
 def score(
-    truth: np.ndarray, ahead: np.ndarray, groups: np.ndarray | None = None, held: np.ndarray | None = None
+    truth: np.ndarray, ahead: np.ndarray, groups: np.ndarray | None = None, repeated: np.ndarray | None = None
 ) -> Anticipation:
     """Evaluate one feature against a noise of 1 count and alarms beyond 1 count."""
     groups = np.zeros(len(truth)) if groups is None else groups
-    one = np.ones(truth.shape[1])
-    return anticipation.score(truth, ahead, groups, horizon=HORIZON, sd=one, theta=one, rate_hz=RATE_HZ, repeated=held)
+    unit = np.ones(truth.shape[1])
+    return anticipation.score(
+        truth, ahead, groups, horizon=HORIZON, sd=unit, theta=unit, rate_hz=RATE_HZ, repeated=repeated
+    )
 
 
 def trained(forecast: str, lasts: tuple[int, int] = (1, 1)) -> Anticipation:
@@ -67,29 +69,31 @@ def trained(forecast: str, lasts: tuple[int, int] = (1, 1)) -> Anticipation:
 
     def ahead(truth: np.ndarray, groups: np.ndarray) -> np.ndarray:
         kind, _, rows = forecast.partition(" ")
-        there = within(truth, groups, {"oracle": HORIZON, "persistence": 0}.get(kind, -int(rows or 0)))
-        return np.asarray(truth + HORIZON * (truth - there) / int(rows)) if kind == "trend" else there
+        known_rows = shift_in_groups(truth, groups, {"oracle": HORIZON, "persistence": 0}.get(kind, -int(rows or 0)))
+        return np.asarray(truth + HORIZON * (truth - known_rows) / int(rows)) if kind == "trend" else known_rows
 
-    (truth, groups), (fresh, others) = touches(1, lasts=lasts), touches(2, lasts=lasts)
+    (truth, groups), (fresh, fresh_groups) = touches(1, lasts=lasts), touches(2, lasts=lasts)
     sd = anticipation.difference_sd(truth, groups, horizon=HORIZON)
     theta = anticipation.calibrate(truth, ahead(truth, groups), groups, horizon=HORIZON, sd=sd, rate_hz=RATE_HZ)
-    return anticipation.score(fresh, ahead(fresh, others), others, horizon=HORIZON, sd=sd, theta=theta, rate_hz=RATE_HZ)
+    return anticipation.score(
+        fresh, ahead(fresh, fresh_groups), fresh_groups, horizon=HORIZON, sd=sd, theta=theta, rate_hz=RATE_HZ
+    )
 
 
 def test_a_forecast_that_knows_the_future_leads_every_event_by_the_whole_horizon() -> None:
-    found = trained("oracle")
-    assert found.events > 100
-    assert found.recall == 1
-    assert found.median_lead_rows == found.median_lead_frames == HORIZON
-    assert found.false_alarms_per_minute < 2
+    scored = trained("oracle")
+    assert scored.events > 100
+    assert scored.recall == 1
+    assert scored.median_lead_rows == scored.median_lead_frames == HORIZON
+    assert scored.false_alarms_per_minute < 2
 
 
 def test_persistence_never_alarms() -> None:
-    found = trained("persistence")
-    assert found.events > 100
-    assert (found.recall, found.false_alarms_per_minute) == (0, 0)
-    assert math.isnan(found.median_lead_rows)
-    assert math.isnan(found.median_lead_frames)
+    scored = trained("persistence")
+    assert scored.events > 100
+    assert (scored.recall, scored.false_alarms_per_minute) == (0, 0)
+    assert math.isnan(scored.median_lead_rows)
+    assert math.isnan(scored.median_lead_frames)
 
 
 @pytest.mark.parametrize("lasts", [(1, 1), (2, 9), (10, 10)])
@@ -97,9 +101,9 @@ def test_persistence_never_alarms() -> None:
 def test_a_forecast_that_follows_what_has_begun_leads_no_more_events_than_chance(
     forecast: str, lasts: tuple[int, int]
 ) -> None:
-    found = trained(forecast, lasts)
-    assert found.events > 100
-    assert found.recall < 0.03, found  # one false alarm a minute falls into the fifth of a second before 1 in 300
+    scored = trained(forecast, lasts)
+    assert scored.events > 100
+    assert scored.recall < 0.03, scored  # one false alarm a minute falls into the fifth of a second before 1 in 300
 
 
 def test_noise_gives_one_false_alarm_a_minute_on_fresh_noise_of_the_same_kind() -> None:
@@ -113,10 +117,10 @@ def test_noise_gives_one_false_alarm_a_minute_on_fresh_noise_of_the_same_kind() 
 
     sd = scale
     theta = anticipation.calibrate(*noise(), groups, horizon=HORIZON, sd=sd, rate_hz=RATE_HZ)
-    found = anticipation.score(*noise(), groups, horizon=HORIZON, sd=sd, theta=theta, rate_hz=RATE_HZ)
-    assert found.events == 0
-    assert math.isnan(found.recall)
-    assert 0.85 < found.false_alarms_per_minute < 1.15  # 400 minutes: a standard error of 7 % for both together
+    scored = anticipation.score(*noise(), groups, horizon=HORIZON, sd=sd, theta=theta, rate_hz=RATE_HZ)
+    assert scored.events == 0
+    assert math.isnan(scored.recall)
+    assert 0.85 < scored.false_alarms_per_minute < 1.15  # 400 minutes: a standard error of 7 % for both together
     assert np.allclose(theta / scale, 3.6, atol=0.3)  # 1 of 3000 of a normal distribution lies beyond 3.59
 
 
@@ -127,9 +131,15 @@ def test_theta_is_the_least_that_gives_no_more_than_one_false_alarm_a_minute() -
     theta = anticipation.calibrate(truth, ahead, groups, horizon=HORIZON, sd=sd, rate_hz=RATE_HZ)
 
     def per_minute(theta: np.ndarray, feature: int) -> float:
-        one = slice(feature, feature + 1)
+        column = slice(feature, feature + 1)
         return anticipation.score(
-            truth[:, one], ahead[:, one], groups, horizon=HORIZON, sd=sd[one], theta=theta[one], rate_hz=RATE_HZ
+            truth[:, column],
+            ahead[:, column],
+            groups,
+            horizon=HORIZON,
+            sd=sd[column],
+            theta=theta[column],
+            rate_hz=RATE_HZ,
         ).false_alarms_per_minute
 
     for feature in range(2):
@@ -137,14 +147,14 @@ def test_theta_is_the_least_that_gives_no_more_than_one_false_alarm_a_minute() -
 
 
 def test_a_lead_counts_from_the_first_alarm_in_the_horizon_before_the_onset() -> None:
-    truth, held = step(100), np.arange(200) % 4 != 0
+    truth, repeated = step(100), np.arange(200) % 4 != 0
     for alarm, lead in ((99, 1), (96, 4), (91, 9), (90, 10)):
         ahead = truth.copy()
         ahead[[alarm, 99]] += 5
-        found = score(truth, ahead, repeated=held)
-        assert (found.events, found.recall, found.median_lead_rows) == (1, 1, lead)
-        assert found.median_lead_frames == sum(row % 4 == 0 for row in range(alarm + 1, 101))
-        assert found.false_alarms_per_minute == 0
+        scored = score(truth, ahead, repeated=repeated)
+        assert (scored.events, scored.recall, scored.median_lead_rows) == (1, 1, lead)
+        assert scored.median_lead_frames == sum(row % 4 == 0 for row in range(alarm + 1, 101))
+        assert scored.false_alarms_per_minute == 0
     for alarm in (89, 100, 101):
         ahead = truth.copy()
         ahead[alarm] += 5
@@ -169,8 +179,8 @@ def test_what_alarms_near_no_event_is_false_once_for_the_rows_that_it_foretells(
 def changes(values: np.ndarray, groups: np.ndarray | None = None) -> list[list[int]]:
     """Return onsets and ends of the changes of one feature whose differences have a deviation of 1."""
     groups = np.zeros(len(values)) if groups is None else groups
-    found: list[list[int]] = anticipation.changes(values[:, None], groups, horizon=HORIZON, sd=np.ones(1))[0].tolist()
-    return found
+    spans: list[list[int]] = anticipation.changes(values[:, None], groups, horizon=HORIZON, sd=np.ones(1))[0].tolist()
+    return spans
 
 
 def test_one_change_is_one_event_where_it_begins() -> None:
@@ -178,7 +188,9 @@ def test_one_change_is_one_event_where_it_begins() -> None:
     assert changes(step(100)[:, 0]) == [[100, 110]]
     assert changes(np.clip(rows - 100, 0, 20)) == [[101, 129]]  # slower than the horizon; below 1.5 at 129
     assert changes(np.clip((rows - 100) / 2, 0, 20)) == [[101, 148]]
-    assert changes(np.where((rows >= 100) & (rows < 103), 10.0, 0)) == [[100, 113]]  # and its echo ten rows later
+    assert changes(np.where((rows >= 100) & (rows < 103), 10.0, 0)) == [
+        [100, 113]
+    ]  # the event and its echo ten rows later
     assert changes(np.where(rows >= 100, 4 + 2 * np.sin(rows), 0))[0][0] == 100
     assert changes(np.where(rows >= 100, 10.0, 0) + np.where(rows >= 140, 10.0, 0)) == [[100, 110], [140, 150]]
     assert changes(np.where(rows >= 100, 10.0, 0) + np.where(rows >= 129, 10.0, 0)) == [[100, 139]]
@@ -189,8 +201,8 @@ def test_one_change_is_one_event_where_it_begins() -> None:
 def test_a_change_that_hovers_at_the_limit_is_one() -> None:
     slopes = 0.3 + 0.05 * np.sin(np.arange(200) / 15)  # three counts in ten rows, more or less, for seconds
     slopes[:40] = slopes[180:] = 0
-    found = changes(slopes.cumsum())
-    assert len(found) == 1
+    spans = changes(slopes.cumsum())
+    assert len(spans) == 1
 
 
 def test_nothing_crosses_groups() -> None:
@@ -199,18 +211,18 @@ def test_nothing_crosses_groups() -> None:
     lengths = [len(part) for part in parts]
     for groups in (np.repeat(np.arange(6), lengths), np.repeat(np.arange(6) % 2 == 0, lengths)):
         offsets = np.cumsum([0, *lengths])
-        apart = [
+        expected = [
             [row + offset for row in pair]
             for part, offset in zip(parts, offsets, strict=False)
             for pair in changes(part)
         ]
-        assert changes(values, groups) == apart
+        assert changes(values, groups) == expected
         alarms = np.full((len(values), 1), 99.0)
-        together = score(values[:, None], alarms, groups)
-        alone = [score(part[:, None], np.full((len(part), 1), 99.0)) for part in parts]
-        assert together.events == sum(one.events for one in alone) == 3
+        joined = score(values[:, None], alarms, groups)
+        by_group = [score(part[:, None], np.full((len(part), 1), 99.0)) for part in parts]
+        assert joined.events == sum(part_score.events for part_score in by_group) == 3
         ends = np.zeros_like(alarms)
-        ends[offsets[1:-1] - 1] = 99  # in the last row of each
+        ends[offsets[1:-1] - 1] = 99  # one in the last row of each
         assert score(values[:, None], values[:, None] + ends, groups).recall == 0
         assert score(values[:, None], values[:, None] + ends, groups).false_alarms_per_minute == 0
 
@@ -250,20 +262,22 @@ def test_events_without_a_forecast_in_all_rows_before_are_not_counted() -> None:
 @given(st.sets(st.integers(0, 14), max_size=11), st.integers(1, 5))
 def test_alarms_are_as_many_as_can_lie_more_than_a_horizon_apart(rows: set[int], horizon: int) -> None:
     choices = itertools.chain.from_iterable(itertools.combinations(sorted(rows), n) for n in range(len(rows) + 1))
-    most = max(len(some) for some in choices if all(late - early > horizon for early, late in itertools.pairwise(some)))
-    truth, one = np.zeros((60, 1)), np.ones(1)
+    largest = max(
+        len(rows) for rows in choices if all(late - early > horizon for early, late in itertools.pairwise(rows))
+    )
+    truth, unit = np.zeros((60, 1)), np.ones(1)
     ahead = truth.copy()
     ahead[sorted(rows)] = 5
-    found = anticipation.score(
+    scored = anticipation.score(
         truth,
         ahead,
         np.zeros(60),
         horizon=horizon,
-        sd=one,
-        theta=one,
+        sd=unit,
+        theta=unit,
         rate_hz=(60 - horizon) / 60,  # one minute
     )
-    assert found.false_alarms_per_minute == pytest.approx(most)
+    assert scored.false_alarms_per_minute == pytest.approx(largest)
 
 
 def test_the_deviation_is_that_of_differences_within_groups() -> None:
@@ -271,29 +285,29 @@ def test_the_deviation_is_that_of_differences_within_groups() -> None:
     truth, groups = rng.normal(size=(100, 2)).cumsum(axis=0), np.repeat([4, 7, 4], [45, 9, 46])
     truth[20, 1] = np.nan
     differences = np.concatenate([part[HORIZON:] - part[:-HORIZON] for part in (truth[:45], truth[54:])])
-    found = anticipation.difference_sd(truth, groups, horizon=HORIZON)
-    assert np.allclose(found, np.nanstd(differences, axis=0))
+    deviations = anticipation.difference_sd(truth, groups, horizon=HORIZON)
+    assert np.allclose(deviations, np.nanstd(differences, axis=0))
 
 
 def test_a_feature_that_stood_still_in_calibration_has_no_events() -> None:
-    found = anticipation.changes(step(100), np.zeros(200), horizon=HORIZON, sd=np.zeros(1))
-    assert found[0].tolist() == []
+    spans = anticipation.changes(step(100), np.zeros(200), horizon=HORIZON, sd=np.zeros(1))
+    assert spans[0].tolist() == []
 
 
 @pytest.mark.parametrize("rows", [0, 1, 9, 10, 11])
 def test_few_rows_tell_nothing(rows: int) -> None:
     truth = np.zeros((rows, 2))
-    groups, one = np.zeros(rows), np.ones(2)
+    groups, unit = np.zeros(rows), np.ones(2)
     assert anticipation.difference_sd(truth, groups, horizon=HORIZON).tolist() == [0, 0]
-    theta = anticipation.calibrate(truth, truth, groups, horizon=HORIZON, sd=one, rate_hz=RATE_HZ)
+    theta = anticipation.calibrate(truth, truth, groups, horizon=HORIZON, sd=unit, rate_hz=RATE_HZ)
     assert theta.tolist() == ([0, 0] if rows == 11 else [np.inf, np.inf])
-    found = score(truth, truth + 5)
-    assert found.events == 0
-    assert math.isnan(found.recall)
+    scored = score(truth, truth + 5)
+    assert scored.events == 0
+    assert math.isnan(scored.recall)
 
 
 def test_what_does_not_fit_is_refused() -> None:
-    truth, one = np.zeros((30, 2)), np.ones(2)
+    truth, unit = np.zeros((30, 2)), np.ones(2)
     groups = np.zeros(30)
     with pytest.raises(TacpipeError, match="horizon must be 1 or more"):
         anticipation.difference_sd(truth, groups, horizon=0)
@@ -302,6 +316,6 @@ def test_what_does_not_fit_is_refused() -> None:
     with pytest.raises(TacpipeError, match=r"sd of \(3,\)"):
         anticipation.changes(truth, groups, horizon=1, sd=np.ones(3))
     with pytest.raises(TacpipeError, match=r"ahead of \(29, 2\)"):
-        anticipation.calibrate(truth, truth[1:], groups, horizon=1, sd=one, rate_hz=RATE_HZ)
+        anticipation.calibrate(truth, truth[1:], groups, horizon=1, sd=unit, rate_hz=RATE_HZ)
     with pytest.raises(TacpipeError, match=r"theta of \(1,\)"):
-        anticipation.score(truth, truth, groups, horizon=1, sd=one, theta=one[1:], rate_hz=RATE_HZ)
+        anticipation.score(truth, truth, groups, horizon=1, sd=unit, theta=unit[1:], rate_hz=RATE_HZ)

@@ -54,28 +54,28 @@ def recording(
     return FakeShard(f"trial-{seed:02d}", pa.table(columns, schema=pa.schema(fields)))
 
 
-def trained(folder: Path, architecture: str = "auto", actions: str = "planned", arm: str = "", **made: Any) -> Any:
-    training, validation = (dataset(*(recording(seed, **made) for seed in seeds)) for seeds in (range(3), [10]))
-    asked = params(architecture=architecture, actions=actions, arm=arm)
-    return forward_training.train(asked, training, validation, folder)
+def trained(folder: Path, architecture: str = "auto", actions: str = "planned", arm: str = "", **options: Any) -> Any:
+    training, validation = (dataset(*(recording(seed, **options) for seed in seeds)) for seeds in (range(3), [10]))
+    requested = params(architecture=architecture, actions=actions, arm=arm)
+    return forward_training.train(requested, training, validation, folder)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("architecture", ["auto", "taxelwise", "gru", "tcn", "recurrent"])
-@pytest.mark.parametrize("made", [{"place": None}, {"place": "mm"}, {"place": "m", "turned": True}], ids=str)
+@pytest.mark.parametrize("options", [{"place": None}, {"place": "mm"}, {"place": "m", "turned": True}], ids=str)
 def test_each_architecture_reads_an_array_of_one_axis_with_and_without_an_arm(
-    tmp_path: Path, architecture: str, made: dict[str, Any]
+    tmp_path: Path, architecture: str, options: dict[str, Any]
 ) -> None:
-    model = trained(tmp_path, architecture, "planned" if made["place"] else "none", **made)
+    model = trained(tmp_path, architecture, "planned" if options["place"] else "none", **options)
     loaded = ForwardModel.load(model)
     assert loaded.config["architecture"] == ("taxelwise" if architecture == "auto" else architecture)
-    window, plan, _ = prediction.inputs(loaded, dataset(recording(20, **made)))
+    window, plan, _ = prediction.inputs(loaded, dataset(recording(20, **options)))
     assert plan.shape[1:] == (HORIZON, len(loaded.plan_columns) + len(loaded.derived_columns))
     assert window.shape[1:] == (CONTEXT, len(loaded.window_columns) + len(loaded.derived_columns) + 1)
-    (one,) = forward_prediction.predict(model, dataset(recording(20, **made)), [HORIZON]).recordings.values()
+    (output,) = forward_prediction.predict(model, dataset(recording(20, **options)), [HORIZON]).recordings.values()
     levels = loaded.predict(window, plan)
     for channel in range(5):
-        stored = one.streams[""].column(f"pad_{channel}_t{HORIZON}").to_numpy()
+        stored = output.streams[""].column(f"pad_{channel}_t{HORIZON}").to_numpy()
         assert np.allclose(levels[:, HORIZON - 1, channel], stored, atol=1e-4)
 
 
@@ -83,9 +83,9 @@ def test_each_architecture_reads_an_array_of_one_axis_with_and_without_an_arm(
 def test_a_stage_in_millimetres_is_the_same_stage_as_in_metres(tmp_path: Path) -> None:
     in_mm, in_m = (ForwardModel.load(trained(tmp_path / place, place=place)) for place in ("mm", "m"))
     window, plan, _ = prediction.inputs(in_m, dataset(recording(20, place="m")))
-    other, other_plan, _ = prediction.inputs(in_mm, dataset(recording(20, place="mm")))
-    assert np.allclose(window, other, atol=1e-6) and np.allclose(plan, other_plan, atol=1e-6)
-    assert np.allclose(in_m.predict(window, plan), in_mm.predict(other, other_plan), atol=1e-4)
+    window_in_mm, plan_in_mm, _ = prediction.inputs(in_mm, dataset(recording(20, place="mm")))
+    assert np.allclose(window, window_in_mm, atol=1e-6) and np.allclose(plan, plan_in_mm, atol=1e-6)
+    assert np.allclose(in_m.predict(window, plan), in_mm.predict(window_in_mm, plan_in_mm), atol=1e-4)
     assert in_m.plan_columns == ("ur_x", "ur_y", "ur_z")
 
 
@@ -108,10 +108,10 @@ def test_an_arm_that_is_not_there_is_a_mistake_of_the_command(tmp_path: Path) ->
 
 @pytest.mark.long
 def test_errors_are_given_in_the_unit_of_the_channels(tmp_path: Path) -> None:
-    for unit, said in (("kPa", "kPa"), ("count", "counts")):
+    for unit, unit_in_text in (("kPa", "kPa"), ("count", "counts")):
         model = trained(tmp_path / unit, unit=unit)
         result = forward_evaluation.evaluate(model, dataset(recording(20, unit=unit), recording(21, unit=unit)))
-        assert {one.unit for one in headline.read(result.files[headline.FILE])} == {said}
+        assert {compared.unit for compared in headline.read(result.files[headline.FILE])} == {unit_in_text}
         (table, *_) = forward_prediction.predict(model, dataset(recording(20, unit=unit)), [1]).recordings.values()
         assert table.streams[""].schema.field("pad_0_t1").metadata[b"unit"] == unit.encode()
         assert ("unit" in json.loads(model["config.json"])["inputs"]) == (unit != "count")

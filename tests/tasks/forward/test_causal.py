@@ -26,7 +26,9 @@ def test_the_arm_row_by_row_is_that_of_the_whole_recording_to_the_last_bit() -> 
     track = trials.track(trials.table(rng.normal(0, 5, (60, 6)), pose))
     for reference in (turned[0], -turned[0]):
         arm = Arm(reference)
-        rows = np.array([arm.row(int(t_ns), one[:3], one[3:]) for t_ns, one in zip(T_NS, pose, strict=True)])
+        rows = np.array(
+            [arm.row(int(t_ns), pose_row[:3], pose_row[3:]) for t_ns, pose_row in zip(T_NS, pose, strict=True)]
+        )
         assert rows.tobytes() == np.ascontiguousarray(tracks.aligned(track.arm, reference)).tobytes()
 
 
@@ -42,8 +44,8 @@ def test_velocities_come_from_joints_until_the_hand_leaves_the_last_link() -> No
     away[30:] += 0.1
     quaternion = np.array([0.0, 0.0, 0.0, 1.0])
     rows = [arm.row(int(T_NS[i]), away[i], quaternion, joints[i], speeds[i]) for i in range(60)]
-    wanted = kinematics.hand_velocity(kinematics.PANDA, joints, speeds, hand_m)
-    np.testing.assert_allclose([row[POSE:] for row in rows[:30]], wanted[:30], rtol=1e-5, atol=1e-6)
+    expected = kinematics.hand_velocity(kinematics.PANDA, joints, speeds, hand_m)
+    np.testing.assert_allclose([row[POSE:] for row in rows[:30]], expected[:30], rtol=1e-5, atol=1e-6)
     differences = np.diff(away, axis=0) / 0.02
     np.testing.assert_allclose([row[POSE : POSE + 3] for row in rows[30:]], differences[29:], rtol=1e-4, atol=1e-5)
 
@@ -69,9 +71,9 @@ def test_a_plan_that_begins_later_is_reached_from_where_the_hand_is_and_one_that
     rows = planned.rows(later, 0, AHEAD_NS, now)
     np.testing.assert_allclose(rows[:, 0], 1 + AHEAD_NS / 1e9, atol=1e-6)
     np.testing.assert_array_equal(rows[:, 3:7], np.tile([0, 0, 0, 1], (10, 1)))
-    ended = planned.rows(later, 300_000_000, 300_000_000 + AHEAD_NS, now)
-    np.testing.assert_array_equal(ended[:, 0], np.ones(10))
-    np.testing.assert_array_equal(ended[:, 7:], np.zeros((10, 6)))
+    after_end = planned.rows(later, 300_000_000, 300_000_000 + AHEAD_NS, now)
+    np.testing.assert_array_equal(after_end[:, 0], np.ones(10))
+    np.testing.assert_array_equal(after_end[:, 7:], np.zeros((10, 6)))
 
 
 @pytest.mark.parametrize("turning", [0.0, 0.7, 3.0])
@@ -81,8 +83,8 @@ def test_without_a_plan_the_hand_moves_and_turns_on_as_it_does(turning: float) -
     rows = planned.without(7, 7 + AHEAD_NS, now)
     after_s = AHEAD_NS / 1e9
     np.testing.assert_allclose(rows[:, :3], now[:3] + after_s[:, None] * now[7:10], atol=1e-6)
-    wanted = Rotation.from_rotvec(after_s[:, None] * [0, turning, 0]) * start
-    assert (wanted * Rotation.from_quat(rows[:, 3:7]).inv()).magnitude().max() < 1e-6
+    expected = Rotation.from_rotvec(after_s[:, None] * [0, turning, 0]) * start
+    assert (expected * Rotation.from_quat(rows[:, 3:7]).inv()).magnitude().max() < 1e-6
     np.testing.assert_array_equal(rows[:, 7:], np.tile(now[7:], (10, 1)).astype(np.float32))
 
 

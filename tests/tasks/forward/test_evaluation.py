@@ -1,4 +1,4 @@
-"""What is evaluated is what numpy computes from the recordings' columns, and everything stands where it is looked for."""
+"""Compare evaluation with numpy on the columns of the recordings, and check the files of a result."""
 
 from __future__ import annotations
 
@@ -37,33 +37,40 @@ OTHERS = {"known", "unseen", "counts", "skill", "anticipation", "situations", "c
 LINEAR = {"train_mean", "damped_trend", "last_value_linear", "ridge", "ridge_actions"}
 
 
-def held(seed: int, object_name: str | None) -> FakeShard:
-    one = motion(seed)
-    return dataclasses.replace(one, attributes={"trial": seed} | ({"object": object_name} if object_name else {}))
+def held_object(seed: int, object_name: str | None) -> FakeShard:
+    recording = motion(seed)
+    return dataclasses.replace(recording, attributes={"trial": seed} | ({"object": object_name} if object_name else {}))
 
 
-TRAIN, TEST = [held(seed, "cup") for seed in range(4)], [held(20, "cup"), held(21, "jug"), held(22, "cup")]
+TRAIN, TEST = (
+    [held_object(seed, "cup") for seed in range(4)],
+    [held_object(20, "cup"), held_object(21, "jug"), held_object(22, "cup")],
+)
 
 
 @pytest.fixture(scope="module")
 def model(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
     folder, fast = tmp_path_factory.mktemp("model"), {"learning_rate": 0.02, "epochs": 15, "patience": 15}
-    return trained(folder, dataset(*TRAIN), dataset(held(10, "cup"), held(11, "cup")), **fast)
+    return trained(folder, dataset(*TRAIN), dataset(held_object(10, "cup"), held_object(11, "cup")), **fast)
 
 
 @pytest.fixture(scope="module")
 def latents() -> Mapping[str, Any]:
-    return {of: compressed(*TRAIN, representation=of) for of in ("levels", "increments")}
+    return {
+        representation: compressed(*TRAIN, representation=representation) for representation in ("levels", "increments")
+    }
 
 
 @pytest.fixture(scope="module")
 def latent_models(latents: Mapping[str, Any], tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, bytes]]:
-    found = {}
+    models = {}
     for name in ("gru levels", "recurrent levels", "gru increments"):
-        architecture, of = name.split()
-        watched = compressed(held(10, "cup"), files=latents[of].files, representation=of)
-        found[name] = trained(tmp_path_factory.mktemp("model"), latents[of], watched, architecture=architecture)
-    return found
+        architecture, representation = name.split()
+        watched = compressed(held_object(10, "cup"), files=latents[representation].files, representation=representation)
+        models[name] = trained(
+            tmp_path_factory.mktemp("model"), latents[representation], watched, architecture=architecture
+        )
+    return models
 
 
 def sliding(values: AnyFloats) -> AnyFloats:
@@ -73,7 +80,7 @@ def sliding(values: AnyFloats) -> AnyFloats:
 
 def oracle(*shards: FakeShard) -> dict[str, AnyFloats]:
     """Errors (window, step, channel) of the two that need no fit, from the columns."""
-    windows = np.concatenate([sliding(counts(one)) for one in shards])
+    windows = np.concatenate([sliding(counts(shard)) for shard in shards])
     ahead = windows[:, CONTEXT:]
     return {
         "persistence": windows[:, CONTEXT - 1, None] - ahead,
@@ -95,12 +102,12 @@ def test_persistence_and_context_mean_are_what_numpy_computes_from_the_columns(m
         for group, mask in groups.items():
             mae, mse = metrics[predictor]["mae_counts"][group], metrics[predictor]["mse_counts"][group]
             for step in range(HORIZON):
-                some = errors[:, step, mask]
-                assert mae[f"t{step + 1}"] == pytest.approx(np.abs(some).mean(), rel=1e-6)
-                assert mse[f"t{step + 1}"] == pytest.approx(np.square(some).mean(), rel=1e-6)
+                group_errors = errors[:, step, mask]
+                assert mae[f"t{step + 1}"] == pytest.approx(np.abs(group_errors).mean(), rel=1e-6)
+                assert mse[f"t{step + 1}"] == pytest.approx(np.square(group_errors).mean(), rel=1e-6)
             assert mae["mean"] == pytest.approx(np.abs(errors[..., mask]).mean(), rel=1e-6)
-        wanted = np.square(errors / scale).mean()
-        assert metrics[predictor]["mse_standard"]["mean"] == pytest.approx(wanted, rel=1e-6)
+        expected = np.square(errors / scale).mean()
+        assert metrics[predictor]["mse_standard"]["mean"] == pytest.approx(expected, rel=1e-6)
     assert metrics["counts"] == {
         "windows": 3 * 72,
         "recordings": 3,
@@ -121,16 +128,16 @@ def test_the_model_s_errors_are_those_of_a_loop_over_predict(model: dict[str, by
     model_error, base = np.array(errors), oracle(*TEST)["persistence"]
     for step in range(HORIZON):
         name = f"t{step + 1}"
-        wanted = np.abs(model_error[:, step]).mean()
-        assert metrics["model"]["mae_counts"]["both"][name] == pytest.approx(wanted, rel=1e-3)
+        expected = np.abs(model_error[:, step]).mean()
+        assert metrics["model"]["mae_counts"]["both"][name] == pytest.approx(expected, rel=1e-3)
         skill = 1 - np.square(model_error[:, step]).mean() / np.square(base[:, step]).mean()
         assert metrics["skill"]["mse_counts"][name]["mean"] == pytest.approx(skill, rel=1e-3)
     lines = list(csv.DictReader(io.StringIO(result.files["horizons.csv"].decode())))
     assert {line["predictor"] for line in lines} == {"model", "persistence", "context_mean"} | LINEAR
     assert [line["horizon_ms"] for line in lines[:HORIZON]] == ["20.0", "40.0", "60.0", "80.0"]
-    named = {(line["predictor"], line["step"]): line for line in lines}
-    told = float(named["ridge", "2"]["mae_counts"])
-    assert told == metrics["ridge"]["mae_counts"]["both"]["t2"]
+    lines_by_step = {(line["predictor"], line["step"]): line for line in lines}
+    stated_mae = float(lines_by_step["ridge", "2"]["mae_counts"])
+    assert stated_mae == metrics["ridge"]["mae_counts"]["both"]["t2"]
 
 
 def test_the_model_beats_persistence_where_the_plan_tells_all(model: dict[str, bytes]) -> None:
@@ -142,14 +149,14 @@ def test_the_model_beats_persistence_where_the_plan_tells_all(model: dict[str, b
 def test_the_sums_of_the_errors_table_are_the_means_of_the_metrics(model: dict[str, bytes]) -> None:
     shards = [*TEST, TRAIN[0]]
     metrics, result = evaluated(model, *shards)
-    found = parquet.from_parquet(result.files["errors.parquet"]).to_pandas()
-    assert set(found["recording"]) == {one.name for one in shards}
-    assert set(found["object"]) == {"cup", "jug"}
+    frame = parquet.from_parquet(result.files["errors.parquet"]).to_pandas()
+    assert set(frame["recording"]) == {shard.name for shard in shards}
+    assert set(frame["object"]) == {"cup", "jug"}
     parts = {
-        "": found[~found["seen"]],
-        "known": found[~found["seen"] & found["known"]],
-        "unseen": found[~found["seen"] & ~found["known"]],
-        "seen": found[found["seen"]],
+        "": frame[~frame["seen"]],
+        "known": frame[~frame["seen"] & frame["known"]],
+        "unseen": frame[~frame["seen"] & ~frame["known"]],
+        "seen": frame[frame["seen"]],
     }
     for name, part in parts.items():
         tree = metrics[name] if name else metrics
@@ -167,23 +174,23 @@ def test_the_sums_of_the_errors_table_are_the_means_of_the_metrics(model: dict[s
 def test_objects_that_the_model_was_trained_on_and_others_are_told_apart(model: dict[str, bytes]) -> None:
     metrics, result = evaluated(model, *TEST)
     assert (metrics["known"]["counts"]["recordings"], metrics["unseen"]["counts"]["recordings"]) == (2, 1)
-    alone, _ = evaluated(model, TEST[0], TEST[2])
-    assert metrics["known"]["model"] == alone["model"]
-    assert not {"known", "unseen", "seen"} & set(alone)
+    known_only, _ = evaluated(model, TEST[0], TEST[2])
+    assert metrics["known"]["model"] == known_only["model"]
+    assert not {"known", "unseen", "seen"} & set(known_only)
     rows = {row["recording"]: row for row in csv.DictReader(io.StringIO(result.files["trials.csv"].decode()))}
     assert (rows["trial-21"]["object"], rows["trial-21"]["known"], rows["trial-20"]["known"]) == (
         "jug",
         "false",
         "true",
     )
-    unnamed, _ = evaluated(model, held(20, None), TEST[1])
+    unnamed, _ = evaluated(model, held_object(20, None), TEST[1])
     assert unnamed["known"]["counts"]["recordings"] == 1  # nobody said what is held
 
 
 def test_recordings_that_the_model_has_seen_are_told_apart(model: dict[str, bytes]) -> None:
-    alone, _ = evaluated(model, *TEST)
-    mixed, result = evaluated(model, *TEST, TRAIN[0], held(10, "cup"))
-    assert {name: value for name, value in mixed.items() if name != "seen"} == alone
+    unseen_only, _ = evaluated(model, *TEST)
+    mixed, result = evaluated(model, *TEST, TRAIN[0], held_object(10, "cup"))
+    assert {name: value for name, value in mixed.items() if name != "seen"} == unseen_only
     assert mixed["seen"]["counts"]["recordings"] == 2
     assert result.recordings[TRAIN[0].name].attributes["seen"] is True
     assert result.recordings[TEST[0].name].attributes == {"trial": 20, "object": "cup", "seen": False}
@@ -219,17 +226,17 @@ def test_names_of_metrics_are_those_that_readers_rely_on(model: dict[str, bytes]
 def test_alarms_are_counted_for_the_model_and_whatever_it_has_to_beat(model: dict[str, bytes]) -> None:
     metrics, _ = evaluated(model, *TEST)
     assert set(metrics["anticipation"]) == {"model", "persistence", *(LINEAR - {"train_mean"})}
-    for found in metrics["anticipation"].values():
-        assert set(found) == {
+    for counts_of_alarms in metrics["anticipation"].values():
+        assert set(counts_of_alarms) == {
             *("events", "recall", "median_lead_rows", "median_lead_frames", "false_alarms_per_minute"),
         }
 
 
 def test_features_are_measured_in_half_their_training_range(model: dict[str, bytes]) -> None:
     metrics, _ = evaluated(model, *TEST)
-    half = np.ptp(np.concatenate([counts(one) for one in TRAIN]), axis=0) / 2
-    wanted = np.square(oracle(*TEST)["persistence"] / half).mean()
-    assert metrics["persistence"]["mse_feature"]["mean"] == pytest.approx(wanted, rel=1e-4)
+    half = np.ptp(np.concatenate([counts(shard) for shard in TRAIN]), axis=0) / 2
+    expected = np.square(oracle(*TEST)["persistence"] / half).mean()
+    assert metrics["persistence"]["mse_feature"]["mean"] == pytest.approx(expected, rel=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -243,8 +250,11 @@ def test_features_are_measured_in_half_their_training_range(model: dict[str, byt
 def test_what_the_codec_alone_loses_stands_beside_the_model(
     name: str, rows: set[str], latents: Mapping[str, Any], latent_models: Mapping[str, dict[str, bytes]]
 ) -> None:
-    of = name.split()[1]
-    codec, test = latents[of], compressed(*TEST, files=latents[of].files, representation=of)
+    representation = name.split()[1]
+    codec, test = (
+        latents[representation],
+        compressed(*TEST, files=latents[representation].files, representation=representation),
+    )
     metrics, result = evaluated(latent_models[name], *test.recordings.values(), files=codec.files)
     assert set(metrics) - LINEAR - OTHERS == {
         *("model", "persistence"),
@@ -254,11 +264,11 @@ def test_what_the_codec_alone_loses_stands_beside_the_model(
     assert metrics["codec"]["mse_latent"]["mean"] == 0
     assert metrics["codec"]["mse_counts"]["both"]["mean"] > 0
     for predictor, errors in oracle(*TEST).items():
-        wanted = np.abs(errors).mean()
-        assert metrics[predictor]["mae_counts"]["both"]["mean"] == pytest.approx(wanted, rel=1e-6)
+        expected = np.abs(errors).mean()
+        assert metrics[predictor]["mae_counts"]["both"]["mean"] == pytest.approx(expected, rel=1e-6)
     assert "codec.json" in result.files
-    found = result.recordings["trial-20"].streams[""]
-    assert found.column_names[:5] == ["t_ns", "contact", "z00", "z00_t1", "z00_t3"]
+    table_written = result.recordings["trial-20"].streams[""]
+    assert table_written.column_names[:5] == ["t_ns", "contact", "z00", "z00_t1", "z00_t3"]
 
 
 def test_what_the_codec_loses_is_what_numpy_computes(
@@ -267,23 +277,23 @@ def test_what_the_codec_loses_is_what_numpy_computes(
     codec = ForwardModel.load(latent_models["gru levels"]).codec
     test = compressed(*TEST, files=latents["levels"].files)
     metrics, _ = evaluated(latent_models["gru levels"], *test.recordings.values(), files=latents["levels"].files)
-    lost = {one.name: codec.decode(codec.encode(counts(one), CHANNELS)) - counts(one) for one in TEST}
-    windows = np.concatenate([sliding(one) for one in lost.values()])
-    for predictor, wanted in (
+    lost = {shard.name: codec.decode(codec.encode(counts(shard), CHANNELS)) - counts(shard) for shard in TEST}
+    windows = np.concatenate([sliding(shard) for shard in lost.values()])
+    for predictor, expected in (
         ("codec", windows[:, CONTEXT:]),
         ("codec_anchored", windows[:, CONTEXT:] - windows[:, CONTEXT - 1, None]),
         ("codec_persistence", windows[:, CONTEXT - 1, None] + oracle(*TEST)["persistence"]),
     ):
-        found = metrics[predictor]["mse_counts"]["both"]["mean"]
-        assert found == pytest.approx(np.square(wanted).mean(), rel=1e-3), predictor
+        stated = metrics[predictor]["mse_counts"]["both"]["mean"]
+        assert stated == pytest.approx(np.square(expected).mean(), rel=1e-3), predictor
 
 
 def test_latents_of_another_codec_are_refused(
     latents: Mapping[str, Any], latent_models: Mapping[str, dict[str, bytes]]
 ) -> None:
-    other = compressed(*TEST)
+    of_another_codec = compressed(*TEST)
     with pytest.raises(TacpipeError, match="another codec than the model's"):
-        evaluated(latent_models["gru levels"], *other.recordings.values(), files=other.files)
+        evaluated(latent_models["gru levels"], *of_another_codec.recordings.values(), files=of_another_codec.files)
     with pytest.raises(TacpipeError, match="trial-20: There is no column z00"):
         evaluated(latent_models["gru levels"], *TEST)
 
@@ -297,8 +307,8 @@ def test_a_model_of_raw_channels_reads_recordings_that_have_latents_too(
 
 
 def test_a_signal_that_stays_has_no_error_and_no_skill(model: dict[str, bytes]) -> None:
-    still = FakeShard("still", table(np.full((40, len(CHANNELS)), 12.0)))
-    metrics, result = evaluated(model, still)
+    constant = FakeShard("still", table(np.full((40, len(CHANNELS)), 12.0)))
+    metrics, result = evaluated(model, constant)
     assert metrics["persistence"]["mse_counts"]["both"]["mean"] == 0
     assert metrics["context_mean"]["mae_counts"]["x"]["t3"] == 0
     assert metrics["skill"]["mse_counts"] == {}
@@ -310,13 +320,13 @@ def test_recordings_without_a_window_are_counted_and_do_no_harm(model: dict[str,
     empty = FakeShard("a-empty", table(np.zeros((0, len(CHANNELS)))))
     short = FakeShard("short", motion(1, rows=LENGTH - 1).content)
     metrics, result = evaluated(model, empty, *TEST, short)
-    wanted, _ = evaluated(model, *TEST)
-    assert metrics["counts"] == wanted["counts"] | {"recordings_without_window": 2}
-    assert metrics["model"] == wanted["model"]
+    expected, _ = evaluated(model, *TEST)
+    assert metrics["counts"] == expected["counts"] | {"recordings_without_window": 2}
+    assert metrics["model"] == expected["model"]
     for name in ("a-empty", "short"):
-        found = result.recordings[name].tables
-        assert isinstance(found, pa.Table)
-        assert found.num_rows == 0
+        predictions = result.recordings[name].tables
+        assert isinstance(predictions, pa.Table)
+        assert predictions.num_rows == 0
     none, _ = evaluated(model, empty)
     assert none == {"counts": {"windows": 0, "recordings": 0, "recordings_without_window": 1, "effective_windows": 0}}
 
@@ -325,18 +335,22 @@ def test_every_window_is_judged_in_contact_or_not(model: dict[str, bytes]) -> No
     free = FakeShard("trial-20", table(counts(TEST[0]), poses(TEST[0]), contact=np.full(80, -1)), TEST[0].attributes)
     metrics, result = evaluated(model, free)
     assert metrics["model"] == evaluated(model, TEST[0])[0]["model"]
-    found = result.recordings["trial-20"].streams[""]
-    assert set(found["contact"].to_pylist()) == {-1}
+    predictions = result.recordings["trial-20"].streams[""]
+    assert set(predictions["contact"].to_pylist()) == {-1}
 
 
 def test_predictions_stand_at_the_time_they_are_known(model: dict[str, bytes]) -> None:
     _, result = evaluated(model, TEST[0])
-    _, _, some = predicted_windows(ForwardModel.load(model), TEST[0])
-    found, name = result.recordings[TEST[0].name].streams[""], CHANNELS[0]
-    assert found["t_ns"].to_pylist()[:2] == [4 * 20_000_000, 5 * 20_000_000]
-    assert [column for column in found.column_names if column.startswith(name)] == [name, f"{name}_t1", f"{name}_t3"]
-    assert np.allclose(found[f"{name}_t3"].to_numpy(), some.features[:, 2, 0], rtol=1e-5)
-    assert np.allclose(found[name].to_numpy(), counts(TEST[0])[4:-4, 0], atol=1e-2)
+    _, _, windows = predicted_windows(ForwardModel.load(model), TEST[0])
+    predictions, name = result.recordings[TEST[0].name].streams[""], CHANNELS[0]
+    assert predictions["t_ns"].to_pylist()[:2] == [4 * 20_000_000, 5 * 20_000_000]
+    assert [column for column in predictions.column_names if column.startswith(name)] == [
+        name,
+        f"{name}_t1",
+        f"{name}_t3",
+    ]
+    assert np.allclose(predictions[f"{name}_t3"].to_numpy(), windows.features[:, 2, 0], rtol=1e-5)
+    assert np.allclose(predictions[name].to_numpy(), counts(TEST[0])[4:-4, 0], atol=1e-2)
 
 
 def test_recordings_of_another_rate_or_grid_are_refused(model: dict[str, bytes]) -> None:
@@ -356,5 +370,5 @@ def test_recordings_of_another_layout_are_refused(model: dict[str, bytes]) -> No
 
 def test_judging_again_gives_the_same_bytes_for_a_control_too(tmp_path: Path) -> None:
     files = trained(tmp_path, actions="shuffled")
-    (_, first), (_, again) = evaluated(files, *TEST), evaluated(files, *TEST)
-    assert first.files == again.files
+    (_, first), (_, second) = evaluated(files, *TEST), evaluated(files, *TEST)
+    assert first.files == second.files

@@ -18,25 +18,27 @@ ROWS, REST = 50, (16000.3, 0.1)
 def table(kind: pa.DataType) -> pa.Table:
     values = np.random.default_rng(0).integers(0, 200, (2, ROWS))
     fields = [
-        pa.field(f"x{number}", kind, metadata={"quantity": "tactile", "rest": str(rest)})
-        for number, rest in enumerate(REST)
+        pa.field(f"x{number}", kind, metadata={"quantity": "tactile", "rest": str(level)})
+        for number, level in enumerate(REST)
     ]
-    return pa.Table.from_arrays([pa.array(one).cast(kind) for one in values], schema=pa.schema(fields))
+    return pa.Table.from_arrays(
+        [pa.array(values_of_channel).cast(kind) for values_of_channel in values], schema=pa.schema(fields)
+    )
 
 
 @pytest.mark.parametrize(
     ("kind", "bytes_each"), [(pa.float32(), 4), (pa.uint16(), 4), (pa.int32(), 8), (pa.float64(), 8)]
 )
 def test_every_index_gives_the_bits_that_an_array_gives(kind: pa.DataType, bytes_each: int) -> None:
-    given = table(kind)
-    found, whole = levels.above_rest(given, ["x0", "x1"]), tactile.above_rest(given, ["x0", "x1"])
-    assert found.stored.nbytes == ROWS * 2 * bytes_each
+    columns = table(kind)
+    lazy, expected = levels.above_rest(columns, ["x0", "x1"]), tactile.above_rest(columns, ["x0", "x1"])
+    assert lazy.stored.nbytes == ROWS * 2 * bytes_each
     windows = np.arange(6)[:, None] + np.arange(4)
     for at in (slice(None), slice(3, 9), windows, np.arange(ROWS) > 7, (slice(None), [1, 0]), (windows[:, 0], 1)):
-        assert np.array_equal(found[at], whole[at]) and found[at].dtype == np.float64
-        assert np.array_equal(found.of_type(np.float32)[at], whole[at].astype(np.float32))
-    assert np.array_equal(found.between(4, 20)[windows], whole[4:20][windows])
-    assert np.array_equal(np.asarray(found), whole) and found.shape == whole.shape
+        assert np.array_equal(lazy[at], expected[at]) and lazy[at].dtype == np.float64
+        assert np.array_equal(lazy.of_type(np.float32)[at], expected[at].astype(np.float32))
+    assert np.array_equal(lazy.between(4, 20)[windows], expected[4:20][windows])
+    assert np.array_equal(np.asarray(lazy), expected) and lazy.shape == expected.shape
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])

@@ -1,4 +1,4 @@
-"""What evaluation holds of a long recording: the recording as it is stored, and one batch of windows."""
+"""Limit the memory of an evaluation: the recording as it is stored, and one batch of windows."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ def peak_bytes(forecaster: Forecaster, rows: int) -> int:
     shard: FakeShard = motion(0, rows=rows)
     track = tracks.track(shard, forecaster.codec)  # type: ignore[arg-type]
     loads = Loads(forecaster.codec.layout, forecaster.horizon)
-    apart = BySituation(forecaster.horizon, len(forecaster.codec.channels))
+    by_situation = BySituation(forecaster.horizon, len(forecaster.codec.channels))
     tracemalloc.start()
     alarms = (loads, SlipAlarms.of(forecaster))
-    evaluation._predictions(forecaster, track, Trial("a", True), alarms, apart, Spill(1))
+    evaluation._predictions(forecaster, track, Trial("a", True), alarms, by_situation, Spill(1))
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     return peak
@@ -49,10 +49,10 @@ def test_the_evaluation_of_a_longer_recording_takes_hardly_more_besides_its_trac
 def test_the_predictions_of_a_batch_are_made_one_after_another(tmp_path: Path) -> None:
     forecaster = Forecaster.load(trained(tmp_path))
     track = tracks.track(motion(0, rows=200), forecaster.codec)  # type: ignore[arg-type]
-    (some,) = predictors.predicted(forecaster, track, track.starts(forecaster.context, forecaster.horizon))
-    found = dict(some.predictions.items())
-    assert list(found) == list(some.predictions) and len(found) == len(some.predictions) > 5
-    for name, prediction in found.items():
-        assert np.array_equal(prediction.count, some.predictions[name].count)
+    (batch,) = predictors.predicted(forecaster, track, track.starts(forecaster.context, forecaster.horizon))
+    stored = dict(batch.predictions.items())
+    assert list(stored) == list(batch.predictions) and len(stored) == len(batch.predictions) > 5
+    for name, prediction in stored.items():
+        assert np.array_equal(prediction.count, batch.predictions[name].count)
     with pytest.raises(KeyError):
-        some.predictions["another"]
+        batch.predictions["another"]

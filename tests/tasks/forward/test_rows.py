@@ -12,7 +12,7 @@ from tests.stages.learning_fakes import motion
 from tests.tasks.forward.trials import CONTEXT, HORIZON, LENGTH, track
 
 TRACKS = [track(motion(seed, rows=count).content) for seed, count in ((0, 30), (1, 8), (2, 20))]
-STARTS = [one.starts(CONTEXT, HORIZON) for one in TRACKS]
+STARTS = [recorded.starts(CONTEXT, HORIZON) for recorded in TRACKS]
 
 
 def joined(actions: str = "planned") -> Rows:
@@ -20,24 +20,24 @@ def joined(actions: str = "planned") -> Rows:
 
 
 def test_windows_are_rows_of_one_recording_each() -> None:
-    found = joined()
-    assert [len(one) for one in STARTS] == [22, 0, 12]
-    assert found.part.count == 34
-    picked, ahead = found.pick(found.starts)
-    wanted = [(one, first) for one, starts in zip(TRACKS, STARTS, strict=True) for first in starts]
-    for index, (one, first) in enumerate(wanted):
+    rows = joined()
+    assert [len(starts) for starts in STARTS] == [22, 0, 12]
+    assert rows.part.count == 34
+    picked, ahead = rows.pick(rows.starts)
+    expected = [(recorded, first) for recorded, starts in zip(TRACKS, STARTS, strict=True) for first in starts]
+    for index, (recorded, first) in enumerate(expected):
         past, future = slice(first, first + CONTEXT), slice(first + CONTEXT, first + LENGTH)
-        assert np.array_equal(picked.touch[:, index].numpy(), one.latent[past])
-        assert np.array_equal(picked.arm[:, index].numpy(), one.arm[first : first + LENGTH])
-        assert np.array_equal(picked.finger[:, index].numpy(), one.finger[past])
-        assert np.array_equal(ahead[:, index].numpy(), one.latent[future])
+        assert np.array_equal(picked.touch[:, index].numpy(), recorded.latent[past])
+        assert np.array_equal(picked.arm[:, index].numpy(), recorded.arm[first : first + LENGTH])
+        assert np.array_equal(picked.finger[:, index].numpy(), recorded.finger[past])
+        assert np.array_equal(ahead[:, index].numpy(), recorded.latent[future])
 
 
 def test_some_are_spread_evenly_and_no_more_than_asked_for() -> None:
-    found = joined()
-    assert torch.equal(found.evenly_spread(100), found.starts)
-    assert found.evenly_spread(10).tolist() == found.starts[::4].tolist()
-    assert len(found.evenly_spread(10)) <= 10
+    rows = joined()
+    assert torch.equal(rows.evenly_spread(100), rows.starts)
+    assert rows.evenly_spread(10).tolist() == rows.starts[::4].tolist()
+    assert len(rows.evenly_spread(10)) <= 10
 
 
 def test_no_recordings_and_no_windows_make_no_rows() -> None:
@@ -46,16 +46,16 @@ def test_no_recordings_and_no_windows_make_no_rows() -> None:
 
 
 def test_a_model_is_told_the_plan_that_its_actions_say() -> None:
-    given = joined().pick(joined().starts)[0]
-    assert acted(given, "planned") is given
-    still = acted(given, "none").arm
-    assert torch.equal(still[CONTEXT:], still[CONTEXT - 1].expand(HORIZON, -1, -1))
+    windows = joined().pick(joined().starts)[0]
+    assert acted(windows, "planned") is windows
+    arm = acted(windows, "none").arm
+    assert torch.equal(arm[CONTEXT:], arm[CONTEXT - 1].expand(HORIZON, -1, -1))
     torch.manual_seed(0)
-    first = acted(given, "shuffled").arm
+    first = acted(windows, "shuffled").arm
     torch.manual_seed(0)
-    assert torch.equal(acted(given, "shuffled").arm, first)
-    assert torch.equal(first[:CONTEXT], given.arm[:CONTEXT])
-    assert not torch.allclose(first[CONTEXT:], given.arm[CONTEXT:], atol=1e-3)
+    assert torch.equal(acted(windows, "shuffled").arm, first)
+    assert torch.equal(first[:CONTEXT], windows.arm[:CONTEXT])
+    assert not torch.allclose(first[CONTEXT:], windows.arm[CONTEXT:], atol=1e-3)
 
 
 def test_actions_that_do_not_exist_are_named_with_those_that_do() -> None:

@@ -21,16 +21,16 @@ LAYOUT = [
 LEAST = np.array([10.0, 2.0])
 
 
-def levels(left: tuple[float, float, float], right: tuple[float, float] = (0.0, 0.0)) -> list[float]:
+def levels(left_means: tuple[float, float, float], right_means: tuple[float, float] = (0.0, 0.0)) -> list[float]:
     """Channels whose means on the left and right are these."""
-    x, y, z = left
-    return [x - 1, y + 2, z - 3, x + 1, y - 2, z + 3, 7000.0, *right]
+    x, y, z = left_means
+    return [x - 1, y + 2, z - 3, x + 1, y - 2, z + 3, 7000.0, *right_means]
 
 
 def score(now: list[float], *ahead: list[float]) -> float:
-    found: Floats = rise_and_fall(np.array([ahead]), np.array([now]), LAYOUT, LEAST)
-    assert found.shape == (1,)
-    return float(found[0])
+    scores: Floats = rise_and_fall(np.array([ahead]), np.array([now]), LAYOUT, LEAST)
+    assert scores.shape == (1,)
+    return float(scores[0])
 
 
 def test_the_shear_load_is_the_length_of_the_mean_of_a_skin() -> None:
@@ -48,7 +48,7 @@ def test_the_score_is_the_rise_to_a_step_and_the_fall_behind_it_over_what_presse
 
 def test_a_peak_before_a_dip_counts_by_the_lowest_step_behind_it() -> None:
     now = levels((0.0, 10.0, 100.0))
-    loads = (30.0, 5.0, 32.0)  # from 10: rise of 20 and fall of 25, or rise of 22 and none
+    loads = (30.0, 5.0, 32.0)  # start 10: rise of 20 and fall of 25, or rise of 22 and no fall
     assert score(now, *(levels((0.0, load, 0.0)) for load in loads)) == pytest.approx((20 + 25) / 100)
 
 
@@ -82,6 +82,6 @@ def test_a_forecast_that_is_not_finite_or_a_sensor_without_shear_has_no_score() 
 def test_the_score_is_the_same_in_every_unit(scale: float, seed: int) -> None:
     rng = np.random.default_rng(seed)
     ahead, now, spread = rng.normal(0, 50, (3, 5, 9)), rng.normal(0, 50, (3, 9)), rng.uniform(1, 9, 9)
-    one = rise_and_fall(ahead, now, LAYOUT, floors(spread, LAYOUT))
-    other = rise_and_fall(scale * ahead, scale * now, LAYOUT, floors(scale * spread, LAYOUT))
-    assert np.allclose(one, other)
+    in_counts = rise_and_fall(ahead, now, LAYOUT, floors(spread, LAYOUT))
+    scaled = rise_and_fall(scale * ahead, scale * now, LAYOUT, floors(scale * spread, LAYOUT))
+    assert np.allclose(in_counts, scaled)

@@ -1,4 +1,4 @@
-"""What the hand does in a window, and that errors by it add up to those of all windows."""
+"""Check situations of windows, and that errors by situation add up to those of all windows."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ REST = {
 
 
 @pytest.mark.parametrize(
-    ("changed", "wanted"),
+    ("changed", "situation"),
     [
         ({}, "holding still"),
         ({"pace_m_s": 0.021}, "holding in motion"),
@@ -41,70 +41,73 @@ REST = {
         ({"touched_now": 0.0, "touched_then": 0.0, "pace_m_s": 1.0}, "no contact"),
     ],
 )
-def test_a_window_has_the_first_name_that_fits(changed: dict[str, float], wanted: str) -> None:
-    found = situations.situation_numbers(
+def test_a_window_has_the_first_name_that_fits(changed: dict[str, float], situation: str) -> None:
+    numbers = situations.situation_numbers(
         Motion(**{name: np.array([value]) for name, value in {**REST, **changed}.items()})
     )
-    assert SITUATIONS[found[0]] == wanted
+    assert SITUATIONS[numbers[0]] == situation
 
 
 def test_windows_of_a_recording_are_named_by_their_last_row_and_those_to_come() -> None:
-    one = motion(0)
-    track = tracks.track(one, tracks.codec_of(one.content, {}))  # type: ignore[arg-type]
+    recording = motion(0)
+    track = tracks.track(recording, tracks.codec_of(recording.content, {}))  # type: ignore[arg-type]
     rows = len(track.t_ns)
     arm = np.zeros((rows, 13), np.float32)
     arm[40:, 7] = 0.5
     contact = np.where(np.arange(rows) < 10, -1, 0)
     finger = np.where(np.arange(rows) < 60, 0.04, 0.05).astype(np.float32)
-    still = np.full(track.tactile.shape, 50.0)
-    still[20:] = 40.0
-    given: Any = dataclasses.replace(track, arm=arm, contact=contact, finger=finger, tactile=still)
+    tactile = np.full(track.tactile.shape, 50.0)
+    tactile[20:] = 40.0
+    changed: Any = dataclasses.replace(track, arm=arm, contact=contact, finger=finger, tactile=tactile)
     now = np.array([3, 8, 12, 17, 25, 37, 45, 57])
-    found = [SITUATIONS[at] for at in situations.of_windows(given, now, HORIZON)]
-    assert found == [
+    names = [SITUATIONS[at] for at in situations.of_windows(changed, now, HORIZON)]
+    assert names == [
         *("no contact", "closing", "holding still", "slipping"),
         *("holding still", "holding in motion", "holding in motion", "releasing"),
     ]
-    assert situations.of_windows(given, now[:0], HORIZON).tolist() == []
+    assert situations.of_windows(changed, now[:0], HORIZON).tolist() == []
 
 
 def test_errors_and_skill_are_those_of_numpy_over_the_windows_of_a_situation() -> None:
     rng = np.random.default_rng(0)
-    sums, kept = BySituation(HORIZON, 3), {}
+    sums, by_recording = BySituation(HORIZON, 3), {}
     for recording in ("a", "b", "c"):
         doing = rng.integers(0, 3, 30)
         truth = rng.normal(size=(30, HORIZON, 3))
-        model, still = truth + rng.normal(0, 0.5, truth.shape), truth + rng.normal(0, 1, truth.shape)
-        for some in (slice(0, 11), slice(11, 30)):
-            sums.count(recording, doing[some])
-            for name, values in (("model", model), ("persistence", still)):
-                sums.add(recording, doing[some], name, Prediction(None, values[some]), Prediction(None, truth[some]))
-        kept[recording] = (doing, truth, model, still)
-    found = sums.summary()
-    assert set(found) == set(SITUATIONS[:3])
+        model, persistence = truth + rng.normal(0, 0.5, truth.shape), truth + rng.normal(0, 1, truth.shape)
+        for part in (slice(0, 11), slice(11, 30)):
+            sums.count(recording, doing[part])
+            for name, values in (("model", model), ("persistence", persistence)):
+                sums.add(recording, doing[part], name, Prediction(None, values[part]), Prediction(None, truth[part]))
+        by_recording[recording] = (doing, truth, model, persistence)
+    measures = sums.summary()
+    assert set(measures) == set(SITUATIONS[:3])
     at = 1
-    errors = [np.concatenate([(one[2 + which] - one[1])[one[0] == at] for one in kept.values()]) for which in (0, 1)]
-    one = found[SITUATIONS[at]]
-    assert (one["windows"], one["recordings"]) == (len(errors[0]), 3)
-    assert one["mae_counts"]["model"]["t2"] == pytest.approx(np.abs(errors[0][:, 1]).mean(), rel=1e-6)
-    assert one["mae_counts"]["persistence"]["mean"] == pytest.approx(np.abs(errors[1]).mean(), rel=1e-6)
-    ratios = [np.divide(*(np.abs(part - truth)[doing == at, 2].sum() for part in (model, still)))
-              for doing, truth, model, still in kept.values()]  # fmt: skip
-    assert one["skill"]["t3"]["mean"] == pytest.approx(1 - np.prod(ratios) ** (1 / 3), rel=1e-6)
-    assert one["skill"]["t3"]["low"] < one["skill"]["t3"]["mean"] < one["skill"]["t3"]["high"]
+    errors = [
+        np.concatenate([(entry[2 + predictor] - entry[1])[entry[0] == at] for entry in by_recording.values()])
+        for predictor in (0, 1)
+    ]
+    entry = measures[SITUATIONS[at]]
+    assert (entry["windows"], entry["recordings"]) == (len(errors[0]), 3)
+    assert entry["mae_counts"]["model"]["t2"] == pytest.approx(np.abs(errors[0][:, 1]).mean(), rel=1e-6)
+    assert entry["mae_counts"]["persistence"]["mean"] == pytest.approx(np.abs(errors[1]).mean(), rel=1e-6)
+    ratios = [np.divide(*(np.abs(part - truth)[doing == at, 2].sum() for part in (model, persistence)))
+              for doing, truth, model, persistence in by_recording.values()]  # fmt: skip
+    assert entry["skill"]["t3"]["mean"] == pytest.approx(1 - np.prod(ratios) ** (1 / 3), rel=1e-6)
+    assert entry["skill"]["t3"]["low"] < entry["skill"]["t3"]["mean"] < entry["skill"]["t3"]["high"]
 
 
 def test_evaluate_states_situations_whose_windows_are_all_windows_of_unseen_recordings(tmp_path: Path) -> None:
     files = trained(tmp_path, epochs=1)
     metrics, _ = evaluated(files, motion(20), motion(21), motion(0))  # the last one was trained on
-    found = metrics["situations"]
+    measures = metrics["situations"]
     assert (
-        sum(one["windows"] for one in found.values())
+        sum(measured["windows"] for measured in measures.values())
         == metrics["counts"]["windows"]
         == 2 * (80 - CONTEXT - HORIZON + 1)
     )
     for name in ("model", "persistence", "ridge"):
-        pooled = sum(one["windows"] * one["mae_counts"][name]["t1"] for one in found.values())
+        pooled = sum(measured["windows"] * measured["mae_counts"][name]["t1"] for measured in measures.values())
         assert pooled / metrics["counts"]["windows"] == pytest.approx(
             metrics[name]["mae_counts"]["both"]["t1"], rel=1e-6
         )

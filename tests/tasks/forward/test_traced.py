@@ -19,8 +19,8 @@ from tests.live import rigs
 
 @pytest.fixture(scope="module")
 def forecaster(tmp_path_factory: pytest.TempPathFactory) -> Forecaster:
-    made = rigs.model(tmp_path_factory.mktemp("model"))
-    return Forecaster.load(made[0])
+    model_files = rigs.model(tmp_path_factory.mktemp("model"))
+    return Forecaster.load(model_files[0])
 
 
 def windows(forecaster: Forecaster, seed: int) -> Windows:
@@ -37,8 +37,8 @@ def test_a_recorded_network_gives_what_the_network_gives_to_the_last_bit(forecas
     network = Network(forecaster)
     assert network.is_recorded
     for seed in range(20):
-        given = windows(forecaster, seed)
-        assert network.features(given).tobytes() == forecaster.features(given).tobytes()
+        inputs = windows(forecaster, seed)
+        assert network.features(inputs).tobytes() == forecaster.features(inputs).tobytes()
 
 
 class Moody(nn.Module):
@@ -50,27 +50,27 @@ class Moody(nn.Module):
         super().__init__()
         self.network = network
 
-    def forward(self, given: Windows) -> Any:
-        found = self.network(given)
-        return found + 1 if float(given.touch.abs().max()) > 0 else found
+    def forward(self, inputs: Windows) -> Any:
+        predicted = self.network(inputs)
+        return predicted + 1 if float(inputs.touch.abs().max()) > 0 else predicted
 
 
 class Unwilling(Moody):
     """Cannot be recorded."""
 
-    def forward(self, given: Windows) -> Any:
+    def forward(self, inputs: Windows) -> Any:
         if torch.jit.is_tracing():  # type: ignore[attr-defined,no-untyped-call]
             raise RuntimeError("not while recorded")
-        return self.network(given)
+        return self.network(inputs)
 
 
 @pytest.mark.parametrize("kind", [Moody, Unwilling])
 def test_a_network_whose_recording_gives_other_numbers_runs_as_it_is(kind: type[Moody], forecaster: Forecaster) -> None:
-    other = dataclasses.replace(forecaster, model=kind(forecaster.model))
-    network = Network(other)
+    changed = dataclasses.replace(forecaster, model=kind(forecaster.model))
+    network = Network(changed)
     assert not network.is_recorded
-    given = windows(forecaster, 0)
-    assert network.features(given).tobytes() == other.features(given).tobytes()
+    inputs = windows(forecaster, 0)
+    assert network.features(inputs).tobytes() == changed.features(inputs).tobytes()
 
 
 def test_a_model_is_recorded_once(forecaster: Forecaster, tmp_path: Path) -> None:

@@ -27,16 +27,16 @@ def timed(t_ns: np.ndarray) -> pa.Table:
 
 
 def test_a_dataset_without_codec_gives_counts_above_rest() -> None:
-    found = track(table(TACTILE))
-    assert np.allclose(found.tactile, TACTILE, atol=2e-3)
-    assert np.allclose(found.latent, found.tactile)
+    recorded = track(table(TACTILE))
+    assert np.allclose(recorded.tactile, TACTILE, atol=2e-3)
+    assert np.allclose(recorded.latent, recorded.tactile)
 
 
 def test_windows_cross_neither_gaps_nor_missing_rows_and_contact_does_not_matter() -> None:
     contact, gap = np.repeat([-1, 0, 1], 10), np.zeros(30, dtype=bool)
     gap[15] = True
-    found = track(table(TACTILE, contact=contact, gap=gap))
-    assert found.starts(3, 2).tolist() == [*range(11), *range(16, 26)]
+    recorded = track(table(TACTILE, contact=contact, gap=gap))
+    assert recorded.starts(3, 2).tolist() == [*range(11), *range(16, 26)]
     t_ns = np.arange(30) * 20_000_000
     t_ns[12:] += 60_000_000
     assert track(timed(t_ns)).starts(5, 5).tolist() == [0, 1, 2, *range(12, 21)]
@@ -45,9 +45,9 @@ def test_windows_cross_neither_gaps_nor_missing_rows_and_contact_does_not_matter
 def test_windows_in_contact_lie_within_one_contact() -> None:
     contact, gap = np.repeat([-1, 0, 1, -1], [5, 10, 8, 7]), np.zeros(30, dtype=bool)
     gap[18] = True
-    found = track(table(TACTILE, contact=contact, gap=gap))
-    assert found.contact_starts(2, 2, 1).tolist() == [*range(5, 12), *range(19, 20)]
-    assert found.contact_starts(2, 2, 3).tolist() == [5, 8, 11, 19]
+    recorded = track(table(TACTILE, contact=contact, gap=gap))
+    assert recorded.contact_starts(2, 2, 1).tolist() == [*range(5, 12), *range(19, 20)]
+    assert recorded.contact_starts(2, 2, 3).tolist() == [5, 8, 11, 19]
     none = track(table(TACTILE, contact=np.full(30, -1)))
     assert none.contact_starts(2, 2, 1).tolist() == []
     assert len(none.starts(2, 2)) == 27
@@ -67,10 +67,10 @@ def test_rows_that_are_not_finite_are_unusable_and_rows_without_contact_are_not(
     finger = np.full(30, 0.04)
     finger[20] = np.nan
     contact = np.full(30, -1)
-    found = track(table(tactile, pose, contact=contact, extra={"robot_finger_m": finger}))
+    recorded = track(table(tactile, pose, contact=contact, extra={"robot_finger_m": finger}))
     # the row after one without a pose has no velocity either
-    assert np.flatnonzero(~found.usable).tolist() == [4, 5, 8, 9, 13, 20]
-    assert found.finger[0] == pytest.approx(0.04)
+    assert np.flatnonzero(~recorded.usable).tolist() == [4, 5, 8, 9, 13, 20]
+    assert recorded.finger[0] == pytest.approx(0.04)
 
 
 def test_the_finger_s_width_is_zero_where_it_is_not_recorded() -> None:
@@ -78,17 +78,17 @@ def test_the_finger_s_width_is_zero_where_it_is_not_recorded() -> None:
 
 
 def test_what_is_held_and_the_grid_are_told_by_attributes() -> None:
-    found = track(table(TACTILE), grid="fresh", object="bottle-200g")
-    assert (found.timeline, found.object) == ("fresh", "bottle-200g")
-    found = track(table(TACTILE))
-    assert (found.timeline, found.object) == ("uniform", None)
+    recorded = track(table(TACTILE), grid="fresh", object="bottle-200g")
+    assert (recorded.timeline, recorded.object) == ("fresh", "bottle-200g")
+    recorded = track(table(TACTILE))
+    assert (recorded.timeline, recorded.object) == ("uniform", None)
 
 
 def test_a_recording_without_rows_has_no_windows() -> None:
-    found = track(table(TACTILE[:0]))
-    assert found.starts(2, 2).tolist() == []
-    assert found.contact_starts(2, 2, 1).tolist() == []
-    assert tracks.rate_hz([found]) == 0.0
+    recorded = track(table(TACTILE[:0]))
+    assert recorded.starts(2, 2).tolist() == []
+    assert recorded.contact_starts(2, 2, 1).tolist() == []
+    assert tracks.rate_hz([recorded]) == 0.0
 
 
 def test_quaternions_that_flip_their_sign_are_one_pose() -> None:
@@ -97,7 +97,7 @@ def test_quaternions_that_flip_their_sign_are_one_pose() -> None:
     pose[:, 3], pose[:, 6] = np.sin(angle / 2), np.cos(angle / 2)
     flipped = pose.copy()
     flipped[::3, 3:] *= -1
-    arms = [track(table(TACTILE, one)).arm for one in (pose, flipped)]
+    arms = [track(table(TACTILE, hand_pose)).arm for hand_pose in (pose, flipped)]
     aligned = [tracks.aligned(arm, pose[0, 3:]) for arm in arms]
     assert np.allclose(aligned[0], aligned[1])
     assert np.allclose(aligned[0][:, :7], pose, atol=1e-6)
@@ -108,12 +108,12 @@ def test_quaternions_that_flip_their_sign_are_one_pose() -> None:
 
 def test_velocities_are_those_of_the_joints_where_the_arm_is_a_panda() -> None:
     pose, joints = panda()
-    found = track(table(JOINTED, pose, extra=joints)).arm[:, 7:]
+    recorded = track(table(JOINTED, pose, extra=joints)).arm[:, 7:]
     rough = track(table(JOINTED, pose)).arm[:, 7:]
-    assert found[0].any() and not rough[0].any()
+    assert recorded[0].any() and not rough[0].any()
     middle = (rough[1:-1] + rough[2:]) / 2  # central differences
-    assert np.allclose(found[1:-1], middle, atol=0.01)
-    assert np.abs(found).max() > 0.1
+    assert np.allclose(recorded[1:-1], middle, atol=0.01)
+    assert np.abs(recorded).max() > 0.1
 
 
 @pytest.mark.parametrize("broken", ["another arm", "no speeds", "no joints"])
@@ -126,17 +126,17 @@ def test_velocities_are_differences_of_poses_on_any_other_arm(broken: str) -> No
     else:
         left_out = "velocity" if broken == "no speeds" else "joint"
         joints = {name: values for name, values in joints.items() if left_out not in name}
-    found = track(table(JOINTED, pose, extra=joints))
-    wanted = kinematics.differences(found.t_ns, pose[:, :3], found.arm[:, 3:7].astype(float))
-    assert np.allclose(found.arm[:, 7:], wanted, atol=1e-4)
+    recorded = track(table(JOINTED, pose, extra=joints))
+    expected = kinematics.differences(recorded.t_ns, pose[:, :3], recorded.arm[:, 3:7].astype(float))
+    assert np.allclose(recorded.arm[:, 7:], expected, atol=1e-4)
 
 
 def test_a_gap_in_the_joints_leaves_the_other_rows_their_velocities() -> None:
     pose, joints = panda()
     joints["robot_joint3_rad"][20] = np.nan
-    whole, torn = track(table(JOINTED, pose, extra=panda()[1])), track(table(JOINTED, pose, extra=joints))
+    intact, torn = track(table(JOINTED, pose, extra=panda()[1])), track(table(JOINTED, pose, extra=joints))
     assert np.flatnonzero(~torn.usable).tolist() == [20]
-    assert np.array_equal(np.delete(torn.arm, 20, 0), np.delete(whole.arm, 20, 0))
+    assert np.array_equal(np.delete(torn.arm, 20, 0), np.delete(intact.arm, 20, 0))
 
 
 @pytest.mark.parametrize(
@@ -156,15 +156,15 @@ def test_ground_truth_is_never_read() -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "said"),
+    ("content", "reason"),
     [
         (table(TACTILE, rest=None), "trial: Channel xela1_taxel01_x has no rest level"),
         (table(TACTILE).drop_columns(["contact"]), "trial: There is no column contact"),
         (table(TACTILE).drop_columns(["robot_position_x_m"]), "trial: There is no column robot_position_x_m"),
     ],
 )
-def test_what_is_absent_is_named_with_its_recording(content: pa.Table, said: str) -> None:
-    with pytest.raises(TacpipeError, match=said):
+def test_what_is_absent_is_named_with_its_recording(content: pa.Table, reason: str) -> None:
+    with pytest.raises(TacpipeError, match=reason):
         track(content)
 
 
@@ -175,9 +175,9 @@ def test_tables_and_codecs_that_do_not_belong_together_are_refused() -> None:
         tracks.codec_of(latent, {})
     with pytest.raises(TacpipeError, match="quantity tactile"):
         tracks.codec_of(bare.select(["t_ns"]), {})
-    other = codecs.Raw(tuple(reversed(CHANNELS)), ())
+    reversed_codec = codecs.Raw(tuple(reversed(CHANNELS)), ())
     with pytest.raises(TacpipeError, match="trial: The codec does not fit"):
-        tracks.track(FakeShard("trial", bare), other)  # type: ignore[arg-type]
+        tracks.track(FakeShard("trial", bare), reversed_codec)  # type: ignore[arg-type]
 
 
 def at(name: str, found_hz: float, timeline: str) -> tracks.Track:
@@ -188,8 +188,8 @@ def at(name: str, found_hz: float, timeline: str) -> tracks.Track:
 
 @pytest.mark.parametrize("timeline", ["logged", "fresh"])
 def test_rows_as_logged_or_fresh_may_come_at_different_rates(timeline: str) -> None:
-    given = [at(name, found_hz, timeline) for name, found_hz in (("a", 32.0), ("b", 41.0), ("c", 46.0))]
-    assert tracks.rate_hz(given) == pytest.approx(41.0, rel=1e-6)
+    recorded = [at(name, found_hz, timeline) for name, found_hz in (("a", 32.0), ("b", 41.0), ("c", 46.0))]
+    assert tracks.rate_hz(recorded) == pytest.approx(41.0, rel=1e-6)
 
 
 def test_rates_on_a_grid_that_differ_are_named_with_their_recordings() -> None:

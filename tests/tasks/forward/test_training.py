@@ -45,10 +45,10 @@ def strolling(seed: int) -> FakeShard:
 
 
 def test_a_tiny_deterministic_set_is_learned_by_heart(tmp_path: Path) -> None:
-    one = dataset(motion(3, rows=24))
+    recordings = dataset(motion(3, rows=24))
     sizes = {"hidden": 24, "epochs": 200, "patience": 200, "learning_rate": 0.01, "cycle": False, "baselines": False}
-    found = losses(trained(tmp_path, one, one, architecture="recurrent", batch=32, **sizes))
-    assert min(found) < 0.001 < found[0]
+    losses_of_epochs = losses(trained(tmp_path, recordings, recordings, architecture="recurrent", batch=32, **sizes))
+    assert min(losses_of_epochs) < 0.001 < losses_of_epochs[0]
 
 
 @pytest.mark.parametrize("latents", [False, True])
@@ -56,12 +56,13 @@ def test_recordings_that_lie_on_disk_while_it_is_trained_give_the_same_model(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, latents: bool
 ) -> None:
     shards = [*TRAIN, *VAL]
-    given = compressed(*shards) if latents else dataset(*shards)
-    train, val = ([one.name for one in part] for part in (TRAIN, VAL))
+    recordings = compressed(*shards) if latents else dataset(*shards)
+    train, val = ([shard.name for shard in part] for part in (TRAIN, VAL))
 
     def model(folder: str) -> dict[str, bytes]:
         parts = (
-            dataset(*(given.recordings[name] for name in names), files=dict(given.files)) for names in (train, val)
+            dataset(*(recordings.recordings[name] for name in names), files=dict(recordings.files))
+            for names in (train, val)
         )
         (tmp_path / folder).mkdir()
         return trained(tmp_path / folder, *parts)
@@ -88,29 +89,31 @@ def test_every_model_is_tensors_and_json_alone(architecture: str, tmp_path: Path
 
 
 def test_the_config_tells_what_was_trained_on_what(tmp_path: Path) -> None:
-    given = [dataclasses.replace(one, attributes={"object": f"bottle-{index % 2}"}) for index, one in enumerate(TRAIN)]
-    found = config(trained(tmp_path, dataset(*given), dataset(*VAL), stride=2))
-    assert (found["task"], found["rate_hz"], found["timeline"]) == ("forward", 50.0, "uniform")
-    assert found["codec"] == {"kind": "raw", "of": "levels", "frames": 1, "latents": 12, "name": "raw"}
-    assert found["inputs"]["tactile"] == CHANNELS
-    assert found["inputs"]["layout"][0] == {"stream": "xela1", "taxel": "1", "axis": "x"}
-    assert found["objects"] == ["bottle-0", "bottle-1"]
-    assert found["trained_on"] == {shard.name: shard.digest for shard in (*TRAIN, *VAL)}
-    assert found["counts"] == {
+    recordings = [
+        dataclasses.replace(shard, attributes={"object": f"bottle-{index % 2}"}) for index, shard in enumerate(TRAIN)
+    ]
+    stored = config(trained(tmp_path, dataset(*recordings), dataset(*VAL), stride=2))
+    assert (stored["task"], stored["rate_hz"], stored["timeline"]) == ("forward", 50.0, "uniform")
+    assert stored["codec"] == {"kind": "raw", "of": "levels", "frames": 1, "latents": 12, "name": "raw"}
+    assert stored["inputs"]["tactile"] == CHANNELS
+    assert stored["inputs"]["layout"][0] == {"stream": "xela1", "taxel": "1", "axis": "x"}
+    assert stored["objects"] == ["bottle-0", "bottle-1"]
+    assert stored["trained_on"] == {shard.name: shard.digest for shard in (*TRAIN, *VAL)}
+    assert stored["counts"] == {
         "train": {"recordings": 3, "windows": 3 * 36},
         "val": {"recordings": 2, "windows": 2 * 72},  # validation and test have every window, whatever the stride
     }
-    assert found["params"] == to_json(params(stride=2, loss="absolute"))
-    assert set(found["baselines"]) == {"damped_trend.phi", "damped_trend.lag", "ridge.alpha", "ridge_actions.alpha"}
-    assert set(found["anticipation"]) == {"sd", "theta"}
+    assert stored["params"] == to_json(params(stride=2, loss="absolute"))
+    assert set(stored["baselines"]) == {"damped_trend.phi", "damped_trend.lag", "ridge.alpha", "ridge_actions.alpha"}
+    assert set(stored["anticipation"]) == {"sd", "theta"}
 
 
 def test_scales_are_those_of_numpy_over_the_training_rows(tmp_path: Path) -> None:
-    found = config(trained(tmp_path, dataset(*TRAIN), epochs=1))["scaling"]
-    columns = [[one.content[name].to_numpy() for name in CHANNELS] for one in TRAIN]
+    stored = config(trained(tmp_path, dataset(*TRAIN), epochs=1))["scaling"]
+    columns = [[shard.content[name].to_numpy() for name in CHANNELS] for shard in TRAIN]
     values = np.concatenate(columns, axis=1).astype(np.float64)  # (channel, time)
-    assert np.allclose(found["channel_count"], values.std(axis=1), rtol=1e-6)
-    assert np.allclose(found["feature_half"], np.ptp(values, axis=1) / 2, rtol=1e-5)
+    assert np.allclose(stored["channel_count"], values.std(axis=1), rtol=1e-6)
+    assert np.allclose(stored["feature_half"], np.ptp(values, axis=1) / 2, rtol=1e-5)
 
 
 def test_validation_recordings_change_neither_scales_nor_baselines_other_than_alpha(tmp_path: Path) -> None:
@@ -126,20 +129,22 @@ def test_validation_recordings_change_neither_scales_nor_baselines_other_than_al
             assert np.array_equal(values, second[name]), name
     for name in ("ridge.centre", "ridge.bias", "ridge_actions.centre", "ridge_actions.bias"):
         assert np.array_equal(first[name], second[name]), name
-    scales, others = load(tame["model.safetensors"]), load(wide["model.safetensors"])
+    scales, wide_scales = load(tame["model.safetensors"]), load(wide["model.safetensors"])
     for name in scales:
         if name.endswith(("_scale", "_mean")):
-            assert np.array_equal(scales[name], others[name]), name
+            assert np.array_equal(scales[name], wide_scales[name]), name
 
 
 def test_a_channel_that_never_moves_and_one_recording_without_rows_do_no_harm(tmp_path: Path) -> None:
-    def dead(one: FakeShard) -> FakeShard:
-        at = one.content.column_names.index(CHANNELS[4])
-        still = pa.array(np.full(one.content.num_rows, 16003.0, np.float32))
-        return dataclasses.replace(one, content=one.content.set_column(at, one.content.schema.field(at), still))
+    def dead(shard: FakeShard) -> FakeShard:
+        at = shard.content.column_names.index(CHANNELS[4])
+        constant = pa.array(np.full(shard.content.num_rows, 16003.0, np.float32))
+        return dataclasses.replace(
+            shard, content=shard.content.set_column(at, shard.content.schema.field(at), constant)
+        )
 
-    given = dataset(*map(dead, TRAIN))
-    files = trained(tmp_path / "dead", given, dataset(dead(VAL[0])), architecture="taxelwise")
+    recordings = dataset(*map(dead, TRAIN))
+    files = trained(tmp_path / "dead", recordings, dataset(dead(VAL[0])), architecture="taxelwise")
     assert config(files)["scaling"]["channel_count"][4] == 1.0
     metrics, _ = evaluated(files, dead(motion(20)))
     assert np.isfinite(metrics["model"]["mse_standard"]["mean"])
@@ -156,12 +161,14 @@ def test_a_single_training_window_is_enough(tmp_path: Path) -> None:
 
 def test_windows_are_all_or_those_in_contact(tmp_path: Path) -> None:
     contact = np.repeat([-1, 0, -1], [30, 30, 20])
-    one = motion(0)
-    at = one.content.column_names.index("contact")
-    content = one.content.set_column(at, one.content.schema.field(at), pa.array(contact.astype(np.int32)))
-    given = dataset(dataclasses.replace(one, content=content))
+    recording = motion(0)
+    at = recording.content.column_names.index("contact")
+    content = recording.content.set_column(at, recording.content.schema.field(at), pa.array(contact.astype(np.int32)))
+    recordings = dataset(dataclasses.replace(recording, content=content))
     windows = {
-        chosen: config(trained(tmp_path / chosen, given, given, epochs=1, windows=chosen))["counts"]["train"]["windows"]
+        chosen: config(trained(tmp_path / chosen, recordings, recordings, epochs=1, windows=chosen))["counts"]["train"][
+            "windows"
+        ]
         for chosen in ("all", "contact")
     }
     assert windows == {"all": 72, "contact": 22}
@@ -170,7 +177,7 @@ def test_windows_are_all_or_those_in_contact(tmp_path: Path) -> None:
 @pytest.mark.parametrize("actions", ["planned", "none", "shuffled"])
 def test_what_is_told_of_the_plan_decides_whether_it_helps(actions: str, tmp_path: Path) -> None:
     sizes = {"epochs": 15, "patience": 15, "learning_rate": 0.01, "baselines": False}
-    validation = dataset(*map(strolling, range(30, 50)))  # with only one, half of the forecast would be persistence
+    validation = dataset(*map(strolling, range(30, 50)))  # half of the forecast would be persistence for one recording
     files = trained(tmp_path, dataset(*map(strolling, range(3))), validation, actions=actions, **sizes)
     metrics, _ = evaluated(files, strolling(20), strolling(21))
     skill = metrics["skill"]["mse_counts"][f"t{HORIZON}"]["mean"]
@@ -183,12 +190,12 @@ def test_what_is_told_of_the_plan_decides_whether_it_helps(actions: str, tmp_pat
 def test_training_again_gives_the_same_bytes_and_another_seed_does_not(
     architecture: str, members: int, tmp_path: Path
 ) -> None:
-    first, again, other = (
+    first, repeated, reseeded = (
         trained(tmp_path / name, architecture=architecture, members=members, epochs=1, seed=seed)
         for name, seed in (("a", 0), ("b", 0), ("c", 1))
     )
-    assert first == again
-    assert first["model.safetensors"] != other["model.safetensors"]
+    assert first == repeated
+    assert first["model.safetensors"] != reseeded["model.safetensors"]
 
 
 @pytest.mark.parametrize(
@@ -198,39 +205,39 @@ def test_training_again_gives_the_same_bytes_and_another_seed_does_not(
 def test_an_interrupted_training_goes_on_where_it_was(
     architecture: str, actions: str, members: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked: dict[str, Any] = {
+    options: dict[str, Any] = {
         "architecture": architecture,
         "actions": actions,
         "members": members,
         "epochs": 4,
         "hidden": 8,
     }
-    whole = trained(tmp_path / "whole", **asked)
-    written, write = iter(range(2)), loop.write_checkpoint
+    uninterrupted = trained(tmp_path / "whole", **options)
+    writes, write = iter(range(2)), loop.write_checkpoint
 
     def killed(*args: Any) -> None:
         write(*args)
-        if next(written, None) is None:
+        if next(writes, None) is None:
             raise KeyboardInterrupt
 
     monkeypatch.setattr(loop, "write_checkpoint", killed)
     with pytest.raises(KeyboardInterrupt):
-        trained(tmp_path / "killed", **asked)
+        trained(tmp_path / "killed", **options)
     monkeypatch.setattr(loop, "write_checkpoint", write)
-    assert trained(tmp_path / "killed", **asked) == whole
+    assert trained(tmp_path / "killed", **options) == uninterrupted
 
 
 @pytest.mark.parametrize("architecture", ["recurrent", "taxelwise"])
 def test_a_model_begins_with_another_and_remembers_what_that_has_seen(architecture: str, tmp_path: Path) -> None:
-    asked: dict[str, Any] = {"architecture": architecture, "epochs": 6, "learning_rate": 0.01, "cycle": False}
-    first = trained(tmp_path / "first", **asked)
-    given = params(**{**asked, "epochs": 1, "learning_rate": 1e-9})
-    tuned = forward_training.train(given, dataset(motion(5)), dataset(motion(10)), tmp_path / "tuned", first)
+    options: dict[str, Any] = {"architecture": architecture, "epochs": 6, "learning_rate": 0.01, "cycle": False}
+    first = trained(tmp_path / "first", **options)
+    requested = params(**{**options, "epochs": 1, "learning_rate": 1e-9})
+    tuned = forward_training.train(requested, dataset(motion(5)), dataset(motion(10)), tmp_path / "tuned", first)
     for name, values in load(first["model.safetensors"]).items():
         assert np.allclose(load(tuned["model.safetensors"])[name], values, atol=1e-6), name
     assert losses(tuned)[0] == pytest.approx(min(losses(first)), rel=1e-4)
     assert config(tuned)["trained_on"] == {
-        **{f"{one.name} of the model before": one.digest for one in TRAIN},
+        **{f"{shard.name} of the model before": shard.digest for shard in TRAIN},
         "trial-05": motion(5).digest,
         "trial-10": motion(10).digest,
     }
@@ -238,24 +245,26 @@ def test_a_model_begins_with_another_and_remembers_what_that_has_seen(architectu
 
 def test_a_model_that_begins_with_another_is_trained_by_its_own_loss_and_dropout(tmp_path: Path) -> None:
     first = trained(tmp_path / "first")
-    found = {
+    trained_files = {
         name: forward_training.train(params(**changed), dataset(*TRAIN), dataset(*VAL), tmp_path / name, first)
         for name, changed in (("same", {}), ("loss", {"loss": "squared"}), ("dropout", {"dropout": 0.5}))
     }
-    assert losses(found["loss"]) != losses(found["same"])
-    assert found["dropout"]["model.safetensors"] != found["same"]["model.safetensors"]
+    assert losses(trained_files["loss"]) != losses(trained_files["same"])
+    assert trained_files["dropout"]["model.safetensors"] != trained_files["same"]["model.safetensors"]
 
 
 @pytest.mark.parametrize(
-    ("changed", "said"),
+    ("changed", "reason"),
     [
         ({"hidden": 8}, "hidden 16 and the one to train 8"),
         ({"architecture": "lstm"}, "architecture gru and the one to train lstm"),
         ({"horizon": 3}, "horizon 4 and the one to train 3"),
     ],
 )
-def test_a_model_of_another_shape_is_nothing_to_begin_with(changed: dict[str, Any], said: str, tmp_path: Path) -> None:
-    with pytest.raises(TacpipeError, match=said):
+def test_a_model_of_another_shape_is_nothing_to_begin_with(
+    changed: dict[str, Any], reason: str, tmp_path: Path
+) -> None:
+    with pytest.raises(TacpipeError, match=reason):
         forward_training.train(
             params(**changed), dataset(*TRAIN), dataset(*VAL), tmp_path / "b", trained(tmp_path / "a")
         )
@@ -266,15 +275,15 @@ def test_a_model_of_another_representation_is_nothing_to_begin_with(tmp_path: Pa
     first, watched = trained(tmp_path / "a"), compressed(*VAL, files=latents.files)
     with pytest.raises(TacpipeError, match="--init reads raw and the recordings hold PCA-3"):
         forward_training.train(params(), latents, watched, tmp_path / "b", first)
-    other = compressed(*VAL)
+    of_another_codec = compressed(*VAL)
     model = forward_training.train(params(), latents, watched, tmp_path / "c")
     with pytest.raises(TacpipeError, match="another codec"):
-        forward_training.train(params(), other, other, tmp_path / "d", model)
+        forward_training.train(params(), of_another_codec, of_another_codec, tmp_path / "d", model)
 
 
-@pytest.mark.parametrize(("of", "name"), [("levels", "PCA-3"), ("increments", "PCA-3 increments")])
-def test_a_model_of_latents_holds_its_codec(of: str, name: str, tmp_path: Path) -> None:
-    training = compressed(*TRAIN, representation=of)
+@pytest.mark.parametrize(("representation", "name"), [("levels", "PCA-3"), ("increments", "PCA-3 increments")])
+def test_a_model_of_latents_holds_its_codec(representation: str, name: str, tmp_path: Path) -> None:
+    training = compressed(*TRAIN, representation=representation)
     files = trained(tmp_path, training, compressed(*VAL, files=training.files))
     assert set(files) == FILES | {"codec.json", "codec.safetensors"}
     assert files["codec.safetensors"] == training.files["codec.safetensors"]
@@ -290,11 +299,11 @@ def test_baselines_can_be_left_out(tmp_path: Path) -> None:
 
 
 def test_ground_truth_columns_change_nothing(tmp_path: Path) -> None:
-    given = [
-        dataclasses.replace(one, content=one.content.append_column("gt_slip", pa.array(np.arange(80.0))))
-        for one in TRAIN
+    with_truth = [
+        dataclasses.replace(shard, content=shard.content.append_column("gt_slip", pa.array(np.arange(80.0))))
+        for shard in TRAIN
     ]
-    files = [trained(tmp_path / name, dataset(*part), epochs=1) for name, part in (("a", given), ("b", TRAIN))]
+    files = [trained(tmp_path / name, dataset(*part), epochs=1) for name, part in (("a", with_truth), ("b", TRAIN))]
     assert files[0] == files[1]
 
 
@@ -306,15 +315,15 @@ def test_training_without_recordings_windows_or_touch_is_refused(tmp_path: Path)
         forward_training.train(params(), dataset(*TRAIN), empty, tmp_path)
     with pytest.raises(TacpipeError, match="training recordings hold no window"):
         forward_training.train(params(), short, dataset(*VAL), tmp_path)
-    still = dataset(FakeShard("still", table(np.zeros((40, len(CHANNELS))))))
+    constant = dataset(FakeShard("still", table(np.zeros((40, len(CHANNELS))))))
     with pytest.raises(TacpipeError, match="None of the 12 tactile channels ever moves in 1 training recordings"):
-        forward_training.train(params(), still, dataset(*VAL), tmp_path)
+        forward_training.train(params(), constant, dataset(*VAL), tmp_path)
 
 
 def test_an_error_that_gaps_cause_names_the_stream_and_the_option(tmp_path: Path) -> None:
     paused = [
-        dataclasses.replace(one, content=one.content.append_column("sole_gap", pa.array(np.arange(80) % 4 > 0)))
-        for one in TRAIN
+        dataclasses.replace(shard, content=shard.content.append_column("sole_gap", pa.array(np.arange(80) % 4 > 0)))
+        for shard in TRAIN
     ]
     with pytest.raises(TacpipeError, match=r"training recordings hold no window.*stream sole.*--gap-ms"):
         forward_training.train(params(), dataset(*paused), dataset(*VAL), tmp_path)

@@ -33,8 +33,8 @@ def plain(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
 
 
 def calibrated(files: dict[str, bytes], *, promise: bool = False, count: int = 4) -> dict[str, bytes]:
-    how = CalibrationRequest(PERCENTS, promise, 0.05, 0)
-    return forward_calibration.calibrate(files, how, dataset(*TRAINING), dataset(*CALIBRATION[:count]))
+    request = CalibrationRequest(PERCENTS, promise, 0.05, 0)
+    return forward_calibration.calibrate(files, request, dataset(*TRAINING), dataset(*CALIBRATION[:count]))
 
 
 @pytest.fixture(scope="module")
@@ -48,25 +48,25 @@ def test_a_calibrated_model_predicts_the_same_and_adds_its_quantiles(
     before = forward_prediction.predict(plain, dataset(TEST), [1, 4]).recordings[TEST.name].streams[""]
     after = forward_prediction.predict(model, dataset(TEST), [1, 4]).recordings[TEST.name].streams[""]
     assert before.equals(after)
-    found = forward_prediction.predict(model, dataset(TEST), [1, 4], [10, 90]).recordings[TEST.name].streams[""]
-    assert found.select(before.column_names).equals(before)
-    assert found.column_names[1:4] == [f"{CHANNELS[0]}_t1", f"{CHANNELS[0]}_t1_q10", f"{CHANNELS[0]}_t1_q90"]
-    assert found.schema.field(f"{CHANNELS[0]}_t1_q90").metadata[b"quantile"] == b"0.9"
-    low, high = (found[f"{CHANNELS[5]}_t4_q{one}"].to_numpy() for one in (10, 90))
+    table = forward_prediction.predict(model, dataset(TEST), [1, 4], [10, 90]).recordings[TEST.name].streams[""]
+    assert table.select(before.column_names).equals(before)
+    assert table.column_names[1:4] == [f"{CHANNELS[0]}_t1", f"{CHANNELS[0]}_t1_q10", f"{CHANNELS[0]}_t1_q90"]
+    assert table.schema.field(f"{CHANNELS[0]}_t1_q90").metadata[b"quantile"] == b"0.9"
+    low, high = (table[f"{CHANNELS[5]}_t4_q{percent}"].to_numpy() for percent in (10, 90))
     assert (low < high).all()
 
 
 def test_the_table_and_arrays_have_the_same_quantiles(model: dict[str, bytes]) -> None:
     table = forward_prediction.predict(model, dataset(TEST), [4], PERCENTS).recordings[TEST.name].streams[""]
     loaded = ForwardModel.load(model)
-    found, starts, _ = predicted_windows(loaded, TEST)
-    arrays = loaded.predict(*asked(found, starts), quantiles=PERCENTS)
+    recorded, starts, _ = predicted_windows(loaded, TEST)
+    arrays = loaded.predict(*asked(recorded, starts), quantiles=PERCENTS)
     assert arrays.shape == (len(starts), HORIZON, len(CHANNELS), 3)
     for at, percent in enumerate(PERCENTS):
-        wanted = table[f"{CHANNELS[3]}_t4_q{percent}"].to_numpy()
-        assert np.allclose(arrays[:, 3, 3, at], wanted, rtol=1e-4, atol=0.05)
-    one = loaded.predict(*(part[0] for part in asked(found, starts)), quantiles=[90])
-    assert np.allclose(one[..., 0], arrays[0, ..., 2], rtol=1e-4, atol=0.05)
+        expected = table[f"{CHANNELS[3]}_t4_q{percent}"].to_numpy()
+        assert np.allclose(arrays[:, 3, 3, at], expected, rtol=1e-4, atol=0.05)
+    single = loaded.predict(*(part[0] for part in asked(recorded, starts)), quantiles=[90])
+    assert np.allclose(single[..., 0], arrays[0, ..., 2], rtol=1e-4, atol=0.05)
 
 
 @pytest.mark.parametrize("changed", [ENSEMBLE, {"actions": "none"}])
@@ -81,8 +81,8 @@ def test_table_and_arrays_have_the_same_quantiles_where_older_rows_or_no_plan_ar
         plan = plan[::-1].copy()  # another plan, of which this model reads nothing
     arrays = model.predict(window, plan, quantiles=PERCENTS)
     for at, percent in enumerate(PERCENTS):
-        wanted = table[f"{CHANNELS[3]}_t4_q{percent}"].to_numpy()
-        assert np.allclose(arrays[:, 3, 3, at], wanted, rtol=1e-4, atol=0.05)
+        expected = table[f"{CHANNELS[3]}_t4_q{percent}"].to_numpy()
+        assert np.allclose(arrays[:, 3, 3, at], expected, rtol=1e-4, atol=0.05)
 
 
 def test_as_many_values_of_calibration_recordings_lie_below_a_quantile_as_its_level_states(
@@ -90,23 +90,23 @@ def test_as_many_values_of_calibration_recordings_lie_below_a_quantile_as_its_le
 ) -> None:
     # the law of the correction on the recordings that it is computed on: no fewer, and no more than a few ties beyond
     tree, _ = evaluated(model, *CALIBRATION)
-    seen = tree["quantiles"]["seen"]["model"]
+    measured = tree["quantiles"]["seen"]["model"]
     for step in range(1, HORIZON + 1):
-        assert seen["below_q90"][f"t{step}"] == pytest.approx(0.9, abs=0.01)
-        assert seen["below_q10"][f"t{step}"] == pytest.approx(0.1, abs=0.01)
+        assert measured["below_q90"][f"t{step}"] == pytest.approx(0.9, abs=0.01)
+        assert measured["below_q10"][f"t{step}"] == pytest.approx(0.1, abs=0.01)
 
 
 def test_evaluation_reports_quantiles_next_to_those_of_persistence(model: dict[str, bytes]) -> None:
     tree, result = evaluated(model, TEST, motion(21))
-    found = tree["quantiles"]
-    assert found["levels"] == [10, 50, 90]
-    assert found["recordings"] == {"fitted": 3, "corrected": 4}
-    assert found["most_promised"] == 0.8
+    measures = tree["quantiles"]
+    assert measures["levels"] == [10, 50, 90]
+    assert measures["recordings"] == {"fitted": 3, "corrected": 4}
+    assert measures["most_promised"] == 0.8
     for predictor in ("model", "model_unconditional", "persistence"):
-        assert set(found[predictor]["coverage"]) == {*(f"t{step}" for step in range(1, HORIZON + 1)), "mean"}
-        assert found[predictor]["coverage_low"] == {}  # two recordings have no interval
-    assert found["persistence"]["pinball_skill"]["mean"] == pytest.approx(0, abs=1e-12)
-    assert 0.6 < found["model"]["coverage"]["mean"] < 0.95
+        assert set(measures[predictor]["coverage"]) == {*(f"t{step}" for step in range(1, HORIZON + 1)), "mean"}
+        assert measures[predictor]["coverage_low"] == {}  # two recordings have no interval
+    assert measures["persistence"]["pinball_skill"]["mean"] == pytest.approx(0, abs=1e-12)
+    assert 0.6 < measures["model"]["coverage"]["mean"] < 0.95
     table = pq.read_table(io.BytesIO(result.files["coverage.parquet"]))
     assert table.num_rows == 2 * 3 * HORIZON
     (drawn, _) = json.loads(result.files["bands.json"])
@@ -116,11 +116,11 @@ def test_evaluation_reports_quantiles_next_to_those_of_persistence(model: dict[s
 def test_pinball_in_metrics_is_that_of_the_predicted_table(model: dict[str, bytes]) -> None:
     tree, _ = evaluated(model, TEST)
     table = forward_prediction.predict(model, dataset(TEST), [2], PERCENTS).recordings[TEST.name].streams[""]
-    _, _, some = predicted_windows(ForwardModel.load(model), TEST)
+    _, _, windows = predicted_windows(ForwardModel.load(model), TEST)
     lost = []
     for channel, name in enumerate(CHANNELS):
         for percent in PERCENTS:
-            above = some.truth.count[:, 1, channel] - table[f"{name}_t2_q{percent}"].to_numpy()
+            above = windows.truth.count[:, 1, channel] - table[f"{name}_t2_q{percent}"].to_numpy()
             lost.append(np.maximum(percent / 100 * above, (percent / 100 - 1) * above).mean())
     assert tree["quantiles"]["model"]["pinball"]["t2"] == pytest.approx(np.mean(lost), rel=1e-5)
 
@@ -167,13 +167,17 @@ def test_recordings_of_the_calibration_count_as_seen(model: dict[str, bytes]) ->
 def test_a_model_of_latents_has_quantiles_in_counts(tmp_path: Path) -> None:
     training = compressed(*TRAINING)
     files = trained(tmp_path, training, compressed(motion(10), files=training.files))
-    how = CalibrationRequest(PERCENTS, False, 0.05, 0)
-    made = forward_calibration.calibrate(files, how, training, compressed(*CALIBRATION, files=training.files))
-    tree, _ = evaluated(made, *compressed(TEST, files=training.files).recordings.values(), files=training.files)
+    request = CalibrationRequest(PERCENTS, False, 0.05, 0)
+    calibrated_model = forward_calibration.calibrate(
+        files, request, training, compressed(*CALIBRATION, files=training.files)
+    )
+    tree, _ = evaluated(
+        calibrated_model, *compressed(TEST, files=training.files).recordings.values(), files=training.files
+    )
     assert 0.5 < tree["quantiles"]["model"]["coverage"]["mean"] <= 1
 
 
 def test_quantiles_of_another_model_are_refused(model: dict[str, bytes], tmp_path: Path) -> None:
-    other = trained(tmp_path, horizon=2)
+    shorter = trained(tmp_path, horizon=2)
     with pytest.raises(TacpipeError, match="other channels or steps"):
-        forward_evaluation.evaluate({**other, "quantiles.safetensors": model["quantiles.safetensors"]}, dataset(TEST))
+        forward_evaluation.evaluate({**shorter, "quantiles.safetensors": model["quantiles.safetensors"]}, dataset(TEST))

@@ -47,9 +47,9 @@ def compressed(*shards: FakeShard, files: Mapping[str, bytes] | None = None, rep
     """The recordings with three principal components, and the codec's files."""
     stage = registry.load("compress.pca")
     assert stage.fit is not None
-    asked = stage.params(components=3, representation=representation)
-    files = dict(files or stage.fit(asked, dataset(*shards)).files)
-    latent = [dataclasses.replace(one, content=stage(asked, one, files)) for one in shards]
+    params = stage.params(components=3, representation=representation)
+    files = dict(files or stage.fit(params, dataset(*shards)).files)
+    latent = [dataclasses.replace(shard, content=stage(params, shard, files)) for shard in shards]
     return dataset(*latent, files=files)
 
 
@@ -66,19 +66,19 @@ def evaluated(model: Mapping[str, bytes], *shards: FakeShard, files: Mapping[str
 
 
 def predicted_windows(forecaster: Forecaster, shard: Any) -> tuple[tracks.Track, Int64s, Predicted]:
-    """What a model predicts for all windows of a recording, with the windows' first rows."""
-    found = tracks.track(shard, forecaster.codec)
-    starts = found.starts(forecaster.context, forecaster.horizon)
-    (some,) = predicted(forecaster, found, starts)
-    return found, starts, some
+    """Return a recording, the first rows of its windows, and the predictions for all of them."""
+    recorded = tracks.track(shard, forecaster.codec)
+    starts = recorded.starts(forecaster.context, forecaster.horizon)
+    (windows,) = predicted(forecaster, recorded, starts)
+    return recorded, starts, windows
 
 
-def asked(found: tracks.Track, starts: Int64s, columns: int = 13) -> tuple[AnyFloats, AnyFloats]:
+def asked(recorded: tracks.Track, starts: Int64s, columns: int = 13) -> tuple[AnyFloats, AnyFloats]:
     """The windows and plans that `predict` is given for these first rows; without velocities where 7 columns do."""
     past, plan = (starts[:, None] + np.arange(*ends) for ends in ((0, CONTEXT), (CONTEXT, LENGTH)))
-    finger = [found.finger[past][..., None]] if columns > 7 else []
-    window = np.concatenate([found.tactile[past], found.arm[past][..., :columns], *finger], axis=-1)
-    return window, found.arm[plan][..., :columns]
+    finger = [recorded.finger[past][..., None]] if columns > 7 else []
+    window = np.concatenate([recorded.tactile[past], recorded.arm[past][..., :columns], *finger], axis=-1)
+    return window, recorded.arm[plan][..., :columns]
 
 
 def counts(shard: FakeShard) -> AnyFloats:

@@ -36,8 +36,8 @@ MANIFEST = {
 def errors(
     ratios: Mapping[str, Mapping[str, float]],
     windows: Mapping[str, int] = WINDOWS,
-    known: Sequence[str] = KNOWN,
-    seen: Sequence[str] = (),
+    known_objects_of: Sequence[str] = KNOWN,
+    seen_recordings: Sequence[str] = (),
     steps: Sequence[int] = STEPS,
 ) -> bytes:
     """Return ``errors.parquet``.
@@ -48,8 +48,8 @@ def errors(
         {
             "recording": name,
             "object": f"object of {name}",
-            "known": name in known,
-            "seen": name in seen,
+            "known": name in known_objects_of,
+            "seen": name in seen_recordings,
             "predictor": predictor,
             "group": group,
             "step": step,
@@ -88,7 +88,7 @@ def result(
         "ridge": dict.fromkeys(WINDOWS, 0.75),
         "codec": dict.fromkeys(WINDOWS, 0.25),
     }
-    shown: dict[str, Any] = {
+    stored_config: dict[str, Any] = {
         "task": "forward",
         "architecture": architecture,
         "codec": CODECS[codec],
@@ -98,8 +98,8 @@ def result(
         **config,
         "params": {"seed": seed, "hidden": 200, "epochs": 50, "actions": "planned", **config.get("params", {})},
     }
-    made = {
-        "config.json": json.dumps(shown).encode(),
+    files = {
+        "config.json": json.dumps(stored_config).encode(),
         "metrics.json": json.dumps(metrics(by_recording)).encode(),
         "errors.parquet": errors(ratios),
         "history.jsonl": b'{"epoch": 1, "train_loss": 0.2, "val_loss": 0.3}\n',
@@ -108,7 +108,7 @@ def result(
     latents = [f"z{index:02d}" for index in range(4)]
     marked = {"published": "xela-flat"} if attributes is None else dict(attributes)
     shards = {name: FakeShard(name, predictions(latents), dict(marked)) for name in WINDOWS}
-    return FakeDataset(shards, made, MANIFEST)
+    return FakeDataset(shards, files, MANIFEST)
 
 
 def metrics(ratio: Mapping[str, float]) -> dict[str, Any]:
@@ -173,11 +173,11 @@ def codec(latents: int, kind: str = "pca", loss: float = 0.5, **content: Any) ->
 
 def _part(ratio: Mapping[str, float], names: Sequence[str]) -> dict[str, Any]:
     mean = float(np.mean([ratio[name] for name in names]))
-    told = {f"t{step}": {"mean": 1 - mean, "low": 0.9 - mean, "high": 1.1 - mean} for step in STEPS}
-    told["mean"] = {"mean": 1 - mean, "low": 0.9 - mean, "high": 1.1 - mean}
+    skill = {f"t{step}": {"mean": 1 - mean, "low": 0.9 - mean, "high": 1.1 - mean} for step in STEPS}
+    skill["mean"] = {"mean": 1 - mean, "low": 0.9 - mean, "high": 1.1 - mean}
     tree: dict[str, Any] = {
         "counts": {"windows": 40, "recordings": len(names), "recordings_without_window": 0, "effective_windows": 13},
-        "skill": {"mse_counts": told, "mse_latent": told},
+        "skill": {"mse_counts": skill, "mse_latent": skill},
     }
     for name, share in (("model", mean), ("persistence", 1.0), ("train_mean", 9.0), ("codec", 0.25)):
         scores = {f"t{step}": share * step for step in STEPS} | {"mean": 2 * share}

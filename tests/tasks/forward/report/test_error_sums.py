@@ -16,27 +16,27 @@ WINDOWS = {"r1": 10, "r2": 30}
 
 
 def test_every_row_lands_at_its_predictor_group_recording_and_step() -> None:
-    found = methods.read_error_sums(errors(RATIOS, WINDOWS, known=["r2"]))
-    assert found.recordings == ("r1", "r2")
-    assert found.steps == (1, 2, 3)
-    assert found.known.tolist() == [False, True]
-    assert found.windows.tolist() == [10, 30]
-    assert found.channels == GROUPS
-    sums = found.of("model", "x")
+    sums_read = methods.read_error_sums(errors(RATIOS, WINDOWS, known_objects_of=["r2"]))
+    assert sums_read.recordings == ("r1", "r2")
+    assert sums_read.steps == (1, 2, 3)
+    assert sums_read.known.tolist() == [False, True]
+    assert sums_read.windows.tolist() == [10, 30]
+    assert sums_read.channels == GROUPS
+    sums = sums_read.of("model", "x")
     assert sums is not None
     assert sums[0].tolist() == [
         [0.5 * 10 * 4 * step for step in (1, 2, 3)],
         [0.25 * 30 * 4 * step for step in (1, 2, 3)],
     ]
     assert sums[1].tolist() == (2 * sums[0]).tolist()
-    assert found.of("nobody", "x") is None
-    assert found.of("model", "y") is None
+    assert sums_read.of("nobody", "x") is None
+    assert sums_read.of("model", "y") is None
 
 
 def test_recordings_that_were_trained_on_are_left_out() -> None:
-    assert methods.read_error_sums(errors(RATIOS, WINDOWS, seen=["r1"])).recordings == ("r2",)
-    nothing = methods.read_error_sums(errors(RATIOS, WINDOWS, seen=["r1", "r2"]))
-    assert (nothing.recordings, nothing.steps, nothing.predictors) == ((), (), ())
+    assert methods.read_error_sums(errors(RATIOS, WINDOWS, seen_recordings=["r1"])).recordings == ("r2",)
+    empty = methods.read_error_sums(errors(RATIOS, WINDOWS, seen_recordings=["r1", "r2"]))
+    assert (empty.recordings, empty.steps, empty.predictors) == ((), (), ())
 
 
 def test_a_predictor_that_lacks_a_group_has_no_errors_there() -> None:
@@ -44,9 +44,9 @@ def test_a_predictor_that_lacks_a_group_has_no_errors_there() -> None:
     lacking = [not (row["predictor"] == "model" and row["group"] == "feature") for row in table.to_pylist()]
     content = io.BytesIO()
     pq.write_table(table.filter(lacking), content)
-    found = methods.read_error_sums(content.getvalue())
-    assert found.of("model", "feature") is None
-    assert found.of("persistence", "feature") is not None
+    sums_read = methods.read_error_sums(content.getvalue())
+    assert sums_read.of("model", "feature") is None
+    assert sums_read.of("persistence", "feature") is not None
 
 
 def test_a_missing_column_and_uneven_windows_are_refused() -> None:

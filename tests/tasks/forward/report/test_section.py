@@ -1,4 +1,4 @@
-"""What the section of forecasts holds beyond the comparison."""
+"""Check the section of forecasts beyond the comparison."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from tests.tasks.forward.report.result_fakes import codec, errors, result
 from tests.tasks.forward.report.test_reading import RATIO
 
 
-def forward(*results: Any, **how: Any) -> Section:
-    return parts.section("forward", *results, **how)
+def forward(*results: Any, **options: Any) -> Section:
+    return parts.section("forward", *results, **options)
 
 
-def many(ratio: float | dict[str, float], recordings: int = 8, **how: Any) -> Any:
+def result_on_many(ratio: float | dict[str, float], recordings: int = 8, **options: Any) -> Any:
     """A result on as many recordings of known objects, on which ridge has 0.75 of persistence's squared error."""
-    one = result("raw", **how)
+    plain = result("raw", **options)
     names = {f"r{index}": 20 for index in range(recordings)}
     by_name = dict.fromkeys(names, ratio) if isinstance(ratio, float) else ratio
     ratios = {"model": by_name, "ridge": dict.fromkeys(names, 0.75), "last_value_linear": dict.fromkeys(names, 0.9)}
-    held = errors(ratios, names, known=tuple(names))
-    return FakeDataset(one.recordings, {**one.files, "errors.parquet": held}, one.manifest)
+    content = errors(ratios, names, known_objects_of=tuple(names))
+    return FakeDataset(plain.recordings, {**plain.files, "errors.parquet": content}, plain.manifest)
 
 
 @pytest.mark.parametrize(
@@ -43,25 +43,27 @@ def many(ratio: float | dict[str, float], recordings: int = 8, **how: Any) -> An
 def test_a_page_is_green_only_where_the_best_baseline_is_beaten_beyond_the_interval(
     ratio: Any, verdict: str, gain: str
 ) -> None:
-    """At 0.8 of persistence's error the model has 20 % less than it, and the intervals of ridge exclude it."""
-    for given in ([many(ratio)], [many(ratio), many(ratio, seed=1)]):
-        found = forward(*given)
-        assert found.verdict == verdict
-        assert gain in found.sentence and "ridge" in found.sentence and "8 recordings" in found.sentence
+    """The model with 0.8 of persistence's error has 20 % less than it, and the intervals of ridge exclude it."""
+    for results in ([result_on_many(ratio)], [result_on_many(ratio), result_on_many(ratio, seed=1)]):
+        section = forward(*results)
+        assert section.verdict == verdict
+        assert gain in section.sentence and "ridge" in section.sentence and "8 recordings" in section.sentence
 
 
 def test_two_recordings_are_too_few_for_a_verdict() -> None:
-    found = forward(result("raw", ratio=RATIO))
-    assert found.verdict == "" and "2 recordings" in found.sentence
+    section = forward(result("raw", ratio=RATIO))
+    assert section.verdict == "" and "2 recordings" in section.sentence
 
 
 def test_the_table_of_all_methods_holds_errors_skill_and_what_they_rest_on() -> None:
-    found = forward(result("raw", 0, ratio=RATIO), result("raw", 1, ratio=1.0), result("PCA-20", ratio=2.0))
+    section = forward(result("raw", 0, ratio=RATIO), result("raw", 1, ratio=1.0), result("PCA-20", ratio=2.0))
     (table,) = [
-        one for one in parts.tables([parts.folds(found)["All methods and baselines"]]) if one.title == "known objects"
+        table
+        for table in parts.tables([parts.folds(section)["All methods and baselines"]])
+        if table.title == "known objects"
     ]
 
-    def of(name: str, *heads: str) -> list[str]:
+    def cells_of(name: str, *heads: str) -> list[str]:
         return [parts.cell(table, name, head).split(" | ")[0] for head in heads]
 
     # squared skills 0.6875 and 0 pool to 0.34375, ratios of recordings to 0.125 ** 0.25;
@@ -75,8 +77,8 @@ def test_the_table_of_all_methods_holds_errors_skill_and_what_they_rest_on() -> 
         "MSE (counts²)",
         "MSE (standardised)",
     )
-    assert of("recurrent · raw", *heads) == ["1.312", "3.938", "0.3438", "0.4054", "0.457", "1.312", "1.312"]
-    assert of("persistence", *heads)[:4] == ["2", "6", "0", "0"]
+    assert cells_of("recurrent · raw", *heads) == ["1.312", "3.938", "0.3438", "0.4054", "0.457", "1.312", "1.312"]
+    assert cells_of("persistence", *heads)[:4] == ["2", "6", "0", "0"]
     heads = (
         "skill over persistence t+1",
         "skill over persistence, channels standardised",
@@ -84,13 +86,13 @@ def test_the_table_of_all_methods_holds_errors_skill_and_what_they_rest_on() -> 
         "recordings",
         "runs",
     )
-    assert of("recurrent · raw", *heads) == ["+0.405", "+0.405", "40", "2", "2"]
+    assert cells_of("recurrent · raw", *heads) == ["+0.405", "+0.405", "40", "2", "2"]
     assert [group.title for group in table.groups] == ["", "Baselines", "Oracles, which know what they predict"]
 
 
 def test_methods_of_a_family_fold_behind_the_best_one() -> None:
-    found = forward(*(result("raw", params={"hidden": width}, ratio=width / 100) for width in (25, 50, 75)))
-    table = parts.tables([parts.folds(found)["All methods and baselines"]])[0]
+    section = forward(*(result("raw", params={"hidden": width}, ratio=width / 100) for width in (25, 50, 75)))
+    table = parts.tables([parts.folds(section)["All methods and baselines"]])[0]
     first = table.groups[0]
     assert first.folded and [parts.text(row.cells[0]) for row in first.rows] == [
         "recurrent · raw · hidden 25", "recurrent · raw · hidden 50", "recurrent · raw · hidden 75"
@@ -99,40 +101,42 @@ def test_methods_of_a_family_fold_behind_the_best_one() -> None:
 
 def test_the_worth_of_the_plan_is_the_difference_to_a_model_without_it() -> None:
     none = {name: ratio + 0.125 for name, ratio in RATIO.items()}
-    found = forward(result("raw", ratio=RATIO), result("raw", ratio=none, params={"actions": "none"}), result("PCA-20"))
-    (table,) = parts.tables([parts.folds(found)["What the plan and the timeline change"]])
-    shown = [[one.split(" | ")[0] for one in parts.cells(table, name)] for name in ("recurrent · raw", "… none")]
-    assert shown[0] == ["+0.646", "–", "–", "+0.134", "–", "–", "1"]
-    assert shown[1] == ["+0.516", "+0.131", "+0.131", "−0.008", "+0.142", "+0.142", "1"]
+    section = forward(
+        result("raw", ratio=RATIO), result("raw", ratio=none, params={"actions": "none"}), result("PCA-20")
+    )
+    (table,) = parts.tables([parts.folds(section)["What the plan and the timeline change"]])
+    cells = [[cell.split(" | ")[0] for cell in parts.cells(table, name)] for name in ("recurrent · raw", "… none")]
+    assert cells[0] == ["+0.646", "–", "–", "+0.134", "–", "–", "1"]
+    assert cells[1] == ["+0.516", "+0.131", "+0.131", "−0.008", "+0.142", "+0.142", "1"]
 
 
 def test_timelines_are_next_to_each_other_with_how_long_a_step_lasts() -> None:
     results = [result("raw", seed, ratio=RATIO) for seed in range(2)]
-    found = forward(*results, result("raw", ratio=0.25, timeline="fresh", rate_hz=10.0))
-    (table,) = parts.tables([parts.folds(found)["What the plan and the timeline change"]])
+    section = forward(*results, result("raw", ratio=0.25, timeline="fresh", rate_hz=10.0))
+    (table,) = parts.tables([parts.folds(section)["What the plan and the timeline change"]])
     assert parts.cells(table, "recurrent · raw · fresh (fresh)")[:2] == ["100", "+0.750"]
-    assert [one.split(" | ")[0] for one in parts.cells(table, "recurrent · raw (uniform)")[:2]] == ["20", "+0.646"]
+    assert [cell.split(" | ")[0] for cell in parts.cells(table, "recurrent · raw (uniform)")[:2]] == ["20", "+0.646"]
 
 
 def test_of_a_labs_own_data_nothing_is_stated_that_the_paper_states_of_its_own() -> None:
     hows: tuple[dict[str, Any], ...] = ({"attributes": {}}, {})
-    own, published = (
+    lab_text, published = (
         parts.words(
             forward(
-                *(result(name, seed, **how) for name in ("PCA-20", "AE-C1-8", "raw") for seed in range(2)),
+                *(result(name, seed, **options) for name in ("PCA-20", "AE-C1-8", "raw") for seed in range(2)),
                 others=[codec(20)],
             )
         )
-        for how in hows
+        for options in hows
     )
-    assert "paper" not in own.lower()
-    for told in ("Table 1 in the paper", "in the paper 20 hold", "Figure 5 in the paper", "Figure 6 in the paper"):
-        assert told in published, told
+    assert "paper" not in lab_text.lower()
+    for phrase in ("Table 1 in the paper", "in the paper 20 hold", "Figure 5 in the paper", "Figure 6 in the paper"):
+        assert phrase in published, phrase
 
 
 def test_table_1_holds_the_papers_numbers_next_to_ours_and_those_not_run() -> None:
-    found = forward(result("PCA-20", 0), result("PCA-20", 1), result("PCA-8"))
-    table = parts.tables([parts.folds(found)["Representations"]])[0]
+    section = forward(result("PCA-20", 0), result("PCA-20", 1), result("PCA-8"))
+    table = parts.tables([parts.folds(section)["Representations"]])[0]
     ours = ["0.0150 ± 0.0071", "1.0000 ± 0.0000", "1.0000 ± 0.0000", "2.0000 ± 0.0000", "0.5"]
     assert parts.cells(table, "PCA-20") == [*ours, "0.0298", "0.0363", "2"]
     assert parts.cells(table, "PCA-8") == ["0.0100", "1.0000", "1.0000", "2.0000", "0.5", "–", "–", "1"]
@@ -141,25 +145,27 @@ def test_table_1_holds_the_papers_numbers_next_to_ours_and_those_not_run() -> No
 
 def test_a_row_of_table_1_has_mean_and_sd_over_runs_in_the_models_own_space() -> None:
     (method,) = grouped(methods.read_runs([result(seed=0, ratio=0.5), result(seed=1, ratio=0.75)]))
-    found = representations.represent_method(method)
-    assert found is not None and found.known is not None
-    assert (found.validation.mean, found.validation.sd) == pytest.approx((0.015, 0.01 / np.sqrt(2)))
-    assert (found.test.mean, found.test.sd) == pytest.approx((1.25, 0.5 / np.sqrt(2)))  # ratio times the mean step, 2
-    assert found.known.mean == pytest.approx(1.25)
-    assert (found.persistence.mean, found.persistence.sd) == pytest.approx((2, 0))
+    represented = representations.represent_method(method)
+    assert represented is not None and represented.known is not None
+    assert (represented.validation.mean, represented.validation.sd) == pytest.approx((0.015, 0.01 / np.sqrt(2)))
+    assert (represented.test.mean, represented.test.sd) == pytest.approx(
+        (1.25, 0.5 / np.sqrt(2))
+    )  # ratio times the mean step, 2
+    assert represented.known.mean == pytest.approx(1.25)
+    assert (represented.persistence.mean, represented.persistence.sd) == pytest.approx((2, 0))
     (method,) = grouped(methods.read_runs([result(validation={"loss": 0.25, "epoch": 3})]))
-    found = representations.represent_method(method)
-    assert found is not None and found.validation.mean == 0.25  # the recurrent model's loss is that error
+    represented = representations.represent_method(method)
+    assert represented is not None and represented.validation.mean == 0.25  # the recurrent model's loss is that error
 
 
 def test_anticipation_is_weighted_by_events_and_leaves_out_what_was_never_seen_coming() -> None:
     names = ("events", "recall", "median_lead_rows", "median_lead_frames", "false_alarms_per_minute")
-    stated = [(4, 0.5, 6.0, None, 1), (12, 1.0, 2.0, 1.0, 3), (0, None, None, None, 9)]
-    given = [result(seed=seed) for seed in range(3)]
-    for one, row in zip(given, stated, strict=True):
+    rows = [(4, 0.5, 6.0, None, 1), (12, 1.0, 2.0, 1.0, 3), (0, None, None, None, 9)]
+    results = [result(seed=seed) for seed in range(3)]
+    for dataset, row in zip(results, rows, strict=True):
         content = {"anticipation": {"model": dict(zip(names, row, strict=True))}}
-        one.files["metrics.json"] = json.dumps(content).encode()
-    (method,) = grouped(methods.read_runs(given))
+        dataset.files["metrics.json"] = json.dumps(content).encode()
+    (method,) = grouped(methods.read_runs(results))
     assert events.anticipation_scores(method, "model") == pytest.approx(
         dict(zip(names, (16, 0.875, 3.0, 1.0, 2.5), strict=True))
     )
@@ -168,59 +174,59 @@ def test_anticipation_is_weighted_by_events_and_leaves_out_what_was_never_seen_c
 
 def test_in_full_are_the_median_run_of_the_best_method_and_of_the_papers() -> None:
     results = [result("raw", seed, ratio=ratio) for seed, ratio in enumerate((0.5, 0.25, 0.375))]
-    found = forward(*results, *(result("PCA-20", seed, ratio=2.0) for seed in range(2)))
-    assert [name for name in parts.folds(found) if name.startswith("In full")] == [
+    section = forward(*results, *(result("PCA-20", seed, ratio=2.0) for seed in range(2)))
+    assert [name for name in parts.folds(section) if name.startswith("In full")] == [
         "In full: recurrent · raw", "In full: recurrent · PCA-20"
     ]  # fmt: skip
     table = next(
-        one for one in parts.tables([parts.folds(found)["In full: recurrent · raw"]]) if "squared" in one.title
+        table for table in parts.tables([parts.folds(section)["In full: recurrent · raw"]]) if "squared" in table.title
     )
-    assert parts.cells(table, "model") == ["0.375", "1.125", "0.75"]  # of the middle run, times the step
+    assert parts.cells(table, "model") == ["0.375", "1.125", "0.75"]  # hidden units of the middle run, times the step
 
 
 def test_known_and_unseen_objects_are_apart_in_a_single_run() -> None:
-    found = forward(result(ratio=RATIO))
-    tables = parts.tables([parts.folds(found)["In full: recurrent · PCA-20"]])
+    section = forward(result(ratio=RATIO))
+    tables = parts.tables([parts.folds(section)["In full: recurrent · PCA-20"]])
     row = parts.cells(tables, "known objects (2 recordings), skill")
     assert row[0] == "+0.625 | +0.525 to +0.725"  # 1 - the mean of 0.5 and 0.25
 
 
 def test_results_of_before_groups_were_renamed_are_still_read() -> None:
-    one = result(ratio=RATIO)
-    old = json.loads(one.files["metrics.json"])
+    plain = result(ratio=RATIO)
+    old = json.loads(plain.files["metrics.json"])
     for name in ("model", "persistence", "train_mean", "codec"):
         for measure in ("mse_counts", "mae_counts"):
             old[name][measure]["all"] = old[name][measure].pop("both")
     del old["known"], old["unseen"]
-    one.files["metrics.json"] = json.dumps(old).encode()
-    text = parts.words(forward(one))
+    plain.files["metrics.json"] = json.dumps(old).encode()
+    text = parts.words(forward(plain))
     assert "model, sensor1" in text and "model, all" not in text
 
 
-@pytest.mark.parametrize("several", [False, True])
-def test_results_of_a_sensor_in_kilopascal_name_no_count(several: bool) -> None:
-    given = [result("raw", seed, attributes={}, inputs={"unit": "kPa"}) for seed in range(2 if several else 1)]
-    text = parts.words(forward(*given))
+@pytest.mark.parametrize("has_two_seeds", [False, True])
+def test_results_of_a_sensor_in_kilopascal_name_no_count(has_two_seeds: bool) -> None:
+    results = [result("raw", seed, attributes={}, inputs={"unit": "kPa"}) for seed in range(2 if has_two_seeds else 1)]
+    text = parts.words(forward(*results))
     assert "kPa²" in text and not re.search(r"\bcounts?\b", text.replace("counts, ", ""))
 
 
 def test_the_number_of_traces_is_the_readers_choice_and_they_are_drawn_in_part() -> None:
     drawn = [parts.charts(forward(result(ratio=RATIO, attributes={}), traces=count)) for count in (0, 1, 2)]
-    named = [[one for one in held if "truth now" in json.dumps(one.spec)] for held in drawn]
-    assert [len(one) for one in named] == [0, 2, 4]  # two latents a recording
+    traces = [[chart for chart in charts if "truth now" in json.dumps(chart.spec)] for charts in drawn]
+    assert [len(chart) for chart in traces] == [0, 2, 4]  # two latents a recording
 
 
 def test_codecs_next_to_results_are_drawn_by_their_width() -> None:
-    found = forward(result(ratio=RATIO), others=[codec(2, loss=0.75), codec(4, loss=0.5)])
-    (chart,) = [one for one in parts.charts(found) if one.title == "Reconstruction error by number of latents"]
+    section = forward(result(ratio=RATIO), others=[codec(2, loss=0.75), codec(4, loss=0.5)])
+    (chart,) = [chart for chart in parts.charts(section) if chart.title == "Reconstruction error by number of latents"]
     assert [(row["x"], row["y"]) for row in parts.values(chart)] == [(2, 0.75), (4, 0.5)]
-    assert parts.cells(parts.tables([parts.folds(found)["Representations"]]), "PCA")[:2] == ["2", "0.7500"]
+    assert parts.cells(parts.tables([parts.folds(section)["Representations"]]), "PCA")[:2] == ["2", "0.7500"]
 
 
 def test_the_paper_figures_are_of_its_latents() -> None:
-    found = forward(result("PCA-20"), result("AE-C1-8"), result("raw"))
-    drawn = [one.title for one in parts.charts(found) if one.title.startswith("Figure")]
-    assert [one.rpartition(" ")[2] for one in drawn] == ["z00", "z01", "z01", "z03"]
+    section = forward(result("PCA-20"), result("AE-C1-8"), result("raw"))
+    drawn = [chart.title for chart in parts.charts(section) if chart.title.startswith("Figure")]
+    assert [chart.rpartition(" ")[2] for chart in drawn] == ["z00", "z01", "z01", "z03"]
 
 
 def test_a_result_without_errors_by_recording_is_still_reported_next_to_others() -> None:
@@ -228,17 +234,17 @@ def test_a_result_without_errors_by_recording_is_still_reported_next_to_others()
         files={"metrics.json": b'{"counts": {"recordings": 0}}', "config.json": b'{"task": "forward"}'},
         manifest={"stage": "evaluate"},
     )
-    for given in ([plain], [result(), plain]):
-        assert parts.cells(parts.tables(forward(*given)), "counts, recordings") == ["0"]
+    for results in ([plain], [result(), plain]):
+        assert parts.cells(parts.tables(forward(*results)), "counts, recordings") == ["0"]
 
 
 def test_recordings_are_listed_worst_first_with_the_command_to_see_each() -> None:
-    found = forward(result("raw", ratio={"r1": 0.5, "r2": 0.25, "r3": 1.5, "r4": 0.5}))
-    known, unseen = parts.tables([parts.folds(found)["Recordings"]])
-    assert [parts.text(row.cells[0]) for row in (*known.rows, *unseen.rows)] == ["r1", "r2", "r3", "r4"]
-    first = unseen.rows[0].cells[0]
+    section = forward(result("raw", ratio={"r1": 0.5, "r2": 0.25, "r3": 1.5, "r4": 0.5}))
+    known_table, unseen_table = parts.tables([parts.folds(section)["Recordings"]])
+    assert [parts.text(row.cells[0]) for row in (*known_table.rows, *unseen_table.rows)] == ["r1", "r2", "r3", "r4"]
+    first = unseen_table.rows[0].cells[0]
     assert not isinstance(first, str) and first.copy.split()[:2] == ["tacpipe", "view"] and "r3" in first.copy
-    assert parts.cell(unseen, "r3", "skill") == "−1.000"  # 1.5 next to 0.75
+    assert parts.cell(unseen_table, "r3", "skill") == "−1.000"  # 1.5 next to 0.75
 
 
 def test_a_page_states_how_far_training_rows_look_ahead_and_of_which_methods() -> None:

@@ -15,9 +15,9 @@ from tests.report.parts import cells
 NAMES = ("events", "led", "median_lead_ms", "false_alarms", "minutes")
 
 
-def run(**found: tuple[int, int, float | None, int, float]) -> Any:
+def run(**measures: tuple[int, int, float | None, int, float]) -> Any:
     """A run with what the alarm was worth by predictor."""
-    tree = {name: dict(zip(NAMES, one, strict=True)) for name, one in found.items()}
+    tree = {name: dict(zip(NAMES, values, strict=True)) for name, values in measures.items()}
     return SimpleNamespace(details=SimpleNamespace(metrics={"slips": tree} if tree else {}))
 
 
@@ -30,37 +30,39 @@ def context(*methods: Any) -> Any:
 
 
 def test_runs_add_up_and_the_median_lead_is_weighted_by_slips_that_were_led() -> None:
-    found = events.slip_scores(
+    scores = events.slip_scores(
         method("gru", run(model=(10, 6, 120.0, 3, 4.0)), run(model=(30, 2, 40.0, 5, 12.0))), "model"
     )
-    assert found is not None
-    assert (found["events"], found["led"], found["false_alarms"], found["minutes"]) == (40, 8, 8, 16.0)
-    assert found["led_percent"] == pytest.approx(20)
+    assert scores is not None
+    assert (scores["events"], scores["led"], scores["false_alarms"], scores["minutes"]) == (40, 8, 8, 16.0)
+    assert scores["led_percent"] == pytest.approx(20)
     interval = stats.binomtest(8, 40).proportion_ci(method="wilson")
-    assert (found["low_percent"], found["high_percent"]) == pytest.approx((100 * interval.low, 100 * interval.high))
-    assert found["median_lead_ms"] == pytest.approx((6 * 120 + 2 * 40) / 8)
-    assert found["false_alarms_per_hour"] == pytest.approx(30)
+    assert (scores["low_percent"], scores["high_percent"]) == pytest.approx((100 * interval.low, 100 * interval.high))
+    assert scores["median_lead_ms"] == pytest.approx((6 * 120 + 2 * 40) / 8)
+    assert scores["false_alarms_per_hour"] == pytest.approx(30)
 
 
 def test_without_a_slip_that_was_led_there_is_no_lead_and_without_minutes_no_rate() -> None:
-    found = events.slip_scores(method("gru", run(model=(4, 0, None, 0, 0.0))), "model")
-    assert found is not None and found["led_percent"] == 0
-    assert math.isnan(found["median_lead_ms"]) and math.isnan(found["false_alarms_per_hour"])
+    scores = events.slip_scores(method("gru", run(model=(4, 0, None, 0, 0.0))), "model")
+    assert scores is not None and scores["led_percent"] == 0
+    assert math.isnan(scores["median_lead_ms"]) and math.isnan(scores["false_alarms_per_hour"])
 
 
 def test_a_run_whose_recordings_do_not_state_slips_counts_for_nothing() -> None:
-    alone = method("gru", run(model=(10, 6, 120.0, 3, 4.0)))
-    assert events.slip_scores(method("gru", *alone.runs, run()), "model") == events.slip_scores(alone, "model")
-    assert events.slip_scores(alone, "ridge") is None
+    single_run = method("gru", run(model=(10, 6, 120.0, 3, 4.0)))
+    assert events.slip_scores(method("gru", *single_run.runs, run()), "model") == events.slip_scores(
+        single_run, "model"
+    )
+    assert events.slip_scores(single_run, "ridge") is None
     assert events.slip_scores(method("gru", run()), "model") is None
 
 
 def test_the_table_has_methods_and_baselines_and_the_best_first() -> None:
     best = method("taxelwise", run(model=(10, 6, 120.0, 1200, 4.0), persistence=(10, 1, 20.0, 3, 4.0)))
-    (one,) = events.slip_folds(context(method("gru", run(model=(10, 4, 60.0, 3, 4.0))), best))
-    (found,) = one.blocks
-    assert [str(row.cells[0]) for row in found.rows] == ["taxelwise", "gru", "persistence"]  # type: ignore[union-attr]
-    assert cells(found, "taxelwise") == ["10", "6", "60 | 31 to 83", "120", "1,200", "4", "18,000"]  # type: ignore[arg-type]
+    (fold,) = events.slip_folds(context(method("gru", run(model=(10, 4, 60.0, 3, 4.0))), best))
+    (table,) = fold.blocks
+    assert [str(row.cells[0]) for row in table.rows] == ["taxelwise", "gru", "persistence"]  # type: ignore[union-attr]
+    assert cells(table, "taxelwise") == ["10", "6", "60 | 31 to 83", "120", "1,200", "4", "18,000"]  # type: ignore[arg-type]
 
 
 def test_results_of_recordings_without_slips_have_no_such_part() -> None:
