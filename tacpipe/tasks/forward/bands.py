@@ -162,7 +162,7 @@ class _Drawn:
     def example(self, percents: Sequence[int]) -> dict[str, Any]:
         """Return the curves: time in s, what was measured, and each quantile."""
         columns = np.array(self._rows[:MOST_ROWS]).T
-        names = ("t_s", "measured", *(f"q{values}" for values in percents))
+        names = ("t_s", "measured", *(f"q{percent}" for percent in percents))
         return {
             **self._about,
             **{name: np.round(values, 4).tolist() for name, values in zip(names, columns, strict=True)},

@@ -296,7 +296,7 @@ def _intervals(model: AnyFloats, baseline: AnyFloats, clusters: AnyArray) -> Tre
 
 
 def _geometric_skill(model: AnyFloats, baseline: AnyFloats, clusters: AnyArray) -> Tree:
-    """Return skill by the geometric mean of ratios of absolute errors (recording, step), as `_named` does."""
+    """Return skill by the geometric mean of ratios of absolute errors (recording, step), as `_intervals_by_step` does."""
     wide = [np.hstack([sums, sums.sum(axis=1, keepdims=True)]) for sums in (model, baseline)]
     return _intervals_by_step(intervals.geometric_skill_interval(wide[0], wide[1], clusters))
 

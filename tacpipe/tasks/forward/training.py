@@ -123,8 +123,8 @@ def train(
         ),
         "objects": sorted({track.object for track in parts[0] if track.object is not None}),
         "counts": {
-            name: {"recordings": len(part), "windows": len(track.starts)}
-            for name, part, track in zip(("train", "val"), parts, (training_rows, validation_rows), strict=True)
+            name: {"recordings": len(part), "windows": len(rows_of_part.starts)}
+            for name, part, rows_of_part in zip(("train", "val"), parts, (training_rows, validation_rows), strict=True)
         },
     }
     files = {} if codec.kind == "raw" else {name: training.files[name] for name in (codecs.DESCRIPTION, codecs.TENSORS)}
@@ -132,7 +132,7 @@ def train(
         linear = Baselines.fit(_linear(training_rows), _linear(validation_rows))
         config["baselines"] = linear.chosen
         files[BASELINES] = save_arrays(
-            {name: np.ascontiguousarray(track) for name, track in linear.to_tensors().items()}
+            {name: np.ascontiguousarray(array) for name, array in linear.to_tensors().items()}
         )
     files |= {WEIGHTS: save_tensors(weights), CONFIG: model_files.to_json(config)}
     if params.baselines:
