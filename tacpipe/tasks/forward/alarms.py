@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import Any
 
 import numpy as np
 
@@ -14,6 +13,7 @@ from tacpipe.signals import holds
 from tacpipe.tasks.forward import anticipation
 from tacpipe.tasks.forward.headline import BASELINE, MODEL
 from tacpipe.tasks.forward.loads import loads
+from tacpipe.tasks.forward.params import AlarmLevels
 from tacpipe.tasks.forward.predictors import Predicted, Prediction
 from tacpipe.tasks.forward.tracks import Track
 
@@ -54,7 +54,7 @@ class Loads:
         if name in WATCHED:
             self.ahead[name][-1][now] = loads(prediction.count[:, -1], self.layout)
 
-    def calibrated(self) -> dict[str, Any]:
+    def calibrated(self) -> AlarmLevels:
         """Return each load's usual change and, by predictor, the alarm levels that give a false alarm a minute."""
         if not self.truth:
             return {}
@@ -70,7 +70,7 @@ class Loads:
         levels = {name: [value if math.isfinite(value) else None for value in values] for name, values in theta.items()}
         return {"sd": sd.tolist(), "theta": levels}
 
-    def scored(self, levels: Mapping[str, Any]) -> dict[str, dict[str, float | int | None]]:
+    def scored(self, levels: AlarmLevels) -> dict[str, dict[str, float | int | None]]:
         """Return how well each predictor predicted changes with the ``levels`` that `calibrated` gave."""
         if not levels or not self.truth:
             return {}

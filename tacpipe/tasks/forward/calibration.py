@@ -44,7 +44,7 @@ def calibrate(
     levels = np.array(request.quantiles) / 100
     uncertainty = Uncertainty.fit(levels, training_errors, errors, promised=request.promise, seed=request.seed)
     count = len(np.unique(errors.recordings))
-    config = dict(forecaster.config)
+    config = forecaster.config.copy()
     config["quantiles"] = {
         "levels": list(request.quantiles),
         "method": "promised" if request.promise else "pooled",

@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple, Self
+from typing import TYPE_CHECKING, NamedTuple, Self, cast
 
 import numpy as np
 import torch
@@ -27,7 +27,7 @@ from tacpipe.signals import kinematics
 from tacpipe.signals.rotations import continuous
 from tacpipe.tasks import calibrated
 from tacpipe.tasks.forward import networks, tracks
-from tacpipe.tasks.forward.params import Params
+from tacpipe.tasks.forward.params import ForwardConfig, Params
 from tacpipe.tasks.forward.rows import acted
 from tacpipe.tasks.forward.uncertainty import FILE as QUANTILES
 from tacpipe.tasks.forward.uncertainty import Uncertainty, window_signs
@@ -36,7 +36,6 @@ from tacpipe.tasks.opened import Chain
 if TYPE_CHECKING:
     from tacpipe.tasks.forward.traced import Network
 
-Config = dict[str, Any]
 
 TASK = "forward"
 FAR = 0.95  # quantile over channels of the levels of a training row, of which the largest is kept
@@ -68,7 +67,7 @@ class Forecaster:
 
     model: nn.Module
     params: Params
-    config: Config  # the stored configuration
+    config: ForwardConfig  # the stored configuration
     codec: codecs.Codec
     baselines: Baselines | None
     codec_files: Mapping[str, bytes] = field(default_factory=dict)
@@ -170,10 +169,10 @@ class Forecaster:
         ``chain`` are the stages that it was trained behind, as its manifest lists them; without them `predict` cannot check
         that recordings went through the same.
         """
-        config = model_files.tree(files, CONFIG, {"task": str})
-        if config["task"] != TASK:
-            raise TacpipeError(f"This model was trained for {plain(config['task'])}, not for {TASK}.")
-        config = model_files.tree(files, CONFIG, NEEDED)
+        task = model_files.tree(files, CONFIG, {"task": str})["task"]
+        if task != TASK:
+            raise TacpipeError(f"This model was trained for {plain(task)}, not for {TASK}.")
+        config = cast("ForwardConfig", model_files.tree(files, CONFIG, NEEDED))
         params = params_of.read(Params, config["params"], f"{CONFIG}, params")
         inputs = config["inputs"]
         raw = codecs.Raw(tuple(inputs["tactile"]), tuple(inputs["layout"]))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TypedDict
 
 import numpy as np
 
@@ -71,7 +71,18 @@ def leads(t_ns: Times, states: Int64s, events: Times, horizon_ns: int, period_ns
     return Leads(counted, tuple(led), false, hours)
 
 
-def summed(parts: Sequence[Leads]) -> dict[str, Any]:
+class LeadSums(TypedDict):
+    """The score of alarms over several recordings."""
+
+    events: int
+    led: int
+    median_lead_ms: float | None
+    false_alarms: int
+    false_alarms_per_hour: float | None
+    minutes: float
+
+
+def summed(parts: Sequence[Leads]) -> LeadSums:
     """Return what alarms were worth together; None where there is nothing to divide by.
 
     >>> both = summed([Leads(3, (40.0, 120.0), 1, 0.25), Leads(1, (), 0, 0.25)])

@@ -24,6 +24,7 @@ from tacpipe.tasks.forward.units import COUNTS
 
 Masks = Mapping[str, Bools]  # name of a group of channels, (channel,)
 Tree = dict[str, Any]  # names down to numbers
+IntervalsByStep = dict[str, dict[str, float]]  # mean, low and high of a value by step
 
 _COLUMNS = pa.schema(
     {
@@ -273,13 +274,13 @@ def _summary(trials: Sequence[Trial], groups: Masks, horizon: int, channel_scale
     return tree
 
 
-def _steps(sums: AnyFloats, windows: Int64s) -> Tree:
+def _steps(sums: AnyFloats, windows: Int64s) -> dict[str, float]:
     """Return the mean error by step and over all steps; ``sums`` is (recording, step, channel)."""
     error = regression.mean_error(sums, windows)
     return {f"t{step}": _rounded(value) for step, value in enumerate(error, 1)} | {"mean": _rounded(error.mean())}
 
 
-def _grouped(sums: AnyFloats, windows: Int64s, groups: Masks) -> Tree:
+def _grouped(sums: AnyFloats, windows: Int64s, groups: Masks) -> dict[str, dict[str, float]]:
     """Return the mean error by group of channels and step."""
     return {name: _steps(sums[:, :, mask], windows) for name, mask in groups.items()}
 
@@ -289,22 +290,22 @@ def _by_step(trials: Sequence[Trial], predictor: str, attribute: str) -> AnyFloa
     return np.stack([getattr(trial.errors[predictor], attribute).sum(axis=1) for trial in trials])
 
 
-def _intervals(model: AnyFloats, baseline: AnyFloats, clusters: AnyArray) -> Tree:
+def _intervals(model: AnyFloats, baseline: AnyFloats, clusters: AnyArray) -> IntervalsByStep:
     """Return skill with its interval over clusters by step and over all, from sums (recording, step); undefined left out."""
     wide = [np.hstack([sums, sums.sum(axis=1, keepdims=True)]) for sums in (model, baseline)]  # (recording, step + 1)
     return _intervals_by_step(intervals.skill_interval(wide[0], wide[1], clusters))
 
 
-def _geometric_skill(model: AnyFloats, baseline: AnyFloats, clusters: AnyArray) -> Tree:
+def _geometric_skill(model: AnyFloats, baseline: AnyFloats, clusters: AnyArray) -> IntervalsByStep:
     """Return skill by the geometric mean of ratios of absolute errors (recording, step), as `_intervals_by_step` does."""
     wide = [np.hstack([sums, sums.sum(axis=1, keepdims=True)]) for sums in (model, baseline)]
     return _intervals_by_step(intervals.geometric_skill_interval(wide[0], wide[1], clusters))
 
 
-def _intervals_by_step(interval: Interval) -> Tree:
+def _intervals_by_step(interval: Interval) -> IntervalsByStep:
     """Return values with their intervals by step and over all; what is not defined is left out."""
     names = [f"t{step}" for step in range(1, len(interval.mean))] + ["mean"]
-    tree: Tree = {}
+    tree: IntervalsByStep = {}
     for index, name in enumerate(names):
         ends = {part: float(getattr(interval, part)[index]) for part in ("mean", "low", "high")}
         tree[name] = {part: _rounded(value) for part, value in ends.items() if math.isfinite(value)}

@@ -8,7 +8,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NotRequired, TypedDict
 
 from tacpipe.plugins.constraints import PositiveFloat, PositiveInt, Range, Seed
 from tacpipe.plugins.params import added
@@ -146,3 +146,85 @@ class Recurrent(Forward):
 
 
 Params = Forward  # params of any architecture
+
+
+class CodecDescription(TypedDict):
+    """The representation that a model reads, in its configuration."""
+
+    kind: str  # as `tacpipe compress` names it; raw: no codec
+    of: str  # levels or increments
+    frames: int
+    latents: int
+    name: str  # in reports
+
+
+class ArmColumns(TypedDict):
+    """The columns of the arm that a model reads, in its configuration."""
+
+    position: Sequence[str]
+    orientation: Sequence[str]
+
+
+class ModelInputs(TypedDict):
+    """The columns that a model reads, in its configuration."""
+
+    tactile: list[str]
+    layout: list[dict[str, str]]  # stream, taxel and axis of each channel
+    orientation_reference: list[float]  # (4,): quaternions have the sign that is nearest to this one
+    unit: NotRequired[str]  # of the channels; absent: counts
+    pose: NotRequired[ArmColumns]  # absent: the columns of a Panda
+
+
+class Scaling(TypedDict):
+    """Spreads over usable training rows, in a model's configuration."""
+
+    feature_half: list[float]  # half the range of each feature
+    channel_count: list[float]  # the standard deviation of each channel in counts
+
+
+class LookAhead(TypedDict):
+    """The time by which rows of the training recordings look ahead, in a model's configuration."""
+
+    mean_ms: float
+    max_ms: float
+
+
+class AlarmLevels(TypedDict, total=False):
+    """The levels of alarms that validation recordings set, in a model's configuration; empty without recordings."""
+
+    sd: list[float]  # usual change of each load
+    theta: dict[str, list[float | None]]  # level of each load by predictor; None: never
+
+
+class QuantileDescription(TypedDict):
+    """The calibration of a model's quantiles, in its configuration."""
+
+    levels: list[int]  # percent
+    method: str
+    recordings: dict[str, int]
+    most_promised: float
+
+
+class ForwardConfig(TypedDict):
+    """``config.json`` of a model of the task ``forward``."""
+
+    task: str
+    architecture: str
+    params: dict[str, Any]
+    codec: CodecDescription
+    context: int
+    horizon: int
+    inputs: ModelInputs
+    rate_hz: float
+    gap_ms: dict[str, float]  # longest time without a gap by stream
+    look_ahead: NotRequired[LookAhead]
+    timeline: str
+    scaling: Scaling
+    largest_level: NotRequired[float | None]  # absent from older models
+    validation: dict[str, float]  # loss and epoch of the stored weights
+    trained_on: dict[str, str]  # digests of recordings by name
+    objects: list[str]
+    counts: dict[str, dict[str, int]]
+    baselines: NotRequired[dict[str, float]]
+    anticipation: NotRequired[AlarmLevels]
+    quantiles: NotRequired[QuantileDescription]

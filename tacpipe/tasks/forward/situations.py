@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, TypedDict
 
 import numpy as np
 
@@ -24,7 +24,15 @@ SITUATIONS = ("no contact", "closing", "releasing", "slipping", "holding in moti
 WIDTH_M = 0.0005  # least change of the gripper's width where it closes or opens
 LOST = 0.05  # fraction of the load that is lost over the rows to come where an object slips
 PACE_M_S, TURNING_RAD_S = 0.02, 0.1  # least speeds of a moving hand
-Tree = dict[str, Any]
+
+
+class SituationMeasures(TypedDict):
+    """Errors and skill of forecasts in one situation."""
+
+    windows: int
+    recordings: int
+    mae_counts: dict[str, dict[str, float]]  # by predictor and step
+    skill: dict[str, dict[str, float]]  # mean, low and high by step
 
 
 class Motion(NamedTuple):
@@ -109,7 +117,7 @@ class BySituation:
                 axis=1
             )
 
-    def summary(self) -> Tree:
+    def summary(self) -> dict[str, SituationMeasures]:
         """Return by situation the windows, recordings, mean absolute errors by predictor and step, and the model's skill.
 
         Skill is 1 - mean absolute error / that of persistence, the geometric mean of the ratios of recordings, by step and
@@ -120,7 +128,7 @@ class BySituation:
     def _recordings(self, situation: int) -> list[str]:
         return [name for name, windows in self.windows.items() if windows[situation]]
 
-    def _measures(self, at: int) -> Tree:
+    def _measures(self, at: int) -> SituationMeasures:
         recordings = self._recordings(at)
         count = sum(int(self.windows[name][at]) for name in recordings)
         predictors = list(dict.fromkeys(name for _, name in self.absolute))
@@ -149,7 +157,7 @@ class BySituation:
         return np.stack([sums[recording, name][at] for recording in recordings])
 
 
-def _steps(errors: AnyFloats) -> Tree:
+def _steps(errors: AnyFloats) -> dict[str, float]:
     return {f"t{step}": _rounded(value) for step, value in enumerate(errors, 1)} | {"mean": _rounded(errors.mean())}
 
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
 from tacpipe.arrays import AnyFloats, Bools, Floats, Int64s, Times
 from tacpipe.tasks.forward import anticipation
 from tacpipe.tasks.forward.alarms import WATCHED
-from tacpipe.tasks.forward.leads import Leads, events, leads, near, summed
+from tacpipe.tasks.forward.leads import Leads, LeadSums, events, leads, near, summed
 from tacpipe.tasks.forward.shear import Layout, floors, rise_and_fall
 from tacpipe.tasks.forward.tracks import Track
 
@@ -39,6 +39,12 @@ class Rows:
     def events(self) -> Times:
         """Return when slips begin and end (event, 2)."""
         return events(self.t_ns, np.zeros(len(self.t_ns), bool) if self.slips is None else self.slips)
+
+
+class SlipScore(LeadSums):
+    """The score of a slip alarm."""
+
+    recall: float | None  # fraction of the slips that an alarm preceded
 
 
 @dataclass
@@ -90,7 +96,7 @@ class SlipAlarms:
             per_minute=per_hour / 60,
         )
 
-    def scored(self, per_hour: float = PER_HOUR) -> dict[str, dict[str, Any]]:
+    def scored(self, per_hour: float = PER_HOUR) -> dict[str, SlipScore]:
         """Return by predictor what its alarm is worth on the recordings that state where they slip.
 
         Levels are set for ``per_hour`` false alarms: for each fifth of the recordings on the others, so that no recording
@@ -102,7 +108,7 @@ class SlipAlarms:
         ):
             return {}
         parts = [part for part in (labelled[first::PARTS] for first in range(PARTS)) if part]
-        scores: dict[str, dict[str, Any]] = {}
+        scores: dict[str, SlipScore] = {}
         for name in dict.fromkeys(name for place in labelled for name in self.recordings[place].scores):
             lead_parts: list[Leads] = []
             for part in parts:

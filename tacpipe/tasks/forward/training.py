@@ -7,7 +7,7 @@ import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, cast
+from typing import TYPE_CHECKING, Literal, cast
 
 import numpy as np
 import torch
@@ -37,13 +37,21 @@ from tacpipe.tasks.forward.forecaster import (
     SHRINKAGE,
     TASK,
     WEIGHTS,
-    Config,
     Forecaster,
     largest_level,
     layout,
 )
 from tacpipe.tasks.forward.headline import look_ahead_notes
-from tacpipe.tasks.forward.params import Change, Params
+from tacpipe.tasks.forward.params import (
+    AlarmLevels,
+    Change,
+    CodecDescription,
+    ForwardConfig,
+    LookAhead,
+    ModelInputs,
+    Params,
+    Scaling,
+)
 from tacpipe.tasks.forward.predictors import predicted
 from tacpipe.tasks.forward.rows import Rows, acted, rows
 from tacpipe.tasks.forward.tracks import Track
@@ -109,11 +117,16 @@ def train(
     )
     weights = trained.weights | _shrinkage(trained.weights, params, codec, validation_rows)
     best = min(trained.history, key=lambda line: line["val_loss"])
-    config: Config = {
-        **_description(params, codec, pose, unit, reference),
+    config: ForwardConfig = {
+        "task": TASK,
+        "architecture": params.architecture,
+        "params": params_of.to_json(params),
+        "codec": _described(codec),
+        "context": params.context,
+        "horizon": params.horizon,
+        "inputs": _inputs(codec, pose, unit, reference),
         "rate_hz": rate_hz,
         "gap_ms": _gap_ms(training),
-        **_look_ahead(training),
         "timeline": parts[0][0].timeline,
         "scaling": _scaling(parts[0], mapped),
         "largest_level": max(largest_level(track.tactile[usable]) for track, usable in _usable(parts[0], mapped)),
@@ -127,6 +140,8 @@ def train(
             for name, part, rows_of_part in zip(("train", "val"), parts, (training_rows, validation_rows), strict=True)
         },
     }
+    if look_ahead := _look_ahead(training):
+        config["look_ahead"] = look_ahead
     files = {} if codec.kind == "raw" else {name: training.files[name] for name in (codecs.DESCRIPTION, codecs.TENSORS)}
     if params.baselines:
         linear = Baselines.fit(_linear(training_rows), _linear(validation_rows))
@@ -171,27 +186,22 @@ def _shrinkage(weights: dict[str, Tensor], params: Params, codec: codecs.Codec, 
     return {SHRINKAGE: persistence_weights(model(windows) - now, ahead - now, watched.recording_of(starts))}
 
 
-def _description(params: Params, codec: codecs.Codec, pose: Pose, unit: str, reference: AnyFloats) -> Config:
-    """Return what a model states of its architecture and of what it reads."""
-    return {
-        "task": TASK,
-        "architecture": params.architecture,
-        "params": params_of.to_json(params),
-        "codec": _described(codec),
-        "context": params.context,
-        "horizon": params.horizon,
-        "inputs": {
-            "tactile": list(codec.channels),
-            "layout": [dict(channel) for channel in codec.layout],
-            "orientation_reference": reference.tolist(),
-            **({} if unit == units.COUNT else {"unit": unit}),
-            **({} if pose == NAMED else {"pose": {"position": pose.position, "orientation": pose.orientation}}),
-        },
+def _inputs(codec: codecs.Codec, pose: Pose, unit: str, reference: AnyFloats) -> ModelInputs:
+    """Return the columns that a model reads, as its configuration holds them."""
+    inputs: ModelInputs = {
+        "tactile": list(codec.channels),
+        "layout": [dict(channel) for channel in codec.layout],
+        "orientation_reference": reference.tolist(),
     }
+    if unit != units.COUNT:
+        inputs["unit"] = unit
+    if pose != NAMED:
+        inputs["pose"] = {"position": pose.position, "orientation": pose.orientation}
+    return inputs
 
 
-def _look_ahead(training: Dataset) -> dict[str, Any]:
-    """Return how far the rows of the training recordings look ahead, ms; nothing where no recording states it."""
+def _look_ahead(training: Dataset) -> LookAhead | None:
+    """Return how far the rows of the training recordings look ahead; None where no recording states it."""
     look_ahead = [
         (
             float(recording.attributes[masks.LOOK_AHEAD_MEAN] or 0),
@@ -201,9 +211,9 @@ def _look_ahead(training: Dataset) -> dict[str, Any]:
         if masks.LOOK_AHEAD_MAX in recording.attributes
     ]
     if not look_ahead:
-        return {}
+        return None
     mean, largest = (np.array(column) for column in zip(*look_ahead, strict=True))
-    return {"look_ahead": {"mean_ms": round(float(mean.mean()), 3), "max_ms": float(largest.max())}}
+    return {"mean_ms": round(float(mean.mean()), 3), "max_ms": float(largest.max())}
 
 
 def _gap_ms(training: Dataset) -> dict[str, float]:
@@ -216,7 +226,7 @@ def _gap_ms(training: Dataset) -> dict[str, float]:
     return {stream: float(np.median(gaps_ms)) for stream, gaps_ms in sorted(values.items())}
 
 
-def _alarms(forecaster: Forecaster, part: Sequence[Track]) -> dict[str, Any]:
+def _alarms(forecaster: Forecaster, part: Sequence[Track]) -> AlarmLevels:
     """Return the levels of alarms, set on the validation recordings."""
     loads = Loads(forecaster.codec.layout, forecaster.horizon)
     for track in part:
@@ -270,7 +280,7 @@ def _check_channels(codec: codecs.Codec, part: Sequence[Track]) -> None:
         )
 
 
-def _scaling(part: Sequence[Track], mapped: MappedArrays) -> dict[str, list[float]]:
+def _scaling(part: Sequence[Track], mapped: MappedArrays) -> Scaling:
     """Return half the range of each feature and the standard deviation of each channel over usable training rows."""
     ranges = [scaling.fit(track.latent[usable]) for track, usable in _usable(part, mapped)]
     if not ranges:
@@ -306,7 +316,7 @@ def _summed(total: AnyFloats, rows: AnyFloats) -> AnyFloats:
     return sums
 
 
-def _described(codec: codecs.Codec) -> dict[str, Any]:
+def _described(codec: codecs.Codec) -> CodecDescription:
     """Return what a model's configuration holds of its codec, and a short name for it."""
     frames, latents = int(getattr(codec, "frames", 1)), len(codec.latents)
     name = {"raw": "raw", "pca": f"PCA-{latents}", "autoencoder": f"AE-C{frames}-{latents}"}.get(codec.kind, codec.kind)
