@@ -11,6 +11,7 @@ import pytest
 
 from tacpipe.arrays import AnyFloats
 from tacpipe.tasks.forward.alarms import Loads
+from tacpipe.tasks.forward.params import AlarmLevels
 from tacpipe.tasks.forward.predictors import Predicted, Prediction
 from tacpipe.tasks.forward.tracks import Track
 from tests.models.window_fakes import LAYOUT
@@ -109,7 +110,7 @@ def test_a_level_that_is_never_reached_is_written_as_nothing_and_read_as_never()
     read: dict[str, Any] = json.loads(json.dumps(levels), parse_constant=pytest.fail)
     assert read == levels
     load = stepped()
-    never = {"sd": [1.0] * 6, "theta": {"model": [None] * 6}}
+    never: AlarmLevels = {"sd": [1.0] * 6, "theta": {"model": [None] * 6}}
     scores = loads((recorded_track(load), seer(load))).scored(never)
     assert set(scores) == {"model"}  # nothing was set for persistence
     assert scores["model"]["recall"] == 0.0

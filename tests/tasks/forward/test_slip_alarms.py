@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -12,7 +11,7 @@ import pytest
 
 from tacpipe.arrays import AnyFloats, Bools
 from tacpipe.tasks.forward.shear import Layout
-from tacpipe.tasks.forward.slip_alarms import SlipAlarms
+from tacpipe.tasks.forward.slip_alarms import SlipAlarms, SlipScore
 from tacpipe.tasks.forward.slip_labels import slips_of
 from tacpipe.tasks.forward.tracks import Track
 from tests.stages.learning_fakes import CHANNELS, table
@@ -66,7 +65,7 @@ def test_of_a_recording_that_does_not_state_its_slips_every_alarm_is_false() -> 
     assert alarms((None, pulled)).level("model", 1e-6) == pytest.approx(90 / PRESSED)
 
 
-def worth(*parts: tuple[Bools | None, dict[int, float]], per_hour: float = 1e-6) -> dict[str, Any]:
+def worth(*parts: tuple[Bools | None, dict[int, float]], per_hour: float = 1e-6) -> SlipScore:
     return alarms(*parts).scored(per_hour)["model"]
 
 
