@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -66,7 +66,6 @@ class ForwardReport(TaskReport):
         return run_columns(run)
 
 
-Tree = Mapping[str, Any]
 LINES = 4  # methods in a figure of skill, the paper's not counted
 FLOOR = -1.0  # skill at which figures end
 SETTINGS = ("preset", "epochs", "stride", "hidden", "batch", "seed")

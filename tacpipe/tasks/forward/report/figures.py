@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from tacpipe.comparison.runs import MODEL, Method, Run
 from tacpipe.report import blocks, charts
 from tacpipe.report.blocks import Cell, Chart, Charts, Fold, Note, Table, counted, fold, number, table
 from tacpipe.report.charts import Line
-from tacpipe.report.context import Context, loss_chart, median_run
+from tacpipe.report.context import Context, Tree, loss_chart, median_run
 from tacpipe.tasks.forward import headline, units
 from tacpipe.tasks.forward.report import methods
 
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Recording
 
 
-Tree = Mapping[str, Any]
 OFF_SCALE = ("context_mean", "train_mean")  # so far off that the others would lie on one line
 EXPLAINED = {
     "model": "the trained model",

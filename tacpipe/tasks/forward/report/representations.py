@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,14 +14,12 @@ from tacpipe.comparison.runs import MODEL, Method, Run, Spread, spread
 from tacpipe.report import blocks, charts
 from tacpipe.report.blocks import NONE, Cell, Chart, Charts, Fold, Note, Table, fold, number, table
 from tacpipe.report.charts import Line
-from tacpipe.report.context import Context, is_published
+from tacpipe.report.context import Context, Tree, is_published
 from tacpipe.tasks.forward.report import methods
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
 
-
-Tree = Mapping[str, Any]
 
 CODEC_FILE = "codec.json"
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -79,7 +79,6 @@ def skill_cell(intervals: Interval | None, at: int) -> Cell:
     return blocks.interval(float(intervals.mean[at]), float(intervals.low[at]), float(intervals.high[at]))
 
 
-Tree = Mapping[str, Any]
 SITUATION_NOTE = (
     "A window is named by its last row and the rows to come, the first name that fits: no contact; closing: the gripper "
     f"closes by more than {1000 * WIDTH_M:g} mm or contact begins; releasing: it opens by more than that or contact ends; "
