@@ -175,7 +175,7 @@ class ModelInputs(TypedDict):
     pose: NotRequired[ArmColumns]  # absent: the columns of a Panda
 
 
-class Scaling(TypedDict):
+class ForwardScaling(TypedDict):
     """Spreads over usable training rows, in a model's configuration."""
 
     feature_half: list[float]  # half the range of each feature
@@ -219,7 +219,7 @@ class ForwardConfig(TypedDict):
     gap_ms: dict[str, float]  # longest time without a gap by stream
     look_ahead: NotRequired[LookAhead]
     timeline: str
-    scaling: Scaling
+    scaling: ForwardScaling
     largest_level: NotRequired[float | None]  # absent from older models
     validation: dict[str, float]  # loss and epoch of the stored weights
     trained_on: dict[str, str]  # digests of recordings by name

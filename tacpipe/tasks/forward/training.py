@@ -47,10 +47,10 @@ from tacpipe.tasks.forward.params import (
     Change,
     CodecDescription,
     ForwardConfig,
+    ForwardScaling,
     LookAhead,
     ModelInputs,
     Params,
-    Scaling,
 )
 from tacpipe.tasks.forward.predictors import predicted
 from tacpipe.tasks.forward.rows import Rows, acted, rows
@@ -280,7 +280,7 @@ def _check_channels(codec: codecs.Codec, part: Sequence[Track]) -> None:
         )
 
 
-def _scaling(part: Sequence[Track], mapped: MappedArrays) -> Scaling:
+def _scaling(part: Sequence[Track], mapped: MappedArrays) -> ForwardScaling:
     """Return half the range of each feature and the standard deviation of each channel over usable training rows."""
     ranges = [scaling.fit(track.latent[usable]) for track, usable in _usable(part, mapped)]
     if not ranges:
