@@ -15,6 +15,7 @@ from typing import Any
 
 DOCS = Path(__file__).parent
 BUILT_IN = ("tacpipe.", "tacpipe_stages.")
+FIRST = ("open", "load", "run", "Dataset", "Recording")  # names at the top of the page on Python
 TABLE = re.compile(r"^\[\[results: (\w+)\]\]$", re.MULTILINE)
 
 
@@ -27,8 +28,10 @@ def on_files(files: Any, config: Any) -> Any:
     return files
 
 
-def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Put the tables of results where a page asks for them with ``[[results: NAME]]``."""
+def on_page_markdown(markdown: str, page: Any = None, **_: Any) -> str:
+    """Insert the tables of results at ``[[results: NAME]]``, and leave decisions out of the search index."""
+    if page is not None and page.file.src_uri.startswith("decisions/"):
+        page.meta["search"] = {"exclude": True}
     return TABLE.sub(lambda found: result_table(found.group(1)), markdown)
 
 
@@ -63,7 +66,8 @@ def command_line() -> str:
     """Return the page of all commands, each with its help as the program prints it."""
     parts = [
         "# Command line\n",
-        "The text below is what `tacpipe COMMAND --help` prints, `-h` for short.\n",
+        "The help of every command, as `tacpipe COMMAND --help` prints it. `-h` prints the common options. "
+        "[Options that commands share](options.md) has them in one table.\n",
         f"```text\n{help_of([])}\n```\n",
     ]
     for words in command_names():
@@ -171,12 +175,14 @@ def python() -> str:
 
     parts = [
         "# Python\n",
-        "All public names are those of `tacpipe.__all__`, and the constraints that params are annotated with.\n",
+        "The public names of `tacpipe`, errors last, and the constraints for params. "
+        "[From Python](../python.md) explains them with examples.\n",
     ]
-    for name in sorted(tacpipe.__all__, key=str.lower):
-        if name.startswith("__"):
-            continue
-        parts.append(f"::: {_path(name)}\n    options:\n      heading_level: 2\n")
+    public = [name for name in tacpipe.__all__ if not name.startswith("__")]
+    errors = [name for name in public if name.endswith(("Error", "Warning"))]
+    others = sorted({*public} - {*FIRST, *errors}, key=str.lower)
+    names = (*(name for name in FIRST if name in public), *others, *sorted(errors))
+    parts += [f"::: {_path(name)}\n    options:\n      heading_level: 2\n" for name in names]
     parts.append(
         "## Constraints of params\n\n::: tacpipe.plugins.constraints\n    options:\n      show_root_heading: false\n"
         "      filters: ['!^_', '!^allows$', '!^describe$']\n"
@@ -195,7 +201,7 @@ def _path(name: str) -> str:
 
 def decisions() -> str:
     """Return the list of decisions, oldest first."""
-    lines = ["# Decisions\n", "What took an argument or a measurement to decide, one page each.\n"]
+    lines = ["# Decisions\n", "Decisions that needed an argument or a measurement, one page each.\n"]
     for page in sorted((DOCS / "decisions").glob("[0-9]*.md")):
         if page.stem.startswith("0000"):
             continue

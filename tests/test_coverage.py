@@ -11,7 +11,7 @@ import pytest
 
 from tests.test_docs import module
 
-PAGE = Path(__file__).parents[1] / "docs" / "explanation" / "intervals.md"
+PAGE = Path(__file__).parents[1] / "docs" / "benchmarks" / "intervals.md"
 pytestmark = [
     pytest.mark.long,
     pytest.mark.skipif(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import importlib.util
 import io
+import json
 import os
 import re
 import shlex
@@ -33,6 +34,7 @@ RUN = [  # pages whose console and Python blocks are run, in this order, in one 
         ROOT / "docs" / f"{name}.md"
         for name in (
             "tutorials/simulated",
+            "tutorials/compare",
             "tutorials/own-data",
             "howto/hdf5",
             "howto/view",
@@ -43,11 +45,10 @@ RUN = [  # pages whose console and Python blocks are run, in this order, in one 
         )
     ),
     *sorted((ROOT / "docs" / "tasks").glob("*.md")),
-    ROOT / "docs" / "rig.md",
 ]
 EXTENDING = [  # pages whose packages tests/test_extending.py installs and whose blocks it runs, in this order in one project
     ROOT / "docs" / "extending" / f"{name}.md"
-    for name in ("model", "codec", "task", "tracker", "executor", "stage", "format", "sensor")
+    for name in ("model", "codec", "task", "tracker", "executor", "export", "stage", "format", "sensor")
 ]
 PYTHON = ROOT / "docs" / "python.md"  # tests/test_python_page.py runs its blocks.
 BUILT_IN = sorted(
@@ -92,13 +93,18 @@ def fenced(text: str) -> list[Block]:
     return [Block(language, code, title, mark) for mark, language, title, code in matches]
 
 
+def joined(text: str) -> str:
+    """Return commands that continue on the next line as one line each."""
+    return re.sub(r" *\\\n +", " ", text)
+
+
 MORE = "…"  # This stands in a page for further lines that a command prints.
 
 
 def printed(block: str) -> list[tuple[str, list[str]]]:
     """Return the commands of a console block, each with the lines that are printed below it, but for empty ones."""
     outputs: list[tuple[str, list[str]]] = []
-    for line in block.splitlines():
+    for line in joined(block).splitlines():
         if line.startswith("$ "):
             outputs.append((line.removeprefix("$ "), []))
         elif line:
@@ -222,7 +228,7 @@ def test_the_commands_in_all_pages_exist(lab: Lab) -> None:
     lines_of_pages = []
     for page in PAGES:
         text = page.read_text()
-        lines = [line.split("#")[0] for block in blocks(text, "sh") for line in block.splitlines()]
+        lines = [line.split("#")[0] for block in blocks(text, "sh") for line in joined(block).splitlines()]
         lines_of_pages += [line for line in lines if line.startswith("tacpipe ")] + re.findall(
             r"`(tacpipe [^`]+)`", text
         )
@@ -346,6 +352,57 @@ def test_the_tables_of_results_are_made_from_results() -> None:
     assert len(rows) == 8
 
 
+PARSED = {  # beginnings of examples of the help that are parsed and not run, and why
+    "acquire": "needs the devices of a rig",
+    "candidates": "names a published grasp",
+    "demo": "runs for minutes, and the examples here do the same",
+    "ingest": "needs files of other programs; tests/formats reads such files",
+    "limits": "runs for minutes",
+    "live": "needs the devices of a rig",
+    "sensors emulate": "runs until Ctrl-C",
+    "sensors probe": "needs a device",
+    "store checkout": "names the digest of another store",
+    "store pull": "needs another store",
+    "store push": "needs a bucket",
+    "store verify --remote": "needs a bucket",
+    "track": "needs an extra",
+    "view": "opens a window",
+}
+PREPARED = {  # commands that must run before the example of a command
+    "train material": "split data/slides -o data/slides-split --stratify sensor,material",
+    "train touch": "split data/grasps -o data/grasps-split --stratify object",
+    "compare": "evaluate models/forward data/segments --split data/split -o results/forward-gru",
+}
+SHORT = """
+train: {forward: {epochs: 1, stride: 8}, material: {features: 500}, touch: {trees: 10}}
+compress: {autoencoder: {epochs: 1, search: 0}}
+"""
+CHAIN = "stages: {train: {cmd: tacpipe version}, evaluate: {cmd: tacpipe version}, forward: {cmd: tacpipe version}}"
+
+
+@pytest.mark.long
+def test_the_examples_of_all_help_texts_run_as_pasted(tmp_path: Path) -> None:
+    """They run in the order of the reference, in one project whose ``params.yaml`` makes trainings short."""
+    (tmp_path / ".tacpipe").mkdir()
+    (tmp_path / "params.yaml").write_text(SHORT)
+    (tmp_path / "dvc.yaml").write_text(CHAIN)
+    made, ran = hooks(), 0
+    environment = {"OMP_NUM_THREADS": "1", "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
+
+    for words in made.command_names():
+        texts = re.split(r"\nExamples?:\n", made.help_of(words))[1:]
+        for example in "".join(texts).split("\n\n")[0].splitlines():
+            command = " ".join(shlex.split(example, comments=True)[1:])
+            if command.startswith(tuple(PARSED)):
+                continue
+            prepared = PREPARED.get(" ".join(words))
+            for line in [*([prepared] if prepared else []), command]:
+                done = tacpipe(tmp_path, line, **environment)
+                assert done.returncode == 0, f"{line}: {done.stderr}"
+            ran += 1
+    assert ran >= 40
+
+
 def test_every_page_is_in_the_navigation_and_every_link_leads_to_a_page() -> None:
     navigation = (ROOT / "mkdocs.yml").read_text()
     generated = set(hooks().pages())
@@ -357,14 +414,102 @@ def test_every_page_is_in_the_navigation_and_every_link_leads_to_a_page() -> Non
             assert place.exists() or place.relative_to(ROOT / "docs").as_posix() in generated, f"{path}: {target}"
 
 
-def test_every_page_is_at_most_two_links_from_the_readme() -> None:
+WIDTH = 76  # characters of a command line that fit a block of code on the site
+QUESTIONS = {  # what people ask, and the page and heading that answer it
+    "How do I record two serial sensors?": ("tutorials/rig.md", "Your first rig: two serial sensors"),
+    "How do I read my CSV files?": ("tutorials/own-data.md", "Your own CSV files"),
+    "What does synchronize do to timestamps?": ("explanation/recording.md", "Two clocks"),
+    "Which forward model is best?": ("howto/choose-model.md", "Choose a model"),
+    "How do I run on Slurm?": ("howto/cluster.md", "Use Slurm"),
+    "How do I clean the store?": ("howto/data.md", "Manage data and the store"),
+    "How do I get data into LeRobot?": ("howto/export.md", "LeRobot"),
+    "Can I trust the cache?": ("promises.md", "Guarantees and evidence"),
+    "How do I add my sensor?": ("howto/board.md", "Connect a board of your own"),
+    "How do I use my network?": ("extending/model.md", "A model"),
+    "How do I label slips?": ("howto/label.md", "Slips"),
+    "What does skill mean?": ("reference/metrics.md", "What skill means"),
+    "How do I get forecasts live?": ("tutorials/live.md", "Forecast live"),
+    "How do I share a dataset?": ("howto/export.md", "Publish a dataset"),
+    "How do I cite tacpipe?": ("../README.md", "More"),
+}
+ANSWERS = {  # a part of the answer, which the section must contain
+    "How do I run on Slurm?": "--executor slurm",
+    "How do I clean the store?": "tacpipe store gc",
+    "Which forward model is best?": "taxelwise",
+    "How do I label slips?": "segment slips",
+    "How do I get data into LeRobot?": "observation.state",
+    "How do I cite tacpipe?": "CITATION.cff",
+    "What does skill mean?": "1 − error",
+    "What does synchronize do to timestamps?": "synchronize",
+}
+
+
+def within_links(count: int) -> set[Path]:
+    """Return the pages that are at most ``count`` links from the README."""
     reached = {ROOT / "README.md"}
-    for _ in range(2):
+    for _ in range(count):
         for page in list(reached):
             targets = re.findall(r"\]\(([^)#\s]+\.md)(?:#[^)]*)?\)", page.read_text())
             reached |= {path for target in targets if (path := (page.parent / target).resolve()).exists()}
+    return reached
+
+
+@pytest.mark.parametrize("question", QUESTIONS)
+def test_a_question_has_one_heading_with_its_answer_at_most_two_links_from_the_readme(question: str) -> None:
+    name, heading = QUESTIONS[question]
+    page = (ROOT / "docs" / name).resolve()
+    text = "\n" + page.read_text()
+    (start,) = re.finditer(rf"^(#+) {re.escape(heading)}$", text, re.MULTILINE)
+    answer = re.split(rf"^#{{1,{len(start[1])}}} ", text[start.end() :], maxsplit=1, flags=re.MULTILINE)[0]
+
+    assert page in within_links(2)
+    assert ANSWERS.get(question, "") in answer
+
+
+def test_every_page_is_at_most_two_links_from_the_readme() -> None:
     pages = {page for page in DOCS if page.parent.name != "decisions"}
-    assert {str(page.relative_to(ROOT)) for page in pages - reached} == set()
+    assert {str(page.relative_to(ROOT)) for page in pages - within_links(2)} == set()
+
+
+def test_command_lines_fit_a_block_of_code() -> None:
+    shown = [
+        f"{page.name}: {line}"
+        for page in PAGES
+        for block in fenced(page.read_text())
+        if block.language in ("sh", "bash", "console")
+        for line in block.text.splitlines()
+        if len(line) > WIDTH and (block.language != "console" or line.startswith("$ "))
+    ]
+    assert shown == []
+
+
+def test_pages_avoid_words_of_a_translation() -> None:
+    text = "\n".join(page.read_text() for page in PAGES if page.parent.name != "decisions")
+    prose = re.sub(r"^```.*?^```$", "", text, flags=re.DOTALL | re.MULTILINE)
+
+    assert len(re.findall(r"\balone\b", prose, re.IGNORECASE)) <= 10
+    assert re.findall(r"\b(?:anew|whoever|what lies|besides|a row a recording)\b", prose, re.IGNORECASE) == []
+
+
+@pytest.mark.long
+def test_the_notebook_opens_a_dataset_and_fits_a_model(tmp_path: Path) -> None:
+    (tmp_path / ".tacpipe").mkdir()
+    (block, *_) = fenced(section((ROOT / "README.md").read_text(), "From data to a report"))
+    for command, _ in printed(block.text)[:4]:
+        ran = tacpipe(tmp_path, command.removeprefix("tacpipe "), OMP_NUM_THREADS="1")
+        assert ran.returncode == 0, ran.stderr
+    cells = json.loads((ROOT / "docs" / "tutorials" / "explore.ipynb").read_text())["cells"]
+    code = "\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=tmp_path,
+        env={**os.environ, "MPLBACKEND": "Agg"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert re.fullmatch(r"own model [\d.]+ counts, persistence [\d.]+ counts, skill \+0\.\d\d\n", done.stdout)
 
 
 @pytest.mark.long

@@ -7,7 +7,7 @@ import pytest
 
 from tacpipe.channels import vocabulary
 
-PAGE = Path(__file__).parents[1] / "docs" / "format.md"
+PAGE = Path(__file__).parents[1] / "docs" / "reference" / "recordings.md"
 
 
 def test_the_quantities_of_the_page_of_formats_are_the_vocabulary() -> None:

@@ -12,6 +12,11 @@ from tacpipe.plugins import extras
 
 LEARNING = ("jinja2", "matplotlib", "safetensors", "scipy", "sklearn", "torch", "vl_convert")
 LINKS = ("serial", "websockets")
+NEXT = """Open the page below in a browser. What to try next:
+  tacpipe show {output}/results        the table of a result
+  tacpipe explain {output}/results     where it comes from
+  tacpipe demo -o {output}             a second time: every result is reused
+  docs/tutorials/simulated.md          the same commands, explained"""
 
 
 def run_rig(output: Path, rig_file: Path) -> Path:
@@ -38,10 +43,12 @@ def run_rig(output: Path, rig_file: Path) -> Path:
     return demo.page(output)
 
 
-def _run(several: list[list[str]]) -> None:
-    for command in several:
+def _run(commands: list[list[str]]) -> None:
+    """Run commands one after another. Print one line for each, and the errors of one that fails."""
+    for command in commands:
         terminal.note("$ tacpipe " + " ".join(command))
-        process = subprocess.Popen([sys.executable, "-m", "tacpipe", *command], stdout=subprocess.DEVNULL)
+        quiet = [] if command[0] == "show" else ["--quiet"]
+        process = subprocess.Popen([sys.executable, "-m", "tacpipe", *command, *quiet], stdout=subprocess.DEVNULL)
         with termination.reporting(""):  # the command states it
             try:
                 code = process.wait()
@@ -53,6 +60,15 @@ def _run(several: list[list[str]]) -> None:
             raise TacpipeError(f"The demo stopped: `tacpipe {' '.join(command)}` ended with {code}.")
 
 
+def headline_of(result: Path) -> str:
+    """Return one sentence on the model of a result against its best baseline."""
+    from tacpipe.cli import headline_table
+    from tacpipe.metrics import headline
+
+    headlines = headline_table.of_output(result, headline.FILE)
+    return f"{headlines[0].task}: {headline.sentence(headlines[0])}" if headlines else headline_table.EMPTY
+
+
 def run(output: Path) -> Path:
     """Run the commands, showing each, and return the path of the report.
 
@@ -62,4 +78,10 @@ def run(output: Path) -> Path:
 
     extras.require("The demo", *LEARNING)
     _run(demo.commands(output))
+    for part in demo.parts(output):
+        terminal.note(headline_of(Path(part.results[0])))
+    terminal.note(
+        f"Trained only briefly: {', '.join(model for part in demo.parts(output) for model in part.shortened)}."
+    )
+    terminal.note(NEXT.format(output=output))
     return demo.page(output)

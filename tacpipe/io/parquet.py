@@ -22,7 +22,9 @@ from tacpipe.io.parquet_claims import Claims
 from tacpipe.printable import plain
 
 ROW_GROUP_ROWS = 1 << 20
-REPEATED_SHARE = 0.25  # above this fraction of repeated rows zstd beats delta packing; measured, docs/format.md
+REPEATED_SHARE = (
+    0.25  # above this fraction of repeated rows zstd beats delta packing; measured, docs/reference/recordings.md
+)
 LARGE_BYTES = 1 << 25  # size in memory
 BATCH_ROWS = 1024  # Arrow's own
 PAGE_BYTES = 1 << 20  # encoded frames per page; a batch of 1024 could exceed the 2 GiB of a page

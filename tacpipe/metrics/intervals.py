@@ -7,7 +7,7 @@ logarithm. Of clusters that count differently, the degrees of freedom follow fro
 that rests on four clusters is as uncertain as if there were four. Several seeds are a second factor that is left out one
 by one; the freedom of both is combined by Satterthwaite's formula (Biometrics Bulletin, 1946).
 
-``docs/explanation/intervals.md`` has the coverage in simulations, next to that of bootstrap intervals.
+``docs/benchmarks/intervals.md`` has the coverage in simulations, next to that of bootstrap intervals.
 """
 
 from __future__ import annotations

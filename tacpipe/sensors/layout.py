@@ -41,7 +41,7 @@ class Number:
     count: int = 1  # how many
     axes: str = ""  # axes of each, such as "xyz" for three numbers per taxel: taxel01_x, taxel01_y, …
     unit: str = "1"  # unit of the channel
-    quantity: str = "tactile"  # quantity of the channel, one of docs/format.md
+    quantity: str = "tactile"  # quantity of the channel, one of docs/reference/recordings.md
     order: Order | None = None  # byte order, where it differs from that of the frame
     equals: int | None = None  # constant value; such a number is checked and is not a channel
     skip: bool = False  # it is not a channel

@@ -26,7 +26,7 @@ class Column:
     name: str  # name of the channel; taxel{1..16} and taxel{1..4}_{x,y,z} are several, the last braces count fastest
     type: Type = "f32"  # u unsigned, i signed, f floating point, and the bits
     unit: str = "1"  # unit of the channel
-    quantity: str = "tactile"  # quantity of the channel, one of docs/format.md
+    quantity: str = "tactile"  # quantity of the channel, one of docs/reference/recordings.md
     label: str = ""  # text right before each number, as "x:"; with the braces of the name
     skip: bool = False  # it is not a channel, and may hold any text
 

@@ -16,7 +16,7 @@ EMULATED = "emulated"  # the folder of the emulated rig's own rig file
 
 def commands(output: Path) -> list[list[str]]:
     """Return the commands of each task's demo without the leading ``tacpipe``, and the page of all results."""
-    demos = _demos(output)
+    demos = parts(output)
     given = [*(name for demo in demos for name in demo.results), *(name for demo in demos for name in demo.datasets)]
     return [*(words for demo in demos for words in demo.commands), ["report", *given, "-o", str(page(output))]]
 
@@ -28,12 +28,12 @@ def rig(output: Path) -> list[list[str]]:
     return [
         ["acquire", str(output / EMULATED / "rig.toml"), "-o", recordings, *live],
         ["show", recordings],
-        *(words for demo in _demos(output) for words in demo.recorded),
+        *(words for demo in parts(output) for words in demo.recorded),
         ["report", str(output / "results"), "-o", str(page(output))],
     ]
 
 
-def _demos(output: Path) -> list[Demo]:
+def parts(output: Path) -> list[Demo]:
     """Return the parts of all tasks that have one."""
     return [demo for name in registry.tasks() if (demo := registry.load_task(name).demo(output)) is not None]
 

@@ -68,6 +68,7 @@ class Demo(NamedTuple):
     datasets: Sequence[str] = ()  # paths of datasets that the page uses, which are not results
     # commands from the emulated rig's ``recordings`` below the output to ``results``; empty without such a part
     recorded: Sequence[list[str]] = ()
+    shortened: Sequence[str] = ()  # models that are trained for a part of their schedule, each with that part
 
 
 class Task(ABC):

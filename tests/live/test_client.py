@@ -14,7 +14,7 @@ from tacpipe.tasks.forward.live.messages import Description, Message
 from tests.live.test_publishers import free_port
 from tests.recording.live import ROOT, awaited
 
-PAGE = ROOT / "docs" / "howto" / "live.md"
+PAGE = ROOT / "docs" / "howto" / "subscribe.md"
 
 
 def client() -> str:

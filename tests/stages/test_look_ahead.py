@@ -21,7 +21,7 @@ from tacpipe.signals.contact import contact_intervals
 from tacpipe.tasks.forward import tracks
 from tests.fake_recordings import FakeRecording, FakeShard, dataset
 
-PAGE = Path(__file__).parents[2] / "docs/explanation/causal.md"
+PAGE = Path(__file__).parents[2] / "docs/reference/look-ahead.md"
 MS = 1_000_000
 PERIOD_MS = 20
 SECONDS = 5.0  # of a simulated trial

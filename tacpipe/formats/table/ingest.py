@@ -25,7 +25,7 @@ from tacpipe.plugins.stream_selection import StreamSelection
 class Params(StreamSelection):
     """How the tables are laid out."""
 
-    layout: Annotated[str, TomlFile()] = ""  # layout file; docs/tutorials/own-data.md describes its entries
+    layout: Annotated[str, TomlFile()] = ""  # layout file; docs/reference/layout.md describes its entries
 
     def check(self) -> None:
         """Raise `UsageError` for a layout that is missing or wrong, before any file is looked for."""

@@ -1,6 +1,6 @@
 """The layout file: which files make a recording, what their columns hold, where time and labels come from.
 
-``docs/tutorials/own-data.md`` describes each entry. A layout is checked as a whole when it is read, before any data file
+``docs/reference/layout.md`` describes each entry. A layout is checked as a whole when it is read, before any data file
 is opened.
 """
 

@@ -22,7 +22,9 @@ def demo(output: Path) -> Demo:
         ["train", "forward", place["latents"], *split, "-o", place["paper-model"], *paper],
         ["evaluate", place["paper-model"], place["latents"], *split, "-o", place["paper-results"]],
     ]
-    return Demo(commands, [place["results"], place["paper-results"]], recorded=chain(output))
+    shortened = [f"{place['model']} (6 of 16 epochs)", f"{place['paper-model']} (6 of 50 epochs)"]
+    results = [place["results"], place["paper-results"]]
+    return Demo(commands, results, recorded=chain(output), shortened=shortened)
 
 
 def chain(output: Path) -> list[list[str]]:

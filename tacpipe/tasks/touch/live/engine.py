@@ -34,7 +34,7 @@ class TouchEngine(Engine):
         self.requests = {name: sensor for name, sensor in sensors.items() if isinstance(sensor, Grasps)}
         if not self.requests:
             raise TacpipeError(
-                "The rig has no stream of the sensor grasps, by which candidates come; add one, as in docs/howto/live.md."
+                "The rig has no stream of the sensor grasps for requests. Add one, as in docs/howto/live-grasps.md."
             )
         fingers = {target.rpartition("_")[2] for target in predictor.targets}
         if len(fingers) < criterion.fingers:
