@@ -116,7 +116,7 @@ Params = Random | Kfold | Blocked | LeaveOneOut | Authors
 def split(params: Params, recordings: Dataset, extend: Roles | None = None) -> Result:
     """Give each recording its role: train, val, calibration or test.
 
-    Returns one table, ``split``, with a row a recording and fold: recording, fold, role. Recordings that have a role in
+    Returns one table, ``split``, with one row per recording and fold: recording, fold, role. Recordings that have a role in
     the older split ``extend`` keep it. A note names folds without validation recordings, unless ``val`` is 0.
     """
     import pyarrow as pa

@@ -125,7 +125,7 @@ def run(
     :param codec: a dataset whose fitted codec to apply; ``init``: a model to begin with; ``extend``: an older split
         whose roles to keep.
     :param preset: a preset of params. A file of params is read only if ``params_file`` names one (``block``: its block).
-    :param jobs: processes to use; 0: one a core. ``skip_bad`` leaves out recordings that cannot be read, ``rerun``
+    :param jobs: processes to use; 0: one per core. ``skip_bad`` leaves out recordings that cannot be read, ``rerun``
         computes what is stored too, ``replace`` lets the output replace what it must not lose otherwise.
     :param device: what networks are trained on: cpu, cuda or mps; auto is cuda where there is one.
     :param progress: show progress on a terminal, and print what a command prints while it runs.

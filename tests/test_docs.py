@@ -429,7 +429,7 @@ QUESTIONS = {  # what people ask, and the page and heading that answer it
     "How do I label slips?": ("howto/label.md", "Slips"),
     "What does skill mean?": ("reference/metrics.md", "What skill means"),
     "How do I get forecasts live?": ("tutorials/live.md", "Forecast live"),
-    "How do I share a dataset?": ("howto/export.md", "Publish a dataset"),
+    "How do I share a dataset?": ("howto/push.md", "Push and pull datasets"),
     "How do I cite tacpipe?": ("../README.md", "More"),
 }
 ANSWERS = {  # a part of the answer, which the section must contain
@@ -469,6 +469,18 @@ def test_a_question_has_one_heading_with_its_answer_at_most_two_links_from_the_r
 def test_every_page_is_at_most_two_links_from_the_readme() -> None:
     pages = {page for page in DOCS if page.parent.name != "decisions"}
     assert {str(page.relative_to(ROOT)) for page in pages - within_links(2)} == set()
+
+
+def test_pages_are_short() -> None:
+    """Count words outside of code; troubleshooting is a table to look up."""
+    longest = {"tutorials": 900, "howto": 600, "explanation": 1000, "tasks": 1000}
+    counts = {
+        page: len(re.sub(r"^```.*?^```$|<!--.*?-->", "", page.read_text(), flags=re.DOTALL | re.MULTILINE).split())
+        for page in DOCS
+        if page.parent.name in longest
+    }
+    tables = ("troubleshooting.md",)
+    assert {p.name: n for p, n in counts.items() if n > longest[p.parent.name] and p.name not in tables} == {}
 
 
 def test_command_lines_fit_a_block_of_code() -> None:

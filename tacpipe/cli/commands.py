@@ -40,7 +40,7 @@ def _label(program: typer.Typer) -> None:
         "label",
         help=SUMMARIES["label"]
         + "\n\nLabels are set on the recordings that are named, or on each by a table with --from: "
-        "CSV, TSV, Parquet, JSON or YAML with a row a recording. An empty cell changes nothing.\n\n"
+        "CSV, TSV, Parquet, JSON or YAML with one row per recording. An empty cell changes nothing.\n\n"
         "Example: tacpipe label data/recordings trial-003 --label material=foam",
     )
     def label(
@@ -56,7 +56,7 @@ def _label(program: typer.Typer) -> None:
         ] = None,
         include: Annotated[bool, typer.Option("--include", help="Undo --exclude.")] = False,
         from_: Annotated[
-            Path | None, typer.Option("--from", help="Table with a row a recording and a column a label.")
+            Path | None, typer.Option("--from", help="Table with one row per recording and a column a label.")
         ] = None,
         key: Annotated[
             str, typer.Option("--key", help="Column of --from that names recordings; found where it is left out.")

@@ -65,7 +65,7 @@ def add(program: typer.Typer, summary: str) -> None:
             typer.Argument(metavar="STAGES", help="Stages to run, with all that they depend on; by default all."),
         ] = None,
         jobs: Annotated[
-            int, typer.Option("--jobs", min=0, help="Stages at the same time, each in a process; 0: one a core.")
+            int, typer.Option("--jobs", min=0, help="Stages at the same time, each in its process; 0: one per core.")
         ] = 1,
         quiet: Annotated[bool, typer.Option("--quiet", help="No names of stages, no summary.")] = False,
     ) -> None:

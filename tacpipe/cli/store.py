@@ -176,7 +176,7 @@ def gc(
     ] = None,
     remote: AtRemote = None,
     cache: Annotated[
-        bool, typer.Option("--cache", help="Remove from this computer alone what the bucket of TACPIPE_STORE has too.")
+        bool, typer.Option("--cache", help="Remove local copies of what the bucket of TACPIPE_STORE has.")
     ] = False,
     as_json: AsJson = False,
 ) -> None:

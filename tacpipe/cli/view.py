@@ -54,7 +54,7 @@ def view(
     ] = False,
     save: Annotated[
         Path | None,
-        typer.Option("--save", help="Write a file (.rrd) for the viewer instead, or a folder with one a recording."),
+        typer.Option("--save", help="Write a file (.rrd) for the viewer instead, or a folder with one per recording."),
     ] = None,
     web: Annotated[bool, typer.Option("--web", help="Open in the browser instead, until Ctrl-C.")] = False,
     port: Annotated[int | None, typer.Option("--port", help="Port of --web; 9090 or a free one by default.")] = None,

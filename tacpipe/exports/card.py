@@ -243,7 +243,7 @@ def _with_recording_column(table: pa.Table, name: str) -> pa.Table:
 
 
 def _labels(recordings: Dataset) -> bytes:
-    """Return a table with a row a recording and a column an attribute."""
+    """Return a table with one row per recording and a column an attribute."""
     import pyarrow as pa
 
     from tacpipe.datasets import frames

@@ -63,7 +63,7 @@ def part(params: Params, recording: Recording, name: RecordingName) -> Result:
 def csv(params: Params, recordings: Dataset, parts: Parts) -> Result:
     """Write recordings as CSV files that can be read back.
 
-    One file a stream. `tacpipe ingest table EXPORT --layout EXPORT/layout.toml` gives values, stamps, types, units and
+    One file per stream. `tacpipe ingest table EXPORT --layout EXPORT/layout.toml` gives values, stamps, types, units and
     labels back.
 
     Example: tacpipe export csv data/recordings -o exports/csv

@@ -66,7 +66,7 @@ was given: robomimic reads them with `hdf5_filter_key`.
 class Params:
     """How the files are structured."""
 
-    structure: Literal["streams", "robomimic"] = "streams"  # a file a recording, or one of demonstrations
+    structure: Literal["streams", "robomimic"] = "streams"  # one file per recording, or one with demonstrations
     rate_hz: Rate | None = None  # robomimic: synchronize to this rate first
     master: str = ""  # robomimic: stream whose samples start and end the frames; without it the first tactile one
     actions: str = ""  # robomimic: stream of the actions: its targets, else its state one frame later

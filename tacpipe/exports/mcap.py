@@ -68,8 +68,8 @@ def part(params: Params, recording: Recording, name: RecordingName) -> Result:
 def mcap(params: Params, recordings: Dataset, parts: Parts) -> Result:
     """Write recordings as MCAP files for Foxglove and ROS 2.
 
-    One file a recording, one topic a stream at its own rate with each column in its own type; labels are metadata, events
-    a topic.
+    One file per recording, one topic per stream at its own rate with each column in its own type. Labels are metadata, and
+    events are a topic.
 
     Example: tacpipe export mcap data/recordings -o exports/mcap
     """

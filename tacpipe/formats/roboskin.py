@@ -47,7 +47,7 @@ KIND = re.compile(r"[<>|=]?[bfiu](\d)")  # numeric dtype with its size in bytes
 class Params(StreamSelection):
     """How slides are read."""
 
-    rate_hz: Rate = 50.0  # frames a second that stamps are made from; nominal, the set does not state
+    rate_hz: Rate = 50.0  # frames per second of the stamps; nominal, the set does not state
     # time: frames in order of time; authors: in the order in which they were published, to compare with
     layout: Literal["time", "authors"] = "time"
 

@@ -37,7 +37,7 @@ class ForwardSettings(TaskSettings):
     plan_from: str = ""  # IP address whose plans are accepted, for --plan udp:HOST:PORT
     steps: tuple[PositiveInt, ...] = ()  # Steps ahead that are published; all by default
     quantiles: tuple[PositiveInt, ...] = ()  # Quantiles published next to forecasts, percent, as 10,90; none by default
-    # False alarms an hour that each alarm may give; 0: no alarms (default)
+    # False alarms per hour that each alarm may give; 0: no alarms (default)
     alarms_per_hour: Annotated[float, Range(0, below=1e6)] = 0.0
     alarms_on: str = ""  # Recordings that the levels of alarms are set on
     split: str = ""  # Split whose validation recordings --alarms-on means
