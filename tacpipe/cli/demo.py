@@ -78,10 +78,9 @@ def run(output: Path) -> Path:
 
     extras.require("The demo", *LEARNING)
     _run(demo.commands(output))
-    for part in demo.parts(output):
+    parts = demo.parts(output)
+    for part in parts:
         terminal.note(headline_of(Path(part.results[0])))
-    terminal.note(
-        f"Trained only briefly: {', '.join(model for part in demo.parts(output) for model in part.shortened)}."
-    )
+    terminal.note(f"Trained only briefly: {', '.join(model for part in parts for model in part.shortened)}.")
     terminal.note(NEXT.format(output=output))
     return demo.page(output)
