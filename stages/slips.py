@@ -68,9 +68,10 @@ def slips(params: Params, recording: Recording) -> pa.Table | pa.RecordBatchRead
     They are detected by the object's distance from the wrist. Adds the labels ``slip``, detected in the whole
     recording, ``slip_online``, detected from the rows so far, and ``dropped``. Run it behind ``segment contacts``: each
     contact is a grasp, and a drop lasts until the next one. Without the column ``contact`` all of the recording is one.
-    Outside of contacts, after a drop and where there is no reading nothing slips.
+    Outside of contacts, after a drop and where there is no reading nothing slips. Rows need one rate, as of
+    ``synchronize --rate-hz 50``.
 
-    Example: tacpipe segment slips data/segments -o data/slips
+    Example: tacpipe segment slips data/even-contacts -o data/slips
     """
     import numpy as np
     import pyarrow as pa

@@ -369,9 +369,13 @@ PARSED = {  # beginnings of examples of the help that are parsed and not run, an
     "view": "opens a window",
 }
 PREPARED = {  # commands that must run before the example of a command
-    "train material": "split data/slides -o data/slides-split --stratify sensor,material",
-    "train touch": "split data/grasps -o data/grasps-split --stratify object",
-    "compare": "evaluate models/forward data/segments --split data/split -o results/forward-gru",
+    "segment slips": (
+        "synchronize data/recordings -o data/even --rate-hz 50",
+        "segment contacts data/even -o data/even-contacts",
+    ),
+    "train material": ("split data/slides -o data/slides-split --stratify sensor,material",),
+    "train touch": ("split data/grasps -o data/grasps-split --stratify object",),
+    "compare": ("evaluate models/forward data/segments --split data/split -o results/forward-gru",),
 }
 SHORT = """
 train: {forward: {epochs: 1, stride: 8}, material: {features: 500}, touch: {trees: 10}}
@@ -395,8 +399,7 @@ def test_the_examples_of_all_help_texts_run_as_pasted(tmp_path: Path) -> None:
             command = " ".join(shlex.split(example, comments=True)[1:])
             if command.startswith(tuple(PARSED)):
                 continue
-            prepared = PREPARED.get(" ".join(words))
-            for line in [*([prepared] if prepared else []), command]:
+            for line in (*PREPARED.get(" ".join(words), ()), command):
                 done = tacpipe(tmp_path, line, **environment)
                 assert done.returncode == 0, f"{line}: {done.stderr}"
             ran += 1
