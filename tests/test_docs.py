@@ -390,20 +390,20 @@ def test_the_examples_of_all_help_texts_run_as_pasted(tmp_path: Path) -> None:
     (tmp_path / ".tacpipe").mkdir()
     (tmp_path / "params.yaml").write_text(SHORT)
     (tmp_path / "dvc.yaml").write_text(CHAIN)
-    made, ran = hooks(), 0
+    reference, count = hooks(), 0
     environment = {"OMP_NUM_THREADS": "1", "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
 
-    for words in made.command_names():
-        texts = re.split(r"\nExamples?:\n", made.help_of(words))[1:]
+    for words in reference.command_names():
+        texts = re.split(r"\nExamples?:\n", reference.help_of(words))[1:]
         for example in "".join(texts).split("\n\n")[0].splitlines():
             command = " ".join(shlex.split(example, comments=True)[1:])
             if command.startswith(tuple(PARSED)):
                 continue
             for line in (*PREPARED.get(" ".join(words), ()), command):
-                done = tacpipe(tmp_path, line, **environment)
-                assert done.returncode == 0, f"{line}: {done.stderr}"
-            ran += 1
-    assert ran >= 40
+                process = tacpipe(tmp_path, line, **environment)
+                assert process.returncode == 0, f"{line}: {process.stderr}"
+            count += 1
+    assert count >= 40
 
 
 def test_every_page_is_in_the_navigation_and_every_link_leads_to_a_page() -> None:
@@ -418,7 +418,7 @@ def test_every_page_is_in_the_navigation_and_every_link_leads_to_a_page() -> Non
 
 
 WIDTH = 76  # characters of a command line that fit a block of code on the site
-QUESTIONS = {  # what people ask, and the page and heading that answer it
+QUESTIONS = {  # Questions of users, each with the page and the heading of the answer.
     "How do I record two serial sensors?": ("tutorials/rig.md", "Your first rig: two serial sensors"),
     "How do I read my CSV files?": ("tutorials/own-data.md", "Your own CSV files"),
     "What does synchronize do to timestamps?": ("explanation/recording.md", "Two clocks"),
@@ -487,7 +487,7 @@ def test_pages_are_short() -> None:
 
 
 def test_command_lines_fit_a_block_of_code() -> None:
-    shown = [
+    long_lines = [
         f"{page.name}: {line}"
         for page in PAGES
         for block in fenced(page.read_text())
@@ -495,7 +495,7 @@ def test_command_lines_fit_a_block_of_code() -> None:
         for line in block.text.splitlines()
         if len(line) > WIDTH and (block.language != "console" or line.startswith("$ "))
     ]
-    assert shown == []
+    assert long_lines == []
 
 
 def test_pages_avoid_words_of_a_translation() -> None:
@@ -515,7 +515,7 @@ def test_the_notebook_opens_a_dataset_and_fits_a_model(tmp_path: Path) -> None:
         assert ran.returncode == 0, ran.stderr
     cells = json.loads((ROOT / "docs" / "tutorials" / "explore.ipynb").read_text())["cells"]
     code = "\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-c", code],
         cwd=tmp_path,
         env={**os.environ, "MPLBACKEND": "Agg"},
@@ -523,8 +523,8 @@ def test_the_notebook_opens_a_dataset_and_fits_a_model(tmp_path: Path) -> None:
         text=True,
         check=False,
     )
-    assert done.returncode == 0, done.stderr
-    assert re.fullmatch(r"own model [\d.]+ counts, persistence [\d.]+ counts, skill \+0\.\d\d\n", done.stdout)
+    assert process.returncode == 0, process.stderr
+    assert re.fullmatch(r"own model [\d.]+ counts, persistence [\d.]+ counts, skill \+0\.\d\d\n", process.stdout)
 
 
 @pytest.mark.long

@@ -172,7 +172,9 @@ def test_a_spool_is_kept_where_asked_for_and_no_collection_removes_it(lab: Lab, 
 
     assert (path / "bytes").read_bytes() == content and list(live.shards(lab.folder)) == ["one"]
     before = counts(live.only(lab.folder))
-    shutil.move(path, lab.store.root / "spool" / path.name)  # as docs/howto/record.md states, to decode it once more
+    shutil.move(
+        path, lab.store.root / "spool" / path.name
+    )  # The page howto/record.md states that this decodes it once more.
     lab.run("acquire --recover")
     assert list(live.shards(lab.folder)) == ["one"] and counts(live.only(lab.folder)) == before
 
