@@ -24,7 +24,8 @@ PAGES = ("rig.md", "howto/programs.md", "howto/board.md", "tutorials/rig.md", "e
 def blocks(language: str) -> list[str]:
     """Return the fenced blocks of a language on the pages about rigs."""
     text = "\n".join((DOCS / name).read_text(encoding="utf-8") for name in PAGES)
-    return re.findall(rf"^```{language}[^\n]*\n(.*?)^```$", text, re.DOTALL | re.MULTILINE)
+    contents: list[str] = re.findall(rf"^```{language}[^\n]*\n(.*?)^```$", text, re.DOTALL | re.MULTILINE)
+    return contents
 
 
 def table() -> dict[str, list[str]]:
