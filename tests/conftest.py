@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import gc
+import json
 import os
 import shlex
 import shutil
@@ -15,6 +16,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 import pytest
 from hypothesis import settings
@@ -128,6 +130,10 @@ class Lab:
         assert ran.code == 0, f"{command} ended with {ran.code}: {ran.err}"
         return ran
 
+    def run_json(self, command: str) -> Any:
+        """Run a command that must succeed with ``--json``, and return the value that it prints."""
+        return json.loads(self.run(f"{command} --json").out)
+
     def manifest(self, path: str) -> Manifest:
         """Return the manifest of a dataset."""
         return find(self.folder / path).manifest
@@ -136,6 +142,22 @@ class Lab:
     def store(self) -> Store:
         """The project's store."""
         return Store(self.folder / ".tacpipe")
+
+
+def write_source(folder: str | Path, **texts: str) -> None:
+    """Write a source of the format ``numbers``, one text of numbers per recording."""
+    Path(folder).mkdir(exist_ok=True)
+    for recording, text in texts.items():
+        Path(folder, f"{recording}.txt").write_text(text)
+
+
+def write_plugin(folder: Path, name: str, entry_points: str, **modules: str) -> None:
+    """Write the modules and the metadata of a package into ``folder``, which then need only be on the path."""
+    metadata = folder / f"{name}.egg-info"
+    metadata.mkdir(parents=True, exist_ok=True)
+    (metadata / "entry_points.txt").write_text(entry_points)
+    for module, source in modules.items():
+        (folder / f"{module}.py").write_text(source)
 
 
 def sample_data() -> Path:
@@ -150,8 +172,7 @@ def plugin(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("plugin")
     for name in ("toy_stages.py", "toy_sensor.py"):
         shutil.copy(Path(__file__).parent / "plugin" / name, folder)
-    (folder / "toy.egg-info").mkdir()
-    (folder / "toy.egg-info" / "entry_points.txt").write_text(ENTRY_POINTS)
+    write_plugin(folder, "toy", ENTRY_POINTS)
     return folder
 
 

@@ -1,18 +1,22 @@
-"""Recordings and datasets without a store, for functions that read them."""
+"""Build recordings and datasets for tests, without a store for functions that read them, and published in one."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pytest
 
+from tacpipe.datasets import directory
+from tacpipe.datasets.manifest import Manifest
 from tacpipe.io.columns import Columns
 from tacpipe.io.hashing import digest
 from tacpipe.io.parquet import ParquetTable, to_parquet
+from tacpipe.store.store import Store
 
 
 class _Fake:
@@ -70,6 +74,26 @@ class FakeDataset:
 def dataset(*recordings: FakeRecording | FakeShard, files: Mapping[str, bytes] | None = None) -> Any:
     """Return a dataset of these recordings."""
     return FakeDataset({recording.name: recording for recording in recordings}, files or {})
+
+
+def publish_dataset(
+    store: Store, path: Path, tables: Mapping[str, Mapping[str, pa.Table]], **labels: list[Any]
+) -> None:
+    """Publish recordings by name and stream as a result of the stage scale, each label a list of one value per recording."""
+    store.prepare()
+    entries = {
+        name: {
+            "attributes": {label: values[place] for label, values in labels.items() if values[place] is not None},
+            "shards": {
+                stream: {**vars(store.put(to_parquet(table))), "rows": table.num_rows}
+                for stream, table in streams.items()
+            },
+        }
+        for place, (name, streams) in enumerate(tables.items())
+    }
+    manifest = Manifest("scale", 1, {"factor": 2}, recordings=entries)
+    store.put(manifest.content)
+    directory.publish(store, manifest, path)
 
 
 def column(table: pa.Table, name: str) -> np.ndarray[Any, Any]:

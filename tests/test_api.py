@@ -20,14 +20,12 @@ import pytest
 import torch
 
 import tacpipe
-from tacpipe.datasets import directory
 from tacpipe.datasets.dataset import Dataset
-from tacpipe.datasets.manifest import Manifest
 from tacpipe.engine import calling
-from tacpipe.io.parquet import to_parquet
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
-from tests.conftest import Lab
+from tests.conftest import Lab, write_source
+from tests.fake_recordings import publish_dataset
 
 STEP_NS = 20_000_000
 HEAVY = {"torch", "pyarrow", "pandas", "polars", "duckdb", "numpy", "sklearn", "typer"}
@@ -55,19 +53,7 @@ def synced(rows: int = 12, *, gap: int | None = None, late: int | None = None, n
 
 def publish(lab: Lab, path: str, tables: dict[str, dict[str, pa.Table]], **labels: list[Any]) -> Dataset:
     """Publish recordings by name and stream, each label a list of one value a recording, and open them."""
-    store = lab.store
-    store.prepare()
-    entries = {
-        name: {
-            "attributes": {label: values[place] for label, values in labels.items() if values[place] is not None},
-            "shards": {
-                stream: {**vars(store.put(to_parquet(table))), "rows": table.num_rows}
-                for stream, table in streams.items()
-            },
-        }
-        for place, (name, streams) in enumerate(tables.items())
-    }
-    directory.publish(store, Manifest("scale", 1, {"factor": 2}, recordings=entries), lab.folder / path)
+    publish_dataset(lab.store, lab.folder / path, tables, **labels)
     return tacpipe.open(lab.folder / path)
 
 
@@ -135,7 +121,7 @@ def test_run_answers_what_the_command_computed_and_the_other_way_round(lab: Lab)
     assert dataset.path == lab.folder / "data/s" and dataset.manifest["params"]["factor"] == 3
     assert lab.store.roots.get((lab.folder / "data/s").absolute()) == before
     tacpipe.run("scale", tacpipe.open("data/r"), output=Path("data/five"), factor=5)
-    assert json.loads(lab.run("scale data/r -o data/five --factor 5 --json").out)["reused"] == 3
+    assert lab.run_json("scale data/r -o data/five --factor 5")["reused"] == 3
 
 
 def test_run_splits_fits_and_writes_one_file_like_the_commands(lab: Lab) -> None:
@@ -150,8 +136,7 @@ def test_run_splits_fits_and_writes_one_file_like_the_commands(lab: Lab) -> None
     assert set(centred.select(split=split, role="train").recordings) == {"trial-000", "trial-001"}
     page = tacpipe.run("page", "data/s", output="page.html")
     assert page == Path("page.html") and page.read_text() == "<p>4 recordings</p>"
-    (lab.folder / "numbers").mkdir()
-    (lab.folder / "numbers/a.txt").write_text("1\n2\n")
+    write_source("numbers", a="1\n2\n")
     read = tacpipe.run("ingest.numbers", "numbers", output="data/n")
     assert read["a"].table("left")["x"].to_pylist() == [1, 2]
 
@@ -187,9 +172,7 @@ def test_run_refuses_an_unknown_stage_a_missing_dataset_and_a_part_of_one(lab: L
 def test_run_shows_no_progress_and_warns_of_recordings_that_it_left_out(
     lab: Lab, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (lab.folder / "numbers").mkdir()
-    for name, text in (("good", "1 2"), ("bad", "1 x")):
-        (lab.folder / "numbers" / f"{name}.txt").write_text(text)
+    write_source("numbers", good="1 2", bad="1 x")
     with pytest.warns(tacpipe.ResultWarning, match=r"bad.*x") as warnings:
         dataset = tacpipe.run("ingest.numbers", "numbers", output="data/n", skip_bad=True)
     assert {Path(warning.filename).name for warning in warnings} == {Path(__file__).name}

@@ -18,7 +18,7 @@ import pytest
 from tacpipe.errors import ResultWarning, TacpipeError
 from tacpipe.plugins import architectures, given_params, registry
 from tacpipe.plugins import params as params_of
-from tests.conftest import Ran, forget
+from tests.conftest import Ran, forget, write_plugin
 
 MODULE = '''
 from dataclasses import dataclass
@@ -188,10 +188,9 @@ touch.flat = lab_architectures:Flat
 
 def declare(folder: Path, version: str) -> None:
     """Write the metadata of the package."""
-    about = folder / "lab_architectures.egg-info"
-    about.mkdir(exist_ok=True)
-    (about / "entry_points.txt").write_text(ENTRIES)
-    (about / "PKG-INFO").write_text(f"Metadata-Version: 2.1\nName: lab-architectures\nVersion: {version}\n\nText: no\n")
+    write_plugin(folder, "lab_architectures", ENTRIES)
+    about = f"Metadata-Version: 2.1\nName: lab-architectures\nVersion: {version}\n\nText: no\n"
+    (folder / "lab_architectures.egg-info" / "PKG-INFO").write_text(about)
     forget()
 
 

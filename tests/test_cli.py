@@ -68,7 +68,7 @@ def test_a_mistake_is_a_sentence_with_the_documented_code_and_leaves_nothing_beh
 
 def test_stdout_holds_the_path_or_one_json_object_and_nothing_else(lab: Lab) -> None:
     assert lab.run("simulate toy -o data/r").out == "data/r\n"
-    value = json.loads(lab.run("scale data/r -o data/s --json").out)
+    value = lab.run_json("scale data/r -o data/s")
     assert {"schema_version", "output", "key", "ran", "reused", "rows", "seconds", "bad"} <= set(value)
     assert (value["output"], value["ran"], value["rows"], value["bad"]) == ("data/s", 4, 80, {})
     assert lab.run("scale data/r -o data/s --quiet").err == ""
@@ -85,7 +85,7 @@ def test_show_tells_rows_rates_and_labels(lab: Lab) -> None:
     lab.run("simulate toy -o data/r --trials 25 --rows 11")
     printed = lab.run("show data/r").out
     assert "and 5 more" in printed and "material: cork (25)" in printed and "25 recordings, 550 rows" in printed
-    value = json.loads(lab.run("show data/r --json").out)
+    value = lab.run_json("show data/r")
     assert value["recordings"]["trial-003"]["left"]["rate_hz"] == 100.0
     assert value["recordings"]["trial-003"]["left"]["duration_s"] == 0.1
     lab.run("scale data/r -o data/s")

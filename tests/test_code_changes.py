@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.conftest import Lab, made_once, tacpipe
+from tests.conftest import Lab, made_once, tacpipe, write_plugin, write_source
 
 STAGES = '''
 """Stages of a lab."""
@@ -102,11 +102,8 @@ def prepared(folder: Path) -> None:
     """Make a project with a plug-in of its own, whose recordings are made, multiplied and added up."""
     (folder / ".tacpipe").mkdir()
     package = folder / "package"
-    (package / "lab.egg-info").mkdir(parents=True)
-    (package / "lab.egg-info/entry_points.txt").write_text(POINTS)
+    write_plugin(package, "lab", POINTS, lab_stages=STAGES, lab_helper='WEIGHTS = "of ReLU"\n')
     (package / "lab.egg-info/top_level.txt").write_text("lab_stages\nlab_helper\n")
-    (package / "lab_stages.py").write_text(STAGES)
-    (package / "lab_helper.py").write_text('WEIGHTS = "of ReLU"\n')
     ran(folder, "simulate numbers -o data/r")
     ran(folder, "times data/r -o data/t")
     ran(folder, "sums data/t -o data/s")
@@ -279,9 +276,7 @@ def test_notes_of_a_stage_are_printed_once_for_all_recordings_and_on_a_hit_too(p
 
 
 def test_a_run_of_which_no_recording_is_left_is_an_error_and_publishes_nothing(lab: Lab) -> None:
-    Path("src").mkdir()
-    Path("src/a.txt").write_text("one")
-    Path("src/b.txt").write_text("two")
+    write_source("src", a="one", b="two")
     ran = lab.call("ingest numbers src -o data/r --skip-bad")
     assert ran.code == 1 and "could not read any of the 2 recordings" in ran.err and not Path("data/r").exists()
 
@@ -328,7 +323,7 @@ def test_a_recording_that_lost_a_stream_is_one_object_with_the_error_in_it(
 
 def test_label_prints_what_it_changed_as_json(lab: Lab) -> None:
     lab.run("simulate toy -o data/r")
-    value = json.loads(lab.run("label data/r trial-00[12] --set material=foam --json").out)
+    value = lab.run_json("label data/r trial-00[12] --set material=foam")
     assert value == {
         "schema_version": 1,
         "output": "data/r",

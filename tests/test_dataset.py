@@ -19,13 +19,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import tacpipe
-from tacpipe.datasets import directory
-from tacpipe.datasets.manifest import Manifest
 from tacpipe.errors import UsageError
 from tacpipe.io.hashing import bytes_digest
 from tacpipe.io.parquet import to_parquet
 from tacpipe.store.store import Store
 from tests.any_table import bits, tables
+from tests.fake_recordings import publish_dataset
 
 drawn = settings(
     deadline=None, max_examples=25, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large]
@@ -38,20 +37,7 @@ def published(recordings: Mapping[str, Mapping[str, pa.Table]]) -> Iterator[Path
     """Give the directory of a dataset that holds these recordings, stream by stream."""
     with tempfile.TemporaryDirectory() as folder:
         store = Store(Path(folder) / ".tacpipe")
-        store.prepare()
-        entries = {
-            name: {
-                "attributes": {},
-                "shards": {
-                    stream: {**vars(store.put(to_parquet(table))), "rows": table.num_rows}
-                    for stream, table in streams.items()
-                },
-            }
-            for name, streams in recordings.items()
-        }
-        manifest = Manifest("scale", 1, recordings=entries)
-        store.put(manifest.content)
-        directory.publish(store, manifest, Path(folder) / "data")
+        publish_dataset(store, Path(folder) / "data", recordings)
         yield Path(folder) / "data"
 
 

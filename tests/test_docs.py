@@ -23,7 +23,7 @@ import yaml
 from tacpipe.cli import commands
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
-from tests.conftest import Lab, tacpipe
+from tests.conftest import Lab, tacpipe, write_plugin
 
 ROOT = Path(__file__).parents[1]
 DOCS = sorted(page for page in (ROOT / "docs").rglob("*.md") if page.name != "0000-template.md")
@@ -151,8 +151,7 @@ def test_the_commands_and_python_of_every_page_run_and_print_what_it_says(tmp_pa
     for page in RUN:
         page_blocks = [block for block in fenced(page.read_text()) if not block.mark]
         for name, text in entry_points(page_blocks):
-            (tmp_path / f"{name}.egg-info").mkdir()
-            (tmp_path / f"{name}.egg-info" / "entry_points.txt").write_text(text)
+            write_plugin(tmp_path, name, text)
         page_commands: set[str] = set()
         for block in page_blocks:
             if block.title:

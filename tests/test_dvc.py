@@ -62,8 +62,10 @@ class Project:
         assert process.returncode == 0, f"{command} ended with {process.returncode}: {process.stdout}{process.stderr}"
         return process.stdout + process.stderr
 
-    def start(self) -> None:
-        """Make the folder a repository and commit what is in it."""
+    def start(self, params: Mapping[str, Any] | None = None) -> None:
+        """Make the folder a repository and commit what is in it, with ``params`` in the params file."""
+        if params is not None:
+            (self.folder / "params.yaml").write_text(yaml.safe_dump(params, sort_keys=False))
         self.run("git init --quiet")
         self.run("dvc init --quiet")
         self.commit("start")
@@ -132,6 +134,15 @@ def toy(tmp_path: Path, environment: Mapping[str, str], tmp_path_factory: pytest
     return Project(shutil.copytree(prototype, tmp_path / "toy", symlinks=True), environment)
 
 
+def copy_chains(folder: Path, environment: Mapping[str, str]) -> tuple[Project, dict[str, Any]]:
+    """Return a project with the chains of this repository, and their params."""
+    for name in ("dvc.yaml", "params.yaml", "docs/tasks/horizons.json"):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(HERE / name, folder / name)
+    (folder / ".gitignore").write_text(".tacpipe/\n/data/\n/models/\n/results/\n")
+    return Project(folder, environment), yaml.safe_load((folder / "params.yaml").read_text())
+
+
 def expected(factor: int) -> dict[str, list[int]]:
     """Return the values that the toy chain computes with an offset of 1."""
     return {f"trial-{trial:03d}": [factor * (row * (trial + 1) + 1) for row in range(20)] for trial in range(4)}
@@ -148,16 +159,10 @@ def cached(folder: Path) -> list[bytes]:
 def test_a_method_of_the_forward_chain_runs_once_and_dvc_shows_its_metrics_params_and_plots(
     tmp_path: Path, environment: Mapping[str, str]
 ) -> None:
-    project = Project(tmp_path / "forward", environment)
-    (project.folder / "docs" / "tasks").mkdir(parents=True)
-    for name in ("dvc.yaml", "params.yaml", "docs/tasks/horizons.json"):
-        shutil.copy(HERE / name, project.folder / name)
-    (project.folder / ".gitignore").write_text(".tacpipe/\n/data/\n/models/\n/results/\n")
-    params = yaml.safe_load((project.folder / "params.yaml").read_text())
+    project, params = copy_chains(tmp_path / "forward", environment)
     params["forward"] |= {"recordings": "simulate forward --trials 10 --duration-s 4", "preset": "quick", "folds": [0]}
     params["forward"]["quick"]["methods"]["taxelwise"] |= {"epochs": 1, "hidden": 8}
-    (project.folder / "params.yaml").write_text(yaml.safe_dump(params, sort_keys=False))
-    project.start()
+    project.start(params)
     target, results = "forward-calibrated@taxelwise-0", "results/forward/taxelwise/0"
     project.run(f"dvc repro {target}")
     second_run = project.run(f"dvc repro {target}")
@@ -192,17 +197,11 @@ def test_a_method_of_the_forward_chain_runs_once_and_dvc_shows_its_metrics_param
 def test_a_method_of_the_material_chain_runs_once_and_is_reported(
     tmp_path: Path, environment: Mapping[str, str]
 ) -> None:
-    project = Project(tmp_path / "material", environment)
-    project.folder.mkdir()
-    for name in ("dvc.yaml", "params.yaml"):
-        shutil.copy(HERE / name, project.folder / name)
-    (project.folder / ".gitignore").write_text(".tacpipe/\n/data/\n/models/\n/results/\n")
-    params = yaml.safe_load((project.folder / "params.yaml").read_text())
+    project, params = copy_chains(tmp_path / "material", environment)
     params["material"]["sources"] = {"simulated": "simulate material --trials 96 --materials 3 --no-pac"}
     params["material"]["readouts"]["patterns"]["features"] = 200
     params["material"]["calibrate"] = {"false_unknown": 0.4}  # So few slides cannot promise a lower rate.
-    (project.folder / "params.yaml").write_text(yaml.safe_dump(params, sort_keys=False))
-    project.start()
+    project.start(params)
     project.run("dvc repro material-readout@patterns-0")
     second_run = project.run("dvc repro material-readout@patterns-0")
 
@@ -223,20 +222,14 @@ def test_a_method_of_the_material_chain_runs_once_and_is_reported(
 def test_methods_and_settings_of_the_touch_chain_run_once_and_are_reported(
     tmp_path: Path, environment: Mapping[str, str]
 ) -> None:
-    project = Project(tmp_path / "touch", environment)
-    project.folder.mkdir()
-    for name in ("dvc.yaml", "params.yaml"):
-        shutil.copy(HERE / name, project.folder / name)
-    (project.folder / ".gitignore").write_text(".tacpipe/\n/data/\n/models/\n/results/\n")
-    params = yaml.safe_load((project.folder / "params.yaml").read_text())
+    project, params = copy_chains(tmp_path / "touch", environment)
     small = {"folds": [0], "objects": [0], "methods": ["trees", "pointnet"], "settings": ["xyz"]}
     params["touch"] |= {"recordings": "simulate touch --trials 24 --objects 1 --families box,sphere", **small}
     methods, settings = params["touch"]["quick"]["methods"], params["touch"]["quick"]["settings"]
     methods["trees"]["trees"] = 5
     for options in (methods["pointnet"], settings["xyz"]):
         options |= {"epochs": 1, "points": 32, "head": "fc1"}
-    (project.folder / "params.yaml").write_text(yaml.safe_dump(params, sort_keys=False))
-    project.start()
+    project.start(params)
     project.run("dvc repro touch")
     second_run = project.run("dvc repro touch")
 

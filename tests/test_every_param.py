@@ -31,7 +31,7 @@ from tacpipe.tasks.material.pairs import EVERY, PAIRINGS
 from tacpipe.tasks.touch.inputs import MODES, WRISTS
 from tacpipe.tasks.touch.losses import LOSSES
 from tacpipe.training.scaling import KINDS
-from tests.conftest import Ran, forget
+from tests.conftest import Ran, forget, write_plugin
 
 Call = Callable[[str], Ran]
 STAGES = [name for name in registry.stages() if registry.load(name).function.__module__.startswith("tacpipe")]
@@ -504,9 +504,7 @@ def bend(params: Params, trial: Trial) -> Table:
 @pytest.fixture
 def bending(tmp_path: Path, call: Call, monkeypatch: pytest.MonkeyPatch) -> Iterator[Call]:
     folder = tmp_path / "plugin"
-    (folder / "bend.egg-info").mkdir(parents=True)
-    (folder / "bend_stages.py").write_text(PLUGIN)
-    (folder / "bend.egg-info" / "entry_points.txt").write_text("[tacpipe.stages]\nbend = bend_stages:bend\n")
+    write_plugin(folder, "bend", "[tacpipe.stages]\nbend = bend_stages:bend\n", bend_stages=PLUGIN)
     monkeypatch.syspath_prepend(folder)
     (tmp_path / "lab").mkdir()
     monkeypatch.chdir(tmp_path / "lab")

@@ -23,7 +23,7 @@ from tacpipe.plugins import extras, registry
 from tests import without_extras
 from tests.clouds import shapes
 from tests.commands import run as run_all
-from tests.conftest import Lab, forget
+from tests.conftest import Lab, forget, write_plugin
 from tests.formats import grasp_files, slide_files, xdf_writer, xela_files
 from tests.formats.arrays import files as array_files
 from tests.formats.lerobot import files as lerobot_files
@@ -347,12 +347,10 @@ def test_a_mistake_of_our_own_is_no_missing_extra() -> None:
 
 def test_a_module_that_a_plug_in_needs_is_named_with_its_package(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = lab.folder / "other"
-    (folder / "other_stages-1.egg-info").mkdir(parents=True)
-    (folder / "other_stages-1.egg-info" / "PKG-INFO").write_text(
-        "Metadata-Version: 2.1\nName: other-stages\nVersion: 1\n"
-    )
     points = "[tacpipe.stages]\nlate = late_stages:late\nearly = early_stages:early\n"
-    (folder / "other_stages-1.egg-info" / "entry_points.txt").write_text(points)
+    write_plugin(folder, "other_stages-1", points)
+    about = "Metadata-Version: 2.1\nName: other-stages\nVersion: 1\n"
+    (folder / "other_stages-1.egg-info" / "PKG-INFO").write_text(about)
     stage = "from __future__ import annotations\nfrom dataclasses import dataclass\nfrom tacpipe import stage\n"
     stage += "@dataclass(frozen=True)\nclass Params:\n    pass\n@stage(version=1)\n"
     (folder / "late_stages.py").write_text(

@@ -17,7 +17,7 @@ from tacpipe.errors import FAILED, StorageError
 from tacpipe.maintenance import checkout, garbage, pushed, repair, unnamed
 from tacpipe.store import layout, location, projects, records
 from tacpipe.store.store import Store
-from tests.conftest import Lab
+from tests.conftest import Lab, write_source
 from tests.test_garbage import age
 
 NUMBERS = [errno.EIO, errno.EMFILE, errno.ESTALE, errno.EACCES]
@@ -51,9 +51,7 @@ def failing(number: int, meets: Callable[[str], bool], calls: tuple[str, ...] = 
 @pytest.fixture
 def full(lab: Lab) -> Lab:
     """A project with recordings, labels, a chain, a push and what nothing needs any more."""
-    Path("src").mkdir()
-    for name in "ab":
-        Path(f"src/{name}.txt").write_text(f"1 2 {ord(name)}")
+    write_source("src", a="1 2 97", b="1 2 98")
     lab.run("ingest numbers src -o data/r --jobs 1")
     lab.run("label data/r b --set material=foam")
     lab.run("scale data/r -o data/s --jobs 1")

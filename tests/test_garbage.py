@@ -1,4 +1,3 @@
-import json
 import os
 import shutil
 import time
@@ -14,7 +13,7 @@ import tacpipe
 from tacpipe.io.hashing import bytes_digest
 from tacpipe.maintenance import garbage, repair
 from tacpipe.store.store import Store
-from tests.conftest import Lab
+from tests.conftest import Lab, write_source
 from tests.test_pipeline import counts, replace_stream
 
 
@@ -27,17 +26,16 @@ def age(lab: Lab, days: float = 30.0) -> None:
 
 
 def collected(lab: Lab, options: str = "") -> dict[str, int]:
-    value: dict[str, int] = json.loads(lab.run(f"store gc --json {options}").out)
+    value: dict[str, int] = lab.run_json(f"store gc {options}")
     return value
 
 
 def replaced_recording(lab: Lab) -> str:
     """Ingest a recording, then another in its place; return the digest of the first, which nothing names any more."""
-    Path("src").mkdir()
-    Path("src/a.txt").write_text("1 2 3")
+    write_source("src", a="1 2 3")
     lab.run("ingest numbers src -o data/r")
     (name,) = (shard["digest"] for shard in lab.manifest("data/r").recordings["a"]["shards"].values())
-    Path("src/a.txt").write_text("4 5 6")
+    write_source("src", a="4 5 6")
     lab.run("ingest numbers src -o data/r --replace")
     return str(name)
 

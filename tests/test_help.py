@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import platform
 import re
 from importlib import metadata
@@ -113,6 +112,6 @@ def test_version_names_tacpipe_python_and_what_is_installed(lab: Lab) -> None:
     assert f"numpy {metadata.version('numpy')}" in text
     assert lab.run("--version").out == text
 
-    parts = json.loads(lab.run("version --json").out)["parts"]
+    parts = lab.run_json("version")["parts"]
     assert parts["core"]["typer"] == metadata.version("typer")
     assert {"core", "learn", "clouds", "devices"} <= set(parts) and "all" not in parts

@@ -21,7 +21,7 @@ from tacpipe.io.hashing import canonical, digest
 from tacpipe.plugins import given_params
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins.stage import AnyStage, stage
-from tests.conftest import Lab
+from tests.conftest import Lab, write_source
 
 numbers = st.integers(-(2**80), 2**80) | st.floats(allow_nan=False, allow_infinity=False)
 texts = st.text('a"\\,:[]{} 1\u00e9e\u0301\U0001f590\n', max_size=6) | st.text(max_size=6)
@@ -387,8 +387,7 @@ DATASET = '{"files":{},"recordings":{"trial-000":' + ENTRY + "}}"
 
 
 def test_keys_and_digests_are_those_of_the_identities_as_the_format_tells_them(lab: Lab) -> None:
-    (lab.folder / "src").mkdir()
-    (lab.folder / "src" / "a.txt").write_text("1 2 3")
+    write_source("src", a="1 2 3")
     lab.run("simulate toy --trials 1 --rows 3 -o data/r")
     lab.run("scale data/r -o data/s")
     lab.run("named data/r -o data/n")

@@ -46,7 +46,7 @@ def labels(lab: Lab) -> dict[str, dict[str, Any]]:
 @pytest.mark.parametrize("name", TABLES)
 def test_each_row_labels_its_recording_with_the_types_that_it_has(toys: Lab, name: str) -> None:
     Path(name).write_text(TABLES[name])
-    value = json.loads(toys.run(f"label data/r --from {name} --json").out)
+    value = toys.run_json(f"label data/r --from {name}")
     assert labels(toys) == WANTED
     assert value["recordings"] == ["trial-000", "trial-002"] and value["without"] == ["trial-001"]
     for recording, expected in WANTED.items():
@@ -69,9 +69,9 @@ def test_a_changed_row_costs_the_recordings_whose_labels_changed(toys: Lab) -> N
     toys.run("label data/r --from labels.csv")
     toys.run("named data/r -o data/named")
     Path("labels.csv").write_text(TABLES["labels.csv"].replace("foam", "felt"))
-    value = json.loads(toys.run("label data/r --from labels.csv --json").out)
+    value = toys.run_json("label data/r --from labels.csv")
     assert value["labels"] == {"trial-000": {"material": "felt"}}
-    rerun = json.loads(toys.run("named data/r -o data/named --json").out)
+    rerun = toys.run_json("named data/r -o data/named")
     assert (rerun["ran"], rerun["reused"]) == (1, 2)
 
 
@@ -86,7 +86,7 @@ def test_a_dry_run_prints_each_change_and_makes_none(toys: Lab) -> None:
 
 def test_the_key_is_the_column_whose_values_are_names_whatever_it_is_called(toys: Lab) -> None:
     Path("labels.csv").write_text("nr,which,material\n1,trial-001,foam\n")
-    assert json.loads(toys.run("label data/r --from labels.csv --json").out)["key"] == "which"
+    assert toys.run_json("label data/r --from labels.csv")["key"] == "which"
     assert labels(toys)["trial-001"]["material"] == "foam"
 
 

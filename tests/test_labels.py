@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -51,7 +50,7 @@ def test_show_reads_the_shards_of_the_recordings_that_it_lists(many_recordings: 
     assert f"material: cork ({MANY})" in text
     assert many_recordings.run("show data/r --full").out.count("left") == MANY
     assert read() == MANY * STREAMS
-    assert len(json.loads(many_recordings.run("show data/r --json").out)["recordings"]) == MANY
+    assert len(many_recordings.run_json("show data/r")["recordings"]) == MANY
 
 
 def inodes(folder: Path) -> dict[str, int]:

@@ -1,28 +1,25 @@
-import json
 import os
-from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tacpipe.store.store import Store
-from tests.conftest import Lab
+from tests.conftest import Lab, write_source
 
 
 def explained(lab: Lab, path: str) -> dict[str, object]:
-    value: dict[str, object] = json.loads(lab.run(f"explain {path} --json").out)
+    value: dict[str, object] = lab.run_json(f"explain {path}")
     return value
 
 
 def test_the_lineage_goes_down_to_the_raw_files(lab: Lab) -> None:
     from tacpipe.io.hashing import file_digest
 
-    Path("src").mkdir()
-    Path("src/a.txt").write_text("1 2 3")
+    write_source("src", a="1 2 3")
     lab.run("ingest numbers src -o data/r")
     lab.run("scale data/r -o data/s --factor 4")
     lab.run("total data/s -o data/t")
-    tree = json.loads(lab.run("explain data/t --json").out)
+    tree = lab.run_json("explain data/t")
     synced = tree["inputs"]["datasets"][0]
     recordings = synced["inputs"]["datasets"][0]
     assert (tree["stage"], synced["stage"], recordings["stage"]) == ("total", "scale", "ingest.numbers")
@@ -33,16 +30,13 @@ def test_the_lineage_goes_down_to_the_raw_files(lab: Lab) -> None:
 
 
 def test_the_part_of_the_key_that_changed_is_named(lab: Lab) -> None:
-    Path("src").mkdir()
-    Path("src/a.txt").write_text("1 2 3")
-    Path("src/b.txt").write_text("1 2 3")
+    write_source("src", a="1 2 3", b="1 2 3")
     lab.run("ingest numbers src -o data/r")
     lab.run("scale data/r -o data/s")
     assert explained(lab, "data/s")["changes"] is None
     lab.run("scale data/r -o data/s --factor 3")
     assert explained(lab, "data/s")["changes"] == ["params.factor: 2 became 3"]
-    Path("src/a.txt").write_text("9")
-    Path("src/c.txt").write_text("7")
+    write_source("src", a="9", c="7")
     lab.run("ingest numbers src -o data/r --replace")
     assert explained(lab, "data/r")["changes"] == ["sources: 1 new (c)", "sources: 1 other (a)"]
     lab.run("scale data/r -o data/s --factor 3")

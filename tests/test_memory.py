@@ -17,7 +17,7 @@ import pytest
 from tacpipe.errors import DamagedError, ShortageError, TacpipeError
 from tacpipe.io import memory
 from tacpipe.io.parquet import from_parquet, to_parquet
-from tests.conftest import Lab
+from tests.conftest import Lab, write_source
 
 
 @pytest.mark.parametrize(
@@ -65,9 +65,7 @@ def test_a_table_that_memory_does_not_hold_is_not_called_damaged(
 
 
 def test_a_recording_that_memory_does_not_hold_is_no_bad_recording(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
-    (lab.folder / "raw").mkdir()
-    for name in ("a", "b"):
-        (lab.folder / "raw" / f"{name}.txt").write_text("1\n2\n")
+    write_source("raw", a="1\n2\n", b="1\n2\n")
     real = Path.read_text
 
     def read_text(path: Path, *arguments: Any, **options: Any) -> str:

@@ -16,7 +16,7 @@ from tacpipe.engine import processor, provenance
 from tacpipe.io.hashing import digest, file_digest
 from tacpipe.io.parquet import to_parquet
 from tacpipe.store.records import named
-from tests.conftest import Lab
+from tests.conftest import Lab, write_source
 
 
 def counts(printed: str) -> tuple[int, int]:
@@ -84,9 +84,7 @@ def test_a_changed_recording_costs_one_recording_and_equal_bytes_stop_the_chain(
 
 
 def test_two_recordings_of_the_same_content_are_computed_once_each_and_named_apart(lab: Lab) -> None:
-    Path("src").mkdir()
-    Path("src/a.txt").write_text("1 2 3")
-    Path("src/b.txt").write_text("1 2 3")
+    write_source("src", a="1 2 3", b="1 2 3")
     lab.run("ingest numbers src -o data/r")
     lab.run("scale data/r -o data/s --jobs 1")
     manifest = lab.manifest("data/s")
@@ -147,10 +145,8 @@ def test_a_fitted_codec_can_be_applied_to_other_recordings(lab: Lab) -> None:
 
 
 def test_several_datasets_are_read_as_one_if_names_are_unique(lab: Lab) -> None:
-    Path("src1").mkdir()
-    Path("src2").mkdir()
-    Path("src1/a.txt").write_text("1")
-    Path("src2/b.txt").write_text("2")
+    write_source("src1", a="1")
+    write_source("src2", b="2")
     lab.run("ingest numbers src1 -o data/r1")
     lab.run("ingest numbers src2 -o data/r2")
     lab.run("scale data/r1 data/r2 -o data/s")
@@ -190,8 +186,7 @@ def test_a_damaged_object_is_made_again_through_the_whole_chain(lab: Lab) -> Non
 
 
 def test_damage_to_a_recording_that_cannot_be_made_again_is_said_so_unless_its_copy_is_sound(lab: Lab) -> None:
-    Path("src").mkdir()
-    Path("src/a.txt").write_text("1 2 3")
+    write_source("src", a="1 2 3")
     lab.run("ingest numbers src -o data/r")
     (stored,) = (shard["digest"] for shard in lab.manifest("data/r").recordings["a"]["shards"].values())
     path = Path(lab.store.object_path(stored))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 from collections.abc import Callable, Iterator
@@ -55,10 +54,10 @@ def content(folder: Path) -> dict[str, str]:
 def test_what_is_noted_is_a_hit_that_looks_at_no_file_and_reports_what_the_look_reported(
     noted: Lab, shows: list[Path]
 ) -> None:
-    from_note = json.loads(noted.run(f"{SCALE} --json").out)
+    from_note = noted.run_json(SCALE)
     assert shows == []
     shutil.rmtree(noted.folder / ".tacpipe/presence")
-    from_look = json.loads(noted.run(f"{SCALE} --json").out)
+    from_look = noted.run_json(SCALE)
     assert shows == [noted.folder / "data/s"]
     assert {**from_note, "seconds": 0} == {**from_look, "seconds": 0}
     assert from_note["reused"] == 4 and from_note["rows"] == 12

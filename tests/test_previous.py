@@ -146,7 +146,7 @@ def test_of_a_dataset_of_which_one_recording_changed_no_other_group_is_asked_for
     keys: list[str] = []
     read = Store.read_record
     monkeypatch.setattr(Store, "read_record", lambda self, key: read(self, keys.append(key) or key))  # type: ignore[func-returns-value]
-    ran = json.loads(lab.run(f"{NAMED} --json").out)
+    ran = lab.run_json(NAMED)
 
     assert (ran["ran"], ran["reused"]) == (1, count - 1)
     assert reused_counts[-1] >= count - max(sizes)
@@ -210,7 +210,7 @@ def test_results_that_other_code_gave_are_not_taken_over_as_it_is_not_known_whic
     lab.run(NAMED)
     assert reused_counts[-1] > 0
     lab.run("label data/r trial-004 --set material=felt")
-    ran = json.loads(lab.run(f"{NAMED} --json").out)
+    ran = lab.run_json(NAMED)
     assert reused_counts[-1] == 0
     assert (ran["ran"], ran["reused"]) == (1, TRIALS - 1)
 

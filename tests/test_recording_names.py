@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +12,7 @@ import pyarrow as pa
 from tacpipe.engine import keys
 from tacpipe.plugins.stage import RecordingOutput, Source, stage
 from tacpipe.store.store import Store
-from tests.conftest import Lab
+from tests.conftest import Lab, write_plugin
 
 if TYPE_CHECKING:
     from tacpipe.plugins.stage import Files, RecordingName
@@ -83,9 +82,8 @@ def test_the_name_is_part_of_the_key_of_a_stage_that_takes_it_and_of_no_other(tm
 
 
 def test_a_format_of_a_plug_in_is_given_the_name_and_a_renamed_recording_is_read_again(lab: Lab) -> None:
-    Path("named_format.py").write_text(PLUGIN)
-    Path("named.egg-info").mkdir()
-    Path("named.egg-info/entry_points.txt").write_text("[tacpipe.formats]\nnamed-numbers = named_format:read\n")
+    points = "[tacpipe.formats]\nnamed-numbers = named_format:read\n"
+    write_plugin(lab.folder, "named", points, named_format=PLUGIN)
     import sys
 
     from tests.conftest import forget
@@ -100,7 +98,7 @@ def test_a_format_of_a_plug_in_is_given_the_name_and_a_renamed_recording_is_read
         attributes = {name: entry["attributes"] for name, entry in lab.manifest("data/r").recordings.items()}
         assert attributes == {"cup": {"called": "cup"}, "can": {"called": "can"}}
         Path("in/cup").rename("in/mug")
-        result = json.loads(lab.run("ingest named-numbers in -o data/r --replace --json --jobs 1").out)
+        result = lab.run_json("ingest named-numbers in -o data/r --replace --jobs 1")
         assert (result["ran"], result["reused"]) == (1, 1)
         Path("in/mug/numbers.txt").write_text("")
         ran = lab.call("ingest named-numbers in -o data/r --replace --jobs 1")

@@ -8,7 +8,7 @@ import pytest
 
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.plugins import registry
-from tests.conftest import Lab, forget
+from tests.conftest import Lab, forget, write_plugin
 
 
 def test_the_names_are_those_that_importlib_finds() -> None:
@@ -37,12 +37,8 @@ def test_a_third_party_s_stage_stands_beside_the_built_in_ones(lab: Lab) -> None
 
 def test_a_broken_plug_in_spoils_its_own_name_alone(lab: Lab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     broken = tmp_path / "broken"
-    (broken / "b.egg-info").mkdir(parents=True)
-    (broken / "b.egg-info/entry_points.txt").write_text(
-        "[tacpipe.stages]\nlost = nowhere:f\nwrong = syntax_of:f\nplain = plain_of:f\nsegment.lost = nowhere:g\n"
-    )
-    (broken / "syntax_of.py").write_text("def f(:\n")
-    (broken / "plain_of.py").write_text('"""Say nothing."""\n\nf = 3\n')
+    points = "[tacpipe.stages]\nlost = nowhere:f\nwrong = syntax_of:f\nplain = plain_of:f\nsegment.lost = nowhere:g\n"
+    write_plugin(broken, "b", points, syntax_of="def f(:\n", plain_of='"""Say nothing."""\n\nf = 3\n')
     monkeypatch.syspath_prepend(broken)
     forget()
     assert lab.call("--help").code == 0
@@ -112,11 +108,8 @@ def test_the_parts_of_a_task_come_from_the_plug_in_that_brings_the_task(
     from tacpipe.report import page
     from tests.fake_recordings import FakeDataset
 
-    (tmp_path / "own" / "own.egg-info").mkdir(parents=True)
-    (tmp_path / "own/own.egg-info/entry_points.txt").write_text(
-        "[tacpipe.tasks]\nweighing = own_task:Weighing\nunfinished = own_task:Unfinished\nold = own_task\n"
-    )
-    (tmp_path / "own/own_task.py").write_text(OWN_TASK)
+    points = "[tacpipe.tasks]\nweighing = own_task:Weighing\nunfinished = own_task:Unfinished\nold = own_task\n"
+    write_plugin(tmp_path / "own", "own", points, own_task=OWN_TASK)
     monkeypatch.syspath_prepend(tmp_path / "own")
     forget()
     files = {"metrics.json": b"{}", "config.json": json.dumps({"task": "weighing"}).encode()}
@@ -176,12 +169,12 @@ def test_the_demo_on_a_rig_trains_on_the_recordings_of_the_rig_and_shows_what_it
 def test_a_plug_in_states_the_order_and_the_lines_of_its_commands(
     lab: Lab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "own" / "own.egg-info").mkdir(parents=True)
-    (tmp_path / "own/own.egg-info/entry_points.txt").write_text(
+    points = (
         "[tacpipe.commands]\nown = own_stages:COMMANDS\nlost = nowhere:COMMANDS\n\n"
         "[tacpipe.stages]\nweigh.twice = own_stages:f\n"
     )
-    (tmp_path / "own/own_stages.py").write_text('"""Weigh."""\n\nCOMMANDS = {"weigh": "Weigh objects.", "gone": ""}\n')
+    stages = '"""Weigh."""\n\nCOMMANDS = {"weigh": "Weigh objects.", "gone": ""}\n'
+    write_plugin(tmp_path / "own", "own", points, own_stages=stages)
     monkeypatch.syspath_prepend(tmp_path / "own")
     forget()
     assert registry.commands()["weigh"] == "Weigh objects."

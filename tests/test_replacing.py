@@ -9,15 +9,9 @@ import pytest
 
 import tacpipe
 from tacpipe.io.hashing import bytes_digest
-from tests.conftest import Lab
+from tests.conftest import Lab, write_source
 from tests.test_garbage import age
 from tests.test_pipeline import counts
-
-
-def source(name: str, **numbers: str) -> None:
-    Path(name).mkdir(exist_ok=True)
-    for recording, text in numbers.items():
-        Path(name, f"{recording}.txt").write_text(text)
 
 
 def content(folder: str) -> dict[str, bytes]:
@@ -35,7 +29,7 @@ def refused(lab: Lab, command: str, dataset: str, *words: str) -> None:
 
 
 def listed(lab: Lab) -> list[dict[str, object]]:
-    manifests: list[dict[str, object]] = json.loads(lab.run("store list --json").out)["manifests"]
+    manifests: list[dict[str, object]] = lab.run_json("store list")["manifests"]
     return manifests
 
 
@@ -44,7 +38,7 @@ def listed(lab: Lab) -> list[dict[str, object]]:
 
 @pytest.mark.parametrize("spelling", ["data/r", "data/../data/r", "./data/r/", "linked"])
 def test_an_output_that_is_the_input_is_refused_with_and_without_replace(lab: Lab, spelling: str) -> None:
-    source("src", a="1 2", b="3 4")
+    write_source("src", a="1 2", b="3 4")
     lab.run("ingest numbers src -o data/r")
     Path("linked").symlink_to("data/r")
     refused(lab, f"scale data/r -o {spelling}", "data/r", "is an input of this command")
@@ -59,7 +53,7 @@ def test_split_codec_and_source_count_as_inputs_too(lab: Lab) -> None:
     lab.run("centre data/s --split data/split -o data/c")
     refused(lab, "centre data/s --split data/split -o data/split --replace", "data/split", "is an input")
     refused(lab, "centre data/s --split data/split --codec data/c -o data/c --replace", "data/c", "is an input")
-    source("src", a="1")
+    write_source("src", a="1")
     refused(lab, "ingest numbers src -o src --replace", "src", "is an input")
 
 
@@ -67,7 +61,7 @@ def test_split_codec_and_source_count_as_inputs_too(lab: Lab) -> None:
 
 
 def test_a_dataset_of_another_stage_needs_replace_and_can_be_had_back_with_its_labels(lab: Lab) -> None:
-    source("src", a="1 2", b="3 4")
+    write_source("src", a="1 2", b="3 4")
     lab.run("ingest numbers src -o data/r")
     lab.run("label data/r a --set material=cork --exclude dropped")
     before = content("data/r")
@@ -106,7 +100,7 @@ def test_a_stage_writes_its_own_dataset_again_with_other_params_and_inputs(lab: 
 
 
 def test_a_rerun_of_what_is_shown_is_never_refused(lab: Lab) -> None:
-    source("src", a="1 2")
+    write_source("src", a="1 2")
     lab.run("ingest numbers src -o data/r")
     lab.run("label data/r a --set material=cork")
     assert counts(lab.run("ingest numbers src -o data/r --json").out) == (0, 1)
@@ -159,8 +153,8 @@ def test_a_file_is_replaced_only_by_the_command_that_writes_such_files(
 
 
 def test_ingest_appends(lab: Lab) -> None:
-    source("monday", a="1 2", b="3 4")
-    source("tuesday", c="5 6")
+    write_source("monday", a="1 2", b="3 4")
+    write_source("tuesday", c="5 6")
     lab.run("ingest numbers monday -o data/r")
     lab.run("label data/r b --set material=foam")
     ran, reused = counts(lab.run("ingest numbers tuesday -o data/r --json").out)
@@ -175,8 +169,8 @@ def test_ingest_appends(lab: Lab) -> None:
 
 
 def test_the_order_in_which_recordings_are_ingested_leaves_no_trace(lab: Lab) -> None:
-    source("monday", a="1 2", b="3 4")
-    source("tuesday", c="5 6")
+    write_source("monday", a="1 2", b="3 4")
+    write_source("tuesday", c="5 6")
     for first, second, output in (("monday", "tuesday", "data/one"), ("tuesday", "monday", "data/two")):
         lab.run(f"ingest numbers {first} -o {output}")
         lab.run(f"ingest numbers {second} -o {output}")
@@ -184,26 +178,26 @@ def test_the_order_in_which_recordings_are_ingested_leaves_no_trace(lab: Lab) ->
 
 
 def test_a_name_that_exists_with_other_content_is_refused(lab: Lab) -> None:
-    source("src", a="1 2", b="3 4")
+    write_source("src", a="1 2", b="3 4")
     lab.run("ingest numbers src -o data/r")
-    source("src", b="9")
+    write_source("src", b="9")
     refused(lab, "ingest numbers src -o data/r", "data/r", "of the same name", "other files: b.", "--replace")
     lab.run("ingest numbers src -o data/r --replace")
     assert tacpipe.open("data/r").table("left")["x"].to_pylist() == [1, 2, 9]
 
 
 def test_replace_makes_the_dataset_that_of_the_source_alone(lab: Lab) -> None:
-    source("monday", a="1 2", b="3 4")
-    source("tuesday", c="5 6")
+    write_source("monday", a="1 2", b="3 4")
+    write_source("tuesday", c="5 6")
     lab.run("ingest numbers monday -o data/r")
     lab.run("ingest numbers tuesday -o data/r --replace")
     assert list(lab.manifest("data/r").recordings) == ["c"] and not Path("data/r/a").exists()
 
 
 def test_a_recording_that_cannot_be_read_this_time_keeps_what_it_was(lab: Lab) -> None:
-    source("src", a="1 2")
+    write_source("src", a="1 2")
     lab.run("ingest numbers src -o data/r")
-    source("more", b="3", c="none")
+    write_source("more", b="3", c="none")
     ran = lab.run("ingest numbers more -o data/r --skip-bad")
     kept_manifest = lab.manifest("data/r")
     assert (
@@ -228,7 +222,7 @@ def test_labels_of_recordings_that_would_go_are_refused(lab: Lab) -> None:
 
 @pytest.mark.parametrize("removed", ["data/r", "data/r/manifest.json"])
 def test_labels_come_back_with_their_recordings_when_the_directory_was_deleted(lab: Lab, removed: str) -> None:
-    source("src", a="1 2", b="3 4")
+    write_source("src", a="1 2", b="3 4")
     lab.run("ingest numbers src -o data/r")
     lab.run("label data/r a --exclude dropped")
     before = Path("data/r/manifest.json").read_bytes()
@@ -240,8 +234,8 @@ def test_labels_come_back_with_their_recordings_when_the_directory_was_deleted(l
 
 
 def test_labels_come_back_with_recordings_that_are_ingested_again_one_folder_after_the_other(lab: Lab) -> None:
-    source("monday", a="1 2")
-    source("tuesday", b="3 4", c="5 6")
+    write_source("monday", a="1 2")
+    write_source("tuesday", b="3 4", c="5 6")
     for folder in ("monday", "tuesday"):
         lab.run(f"ingest numbers {folder} -o data/r")
     lab.run("label data/r b --exclude dropped")
@@ -259,7 +253,7 @@ def test_labels_come_back_with_recordings_that_are_ingested_again_one_folder_aft
 
 
 def test_labels_come_back_when_another_stage_s_dataset_was_in_their_place(lab: Lab) -> None:
-    source("src", a="1 2", b="3 4")
+    write_source("src", a="1 2", b="3 4")
     lab.run("ingest numbers src -o data/r")
     lab.run("label data/r a --exclude dropped")
     before = Path("data/r/manifest.json").read_bytes()
@@ -269,13 +263,13 @@ def test_labels_come_back_when_another_stage_s_dataset_was_in_their_place(lab: L
 
 
 def test_the_labels_that_come_back_are_those_that_a_recording_had_last(lab: Lab) -> None:
-    source("src", a="1 2", b="3 4")
+    write_source("src", a="1 2", b="3 4")
     lab.run("ingest numbers src -o data/r")
     lab.run("label data/r a --exclude dropped --set material=cork")
     shutil.rmtree("data/r")
-    source("src", a="7")
+    write_source("src", a="7")
     lab.run("ingest numbers src -o data/r")  # another recording of this name
-    source("src", a="1 2")
+    write_source("src", a="1 2")
     for options in ("--replace", ""):
         lab.run(f"ingest numbers src -o data/r {options}")
         assert lab.manifest("data/r").labels == {"a": {"excluded": "dropped", "material": "cork"}}
@@ -307,12 +301,12 @@ def test_an_acquired_dataset_comes_back_with_its_labels_long_after_its_directory
 
 
 def test_labels_do_not_come_back_on_other_recordings_of_the_same_name(lab: Lab) -> None:
-    source("src", a="1 2", b="3 4")
+    write_source("src", a="1 2", b="3 4")
     lab.run("ingest numbers src -o data/r")
     lab.run("label data/r a --exclude dropped")
     lab.run("label data/r b --set material=cork")
     shutil.rmtree("data/r")
-    source("src", a="7")
+    write_source("src", a="7")
     lab.run("ingest numbers src -o data/r")
     assert lab.manifest("data/r").labels == {"b": {"material": "cork"}}
 
@@ -340,13 +334,13 @@ def test_acquired_recordings_of_one_name_and_rig_are_not_the_same(lab: Lab) -> N
 
 
 def test_what_was_replaced_outlives_gc_but_not_one_that_is_asked_to_take_recordings(lab: Lab) -> None:
-    source("src", a="1 2", b="3 4")
+    write_source("src", a="1 2", b="3 4")
     lab.run("ingest numbers src -o data/r")
     lab.run("label data/r a --set material=cork")
     lab.run("simulate toy -o data/r --replace")
     (old,) = [entry for entry in listed(lab) if entry["labelled"]]
     age(lab)
-    assert json.loads(lab.run("store gc --json").out)["kept_recordings"] == 2
+    assert lab.run_json("store gc")["kept_recordings"] == 2
     lab.run(f"store checkout {old['manifest']} -o data/back")
     assert lab.manifest("data/back").labels == {"a": {"material": "cork"}}
     shutil.rmtree("data/back")
@@ -358,7 +352,7 @@ def test_what_was_replaced_outlives_gc_but_not_one_that_is_asked_to_take_recordi
 
 
 def test_a_directory_that_was_deleted_keeps_its_recordings_and_labels_in_the_store(lab: Lab) -> None:
-    source("src", a="1 2")
+    write_source("src", a="1 2")
     lab.run("ingest numbers src -o data/r")
     lab.run("label data/r a --set material=cork")
     before = content("data/r")
@@ -398,7 +392,7 @@ def _shards(manifest: dict[str, dict[str, dict[str, dict[str, dict[str, str]]]]]
 
 
 def test_a_manifest_that_no_root_names_any_more_is_checked_out_by_its_digest(lab: Lab) -> None:
-    source("src", a="1 2")
+    write_source("src", a="1 2")
     lab.run("ingest numbers src -o data/r")
     before, name = content("data/r"), bytes_digest(Path("data/r/manifest.json").read_bytes())
     shard = next(digest for _, digest in lab.manifest("data/r").objects())
@@ -413,8 +407,8 @@ def test_a_manifest_that_no_root_names_any_more_is_checked_out_by_its_digest(lab
 
 
 def test_a_checkout_replaces_recordings_only_when_it_is_asked_to(lab: Lab) -> None:
-    source("one", a="1 2")
-    source("two", b="3 4")
+    write_source("one", a="1 2")
+    write_source("two", b="3 4")
     lab.run("ingest numbers one -o data/one")
     lab.run("ingest numbers two -o data/two")
     root = lab.store.roots.get(lab.folder / "data/one")
@@ -428,7 +422,7 @@ def test_a_checkout_replaces_recordings_only_when_it_is_asked_to(lab: Lab) -> No
 def test_a_copy_without_its_store_is_kept_whole_when_it_is_replaced(
     lab: Lab, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    source("src", a="1 2")
+    write_source("src", a="1 2")
     lab.run("ingest numbers src -o data/r")
     shutil.copytree("data/r", "data/copy")
     shutil.rmtree(lab.store.root)
@@ -442,7 +436,7 @@ def test_a_copy_without_its_store_is_kept_whole_when_it_is_replaced(
 
 
 def test_a_hundred_reruns_leave_a_short_history_and_one_loss_stays_in_it(lab: Lab) -> None:
-    source("src", a="1 2")
+    write_source("src", a="1 2")
     lab.run("ingest numbers src -o data/r")
     root = lab.store.roots.get(lab.folder / "data/r")
     assert root is not None

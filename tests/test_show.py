@@ -18,7 +18,7 @@ from tacpipe.channels import streams
 from tacpipe.cli import show, show_recording
 from tacpipe.io.columns import Columns
 from tacpipe.io.parquet import to_parquet
-from tests.conftest import Lab
+from tests.conftest import Lab, write_source
 
 MANY = 12
 
@@ -33,7 +33,7 @@ def _export(lab: Lab) -> Lab:
 
 def test_of_an_export_the_files_are_counted_and_the_first_are_named(lab: Lab) -> None:
     _export(lab)
-    value = json.loads(lab.run("show out --json").out)
+    value = lab.run_json("show out")
     assert value["kind"] == "export" and len(value["files"]) > MANY
     text = lab.run("show out").out
     assert f"{len(value['files'])}, together" in text and "README.md" in text
@@ -122,7 +122,7 @@ def test_a_recording_is_shown_with_streams_columns_rates_gaps_and_labels(lab: La
     stamps = robot["t_ns"].to_numpy()
     lost = np.diff(robot["seq"].to_numpy()) - 1
     text = lab.run("show data/r trial-000").out
-    value = json.loads(lab.run("show data/r trial-000 --json").out)
+    value = lab.run_json("show data/r trial-000")
 
     figures = value["streams"]["robot"]
     assert figures["mean_hz"] == round((len(stamps) - 1) / ((stamps[-1] - stamps[0]) / 1e9), 3)
@@ -166,9 +166,7 @@ def test_of_streams_that_are_too_long_only_the_rows_are_listed(lab: Lab, monkeyp
 
 
 def test_recordings_that_fail_for_the_same_reason_are_one_line(lab: Lab) -> None:
-    (lab.folder / "raw").mkdir()
-    for name, text in {"a": "1\n2\n", "b": "x\n", "c": "x\n", "d": "1\ny\n"}.items():
-        (lab.folder / "raw" / f"{name}.txt").write_text(text)
+    write_source("raw", a="1\n2\n", b="x\n", c="x\n", d="1\ny\n")
     ran = lab.run("ingest numbers raw -o data/r --skip-bad")
     for text in (ran.err, lab.run("show data/r").out):
         (equal, unequal) = [line for line in text.splitlines() if "left out" in line]

@@ -14,18 +14,16 @@ import pytest
 from tacpipe.io import memory
 from tacpipe.maintenance import repair
 from tacpipe.store.store import MissingError, Store
-from tests.conftest import Lab
+from tests.conftest import Lab, write_plugin, write_source
 
 PLUGIN = "open('ran', 'w').close()\nraise SystemExit(9)\n"
 
 
 def test_a_plug_in_in_a_project_folder_is_not_loaded(tmp_path: Path) -> None:
-    (tmp_path / "hostile.py").write_text(PLUGIN)
-    (tmp_path / "hostile.egg-info").mkdir()
     points = "\n".join(
         f"[tacpipe.{group}]\nhostile = hostile:it" for group in ("stages", "formats", "sensors", "tasks")
     )
-    (tmp_path / "hostile.egg-info/entry_points.txt").write_text(points)
+    write_plugin(tmp_path, "hostile", points, hostile=PLUGIN)
     command = Path(sys.executable).with_name("tacpipe")
     if not command.exists():
         pytest.skip("the command tacpipe is not installed next to this Python")
@@ -42,8 +40,7 @@ def test_a_plug_in_in_a_project_folder_is_not_loaded(tmp_path: Path) -> None:
 
 
 def test_no_manifest_holds_a_path_of_the_computer_or_its_name(lab: Lab) -> None:
-    Path("src").mkdir()
-    Path("src/a.txt").write_text("1 2 3")
+    write_source("src", a="1 2 3")
     lab.run("ingest numbers src -o data/r")
     lab.run(f"scale {lab.folder}/data/r -o {lab.folder}/data/s")
     lab.run("total data/s -o data/t")

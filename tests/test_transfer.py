@@ -15,7 +15,7 @@ from tacpipe.maintenance import repair
 from tacpipe.store import projects
 from tacpipe.store.roots import HISTORY, Roots
 from tacpipe.store.store import MissingError, Store
-from tests.conftest import Lab
+from tests.conftest import Lab, write_source
 from tests.test_pipeline import counts
 
 
@@ -56,7 +56,7 @@ def test_a_manifest_that_git_brought_is_enough_to_pull(lab: Lab, clone: Path) ->
 
 def test_a_second_push_or_pull_moves_nothing(lab: Lab, clone: Path) -> None:
     lab.run(f"store pull {remote_of(lab)} data/s")
-    assert json.loads(lab.run(f"store pull {remote_of(lab)} data/s --json").out)["objects"] == 0
+    assert lab.run_json(f"store pull {remote_of(lab)} data/s")["objects"] == 0
 
 
 def test_a_pull_brings_back_what_was_damaged_here(lab: Lab, clone: Path) -> None:
@@ -126,7 +126,7 @@ def collect(lab: Lab, store: Path, options: str = "") -> None:
 
 def snapshots(lab: Lab) -> list[tuple[str, str, str]]:
     """Return project, path and state of all that was pushed, newest first where a project pushed."""
-    listed = json.loads(lab.run(f"store list --remote {lab.folder}/remote --json").out)["manifests"]
+    listed = lab.run_json(f"store list --remote {lab.folder}/remote")["manifests"]
     return [(entry["project"], entry["path"], entry["state"]) for entry in listed]
 
 
@@ -195,9 +195,7 @@ def test_a_push_onto_what_somebody_else_pushed_since_is_refused_and_erases_nothi
     two.run("store push ../remote data/r --replace")
     collect(two, two.folder / "remote", "--recordings")
     assert len(snapshots(two)) == 3
-    digests = [
-        entry["manifest"] for entry in json.loads(two.run("store list --remote ../remote --json").out)["manifests"]
-    ]
+    digests = [entry["manifest"] for entry in two.run_json("store list --remote ../remote")["manifests"]]
     labelled = set()
     for digest in digests:
         two.run(f"store checkout {digest} --remote ../remote -o back/{digest}")
@@ -218,9 +216,8 @@ def test_a_dataset_that_was_made_again_and_again_is_pushed_without_a_question(
 
 def test_what_was_pushed_earlier_is_kept_by_the_stated_rule(two: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
     enter(two, "one", monkeypatch)
-    Path("src").mkdir()
     for count in range(1, 4):  # recordings of each
-        Path(f"src/{count}.txt").write_text("1 2 3")
+        write_source("src", **{str(count): "1 2 3"})
         two.run("ingest numbers src -o data/i")
         two.run("store push ../remote data/i")
     for rows in range(1, HISTORY + 5):
@@ -231,11 +228,11 @@ def test_what_was_pushed_earlier_is_kept_by_the_stated_rule(two: Lab, monkeypatc
     assert [path for _, path, _ in snapshots(two)].count("data/r") == 1 + HISTORY
     newest, middle, oldest = (
         entry["manifest"]
-        for entry in json.loads(two.run("store list --remote ../remote --json").out)["manifests"]
+        for entry in two.run_json("store list --remote ../remote")["manifests"]
         if entry["path"] == "data/i"
     )
     collect(two, two.folder / "remote", f"--recordings --forget {newest} --forget {oldest[:12]}")
-    remaining = json.loads(two.run("store list --remote ../remote --json").out)["manifests"]
+    remaining = two.run_json("store list --remote ../remote")["manifests"]
     assert [(entry["manifest"], entry["state"]) for entry in remaining if entry["path"] == "data/i"] == [
         (middle, "pushed here")
     ]
@@ -271,7 +268,7 @@ def test_a_store_elsewhere_serves_projects_without_a_mark_and_no_dataset_is_a_do
         lab.run(f"store push {remote} data/r data/s")
     monkeypatch.chdir(folder / "a/data/r")
     lab.run(f"store push {remote} .")
-    listed = json.loads(lab.run(f"store list --remote {remote} --json").out)["manifests"]
+    listed = lab.run_json(f"store list --remote {remote}")["manifests"]
     names = sorted(f"{entry['project']}:{entry['path']}" for entry in listed)
     assert names == ["a:data/r", "a:data/s", "b:data/r", "b:data/s", "data:r"]
 
@@ -376,7 +373,7 @@ def test_a_push_replaces_what_has_another_size_there(
     content = path.read_bytes()
     path.chmod(0o644)
     os.truncate(path, size)
-    outcome = json.loads(lab.run(f"store push {remote_of(lab)} data/s --json").out)
+    outcome = lab.run_json(f"store push {remote_of(lab)} data/s")
     assert (outcome["objects"], outcome["replaced"], path.read_bytes()) == (1, 1, content)
 
 
@@ -389,7 +386,7 @@ def test_a_push_that_verifies_replaces_what_has_other_bytes_there(
     content = path.read_bytes()
     path.chmod(0o644)
     path.write_bytes(content[:-1] + b"?")
-    assert json.loads(lab.run(f"store push {remote_of(lab)} data/s --json").out)["replaced"] == 0
+    assert lab.run_json(f"store push {remote_of(lab)} data/s")["replaced"] == 0
     assert "replaced 1 that were damaged there" in lab.run(f"store push {remote_of(lab)} data/s --verify").out
     assert path.read_bytes() == content
     assert repair.verify(Store(remote_of(lab))).clean

@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from tests.conftest import ENTRY_POINTS
+from tests.conftest import ENTRY_POINTS, write_plugin
 from tests.power import block_log, machine
 from tests.promises.counts import count
 
@@ -36,8 +36,7 @@ class Tried:
 def plugin(folder: Path) -> Path:
     """Return a folder with the small stages of the tests, installed."""
     shutil.copytree(PLUGIN, folder)
-    (folder / "toy.egg-info").mkdir()
-    (folder / "toy.egg-info" / "entry_points.txt").write_text(ENTRY_POINTS)
+    write_plugin(folder, "toy", ENTRY_POINTS)
     return folder
 
 

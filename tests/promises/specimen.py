@@ -21,7 +21,7 @@ from tacpipe.errors import DAMAGED, TacpipeError, UsageError
 from tacpipe.io.hashing import bytes_digest
 from tacpipe.io.parquet import owned
 from tests.any_table import bits
-from tests.conftest import Lab, Ran
+from tests.conftest import Lab, Ran, write_source
 
 CHAIN = (
     "ingest numbers src -o data/recordings --jobs 1",
@@ -38,10 +38,8 @@ Contents = dict[str, Any]  # path within a dataset to bits of a table, or to byt
 
 def make(lab: Lab) -> None:
     """Run the chain in an empty project."""
-    source = lab.folder / "src"
-    source.mkdir()
-    for number, name in enumerate("abc"):
-        (source / f"{name}.txt").write_text(" ".join(str(value + 5 * number) for value in range(10)))
+    texts = {name: " ".join(str(value + 5 * number) for value in range(10)) for number, name in enumerate("abc")}
+    write_source(lab.folder / "src", **texts)
     lab.run(CHAIN[0])
     lab.run(LABEL)
     for command in CHAIN[1:]:

@@ -11,11 +11,10 @@ import pytest
 from tacpipe.datasets.manifest import Manifest, parse
 from tacpipe.errors import DAMAGED
 from tacpipe.io.hashing import bytes_digest
-from tests.conftest import Lab
+from tests.conftest import Lab, write_source
 from tests.promises import damages, specimen
 from tests.promises.counts import count
 from tests.recording.test_recovering import spooled
-from tests.test_replacing import source
 
 COLLECT = "store gc --grace-days 0"
 QUICK = ("it is gone", "a bit is flipped")
@@ -32,24 +31,24 @@ def manifests() -> list[Manifest]:
 def project(lab: Lab, manifests: list[Manifest], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A copy of a project whose recordings are at their path, deleted, replaced, in no dataset, acquired and deleted."""
     manifests.clear()
-    source("monday", a="1 2", b="3 4")
+    write_source("monday", a="1 2", b="3 4")
     lab.run("ingest numbers monday -o data/here")
     lab.run("label data/here a --set material=foam")
     manifests.append(lab.manifest("data/here"))
     lab.run("scale data/here -o data/scaled --factor 7")
-    source("tuesday", c="5 6", d="7 8")
+    write_source("tuesday", c="5 6", d="7 8")
     lab.run("ingest numbers tuesday -o data/gone")
     lab.run("label data/gone c --exclude dropped")
     manifests.append(lab.manifest("data/gone"))
     shutil.rmtree("data/gone")
-    source("wednesday", e="9 1")
+    write_source("wednesday", e="9 1")
     lab.run("ingest numbers wednesday -o data/over")
     lab.run("label data/over e --set material=cork")
     manifests.append(lab.manifest("data/over"))
-    source("thursday", f="2 2")
+    write_source("thursday", f="2 2")
     lab.run("ingest numbers thursday -o data/over --replace")
     manifests.append(lab.manifest("data/over"))
-    source("friday", g="3 3", h="none")
+    write_source("friday", g="3 3", h="none")
     assert lab.call("ingest numbers friday -o data/bad").code == 1  # one of them is good, and is kept
     manifests.append(_read_alone(lab, "g"))
     spooled(lab)
@@ -186,7 +185,7 @@ def test_records_roots_or_manifests_alone_keep_every_recording(
 def test_a_damaged_record_or_manifest_holds_from_quarantine_what_nothing_else_names(
     lab: Lab, only: str, removed: str, before: bytes, after: bytes
 ) -> None:
-    source("src", a="1 2", b="3 4")
+    write_source("src", a="1 2", b="3 4")
     lab.run("ingest numbers src -o data/rec")
     manifest = lab.manifest("data/rec")
     shards = [name for _, name in manifest.objects()]
@@ -211,7 +210,7 @@ def test_a_damaged_record_or_manifest_holds_from_quarantine_what_nothing_else_na
 
 def test_a_manifest_whose_recordings_are_all_in_a_later_one_is_collected(lab: Lab) -> None:
     for number in range(4):
-        source(f"day{number}", **{f"r{number}": f"{number} 1"})
+        write_source(f"day{number}", **{f"r{number}": f"{number} 1"})
         lab.run(f"ingest numbers day{number} -o data/rec")
         lab.run(f"label data/rec r{number} --set material=foam")
     lab.run("label data/rec r0 --set material=cork")  # said anew, by hand
@@ -228,7 +227,7 @@ def test_a_manifest_whose_recordings_are_all_in_a_later_one_is_collected(lab: La
 
 
 def test_quarantine_is_kept_for_the_grace_since_it_was_filled(lab: Lab) -> None:
-    source("src", a="1 2")
+    write_source("src", a="1 2")
     lab.run("ingest numbers src -o data/rec")
     lab.run("scale data/rec -o data/s")
     name = lab.manifest("data/s").recordings["a"]["shards"][""]["digest"]

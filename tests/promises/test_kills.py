@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 
 from tacpipe.io.termination import SENTENCE
+from tests.conftest import write_plugin
 from tests.promises import kills, stubborn
 from tests.promises.counts import count
 from tests.promises.kills import Scene
@@ -55,8 +56,7 @@ def learned() -> Iterator[Warm]:
 def stubborn_plugin(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("stubborn")
     shutil.copy(str(stubborn.__file__), folder)
-    (folder / "stubborn.egg-info").mkdir()
-    (folder / "stubborn.egg-info/entry_points.txt").write_text(stubborn.ENTRY_POINTS)
+    write_plugin(folder, "stubborn", stubborn.ENTRY_POINTS)
     return folder
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from tacpipe.engine import execution
 from tacpipe.errors import DAMAGED, FAILED
-from tests.conftest import forget, tacpipe
+from tests.conftest import forget, tacpipe, write_plugin
 from tests.promises import damages, specimen
 from tests.promises.counts import count
 from tests.promises.specimen import CHAIN, Specimen
@@ -37,8 +37,7 @@ def uncertain(project: Specimen, tmp_path_factory: pytest.TempPathFactory, monke
     """A project in which a plug-in with stages that are not deterministic is installed."""
     folder = tmp_path_factory.mktemp("uncertain")
     shutil.copy(Path(__file__).parent / "plugin" / "uncertain_stages.py", folder)
-    (folder / "uncertain.egg-info").mkdir()
-    (folder / "uncertain.egg-info" / "entry_points.txt").write_text(ENTRY_POINTS)
+    write_plugin(folder, "uncertain", ENTRY_POINTS)
     monkeypatch.syspath_prepend(folder)
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(folder), os.environ.get("PYTHONPATH", "")]))
     forget()
