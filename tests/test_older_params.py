@@ -17,8 +17,8 @@ from tacpipe.tasks.forward import prediction as forward_prediction
 from tacpipe.tasks.material import prediction as material_prediction
 from tacpipe.tasks.touch import prediction as touch_prediction
 from tacpipe.tasks.touch.params import Trees
-from tests.asked import asked
 from tests.fake_recordings import FakeDataset
+from tests.stage_params import build_params
 from tests.stages.learning_fakes import motion
 from tests.tasks.forward import trials
 from tests.tasks.material import textures
@@ -83,7 +83,7 @@ TAGS = {
 
 @pytest.mark.parametrize("name", DEFAULTS)
 def test_the_params_of_stages_in_chains_stand_in_keys_as_before(name: str) -> None:
-    built = asked(name)
+    built = build_params(name)
     assert digest(params_of.to_json(built))[:16] == DEFAULTS[name], (
         f"The params of {name} are others than before, so that all recordings are computed again and models that were "
         f"trained behind it no longer fit. If that is meant, pin the new digest."
@@ -122,7 +122,7 @@ RENAMED = [  # stage, option, what is stored
 def test_a_renamed_param_is_stored_under_its_first_name_and_read_back(
     name: str, options: dict[str, Any], stored: dict[str, Any]
 ) -> None:
-    built, stage = asked(name, **options), registry.load(name)
+    built, stage = build_params(name, **options), registry.load(name)
     values = params_of.to_json(built)
     assert {key: values[key] for key in stored} == stored
     assert params_of.from_json(stage, values) == built
@@ -130,14 +130,14 @@ def test_a_renamed_param_is_stored_under_its_first_name_and_read_back(
     assert {key: params_of.named(name, values)[key] for key in options} == options
     assert {key: params_of.to_input(built)[key] for key in options} == options
     with pytest.raises(UsageError):  # a former name is not an option
-        asked(name, **{**options, **stored})
+        build_params(name, **{**options, **stored})
 
 
 def test_people_read_a_renamed_param_of_a_chain_by_its_name_of_today() -> None:
     from tacpipe.datasets.merging import chain_difference
     from tacpipe.tasks import opened
 
-    stored = params_of.to_json(asked("compress.pca", components=3, representation="increments"))
+    stored = params_of.to_json(build_params("compress.pca", components=3, representation="increments"))
     step = {"stage": "compress.pca", "version": 2, "params": stored, "fitted": None}
     assert opened._command(step) == "compress pca --components 3 --representation increments"
     renamed_step = {**step, "params": {**stored, "of": "levels"}}
@@ -166,7 +166,7 @@ def test_a_models_params_are_of_the_class_of_its_architecture_and_of_the_right_t
 
 def test_stored_values_are_read_without_the_checks_of_new_ones() -> None:
     stage = registry.load("segment.contacts")
-    stored = params_of.to_json(asked("segment.contacts")) | {"on_count": 1.0, "min_s": -1.0}
+    stored = params_of.to_json(build_params("segment.contacts")) | {"on_count": 1.0, "min_s": -1.0}
     params = params_of.from_json(stage, stored)
     assert (params.on_count, params.min_s) == (1.0, -1.0)
 
@@ -174,7 +174,7 @@ def test_stored_values_are_read_without_the_checks_of_new_ones() -> None:
 def test_a_step_of_a_chain_with_a_param_that_is_gone_is_refused() -> None:
     stage = registry.load("synchronize")
     with pytest.raises(TacpipeError, match="another version of synchronize, with the param drift, which this version"):
-        params_of.from_json(stage, {**params_of.to_json(asked("synchronize")), "drift": 1.0})
+        params_of.from_json(stage, {**params_of.to_json(build_params("synchronize")), "drift": 1.0})
 
 
 def older(files: Mapping[str, bytes], name: str, **changed: Any) -> dict[str, bytes]:

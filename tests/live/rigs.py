@@ -17,8 +17,8 @@ from tacpipe.tasks.calibrated import CalibrationRequest
 from tacpipe.tasks.forward import calibration as forward_calibration
 from tacpipe.tasks.forward import training as forward_training
 from tacpipe.tasks.forward.live.chain import Chain, Forecast
-from tests.asked import fitting
 from tests.fake_recordings import FakeRecording, FakeShard, dataset
+from tests.stage_params import fitting
 
 T0 = 1_700_000_000_000_000_000
 MS = 1_000_000

@@ -22,10 +22,10 @@ from tacpipe.tasks.forward import training as forward_training
 from tacpipe.tasks.forward.forecaster import Forecaster
 from tacpipe.tasks.forward.live.chain import BLOCKING, Beginning, Cause, Chain, Forecast
 from tacpipe.tasks.forward.predictors import forecasts
-from tests.asked import fitting
 from tests.fake_recordings import FakeRecording, dataset
 from tests.live import rigs
 from tests.live.rigs import MS, T0, Made
+from tests.stage_params import fitting
 
 KINDS: dict[str, dict[str, Any]] = {
     "raw": {"actions": "none"},

@@ -33,11 +33,11 @@ from tacpipe.tasks.material.live.engine import RESTARTED, THROWN, MaterialEngine
 from tacpipe.tasks.material.live.messages import FINAL, SLIDING, WAITING, MaterialMessage
 from tacpipe.tasks.material.live.slide import UNLIKE
 from tacpipe.tasks.material.live.task import MaterialLive, MaterialSettings
-from tests.asked import fitting
 from tests.fake_recordings import FakeDataset, FakeRecording
 from tests.live import rigs
 from tests.sensors import made
 from tests.simulation.slide_datasets import SEED, indices, slides
+from tests.stage_params import fitting
 from tests.tasks.material.textures import Slide
 
 FRAMES = 120

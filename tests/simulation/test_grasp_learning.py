@@ -19,8 +19,8 @@ from tacpipe.simulation.grasp_scene import Rig
 from tacpipe.tasks.touch import evaluation as touch_evaluation
 from tacpipe.tasks.touch import training as touch_training
 from tacpipe.tasks.touch.model import TouchModel
-from tests.asked import fitting
 from tests.simulation.grasp_datasets import grasps, readings
+from tests.stage_params import fitting
 
 POINTNET = {
     "architecture": "pointnet",

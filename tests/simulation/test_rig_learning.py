@@ -24,8 +24,8 @@ from tacpipe.tasks.forward import training as forward_training
 from tacpipe.tasks.forward.forecaster import Forecaster
 from tacpipe.tasks.forward.headline import BASELINE, MODEL
 from tacpipe.tasks.forward.predictors import predicted
-from tests.asked import fitting
 from tests.fake_recordings import FakeRecording, FakeShard, column, dataset
+from tests.stage_params import fitting
 
 HORIZON = 10
 ROW_NS = 20_000_000

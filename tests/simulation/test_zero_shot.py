@@ -19,8 +19,8 @@ from tacpipe.plugins.registry import load
 from tacpipe.simulation.slide import SENSORS, SPECTRA
 from tacpipe.tasks.material import evaluation as material_evaluation
 from tacpipe.tasks.material import training as material_training
-from tests.asked import fitting
 from tests.fake_recordings import FakeRecording
+from tests.stage_params import fitting
 from tests.tasks.material.textures import Slide, dataset
 
 SEEDS, MATERIALS = (0, 1, 2), 12

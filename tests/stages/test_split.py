@@ -10,8 +10,8 @@ import pytest
 
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins.registry import load
-from tests.asked import asked
 from tests.fake_recordings import FakeDataset
+from tests.stage_params import build_params
 
 split = load("split")
 Recording = Callable[..., Any]
@@ -22,7 +22,7 @@ def dataset(shard: Recording, count: int) -> FakeDataset:
 
 
 def test_the_split_is_one_table_with_a_row_a_recording_and_fold(shard: Recording) -> None:
-    result = split(asked("split", scheme="leave-one-out"), dataset(shard, 12))
+    result = split(build_params("split", scheme="leave-one-out"), dataset(shard, 12))
     assert set(result.recordings) == {"split"}
     table = result.recordings["split"].tables
     assert table.schema == pa.schema([("recording", pa.string()), ("fold", pa.int32()), ("role", pa.string())])
@@ -31,12 +31,12 @@ def test_the_split_is_one_table_with_a_row_a_recording_and_fold(shard: Recording
 
 
 def test_the_same_params_give_the_same_table(shard: Recording) -> None:
-    tables = [split(asked("split", seed=3), dataset(shard, 20)).recordings["split"].tables for _ in range(2)]
+    tables = [split(build_params("split", seed=3), dataset(shard, 20)).recordings["split"].tables for _ in range(2)]
     assert tables[0].equals(tables[1])
 
 
 def test_every_param_reaches_the_scheme(shard: Recording) -> None:
-    params = asked("split", scheme="kfold", folds=2, val=0.25, seed=5, stratify="object", apart="object")
+    params = build_params("split", scheme="kfold", folds=2, val=0.25, seed=5, stratify="object", apart="object")
     rows = split(params, dataset(shard, 16)).recordings["split"].tables.to_pylist()
     objects = {f"t{i:02d}": i % 4 for i in range(16)}
     for fold in (0, 1):
@@ -46,12 +46,12 @@ def test_every_param_reaches_the_scheme(shard: Recording) -> None:
 
 def test_a_missing_attribute_is_an_error_sentence(shard: Recording) -> None:
     with pytest.raises(TacpipeError, match="has no attribute authors_role"):
-        split(asked("split", scheme="authors"), dataset(shard, 3))
+        split(build_params("split", scheme="authors"), dataset(shard, 3))
 
 
 def test_the_options_of_few_repeats_and_reverse_reach_the_scheme(shard: Recording) -> None:
     given = dataset(shard, 16)
-    few = asked("split", test=0.25, val=0.0, few=1, few_by="object", few_of="object=2", repeats=2)
+    few = build_params("split", test=0.25, val=0.0, few=1, few_by="object", few_of="object=2", repeats=2)
     rows = split(few, given).recordings["split"].tables.to_pylist()
     assert {row["fold"] for row in rows} == {0, 1}
     for fold in (0, 1):
@@ -59,7 +59,7 @@ def test_the_options_of_few_repeats_and_reverse_reach_the_scheme(shard: Recordin
         assert of_two.count("train") == 1
         assert "unused" in of_two
         assert not any(row["role"] == "unused" for row in rows if int(row["recording"][1:]) % 4 != 2)
-    blocked = asked("split", scheme="blocked", test=0.25, val=0.0, reverse=True)
+    blocked = build_params("split", scheme="blocked", test=0.25, val=0.0, reverse=True)
     rows = split(blocked, given).recordings["split"].tables.to_pylist()
     assert [row["recording"] for row in rows if row["role"] == "test"] == ["t00", "t01", "t02", "t03"]
 
@@ -81,15 +81,15 @@ def test_the_options_of_few_repeats_and_reverse_reach_the_scheme(shard: Recordin
 def test_folds_without_validation_recordings_are_noted_with_a_share_that_gives_them_some(
     params: dict[str, Any], count: int, wanted: str, shard: Recording
 ) -> None:
-    (note,) = split(asked("split", **params), dataset(shard, count)).notes
+    (note,) = split(build_params("split", **params), dataset(shard, count)).notes
     assert wanted in note
     if "Give --val " in note:
         enough = float(note.split("Give --val ")[1].split(",")[0])
-        assert split(asked("split", **{**params, "val": enough}), dataset(shard, count)).notes == []
+        assert split(build_params("split", **{**params, "val": enough}), dataset(shard, count)).notes == []
 
 
 @pytest.mark.parametrize(("params", "count"), [({"val": 0.0}, 3), ({}, 12), ({"scheme": "kfold", "val": 0.0}, 5)])
 def test_a_split_with_validation_recordings_or_asked_for_without_has_no_note(
     params: dict[str, Any], count: int, shard: Recording
 ) -> None:
-    assert split(asked("split", **params), dataset(shard, count)).notes == []
+    assert split(build_params("split", **params), dataset(shard, count)).notes == []

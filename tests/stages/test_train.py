@@ -10,8 +10,8 @@ import pytest
 from tacpipe.datasets.dataset import Dataset
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins import registry
-from tests.asked import asked
 from tests.fake_recordings import dataset
+from tests.stage_params import build_params
 from tests.stages.learning_fakes import motion
 from tests.tasks.forward.trials import SMALL, compressed
 
@@ -20,7 +20,7 @@ STAGE = registry.load("train.forward")
 
 def test_a_model_holds_all_that_it_needs_to_be_used(tmp_path: Path) -> None:
     training = compressed(*(motion(seed) for seed in range(3)))
-    params = asked("train.forward", **SMALL)
+    params = build_params("train.forward", **SMALL)
     files = STAGE(params, training, compressed(motion(9), files=training.files), tmp_path).files
     assert set(files) == {
         *("model.safetensors", "baselines.safetensors", "config.json", "history.jsonl"),
@@ -35,7 +35,7 @@ def test_a_model_holds_all_that_it_needs_to_be_used(tmp_path: Path) -> None:
 
 def test_a_stage_begins_with_the_model_of_init(tmp_path: Path) -> None:
     training, watched = dataset(*(motion(seed) for seed in range(2))), dataset(motion(9))
-    params = asked("train.forward", **{**SMALL, "epochs": 1})
+    params = build_params("train.forward", **{**SMALL, "epochs": 1})
     init: Dataset = dataset(files=STAGE(params, training, watched, tmp_path / "a").files)
     tuned = STAGE(params, training, watched, tmp_path / "b", init).files
     first, second = (json.loads(one["history.jsonl"])["val_loss"] for one in (init.files, tuned))
@@ -44,7 +44,7 @@ def test_a_stage_begins_with_the_model_of_init(tmp_path: Path) -> None:
 
 def test_the_default_model_follows_what_the_dataset_holds(tmp_path: Path) -> None:
     shards = [motion(seed) for seed in range(2)]
-    params = asked("train.forward", hidden=8, epochs=1, context=5, horizon=4)
+    params = build_params("train.forward", hidden=8, epochs=1, context=5, horizon=4)
     found = {}
     for kind, given in (
         ("raw", dataset(*shards)),
@@ -60,9 +60,11 @@ def test_the_default_model_follows_what_the_dataset_holds(tmp_path: Path) -> Non
 def test_what_is_not_named_is_what_the_model_of_init_is(tmp_path: Path) -> None:
     training, small = dataset(motion(0)), {"hidden": 8, "epochs": 1, "context": 5, "horizon": 4}
     first: Dataset = dataset(
-        files=STAGE(asked("train.forward", architecture="tcn", **small), training, training, tmp_path / "a").files
+        files=STAGE(
+            build_params("train.forward", architecture="tcn", **small), training, training, tmp_path / "a"
+        ).files
     )
-    files = STAGE(asked("train.forward", **small), training, training, tmp_path / "b", first).files
+    files = STAGE(build_params("train.forward", **small), training, training, tmp_path / "b", first).files
     assert json.loads(files["config.json"])["architecture"] == "tcn"
 
 
@@ -70,13 +72,13 @@ def test_an_architecture_that_cannot_read_latents_is_refused_before_training(tmp
     given = compressed(motion(0))
     given.recordings["absent"] = None  # whoever reads on past the first recording trips over this one
     with pytest.raises(TacpipeError, match=r"reads raw channels .* the recordings hold latents"):
-        STAGE(asked("train.forward", architecture="taxelwise"), given, given, tmp_path)
+        STAGE(build_params("train.forward", architecture="taxelwise"), given, given, tmp_path)
     assert not any(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("preset", ["paper", "quick"])
 def test_presets_name_params_that_exist_and_train(preset: str, tmp_path: Path) -> None:
-    params = asked("train.forward", preset, hidden=8, epochs=1)
+    params = build_params("train.forward", preset, hidden=8, epochs=1)
     files = STAGE(params, dataset(motion(0)), dataset(motion(9)), tmp_path).files
     config = json.loads(files["config.json"])
     assert config["architecture"] == {"paper": "recurrent", "quick": "taxelwise"}[preset]

@@ -15,8 +15,8 @@ from tacpipe.clouds.grasp import Grasp
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins import registry
 from tacpipe.plugins.params import to_json
-from tests.asked import asked
 from tests.conftest import Lab
+from tests.stage_params import build_params
 from tests.tasks.touch.handmade import dataset, recordings
 
 STAGE = registry.load("train.touch")
@@ -24,7 +24,7 @@ TREES = "--architecture trees --trees 5 --leaf 2"
 
 
 def test_the_stage_hands_its_params_to_the_task(tmp_path: Path) -> None:
-    params = asked("train.touch", trees=6, leaf=2, run_label="blocked")
+    params = build_params("train.touch", trees=6, leaf=2, run_label="blocked")
     files = STAGE(params, recordings(), dataset(), tmp_path).files
     assert set(files) == {"config.json", "model.safetensors", "baselines.safetensors"}
     config = json.loads(files["config.json"])
@@ -35,7 +35,7 @@ def test_the_stage_hands_its_params_to_the_task(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("preset", "architecture"), [("paper", "pointnet"), ("quick", "strong")])
 def test_presets_name_params_that_exist_and_train(preset: str, architecture: str, tmp_path: Path) -> None:
     small: dict[str, Any] = {"trees": 5, "leaf": 2} if preset == "quick" else {"epochs": 1, "points": 20, "head": "fc1"}
-    params = asked("train.touch", preset, targets="pdc_th,e_mf", **small)
+    params = build_params("train.touch", preset, targets="pdc_th,e_mf", **small)
     files = STAGE(params, recordings(), recordings(6, 1), tmp_path).files
     config = json.loads(files["config.json"])
     assert config["architecture"] == architecture
@@ -51,7 +51,7 @@ def test_presets_name_params_that_exist_and_train(preset: str, architecture: str
 
 
 def test_the_papers_preset_is_what_the_letter_says() -> None:
-    params = asked("train.touch", "paper")
+    params = build_params("train.touch", "paper")
     assert (params.points, params.batch, params.epochs, params.learning_rate) == (750, 10, 250, 0.01)
     assert (params.normalisation, params.head, params.loss, params.multi_target) == ("minmax", "fc3", "rmse", False)
     assert (params.cycle, params.weight_decay, params.patience, params.select) == (False, 0, 0, "last")

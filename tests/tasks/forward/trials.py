@@ -22,8 +22,8 @@ from tacpipe.tasks.forward import tracks
 from tacpipe.tasks.forward import training as forward_training
 from tacpipe.tasks.forward.forecaster import Forecaster
 from tacpipe.tasks.forward.predictors import Predicted, predicted
-from tests.asked import fitting
 from tests.fake_recordings import FakeShard, dataset
+from tests.stage_params import fitting
 from tests.stages.learning_fakes import CHANNELS, REST, motion, table
 
 CONTEXT, HORIZON = 5, 4

@@ -14,8 +14,8 @@ from tacpipe.io.hashing import digest
 from tacpipe.plugins.stage import Result
 from tacpipe.tasks.material import evaluation as material_evaluation
 from tacpipe.tasks.material import training as material_training
-from tests.asked import fitting
 from tests.fake_recordings import FakeDataset, FakeRecording
+from tests.stage_params import fitting
 
 MATERIALS = (1, 2, 3, 4)
 FRAMES = {"biotac": 40, "roboskin": 24}

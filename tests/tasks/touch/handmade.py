@@ -20,8 +20,8 @@ from tacpipe.tasks.touch import evaluation as touch_evaluation
 from tacpipe.tasks.touch import grasps as grasps_of
 from tacpipe.tasks.touch import training as touch_training
 from tacpipe.tasks.touch.grasps import Grasps
-from tests.asked import fitting
 from tests.fake_recordings import FakeDataset, FakeRecording
+from tests.stage_params import fitting
 
 OBJECTS = {"ball": 0.03, "melon": 0.05}  # metres, half the size
 POINTS = 40

@@ -9,7 +9,7 @@ from tacpipe.plugins import given_params, registry
 from tacpipe.plugins import params as params_of
 
 
-def asked(name: str, preset: str | None = None, /, **options: Any) -> Any:
+def build_params(name: str, preset: str | None = None, /, **options: Any) -> Any:
     """Return the params of stage ``name`` with these options."""
     return given_params.build(name, registry.load(name), preset=preset, options=options)
 
@@ -20,4 +20,4 @@ def fitting(name: str, usual: Mapping[str, Any], **changed: Any) -> Any:
     tag = params_of.tag(stage) or ""
     chosen = changed.get(tag, usual.get(tag, (params_of.defaults(stage, tag) or [""])[0]))
     counting = {key: value for key, value in usual.items() if chosen in (params_of.having(stage, key) or [chosen])}
-    return asked(name, **{**counting, **changed})
+    return build_params(name, **{**counting, **changed})
