@@ -34,7 +34,7 @@ def _line(folder: Path, rounds: int, batch: int, latents: int) -> timing.Line:
     def epoch() -> None:
         with tempfile.TemporaryDirectory(dir=folder) as workspace:
             loop.train(
-                lambda: _loaded(RecurrentForward(latents, STATES, HIDDEN), first),
+                lambda: _load_weights(RecurrentForward(latents, STATES, HIDDEN), first),
                 loop.Windows(loop.Part(WINDOWS, _loss(rows, latents)), loop.Part(1, _loss(rows, latents)), batch),
                 schedule,
                 Path(workspace),
@@ -87,7 +87,7 @@ def _step(model: nn.Module, optimiser: torch.optim.Optimizer, loss: Tensor) -> f
 
 def _check(first: dict[str, Tensor], rows: Tensor, latents: int) -> None:
     """Refuse to compare models whose losses over the first steps differ."""
-    models = _loaded(RecurrentForward(latents, STATES, HIDDEN), first), _plain(first, latents)
+    models = _load_weights(RecurrentForward(latents, STATES, HIDDEN), first), _plain(first, latents)
     losses = []
     for model, fused in zip(models, (True, False), strict=True):
         optimiser = torch.optim.Adam(model.parameters(), lr=1e-3, fused=fused)
@@ -116,9 +116,9 @@ def _error(model: nn.Module, windows: Tensor, latents: int) -> Tensor:
 
 def _plain(first: dict[str, Tensor], latents: int) -> nn.Module:
     renamed = {name.removesuffix("_l0") if "decoder" in name else name: value for name, value in first.items()}
-    return _loaded(_Plain(latents), renamed)
+    return _load_weights(_Plain(latents), renamed)
 
 
-def _loaded(model: nn.Module, weights: dict[str, Tensor]) -> nn.Module:
+def _load_weights(model: nn.Module, weights: dict[str, Tensor]) -> nn.Module:
     model.load_state_dict(weights)
     return model

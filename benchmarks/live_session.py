@@ -57,7 +57,7 @@ def models(process: int) -> list[int]:
         return []
 
 
-def watched(session: subprocess.Popen[str], memory_mb_over_time: dict[str, list[tuple[float, float]]]) -> None:
+def watch_memory(session: subprocess.Popen[str], memory_mb_over_time: dict[str, list[tuple[float, float]]]) -> None:
     """Add the memory of a session's processes to ``found`` until it ends."""
     began_s = time.monotonic()
     while session.poll() is None:
@@ -94,7 +94,7 @@ def run(arguments: argparse.Namespace, folder: Path) -> tuple[dict[str, Any], di
         words += [word for address in arguments.publish for word in ("--publish", address)]
         command = [sys.executable, "-m", "tacpipe", *words]
         session = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-        watcher = threading.Thread(target=watched, args=(session, memory), daemon=True)
+        watcher = threading.Thread(target=watch_memory, args=(session, memory), daemon=True)
         watcher.start()
         printed, _ = session.communicate()
         session_ended.set()

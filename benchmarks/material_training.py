@@ -39,7 +39,7 @@ def measure(folder: Path, rounds: int) -> list[timing.Line]:
 
     def epoch() -> None:
         with tempfile.TemporaryDirectory(dir=folder) as workspace:
-            loop.train(lambda: _loaded(_ours(), first), work, schedule, Path(workspace))
+            loop.train(lambda: _load_weights(_ours(), first), work, schedule, Path(workspace))
 
     times = timing.interleaved({"tacpipe": epoch, "plain loop": lambda: next(plain)}, max(3, rounds // 4))
     ours, plain_s = (f"{timing.median(times, name):.2f} s per epoch" for name in times)
@@ -120,7 +120,7 @@ def _check(first: Mapping[str, Tensor], felt: Mapping[str, ScaledSlides]) -> Non
     work = _work(felt)
     losses: list[list[float]] = []
     rows = torch.arange(8 * BATCH).chunk(8)
-    ours, plain = _loaded(_ours(), first), _plain(first)
+    ours, plain = _load_weights(_ours(), first), _plain(first)
     for model, fused in ((ours, True), (plain, False)):
         optimiser = torch.optim.Adam(model.parameters(), lr=RATE, fused=fused)
         losses.append([])
@@ -187,6 +187,6 @@ def _plain(first: Mapping[str, Tensor]) -> nn.ModuleDict:
     return models
 
 
-def _loaded(model: nn.ModuleDict, weights: Mapping[str, Tensor]) -> nn.ModuleDict:
+def _load_weights(model: nn.ModuleDict, weights: Mapping[str, Tensor]) -> nn.ModuleDict:
     model.load_state_dict(weights)
     return model

@@ -56,7 +56,7 @@ def look(process: int) -> Look:
     return Look(time.monotonic(), processor_s, memory_mb["VmRSS"], memory_mb["VmHWM"])
 
 
-def watched(command: list[str], seconds: float, store: Path) -> tuple[list[Look], Look]:
+def watch_recording(command: list[str], seconds: float, store: Path) -> tuple[list[Look], Look]:
     """Run a command that records for ``seconds`` and return looks at it while it does, and the last while it seals."""
     process = subprocess.Popen(command, env={**os.environ, "TACPIPE_STORE": str(store)})
     looks = []
@@ -74,7 +74,7 @@ def watched(command: list[str], seconds: float, store: Path) -> tuple[list[Look]
     return looks, last
 
 
-def accounted(table: pa.Table, ledger: Ledger) -> str:
+def account_stream(table: pa.Table, ledger: Ledger) -> str:
     """Return what a recorded stream has beside what was sent; raises `AssertionError` for a sample that is wrong."""
     counts = table.column("seq").to_numpy()
     assert np.array_equal(np.diff(counts), np.ones(len(counts) - 1)), "the counter has gaps"
@@ -96,7 +96,7 @@ def main() -> None:
             rig.write_text(rig_of.to_toml(emulator.rig))
             seconds = 60 * chosen.minutes
             words = ["acquire", str(rig), "-o", str(folder / "rec"), "--duration-s", str(seconds), "--quiet"]
-            looks, sealed = watched([str(BIN / "tacpipe"), *words], seconds, folder / "store")
+            looks, sealed = watch_recording([str(BIN / "tacpipe"), *words], seconds, folder / "store")
         os.environ["TACPIPE_STORE"] = str(folder / "store")
         recordings = tacpipe.open(folder / "rec")
         (shard,) = recordings.recordings.values()
@@ -112,7 +112,7 @@ def main() -> None:
             if stream == "events":
                 print(f"events: {shard.table(stream).to_pylist()}")
                 continue
-            print(f"{stream}: {accounted(shard.table(stream), emulator.ledger[stream])}")
+            print(f"{stream}: {account_stream(shard.table(stream), emulator.ledger[stream])}")
 
 
 if __name__ == "__main__":

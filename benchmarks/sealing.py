@@ -27,7 +27,7 @@ BLOCK = 1000  # packets that a recorder appends at a time
 FLOATS = 41  # channels of floats that the arm gives
 
 
-def spooled(folder: Path, seconds: int) -> Path:
+def write_spool(folder: Path, seconds: int) -> Path:
     """Write the spool of an arm that moves smoothly, as a killed recorder leaves it, and return its folder."""
     sensor = rig_of.parse(RIG).streams["robot"].sensor
     store = Store(folder / ".tacpipe")
@@ -58,7 +58,7 @@ def main() -> None:
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="tacpipe-seal-") as name:
         folder = Path(name)
-        spool_folder = spooled(folder, round(60 * options.minutes))
+        spool_folder = write_spool(folder, round(60 * options.minutes))
         size = (spool_folder / "bytes").stat().st_size
         cost = timing.cost(["tacpipe", "acquire", "--recover"], folder)
         manifest = find(folder / "rec").manifest

@@ -214,10 +214,10 @@ def chained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from tests import chain
 
     folder = tmp_path_factory.mktemp("chained") / "project"  # a module's own: no other's results lie in its store
-    return shutil.copytree(made_once(tmp_path_factory, "chain", chain.run), folder, symlinks=True)
+    return shutil.copytree(make_once(tmp_path_factory, "chain", chain.run), folder, symlinks=True)
 
 
-def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], None]) -> Path:
+def make_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], None]) -> Path:
     """Return a folder that ``make`` fills, once for all workers that run tests: who comes second waits for it."""
     base = factory.getbasetemp()
     folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / f"made-{name}"

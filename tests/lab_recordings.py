@@ -30,10 +30,10 @@ def write(folder: Path, count: int = 20, seconds: float = 8.0, seed: int = 0) ->
         place = folder / f"trial_{trial + 1:02d}"
         place.mkdir(parents=True)
         start_s = 1_730_000_000 + 60 * trial
-        time_s, position_m, tilt_rad = moved(rng, seconds + rng.uniform(-0.5, 0.5))
+        time_s, position_m, tilt_rad = move_arm(rng, seconds + rng.uniform(-0.5, 0.5))
         skin_s = np.arange(0.004, time_s[-1] - 0.01, 1 / SKIN_HZ)
         skin_s += rng.normal(0, 2e-4, len(skin_s))
-        counts = offsets + gains * pressed(rng, PERIODS_M[material], skin_s, time_s, position_m, tilt_rad)
+        counts = offsets + gains * press_taxels(rng, PERIODS_M[material], skin_s, time_s, position_m, tilt_rad)
         counts = np.rint(np.clip(counts + rng.normal(0, 1.5, counts.shape), 0, 65535)).astype(int)
         names = [f"t{row}{column}" for row in range(SIDE) for column in range(SIDE)]
         skin = pd.DataFrame(counts, columns=names)
@@ -47,7 +47,7 @@ def write(folder: Path, count: int = 20, seconds: float = 8.0, seed: int = 0) ->
         (place / "labels.yaml").write_text(f"material: {material}\nobject: plate_{trial % 5 + 1}\n")
 
 
-def moved(rng: np.random.Generator, seconds: float) -> tuple[AnyFloats, AnyFloats, AnyFloats]:
+def move_arm(rng: np.random.Generator, seconds: float) -> tuple[AnyFloats, AnyFloats, AnyFloats]:
     """Return times (time,), the arm's positions (time, 3) in m and its tilt (time,) in rad: down, along, up."""
     time_s = np.arange(int(seconds * ARM_HZ)) / ARM_HZ
     down, up, press_m = 0.7 + rng.uniform(0, 0.2), seconds - 0.8, rng.uniform(0.6, 1.8) * 1e-3
@@ -63,7 +63,7 @@ def moved(rng: np.random.Generator, seconds: float) -> tuple[AnyFloats, AnyFloat
     return time_s, np.column_stack([along, np.full(len(time_s), 0.1), height]), tilt_rad
 
 
-def pressed(
+def press_taxels(
     rng: np.random.Generator,
     period_m: float,
     skin_s: AnyFloats,

@@ -18,7 +18,7 @@ ANSWERS = {  # Answers of a user who knows the rig: the line that has it, and wh
 }
 
 
-def answered(guess: str) -> str:
+def answer_guess(guess: str) -> str:
     """Return a guessed layout with each "?" replaced, and nothing else changed."""
     lines = guess.splitlines()
     for at, line in enumerate(lines):
@@ -29,17 +29,17 @@ def answered(guess: str) -> str:
     return "\n".join(lines)
 
 
-def ingested(lab: Lab, count: int, seconds: float) -> None:
+def ingest_recordings(lab: Lab, count: int, seconds: float) -> None:
     """Write recordings of a lab and read them into ``data/recordings`` with the layout that is guessed for them."""
     lab_recordings.write(lab.folder / "lab", count, seconds)
     guess = lab.run("ingest table lab --guess").out
-    Path("layout.toml").write_text(answered(guess))
+    Path("layout.toml").write_text(answer_guess(guess))
     assert '"?"' not in Path("layout.toml").read_text().partition("[streams")[2]
     lab.run("ingest table lab --layout layout.toml -o data/recordings")
 
 
 def test_a_lab_s_folder_is_synchronized_and_segmented_with_a_guessed_layout(lab: Lab) -> None:
-    ingested(lab, 2, 3.0)
+    ingest_recordings(lab, 2, 3.0)
     lab.run("synchronize data/recordings -o data/synced")
     lab.run("segment contacts data/synced -o data/segments")
     lab.run("segment slides data/recordings -o data/slides --trigger load --frames 50")
@@ -51,7 +51,7 @@ def test_a_lab_s_folder_is_synchronized_and_segmented_with_a_guessed_layout(lab:
 
 @pytest.mark.long
 def test_a_lab_s_folder_gives_a_report_of_forecasts_and_one_of_materials_without_a_line_of_python(lab: Lab) -> None:
-    ingested(lab, 20, 8.0)
+    ingest_recordings(lab, 20, 8.0)
     lab.run("synchronize data/recordings -o data/synced")
     lab.run("segment contacts data/synced -o data/segments")
     lab.run("split data/segments -o data/split --scheme random --test 0.4")

@@ -31,7 +31,9 @@ STEP_NS = 20_000_000
 HEAVY = {"torch", "pyarrow", "pandas", "polars", "duckdb", "numpy", "sklearn", "typer"}
 
 
-def synced(rows: int = 12, *, gap: int | None = None, late: int | None = None, nan: int | None = None) -> pa.Table:
+def synchronized_table(
+    rows: int = 12, *, gap: int | None = None, late: int | None = None, nan: int | None = None
+) -> pa.Table:
     """Return a table of two streams side by side, as `tacpipe synchronize` makes it."""
     t_ns = np.arange(rows) * STEP_NS  # (time,)
     if late is not None:
@@ -63,7 +65,7 @@ def four(lab: Lab) -> Dataset:
     return publish(
         lab,
         "data/four",
-        {f"trial-{place:03d}": {"": synced()} for place in range(4)},
+        {f"trial-{place:03d}": {"": synchronized_table()} for place in range(4)},
         object=["cup", "egg", "cup", None],
         speed_m_s=[0.1, 0.2, 0.3, 0.4],
         trial=[0, 1, 2, None],
@@ -204,7 +206,7 @@ def test_a_stream_of_a_synchronized_recording_has_the_names_with_which_it_was_re
     recording = four["trial-001"]
     assert recording.table("left").to_pydict() == {"t_ns": [n * STEP_NS for n in range(12)], "x": list(range(12))}
     assert recording.table("arm", ["force_n"]).column_names == ["force_n"]
-    assert recording.table().column_names == synced().column_names
+    assert recording.table().column_names == synchronized_table().column_names
     with pytest.raises(tacpipe.UsageError, match=r"right.*left"):
         recording.table("right")
     assert four.to_pandas("left").columns.tolist() == ["recording", "t_ns", "x"]
@@ -288,13 +290,13 @@ def test_duckdb_has_a_view_a_stream_and_one_of_the_labels(lab: Lab, four: Datase
 
 def test_a_dataset_describes_itself_and_nothing_of_it_reaches_a_notebook_as_markup(lab: Lab) -> None:
     word = "<script>alert(1)</script>"
-    dataset = publish(lab, "data/odd", {"a": {"": synced()}}, object=[word])
+    dataset = publish(lab, "data/odd", {"a": {"": synchronized_table()}}, object=[word])
     text = repr(dataset)
     for part in ("scale", "factor=2", "1: a", "50 Hz", "left", "arm", word):
         assert part in text
     markup = dataset._repr_html_()
     assert word not in markup and html.escape(word) in markup and len(markup) < 2000
-    assert "of 2" in repr(publish(lab, "data/two", {n: {"": synced()} for n in "ab"}).select("a"))
+    assert "of 2" in repr(publish(lab, "data/two", {n: {"": synchronized_table()} for n in "ab"}).select("a"))
     (lab.folder / "data/odd/a.parquet").unlink()
     Path(lab.store.object_path(dataset["a"].digest)).unlink()
     assert "not readable" in repr(tacpipe.open("data/odd"))  # Looking at a damaged dataset is no error.
@@ -331,11 +333,11 @@ def test_windows_are_those_of_one_recording_without_a_gap_a_late_row_or_a_missin
     lab: Lab, context: int, horizon: int, stride: int
 ) -> None:
     tables = {
-        "whole": synced(),
-        "gap": synced(gap=5),
-        "late": synced(late=7),
-        "nan": synced(nan=3),
-        "short": synced(2),
+        "whole": synchronized_table(),
+        "gap": synchronized_table(gap=5),
+        "late": synchronized_table(late=7),
+        "nan": synchronized_table(nan=3),
+        "short": synchronized_table(2),
     }
     dataset = publish(lab, "data/w", {name: {"": table} for name, table in tables.items()})
     windows = dataset.windows(context, horizon, stride=stride)
@@ -398,7 +400,10 @@ def test_windows_subtract_the_level_at_rest_of_tactile_channels(four: Dataset) -
 
 
 def test_windows_are_scaled_by_the_rows_that_they_hold_or_as_others_are(lab: Lab) -> None:
-    tables = {"a": synced(nan=11), "b": synced(7, gap=0)}  # the last row of a and the first of b are in no window
+    tables = {
+        "a": synchronized_table(nan=11),
+        "b": synchronized_table(7, gap=0),
+    }  # the last row of a and the first of b are in no window
     dataset = publish(lab, "data/w", {name: {"": table} for name, table in tables.items()})
     rows = np.concatenate([np.arange(11.0), np.arange(1, 7.0)])  # Values of left_x.
     windows = dataset.windows(2, 1, inputs=["left_x"], targets=["arm_force_n"], scale=True, dtype="float64")

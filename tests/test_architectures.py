@@ -206,7 +206,7 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     forget()
 
 
-def built(task: str, **options: Any) -> Any:
+def build_train_params(task: str, **options: Any) -> Any:
     """Return the params of `tacpipe train TASK` for some options."""
     name = f"train.{task}"
     return given_params.build(name, registry.load(name), options=options)
@@ -221,11 +221,11 @@ def test_every_choice_of_a_built_in_architecture_but_the_automatic_one_is_an_ent
 
 
 def test_an_architecture_of_another_package_is_a_choice_and_its_params_are_options(package: Path) -> None:
-    assert built("forward", architecture="plain", width=5).width == 5
+    assert build_train_params("forward", architecture="plain", width=5).width == 5
     with pytest.raises(TacpipeError, match="--width belongs to the architecture plain"):
-        built("forward", architecture="gru", width=5)
+        build_train_params("forward", architecture="gru", width=5)
     with pytest.raises(TacpipeError, match="--dropout belongs to"):
-        built("forward", architecture="plain", dropout=0.1)
+        build_train_params("forward", architecture="plain", dropout=0.1)
     stage = registry.load("train.forward")
     assert set(params_of.panels(stage)) == set(params_of.fields(stage))
     assert params_of.panels(stage)["width"] == "Model"
@@ -248,9 +248,9 @@ def test_the_help_shows_it_in_a_panel_and_imports_nothing_heavy(
 
 
 def test_name_and_version_of_the_package_are_in_keys_and_those_of_built_in_ones_are_as_before(package: Path) -> None:
-    params = built("forward", architecture="plain")
+    params = build_train_params("forward", architecture="plain")
     assert params_of.to_json(params)["plugin"] == "lab-architectures 1.0"
-    assert "plugin" not in params_of.to_json(built("forward", architecture="gru"))
+    assert "plugin" not in params_of.to_json(build_train_params("forward", architecture="gru"))
     before = params_of.to_json(params)
     declare(package, "1.1")
     assert params_of.to_json(params)["plugin"] == "lab-architectures 1.1"
@@ -263,7 +263,7 @@ def test_name_and_version_of_the_package_are_in_keys_and_those_of_built_in_ones_
 
 
 def test_a_model_without_its_package_names_architecture_package_and_version(package: Path) -> None:
-    stored = params_of.to_json(built("forward", architecture="plain"))
+    stored = params_of.to_json(build_train_params("forward", architecture="plain"))
     (package / "lab_architectures.egg-info" / "entry_points.txt").write_text("")
     forget()
     stage = registry.load("train.forward")
@@ -276,7 +276,7 @@ def test_a_model_without_its_package_names_architecture_package_and_version(pack
 def test_an_architecture_without_a_way_to_learn_is_no_choice_and_the_reason_names_the_method(package: Path) -> None:
     assert "unfinished" not in params_of.fields(registry.load("train.material"))["architecture"].__args__
     with pytest.raises(TacpipeError, match="must be a class with the methods fit"):
-        built("material", architecture="unfinished")
+        build_train_params("material", architecture="unfinished")
 
 
 @pytest.mark.parametrize(
@@ -284,10 +284,10 @@ def test_an_architecture_without_a_way_to_learn_is_no_choice_and_the_reason_name
     [("lost", "nowhere_at_all"), ("odd", "must be a dataclass that extends"), ("double", "has the choice gru")],
 )
 def test_one_that_does_not_fit_spoils_itself_alone_and_says_why(package: Path, name: str, reason: str) -> None:
-    assert built("forward", architecture="gru").architecture == "gru"
+    assert build_train_params("forward", architecture="gru").architecture == "gru"
     assert name not in params_of.fields(registry.load("train.forward"))["architecture"].__args__
     with pytest.raises(TacpipeError, match=reason):
-        built("forward", architecture=name)
+        build_train_params("forward", architecture=name)
 
 
 @pytest.mark.long
@@ -313,7 +313,7 @@ def slides(seed: int) -> tuple[Any, Any]:
 def test_an_estimator_is_stored_without_pickle_and_the_same_one_has_the_same_bytes(package: Path) -> None:
     from tacpipe.tasks.material import estimators
 
-    params = built("material", architecture="nearest")
+    params = build_train_params("material", architecture="nearest")
     frames, materials = slides(0)
     fitted, refitted = (estimators.Fitted.fit(params, frames, materials) for _ in range(2))
     content = estimators.packed({"biotac": fitted}, params)
@@ -332,7 +332,7 @@ def test_a_changed_file_of_an_estimator_is_refused_or_read_and_names_of_other_pa
 ) -> None:
     from tacpipe.tasks.material import estimators
 
-    params = built("material", architecture="nearest")
+    params = build_train_params("material", architecture="nearest")
     frames, materials = slides(0)
     content = estimators.packed({"biotac": estimators.Fitted.fit(params, frames, materials)}, params)
     rng = np.random.default_rng(0)
@@ -359,7 +359,7 @@ def test_types_that_are_not_validated_are_refused_unless_the_architecture_trusts
     from tacpipe.tasks.material import estimators
 
     frames, materials = slides(0)
-    forest, trusting = (built("material", architecture=name) for name in ("forest", "trusting"))
+    forest, trusting = (build_train_params("material", architecture=name) for name in ("forest", "trusting"))
     fitted = {"biotac": estimators.Fitted.fit(forest, frames, materials)}
     with pytest.raises(TacpipeError, match=r"sklearn\.tree\._tree\.Tree"):
         estimators.packed(fitted, forest)
@@ -374,7 +374,7 @@ def test_types_that_are_not_validated_are_refused_unless_the_architecture_trusts
 def test_features_and_scores_of_another_shape_are_refused(package: Path) -> None:
     from tacpipe.tasks.material import estimators
 
-    params = built("material", architecture="nearest")
+    params = build_train_params("material", architecture="nearest")
     frames, materials = slides(0)
     fitted = estimators.Fitted.fit(params, frames, materials)
     with pytest.raises(TacpipeError, match=r"30 slides are \(8, 4\)"):
@@ -390,12 +390,12 @@ def test_plain_networks_of_material_and_touch_are_called_as_they_promise(package
     from tacpipe.tasks.material import networks
     from tacpipe.tasks.touch import members
 
-    scores = built("material", architecture="scores")
+    scores = build_train_params("material", architecture="scores")
     scores_network = networks.build(scores, Shape(channels=4, classes=3))
     networks.check(scores_network, scores, torch.zeros(5, 8, 4), 3)
     with pytest.raises(TacpipeError, match=r"returns \(2, 3\) for 2 slides.*\(2, 4\)"):
         networks.check(scores_network, scores, torch.zeros(5, 8, 4), 4)
-    flat = built("touch", architecture="flat")
+    flat = build_train_params("touch", architecture="flat")
     network = members.network(flat, ["pdc_th"])
     read = members.patches(flat)
     prediction = network(torch.zeros(2, 3, 7, read.channels), torch.zeros(2, read.grasp_numbers))
@@ -406,7 +406,7 @@ def test_an_architecture_that_extends_none_of_the_two_is_trained_by_its_own_fit(
     from tacpipe.tasks.material import training
     from tests.tasks.material import textures
 
-    params = built("material", architecture="majority", baselines=False)
+    params = build_train_params("material", architecture="majority", baselines=False)
     recordings = textures.dataset(
         *(textures.slide("biotac", material, trial) for material, trial in [(1, 0), (3, 0), (3, 1), (4, 0)])
     )

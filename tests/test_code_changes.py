@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.conftest import Lab, made_once, tacpipe, write_plugin, write_source
+from tests.conftest import Lab, make_once, tacpipe, write_plugin, write_source
 
 STAGES = '''
 """Stages of a lab."""
@@ -98,22 +98,22 @@ def estimator():
 """
 
 
-def prepared(folder: Path) -> None:
+def prepare_project(folder: Path) -> None:
     """Make a project with a plug-in of its own, whose recordings are made, multiplied and added up."""
     (folder / ".tacpipe").mkdir()
     package = folder / "package"
     write_plugin(package, "lab", POINTS, lab_stages=STAGES, lab_helper='WEIGHTS = "of ReLU"\n')
     (package / "lab.egg-info/top_level.txt").write_text("lab_stages\nlab_helper\n")
-    ran(folder, "simulate numbers -o data/r")
-    ran(folder, "times data/r -o data/t")
-    ran(folder, "sums data/t -o data/s")
+    run_printed(folder, "simulate numbers -o data/r")
+    run_printed(folder, "times data/r -o data/t")
+    run_printed(folder, "sums data/t -o data/s")
 
 
 @pytest.fixture
 def project(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Copy the project that `prepared` makes."""
+    """Copy the project that `prepare_project` makes."""
     folder = tmp_path / "own"
-    return shutil.copytree(made_once(tmp_path_factory, "own", prepared), folder, symlinks=True)
+    return shutil.copytree(make_once(tmp_path_factory, "own", prepare_project), folder, symlinks=True)
 
 
 def call(folder: Path, command: str) -> tuple[int, str, str]:
@@ -122,7 +122,7 @@ def call(folder: Path, command: str) -> tuple[int, str, str]:
     return process.returncode, process.stdout, process.stderr
 
 
-def ran(folder: Path, command: str) -> str:
+def run_printed(folder: Path, command: str) -> str:
     code, out, err = call(folder, f"{command} --json")
     assert code == 0, out + err
     return out
@@ -136,44 +136,44 @@ def edit(folder: Path, before: str, after: str, module: str = "lab_stages") -> N
 
 
 def test_a_hit_on_results_of_edited_code_says_so_and_rerun_computes_them_again(project: Path) -> None:
-    assert json.loads(ran(project, "times data/r -o data/t"))["notes"] == []
+    assert json.loads(run_printed(project, "times data/r -o data/t"))["notes"] == []
     edit(project, "params.factor)", "params.factor + 1)")
-    first = json.loads(ran(project, "times data/r -o data/t"))
+    first = json.loads(run_printed(project, "times data/r -o data/t"))
     assert (first["ran"], first["reused"]) == (0, 3)
     (note,) = first["notes"]
     assert note.startswith("3 of these results were computed by other code of times than there is now in lab_stages")
     assert "version 1" in note and "--rerun" in note
-    (note,) = json.loads(ran(project, "sums data/t -o data/s"))["notes"]
+    (note,) = json.loads(run_printed(project, "sums data/t -o data/s"))["notes"]
     assert note.startswith("1 of these results were computed by other code of sums")
-    rerun = json.loads(ran(project, "times data/r -o data/t --rerun"))
+    rerun = json.loads(run_printed(project, "times data/r -o data/t --rerun"))
     assert (rerun["ran"], rerun["reused"], rerun["notes"]) == (3, 0, [])
-    assert json.loads(ran(project, "times data/r -o data/t"))["notes"] == []
-    ran(project, "sums data/t -o data/s --rerun")
+    assert json.loads(run_printed(project, "times data/r -o data/t"))["notes"] == []
+    run_printed(project, "sums data/t -o data/s --rerun")
     assert (project / "data/s/sum.txt").read_text() == str(3 * ((0 + 2 + 3) + (1 + 2 + 3) + (2 + 2 + 3)))
 
 
 def test_new_recordings_do_not_hide_that_others_are_of_older_code(project: Path) -> None:
     edit(project, "params.factor)", "params.factor + 1)")
-    ran(project, "simulate numbers -o data/r --trials 5 --rerun")
+    run_printed(project, "simulate numbers -o data/r --trials 5 --rerun")
     for _ in range(2):  # The first run computes, the second is a hit.
-        outcome = json.loads(ran(project, "times data/r -o data/t"))
+        outcome = json.loads(run_printed(project, "times data/r -o data/t"))
         (note,) = outcome["notes"]
         assert note.startswith("3 of these results were computed by other code of times")
     assert outcome["reused"] == 5
 
 
 def test_a_hit_names_the_package_of_which_a_module_was_edited_that_the_stage_imports_late(project: Path) -> None:
-    assert json.loads(ran(project, "sums data/t -o data/s2"))["notes"] == []
+    assert json.loads(run_printed(project, "sums data/t -o data/s2"))["notes"] == []
     edit(project, "ReLU", "Tanh", "lab_helper")
     for command, count in (("sums data/t -o data/s2", 1), ("times data/r -o data/t", 3)):
         for _ in range(2):
-            outcome = json.loads(ran(project, command))
+            outcome = json.loads(run_printed(project, command))
             (note,) = outcome["notes"]
             assert outcome["ran"] == 0 and note.startswith(
                 f"{count} of these results were computed by other code of the package lab than is installed now."
             )
-    ran(project, "sums data/t -o data/s2 --rerun")
-    assert json.loads(ran(project, "sums data/t -o data/s2"))["notes"] == []
+    run_printed(project, "sums data/t -o data/s2 --rerun")
+    assert json.loads(run_printed(project, "sums data/t -o data/s2"))["notes"] == []
 
 
 @pytest.mark.long
@@ -185,32 +185,32 @@ def test_a_model_and_its_evaluation_name_the_edited_package_of_their_architectur
     (package / "lab.egg-info/entry_points.txt").write_text(
         "[tacpipe.models]\nmaterial.nearest = lab_estimator:Nearest\n"
     )
-    ran(project, "simulate material --trials 12 --materials 2 -o data/m")
-    ran(project, "segment slides data/m -o data/slides")
-    ran(project, "split data/slides -o data/split --scheme random --stratify material")
+    run_printed(project, "simulate material --trials 12 --materials 2 -o data/m")
+    run_printed(project, "segment slides data/m -o data/slides")
+    run_printed(project, "split data/slides -o data/split --scheme random --stratify material")
     train = "train material data/slides --split data/split -o models/m --architecture nearest"
     evaluate = "evaluate models/m data/slides --split data/split -o results/m"
-    assert json.loads(ran(project, train))["notes"] == json.loads(ran(project, evaluate))["notes"] == []
+    assert json.loads(run_printed(project, train))["notes"] == json.loads(run_printed(project, evaluate))["notes"] == []
     edit(project, "GaussianNB()", "GaussianNB(var_smoothing=0.5)", "lab_helper")
     for command in (train, evaluate):
-        assert any("other code of the package lab " in note for note in json.loads(ran(project, command))["notes"]), (
-            command
-        )
-    ran(project, f"{train} --rerun")
-    assert not any("other code" in note for note in json.loads(ran(project, train))["notes"])
+        assert any(
+            "other code of the package lab " in note for note in json.loads(run_printed(project, command))["notes"]
+        ), command
+    run_printed(project, f"{train} --rerun")
+    assert not any("other code" in note for note in json.loads(run_printed(project, train))["notes"])
 
 
 def test_a_training_never_resumes_a_checkpoint_that_other_code_wrote(project: Path) -> None:
     train = "train numbers data/r -o models/m"
     assert call(project, train)[0] == 9
     assert (
-        ran(project, train) and (project / "models/m/model.txt").read_text() == "of ReLU"
+        run_printed(project, train) and (project / "models/m/model.txt").read_text() == "of ReLU"
     )  # The same code resumes it.
     assert call(project, f"{train}2 --factor 3")[0] == 9
     edit(project, "ReLU", "Tanh", "lab_helper")
     code, _, err = call(project, f"{train}2 --factor 3")
     assert code == 9 and "was written by other code; training starts over" in err
-    ran(project, f"{train}2 --factor 3")
+    run_printed(project, f"{train}2 --factor 3")
     assert (project / "models/m2/model.txt").read_text() == "of Tanh"
     assert not list((project / ".tacpipe/checkpoints").iterdir())
 
@@ -267,9 +267,9 @@ def test_a_module_that_cannot_be_loaded_is_one_sentence_though_its_results_are_s
 def test_notes_of_a_stage_are_printed_once_for_all_recordings_and_on_a_hit_too(project: Path) -> None:
     edit(project, "NOTES = ()", 'NOTES = ("no number is above 100.",)')
     for ran_anew in (True, False):
-        outcome = json.loads(ran(project, "times data/r -o data/n --factor 3"))
+        outcome = json.loads(run_printed(project, "times data/r -o data/n --factor 3"))
         assert outcome["notes"] == ["all 3 recordings: no number is above 100."] and (outcome["ran"] == 3) == ran_anew
-    ran(project, "simulate numbers -o data/r --trials 5")
+    run_printed(project, "simulate numbers -o data/r --trials 5")
     edit(project, "notes=NOTES", "notes=NOTES if table['x'][0].as_py() < 2 else ()")
     code, _, err = call(project, "times data/r -o data/m --factor 4")
     assert code == 0 and "tacpipe: 2 recordings (trial-000, trial-001): no number is above 100.\n" in err

@@ -26,7 +26,7 @@ print("IMPORTED", *sorted({name.partition(".")[0] for name in sys.modules}))
 """
 
 
-def environment(shell: str, line: str) -> dict[str, str]:
+def completion_variables(shell: str, line: str) -> dict[str, str]:
     """Return what a shell's script sets when TAB is pressed behind ``line``."""
     variables = {"_TACPIPE_COMPLETE": f"complete_{shell}"}
     if shell == "bash":
@@ -34,8 +34,8 @@ def environment(shell: str, line: str) -> dict[str, str]:
     return variables | {"_TYPER_COMPLETE_ARGS": line, "_TYPER_COMPLETE_FISH_ACTION": "get-args"}
 
 
-def completed(folder: Path, shell: str, line: str) -> set[str]:
-    process = tacpipe(folder, "", **environment(shell, line))
+def complete(folder: Path, shell: str, line: str) -> set[str]:
+    process = tacpipe(folder, "", **completion_variables(shell, line))
     assert "Traceback" not in process.stderr
     return {word.partition("\t")[0].strip('(")*:') for word in process.stdout.replace('":"', "\t").split("\n")}
 
@@ -43,16 +43,16 @@ def completed(folder: Path, shell: str, line: str) -> set[str]:
 @pytest.mark.parametrize("shell", ["bash", *(pytest.param(name, marks=pytest.mark.long) for name in ("zsh", "fish"))])
 def test_commands_methods_and_options_are_completed_in_every_shell(tmp_path: Path, shell: str) -> None:
     names = {name.partition(".")[0] for name in registry.stages()} | set(commands.NAMES)
-    words = completed(tmp_path, shell, "tacpipe ")
+    words = complete(tmp_path, shell, "tacpipe ")
     assert {name for name in names if any(word.endswith(name) for word in words)} == names
-    assert any("material" in word for word in completed(tmp_path, shell, "tacpipe train m"))
-    options = completed(tmp_path, shell, "tacpipe split --s")
+    assert any("material" in word for word in complete(tmp_path, shell, "tacpipe train m"))
+    options = complete(tmp_path, shell, "tacpipe split --s")
     for option in ("--seed", "--scheme", "--set", "--skip-bad"):
         assert any(word.endswith(option) for word in options)
 
 
 def test_a_group_of_commands_completes_its_verbs(tmp_path: Path) -> None:
-    assert completed(tmp_path, "bash", "tacpipe store p") - {""} == {"push", "pull"}
+    assert complete(tmp_path, "bash", "tacpipe store p") - {""} == {"push", "pull"}
 
 
 @pytest.mark.parametrize("line", ["tacpipe ", "tacpipe train forward --", "tacpipe synchronize --r"])
@@ -60,7 +60,7 @@ def test_completion_imports_nothing_heavy(tmp_path: Path, line: str) -> None:
     process = subprocess.run(
         [sys.executable, "-c", PROBE],
         cwd=tmp_path,
-        env={**os.environ, **environment("bash", line)},
+        env={**os.environ, **completion_variables("bash", line)},
         capture_output=True,
         text=True,
         check=True,

@@ -17,7 +17,7 @@ GROUPS = st.lists(st.lists(SCORES, min_size=1, max_size=6), min_size=2, max_size
 LEVELS = st.floats(0.05, 0.95)
 
 
-def joined(groups: list[list[float]]) -> tuple[np.ndarray, np.ndarray]:
+def join_groups(groups: list[list[float]]) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate([np.array(group) for group in groups]), np.repeat(
         range(len(groups)), [len(group) for group in groups]
     )
@@ -30,7 +30,7 @@ def test_a_group_left_out_lies_below_the_promised_quantile_of_the_others_as_ofte
     # Each of exchangeable groups is the new one with the same probability, so this mean is the coverage given the values.
     below = []
     for at, group in enumerate(groups):
-        scores, numbers = joined(groups[:at] + groups[at + 1 :])
+        scores, numbers = join_groups(groups[:at] + groups[at + 1 :])
         below.append(np.mean(np.array(group) <= conformal_quantile(scores, numbers, level, promised=True)))
     assert np.mean(below) >= level - 1e-9
 
@@ -50,12 +50,12 @@ def test_pooled_scores_of_one_group_have_the_quantile_of_numpy(scores: list[floa
 
 
 def test_a_long_recording_weighs_as_much_as_a_short_one() -> None:
-    scores, groups = joined([[0.0] * 98, [1.0, 2.0]])
+    scores, groups = join_groups([[0.0] * 98, [1.0, 2.0]])
     assert conformal_quantile(scores, groups, 0.75) == 1.0
 
 
 def test_four_recordings_promise_eighty_percent_and_no_more() -> None:
-    scores, groups = joined([[1.0], [2.0], [3.0], [4.0]])
+    scores, groups = join_groups([[1.0], [2.0], [3.0], [4.0]])
     assert most_promised(4) == 0.8
     assert conformal_quantile(scores, groups, 0.8, promised=True) == 4.0
     assert conformal_quantile(scores, groups, 0.81, promised=True) == math.inf
@@ -69,7 +69,7 @@ def test_bands_of_simulated_recordings_hold_as_often_as_promised() -> None:
 
     covered = []
     for _ in range(2000):
-        scores, groups = joined([list(recording()) for _ in range(9)])
+        scores, groups = join_groups([list(recording()) for _ in range(9)])
         covered.append(np.mean(recording() <= conformal_quantile(scores, groups, 0.8, promised=True)))
     assert 0.79 < np.mean(covered) < 0.95
 

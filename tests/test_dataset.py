@@ -33,7 +33,7 @@ streams = st.dictionaries(st.sampled_from(["left", "right", "robot_state"]), tab
 
 
 @contextmanager
-def published(recordings: Mapping[str, Mapping[str, pa.Table]]) -> Iterator[Path]:
+def publish_temporarily(recordings: Mapping[str, Mapping[str, pa.Table]]) -> Iterator[Path]:
     """Give the directory of a dataset that holds these recordings, stream by stream."""
     with tempfile.TemporaryDirectory() as folder:
         store = Store(Path(folder) / ".tacpipe")
@@ -46,7 +46,7 @@ def published(recordings: Mapping[str, Mapping[str, pa.Table]]) -> Iterator[Path
 def test_every_table_comes_out_of_a_dataset_as_it_went_in_to_the_bit(
     recordings: dict[str, dict[str, pa.Table]],
 ) -> None:
-    with published(recordings) as path:
+    with publish_temporarily(recordings) as path:
         dataset = tacpipe.open(path)
         assert set(dataset.recordings) == set(recordings)
         for name, tables in recordings.items():
@@ -60,7 +60,7 @@ def test_every_table_comes_out_of_a_dataset_as_it_went_in_to_the_bit(
 def test_pandas_and_duckdb_read_the_values_that_were_written(table: pa.Table) -> None:
     if not table.num_columns:
         return  # duckdb knows no table without columns
-    with published({"trial-000": {"": table}}) as path:
+    with publish_temporarily({"trial-000": {"": table}}) as path:
         file = path / "trial-000.parquet"
         assert file.read_bytes() == to_parquet(table)
         frame = pd.read_parquet(file, dtype_backend="pyarrow")
@@ -81,7 +81,7 @@ def test_all_recordings_in_one_table_are_the_recordings_one_after_another(table:
     first = table.rename_columns([f"c{place}" for place in range(table.num_columns)])
     sizes = np.random.default_rng(seed).integers(0, first.num_rows + 1, 4)
     recordings = {f"trial-{place:03d}": {"": first.slice(0, int(size))} for place, size in enumerate(sizes)}
-    with published(recordings) as path:
+    with publish_temporarily(recordings) as path:
         joined = tacpipe.open(path).table()
         assert joined["recording"].to_pylist() == [
             name for name, tables in recordings.items() for _ in range(tables[""].num_rows)
@@ -99,7 +99,7 @@ def test_arrays_and_tensors_hold_the_columns_that_were_asked_for_in_their_order(
     values = np.random.default_rng(seed).normal(size=(rows, columns))  # (time, channel)
     table = pa.table({f"c{place}": values[:, place] for place in range(columns)})
     order = [f"c{place}" for place in np.random.default_rng(seed).permutation(columns)]
-    with published({"trial-000": {"": table}}) as path:
+    with publish_temporarily({"trial-000": {"": table}}) as path:
         dataset = tacpipe.open(path)
         expected = values[:, [int(name[1:]) for name in order]]
         arrays, tensors = dataset.to_numpy(columns=order)["trial-000"], dataset.to_torch(columns=order)["trial-000"]
@@ -125,7 +125,7 @@ def as_stored(column: pa.ChunkedArray) -> list[Any]:
 @given(tables(columns=5))
 @drawn
 def test_no_value_that_is_read_differs_from_that_of_the_file(table: pa.Table) -> None:
-    with published({"trial-000": {"": table}}) as path:
+    with publish_temporarily({"trial-000": {"": table}}) as path:
         dataset, expected = tacpipe.open(path), {name: as_stored(table[name]) for name in table.column_names}
         frame, arrays = dataset.to_pandas(), dataset.to_numpy()["trial-000"]
         assert {name: exactly(frame[name]) for name in expected} == expected
@@ -150,7 +150,7 @@ def test_no_value_that_is_read_differs_from_that_of_the_file(table: pa.Table) ->
 def test_a_signalling_nan_is_nan_in_the_type_that_all_channels_share() -> None:
     signalling = np.array([0x7F800001], "<u4").view(np.float32)
     table = pa.table({"x": pa.array([7], pa.int32()), "y": pa.array(signalling)})
-    with published({"trial-000": {"": table}}) as path:
+    with publish_temporarily({"trial-000": {"": table}}) as path:
         values = tacpipe.open(path).to_numpy()["trial-000"].values
     assert values.dtype == np.float64 and values[0, 0] == 7 and np.isnan(values[0, 1])
 
@@ -161,7 +161,7 @@ def test_times_stay_whole_nanoseconds_beside_channels_of_floats() -> None:
         {"t_ns": t_ns, "x": pa.array(np.linspace(0, 1, 5), pa.float32()), "y": np.arange(5, dtype=np.uint16)}
     )
     assert (t_ns.astype(np.float64).astype(np.int64) != t_ns).any()  # A matrix with the times in it would hold these.
-    with published({"trial-000": {"": table}}) as path:
+    with publish_temporarily({"trial-000": {"": table}}) as path:
         arrays, tensors = (read()["trial-000"] for read in (tacpipe.open(path).to_numpy, tacpipe.open(path).to_torch))
         assert arrays.t_ns is not None and tensors.t_ns is not None
         assert arrays.t_ns.dtype == np.int64 and arrays.t_ns.tolist() == tensors.t_ns.tolist() == t_ns.tolist()
@@ -174,7 +174,7 @@ def test_masks_labels_and_counters_are_read_by_name_and_are_no_channels() -> Non
     unread = [pa.field("x_gap", pa.bool_()), pa.field("seq", pa.int64()), pa.field("gt_force_n", pa.float64())]
     fields = pa.schema([pa.field("x", pa.int16()), label, *unread])
     table = pa.table([[1, 2], [-1, 0], [True, False], [2**62, 2**62 + 1], [0.5, 1.5]], schema=fields)
-    with published({"trial-000": {"": table}}) as path:
+    with publish_temporarily({"trial-000": {"": table}}) as path:
         arrays = tacpipe.open(path).to_numpy()["trial-000"]
         assert arrays.columns == ("x",) and arrays.values.tolist() == [[1], [2]] and arrays.values.dtype == np.int16
         assert arrays["contact"].tolist() == [-1, 0] and arrays["x_gap"].tolist() == [True, False]
@@ -183,7 +183,7 @@ def test_masks_labels_and_counters_are_read_by_name_and_are_no_channels() -> Non
 
 def test_an_integer_channel_that_a_matrix_of_floats_would_round_is_refused_there_and_read_alone() -> None:
     table = pa.table({"wide": [2**53 + 1, 0], "x": [0.5, 1.0]})
-    with published({"trial-000": {"": table}}) as path:
+    with publish_temporarily({"trial-000": {"": table}}) as path:
         arrays = tacpipe.open(path).to_numpy()["trial-000"]
         with pytest.raises(UsageError, match=r"wide \(int64\) holds integers beyond 2\^53.*arrays\['wide'\]"):
             _ = arrays.values
@@ -193,7 +193,7 @@ def test_an_integer_channel_that_a_matrix_of_floats_would_round_is_refused_there
 
 def test_integers_that_some_recordings_lack_stay_integers_in_one_frame() -> None:
     table = pa.table({"t_ns": [1], "t_device_ns": [2**60 + 1]})
-    with published({"trial-000": {"": table}, "trial-001": {"": table.select(["t_ns"])}}) as path:
+    with publish_temporarily({"trial-000": {"": table}, "trial-001": {"": table.select(["t_ns"])}}) as path:
         frame = tacpipe.open(path).to_pandas()
         assert frame["t_device_ns"].tolist() == [2**60 + 1, pd.NA]
 
@@ -202,7 +202,7 @@ def test_integers_that_some_recordings_lack_stay_integers_in_one_frame() -> None
 def test_more_rows_than_a_group_holds_come_back(rows: int) -> None:
     table = pa.table({"t_ns": np.arange(rows), "x": pa.array(np.arange(rows) % 251, pa.uint8())})
     cut = pa.concat_tables([table.slice(0, 700_001), table.slice(700_001)])
-    with published({"trial-000": {"": table}}) as path:
+    with publish_temporarily({"trial-000": {"": table}}) as path:
         assert tacpipe.open(path).recordings["trial-000"].table().equals(table)
         groups = pq.ParquetFile(path / "trial-000.parquet").metadata.num_row_groups
         assert groups == math.ceil(rows / (1 << 20))

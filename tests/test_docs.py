@@ -85,7 +85,7 @@ class Block:
     mark: str = ""
 
 
-def fenced(text: str) -> list[Block]:
+def fenced_blocks(text: str) -> list[Block]:
     """Return the fenced blocks of a page, with the comment ``<!-- not run: REASON -->`` above one as its mark."""
     matches = re.findall(
         r'(?:^<!-- not run: ([^\n]+) -->\n)?^```(\w+)(?: title="([^"]+)")?\n(.*?)^```$', text, re.DOTALL | re.MULTILINE
@@ -101,7 +101,7 @@ def joined(text: str) -> str:
 MORE = "…"  # This stands in a page for further lines that a command prints.
 
 
-def printed(block: str) -> list[tuple[str, list[str]]]:
+def printed_commands(block: str) -> list[tuple[str, list[str]]]:
     """Return the commands of a console block, each with the lines that are printed below it, but for empty ones."""
     outputs: list[tuple[str, list[str]]] = []
     for line in joined(block).splitlines():
@@ -149,7 +149,7 @@ def test_the_commands_and_python_of_every_page_run_and_print_what_it_says(tmp_pa
     before: set[str] = set()  # commands of earlier pages
 
     for page in RUN:
-        page_blocks = [block for block in fenced(page.read_text()) if not block.mark]
+        page_blocks = [block for block in fenced_blocks(page.read_text()) if not block.mark]
         for name, text in entry_points(page_blocks):
             write_plugin(tmp_path, name, text)
         page_commands: set[str] = set()
@@ -159,7 +159,7 @@ def test_the_commands_and_python_of_every_page_run_and_print_what_it_says(tmp_pa
             elif block.language == "python":
                 run_python(page, block.text, project, environment)
             elif block.language == "console":
-                for command, lines in printed(block.text):
+                for command, lines in printed_commands(block.text):
                     ran = tacpipe(project, command.removeprefix("tacpipe "), **environment)
                     assert ran.returncode == 0, f"{page.name}: {command}: {ran.stderr}"
                     lines_printed = [line for line in (ran.stderr + ran.stdout).splitlines() if line]
@@ -211,16 +211,16 @@ def test_every_block_of_commands_or_python_runs_or_states_why_it_does_not() -> N
     unmarked = [
         f"{page.name}: {block.text[:60]}"
         for page in PAGES
-        for block in fenced(page.read_text())
+        for block in fenced_blocks(page.read_text())
         if block.language in ("sh", "console", "python")
         and not block.mark
         and (page not in (*RUN, *EXTENDING, PYTHON) or block.language == "sh")
     ]
-    reasons = [block.mark for page in PAGES for block in fenced(page.read_text()) if block.mark]
+    reasons = [block.mark for page in PAGES for block in fenced_blocks(page.read_text()) if block.mark]
 
     assert unmarked == []
     assert len(reasons) >= 10 and all(len(reason) > 10 for reason in reasons)
-    assert sum(block.language == "console" for page in RUN for block in fenced(page.read_text())) >= 10
+    assert sum(block.language == "console" for page in RUN for block in fenced_blocks(page.read_text())) >= 10
 
 
 def test_the_commands_in_all_pages_exist(lab: Lab) -> None:

@@ -17,7 +17,7 @@ MODULES = sorted(
 )
 
 
-def tried(name: str) -> doctest.TestResults:
+def run_examples(name: str) -> doctest.TestResults:
     """Import a module and run its examples; none are looked for where no line begins one, which takes its time."""
     module = importlib.import_module(name)
     has_examples = Path(str(module.__file__)).read_text().count(">>> ")
@@ -26,9 +26,9 @@ def tried(name: str) -> doctest.TestResults:
 
 @pytest.mark.parametrize("name", MODULES)
 def test_the_examples_of_a_module_give_what_they_say(name: str) -> None:
-    assert tried(name).failed == 0
+    assert run_examples(name).failed == 0
 
 
 def test_there_are_examples() -> None:
-    counts = itertools.accumulate(tried(name).attempted for name in MODULES)
+    counts = itertools.accumulate(run_examples(name).attempted for name in MODULES)
     assert any(count >= 10 for count in counts)

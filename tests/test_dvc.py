@@ -20,7 +20,7 @@ import yaml
 
 import tacpipe
 from tacpipe.plugins import registry
-from tests.conftest import Lab, made_once
+from tests.conftest import Lab, make_once
 
 HERE = Path(__file__).parents[1]
 NEEDS_DVC = pytest.mark.skipif(
@@ -130,7 +130,7 @@ def toy(tmp_path: Path, environment: Mapping[str, str], tmp_path_factory: pytest
         project.run("dvc repro")
         project.commit("factor 3")
 
-    prototype = made_once(tmp_path_factory, "dvc", make)
+    prototype = make_once(tmp_path_factory, "dvc", make)
     return Project(shutil.copytree(prototype, tmp_path / "toy", symlinks=True), environment)
 
 
@@ -143,12 +143,12 @@ def copy_chains(folder: Path, environment: Mapping[str, str]) -> tuple[Project, 
     return Project(folder, environment), yaml.safe_load((folder / "params.yaml").read_text())
 
 
-def expected(factor: int) -> dict[str, list[int]]:
+def expected_values(factor: int) -> dict[str, list[int]]:
     """Return the values that the toy chain computes with an offset of 1."""
     return {f"trial-{trial:03d}": [factor * (row * (trial + 1) + 1) for row in range(20)] for trial in range(4)}
 
 
-def cached(folder: Path) -> list[bytes]:
+def cached_contents(folder: Path) -> list[bytes]:
     """Return the content of every file in DVC's cache."""
     return [path.read_bytes() for path in (folder / ".dvc" / "cache").rglob("*") if path.is_file()]
 
@@ -184,7 +184,7 @@ def test_a_method_of_the_forward_chain_runs_once_and_dvc_shows_its_metrics_param
     assert "persistence" in page
     assert "mse_counts" in page
     assert "<DVC_METRIC" not in page
-    contents = cached(project.folder)
+    contents = cached_contents(project.folder)
     # a manifest each of recordings, synced, segments and split, and of model and results before and after calibration
     assert sum(b'"format": 1' in content for content in contents) == 8
     assert not [content for content in contents if content.startswith(b"PAR1")]
@@ -275,14 +275,14 @@ def test_methods_and_settings_of_the_touch_chain_run_once_and_are_reported(
 @pytest.mark.dvc
 @NEEDS_DVC
 def test_after_checkout_of_an_older_commit_tacpipe_reads_what_the_manifest_names(toy: Project) -> None:
-    assert toy.values("data/scaled") == expected(3)
+    assert toy.values("data/scaled") == expected_values(3)
     toy.run("git checkout --quiet HEAD~1")
     toy.run("dvc checkout")
 
-    assert toy.values_in_folder("data/scaled") == expected(3)  # stale: DVC knows nothing of them
-    assert toy.values("data/scaled") == expected(2)
+    assert toy.values_in_folder("data/scaled") == expected_values(3)  # stale: DVC knows nothing of them
+    assert toy.values("data/scaled") == expected_values(2)
     toy.run("tacpipe store link data/scaled")
-    assert toy.values_in_folder("data/scaled") == expected(2)
+    assert toy.values_in_folder("data/scaled") == expected_values(2)
     assert "Running stage" not in toy.run("dvc repro")
 
 
@@ -294,10 +294,10 @@ def test_after_a_restore_from_the_run_cache_tacpipe_reads_what_the_manifest_name
     output = toy.run("dvc repro")
 
     assert "Stage 'scaled' is cached" in output
-    assert toy.values_in_folder("data/scaled") == expected(3)  # stale: the stage did not run
-    assert toy.values("data/scaled") == expected(2)
+    assert toy.values_in_folder("data/scaled") == expected_values(3)  # stale: the stage did not run
+    assert toy.values("data/scaled") == expected_values(2)
     metrics = json.loads((toy.folder / "results" / "toy" / "metrics.json").read_text())
-    assert metrics == {name: sum(values) for name, values in expected(2).items()}
+    assert metrics == {name: sum(values) for name, values in expected_values(2).items()}
 
 
 @pytest.mark.long
@@ -314,13 +314,13 @@ def test_a_second_clone_with_the_same_caches_gets_the_results_without_running_a_
     first = clone.run("dvc repro")
     assert "0 ran, 4 reused" in first  # recordings have no input that DVC could look up, so they are asked for
     assert "Stage 'scaled' is cached" in first
-    assert clone.values("data/scaled") == expected(3)
+    assert clone.values("data/scaled") == expected_values(3)
 
     for folder in ("data/scaled", "results"):
         shutil.rmtree(clone.folder / folder)
     clone.change("factor: 3", "factor: 2")
     assert "Stage 'scaled' is cached" in clone.run("dvc repro")
-    assert clone.values("data/scaled") == expected(2)
+    assert clone.values("data/scaled") == expected_values(2)
 
 
 @pytest.mark.long
@@ -336,20 +336,20 @@ def test_labels_set_by_hand_survive_the_next_repro(toy: Project) -> None:
     assert "Running stage" not in toy.run("dvc repro")
 
 
-def filled(value: Any, names: Mapping[str, str]) -> Any:
+def fill_names(value: Any, names: Mapping[str, str]) -> Any:
     """Return ``value`` with each ``${name}`` in its texts replaced."""
     if isinstance(value, str):
         for name, text in names.items():
             value = value.replace(f"${{{name}}}", text)
         return value
     if isinstance(value, list):
-        return [filled(item, names) for item in value]
+        return [fill_names(item, names) for item in value]
     if isinstance(value, dict):
-        return {filled(name, names): filled(item, names) for name, item in value.items()}
+        return {fill_names(name, names): fill_names(item, names) for name, item in value.items()}
     return value
 
 
-def looked_up(value: Any, params: Mapping[str, Any]) -> Any:
+def look_up(value: Any, params: Mapping[str, Any]) -> Any:
     """Return a list of the chain, which may be told by the name of a param like ``${forward.folds}``."""
     if isinstance(value, str) and value.startswith("${"):
         for part in value[2:-1].split("."):
@@ -361,10 +361,10 @@ def looked_up(value: Any, params: Mapping[str, Any]) -> Any:
 def items_of(value: Mapping[str, Any], params: Mapping[str, Any]) -> Iterator[dict[str, str]]:
     """Yield what stands for ``${item...}`` and ``${key}`` in each stage that a ``matrix`` or ``foreach`` makes."""
     if "foreach" in value:
-        for key, choice in looked_up(value["foreach"], params).items():
+        for key, choice in look_up(value["foreach"], params).items():
             yield {"key": key, "item": choice}
         return
-    matrix = {key: looked_up(values, params) for key, values in value.get("matrix", {}).items()}
+    matrix = {key: look_up(values, params) for key, values in value.get("matrix", {}).items()}
     matrix = {key: values[:1] if key == "fold" else values for key, values in matrix.items()}
     for chosen in itertools.product(*matrix.values()):
         replacements: dict[str, str] = {}
@@ -389,7 +389,7 @@ def stages(preset: str) -> Iterator[tuple[str, dict[str, Any], list[list[str]]]]
     for name, value in yaml.safe_load((HERE / "dvc.yaml").read_text())["stages"].items():
         for items in items_of(value, params):
             body = value.get("do", value)
-            filled_stage = filled(
+            filled_stage = fill_names(
                 {key: part for key, part in body.items() if key != "matrix"}, {**replacements, **items}
             )
             commands = filled_stage["cmd"] if isinstance(filled_stage["cmd"], list) else [filled_stage["cmd"]]

@@ -82,13 +82,13 @@ def every_param() -> Iterator[tuple[str, Any, str, Any]]:
                 yield name, kind, field, annotation
 
 
-def tagged(name: str, kind: Any) -> dict[str, Any]:
+def tag_option(name: str, kind: Any) -> dict[str, Any]:
     """Return the option that chooses a kind of params, if there are several."""
     tag = params_of.tag(registry.load(name))
     return {tag: get_args(fields.bare(fields.hints(kind)[tag]))[0]} if tag else {}
 
 
-def outside(annotation: Any) -> Iterator[Any]:
+def values_outside(annotation: Any) -> Iterator[Any]:
     """Yield values just outside of each end of a range."""
     is_integer = fields.bare(annotation) is int
     for constraint in fields.constraints(annotation):
@@ -111,7 +111,7 @@ def command(name: str, options: dict[str, Any]) -> str:
 RANGED = {
     (name, kind, field): annotation
     for name, kind, field, annotation in every_param()
-    if any(True for _ in outside(annotation))
+    if any(True for _ in values_outside(annotation))
 }
 CHOICES = {
     (name, kind, field): annotation
@@ -150,18 +150,18 @@ def test_a_number_out_of_its_range_ends_with_code_2_before_anything_is_read(
     name, kind, field = key
     monkeypatch.chdir(tmp_path)
     stage = registry.load(name)
-    for value in outside(RANGED[key]):
-        ran = call(command(name, {**tagged(name, kind), field: value}))
+    for value in values_outside(RANGED[key]):
+        ran = call(command(name, {**tag_option(name, kind), field: value}))
         assert (ran.code, ran.out) == (2, ""), ran
         flag = f"--{field.replace('_', '-')}"
         assert ran.err == f"tacpipe: {flag} is {fields.shown(value)}; it must be {fields.describe(RANGED[key])}.\n"
         with pytest.raises(UsageError, match=f"{field} is "):
             given_params.build(
-                name, stage, sets=[*(f"{k}={v}" for k, v in tagged(name, kind).items()), f"{field}={value}"]
+                name, stage, sets=[*(f"{k}={v}" for k, v in tag_option(name, kind).items()), f"{field}={value}"]
             )
         with pytest.raises(UsageError, match=f"preset odd of {name}: {field} is "), monkeypatch.context() as patched:
             patched.setattr(kind, "PRESETS", {"odd": {field: value}}, raising=False)
-            given_params.build(name, stage, preset="odd", options=tagged(name, kind))
+            given_params.build(name, stage, preset="odd", options=tag_option(name, kind))
     assert not any(tmp_path.iterdir())
 
 
@@ -183,7 +183,7 @@ def test_a_word_that_is_no_choice_ends_with_code_2_before_anything_is_read(
 ) -> None:
     name, kind, field = key
     monkeypatch.chdir(tmp_path)
-    ran = call(command(name, {**tagged(name, kind), field: "zzz"}))
+    ran = call(command(name, {**tag_option(name, kind), field: "zzz"}))
     assert (ran.code, ran.out, ran.err.count("\n")) == (2, "", 1), ran
     assert ran.err.startswith(f"tacpipe: --{field.replace('_', '-')} is 'zzz'; it must be one of ")
 
@@ -195,14 +195,14 @@ def test_an_option_of_another_kind_of_params_is_refused_and_is_in_no_key(
     stage = registry.load(name)
     monkeypatch.chdir(tmp_path)
     for kind in params_of.kinds(stage):
-        params = given_params.build(name, stage, options=tagged(name, kind))
+        params = given_params.build(name, stage, options=tag_option(name, kind))
         assert set(params_of.to_input(params)) == set(fields.hints(kind))
         for other_kind in params_of.kinds(stage):
             for field in set(fields.hints(other_kind)) - set(fields.hints(kind)):
                 default = other_kind.__dataclass_fields__[field].default
                 with pytest.raises(UsageError, match=f"--{field.replace('_', '-')} belongs to the "):
-                    given_params.build(name, stage, options={**tagged(name, kind), field: default})
-                (tmp_path / "params.yaml").write_text(json.dumps({"own": {**tagged(name, kind), field: default}}))
+                    given_params.build(name, stage, options={**tag_option(name, kind), field: default})
+                (tmp_path / "params.yaml").write_text(json.dumps({"own": {**tag_option(name, kind), field: default}}))
                 ran = call(f"{command(name, {})} --block own")
                 assert ran.code == 2
                 assert f"params.yaml, block own: {field} belongs to the {params_of.tag(stage)} " in ran.err

@@ -23,7 +23,7 @@ def packages(folder: Path) -> list[Path]:
     for page in docs.EXTENDING:
         place = folder / page.stem
         place.mkdir(parents=True)
-        for block in docs.fenced(page.read_text()):
+        for block in docs.fenced_blocks(page.read_text()):
             if block.title:
                 (place / block.title).write_text(block.text)
         assert (place / "pyproject.toml").exists(), page
@@ -31,7 +31,7 @@ def packages(folder: Path) -> list[Path]:
     return folders
 
 
-def environment(folder: Path) -> Path:
+def make_environment(folder: Path) -> Path:
     """Return the folder of programs of a fresh environment, which has what this one has and nothing of its own."""
     venv.create(folder, with_pip=False, symlinks=True)
     (site_packages,) = folder.glob("lib/python*/site-packages")
@@ -48,7 +48,7 @@ def environment(folder: Path) -> Path:
 @pytest.mark.timeout(3600)
 def test_the_package_of_every_page_installs_and_does_what_the_page_prints(tmp_path: Path) -> None:
     """One project serves all pages: what one computed is reused on the next."""
-    programs = environment(tmp_path / "environment")
+    programs = make_environment(tmp_path / "environment")
     project = tmp_path / "project"
     project.mkdir()
     clean = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "TACPIPE_STORE")}
@@ -66,11 +66,11 @@ def test_the_package_of_every_page_installs_and_does_what_the_page_prints(tmp_pa
     before: set[str] = set()
     for page in docs.EXTENDING:
         page_commands = set()
-        for block in docs.fenced(page.read_text()):
+        for block in docs.fenced_blocks(page.read_text()):
             if block.language == "python" and not block.title:
                 run_program([str(programs / "python"), "-c", block.text], page.name)
             elif block.language == "console":
-                for command, lines in docs.printed(block.text):
+                for command, lines in docs.printed_commands(block.text):
                     printed_lines = run_program(
                         [str(programs / "tacpipe"), *shlex.split(command)[1:]], f"{page.name}: {command}"
                     )

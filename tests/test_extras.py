@@ -195,10 +195,10 @@ def bare(tmp_path_factory: pytest.TempPathFactory, chained: Path) -> Iterator[Ca
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", str(hiding))
         with serving() as warm:
-            yield lambda command: ran(warm, project, command)
+            yield lambda command: run_warm(warm, project, command)
 
 
-def ran(warm: Warm, project: Path, command: str) -> tuple[int, str]:
+def run_warm(warm: Warm, project: Path, command: str) -> tuple[int, str]:
     out = project.parent / "printed"
     out.unlink(missing_ok=True)
     pid = warm.start(project, command.format(o=f"new/{len(list((project.parent).rglob('*')))}"), out, {})
@@ -275,7 +275,7 @@ def test_python_gets_the_same_sentence(chained: Path, tmp_path: Path, call: str,
     assert process.stdout.startswith(start) and process.stdout.count("\n") == 1
 
 
-def installed(folder: Path, monkeypatch: pytest.MonkeyPatch, url: Any) -> None:
+def install_from_url(folder: Path, monkeypatch: pytest.MonkeyPatch, url: Any) -> None:
     """Make tacpipe look installed from a URL, by pip."""
     about = folder / "tacpipe-9.9.dist-info"
     about.mkdir()
@@ -309,7 +309,7 @@ def test_the_command_installs_from_where_tacpipe_came_from(tmp_path: Path, monke
     for number, (command, url) in enumerate(cases.items()):
         (tmp_path / str(number)).mkdir()
         with monkeypatch.context() as patch:
-            installed(tmp_path / str(number), patch, url)
+            install_from_url(tmp_path / str(number), patch, url)
             assert extras.command("learn") == command
             patch.chdir(clone)
             assert extras.command("learn") == command.replace(f"-e '{clone}[", "-e '.[").replace(f" '{clone}[", " '.[")
@@ -334,7 +334,7 @@ def test_modules_belong_to_the_extra_whose_package_brings_them(tmp_path: Path, m
 
     assert {module: extras.of(module) for module in extra_by_module} == extra_by_module
     assert extras.of("numpy") is None and extras.of("nobody") is None
-    installed(tmp_path, monkeypatch, None)
+    install_from_url(tmp_path, monkeypatch, None)
     assert (extras.of("sklearn"), extras.of("scipy")) == ("learn", "dev")
 
 

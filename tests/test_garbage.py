@@ -25,12 +25,12 @@ def age(lab: Lab, days: float = 30.0) -> None:
             os.utime(path, (changed_s, changed_s))
 
 
-def collected(lab: Lab, options: str = "") -> dict[str, int]:
+def collect_garbage(lab: Lab, options: str = "") -> dict[str, int]:
     value: dict[str, int] = lab.run_json(f"store gc {options}")
     return value
 
 
-def replaced_recording(lab: Lab) -> str:
+def replace_recording(lab: Lab) -> str:
     """Ingest a recording, then another in its place; return the digest of the first, which nothing names any more."""
     write_source("src", a="1 2 3")
     lab.run("ingest numbers src -o data/r")
@@ -45,7 +45,7 @@ def test_nothing_that_a_root_or_its_ancestors_need_is_removed(lab: Lab) -> None:
     lab.run("scale data/r -o data/s")
     lab.run("total data/s -o data/t")
     age(lab)
-    assert collected(lab)["objects"] == 0
+    assert collect_garbage(lab)["objects"] == 0
     assert counts(lab.run("total data/s -o data/t --json").out) == (0, 1)
 
 
@@ -54,9 +54,9 @@ def test_what_an_output_held_before_is_removed_and_a_dry_run_only_counts(lab: La
     lab.run("scale data/r -o data/s --factor 2")
     lab.run("scale data/r -o data/s --factor 3")
     age(lab)
-    dry = collected(lab, "--dry-run")
+    dry = collect_garbage(lab, "--dry-run")
     assert dry["objects"] == 4  # a manifest and three shards: three times two is two times three, and stays
-    assert collected(lab) == {**dry, "drafts": dry["drafts"]}
+    assert collect_garbage(lab) == {**dry, "drafts": dry["drafts"]}
     assert repair.verify(lab.store).clean
     assert counts(lab.run("scale data/r -o data/s --factor 3 --json").out) == (0, 4)
     ran, reused = counts(lab.run("scale data/r -o data/s --factor 2 --json").out)
@@ -67,12 +67,12 @@ def test_young_objects_and_those_of_a_running_process_are_kept(lab: Lab) -> None
     lab.run("simulate toy -o data/r")
     lab.run("scale data/r -o data/s --factor 2")
     lab.run("scale data/r -o data/s --factor 3")
-    assert collected(lab)["objects"] == 0  # seconds old: somebody may be about to name them
+    assert collect_garbage(lab)["objects"] == 0  # seconds old: somebody may be about to name them
     manifest = lab.manifest("data/s")
     lab.run("scale data/r -o data/s --factor 5")
     age(lab)
     with lab.store.leases.running([bytes_digest(manifest.content)]):
-        collected(lab)
+        collect_garbage(lab)
     assert all(lab.store.has(name) for _, name in manifest.objects())
 
 
@@ -86,9 +86,9 @@ def test_what_a_run_announces_is_kept_however_old_it_looks(lab: Lab) -> None:
     with store.at_work():
         store.announce(names)
         age(lab)
-        collected(lab)
+        collect_garbage(lab)
         assert all(store.has(name) for name in names)
-    collected(lab)
+    collect_garbage(lab)
     assert sum(store.has(name) for name in names) == 1  # three times two is two times three
 
 
@@ -127,7 +127,7 @@ def test_what_a_killed_collection_had_moved_aside_is_found_and_put_back(lab: Lab
         Path(store.object_path(name)).rename(store.aside(name))
     assert store.read(names[0]) and store.has(names[1])
     age(lab)
-    collected(lab)
+    collect_garbage(lab)
     assert all(Path(store.object_path(name)).exists() for name in names)
     assert repair.verify(store).clean
 
@@ -149,7 +149,7 @@ def test_nothing_is_removed_while_a_manifest_that_something_descends_from_is_dam
     assert failed.code == 4 and name[:12] in failed.err and "nothing was removed" in failed.err
     assert sorted(lab.store.root.glob("objects/*/*")) == [remaining for remaining in before if remaining != path]
     lab.run("scale data/r -o data/s")
-    assert collected(lab, "--grace-days 0")["objects"] > 0
+    assert collect_garbage(lab, "--grace-days 0")["objects"] > 0
 
 
 def test_nothing_is_removed_while_a_root_is_damaged(lab: Lab) -> None:
@@ -163,11 +163,11 @@ def test_nothing_is_removed_while_a_root_is_damaged(lab: Lab) -> None:
     assert failed.code == 4 and "1 roots" in failed.err
     assert counts(lab.run("scale data/r -o data/s --json").out) == (0, 4)
     assert lab.store.roots.get(lab.folder / "data/s") == {**(root or {}), "written_s": ANY}
-    assert collected(lab)["objects"] == 0
+    assert collect_garbage(lab)["objects"] == 0
 
 
 def test_a_recording_whose_record_was_damaged_is_kept_though_nothing_names_it(lab: Lab) -> None:
-    name = replaced_recording(lab)
+    name = replace_recording(lab)
     (record,) = (path for path in lab.store.root.glob("records/*/*") if name in path.read_text())
     record.write_text(record.read_text().replace("irreplaceable", "irreplaceablf"))
     for path in lab.store.root.glob("roots/*"):  # A root names the manifest that names the record.
@@ -175,10 +175,10 @@ def test_a_recording_whose_record_was_damaged_is_kept_though_nothing_names_it(la
     assert lab.call("store verify").code == 4 and not record.exists()
     for _ in range(3):
         age(lab)
-        collected(lab, "--grace-days 0")
+        collect_garbage(lab, "--grace-days 0")
     assert lab.store.has(name)
     for _ in range(2):  # the first drops the damaged record, the second what it named
-        collected(lab, "--grace-days 0 --recordings")
+        collect_garbage(lab, "--grace-days 0 --recordings")
     assert not lab.store.has(name)
 
 
@@ -190,9 +190,9 @@ def test_what_was_pushed_to_a_store_stays_until_it_is_forgotten(lab: Lab, monkey
     monkeypatch.setenv("TACPIPE_STORE", str(remote.root))
     for path in remote.root.rglob("*"):
         os.utime(path, (0, 0))
-    assert collected(lab, "--grace-days 0")["objects"] == 0
+    assert collect_garbage(lab, "--grace-days 0")["objects"] == 0
     assert lab.call("store gc --forget data/other").code == 2
-    assert collected(lab, "--grace-days 0 --forget data/s")["objects"] > 0
+    assert collect_garbage(lab, "--grace-days 0 --forget data/s")["objects"] > 0
 
 
 def test_a_project_that_was_moved_keeps_its_datasets(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -202,16 +202,16 @@ def test_a_project_that_was_moved_keeps_its_datasets(lab: Lab, monkeypatch: pyte
     moved = lab.folder.with_name(f"{lab.folder.name}-moved")
     lab.folder.rename(moved)
     monkeypatch.chdir(moved)
-    assert collected(lab, "--grace-days 0")["objects"] == 0
+    assert collect_garbage(lab, "--grace-days 0")["objects"] == 0
     assert counts(lab.run("scale data/r -o data/s --json").out) == (0, 4)
     lab.folder.mkdir()
 
 
 def test_recordings_that_nothing_names_are_kept_unless_asked_for(lab: Lab) -> None:
-    name = replaced_recording(lab)
+    name = replace_recording(lab)
     age(lab)
-    assert collected(lab)["kept_recordings"] == 1 and lab.store.has(name)
-    assert collected(lab, "--recordings")["objects"] >= 1 and not lab.store.has(name)
+    assert collect_garbage(lab)["kept_recordings"] == 1 and lab.store.has(name)
+    assert collect_garbage(lab, "--recordings")["objects"] >= 1 and not lab.store.has(name)
 
 
 def test_a_root_that_cannot_be_reached_counts_for_fourteen_days(lab: Lab) -> None:
@@ -219,15 +219,15 @@ def test_a_root_that_cannot_be_reached_counts_for_fourteen_days(lab: Lab) -> Non
     lab.run("scale data/r -o data/s")
     Path("data/s").rename("elsewhere")
     age(lab)
-    assert collected(lab)["objects"] == 0
+    assert collect_garbage(lab)["objects"] == 0
     root = lab.store.roots.get(lab.folder / "data/s")
     assert root is not None and "missing_since_s" in root
     root["missing_since_s"] -= 13 * 86400
     lab.store.roots.write(root)
-    assert collected(lab)["objects"] == 0
+    assert collect_garbage(lab)["objects"] == 0
     root["missing_since_s"] -= 2 * 86400
     lab.store.roots.write(root)
-    assert collected(lab)["objects"] > 0
+    assert collect_garbage(lab)["objects"] > 0
 
 
 def test_the_fourteen_days_begin_anew_when_a_path_was_reached_in_between(lab: Lab) -> None:
@@ -235,14 +235,14 @@ def test_the_fourteen_days_begin_anew_when_a_path_was_reached_in_between(lab: La
     lab.run("scale data/r -o data/s")
     Path("data/s").rename("elsewhere")
     age(lab)
-    collected(lab)
+    collect_garbage(lab)
     root = lab.store.roots.get(lab.folder / "data/s") or {}
     lab.store.roots.write({**root, "missing_since_s": root["missing_since_s"] - 20 * 86400})
     Path("elsewhere").rename("data/s")
-    collected(lab)
+    collect_garbage(lab)
     assert "missing_since_s" not in (lab.store.roots.get(lab.folder / "data/s") or {})
     Path("data/s").rename("elsewhere")
-    assert collected(lab)["objects"] == 0
+    assert collect_garbage(lab)["objects"] == 0
 
 
 def test_what_git_brought_back_to_a_path_is_live_though_the_root_names_another(lab: Lab) -> None:
@@ -252,7 +252,7 @@ def test_what_git_brought_back_to_a_path_is_live_though_the_root_names_another(l
     lab.run("scale data/r -o data/s --factor 3")
     Path("data/s/manifest.json").write_bytes(old)
     age(lab)
-    collected(lab)
+    collect_garbage(lab)
     assert tacpipe.open("data/s").to_numpy()["trial-001"].values[1].tolist() == [4]
     assert repair.verify(lab.store).clean
 
@@ -273,7 +273,7 @@ def test_whatever_happens_in_whatever_order_no_dataset_at_a_path_loses_anything(
             Path("data/t/manifest.json").unlink(missing_ok=True)
         elif verb == "gc":
             age(lab)
-            collected(lab, "--recordings --grace-days 0")
+            collect_garbage(lab, "--recordings --grace-days 0")
         for path in Path("data").glob("*/manifest.json"):
             for _, name in lab.manifest(str(path.parent)).objects():
                 lab.store.read(name)
@@ -284,7 +284,7 @@ def test_leases_of_killed_processes_are_swept_up_and_those_of_others_stay(lab: L
     leases = lab.store.root / "leases"
     (leases / f"{'ab' * 32}.lock").touch()
     with lab.store.leases.hold("cd" * 32):
-        collected(lab)
+        collect_garbage(lab)
         assert [path.name[:2] for path in leases.iterdir()] == ["cd"]
 
 

@@ -71,7 +71,7 @@ def cut(params: Params) -> None: ...
 STAGE: AnyStage = stage(version=3)(cut)
 
 
-def built(**options: Any) -> Params:
+def build_cut_params(**options: Any) -> Params:
     params = given_params.build("cut", STAGE, options=options)
     assert isinstance(params, Params)
     return params
@@ -83,22 +83,22 @@ def key(
     return digest(keys.identity(name, definition.version, params or Params(), inputs or {}))
 
 
-def typed(value: Any) -> Any:
+def with_types(value: Any) -> Any:
     """Return the value in a form in which two are equal only if they are of the same types throughout."""
     if isinstance(value, list | tuple):
-        return ["list", *map(typed, value)]
+        return ["list", *map(with_types, value)]
     if isinstance(value, dict):
         return [
             "mapping",
-            *sorted(([name, typed(inner)] for name, inner in value.items()), key=lambda pair: pair[0]),
+            *sorted(([name, with_types(inner)] for name, inner in value.items()), key=lambda pair: pair[0]),
         ]
     return [type(value).__name__, repr(value)]
 
 
-def reversed_throughout(value: Any) -> Any:
+def reverse_throughout(value: Any) -> Any:
     if isinstance(value, dict):
-        return {name: reversed_throughout(value[name]) for name in reversed(value)}
-    return [reversed_throughout(inner) for inner in value] if isinstance(value, list) else value
+        return {name: reverse_throughout(value[name]) for name in reversed(value)}
+    return [reverse_throughout(inner) for inner in value] if isinstance(value, list) else value
 
 
 # ---- values
@@ -106,7 +106,7 @@ def reversed_throughout(value: Any) -> Any:
 
 @given(values)
 def test_canonical_json_tells_the_value_back_so_no_two_values_share_a_digest(value: Any) -> None:
-    assert typed(json.loads(canonical(value))) == typed(value)
+    assert with_types(json.loads(canonical(value))) == with_types(value)
 
 
 @given(values, values)
@@ -123,7 +123,7 @@ def test_where_one_value_ends_and_the_next_begins_is_part_of_the_digest(first_va
         (first, second)
         for first in range(5)
         for second in range(first)
-        if typed(structures[first]) == typed(structures[second])
+        if with_types(structures[first]) == with_types(structures[second])
     }
     assert {
         (first, second) for first in range(5) for second in range(first) if digests[first] == digests[second]
@@ -132,7 +132,7 @@ def test_where_one_value_ends_and_the_next_begins_is_part_of_the_digest(first_va
 
 @given(values)
 def test_the_order_of_keys_does_not_count_however_deep_they_lie(value: Any) -> None:
-    assert canonical(reversed_throughout(value)) == canonical(value)
+    assert canonical(reverse_throughout(value)) == canonical(value)
 
 
 @pytest.mark.parametrize(
@@ -213,12 +213,16 @@ def test_a_list_that_goes_on_for_ever_or_is_too_deep_is_refused() -> None:
 def test_the_order_in_which_params_are_given_does_not_count(params: Params) -> None:
     options = {name: value for name, value in asdict(params).items() if value is not None}
     backwards = dict(reversed(options.items()))
-    assert key(built(**options)) == key(built(**backwards)) == key(built(**{**options, "frames": params.frames}))
+    assert (
+        key(build_cut_params(**options))
+        == key(build_cut_params(**backwards))
+        == key(build_cut_params(**{**options, "frames": params.frames}))
+    )
 
 
 @given(any_params, any_params)
 def test_two_sets_of_params_share_a_key_only_if_they_are_equal(first: Params, second: Params) -> None:
-    first_built, right = built(**asdict(first)), built(**asdict(second))
+    first_built, right = build_cut_params(**asdict(first)), build_cut_params(**asdict(second))
     assert (key(first_built) == key(right)) == (first_built == right)
 
 
@@ -228,60 +232,64 @@ def test_any_one_param_that_changes_changes_the_key(params: Params, data: st.Dat
     name = data.draw(st.sampled_from(list(asdict(params))))
     value = getattr(alternative, name)
     assume(value != getattr(params, name))
-    assert key(built(**asdict(replace(params, **{name: value})))) != key(built(**asdict(params)))
+    assert key(build_cut_params(**asdict(replace(params, **{name: value})))) != key(build_cut_params(**asdict(params)))
 
 
 @given(any_params)
 def test_params_come_back_from_a_key_and_give_it_again(params: Params) -> None:
-    before = built(**asdict(params))
+    before = build_cut_params(**asdict(params))
     after = params_of.from_json(STAGE, json.loads(canonical(params_of.to_json(before))))
     assert after == before and key(after) == key(before)
 
 
 @given(st.integers(-(10**15), 10**15))
 def test_a_whole_number_given_for_a_number_gives_the_same_key_from_wherever_it_comes(number: int) -> None:
-    expected = key(built(rate_hz=float(number), gains=[float(number)], cutoff_hz=float(number)))
-    assert key(built(rate_hz=number, gains=[number], cutoff_hz=number)) == expected
+    expected = key(build_cut_params(rate_hz=float(number), gains=[float(number)], cutoff_hz=float(number)))
+    assert key(build_cut_params(rate_hz=number, gains=[number], cutoff_hz=number)) == expected
     sets = [f"rate_hz={number}", f"gains=[{number}.0]", f"cutoff_hz={number}"]
     assert key(given_params.build("cut", STAGE, sets=sets)) == expected
 
 
 @pytest.mark.parametrize("text", ["2e-2", "0.02", "+2.0E-2", ".2e-1"])
 def test_a_number_with_an_exponent_is_a_number_as_everywhere_but_in_yaml(text: str) -> None:
-    assert key(given_params.build("cut", STAGE, sets=[f"rate_hz={text}"])) == key(built(rate_hz=0.02))
+    assert key(given_params.build("cut", STAGE, sets=[f"rate_hz={text}"])) == key(build_cut_params(rate_hz=0.02))
 
 
 def test_minus_zero_is_zero() -> None:
-    assert key(built(rate_hz=-0.0, gains=[-0.0], cutoff_hz=-0.0)) == key(built(rate_hz=0, gains=[0], cutoff_hz=0.0))
-    assert str(built(rate_hz=-0.0).rate_hz) == "0.0"  # No stage divides by a sign that its key does not hold.
+    assert key(build_cut_params(rate_hz=-0.0, gains=[-0.0], cutoff_hz=-0.0)) == key(
+        build_cut_params(rate_hz=0, gains=[0], cutoff_hz=0.0)
+    )
+    assert (
+        str(build_cut_params(rate_hz=-0.0).rate_hz) == "0.0"
+    )  # No stage divides by a sign that its key does not hold.
 
 
 @pytest.mark.parametrize("value", [True, 1.0])
 def test_a_choice_among_whole_numbers_is_that_number_and_nothing_that_equals_it(value: object) -> None:
     with pytest.raises(UsageError, match=r"order is .*; it must be one of 1, 2"):
-        built(order=value)
+        build_cut_params(order=value)
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf"), pytest.param(1 << 20_000, id="huge")])
 @pytest.mark.parametrize("name", ["rate_hz", "cutoff_hz", "gains"])
 def test_a_number_that_is_none_is_refused_with_the_name_of_its_param(name: str, value: float) -> None:
     with pytest.raises(UsageError, match=name.replace("_", "-")) as caught:
-        built(**{name: [1.0, value] if name == "gains" else value})
+        build_cut_params(**{name: [1.0, value] if name == "gains" else value})
     assert caught.value.exit_code == 2 and len(str(caught.value)) < 500
 
 
 def test_text_that_is_no_unicode_is_refused_with_the_name_of_its_param() -> None:
     with pytest.raises(UsageError, match="note"):  # A terminal gives this for bytes that are no UTF-8.
-        built(note="caf\udce9")
+        build_cut_params(note="caf\udce9")
 
 
 def test_composed_and_decomposed_text_are_two_values_of_a_param() -> None:
-    assert key(built(note="caf\u00e9")) != key(built(note="cafe\u0301"))
+    assert key(build_cut_params(note="caf\u00e9")) != key(build_cut_params(note="cafe\u0301"))
 
 
 @pytest.mark.parametrize("value", [np.float64(25.0), np.float64(-0.0)])
 def test_a_number_of_numpy_gives_the_key_of_the_number(value: np.float64) -> None:
-    assert key(built(rate_hz=value)) == key(built(rate_hz=float(value)))
+    assert key(build_cut_params(rate_hz=value)) == key(build_cut_params(rate_hz=float(value)))
 
 
 # ---- identities
@@ -298,7 +306,7 @@ def test_a_recordings_key_rests_on_its_streams_and_on_the_attributes_that_are_de
         {name: values_by_name[name] for name in reads if name in values_by_name}
         for values_by_name in (entry["attributes"], changed)
     ]
-    assert (digest(before) == digest(after)) == (typed(declared[0]) == typed(declared[1]))
+    assert (digest(before) == digest(after)) == (with_types(declared[0]) == with_types(declared[1]))
 
 
 @given(entries, entries)
@@ -316,19 +324,21 @@ def test_streams_their_names_and_their_digests_count_and_rows_and_bytes_do_not(
 def test_a_key_over_a_dataset_rests_on_names_attributes_and_streams_in_any_order(
     first: dict[str, Any], second: dict[str, Any]
 ) -> None:
-    def described(dataset_entries: dict[str, Any], reads: tuple[str, ...] | None = None) -> str:
+    def dataset_digest(dataset_entries: dict[str, Any], reads: tuple[str, ...] | None = None) -> str:
         return digest(keys.of_dataset(Manifest("scale", 1, recordings=dataset_entries), reads, dataset_entries))
 
-    def content(dataset_entries: dict[str, Any]) -> Any:
+    def dataset_content(dataset_entries: dict[str, Any]) -> Any:
         return {
             name: [entry["attributes"], {stream: shard["digest"] for stream, shard in entry["shards"].items()}]
             for name, entry in dataset_entries.items()
         }
 
-    assert described(dict(reversed(first.items()))) == described(first)
-    assert (described(first) == described(second)) == (typed(content(first)) == typed(content(second)))
+    assert dataset_digest(dict(reversed(first.items()))) == dataset_digest(first)
+    assert (dataset_digest(first) == dataset_digest(second)) == (
+        with_types(dataset_content(first)) == with_types(dataset_content(second))
+    )
     bare = {name: {**entry, "attributes": {}} for name, entry in first.items()}
-    assert described(first, ()) == described(bare, ())
+    assert dataset_digest(first, ()) == dataset_digest(bare, ())
 
 
 def test_stage_version_params_and_inputs_each_change_the_key() -> None:
@@ -337,7 +347,7 @@ def test_stage_version_params_and_inputs_each_change_the_key() -> None:
         key(),
         key(name="cut.fit"),
         key(definition=later),
-        key(built(frames=401)),
+        key(build_cut_params(frames=401)),
         key(inputs={"recording": {}}),
         key(inputs={"other": {}}),
         key(inputs={"recording": {"shards": {}}}),
@@ -413,7 +423,7 @@ def test_keys_and_digests_are_those_of_the_identities_as_the_format_tells_them(l
 
 def test_a_key_is_to_the_digit_what_it_was() -> None:
     inputs = {"recording": keys.of_recording({"attributes": {"a": 1.5}, "shards": {"": {"digest": "ab"}}}, None)}
-    params = built(rate_hz=100, note="caf\u00e9", gains=[1, 0.1])
+    params = build_cut_params(rate_hz=100, note="caf\u00e9", gains=[1, 0.1])
     assert (
         key(params, inputs)
         == SHA(

@@ -72,7 +72,7 @@ def made_project(lab: Lab) -> Lab:
     return lab
 
 
-def refused(ran: Ran, *words: str) -> None:
+def check_refusal(ran: Ran, *words: str) -> None:
     assert ran.code == 2 and ran.err.startswith("tacpipe: ") and ran.err.count("\n") == 1, ran
     assert all(word in ran.err for word in words), ran.err
 
@@ -96,7 +96,7 @@ def test_a_folder_that_is_not_a_store_is_refused_by_every_command_and_stays_as_i
     monkeypatch.setenv("TACPIPE_STORE", str(theirs))
     for command in EVERY:
         ran = made_project.call(command)
-        refused(ran, str(theirs), "is not a store of tacpipe", "no file format", "TACPIPE_STORE")
+        check_refusal(ran, str(theirs), "is not a store of tacpipe", "no file format", "TACPIPE_STORE")
         assert (tree(theirs), tree(made_project.folder / "data")) == before, command
 
 
@@ -165,7 +165,7 @@ def test_a_store_of_another_format_is_refused_by_every_command(made_project: Lab
     (made_project.store.root / "format").write_text(mark)
     before = tree(made_project.folder)
     for command in EVERY:
-        refused(made_project.call(command), "has format", "reads format 1")
+        check_refusal(made_project.call(command), "has format", "reads format 1")
         assert tree(made_project.folder) == before, command
 
 
@@ -183,7 +183,7 @@ def test_a_folder_of_a_store_that_is_a_link_is_refused_by_every_command(
     folder.symlink_to(theirs)
     before = tree(theirs), tree(made_project.folder)
     for command in EVERY:
-        refused(made_project.call(command), str(folder), "is a symbolic link")
+        check_refusal(made_project.call(command), str(folder), "is a symbolic link")
         assert (tree(theirs), tree(made_project.folder)) == before, command
 
 
@@ -202,7 +202,7 @@ def test_a_store_that_is_itself_a_link_to_another_disk_works(
     made_project.store.root.unlink()
     made_project.store.root.symlink_to(disk.parent / "fresh")
     for command in (*READ, "simulate toy -o data/new"):
-        refused(made_project.call(command), "which is not there", "Mount its disk")
+        check_refusal(made_project.call(command), "which is not there", "Mount its disk")
     (disk.parent / "fresh").mkdir()
     made_project.run("simulate toy -o data/new")
     assert (disk.parent / "fresh" / "format").exists()

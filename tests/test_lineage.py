@@ -7,7 +7,7 @@ from tacpipe.store.store import Store
 from tests.conftest import Lab, write_source
 
 
-def explained(lab: Lab, path: str) -> dict[str, object]:
+def explain(lab: Lab, path: str) -> dict[str, object]:
     value: dict[str, object] = lab.run_json(f"explain {path}")
     return value
 
@@ -33,21 +33,21 @@ def test_the_part_of_the_key_that_changed_is_named(lab: Lab) -> None:
     write_source("src", a="1 2 3", b="1 2 3")
     lab.run("ingest numbers src -o data/r")
     lab.run("scale data/r -o data/s")
-    assert explained(lab, "data/s")["changes"] is None
+    assert explain(lab, "data/s")["changes"] is None
     lab.run("scale data/r -o data/s --factor 3")
-    assert explained(lab, "data/s")["changes"] == ["params.factor: 2 became 3"]
+    assert explain(lab, "data/s")["changes"] == ["params.factor: 2 became 3"]
     write_source("src", a="9", c="7")
     lab.run("ingest numbers src -o data/r --replace")
-    assert explained(lab, "data/r")["changes"] == ["sources: 1 new (c)", "sources: 1 other (a)"]
+    assert explain(lab, "data/r")["changes"] == ["sources: 1 new (c)", "sources: 1 other (a)"]
     lab.run("scale data/r -o data/s --factor 3")
-    assert explained(lab, "data/s")["changes"] == [
+    assert explain(lab, "data/s")["changes"] == [
         "inputs.datasets.shards: 1 new (c)",
         "inputs.datasets.shards: 1 other (a)",
     ]
     lab.run("label data/r b --set material=foam")
-    assert explained(lab, "data/r")["changes"] == ["labels: 1 new (b)"]
+    assert explain(lab, "data/r")["changes"] == ["labels: 1 new (b)"]
     lab.run("scale data/r -o data/s --factor 3")
-    assert explained(lab, "data/s")["changes"] == ["inputs.datasets.attributes: 1 other (b)"]
+    assert explain(lab, "data/s")["changes"] == ["inputs.datasets.attributes: 1 other (b)"]
 
 
 def test_a_dataset_that_came_without_its_ancestors_is_explained_as_far_as_it_goes(lab: Lab) -> None:
@@ -66,20 +66,20 @@ def test_explain_reads_the_record_of_the_dataset_and_not_those_of_its_recordings
     lab.run("scale data/r -o data/s --jobs 1")
     honest, read = Store.read_record, list[str]()
 
-    def counted(store: Store, key: str) -> Any:
+    def count_read(store: Store, key: str) -> Any:
         read.append(key)
         return honest(store, key)
 
-    monkeypatch.setattr(Store, "read_record", counted)
+    monkeypatch.setattr(Store, "read_record", count_read)
     for dataset in ("data/r", "data/s"):
         read.clear()
-        assert explained(lab, dataset)["provenance"] is not None
+        assert explain(lab, dataset)["provenance"] is not None
         assert len(read) == 1 < len(list(lab.store.root.glob("records/*/*"))) / 30
 
 
 def test_a_record_that_was_written_at_another_time_than_its_root_is_found_all_the_same(lab: Lab) -> None:
     lab.run("simulate toy --trials 3 --rows 3 -o data/r --jobs 1")
-    provenance = explained(lab, "data/r")["provenance"]
+    provenance = explain(lab, "data/r")["provenance"]
     for number, path in enumerate(sorted(lab.store.root.glob("records/*/*"))):
         os.utime(path, (10**9 + number, 10**9 + number))
-    assert provenance is not None and explained(lab, "data/r")["provenance"] == provenance
+    assert provenance is not None and explain(lab, "data/r")["provenance"] == provenance

@@ -41,7 +41,7 @@ def test_arrays_of_all_shapes_and_types_come_back_also_after_they_were_let_go_of
     assert (filled == 3).all()
 
 
-def resident() -> int:
+def resident_bytes() -> int:
     """Return how many bytes of this process are in memory."""
     match = re.search(r"VmRSS:\s+(\d+)", Path("/proc/self/status").read_text())
     assert match
@@ -51,11 +51,11 @@ def resident() -> int:
 def test_what_was_read_takes_no_memory_once_it_is_let_go_of() -> None:
     mapped_arrays, size = MappedArrays(0), 200 << 20
     array = mapped_arrays.empty((size // 8,), np.float64)
-    before = resident()
+    before = resident_bytes()
     array[:] = 1.0
-    assert resident() > before + size // 2
+    assert resident_bytes() > before + size // 2
     mapped_arrays.read(mapped.MOST_READ + 1)
-    assert resident() < before + size // 8
+    assert resident_bytes() < before + size // 8
     assert array.sum() == len(array)
 
 

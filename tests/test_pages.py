@@ -82,7 +82,7 @@ def few_are_many(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @contextmanager
-def divided(grouped: int) -> Iterator[None]:
+def divide_into_pages(grouped: int) -> Iterator[None]:
     """All datasets of two recordings and more have pages, with ``grouped`` recordings in the mean."""
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(pages, "INLINE", 1)
@@ -109,7 +109,7 @@ def test_a_dataset_of_a_thousand_recordings_has_the_manifest_that_it_always_had(
 
 @given(MANY, st.integers(1, 5))
 def test_a_manifest_that_lists_pages_holds_what_it_was_made_of(items: dict[str, Item], grouped: int) -> None:
-    with divided(grouped):
+    with divide_into_pages(grouped):
         full_manifest = of_items(items)
         parsed, _ = read_again(full_manifest)
 
@@ -137,7 +137,7 @@ def test_a_manifest_that_lists_pages_holds_what_it_was_made_of(items: dict[str, 
 def test_recordings_that_come_change_or_go_give_the_pages_of_a_dataset_made_at_once(
     items: dict[str, Item], data: st.DataObject, grouped: int
 ) -> None:
-    with divided(grouped):
+    with divide_into_pages(grouped):
         parsed, _ = read_again(of_items(items))
         changes = data.draw(st.dictionaries(st.sampled_from(sorted(items)) | NAMES, st.none() | ITEMS, max_size=5))
         expected = {name: item for name, item in {**items, **changes}.items() if item is not None}
@@ -149,7 +149,7 @@ def test_recordings_that_come_change_or_go_give_the_pages_of_a_dataset_made_at_o
 
 @given(MANY, st.integers(1, 5))
 def test_a_key_over_a_dataset_in_pages_is_that_of_its_recordings(items: dict[str, Item], grouped: int) -> None:
-    with divided(grouped):
+    with divide_into_pages(grouped):
         parsed, _ = read_again(of_items(items))
         value = keys.of_dataset(parsed, None, parsed.included)
     plain = {name: keys.of_recording(item.entry, None) for name, item in sorted(items.items())}

@@ -28,7 +28,7 @@ def cut(params: Params) -> None: ...
 STAGE: AnyStage = stage(version=1)(cut)
 
 
-def built(**inputs: object) -> Params:
+def build_cut_params(**inputs: object) -> Params:
     params = given_params.build("cut", STAGE, **inputs)  # type: ignore[arg-type]
     assert isinstance(params, Params)
     return params
@@ -42,17 +42,17 @@ def file(tmp_path: Path) -> Path:
 
 
 def test_each_place_goes_over_the_one_before(file: Path) -> None:
-    assert built().frames == 400
-    assert built(file=file).frames == 7
-    assert built(file=file, preset="quick").frames == 10
-    assert built(file=file, preset="quick", sets=["frames=11"]).frames == 11
-    assert built(file=file, preset="quick", sets=["cut.frames=11"], options={"frames": 12}).frames == 12
-    assert built(file=file, block="forward.cut").frames == 9
-    assert built(file=file, block="forward.cut").rate_hz == 50.0
+    assert build_cut_params().frames == 400
+    assert build_cut_params(file=file).frames == 7
+    assert build_cut_params(file=file, preset="quick").frames == 10
+    assert build_cut_params(file=file, preset="quick", sets=["frames=11"]).frames == 11
+    assert build_cut_params(file=file, preset="quick", sets=["cut.frames=11"], options={"frames": 12}).frames == 12
+    assert build_cut_params(file=file, block="forward.cut").frames == 9
+    assert build_cut_params(file=file, block="forward.cut").rate_hz == 50.0
 
 
 def test_a_whole_number_is_a_number_and_keys_do_not_tell_them_apart(file: Path) -> None:
-    rate = built(file=file).rate_hz
+    rate = build_cut_params(file=file).rate_hz
     assert rate == 100.0 and isinstance(rate, float)
 
 
@@ -74,26 +74,26 @@ def test_what_is_wrong_in_a_params_file_is_one_sentence_that_names_it(tmp_path: 
     path = tmp_path / "params.yaml"
     path.write_text(text)
     with pytest.raises(UsageError, match=sentence) as caught:
-        built(file=path)
+        build_cut_params(file=path)
     assert "params.yaml" in str(caught.value)
 
 
 def test_a_block_that_is_asked_for_must_be_there(file: Path) -> None:
     with pytest.raises(UsageError, match=r"no block forward\.slice"):
-        built(file=file, block="forward.slice")
+        build_cut_params(file=file, block="forward.slice")
     with pytest.raises(UsageError, match="no file"):
-        built(file=file.with_name("other.yaml"))
+        build_cut_params(file=file.with_name("other.yaml"))
 
 
 def test_an_unknown_preset_or_set_is_refused() -> None:
     with pytest.raises(UsageError, match="no preset huge"):
-        built(preset="huge")
+        build_cut_params(preset="huge")
     with pytest.raises(UsageError, match="--set frame=1"):
-        built(sets=["frame=1"])
+        build_cut_params(sets=["frame=1"])
 
 
 def test_params_come_back_from_what_stands_in_a_key() -> None:
-    params = built(sets=["sensors=[2]", "note=wet"])
+    params = build_cut_params(sets=["sensors=[2]", "note=wet"])
     assert params_of.from_json(STAGE, params_of.to_json(params)) == params
     assert params_of.to_json(params)["sensors"] == [2]
 
@@ -169,7 +169,7 @@ def grow(params: Sized) -> None: ...
 GROW: AnyStage = stage(version=1)(grow)
 
 
-def grown(**inputs: object) -> Any:
+def build_grow_params(**inputs: object) -> Any:
     return given_params.build("grow", GROW, **inputs)  # type: ignore[arg-type]
 
 
@@ -189,21 +189,21 @@ def grown(**inputs: object) -> Any:
     ],
 )
 def test_the_tag_chooses_the_kind_of_params(inputs: dict[str, Any], expected: Sized) -> None:
-    assert grown(**inputs) == expected
+    assert build_grow_params(**inputs) == expected
     assert params_of.from_json(GROW, params_of.to_json(expected)) == expected
 
 
 def test_a_file_chooses_a_kind_and_a_preset_or_an_option_another(tmp_path: Path) -> None:
     path = tmp_path / "params.yaml"
     path.write_text("grow: {size: large, seed: 3}\nodd: {size: tiny, cells: 2}\n")
-    assert grown(file=path) == Large(seed=3)
-    assert grown(file=path, preset="quick") == Large(seed=3, layers=1)
-    assert grown(file=path, options={"size": "small"}) == Small(seed=3)
-    assert grown(file=path, block="odd", preset="quick") == Small("tiny", cells=1)
+    assert build_grow_params(file=path) == Large(seed=3)
+    assert build_grow_params(file=path, preset="quick") == Large(seed=3, layers=1)
+    assert build_grow_params(file=path, options={"size": "small"}) == Small(seed=3)
+    assert build_grow_params(file=path, block="odd", preset="quick") == Small("tiny", cells=1)
     with pytest.raises(
         UsageError, match=r"block odd: cells belongs to the size small or tiny, and the size is large\."
     ):
-        grown(file=path, block="odd", preset="paper")
+        build_grow_params(file=path, block="odd", preset="paper")
 
 
 @pytest.mark.parametrize(
@@ -238,7 +238,7 @@ def test_a_file_chooses_a_kind_and_a_preset_or_an_option_another(tmp_path: Path)
 )
 def test_what_does_not_belong_to_the_kind_is_refused_with_whose_it_is(inputs: dict[str, Any], sentence: str) -> None:
     with pytest.raises(UsageError, match=sentence):
-        grown(**inputs)
+        build_grow_params(**inputs)
 
 
 def test_help_of_a_field_stands_behind_it_or_above_it_and_is_joined_over_kinds() -> None:
@@ -257,4 +257,4 @@ def test_params_that_count_are_those_of_the_kind_and_all_where_it_is_unknown() -
 def test_a_preset_with_a_param_that_there_is_none_of_is_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Small, "PRESETS", {"odd": {"width": 1}})
     with pytest.raises(UsageError, match=r"^preset odd of grow: there is no param width; there are size, seed"):
-        grown(preset="odd")
+        build_grow_params(preset="odd")

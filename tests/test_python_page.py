@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import tacpipe
-from tests.test_docs import PYTHON, ROOT, fenced, printed, section
+from tests.test_docs import PYTHON, ROOT, fenced_blocks, printed_commands, section
 
 FIRST_COMMANDS = "From data to a report"  # section of the README
 CHECKS = """
@@ -45,11 +45,11 @@ assert report.name == "report.html" and report.read_text().startswith("<!doctype
 @pytest.mark.long
 def test_the_python_of_the_page_runs_as_printed_and_predicts_what_the_command_writes(tmp_path: Path) -> None:
     (tmp_path / ".tacpipe").mkdir()
-    (block, *_) = (block for block in fenced(section((ROOT / "README.md").read_text(), FIRST_COMMANDS)))
-    commands = [command.removeprefix("tacpipe ") for command, _ in printed(block.text)]
+    (block, *_) = (block for block in fenced_blocks(section((ROOT / "README.md").read_text(), FIRST_COMMANDS)))
+    commands = [command.removeprefix("tacpipe ") for command, _ in printed_commands(block.text)]
     for command in [*commands, "predict models/forward data/synced -o data/predicted"]:
         process = tacpipe(tmp_path, command, OMP_NUM_THREADS="1")
         assert process.returncode == 0, f"{command}: {process.stderr}"
-    code = "\n".join([*(block.text for block in fenced(PYTHON.read_text()) if not block.mark), CHECKS])
+    code = "\n".join([*(block.text for block in fenced_blocks(PYTHON.read_text()) if not block.mark), CHECKS])
     ran = subprocess.run([sys.executable, "-W", "error", "-c", code], cwd=tmp_path, capture_output=True, text=True)
     assert ran.returncode == 0, ran.stderr

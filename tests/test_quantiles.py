@@ -15,7 +15,7 @@ from tacpipe.models.residual_quantiles import ResidualQuantiles
 LEVELS = np.array([0.1, 0.5, 0.9])
 
 
-def drawn(windows: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def draw_errors(windows: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Return a feature (window, channel, 1) and errors (window, channel, step) whose spread it sets, known by formula."""
     rng = np.random.default_rng(seed)
     feature = rng.uniform(-1, 1, (windows, 2, 1)).astype(np.float32)
@@ -26,7 +26,7 @@ def drawn(windows: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def true_quantiles(feature: np.ndarray) -> np.ndarray:
-    """Return the quantiles (window, channel, step, level) of what `drawn` draws."""
+    """Return the quantiles (window, channel, step, level) of what `draw_errors` draws."""
     base = 0.3 * feature[..., None] + np.exp(feature)[..., None] * norm.ppf(LEVELS)
     true: np.ndarray = base * np.array([[1.0, 3.0], [10.0, 30.0]])[None, :, :, None]
     return true
@@ -64,8 +64,8 @@ def test_sums_of_two_parts_are_those_of_the_whole() -> None:
 
 
 def test_fitted_quantiles_are_near_those_of_the_distribution_that_errors_are_drawn_from() -> None:
-    fitted = ResidualQuantiles.fit(*drawn(8000, 0), LEVELS)
-    feature, errors = drawn(2000, 1)
+    fitted = ResidualQuantiles.fit(*draw_errors(8000, 0), LEVELS)
+    feature, errors = draw_errors(2000, 1)
     predicted, expected = fitted.predict(feature), true_quantiles(feature)
     spread = np.exp(feature)[..., None] * np.array([[1.0, 3.0], [10.0, 30.0]])[None, :, :, None]
     assert np.abs((predicted - expected) / spread).mean() < 0.1
@@ -74,8 +74,8 @@ def test_fitted_quantiles_are_near_those_of_the_distribution_that_errors_are_dra
 
 
 def test_fitted_quantiles_lose_no_more_than_linear_quantile_regression() -> None:
-    feature, errors = drawn(2000, 0)
-    fitted = ResidualQuantiles.fit(*drawn(8000, 2), LEVELS).predict(feature)
+    feature, errors = draw_errors(2000, 0)
+    fitted = ResidualQuantiles.fit(*draw_errors(8000, 2), LEVELS).predict(feature)
     for at, level in enumerate(LEVELS):
         x, y = feature[:, 0], errors[:, 0, 0]
         linear = QuantileRegressor(quantile=level, alpha=0, solver="highs").fit(x, y).predict(x)
@@ -84,7 +84,7 @@ def test_fitted_quantiles_lose_no_more_than_linear_quantile_regression() -> None
 
 
 def test_quantiles_never_cross_and_are_the_same_after_storage() -> None:
-    fitted = ResidualQuantiles.fit(*drawn(300, 0), np.array([0.05, 0.25, 0.5, 0.75, 0.95]), passes=50)
+    fitted = ResidualQuantiles.fit(*draw_errors(300, 0), np.array([0.05, 0.25, 0.5, 0.75, 0.95]), passes=50)
     far = np.linspace(-100, 100, 50, dtype=np.float32).reshape(25, 2, 1)
     predicted = fitted.predict(far)
     assert (np.diff(predicted, axis=-1) >= 0).all()
@@ -93,13 +93,13 @@ def test_quantiles_never_cross_and_are_the_same_after_storage() -> None:
 
 
 def test_the_same_seed_fits_the_same_quantiles() -> None:
-    first, second = (ResidualQuantiles.fit(*drawn(200, 0), LEVELS, seed=3, passes=20) for _ in range(2))
+    first, second = (ResidualQuantiles.fit(*draw_errors(200, 0), LEVELS, seed=3, passes=20) for _ in range(2))
     assert all((a == b).all() for a, b in zip(first.weights, second.weights, strict=True))
 
 
 def test_too_few_values_are_refused() -> None:
     with pytest.raises(TacpipeError, match="too few"):
-        ResidualQuantiles.fit(*drawn(10, 0), LEVELS)
+        ResidualQuantiles.fit(*draw_errors(10, 0), LEVELS)
 
 
 @pytest.mark.parametrize("percents", [(10, 90), (10, 50, 80), (50,), (90, 50, 10), (0, 50, 100)])

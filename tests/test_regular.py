@@ -7,7 +7,7 @@ import pytest
 
 from tacpipe.errors import StorageError
 from tacpipe.io import memory, regular
-from tests.promises.limits import GIB, bounded, is_sentence
+from tests.promises.limits import GIB, bound_memory, is_sentence
 
 TERA = 3 * 10**12
 
@@ -43,7 +43,7 @@ IRREGULAR: dict[str, Callable[[Path], None]] = {
 def test_what_is_not_a_regular_file_is_refused_and_not_waited_for(tmp_path: Path, kind: str, follow: bool) -> None:
     IRREGULAR[kind](tmp_path / "file")
     for read in (regular.content, regular.opened):
-        with bounded(GIB), pytest.raises(regular.IrregularError) as error:
+        with bound_memory(GIB), pytest.raises(regular.IrregularError) as error:
             read(tmp_path / "file", follow=follow)
         assert is_sentence(str(error.value))
 
@@ -93,11 +93,11 @@ def test_a_file_that_grows_while_it_is_read_is_read_to_its_end_or_its_limit(
 
 def test_a_file_of_three_terabytes_is_refused_before_it_is_read(tmp_path: Path) -> None:
     sparse(tmp_path / "file")
-    with bounded(GIB), pytest.raises(StorageError, match=r"3,000\.0 GB"):
+    with bound_memory(GIB), pytest.raises(StorageError, match=r"3,000\.0 GB"):
         regular.content(tmp_path / "file")
-    with bounded(GIB), pytest.raises(regular.IrregularError, match="3,000,000,000,000 bytes"):
+    with bound_memory(GIB), pytest.raises(regular.IrregularError, match="3,000,000,000,000 bytes"):
         regular.content(tmp_path / "file", 10**6)
-    with bounded(GIB), pytest.raises(regular.IrregularError, match="3,000,000,000,000 bytes"):
+    with bound_memory(GIB), pytest.raises(regular.IrregularError, match="3,000,000,000,000 bytes"):
         next(regular.blocks(tmp_path / "file", 10**6))
 
 

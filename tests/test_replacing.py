@@ -14,21 +14,21 @@ from tests.test_garbage import age
 from tests.test_pipeline import counts
 
 
-def content(folder: str) -> dict[str, bytes]:
+def folder_content(folder: str) -> dict[str, bytes]:
     return {str(path): path.read_bytes() for path in sorted(Path(folder).rglob("*")) if path.is_file()}
 
 
-def refused(lab: Lab, command: str, dataset: str, *words: str) -> None:
+def check_refusal(lab: Lab, command: str, dataset: str, *words: str) -> None:
     """Check that a command is refused with exit code 2 and these words, and leaves a dataset as it was."""
-    before = content(dataset)
+    before = folder_content(dataset)
     for option in ("", " --check"):
         ran = lab.call(command + option)
         assert ran.code == 2 and ran.err.startswith("tacpipe: ") and ran.err.count("\n") == 1, ran
         assert all(word in ran.err for word in words), ran.err
-        assert content(dataset) == before
+        assert folder_content(dataset) == before
 
 
-def listed(lab: Lab) -> list[dict[str, object]]:
+def list_manifests(lab: Lab) -> list[dict[str, object]]:
     manifests: list[dict[str, object]] = lab.run_json("store list")["manifests"]
     return manifests
 
@@ -41,9 +41,9 @@ def test_an_output_that_is_the_input_is_refused_with_and_without_replace(lab: La
     write_source("src", a="1 2", b="3 4")
     lab.run("ingest numbers src -o data/r")
     Path("linked").symlink_to("data/r")
-    refused(lab, f"scale data/r -o {spelling}", "data/r", "is an input of this command")
-    refused(lab, f"scale data/r -o {spelling} --replace", "data/r", "is an input of this command")
-    refused(lab, f"scale data/r/manifest.json -o {spelling}", "data/r", "is an input of this command")
+    check_refusal(lab, f"scale data/r -o {spelling}", "data/r", "is an input of this command")
+    check_refusal(lab, f"scale data/r -o {spelling} --replace", "data/r", "is an input of this command")
+    check_refusal(lab, f"scale data/r/manifest.json -o {spelling}", "data/r", "is an input of this command")
 
 
 def test_split_codec_and_source_count_as_inputs_too(lab: Lab) -> None:
@@ -51,10 +51,10 @@ def test_split_codec_and_source_count_as_inputs_too(lab: Lab) -> None:
     lab.run("scale data/r -o data/s --factor 1")
     lab.run("halves data/s -o data/split")
     lab.run("centre data/s --split data/split -o data/c")
-    refused(lab, "centre data/s --split data/split -o data/split --replace", "data/split", "is an input")
-    refused(lab, "centre data/s --split data/split --codec data/c -o data/c --replace", "data/c", "is an input")
+    check_refusal(lab, "centre data/s --split data/split -o data/split --replace", "data/split", "is an input")
+    check_refusal(lab, "centre data/s --split data/split --codec data/c -o data/c --replace", "data/c", "is an input")
     write_source("src", a="1")
-    refused(lab, "ingest numbers src -o src --replace", "src", "is an input")
+    check_refusal(lab, "ingest numbers src -o src --replace", "src", "is an input")
 
 
 # ---- another stage's dataset
@@ -64,24 +64,24 @@ def test_a_dataset_of_another_stage_needs_replace_and_can_be_had_back_with_its_l
     write_source("src", a="1 2", b="3 4")
     lab.run("ingest numbers src -o data/r")
     lab.run("label data/r a --set material=cork --exclude dropped")
-    before = content("data/r")
-    refused(
+    before = folder_content("data/r")
+    check_refusal(
         lab, "simulate toy -o data/r", "data/r", "2 recordings written by ingest.numbers", "by hand on 1", "--replace"
     )
     lab.run("simulate toy -o data/r --replace")
     assert sorted(lab.manifest("data/r").recordings) == ["trial-000", "trial-001", "trial-002", "trial-003"]
     assert not Path("data/r/a").exists()
-    (old,) = [entry for entry in listed(lab) if entry["stage"] == "ingest.numbers" and entry["labelled"]]
+    (old,) = [entry for entry in list_manifests(lab) if entry["stage"] == "ingest.numbers" and entry["labelled"]]
     assert (old["recordings"], old["state"], old["path"]) == (2, "replaced", str(lab.folder / "data/r"))
     shutil.rmtree("src")
     lab.run(f"store checkout {str(old['manifest'])[:12]} -o data/back")
-    assert {name.replace("data/back", "data/r"): value for name, value in content("data/back").items()} == before
+    assert {name.replace("data/back", "data/r"): value for name, value in folder_content("data/back").items()} == before
 
 
 def test_a_derived_dataset_of_another_stage_needs_replace_too(lab: Lab) -> None:
     lab.run("simulate toy -o data/r")
     lab.run("scale data/r -o data/s")
-    refused(lab, "named data/r -o data/s", "data/s", "4 recordings written by scale", "named would replace it")
+    check_refusal(lab, "named data/r -o data/s", "data/s", "4 recordings written by scale", "named would replace it")
     lab.run("named data/r -o data/s --replace")
     assert lab.manifest("data/s").stage == "named"
 
@@ -109,8 +109,8 @@ def test_a_rerun_of_what_is_shown_is_never_refused(lab: Lab) -> None:
 
 def test_an_output_within_a_dataset_or_around_one_is_refused(lab: Lab) -> None:
     lab.run("simulate toy -o data/r")
-    refused(lab, "scale data/r -o data/r/scaled", "data", "lies within the dataset")
-    refused(lab, "scale data/r -o data", "data", "holds the dataset")
+    check_refusal(lab, "scale data/r -o data/r/scaled", "data", "lies within the dataset")
+    check_refusal(lab, "scale data/r -o data", "data", "holds the dataset")
 
 
 def test_a_page_does_not_replace_a_file_that_tacpipe_did_not_write(lab: Lab, tmp_path: Path) -> None:
@@ -181,7 +181,7 @@ def test_a_name_that_exists_with_other_content_is_refused(lab: Lab) -> None:
     write_source("src", a="1 2", b="3 4")
     lab.run("ingest numbers src -o data/r")
     write_source("src", b="9")
-    refused(lab, "ingest numbers src -o data/r", "data/r", "of the same name", "other files: b.", "--replace")
+    check_refusal(lab, "ingest numbers src -o data/r", "data/r", "of the same name", "other files: b.", "--replace")
     lab.run("ingest numbers src -o data/r --replace")
     assert tacpipe.open("data/r").table("left")["x"].to_pylist() == [1, 2, 9]
 
@@ -213,9 +213,9 @@ def test_a_recording_that_cannot_be_read_this_time_keeps_what_it_was(lab: Lab) -
 def test_labels_of_recordings_that_would_go_are_refused(lab: Lab) -> None:
     lab.run("simulate toy -o data/r")
     lab.run("label data/r trial-003 --set material=foam")
-    refused(lab, "simulate toy -o data/r --trials 3", "data/r", "labels that were set by hand", "trial-003")
+    check_refusal(lab, "simulate toy -o data/r --trials 3", "data/r", "labels that were set by hand", "trial-003")
     lab.run("simulate toy -o data/r --trials 3 --replace")
-    (old,) = [entry for entry in listed(lab) if entry["labelled"]]
+    (old,) = [entry for entry in list_manifests(lab) if entry["labelled"]]
     lab.run(f"store checkout {old['manifest']} -o data/back")
     assert lab.manifest("data/back").recordings["trial-003"]["attributes"]["material"] == "foam"
 
@@ -288,16 +288,16 @@ def test_an_acquired_dataset_comes_back_with_its_labels_long_after_its_directory
     spooled(lab)
     lab.run("acquire --recover")
     lab.run("label rec one --exclude dropped")
-    before = content("rec")
+    before = folder_content("rec")
     dataset = name if name == "rec" else bytes_digest(before["rec/manifest.json"])[:12]
     shutil.rmtree("rec")
     for _ in range(3):
         age(lab, 300)
         lab.run("store gc --grace-days 0")
-    (listed_entry,) = [entry for entry in listed(lab) if entry["state"] == "directory gone"]
+    (listed_entry,) = [entry for entry in list_manifests(lab) if entry["state"] == "directory gone"]
     assert (listed_entry["stage"], listed_entry["recordings"], listed_entry["labelled"]) == ("acquire", 1, 1)
     lab.run(f"store checkout {dataset} -o rec")
-    assert content("rec") == before
+    assert folder_content("rec") == before
 
 
 def test_labels_do_not_come_back_on_other_recordings_of_the_same_name(lab: Lab) -> None:
@@ -338,7 +338,7 @@ def test_what_was_replaced_outlives_gc_but_not_one_that_is_asked_to_take_recordi
     lab.run("ingest numbers src -o data/r")
     lab.run("label data/r a --set material=cork")
     lab.run("simulate toy -o data/r --replace")
-    (old,) = [entry for entry in listed(lab) if entry["labelled"]]
+    (old,) = [entry for entry in list_manifests(lab) if entry["labelled"]]
     age(lab)
     assert lab.run_json("store gc")["kept_recordings"] == 2
     lab.run(f"store checkout {old['manifest']} -o data/back")
@@ -347,7 +347,7 @@ def test_what_was_replaced_outlives_gc_but_not_one_that_is_asked_to_take_recordi
     lab.run("store gc --forget data/back")
     age(lab)
     lab.run("store gc --recordings --grace-days 0")
-    assert not [entry for entry in listed(lab) if entry["labelled"]]
+    assert not [entry for entry in list_manifests(lab) if entry["labelled"]]
     assert lab.call(f"store checkout {old['manifest']} -o data/back").code == 2
 
 
@@ -355,23 +355,23 @@ def test_a_directory_that_was_deleted_keeps_its_recordings_and_labels_in_the_sto
     write_source("src", a="1 2")
     lab.run("ingest numbers src -o data/r")
     lab.run("label data/r a --set material=cork")
-    before = content("data/r")
+    before = folder_content("data/r")
     shutil.rmtree("data/r")
     shutil.rmtree("src")
     for _ in range(2):
         age(lab, 300)
         lab.run("store gc --grace-days 0")
-    (listed_entry,) = [entry for entry in listed(lab) if entry["state"] == "directory gone"]
+    (listed_entry,) = [entry for entry in list_manifests(lab) if entry["state"] == "directory gone"]
     for name in (listed_entry["dataset"], "data/r"):
         lab.run(f"store checkout {name} -o data/r")
-        assert content("data/r") == before
+        assert folder_content("data/r") == before
         shutil.rmtree("data/r")
 
 
 def test_a_derived_dataset_that_was_replaced_is_computed_again_when_it_is_checked_out(lab: Lab) -> None:
     lab.run("simulate toy -o data/r")
     lab.run("scale data/r -o data/s --factor 2")
-    before = content("data/s")
+    before = folder_content("data/s")
     lab.run("scale data/r -o data/s --factor 3")
     old = lab.store.roots.get(lab.folder / "data/s")
     assert old is not None
@@ -384,7 +384,7 @@ def test_a_derived_dataset_that_was_replaced_is_computed_again_when_it_is_checke
         if path.name in {shard for value in [json.loads(lab.store.read(first))] for shard in _shards(value)}:
             path.unlink()
     lab.run(f"store checkout {first} -o data/s --replace")
-    assert content("data/s") == before
+    assert folder_content("data/s") == before
 
 
 def _shards(manifest: dict[str, dict[str, dict[str, dict[str, dict[str, str]]]]]) -> list[str]:
@@ -394,14 +394,14 @@ def _shards(manifest: dict[str, dict[str, dict[str, dict[str, dict[str, str]]]]]
 def test_a_manifest_that_no_root_names_any_more_is_checked_out_by_its_digest(lab: Lab) -> None:
     write_source("src", a="1 2")
     lab.run("ingest numbers src -o data/r")
-    before, name = content("data/r"), bytes_digest(Path("data/r/manifest.json").read_bytes())
+    before, name = folder_content("data/r"), bytes_digest(Path("data/r/manifest.json").read_bytes())
     shard = next(digest for _, digest in lab.manifest("data/r").objects())
     for path in lab.store.root.glob("roots/*"):
         path.unlink()
     shutil.rmtree("data")
-    assert listed(lab) == []
+    assert list_manifests(lab) == []
     lab.run(f"store checkout {name} -o data/r")
-    assert content("data/r") == before
+    assert folder_content("data/r") == before
     ran = lab.call(f"store checkout {shard} -o data/again")  # an object, but not a manifest
     assert ran.code == 2 and "knows no manifest" in ran.err
 
@@ -427,12 +427,12 @@ def test_a_copy_without_its_store_is_kept_whole_when_it_is_replaced(
     shutil.copytree("data/r", "data/copy")
     shutil.rmtree(lab.store.root)
     lab.store.root.mkdir()
-    before = content("data/copy")
-    refused(lab, "simulate toy -o data/copy", "data/copy", "1 recording written by ingest.numbers")
+    before = folder_content("data/copy")
+    check_refusal(lab, "simulate toy -o data/copy", "data/copy", "1 recording written by ingest.numbers")
     lab.run("simulate toy -o data/copy --replace")
-    (old,) = [entry for entry in listed(lab) if entry["stage"] == "ingest.numbers"]
+    (old,) = [entry for entry in list_manifests(lab) if entry["stage"] == "ingest.numbers"]
     lab.run(f"store checkout {old['manifest']} -o data/copy --replace")
-    assert content("data/copy") == before
+    assert folder_content("data/copy") == before
 
 
 def test_a_hundred_reruns_leave_a_short_history_and_one_loss_stays_in_it(lab: Lab) -> None:

@@ -20,7 +20,7 @@ WAITS = "for i in $(seq 3000); do [ -e {} ] && break; sleep 0.02; done; [ -e {} 
 
 
 def test_several_stages_at_a_time_give_the_bytes_that_they_give_one_after_another(lab: Lab, tmp_path: Path) -> None:
-    scaled = {f"scaled-{factor}": _scaled(factor) for factor in (2, 3, 4)}
+    scaled = {f"scaled-{factor}": _scale_stage(factor) for factor in (2, 3, 4)}
     write_chain({"toy": STAGES["toy"], **scaled})
     lab.run("run dvc.yaml --jobs 2")
     separate = tmp_path / "alone"
@@ -152,7 +152,7 @@ def _wait_until_gone(pid: int) -> None:
     pytest.fail(f"process {pid} is still there")
 
 
-def _scaled(factor: int) -> dict[str, object]:
+def _scale_stage(factor: int) -> dict[str, object]:
     """Return a stage that scales the toy recordings into a folder of its own."""
     place = f"data/scaled-{factor}"
     return {

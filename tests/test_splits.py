@@ -251,7 +251,7 @@ def test_blocked_in_reverse_tests_the_first_of_each_stratum_and_trains_on_the_la
 # ---- folds of the authors
 
 
-def published(blocks: int = 4, size: int = 6, tests: int = 0) -> dict[str, dict[str, str | int]]:
+def published_recordings(blocks: int = 4, size: int = 6, tests: int = 0) -> dict[str, dict[str, str | int]]:
     labelled: dict[str, dict[str, str | int]] = {
         f"roboskin-fold{block}-{i:03d}": {"sensor": "roboskin", "material": i % 3, "authors_fold": block}
         for block in range(blocks)
@@ -263,7 +263,7 @@ def published(blocks: int = 4, size: int = 6, tests: int = 0) -> dict[str, dict[
 
 
 def test_blocks_of_the_authors_are_tested_in_turn_where_they_name_no_test() -> None:
-    labelled = published()
+    labelled = published_recordings()
     roles = assign(labelled, Scheme("authors", val=0.25, stratify="material"))
     for fold in range(4):
         assert with_role(roles, "test", fold) == {name for name in labelled if labelled[name]["authors_fold"] == fold}
@@ -273,7 +273,7 @@ def test_blocks_of_the_authors_are_tested_in_turn_where_they_name_no_test() -> N
 
 
 def test_blocks_of_the_authors_are_watched_in_turn_where_they_name_the_test() -> None:
-    labelled = published(tests=5)
+    labelled = published_recordings(tests=5)
     roles = assign(labelled, Scheme("authors", val=0.25))
     for fold in range(4):
         assert with_role(roles, "test", fold) == {name for name in labelled if "authors_role" in labelled[name]}
@@ -288,7 +288,7 @@ def test_recordings_beside_the_blocks_are_dealt_into_as_many_even_parts(tests: i
     without_block: dict[str, dict[str, str | int]] = {
         f"biotac-{i:03d}": {"sensor": "biotac", "material": i % 3} for i in range(24)
     }
-    labelled = published(tests=tests) | without_block
+    labelled = published_recordings(tests=tests) | without_block
     roles = assign(labelled, Scheme("authors", val=0.2, stratify="sensor,material"))
     parts = [with_role(roles, role, fold) & set(without_block) for fold in range(4)]
     assert sorted(name for part in parts for name in part) == sorted(without_block)
@@ -298,7 +298,7 @@ def test_recordings_beside_the_blocks_are_dealt_into_as_many_even_parts(tests: i
 
 
 def test_roles_that_authors_gave_beside_their_blocks_hold_in_every_fold() -> None:
-    labelled = published()
+    labelled = published_recordings()
     labelled |= {"x": {"material": 0, "authors_role": "train"}, "y": {"material": 0, "authors_role": "val"}}
     roles = assign(labelled, Scheme("authors", val=0.2))
     assert {roles["x", fold] for fold in range(4)} == {"train"}
@@ -313,7 +313,7 @@ def test_a_block_that_is_no_number_is_named() -> None:
 # ---- few to train on
 
 
-def trained(count: int, **options: object) -> set[str]:
+def training_names(count: int, **options: object) -> set[str]:
     scheme = Scheme(val=0.2, test=0.2, stratify="sensor,material", few=count, **options)  # type: ignore[arg-type]
     return with_role(assign(two_sensors(), scheme), "train")
 
@@ -333,15 +333,15 @@ def test_few_leaves_so_many_of_each_sensor_spread_over_materials_and_touches_no_
 @given(st.integers(1, 24), st.integers(1, 24), st.integers(0, 9))
 def test_the_fewer_are_among_the_more(first: int, second: int, seed: int) -> None:
     fewer, larger = sorted((first, second))
-    assert trained(fewer, few_by="sensor", seed=seed) <= trained(larger, few_by="sensor", seed=seed)
-    assert len(trained(fewer, few_by="sensor", seed=seed)) == 2 * fewer
+    assert training_names(fewer, few_by="sensor", seed=seed) <= training_names(larger, few_by="sensor", seed=seed)
+    assert len(training_names(fewer, few_by="sensor", seed=seed)) == 2 * fewer
 
 
 def test_few_without_an_attribute_is_of_all_and_few_of_leaves_the_others_alone() -> None:
-    assert len(trained(10)) == 10
-    chosen = Counter(name.split("-")[0] for name in trained(10, few_of="sensor=roboskin"))
+    assert len(training_names(10)) == 10
+    chosen = Counter(name.split("-")[0] for name in training_names(10, few_of="sensor=roboskin"))
     assert chosen == {"biotac": 24, "roboskin": 10}
-    assert len(trained(1000)) == 48
+    assert len(training_names(1000)) == 48
 
 
 def test_few_counts_those_that_an_older_split_trains_on() -> None:

@@ -89,21 +89,21 @@ def test_nothing_is_printed_but_by_the_terminal() -> None:
                 assert ast.unparse(node.func) not in ("print", "typer.echo", "click.echo"), f"{module}:{node.lineno}"
 
 
-def redirected(lab: Lab, command: str, redirections: str) -> subprocess.CompletedProcess[str]:
+def run_redirected(lab: Lab, command: str, redirections: str) -> subprocess.CompletedProcess[str]:
     words = f'"{sys.executable}" -m tacpipe {command} {redirections}'
     return subprocess.run(["sh", "-c", words], cwd=lab.folder, capture_output=True, text=True, check=False)
 
 
 @pytest.mark.parametrize("redirection", ["2>&-", "2>/dev/full", ">&-", "<&- >&- 2>&-"])
 def test_a_command_does_its_work_whatever_stderr_is(lab: Lab, redirection: str) -> None:
-    ran = redirected(lab, "simulate toy -o data/r", redirection)
+    ran = run_redirected(lab, "simulate toy -o data/r", redirection)
     assert ran.returncode == 0
     assert list(lab.manifest("data/r").recordings) == [f"trial-{n:03d}" for n in range(4)]
     assert ran.stdout in ("data/r\n", "")
 
 
 def test_a_result_that_cannot_be_printed_is_kept_and_named(lab: Lab) -> None:
-    ran = redirected(lab, "simulate toy -o data/r", ">/dev/full")
+    ran = run_redirected(lab, "simulate toy -o data/r", ">/dev/full")
     assert ran.returncode == 1
     assert (
         "What the command made is kept, but its result could not be written to standard output: No space" in ran.stderr
@@ -112,5 +112,5 @@ def test_a_result_that_cannot_be_printed_is_kept_and_named(lab: Lab) -> None:
 
 
 def test_a_mistake_keeps_its_exit_code_when_it_cannot_be_printed(lab: Lab) -> None:
-    assert redirected(lab, "show data/absent", "2>/dev/full").returncode == 2
-    assert redirected(lab, "show --no-such-option", "2>&-").returncode == 2
+    assert run_redirected(lab, "show data/absent", "2>/dev/full").returncode == 2
+    assert run_redirected(lab, "show --no-such-option", "2>&-").returncode == 2

@@ -62,7 +62,7 @@ ignore_missing_imports = True
 """
 
 
-def checked(folder: Path, *files: Path) -> subprocess.CompletedProcess[str]:
+def run_mypy(folder: Path, *files: Path) -> subprocess.CompletedProcess[str]:
     command = [
         sys.executable,
         "-m",
@@ -79,7 +79,7 @@ def checked(folder: Path, *files: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(arguments, cwd=folder, env=environment, capture_output=True, text=True, check=False)
 
 
-def printed() -> dict[str, str]:
+def printed_stages() -> dict[str, str]:
     """Return every stage that a text prints, by the name of a module."""
     pages = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
     stage_blocks = [
@@ -94,7 +94,7 @@ def test_mypy_refuses_a_stage_called_with_wrong_arguments_and_accepts_the_right_
     for place, call in enumerate(WRONG):
         text = f"{STAGE}\n\ndef bad(recording: Recording) -> None:\n    {call}\n"
         (tmp_path / f"wrong{place}.py").write_text(text)
-    ran = checked(tmp_path, *sorted(tmp_path.glob("*.py")))
+    ran = run_mypy(tmp_path, *sorted(tmp_path.glob("*.py")))
     errors = [line for line in ran.stdout.splitlines() if "error:" in line]
     for place, kind in enumerate(WRONG.values()):
         (line,) = (error for error in errors if error.startswith(f"wrong{place}.py"))
@@ -114,17 +114,17 @@ def imported_modules() -> dict[str, str]:
 
 @pytest.mark.long
 def test_the_stages_of_the_texts_pass_mypy_strict_as_printed(tmp_path: Path) -> None:
-    files = [tmp_path / f"{name}.py" for name in printed()]
-    for file, code in zip(files, printed().values(), strict=True):
+    files = [tmp_path / f"{name}.py" for name in printed_stages()]
+    for file, code in zip(files, printed_stages().values(), strict=True):
         file.write_text(code)
     for name, code in imported_modules().items():
         (tmp_path / name).write_text(code)
-    ran = checked(tmp_path, *files)
+    ran = run_mypy(tmp_path, *files)
     assert files and (ran.returncode, ran.stdout) == (0, "")
 
 
 def test_the_stages_of_the_texts_pass_ruff_as_printed_with_the_rules_of_the_project() -> None:
-    stages = printed()
+    stages = printed_stages()
     assert stages
     for name, code in stages.items():
         for arguments in (["check"], ["format", "--check"]):

@@ -88,7 +88,7 @@ def _initrd(folder: Path, command: str) -> bytes:
         _with_needs(name, files, ordered)
     init = INIT.format(modules=" ".join(ordered), command=command)
     busybox = Path(shutil.which("busybox") or "busybox").read_bytes()
-    return packed(
+    return pack(
         [
             ("bin", None),
             ("modules", None),
@@ -113,7 +113,7 @@ def _module(path: Path) -> bytes:
     return lzma.decompress(path.read_bytes()) if path.suffix == ".xz" else path.read_bytes()
 
 
-def packed(files: Iterable[tuple[str, bytes | None]]) -> bytes:
+def pack(files: Iterable[tuple[str, bytes | None]]) -> bytes:
     """Return a cpio archive (newc, as the kernel unpacks it) of executable files; None stands for a folder."""
     archive = b""
     for number, (name, content) in enumerate([*files, (TRAILER, b"")], start=1):
@@ -121,9 +121,9 @@ def packed(files: Iterable[tuple[str, bytes | None]]) -> bytes:
         data = content or b""
         numbers = (number, mode, 0, 0, 1, 0, len(data), 0, 0, 0, 0, len(name) + 1, 0)
         head = b"070701" + b"".join(b"%08x" % value for value in numbers) + name.encode() + b"\0"
-        archive += _filled(head) + _filled(data)
+        archive += _fill(head) + _fill(data)
     return archive
 
 
-def _filled(data: bytes) -> bytes:
+def _fill(data: bytes) -> bytes:
     return data + bytes(-len(data) % 4)

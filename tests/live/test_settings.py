@@ -17,7 +17,7 @@ from tacpipe.tasks.forward.live import plans
 from tacpipe.tasks.forward.live.task import ForwardSettings
 from tests.conftest import Lab
 from tests.live.sessions import TRAINED
-from tests.test_docs import fenced
+from tests.test_docs import fenced_blocks
 
 ROOT = Path(__file__).parents[2]
 STREAM = '[[stream]]\nname = "skin"\nsensor = "xela"\ntransport = "ws:127.0.0.1:5000"\n'
@@ -138,7 +138,7 @@ def test_the_table_stays_in_the_text_of_a_rig_and_recorders_do_not_look_at_it() 
 
 @pytest.mark.parametrize("page", ["docs/rig.md", "docs/howto/live.md"])
 def test_the_examples_of_the_pages_are_read(page: str) -> None:
-    texts = [block.text for block in fenced((ROOT / page).read_text()) if block.language == "toml"]
+    texts = [block.text for block in fenced_blocks((ROOT / page).read_text()) if block.language == "toml"]
     found = [text for text in texts if "[live]" in text]
     assert found
     for text in found:

@@ -42,7 +42,7 @@ for client in a b; do on $client "store verify"; echo "CODE $?"; done
 def test_two_clients_of_one_export_that_do_the_same_beside_collections_end_with_the_same_bytes(
     plugin: Path, tmp_path: Path
 ) -> None:
-    disk = machine.formatted(tmp_path / "disk", "ext4", size_mb=512)
+    disk = machine.format_disk(tmp_path / "disk", "ext4", size_mb=512)
     (tmp_path / "work").write_text(WORK.replace("ROUNDS", str(ROUNDS)))
     variables = {
         "PATH": machine.PATH,

@@ -105,7 +105,7 @@ def build(place: Path) -> Built:
     return Built(wheel, sdist)
 
 
-def tried(folder: Path, package: Path, extra: str) -> float:
+def try_environment(folder: Path, package: Path, extra: str) -> float:
     """Install a wheel or an sdist with an extra ("" for none), and use it; return the megabytes that were installed.
 
     Raises `FailedError` with the output of the first command that fails.
@@ -169,7 +169,7 @@ def main() -> int:
             package = built.sdist if name == "sdist" else built.wheel
             (place / name).mkdir()
             try:
-                installed_mb = tried(place / name, package, name if name in EXTRAS else "")
+                installed_mb = try_environment(place / name, package, name if name in EXTRAS else "")
             except FailedError as failure:
                 failed += 1
                 print(f"{name}: {failure}", flush=True)

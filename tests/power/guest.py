@@ -140,7 +140,7 @@ def check(kind: str, disks: list[list[str]]) -> None:
         child = os.fork()
         if not child:
             disk, place = f"/dev/ubd{chr(ord('a') + number)}", PLACE.with_name(f"disk{number}")
-            answer = catch_errors(lambda: survived(kind, disk, place, passed))  # noqa: B023
+            answer = catch_errors(lambda: check_survival(kind, disk, place, passed))  # noqa: B023
             os.write(writing, json.dumps(answer).encode())
             os._exit(0)
         os.close(writing)
@@ -162,7 +162,7 @@ def catch_errors(function: Callable[[], dict[str, Any]]) -> dict[str, Any]:
         return {"wrong": traceback.format_exc()[-3000:]}
 
 
-def survived(kind: str, disk: str, place: Path, passed: list[str]) -> dict[str, Any]:
+def check_survival(kind: str, disk: str, place: Path, passed: list[str]) -> dict[str, Any]:
     """Look at a disk after a loss of power: what had been answered is there, nothing wrong is served, all can go on."""
     import tacpipe as api
     from tacpipe.errors import TacpipeError
@@ -190,13 +190,13 @@ def survived(kind: str, disk: str, place: Path, passed: list[str]) -> dict[str, 
         code, printed = tacpipe(command)
         assert code == 0, f"{command}: {printed}"
     check_recordings(api.open("data/recordings"), {*FIRST, *MORE}, labelled=True)
-    recovered(passed)
+    check_recovery(passed)
     code, printed = tacpipe("store verify")
     assert code == 0, printed
     return {"wrong": ""}
 
 
-def recovered(passed: list[str]) -> None:
+def check_recovery(passed: list[str]) -> None:
     """Expect each frame that a recording holds once and in order: all of one that had ended, the begin of one cut off."""
     import tacpipe as api
 

@@ -45,7 +45,7 @@ def blank(path: Path, size_mb: int) -> Path:
     return path
 
 
-def formatted(path: Path, kind: str, size_mb: int | None = None) -> Path:
+def format_disk(path: Path, kind: str, size_mb: int | None = None) -> Path:
     """Return a disk with an empty file system, of the least size without ``size_mb``."""
     blank(path, size_mb or SIZE_MB[kind])
     subprocess.run([*MAKE[kind], str(path)], check=True, capture_output=True, env={**os.environ, "PATH": PATH})

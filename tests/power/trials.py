@@ -43,8 +43,8 @@ def plugin(folder: Path) -> Path:
 def trial(kind: str, scratch: Path, step: int = 1, seed: int = 0) -> Tried:
     """Return what came of commands on a file system of this kind, whose disk loses power at any moment."""
     environment = {"PYTHONPATH": str(plugin(scratch / "plugin"))}
-    base = machine.formatted(scratch / "base.img", kind)
-    disk, log = copied(base, scratch / "disk.img"), machine.blank(scratch / "log.img", LOG_MB)
+    base = machine.format_disk(scratch / "base.img", kind)
+    disk, log = copy_disk(base, scratch / "disk.img"), machine.blank(scratch / "log.img", LOG_MB)
     (recorded,) = machine.run([disk, log], {"kind": kind, "modules": str(machine.modules())}, scratch, environment)
     assert recorded == {"recorded": kind}, recorded.get("wrong")
     disk.unlink()
@@ -54,7 +54,7 @@ def trial(kind: str, scratch: Path, step: int = 1, seed: int = 0) -> Tried:
     tried = Tried(kind)
     for first in range(0, len(states), TOGETHER):
         batch = states[first : first + TOGETHER]
-        disks = [copied(base, scratch / f"state{number}.img") for number in range(len(batch))]
+        disks = [copy_disk(base, scratch / f"state{number}.img") for number in range(len(batch))]
         for state, image in zip(batch, disks, strict=True):
             block_log.write(state, image)
         answers = look(kind, batch, disks, scratch, environment)
@@ -74,7 +74,7 @@ def look(
     return answers
 
 
-def copied(image: Path, target: Path) -> Path:
+def copy_disk(image: Path, target: Path) -> Path:
     """Return a sparse copy of a disk."""
     target.unlink(missing_ok=True)
     machine.blank(target, 0)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.conftest import Lab, made_once
+from tests.conftest import Lab, make_once
 from tests.promises import specimen
 from tests.promises.specimen import Specimen
 
@@ -19,7 +19,7 @@ def original(lab: Lab, tmp_path_factory: pytest.TempPathFactory) -> Path:
         specimen.make(lab)
         specimen.clone(lab.folder, folder)
 
-    return made_once(tmp_path_factory, "specimen", make)
+    return make_once(tmp_path_factory, "specimen", make)
 
 
 @pytest.fixture

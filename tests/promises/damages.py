@@ -51,7 +51,7 @@ def longer(path: Path) -> None:
     overwrite(path, path.read_bytes() + b"\x00")
 
 
-def replaced(path: Path) -> None:
+def replace(path: Path) -> None:
     """Put another file in its place, so that hard links part."""
     content = path.read_bytes()
     path.unlink()
@@ -72,6 +72,6 @@ ALL: dict[str, Damage] = {
     "it is empty": empty,
     "it is all zeros": zeros,
     "it has a byte more": longer,
-    "another file is in its place": replaced,
+    "another file is in its place": replace,
     "it is gone": delete,
 }

@@ -295,7 +295,7 @@ def orderly(printed: str, code: int) -> None:
     assert len(sentences) == (code in (1, 130)), printed
 
 
-def aged(project: Path) -> None:
+def make_old(project: Path) -> None:
     """Have all files of a project be a month old, as what `gc` looks at mostly is."""
     long_ago_s = time.time() - 30 * 86400
     for path in project.rglob("*"):

@@ -30,14 +30,14 @@ LONGEST = 1 << 18  # bytes of what comes of it
 KINDS = 8
 
 
-def mutated(data: bytes, donors: Sequence[bytes], random: Random) -> bytes:
+def mutate(data: bytes, donors: Sequence[bytes], random: Random) -> bytes:
     """Return ``data`` after some changes; pieces of ``donors`` may come into it."""
     for _ in range(random.choice((1, 1, 1, 2, 3, 5))):
-        data = _changed(data, donors, random)[:LONGEST]
+        data = _change(data, donors, random)[:LONGEST]
     return data
 
 
-def _changed(data: bytes, donors: Sequence[bytes], random: Random) -> bytes:
+def _change(data: bytes, donors: Sequence[bytes], random: Random) -> bytes:
     place = random.randrange(len(data) + 1)
     stop = min(len(data), place + random.choice((1, 1, 2, 4, 8, 30, 300, len(data))))
     kind = random.randrange(KINDS)
@@ -64,7 +64,7 @@ def _changed(data: bytes, donors: Sequence[bytes], random: Random) -> bytes:
 def inputs(examples: Sequence[bytes]) -> st.SearchStrategy[bytes]:
     """Return a strategy of valid inputs after changes, and of bytes that have nothing to do with them."""
     changed = st.builds(
-        lambda example, seed: mutated(example, examples, Random(seed)),
+        lambda example, seed: mutate(example, examples, Random(seed)),
         st.sampled_from(list(examples)),
         st.integers(0, (1 << 32) - 1),
     )

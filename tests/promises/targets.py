@@ -215,10 +215,10 @@ def _codec_files() -> dict[str, bytes]:
 
 
 def _codec(data: bytes) -> object:
-    return codec.load(replaced(_codec_files(), data))
+    return codec.load(replace_one(_codec_files(), data))
 
 
-def replaced(files: dict[str, bytes], data: bytes) -> dict[str, bytes]:
+def replace_one(files: dict[str, bytes], data: bytes) -> dict[str, bytes]:
     """Return ``files`` with the content of one of them, as the first byte of ``data`` tells, taken from the rest."""
     names = list(files)
     return files | {names[data[0] % len(names)]: data[1:]} if data else files
@@ -356,12 +356,12 @@ def _format(name: str, data: bytes) -> object:
     original = path.read_bytes()
     path.write_bytes(data[1:])
     try:
-        return ingested(name, folder)
+        return ingest_recordings(name, folder)
     finally:
         path.write_bytes(original)
 
 
-def ingested(name: str, folder: Path) -> list[Any]:
+def ingest_recordings(name: str, folder: Path) -> list[Any]:
     """Return the recordings that a format reads in a folder."""
     stage = registry.load(f"ingest.{name}")
     assert stage.discover is not None

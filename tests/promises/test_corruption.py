@@ -60,7 +60,7 @@ def root_of(project: Specimen, dataset: str) -> str:
     raise AssertionError(dataset)
 
 
-def harmed(project: Specimen, target: str, damage: str) -> str:
+def harm(project: Specimen, target: str, damage: str) -> str:
     """Harm one file; return what a finding about it should name."""
     path = TARGETS[target](project)
     damages.ALL[damage](path)
@@ -68,8 +68,8 @@ def harmed(project: Specimen, target: str, damage: str) -> str:
     return path.name.partition(".")[0]
 
 
-def served_right_or_refused(project: Specimen, target: str, damage: str) -> None:
-    harmed(project, target, damage)
+def check_served_or_refused(project: Specimen, target: str, damage: str) -> None:
+    harm(project, target, damage)
     served = project.served()
     assert all(served.values()) or target.startswith("the manifest")  # everything else is made again, or adopted
     ran = project.lab.call("scale data/recordings -o data/other --factor 9 --jobs 1")
@@ -87,20 +87,20 @@ def values_of(bits: list[tuple[object, ...]]) -> object:
     return bits[0][-1]
 
 
-def verified_and_repaired(project: Specimen, target: str, damage: str) -> None:
-    name = harmed(project, target, damage)
+def check_verify_and_repair(project: Specimen, target: str, damage: str) -> None:
+    name = harm(project, target, damage)
     verified = project.lab.call("store verify")
     if target.startswith(FOUND) and (damage != "it is gone" or target.startswith(NEEDED)):
         assert verified.code == DAMAGED and name in verified.out, verified
     elif not target.startswith(("the link", "the manifest")):  # these lie beside the store; a link may be the object
         assert verified.code == 0, verified
     assert project.lab.call("store repair").code == 0
-    sound(project)
+    check_sound(project)
     assert all(project.served().values()) or (damage == "it is gone" and target.startswith("the manifest"))
 
 
-def healed_by_a_rerun(project: Specimen, target: str, damage: str) -> None:
-    harmed(project, target, damage)
+def check_rerun_heals(project: Specimen, target: str, damage: str) -> None:
+    harm(project, target, damage)
     if damage in SILENT and target.startswith(("the object", "the link")):  # a link may be the object itself
         project.lab.call("store verify")  # an answer from the store looks at sizes; only who reads looks at bytes
     for ran in project.rerun():
@@ -114,10 +114,10 @@ def healed_by_a_rerun(project: Specimen, target: str, damage: str) -> None:
     assert (
         project.lab.call("store repair").code == 0
     )  # A rerun may not look at all files, such as the record of a shard.
-    sound(project)
+    check_sound(project)
 
 
-def sound(project: Specimen) -> None:
+def check_sound(project: Specimen) -> None:
     """Look whether everything is sound, and a collection finds nothing to take."""
     verified = project.lab.call("store verify")
     assert verified.code == 0 and "all sound" in verified.out, verified
@@ -127,7 +127,7 @@ def sound(project: Specimen) -> None:
 
 
 PROMISES = {
-    promise.__name__: promise for promise in (served_right_or_refused, verified_and_repaired, healed_by_a_rerun)
+    promise.__name__: promise for promise in (check_served_or_refused, check_verify_and_repair, check_rerun_heals)
 }
 
 
@@ -151,8 +151,8 @@ def test_one_file_damaged_in_each_way(original: Path, lab: Lab, target: str, pro
 MANIFESTS = [target for target in TARGETS if "manifest" in target]
 
 
-def collected_without_loss(project: Specimen, target: str, damage: str) -> None:
-    name = harmed(project, target, damage)
+def check_collection_loses_nothing(project: Specimen, target: str, damage: str) -> None:
+    name = harm(project, target, damage)
     specimen.age(project.folder)
     ran = project.lab.call("store gc --recordings --grace-days 0")
     assert ran.code in (0, DAMAGED) and "Traceback" not in ran.err, ran
@@ -169,7 +169,7 @@ def collected_without_loss(project: Specimen, target: str, damage: str) -> None:
 def test_a_collection_takes_nothing_of_a_dataset_whose_manifest_or_root_is_damaged(
     project: Specimen, target: str, damage: str
 ) -> None:
-    collected_without_loss(project, target, damage)
+    check_collection_loses_nothing(project, target, damage)
 
 
 @pytest.mark.faults
@@ -177,4 +177,4 @@ def test_a_collection_takes_nothing_of_a_dataset_whose_manifest_or_root_is_damag
 def test_a_collection_takes_nothing_that_is_needed_whatever_is_damaged(original: Path, lab: Lab, target: str) -> None:
     for damage in damages.ALL:
         if damage != "it is gone" or not target.startswith("the manifest"):  # Deleting a manifest drops its dataset.
-            collected_without_loss(specimen.copy(original, lab), target, damage)
+            check_collection_loses_nothing(specimen.copy(original, lab), target, damage)

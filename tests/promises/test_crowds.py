@@ -53,7 +53,7 @@ def outcomes(scene: Scene, commands: Sequence[str]) -> list[dict[str, int]]:
     while any(running.poll() is None for running in crowd):
         if collecting.poll() is not None:
             assert kills.wait_for_exit(collecting) == 0, collecting.out.read_text()
-            kills.aged(scene.project)  # nothing is spared for its youth
+            kills.make_old(scene.project)  # nothing is spared for its youth
             collecting = scene.start("store gc --grace-days 0")
             collections += 1
         time.sleep(0.01)
@@ -119,7 +119,7 @@ def test_killed_processes_leave_no_lock_that_anybody_waits_for(scene: Scene, siz
     for words in (*commands, "label data/r trial-000 --label material=foam", "store gc", "store repair"):
         at_once = scene.start(words, TACPIPE_LOCK_TIMEOUT_S="0")
         assert kills.wait_for_exit(at_once) == 0, at_once.out.read_text()
-    kills.aged(scene.project)
+    kills.make_old(scene.project)
     scene.run("store gc")
     tidy(Store(scene.project / ".tacpipe"))
     count("kills survived", size)
@@ -154,7 +154,7 @@ def test_garbage_that_is_collected_beside_a_stopped_process_is_not_what_it_needs
 ) -> None:
     scene.run("simulate toy --trials 6 --rows 4 -o data/r")
     scene.run("scale data/r -o data/s --factor 7")  # Its shards are garbage once it is replaced.
-    kills.aged(scene.project)
+    kills.make_old(scene.project)
     scene.keep()
     lasts_s, expected = scene.run(words), kills.State.from_project(scene.project).files
     rng = random.Random(words)
@@ -164,7 +164,7 @@ def test_garbage_that_is_collected_beside_a_stopped_process_is_not_what_it_needs
         running = scene.start(words)
         time.sleep(after_s)
         os.kill(running.pid, signal.SIGSTOP)
-        kills.aged(scene.project)
+        kills.make_old(scene.project)
         scene.run("store gc --grace-days 0")
         os.kill(running.pid, signal.SIGCONT)
         moment = f"stopped after {after_s:.4f} of {lasts_s:.4f} s: "
@@ -179,7 +179,7 @@ def unshares() -> bool:
     return ROOT and subprocess.run([*UNSHARED, "true"], capture_output=True, check=False).returncode == 0
 
 
-def waited(processes: Sequence[subprocess.Popen[str]]) -> list[dict[str, int]]:
+def wait_for_outcomes(processes: Sequence[subprocess.Popen[str]]) -> list[dict[str, int]]:
     reports = []
     for process in processes:
         out, err = process.communicate()
@@ -212,7 +212,7 @@ def test_two_hosts_that_share_a_store_make_each_key_once(scene: Scene, tmp_path:
         )
         for number in range(size)
     ]
-    assert sum(outcome["ran"] for outcome in waited(processes)) == 12
+    assert sum(outcome["ran"] for outcome in wait_for_outcomes(processes)) == 12
     tidy(Store(store))
 
 
@@ -273,6 +273,6 @@ def test_two_users_of_a_group_share_a_store(shared: Scene, size: int) -> None:
     assert sum(json.loads(line)["ran"] for line in lines) == 12  # each wrote over what was the other's
     for first in (0, 1):
         run_by_users(f"label data/r trial-000 --label material=foam{first}", first=first)
-        kills.aged(shared.project)
+        kills.make_old(shared.project)
         run_by_users("store gc", first=first)
     tidy(Store(shared.project / ".tacpipe"))

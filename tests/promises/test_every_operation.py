@@ -37,7 +37,7 @@ QUICK = (TOYS[:5], TOYS[5:11], TOYS[11:])
 EVERY = {case.name: "1" for case in TOYS} | {case.name: f"{1 + n % PART}/{PART}" for n, case in enumerate(STAGES)}
 
 
-def tried(plugin: Path, folder: Path, *words: str, script: str = "") -> list[dict[str, Any]]:
+def run_trials(plugin: Path, folder: Path, *words: str, script: str = "") -> list[dict[str, Any]]:
     """Return what trials of cases tell, made in a process whose threads are few enough to be forked."""
     call = ["-m", "tests.promises.operations_trials"] if not script else ["-c", script]
     path = os.pathsep.join([str(plugin), os.environ.get("PYTHONPATH", "")])
@@ -62,7 +62,7 @@ def tried(plugin: Path, folder: Path, *words: str, script: str = "") -> list[dic
 def test_whatever_fails_nothing_is_torn_and_the_rerun_equals_a_clean_run(
     name: str, plugin: Path, tmp_path: Path
 ) -> None:
-    (trial,) = tried(plugin, tmp_path, name, "--every", EVERY[name])
+    (trial,) = run_trials(plugin, tmp_path, name, "--every", EVERY[name])
     assert trial["failed"] * int(EVERY[name].rpartition("/")[2]) > trial["calls"] > 0
     assert trial["problems"] == []
 
@@ -70,7 +70,7 @@ def test_whatever_fails_nothing_is_torn_and_the_rerun_equals_a_clean_run(
 @pytest.mark.long
 @pytest.mark.parametrize("cases", QUICK, ids=lambda cases: cases[0].name)
 def test_whatever_fails_of_small_commands_nothing_is_torn(cases: Any, plugin: Path, tmp_path: Path) -> None:
-    trials = tried(plugin, tmp_path, *(case.name for case in cases), "--every", "29")
+    trials = run_trials(plugin, tmp_path, *(case.name for case in cases), "--every", "29")
     assert {trial["case"]: trial["problems"] for trial in trials} == {case.name: [] for case in cases}
 
 
@@ -98,7 +98,7 @@ def test_a_store_that_takes_less_care_is_found_out(broken: str, plugin: Path, tm
         f"{BREAKS[broken]}"
         "from tests.promises import operations_trials; operations_trials.main()"
     )
-    (trial,) = tried(plugin, tmp_path, "ingest.numbers", "--every", "29", script=script)
+    (trial,) = run_trials(plugin, tmp_path, "ingest.numbers", "--every", "29", script=script)
     assert trial["problems"]
 
 

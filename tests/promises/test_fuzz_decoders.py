@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from tests.promises import decoding
 from tests.promises.counts import count
-from tests.promises.limits import bounded
+from tests.promises.limits import bound_memory
 from tests.promises.mutations import inputs
 from tests.sensors import harm
 from tests.sensors.test_every_sensor import CASES
@@ -19,7 +19,7 @@ FEW, MANY = 4, 100  # inputs of a sensor
 GARBAGE = 1 << 18  # bytes that have no end
 
 
-def tried(case: str, examples: int) -> None:
+def try_inputs(case: str, examples: int) -> None:
     ran = 0
 
     @settings(max_examples=examples, deadline=None, suppress_health_check=list(HealthCheck), database=None)
@@ -30,20 +30,20 @@ def tried(case: str, examples: int) -> None:
         expected = decoding.samples(case, decoding.chunks(case, data, (len(data) or 1,)))
         assert decoding.samples(case, decoding.chunks(case, data, sizes), at_once) == expected
 
-    with bounded():
+    with bound_memory():
         attempt()
     count("inputs fuzzed", ran)
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_the_same_bytes_give_the_same_samples_however_they_are_cut(case: str) -> None:
-    tried(case, FEW)
+    try_inputs(case, FEW)
 
 
 @pytest.mark.faults
 @pytest.mark.parametrize("case", CASES)
 def test_bytes_changed_in_many_ways_give_the_same_samples_however_they_are_cut(case: str) -> None:
-    tried(case, MANY)
+    try_inputs(case, MANY)
 
 
 @pytest.mark.faults
@@ -59,6 +59,6 @@ def test_garbage_without_end_is_not_kept(case: str, kind: str) -> None:
         "beginnings": example[: max(4, len(example) // decoding.FRAMES // 2)],
     }[kind]
     garbage = (unit * (GARBAGE // len(unit) + 1))[:GARBAGE]
-    with bounded():
+    with bound_memory():
         decoding.samples(case, decoding.chunks(case, garbage, (4096,)), 1, 10_000_000)
     count("inputs fuzzed")

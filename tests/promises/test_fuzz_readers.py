@@ -9,7 +9,7 @@ from tacpipe.clouds.files import SUFFIXES
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins import registry
 from tests.promises.counts import count
-from tests.promises.limits import bounded, is_sentence
+from tests.promises.limits import bound_memory, is_sentence
 from tests.promises.mutations import inputs
 from tests.promises.targets import TREES, Target, targets
 from tests.sensors.test_every_sensor import CASES
@@ -34,7 +34,7 @@ def test_valid_examples_are_read(name: str) -> None:
         FOUND[name].run(example)
 
 
-def tried(target: Target, examples: int) -> None:
+def try_inputs(target: Target, examples: int) -> None:
     """Try so many inputs; each is read, or refused with a sentence."""
     refused = ran = 0
 
@@ -49,7 +49,7 @@ def tried(target: Target, examples: int) -> None:
             assert is_sentence(str(error)), str(error)
             refused += 1
 
-    with bounded():
+    with bound_memory():
         attempt()
     count("inputs fuzzed", ran)
     count("hostile inputs refused", refused)
@@ -57,10 +57,10 @@ def tried(target: Target, examples: int) -> None:
 
 @pytest.mark.parametrize("name", READERS)
 def test_changed_bytes_are_read_or_refused_with_a_sentence(name: str) -> None:
-    tried(FOUND[name], SLOW_FEW if FOUND[name].slow else FEW)
+    try_inputs(FOUND[name], SLOW_FEW if FOUND[name].slow else FEW)
 
 
 @pytest.mark.faults
 @pytest.mark.parametrize("name", READERS)
 def test_bytes_changed_in_thousands_of_ways_are_read_or_refused(name: str) -> None:
-    tried(FOUND[name], SLOW_MANY if FOUND[name].slow else MANY)
+    try_inputs(FOUND[name], SLOW_MANY if FOUND[name].slow else MANY)

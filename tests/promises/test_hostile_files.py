@@ -25,15 +25,17 @@ from tacpipe.io.parquet import from_parquet, to_parquet
 from tests.conftest import Lab, without_created_store
 from tests.promises import targets
 from tests.promises.counts import count
-from tests.promises.limits import GIB, bounded, is_sentence, sample_cases
+from tests.promises.limits import GIB, bound_memory, is_sentence, sample_cases
 
 SMALL = GIB // 2  # memory that refusing a file may take, libraries that it loads included
 XYZ = "property float x\nproperty float y\nproperty float z\n"
 
 
-def refused(read: Callable[[], object], match: str | None = None, kind: type[TacpipeError] = TacpipeError) -> None:
+def check_refusal(
+    read: Callable[[], object], match: str | None = None, kind: type[TacpipeError] = TacpipeError
+) -> None:
     """A reader refuses with a sentence, within little memory."""
-    with bounded(SMALL), pytest.raises(kind, match=match) as error:
+    with bound_memory(SMALL), pytest.raises(kind, match=match) as error:
         read()
     assert is_sentence(str(error.value)), str(error.value)
     count("hostile inputs refused")
@@ -66,7 +68,7 @@ def test_rows_that_a_parquet_file_only_claims_are_not_believed(rows: int) -> Non
     footer = footer_of(content)
     row_count = b"\x16" + varint(77)  # The count of the file, its group, and the column's values.
     assert footer.count(row_count) >= 3
-    refused(
+    check_refusal(
         lambda: from_parquet(with_footer(content, footer.replace(row_count, b"\x16" + varint(rows)))),
         "77",
         DamagedError,
@@ -81,7 +83,7 @@ def test_a_negative_number_of_rows_is_refused(rows: int) -> None:
     encoded = b""
     while number >= 128:
         encoded, number = encoded + bytes([number & 127 | 128]), number >> 7
-    refused(
+    check_refusal(
         lambda: from_parquet(
             with_footer(content, footer_of(content).replace(row_count, b"\x16" + encoded + bytes([number])))
         ),
@@ -102,7 +104,7 @@ def test_a_page_that_claims_to_unpack_to_gigabytes_is_held_against_the_memory(
     assert column_size in footer_of(content)
     bomb = with_footer(bomb, footer_of(content).replace(column_size, b"\x16" + varint(_size(content) + shift)))
     monkeypatch.setattr(memory, "available", lambda: 10**8)
-    refused(lambda: from_parquet(bomb), "declares", ShortageError)
+    check_refusal(lambda: from_parquet(bomb), "declares", ShortageError)
 
 
 def _size(content: bytes) -> int:
@@ -125,13 +127,13 @@ def bomb() -> bytes:
 
 def test_a_file_that_unpacks_to_more_than_the_memory_is_refused_before_it_is_unpacked(bomb: bytes) -> None:
     assert len(bomb) < 800_000
-    refused(lambda: from_parquet(bomb), r"declares 0\.6 GB of data.*do not use it", ShortageError)
+    check_refusal(lambda: from_parquet(bomb), r"declares 0\.6 GB of data.*do not use it", ShortageError)
 
 
 def test_a_long_recording_that_held_still_is_read_where_there_is_memory_for_it(bomb: bytes) -> None:
     content = to_parquet(pa.table({"t_ns": np.arange(2_000_000), "taxel": np.full(2_000_000, 7, np.uint16)}))
     assert len(content) < 40_000
-    with bounded(GIB):
+    with bound_memory(GIB):
         assert from_parquet(content).column("taxel").to_numpy().sum() == 14_000_000
 
 
@@ -147,7 +149,7 @@ def test_texts_that_stand_for_a_million_long_ones_are_refused(encoding: str) -> 
             for _ in range(8):
                 writer.write_table(short)
     assert len(sink.getvalue()) < 40_000_000
-    refused(lambda: from_parquet(sink.getvalue()), "declares", ShortageError)
+    check_refusal(lambda: from_parquet(sink.getvalue()), "declares", ShortageError)
 
 
 @pytest.mark.parametrize(
@@ -189,14 +191,14 @@ PCD = "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\n"
 @pytest.mark.parametrize("points", ["1000000000000", "-5", "1e9", "9" * 5000, "0x10", ""])
 @pytest.mark.parametrize("data", ["ascii", "binary", "binary_compressed"])
 def test_points_that_a_pcd_file_only_claims_are_refused(tmp_path: Path, points: str, data: str) -> None:
-    refused(cloud(tmp_path, "a.pcd", f"{PCD}POINTS {points}\nDATA {data}\n1 2 3\n".encode()), r"a\.pcd")
+    check_refusal(cloud(tmp_path, "a.pcd", f"{PCD}POINTS {points}\nDATA {data}\n1 2 3\n".encode()), r"a\.pcd")
 
 
 @pytest.mark.parametrize("size", ["1000000000000", "99999999", "0", "-1"])
 @pytest.mark.parametrize("data", ["ascii", "binary"])
 def test_a_field_of_a_pcd_point_that_is_absurdly_wide_is_refused(tmp_path: Path, size: str, data: str) -> None:
     head = f"VERSION 0.7\nFIELDS x y z q\nSIZE 4 4 4 8\nTYPE F F F F\nCOUNT 1 1 1 {size}\nPOINTS 20\nDATA {data}\n"
-    refused(cloud(tmp_path, "a.pcd", head.encode() + b"1 2 3\n" * 20), r"a\.pcd")
+    check_refusal(cloud(tmp_path, "a.pcd", head.encode() + b"1 2 3\n" * 20), r"a\.pcd")
 
 
 @pytest.mark.parametrize(
@@ -207,22 +209,22 @@ def test_sizes_of_compressed_points_that_lie_are_refused(
     tmp_path: Path, packed: int, unpacked: int, points: int
 ) -> None:
     head = f"{PCD}WIDTH {points}\nHEIGHT 1\nPOINTS {points}\nDATA binary_compressed\n".encode()
-    refused(cloud(tmp_path, "a.pcd", head + struct.pack("<II", packed, unpacked) + bytes(5)), r"a\.pcd declares")
+    check_refusal(cloud(tmp_path, "a.pcd", head + struct.pack("<II", packed, unpacked) + bytes(5)), r"a\.pcd declares")
 
 
 @pytest.mark.parametrize("points", ["1000000000000", "-5", "1e9", "9" * 5000, ""])
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
 def test_points_that_a_ply_file_only_claims_are_refused(tmp_path: Path, points: str, form: str) -> None:
     content = f"ply\nformat {form} 1.0\nelement vertex {points}\n{XYZ}end_header\n1 2 3\n".encode()
-    refused(cloud(tmp_path, "a.ply", content), r"a\.ply")
-    refused(lambda: ply.parsed(Path("a.ply"), content), r"a\.ply")
+    check_refusal(cloud(tmp_path, "a.ply", content), r"a\.ply")
+    check_refusal(lambda: ply.parsed(Path("a.ply"), content), r"a\.ply")
 
 
 @pytest.mark.parametrize("element", ["face 1000000000000", "face 1"])
 def test_lists_before_the_points_of_a_ply_file_are_not_believed(tmp_path: Path, element: str) -> None:
     lists = f"element {element}\nproperty list uchar int vertex_indices\n"
     content = f"ply\nformat binary_little_endian 1.0\n{lists}element vertex 1000000000000\n{XYZ}end_header\n1 2 3\n"
-    refused(cloud(tmp_path, "a.ply", content.encode()), r"a\.ply")
+    check_refusal(cloud(tmp_path, "a.ply", content.encode()), r"a\.ply")
 
 
 def test_headers_that_overran_the_memory_of_open3d_are_refused(tmp_path: Path) -> None:
@@ -230,12 +232,12 @@ def test_headers_that_overran_the_memory_of_open3d_are_refused(tmp_path: Path) -
         content = (
             f"ply\nformat ascii 1.0\ncomment {word}\nelement vertex 1\n{XYZ}property float {word}\nend_header\n1 2\n"
         )
-        refused(cloud(tmp_path, "a.ply", content.encode()), r"a\.ply")
+        check_refusal(cloud(tmp_path, "a.ply", content.encode()), r"a\.ply")
 
 
 @pytest.mark.parametrize("count", ["1000000000000", "100000000", "9" * 5000])
 def test_points_that_a_pts_file_only_claims_are_refused(tmp_path: Path, count: str) -> None:
-    refused(cloud(tmp_path, "a.pts", f"{count}\n1 2 3\n".encode()), r"a\.pts")
+    check_refusal(cloud(tmp_path, "a.pts", f"{count}\n1 2 3\n".encode()), r"a\.pts")
 
 
 def test_one_long_number_among_many_does_not_take_its_length_for_each() -> None:
@@ -243,7 +245,7 @@ def test_one_long_number_among_many_does_not_take_its_length_for_each() -> None:
     head = f"{PCD}POINTS 100000\nDATA ascii\n".encode()
     text = f"ply\nformat ascii 1.0\nelement vertex 100000\n{XYZ}end_header\n".encode()
     for read, content in ((pcd.parsed, head + rows), (ply.parsed, text + rows)):
-        with bounded(SMALL):
+        with bound_memory(SMALL):
             xyz, _ = read(Path("a"), content)
         assert np.isinf(xyz[0, 0]) and xyz[0, 1:].tolist() == [1, 1] and (xyz[1:] == 1).all()
 
@@ -282,7 +284,7 @@ def test_arrays_whose_heads_lie_are_refused(
     monkeypatch.chdir(tmp_path)
     targets.TREES["roboskin"](tmp_path)
     (tmp_path / name).write_bytes(ARRAYS[case])
-    refused(lambda: targets.ingested("roboskin", tmp_path), name)
+    check_refusal(lambda: targets.ingest_recordings("roboskin", tmp_path), name)
     assert not (tmp_path / "opened").exists()
 
 
@@ -307,7 +309,7 @@ def test_a_pickle_in_place_of_an_array_is_never_opened(tmp_path: Path, name: str
         value = np.empty(1, dtype=object)
         value[0] = Opened(trace)
         np.save(tmp_path / name, value, allow_pickle=True)
-    refused(lambda: targets.ingested("roboskin", tmp_path), name)
+    check_refusal(lambda: targets.ingest_recordings("roboskin", tmp_path), name)
     assert not trace.exists()
     np.load(tmp_path / name, allow_pickle=True)  # A careless reader does this.
     assert trace.exists()
@@ -346,7 +348,7 @@ def test_text_that_is_no_table_is_refused(tmp_path: Path, name: str, options: di
     path = tmp_path / "a.csv"
     path.write_bytes(TEXTS[name])
     columns = ["b", "c"] if "seconds" in options else ["a", "b", "c"]
-    refused(lambda: csv_table.read_csv(path, columns, **options), r"a\.csv")
+    check_refusal(lambda: csv_table.read_csv(path, columns, **options), r"a\.csv")
 
 
 # ---- what is no file
@@ -364,13 +366,13 @@ def replace_by(kind: str, path: Path) -> None:
         path.symlink_to(places[kind])
 
 
-def ingested_with(lab: Lab, name: str, kind: str) -> None:
+def check_source_with(lab: Lab, name: str, kind: str) -> None:
     """Each file of a source in turn is something else; what is ingested is refused, or leaves that recording out."""
     (lab.folder / "source").mkdir()
     targets.TREES[name](lab.folder / "source")
     path = sorted(file for file in (lab.folder / "source").rglob("*") if file.is_file())[0]
     replace_by(kind, path)
-    with bounded(4 * GIB):
+    with bound_memory(4 * GIB):
         ran = targets.ingest(lab, name)
     assert ran.code in (1, 2)
     assert is_sentence(without_created_store(ran.err).removeprefix("tacpipe: ").rstrip("\n")), ran.err
@@ -381,14 +383,14 @@ def ingested_with(lab: Lab, name: str, kind: str) -> None:
 @pytest.mark.parametrize("name", ["roboskin", "vision2tactile", "xela-flat"])
 @pytest.mark.parametrize("kind", ["pipe", "endless"])
 def test_what_is_no_file_in_a_published_source_is_refused_and_not_waited_for(lab: Lab, name: str, kind: str) -> None:
-    ingested_with(lab, name, kind)
+    check_source_with(lab, name, kind)
 
 
 @pytest.mark.faults
 @pytest.mark.parametrize("name", targets.TREES)
 @pytest.mark.parametrize("kind", ["folder", "pipe", "device", "endless", "nothing", "circle"])
 def test_nothing_that_stands_in_place_of_a_published_file_is_waited_for(lab: Lab, name: str, kind: str) -> None:
-    ingested_with(lab, name, kind)
+    check_source_with(lab, name, kind)
 
 
 @pytest.mark.parametrize("suffix", cloud_files.SUFFIXES)
@@ -396,12 +398,12 @@ def test_a_pipe_or_a_device_is_no_cloud(tmp_path: Path, suffix: str) -> None:
     os.mkfifo(tmp_path / f"a{suffix}")
     (tmp_path / f"b{suffix}").symlink_to("/dev/zero")
     for name in "ab":
-        refused(lambda name=name: cloud_files.read(tmp_path / f"{name}{suffix}"), "not a file")  # type: ignore[misc]
+        check_refusal(lambda name=name: cloud_files.read(tmp_path / f"{name}{suffix}"), "not a file")  # type: ignore[misc]
 
 
 def test_a_file_of_a_pipe_is_refused_though_somebody_writes_it(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "a.csv")
     writer = threading.Thread(target=lambda: os.close(os.open(tmp_path / "a.csv", os.O_RDWR)))
     writer.start()
-    refused(lambda: csv_table.read_csv(tmp_path / "a.csv", ["a"]), "a named pipe, not a file")
+    check_refusal(lambda: csv_table.read_csv(tmp_path / "a.csv", ["a"]), "a named pipe, not a file")
     writer.join()

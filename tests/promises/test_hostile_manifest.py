@@ -14,7 +14,7 @@ from tacpipe.errors import TacpipeError
 from tacpipe.io.hashing import bytes_digest, digest
 from tests.conftest import Lab
 from tests.promises.counts import count
-from tests.promises.limits import GIB, bounded, is_sentence
+from tests.promises.limits import GIB, bound_memory, is_sentence
 
 Tree = dict[str, Any]
 SHARD = {"digest": bytes_digest(b"precious\n"), "rows": 3, "bytes": 9}
@@ -56,10 +56,10 @@ def manifest_tree(**changed: Any) -> Tree:
         "labels": {},
         **changed,
     }
-    return signed(tree)
+    return sign(tree)
 
 
-def signed(tree: Tree) -> Tree:
+def sign(tree: Tree) -> Tree:
     """Return a manifest whose digest is that of what it names, as far as one can be made."""
     try:
         recordings = {
@@ -127,7 +127,7 @@ def test_the_manifest_that_these_are_made_of_is_one() -> None:
 
 @pytest.mark.parametrize("case", HOSTILE)
 def test_a_hostile_manifest_is_refused_with_a_sentence(case: str) -> None:
-    with bounded(GIB), pytest.raises(TacpipeError) as error:
+    with bound_memory(GIB), pytest.raises(TacpipeError) as error:
         parse(HOSTILE[case], "given")
     assert is_sentence(str(error.value)), repr(str(error.value))
     count("hostile inputs refused")
@@ -154,7 +154,7 @@ def test_of_two_keys_that_are_the_same_nothing_is_taken_unseen() -> None:
 @pytest.mark.faults
 def test_very_many_recordings_are_read_or_refused_within_bounds() -> None:
     entry = {"attributes": {}, "shards": {"": SHARD}}
-    with bounded(6 * GIB):
+    with bound_memory(6 * GIB):
         parsed = parse(content(manifest_tree(recordings={f"r{number}": entry for number in range(200_000)})), "given")
         assert parsed.rows == 600_000
 
@@ -216,7 +216,7 @@ def kept_out(place: Place, content: bytes) -> None:
     before = place.outside()
     for command in COMMANDS:
         (place.dataset / "manifest.json").write_bytes(content)
-        with bounded(4 * GIB):
+        with bound_memory(4 * GIB):
             ran = place.lab.call(command)
         assert "Traceback" not in ran.err
         assert ran.code in (0, 1, 2, 4), f"{command}: {ran.err}"

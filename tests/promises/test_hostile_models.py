@@ -25,8 +25,8 @@ from tests import chain
 from tests.conftest import tacpipe as ran
 from tests.fake_recordings import FakeDataset
 from tests.promises.counts import count
-from tests.promises.limits import GIB, bounded, is_sentence, sample_cases
-from tests.promises.mutations import mutated
+from tests.promises.limits import GIB, bound_memory, is_sentence, sample_cases
+from tests.promises.mutations import mutate
 from tests.tasks.forward import trials
 from tests.tasks.material import textures
 from tests.tasks.touch import handmade
@@ -72,11 +72,11 @@ def model_files(kind: str) -> Files:
     return dict(handmade.trained(folder, **changed))
 
 
-def loaded(kind: str, files: Mapping[str, bytes]) -> Any:
+def load_model(kind: str, files: Mapping[str, bytes]) -> Any:
     return registry.load_task(kind.partition(" ")[0]).load(files)
 
 
-def evaluated(kind: str, files: Mapping[str, bytes]) -> Any:
+def evaluate_model(kind: str, files: Mapping[str, bytes]) -> Any:
     """Evaluate a model on a recording that fits it."""
     task = kind.partition(" ")[0]
     if task == "forward":
@@ -100,8 +100,8 @@ def _models_are_trained_before_memory_is_bounded(request: pytest.FixtureRequest)
         model_files(SIZES[arguments["case"]][0])
 
 
-def refused(read: Callable[[], object], match: str | None = None) -> None:
-    with bounded(SMALL), pytest.raises(TacpipeError, match=match) as error:
+def check_refusal(read: Callable[[], object], match: str | None = None) -> None:
+    with bound_memory(SMALL), pytest.raises(TacpipeError, match=match) as error:
         read()
     assert is_sentence(str(error.value)), str(error.value)
     count("hostile inputs refused")
@@ -153,9 +153,9 @@ VALUES: tuple[Any, ...] = (
 
 @pytest.mark.parametrize("kind", sample_cases(KINDS, 2))
 def test_a_model_that_nobody_changed_is_loaded_and_judged(kind: str) -> None:
-    with bounded(2 * SMALL):
-        assert loaded(kind, model_files(kind)) is not None
-        assert "metrics.json" in evaluated(kind, model_files(kind)).files
+    with bound_memory(2 * SMALL):
+        assert load_model(kind, model_files(kind)) is not None
+        assert "metrics.json" in evaluate_model(kind, model_files(kind)).files
 
 
 def try_config(kind: str, name: str, share: float) -> None:
@@ -163,7 +163,7 @@ def try_config(kind: str, name: str, share: float) -> None:
     random = Random(0)
     tree = json.loads(model_files(kind)[name])
     tried = 0
-    with bounded(2 * SMALL):
+    with bound_memory(2 * SMALL):
         for path in leaves(tree):
             for value in VALUES:
                 if random.random() > share:
@@ -173,7 +173,7 @@ def try_config(kind: str, name: str, share: float) -> None:
                 tried += 1
                 try:
                     with np.errstate(all="ignore"):
-                        evaluated(kind, files)
+                        evaluate_model(kind, files)
                 except TacpipeError as error:
                     assert is_sentence(str(error)), str(error)
     count("hostile inputs refused", tried)
@@ -200,7 +200,7 @@ def test_a_codec_that_was_changed_anyhow_gives_a_sentence_or_a_result() -> None:
     "content", [b"", b"{", b"[]", b"null", b'{"task": []}', b"[" * 100_000, b"\xff\xfe", b'{"task": "os"}']
 )
 def test_a_configuration_that_is_none_is_refused(kind: str, content: bytes) -> None:
-    refused(lambda: loaded(kind, model_files(kind) | {"config.json": content}))
+    check_refusal(lambda: load_model(kind, model_files(kind) | {"config.json": content}))
 
 
 SIZES: dict[str, tuple[str, tuple[Any, ...]]] = {
@@ -220,7 +220,9 @@ SIZES: dict[str, tuple[str, tuple[Any, ...]]] = {
 @pytest.mark.parametrize("size", [10**7, 10**9, 10**12, 1 << 70])
 def test_a_size_that_the_weights_do_not_have_is_refused_before_memory_is_taken(case: str, size: int) -> None:
     kind, path = SIZES[case]
-    refused(lambda: loaded(kind, with_config(model_files(kind), lambda config: set_value(config, path, size))))
+    check_refusal(
+        lambda: load_model(kind, with_config(model_files(kind), lambda config: set_value(config, path, size)))
+    )
 
 
 def weights(files: Files, change: Callable[[dict[str, torch.Tensor]], Any], name: str = "model.safetensors") -> Files:
@@ -238,7 +240,7 @@ def test_weights_that_are_not_finite_are_refused(kind: str, value: float) -> Non
         )
         tensors[name].view(-1)[0] = value
 
-    refused(lambda: loaded(kind, weights(model_files(kind), spoil)))
+    check_refusal(lambda: load_model(kind, weights(model_files(kind), spoil)))
 
 
 @pytest.mark.parametrize("kind", sample_cases(KINDS, 2))
@@ -258,7 +260,7 @@ def test_weights_of_other_shapes_are_refused(kind: str, change: str) -> None:
                 else tensor[..., :-1],
             }[change].contiguous()
 
-    refused(lambda: evaluated(kind, weights(model_files(kind), spoil)))
+    check_refusal(lambda: evaluate_model(kind, weights(model_files(kind), spoil)))
 
 
 def safetensors(header: Any, body: bytes = b"", length: int | None = None) -> bytes:
@@ -290,26 +292,26 @@ HEADERS = {
 @pytest.mark.parametrize("kind", sample_cases(KINDS, 2))
 @pytest.mark.parametrize("case", HEADERS)
 def test_weights_whose_header_lies_are_refused(kind: str, case: str) -> None:
-    refused(lambda: loaded(kind, model_files(kind) | {"model.safetensors": HEADERS[case]}), "safetensors")
+    check_refusal(lambda: load_model(kind, model_files(kind) | {"model.safetensors": HEADERS[case]}), "safetensors")
 
 
 @pytest.mark.parametrize("case", HEADERS)
 @pytest.mark.parametrize("name", ["codec.safetensors", "baselines.safetensors"])
 def test_codecs_and_baselines_whose_header_lies_are_refused(case: str, name: str) -> None:
     files = model_files("forward recurrent")
-    refused(lambda: loaded("forward recurrent", files | {name: HEADERS[case]}), "safetensors")
+    check_refusal(lambda: load_model("forward recurrent", files | {name: HEADERS[case]}), "safetensors")
 
 
 @pytest.mark.faults
 @pytest.mark.parametrize("kind", KINDS)
 def test_files_of_a_model_changed_in_hundreds_of_ways_give_a_sentence_or_a_result(kind: str) -> None:
     files, random = model_files(kind), Random(0)
-    with bounded(2 * SMALL):
+    with bound_memory(2 * SMALL):
         for _ in range(150):
             name = random.choice(list(files))
             try:
                 with np.errstate(all="ignore"):
-                    evaluated(kind, files | {name: mutated(files[name], list(files.values()), random)})
+                    evaluate_model(kind, files | {name: mutate(files[name], list(files.values()), random)})
             except TacpipeError as error:
                 assert is_sentence(str(error)), str(error)
     count("inputs fuzzed", 150)
@@ -320,7 +322,9 @@ def test_trees_whose_nodes_lead_back_are_refused_and_not_gone_round_for_ever() -
         name = next(key for key in tensors if key.endswith("children"))
         tensors[name][3] = torch.tensor([0, 0], dtype=tensors[name].dtype)
 
-    refused(lambda: loaded("touch strong", weights(model_files("touch strong"), spoil)), "children of a forest")
+    check_refusal(
+        lambda: load_model("touch strong", weights(model_files("touch strong"), spoil)), "children of a forest"
+    )
 
 
 @pytest.mark.parametrize("part", ["roots", "children", "features"])
@@ -330,7 +334,7 @@ def test_trees_that_point_beyond_their_nodes_are_refused(part: str, value: int) 
         name = next(key for key in tensors if key.endswith(part))
         tensors[name].view(-1)[0] = value
 
-    refused(lambda: loaded("touch strong", weights(model_files("touch strong"), spoil)), "forest")
+    check_refusal(lambda: load_model("touch strong", weights(model_files("touch strong"), spoil)), "forest")
 
 
 def test_a_forest_as_it_was_grown_is_one() -> None:

@@ -47,31 +47,33 @@ class Tags(HTMLParser):
         self.text += data
 
 
-def renamed(value: Any, words: Words) -> Any:
+def rename_words(value: Any, words: Words) -> Any:
     """Return a value with these words replaced wherever they stand as a text, a name, or the first part of one."""
     if isinstance(value, str):
         for word, new in words.items():
             if value == word or value.startswith(f"{word}-") or value == f"object of {word}":
                 return value.replace(word, new)
     if isinstance(value, Mapping):
-        return {renamed(key, words): renamed(item, words) for key, item in value.items()}
+        return {rename_words(key, words): rename_words(item, words) for key, item in value.items()}
     if isinstance(value, list):
-        return [renamed(item, words) for item in value]
+        return [rename_words(item, words) for item in value]
     return value
 
 
 def table(content: pa.Table, words: Words) -> pa.Table:
-    return pa.table({name: renamed(content.column(name).to_pylist(), words) for name in content.column_names})
+    return pa.table({name: rename_words(content.column(name).to_pylist(), words) for name in content.column_names})
 
 
 def file(name: str, content: bytes, words: Words) -> bytes:
     if name.endswith(".json"):
-        return json.dumps(renamed(json.loads(content), words)).encode()
+        return json.dumps(rename_words(json.loads(content), words)).encode()
     if name.endswith(".jsonl"):
-        return b"".join(json.dumps(renamed(json.loads(line), words)).encode() + b"\n" for line in content.splitlines())
+        return b"".join(
+            json.dumps(rename_words(json.loads(line), words)).encode() + b"\n" for line in content.splitlines()
+        )
     text = io.StringIO()
     if name.endswith(".csv"):
-        csv.writer(text).writerows(renamed(list(csv.reader(io.StringIO(content.decode()))), words))
+        csv.writer(text).writerows(rename_words(list(csv.reader(io.StringIO(content.decode()))), words))
         return text.getvalue().encode()
     binary = io.BytesIO()
     pq.write_table(table(pq.read_table(io.BytesIO(content)), words), binary)
@@ -80,8 +82,8 @@ def file(name: str, content: bytes, words: Words) -> bytes:
 
 def shard(recording: Any, words: Words) -> Any:
     name, attributes = (
-        renamed(recording.name, words),
-        {**renamed(recording.attributes, words), "note": words[NOTE], "object": words[NOTE]},
+        rename_words(recording.name, words),
+        {**rename_words(recording.attributes, words), "note": words[NOTE], "object": words[NOTE]},
     )
     if isinstance(recording, FakeRecording):
         return FakeRecording(
@@ -90,11 +92,11 @@ def shard(recording: Any, words: Words) -> Any:
     return FakeShard(name, recording.content, attributes)
 
 
-def poisoned(result: Any, words: Words) -> Any:
+def poison(result: Any, words: Words) -> Any:
     """Return a result in which these words are others; its recordings get labels of the same."""
     shards = [shard(recording, words) for recording in result.recordings.values()]
     files = {name: file(name, content, words) for name, content in result.files.items()}
-    return FakeDataset({recording.name: recording for recording in shards}, files, renamed(result.manifest, words))
+    return FakeDataset({recording.name: recording for recording in shards}, files, rename_words(result.manifest, words))
 
 
 @pytest.fixture(autouse=True)
@@ -127,10 +129,10 @@ RESULTS: dict[str, tuple[Callable[[], list[Any]], tuple[str, ...]]] = {  # resul
 }
 
 
-def rendered(case: str, new: str) -> Tags:
+def render_tags(case: str, new: str) -> Tags:
     make, names = RESULTS[case]
     words = {name: f"{new}{place}" for place, name in enumerate(names)} | {NOTE: new}
-    text = page.render([poisoned(result, words) for result in make()], title=new).decode()
+    text = page.render([poison(result, words) for result in make()], title=new).decode()
     check(text.replace(" nan", "").encode())
     tags = Tags()
     tags.feed(text)
@@ -140,7 +142,7 @@ def rendered(case: str, new: str) -> Tags:
 @pytest.mark.filterwarnings("ignore:Glyph")
 @pytest.mark.parametrize("case", sample_cases(sorted(RESULTS, key=lambda case: case != "of another task"), 2))
 def test_nothing_that_a_label_holds_becomes_an_element_of_the_page(case: str) -> None:
-    hostile, harmless = rendered(case, HOSTILE), rendered(case, "harmless")
+    hostile, harmless = render_tags(case, HOSTILE), render_tags(case, "harmless")
     assert (hostile.tags, hostile.scripts) == (harmless.tags, harmless.scripts)
     assert hostile.runs == []
     assert HOSTILE in hostile.text

@@ -14,7 +14,7 @@ from tacpipe.plugins import given_params, registry
 from tacpipe.recording import rig
 from tests.conftest import Lab, without_created_store
 from tests.promises.counts import count
-from tests.promises.limits import GIB, bounded, is_sentence, sample_cases
+from tests.promises.limits import GIB, bound_memory, is_sentence, sample_cases
 
 SMALL = GIB // 2
 COMMANDS = (
@@ -28,10 +28,10 @@ COMMANDS = (
 PATHS = ("../x", "../../x", "/tmp/x", "a/b", "a\\b", ".", "..", "", "a\0b", "x" * 5000, "a b", "A", "~/x", "con:")
 
 
-def refused(lab: Lab, command: str) -> None:
+def check_refusal(lab: Lab, command: str) -> None:
     """A command ends with a sentence and the code for usage, and has done nothing."""
     before = {path: path.stat().st_mtime_ns for path in lab.folder.rglob("*") if ".tacpipe" not in path.parts}
-    with bounded(GIB):
+    with bound_memory(GIB):
         ran = lab.call(command)
     assert ran.code in (1, 2, 5), ran.err
     assert is_sentence(without_created_store(ran.err).removeprefix("tacpipe: ").rstrip("\n")), ran.err
@@ -40,7 +40,7 @@ def refused(lab: Lab, command: str) -> None:
     count("hostile inputs refused")
 
 
-def quoted(text: str) -> str:
+def quote(text: str) -> str:
     """Return a text as TOML has it."""
     if text.isprintable() and not set(text) & set('"\\'):
         return f'"{text}"'
@@ -49,7 +49,7 @@ def quoted(text: str) -> str:
 
 def a_rig(name: str = "xela1", sensor: str = "xela", transport: str = "ws:127.0.0.1:1", further_lines: str = "") -> str:
     values = {"name": name, "sensor": sensor, "transport": transport}
-    return "[[stream]]\n" + "".join(f"{key} = {quoted(value)}\n" for key, value in values.items()) + further_lines
+    return "[[stream]]\n" + "".join(f"{key} = {quote(value)}\n" for key, value in values.items()) + further_lines
 
 
 @pytest.mark.parametrize("command", sample_cases(COMMANDS, 1))
@@ -58,7 +58,7 @@ def a_rig(name: str = "xela1", sensor: str = "xela", transport: str = "ws:127.0.
 )
 def test_an_address_that_is_a_command_or_of_no_known_kind_is_refused(lab: Lab, command: str, scheme: str) -> None:
     (lab.folder / "rig.toml").write_text(a_rig(transport=f"{scheme}{command}"))
-    refused(lab, "acquire rig.toml -o data --duration-s 1")
+    check_refusal(lab, "acquire rig.toml -o data --duration-s 1")
 
 
 @pytest.mark.parametrize("command", sample_cases(COMMANDS[:-1], 0))
@@ -79,7 +79,7 @@ def test_a_command_behind_a_known_scheme_is_a_place_that_is_not_there(
     lab: Lab, command: str, scheme: str, sensor: str, options: str
 ) -> None:
     (lab.folder / "rig.toml").write_text(a_rig("one", sensor, f"{scheme}:{command}", options))
-    refused(lab, "acquire rig.toml -o data --duration-s 1")
+    check_refusal(lab, "acquire rig.toml -o data --duration-s 1")
 
 
 @pytest.mark.parametrize("name", sample_cases([*PATHS, *COMMANDS], 3))
@@ -87,7 +87,7 @@ def test_a_stream_cannot_be_named_so_that_it_lies_elsewhere(lab: Lab, name: str)
     if name == "A":
         name = "Xela"
     (lab.folder / "rig.toml").write_text(a_rig(name, further_lines="options = { sensor = 1 }\n"))
-    refused(lab, "acquire rig.toml -o data --duration-s 1")
+    check_refusal(lab, "acquire rig.toml -o data --duration-s 1")
 
 
 @pytest.mark.parametrize(
@@ -97,7 +97,7 @@ def test_a_recording_cannot_be_named_so_that_it_lies_elsewhere(lab: Lab, name: s
     import shlex
 
     (lab.folder / "rig.toml").write_text(a_rig(further_lines="options = { sensor = 1 }\n"))
-    refused(lab, f"acquire rig.toml -o data --duration-s 1 --name {shlex.quote(name)}")
+    check_refusal(lab, f"acquire rig.toml -o data --duration-s 1 --name {shlex.quote(name)}")
 
 
 RIGS = {
@@ -120,7 +120,7 @@ RIGS = {
 @pytest.mark.parametrize("case", RIGS)
 def test_a_rig_file_that_no_person_wrote_is_refused_with_a_sentence(lab: Lab, case: str) -> None:
     (lab.folder / "rig.toml").write_bytes(RIGS[case].encode("utf-8", "surrogateescape"))
-    refused(lab, "acquire rig.toml -o data --duration-s 1")
+    check_refusal(lab, "acquire rig.toml -o data --duration-s 1")
 
 
 @pytest.mark.parametrize("kind", ["folder", "pipe", "endless", "empty"])
@@ -138,12 +138,12 @@ def test_what_is_no_file_is_no_rig_and_no_params(lab: Lab, kind: str, name: str)
     words = (
         "acquire rig.toml -o data" if name == "rig.toml" else "simulate toy -o data --params params.yaml --block toy"
     )
-    refused(lab, words)
+    check_refusal(lab, words)
 
 
 def test_labels_of_a_rig_are_text_and_nothing_else() -> None:
     parsed = rig.parse(
-        a_rig(further_lines="options = { sensor = 1 }\n") + f"[labels]\nnote = {quoted('$(touch opened)')}\n"
+        a_rig(further_lines="options = { sensor = 1 }\n") + f"[labels]\nnote = {quote('$(touch opened)')}\n"
     )
     assert parsed.labels == {"note": "$(touch opened)"}
 
@@ -201,7 +201,7 @@ def test_params_that_no_person_wrote_are_refused_with_a_sentence(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "params.yaml").write_bytes(YAMLS[case].encode("utf-8", "surrogateescape"))
     stage = registry.load("synchronize")
-    with bounded(SMALL), pytest.raises(UsageError) as error:
+    with bound_memory(SMALL), pytest.raises(UsageError) as error:
         given_params.build("synchronize", stage, file=Path("params.yaml"), block="synchronize")
     assert is_sentence(str(error.value)), str(error.value)
     assert not (tmp_path / "opened").exists()
@@ -213,7 +213,7 @@ def test_a_value_of_set_is_read_as_carefully(tmp_path: Path, case: str, monkeypa
     monkeypatch.chdir(tmp_path)
     stage = registry.load("synchronize")
     value = YAMLS[case].partition("synchronize:")[2]
-    with bounded(SMALL), pytest.raises(UsageError) as error:
+    with bound_memory(SMALL), pytest.raises(UsageError) as error:
         given_params.build("synchronize", stage, sets=[f"rate_hz={value}"])
     assert not (tmp_path / "opened").exists()
     assert len(str(error.value)) < 500 or "--set" in str(error.value)

@@ -19,7 +19,7 @@ from tacpipe.io.hashing import digest
 from tacpipe.store.store import MissingError, Store
 from tests.conftest import Lab
 from tests.promises.counts import count
-from tests.promises.limits import GIB, bounded, is_sentence
+from tests.promises.limits import GIB, bound_memory, is_sentence
 from tests.test_regular import link, sparse
 
 ATTACKS: dict[str, Callable[[Path], None]] = {
@@ -69,7 +69,7 @@ def test_a_pull_ends_with_a_sentence_whatever_lies_in_the_place_of_a_file(
         record.unlink()  # Otherwise the missing object is computed again.
     file.unlink()
     ATTACKS[attack](file)
-    with bounded(GIB):
+    with bound_memory(GIB):
         ran = lab.call(f"store pull {remote.root} data/r")
     assert ran.code == code, ran
     if code:
@@ -86,7 +86,7 @@ def test_a_push_replaces_what_lies_in_the_place_of_an_object(lab: Lab, remote: S
     content = file.read_bytes()
     file.unlink()
     ATTACKS[attack](file)
-    with bounded(GIB):
+    with bound_memory(GIB):
         lab.run(f"store push {remote.root} data/r")
     assert file.is_file() and not file.is_symlink() and file.stat().st_size == len(content)  # else nobody reads it
     assert file.read_bytes() == content
@@ -105,7 +105,7 @@ def test_a_shard_beside_a_manifest_is_adopted_only_where_it_is_a_file_of_its_siz
     (untrusted / "trial-000.parquet").unlink()
     ATTACKS[attack](untrusted / "trial-000.parquet")
     monkeypatch.setenv("TACPIPE_STORE", str(lab.folder / "empty"))
-    with bounded(GIB), pytest.raises(DamagedError) as error:
+    with bound_memory(GIB), pytest.raises(DamagedError) as error:
         tacpipe.open(untrusted).to_numpy()
     assert is_sentence(str(error.value))
     count("hostile inputs refused")
@@ -129,7 +129,7 @@ def test_no_command_waits_for_a_manifest(lab: Lab, command: str, attack: str) ->
     lab.run("simulate toy -o made --trials 1 --rows 3")
     (lab.folder / "given").mkdir()
     ATTACKS[attack](lab.folder / "given/manifest.json")
-    with bounded(GIB):
+    with bound_memory(GIB):
         ran = lab.call(command)
     assert ran.code in (FAILED, USAGE, DAMAGED) and is_sentence(ran.err), ran
     count("hostile inputs refused")
@@ -144,7 +144,7 @@ def test_no_command_waits_for_a_shard(lab: Lab, command: str, attack: str) -> No
     lab.run("scale data/q -o given")
     (lab.folder / "given/trial-000.parquet").unlink()
     ATTACKS[attack](lab.folder / "given/trial-000.parquet")
-    with bounded(GIB):
+    with bound_memory(GIB):
         ran = lab.call(command)
     assert ran.code in (DONE, FAILED) and (ran.code == DONE or is_sentence(ran.err)), ran
     count("hostile inputs refused")
@@ -229,7 +229,7 @@ def test_an_object_is_read_up_to_what_is_declared_and_a_little_one_that_grew_is_
     with pytest.raises(MissingError, match="is now in"):
         store.read(name, 7)
     sparse(path)
-    with bounded(GIB), pytest.raises(MissingError, match="3,000,000,000,000 bytes"):
+    with bound_memory(GIB), pytest.raises(MissingError, match="3,000,000,000,000 bytes"):
         store.read(name, 7)
     assert path.exists(), "nobody read it, so nobody knows whether it is damaged or the declared size is"
 
@@ -239,7 +239,7 @@ def test_a_lease_of_three_terabytes_is_refused(tmp_path: Path) -> None:
     store.prepare()
     path = store.root / "leases" / f"run-{'a' * 32}.lock"
     sparse(path)
-    with path.open() as lease, bounded(GIB):
+    with path.open() as lease, bound_memory(GIB):
         fcntl.flock(lease, fcntl.LOCK_EX)
         with pytest.raises(TacpipeError, match="3,000,000,000,000 bytes"):
             store.leases.runs()
@@ -250,5 +250,5 @@ def test_a_checkpoint_that_is_not_a_file_of_its_own_is_as_none(tmp_path: Path, a
     from tacpipe.training import loop
 
     ATTACKS[attack](tmp_path / loop.FILE)
-    with bounded(4 * GIB):
+    with bound_memory(4 * GIB):
         assert loop.read_checkpoint(tmp_path) is None

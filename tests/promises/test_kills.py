@@ -79,7 +79,7 @@ def prepare_case(scene: Scene, case: Case) -> Scene:
     for command in case.before:
         scene.run(command)
     case.spoil(scene.project)
-    kills.aged(scene.project)
+    kills.make_old(scene.project)
     return scene
 
 

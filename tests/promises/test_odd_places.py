@@ -34,7 +34,7 @@ def seldom(*values: Any) -> list[Any]:
     return [pytest.param(value, marks=pytest.mark.faults) for value in values]
 
 
-def healed(project: Specimen) -> None:
+def check_healing(project: Specimen) -> None:
     """Look whether reruns bring everything back, and whether the store is sound then."""
     for ran in project.rerun():
         assert ran.code == 0, ran
@@ -55,7 +55,7 @@ def test_folders_that_are_gone_are_made_again(project: Specimen, folders: tuple[
     assert all(project.served().values())
     for command in ("status", "verify", "gc --dry-run", "repair"):
         assert project.lab.call(f"store {command}").code in (0, DAMAGED), command
-    healed(project)
+    check_healing(project)
 
 
 def test_a_copy_without_empty_folders_is_a_store(project: Specimen) -> None:
@@ -65,14 +65,14 @@ def test_a_copy_without_empty_folders_is_a_store(project: Specimen) -> None:
     assert not (project.store / "quarantine").exists()
     damages.flip(project.object("scaled", "b.parquet"))
     assert all(project.served().values())
-    healed(project)
+    check_healing(project)
 
 
 def test_a_lost_shelf_of_objects_is_filled_again(project: Specimen) -> None:
     for shelf in sorted((project.store / "objects").iterdir())[::2]:
         shutil.rmtree(shelf)
     assert all(project.served().values())
-    healed(project)
+    check_healing(project)
 
 
 @pytest.mark.parametrize("content", [b"", b"7\n", *seldom(b"\xff\xfe", b"1\n2\n")])
@@ -90,7 +90,7 @@ def test_a_store_whose_mark_is_another_is_left_alone(project: Specimen, content:
     failed = project.lab.call("store verify")
     assert failed.code == USAGE and f"`echo 1 > {project.store / 'format'}`" in failed.err
     (project.store / "format").write_text("1\n")
-    healed(project)
+    check_healing(project)
 
 
 def test_leases_that_somebody_left_or_that_hold_anything_are_in_nobodys_way(project: Specimen) -> None:
@@ -98,7 +98,7 @@ def test_leases_that_somebody_left_or_that_hold_anything_are_in_nobodys_way(proj
         (project.store / "leases" / name).write_bytes(b"\xff\x00{]" + os.urandom(50))
     for command in ("status", "gc", "verify"):
         assert project.lab.call(f"store {command}").code == 0
-    healed(project)
+    check_healing(project)
 
 
 def test_two_objects_that_changed_places_are_both_found(project: Specimen) -> None:
@@ -110,7 +110,7 @@ def test_two_objects_that_changed_places_are_both_found(project: Specimen) -> No
     verified = project.lab.call("store verify")
     assert verified.code == DAMAGED and first.name in verified.out and right.name in verified.out
     count("corruptions found", 2)
-    healed(project)
+    check_healing(project)
 
 
 def test_a_record_in_the_place_of_another_is_none(project: Specimen) -> None:
@@ -118,7 +118,7 @@ def test_a_record_in_the_place_of_another_is_none(project: Specimen) -> None:
     damages.overwrite(ours, theirs.read_bytes())
     assert project.lab.store.record(ours.stem) is None
     count("corruptions found")
-    healed(project)
+    check_healing(project)
 
 
 def test_a_manifest_of_a_later_format_is_refused_and_left_as_it_is(project: Specimen) -> None:
@@ -167,7 +167,7 @@ def test_a_project_that_is_moved_keeps_everything_and_a_collection_after_a_month
         and "no longer at a path" not in explanation
         and "not in this store" not in explanation
     )
-    healed(moved_project)
+    check_healing(moved_project)
 
 
 def test_a_store_that_is_moved_away_from_its_project_still_serves_it(
@@ -197,7 +197,7 @@ def test_a_copy_without_modes_times_and_links_is_as_good(project: Specimen, mode
     for path in specimen.beneath(project.store):
         path.chmod(mode)
     assert all(project.served().values())
-    healed(project)
+    check_healing(project)
 
 
 # ---- rights
@@ -310,7 +310,7 @@ def test_without_hard_links_and_reflinks_all_is_as_with_them(
     fresh(project)
     monkeypatch.setattr(os, "link", refuse(number))
     monkeypatch.setattr(fcntl, "ioctl", refuse(errno.ENOTTY))
-    made_again(project)
+    remake(project)
     assert {path.stat().st_nlink for path in specimen.beneath(project.folder / "data")} == {1}
 
 
@@ -318,7 +318,7 @@ def test_without_hard_links_and_reflinks_all_is_as_with_them(
 def test_without_locks_all_is_as_with_them(project: Specimen, monkeypatch: pytest.MonkeyPatch, number: int) -> None:
     fresh(project)
     monkeypatch.setattr(fcntl, "flock", refuse(number))
-    made_again(project)
+    remake(project)
 
 
 def fresh(project: Specimen) -> None:
@@ -327,10 +327,10 @@ def fresh(project: Specimen) -> None:
     project.store.mkdir()
 
 
-def made_again(project: Specimen) -> None:
+def remake(project: Specimen) -> None:
     project.lab.run(CHAIN[0])
     project.lab.run(specimen.LABEL)
-    healed(project)
+    check_healing(project)
     specimen.age(project.store)
     project.lab.run("store gc --recordings --grace-days 0")
     assert all(project.served().values())
@@ -357,7 +357,7 @@ def test_a_clock_that_was_set_changes_no_result_and_what_is_collected(
     project.lab.run("store gc --recordings --grace-days 0")
     remaining = {path.name for path in specimen.beneath(project.store / "objects")}
     assert project.needed() <= remaining and not garbage & (remaining - project.needed())
-    healed(project)
+    check_healing(project)
 
 
 @pytest.mark.parametrize("number", [errno.EIO, *seldom(errno.EACCES, errno.ESTALE)])
@@ -385,4 +385,4 @@ def test_an_object_that_cannot_be_read_is_made_again_or_told_in_a_sentence(
     assert "Traceback" not in verified.err
     bad.clear()  # Another cable may end the errors.
     assert all(project.served().values())
-    healed(project)
+    check_healing(project)

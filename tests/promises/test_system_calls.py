@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from tacpipe import errors
-from tests.conftest import Lab, made_once
+from tests.conftest import Lab, make_once
 from tests.promises import specimen, tracing
 from tests.promises.counts import count
 
@@ -26,20 +26,20 @@ def leave_as_is(lab: Lab) -> None:
     """Take the project as it is."""
 
 
-def emptied(lab: Lab) -> None:
+def empty_stores(lab: Lab) -> None:
     """Leave what was recorded, and nothing of tacpipe's."""
     shutil.rmtree(lab.folder / ".tacpipe")
     (lab.folder / ".tacpipe").mkdir()
     shutil.rmtree(lab.folder / "data")
 
 
-def unlisted(lab: Lab) -> None:
+def leave_unneeded_dataset(lab: Lab) -> None:
     """Leave a dataset that nobody needs."""
     shutil.rmtree(lab.folder / "data/total")
     specimen.age(lab.folder / ".tacpipe")
 
 
-def pushed(lab: Lab) -> None:
+def push_manifests(lab: Lab) -> None:
     """Leave manifests alone, whose objects lie in another store."""
     lab.run("store push remote data/recordings")
     shutil.rmtree(lab.folder / ".tacpipe")
@@ -58,12 +58,12 @@ class Case:
 
 
 CASES = {
-    "ingest": Case("ingest numbers src -o data/recordings --jobs 1", emptied),
+    "ingest": Case("ingest numbers src -o data/recordings --jobs 1", empty_stores),
     "a stage": Case("scale data/recordings -o data/tripled --factor 3 --jobs 1"),
     "label": Case("label data/recordings b --label material=cork"),
     "push": Case("store push remote data/recordings data/scaled"),
-    "pull": Case("store pull remote data/recordings", pushed),
-    "gc": Case("store gc --grace-days 0", unlisted),
+    "pull": Case("store pull remote data/recordings", push_manifests),
+    "gc": Case("store gc --grace-days 0", leave_unneeded_dataset),
 }
 
 
@@ -94,7 +94,7 @@ def clean(request: pytest.FixtureRequest, original: Path, lab: Lab, tmp_path_fac
         case.before(lab)
         specimen.clone(lab.folder, folder)
 
-    before = made_once(tmp_path_factory, f"system-calls-{name.replace(' ', '-')}", make)
+    before = make_once(tmp_path_factory, f"system-calls-{name.replace(' ', '-')}", make)
     restore(lab, before)
     ran = tracing.run(lab.folder, shlex.split(case.command), tmp_path_factory.mktemp("trace") / "log")
     assert ran.code == 0, ran.err
@@ -126,7 +126,7 @@ def test_whatever_a_system_call_answers_nothing_is_wrong_and_a_rerun_gives_the_s
     log = tmp_path_factory.mktemp("trace") / "log"
     for call, fault, lasting in struck(clean.calls, name):
         restore(lab, clean.before)
-        expression = tracing.injected(call, fault, lasting=lasting)
+        expression = tracing.injection(call, fault, lasting=lasting)
         ran = tracing.run(lab.folder, shlex.split(case.command), log, expression)
         if not ran.struck:  # it met a call of the interpreter's own, because one came more or less than before
             continue

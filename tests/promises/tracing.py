@@ -108,7 +108,7 @@ def run(folder: Path, words: Sequence[str], log: Path, inject: str = "", names: 
     return Traced(ran.returncode, ran.stderr, calls, struck)
 
 
-def injected(call: Call, fault: str, *, lasting: bool = False) -> str:
+def injection(call: Call, fault: str, *, lasting: bool = False) -> str:
     """Return strace's expression for a fault of one call, or of it and all that follow."""
     effect = {"short": "retval=0", "slow": f"delay_enter={SLOW_US}"}.get(fault, f"error={fault}")
     return f"{call.name}:{effect}:when={call.number}{'+' if lasting else ''}"

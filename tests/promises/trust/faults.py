@@ -11,9 +11,9 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from tests.promises.trust.lab import RECORDINGS, VICTIM, Cell, edited, finished, truncated
+from tests.promises.trust.lab import RECORDINGS, VICTIM, Cell, edit_bit, truncate, wait_until_finished
 from tests.promises.trust.steps import NOISE, PAUSE
-from tests.promises.trust.tools import TOOLS, Dvc, Tool, removed, up_to
+from tests.promises.trust.tools import TOOLS, Dvc, Tool, remove_output, up_to
 
 CROWD = 8
 SOON_S = 5.0
@@ -36,7 +36,7 @@ def _edited_output(tool: Tool, folder: Path) -> Cell:
     up_to(tool, lab, "scale")
     place = tool.output_folder(lab, "scale")
     victim = tool.stored(lab, "scale") if place is None else next(place.glob(f"{VICTIM}.*"))
-    edited(victim)
+    edit_bit(victim)
     summed = lab.run(tool.words(lab, "total"))
     note = "it has no workspace, so its cached file was edited; " if place is None else ""
     if tool.values(lab, "total") == lab.right("total"):
@@ -57,7 +57,7 @@ def damaged(harm: Callable[[Path], None]) -> Fault:
         lab = tool.lab(folder)
         up_to(tool, lab, "scale")
         harm(tool.stored(lab, "scale"))
-        removed(tool, lab, "scale")
+        remove_output(tool, lab, "scale")
         brought_back = tool.bring_back(lab, "scale")
         served = tool.values(lab, "scale")
         summed = lab.run(tool.words(lab, "total"))
@@ -108,7 +108,7 @@ def interrupted(tool: Tool, folder: Path) -> Cell:
     process = lab.start_gated(tool.words(lab, "scale"), "scale")
     interrupted_s = time.monotonic()
     os.killpg(process.pid, signal.SIGINT)
-    completed = finished(process)
+    completed = wait_until_finished(process)
     soon = time.monotonic() - interrupted_s < SOON_S
     all_ended = lab.wait_until_still(SOON_S)
     place = tool.output_folder(lab, "scale")
@@ -135,7 +135,7 @@ def crowd(tool: Tool, folder: Path) -> Cell:
     up_to(tool, lab, "load")
     words = tool.words(lab, "scale")
     processes = [lab.start(words, **{PAUSE: "0.1"}) for _ in range(CROWD)]
-    codes = Counter(finished(process).code for process in processes)
+    codes = Counter(wait_until_finished(process).code for process in processes)
     times = Counter(lab.computed("scale")).values()
     right = tool.values(lab, "scale") == lab.right("scale")
     failed = CROWD - codes[0]
@@ -154,10 +154,10 @@ def collected(tool: Tool, folder: Path) -> Cell:
     process = lab.start_gated(tool.words(lab, "scale"), "scale")
     cleaned = lab.run(tool.cleaning())
     lab.open_gate()
-    completed = finished(process)
+    completed = wait_until_finished(process)
     before = len(lab.computed("scale"))
     for step in ("load", "scale"):
-        removed(tool, lab, step)
+        remove_output(tool, lab, step)
         tool.bring_back(lab, step)
     summed = lab.run(tool.words(lab, "total"))
     right = tool.values(lab, "scale") == lab.right("scale") and tool.values(lab, "total") == lab.right("total")
@@ -190,7 +190,7 @@ def _changed_input(tool: Tool, folder: Path, when: str) -> Cell:
     old = lab.raw[VICTIM]
     lab.write_raw(VICTIM, old + 7)
     lab.open_gate()
-    completed = finished(process)
+    completed = wait_until_finished(process)
     lab.run(tool.words(lab, "load"))
     under_new = tool.values(lab, "load") == lab.right("load")
     lab.write_raw(VICTIM, old)
@@ -248,8 +248,8 @@ def full(tool: Tool, folder: Path) -> Cell:
 
 FAULTS: Mapping[str, tuple[str, Fault]] = {
     "edited": ("output edited, size and mtime kept; next stage run", edited_output),
-    "flipped": ("a bit flipped in the cache; output brought back", damaged(edited)),
-    "truncated": ("cached file cut in half; output brought back", damaged(truncated)),
+    "flipped": ("a bit flipped in the cache; output brought back", damaged(edit_bit)),
+    "truncated": ("cached file cut in half; output brought back", damaged(truncate)),
     "deleted": ("cached file deleted; output brought back", damaged(Path.unlink)),
     "killed": ("`kill -9` at work; run again at once with another factor", killed),
     "interrupted": ("Ctrl-C at work", interrupted),

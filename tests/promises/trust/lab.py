@@ -93,7 +93,7 @@ class Lab:
 
     def run(self, words: Sequence[str], **variables: str) -> Done:
         """Run a command to its end."""
-        return finished(self.start(words, **variables))
+        return wait_until_finished(self.start(words, **variables))
 
     def must(self, words: Sequence[str], **variables: str) -> Done:
         """Run a command that has no reason to fail."""
@@ -152,7 +152,7 @@ class Lab:
         return {path.relative_to(self.folder) for path in self.folder.rglob("*") if path.is_file()}
 
 
-def finished(process: subprocess.Popen[str]) -> Done:
+def wait_until_finished(process: subprocess.Popen[str]) -> Done:
     """Wait for a command's end, and only for its own: what it left running may hold its pipes."""
     try:
         out, err = process.communicate(timeout=steps.PATIENCE_S)
@@ -175,7 +175,7 @@ def python(module: str, *words: str) -> list[str]:
     return [sys.executable, "-m", f"tests.promises.trust.{module}", *words]
 
 
-def loaded(text: str) -> dict[str, object]:
+def parse_mapping(text: str) -> dict[str, object]:
     """Return the mapping that a command printed, or none."""
     try:
         value = json.loads(text)
@@ -187,7 +187,7 @@ def loaded(text: str) -> dict[str, object]:
 # ---- harm
 
 
-def edited(path: Path) -> None:
+def edit_bit(path: Path) -> None:
     """Change one bit in the middle of a file in place; size, mode and time of change stay as they were."""
     before = path.stat()
     path.chmod(0o644)
@@ -200,7 +200,7 @@ def edited(path: Path) -> None:
     os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
 
 
-def truncated(path: Path) -> None:
+def truncate(path: Path) -> None:
     """Cut a file to its first half."""
     mode = path.stat().st_mode
     path.chmod(0o644)

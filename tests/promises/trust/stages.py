@@ -40,7 +40,7 @@ def load(params: Nothing, files: Files) -> pa.Table:
 
     (path,) = files.values()
     steps.note_begin("load", path.stem)
-    return pa.table({"x": steps.parsed(path.stem, path.read_text())})
+    return pa.table({"x": steps.parse_numbers(path.stem, path.read_text())})
 
 
 @stage(version=1)
@@ -50,7 +50,7 @@ def scale(params: Factor, recording: Recording) -> pa.Table:
 
     steps.note_begin("scale", recording.name)
     values = recording.table()["x"].to_numpy()
-    return pa.table({"x": steps.scaled(recording.name, values, params.factor)})
+    return pa.table({"x": steps.multiply(recording.name, values, params.factor)})
 
 
 @stage(version=1)

@@ -32,13 +32,13 @@ def note_begin(step: str, recording: str) -> None:
     _wait(step, "before", recording)
 
 
-def parsed(recording: str, text: str) -> np.ndarray:
+def parse_numbers(recording: str, text: str) -> np.ndarray:
     """Return the numbers of a text (time,)."""
     _wait("load", "after", recording)
     return np.array(text.split(), dtype=np.int64)
 
 
-def scaled(recording: str, values: np.ndarray, factor: int) -> np.ndarray:
+def multiply(recording: str, values: np.ndarray, factor: int) -> np.ndarray:
     """Return the numbers times the factor."""
     _wait("scale", "after", recording)
     time.sleep(float(os.environ.get(PAUSE, "0")))
@@ -63,14 +63,14 @@ def load() -> None:
     """Turn texts into arrays."""
     for path in sorted(Path("raw").glob("*.txt")):
         note_begin("load", path.stem)
-        np.save(Path("load") / path.stem, parsed(path.stem, path.read_text()))
+        np.save(Path("load") / path.stem, parse_numbers(path.stem, path.read_text()))
 
 
 def scale(factor: int) -> None:
     """Scale arrays."""
     for path in sorted(Path("load").glob("*.npy")):
         note_begin("scale", path.stem)
-        np.save(Path("scale") / path.stem, scaled(path.stem, np.load(path), factor))
+        np.save(Path("scale") / path.stem, multiply(path.stem, np.load(path), factor))
 
 
 def total() -> None:
@@ -94,13 +94,13 @@ def _by_dvc(step: str, factor: int) -> None:
 def load_one(recording: str, text: str) -> np.ndarray:
     """Turn a text into an array."""
     note_begin("load", recording)
-    return parsed(recording, text)
+    return parse_numbers(recording, text)
 
 
 def scale_one(recording: str, values: np.ndarray, factor: int) -> np.ndarray:
     """Scale an array."""
     note_begin("scale", recording)
-    return scaled(recording, values, factor)
+    return multiply(recording, values, factor)
 
 
 def total_all(values: dict[str, np.ndarray]) -> dict[str, int]:

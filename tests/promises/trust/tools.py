@@ -11,7 +11,7 @@ from typing import Protocol
 import joblib
 import yaml
 
-from tests.promises.trust.lab import RECORDINGS, VICTIM, Done, Lab, loaded, python
+from tests.promises.trust.lab import RECORDINGS, VICTIM, Done, Lab, parse_mapping, python
 from tests.promises.trust.steps import STEPS
 
 JOBLIB_CACHE = Path("cache/joblib/tests/promises/trust/steps")  # joblib names folders after the module
@@ -85,8 +85,8 @@ class Tacpipe:
     def values(self, lab: Lab, step: str, factor: int = 2) -> dict[str, object]:
         if step == "total":
             path = lab.folder / "data" / "total" / "total.json"
-            return loaded(path.read_text()) if path.exists() else {}
-        return loaded(lab.run(python("stages", f"data/{step}")).out)
+            return parse_mapping(path.read_text()) if path.exists() else {}
+        return parse_mapping(lab.run(python("stages", f"data/{step}")).out)
 
     def stored(self, lab: Lab, step: str) -> Path:
         manifest = json.loads((lab.folder / "data" / step / "manifest.json").read_text())
@@ -145,10 +145,10 @@ class Dvc:
     def values(self, lab: Lab, step: str, factor: int = 2) -> dict[str, object]:
         if step == "total":
             path = lab.folder / "total.json"
-            return loaded(path.read_text()) if path.exists() else {}
+            return parse_mapping(path.read_text()) if path.exists() else {}
         read = "import json, numpy, pathlib, sys; print(json.dumps({path.stem: numpy.load(path).tolist() "
         read += "for path in pathlib.Path(sys.argv[1]).glob('*.npy')}))"
-        return loaded(lab.run([sys.executable, "-c", read, step]).out)
+        return parse_mapping(lab.run([sys.executable, "-c", read, step]).out)
 
     def stored(self, lab: Lab, step: str) -> Path:
         lock = yaml.safe_load((lab.folder / "dvc.lock").read_text())
@@ -194,7 +194,7 @@ class Joblib:
         return python("steps", "joblib", step, str(factor))
 
     def values(self, lab: Lab, step: str, factor: int = 2) -> dict[str, object]:
-        return loaded(lab.run(self.words(lab, step, factor)).out)
+        return parse_mapping(lab.run(self.words(lab, step, factor)).out)
 
     def stored(self, lab: Lab, step: str) -> Path:
         right = lab.right(step)[VICTIM]
@@ -216,7 +216,7 @@ class Joblib:
         return False, "it has no way to compare; a hit is served as it is"
 
 
-def removed(tool: Tool, lab: Lab, step: str) -> None:
+def remove_output(tool: Tool, lab: Lab, step: str) -> None:
     """Remove the output of a step from the workspace."""
     place = tool.output_folder(lab, step)
     if place is not None:
