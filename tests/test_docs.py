@@ -489,7 +489,7 @@ def test_command_lines_fit_a_block_of_code() -> None:
     long_lines = [
         f"{page.name}: {line}"
         for page in PAGES
-        for block in fenced(page.read_text())
+        for block in fenced_blocks(page.read_text())
         if block.language in ("sh", "bash", "console")
         for line in block.text.splitlines()
         if len(line) > WIDTH and (block.language != "console" or line.startswith("$ "))
@@ -508,8 +508,8 @@ def test_pages_avoid_words_of_a_translation() -> None:
 @pytest.mark.long
 def test_the_notebook_opens_a_dataset_and_fits_a_model(tmp_path: Path) -> None:
     (tmp_path / ".tacpipe").mkdir()
-    (block, *_) = fenced(section((ROOT / "README.md").read_text(), "From data to a report"))
-    for command, _ in printed(block.text)[:4]:
+    (block, *_) = fenced_blocks(section((ROOT / "README.md").read_text(), "From data to a report"))
+    for command, _ in printed_commands(block.text)[:4]:
         ran = tacpipe(tmp_path, command.removeprefix("tacpipe "), OMP_NUM_THREADS="1")
         assert ran.returncode == 0, ran.stderr
     cells = json.loads((ROOT / "docs" / "tutorials" / "explore.ipynb").read_text())["cells"]
