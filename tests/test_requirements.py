@@ -13,7 +13,7 @@ from tacpipe.errors import TacpipeError
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
 from tacpipe.tasks.forward import tracks
-from tacpipe.tasks.forward.requirements import REQUIREMENTS as FORWARD
+from tacpipe.tasks.forward.params import REQUIREMENTS as FORWARD
 from tacpipe.tasks.material import slides as material_slides
 from tacpipe.tasks.material.requirements import REQUIREMENTS as MATERIAL
 from tests.conftest import Lab

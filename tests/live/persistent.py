@@ -24,11 +24,11 @@ from tacpipe.live.preparation import LiveModel
 from tacpipe.live.settings import SessionOptions
 from tacpipe.plugins import registry
 from tacpipe.recording import rig as rigs
+from tacpipe.tasks.forward.alarms import axes
 from tacpipe.tasks.forward.live.alarms import Alarms
 from tacpipe.tasks.forward.live.chain import Beginning, Cause, Forecast
 from tacpipe.tasks.forward.live.engine import ForecastEngine
 from tacpipe.tasks.forward.live.task import ForwardSettings
-from tacpipe.tasks.forward.loads import axes
 
 HORIZON = 3
 PERIOD_NS = 20_000_000

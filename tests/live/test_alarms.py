@@ -11,12 +11,11 @@ import pytest
 
 from tacpipe.arrays import Bools, Floats
 from tacpipe.sensors.live import OFF, ON, UNKNOWN
-from tacpipe.tasks.forward.alarms import Loads
+from tacpipe.tasks.forward.alarms import Loads, axes
 from tacpipe.tasks.forward.headline import MODEL
 from tacpipe.tasks.forward.live import alarms
 from tacpipe.tasks.forward.live.alarms import LOAD, NAMES, SLIP, Alarms
-from tacpipe.tasks.forward.loads import axes
-from tacpipe.tasks.forward.slip_alarms import Rows, SlipAlarms
+from tacpipe.tasks.forward.slips import Rows, SlipAlarms
 
 LAYOUT = [{"stream": "skin", "axis": axis, "taxel": str(taxel)} for taxel in (1, 2) for axis in "xyz"]
 HORIZON, RATE_HZ = 10, 50.0

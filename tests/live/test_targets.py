@@ -14,7 +14,7 @@ from tacpipe.recording import rig as rigs_of
 from tacpipe.recording.reading import Reading
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.sensor import Sensor
-from tacpipe.tasks.forward import planned
+from tacpipe.tasks.forward import causal
 from tacpipe.tasks.forward.live.chain import Cause, Chain
 from tacpipe.tasks.forward.live.plans import Targets
 from tests.fake_recordings import FakeRecording
@@ -119,13 +119,13 @@ def test_the_plan_is_what_the_set_point_did_last_taken_to_continue(
     model: Made, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen: list[Any] = []
-    used = planned.without
+    used = causal.without
 
     def without(*given: Any) -> Any:
         seen.append(given)
         return used(*given)
 
-    monkeypatch.setattr(planned, "without", without)
+    monkeypatch.setattr(causal, "without", without)
     given = aimed(6)
     fed(model, given, [])
     robot = given.tables["robot"]

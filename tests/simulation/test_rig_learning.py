@@ -223,7 +223,7 @@ def median_lead(forecaster: Forecaster, kind: dict[str, Any]) -> float:
     The event is the slip itself, at the first row T of the truth's. An alarm is on in a row in which touch, as foretold
     ten rows later, would pass what friction holds; the judge knows the friction, the forecaster does not. The lead is T
     less the first row with an alarm from T - 12, for what a forecast rounds, but never above 10, to T + 9; with none it
-    is -10. The onset of a change of load, as `tacpipe.tasks.forward.anticipation` tells it, is another event: the load rises
+    is -10. The onset of a change of load, as `tacpipe.tasks.forward.alarms` tells it, is another event: the load rises
     before the object slips, and an exact forecast leads the rise by a few rows only.
     """
     found = []

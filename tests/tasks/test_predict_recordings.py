@@ -12,7 +12,7 @@ from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
 from tacpipe.errors import UsageError
 from tacpipe.plugins import registry
-from tacpipe.tasks.forward.model import ForwardModel
+from tacpipe.tasks.forward.prediction import ForwardModel
 from tests.conftest import Lab
 
 

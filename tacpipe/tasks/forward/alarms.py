@@ -1,21 +1,294 @@
-"""Measure whether predictors warn of a change of load before it begins."""
+"""Measure whether predictors warn of a change of load before it begins.
+
+A curve of forecasts drawn at the time they are made always looks early if it is any good, and also if it overshoots;
+so warnings are counted. ``truth`` is (time, feature), and ``ahead`` (time, feature) in row t the forecast, made at t, of
+``truth`` k rows later, k being the ``horizon``; NaN where there is none. ``groups`` (time,) numbers recordings or
+contacts, equal neighbours belong together, and nothing is given across them. Each feature is evaluated by itself.
+
+- A *change* is a run of rows t in which |z_t - z_{t-k}| is beyond 3 times its standard deviation sd in calibration data,
+  until it is below 1.5 times. A run that begins within 2 k rows of the end of the last belongs to it: a difference over
+  k rows repeats a short push with the other sign k rows later, and what warns of a change needs k rows of quiet before.
+- An *event* is the onset of a change: where the run begins, at t, the row after the last of t - k, ..., t - 1 that is
+  within a twentieth of z_t - z_{t-k} from z_{t-k}. Were it t itself, a forecast that merely follows would look early,
+  because a change that takes time has begun before it is beyond 3 sd.
+- An *alarm* is on in a row in which |ahead_t - z_t| > theta. It *leads* an event at T if it is on in one of the rows
+  T - k, ..., T - 1, by T less the first of them: what k rows predict is never known more than k rows before.
+- A *false alarm* is one in a row that is free of events: with a forecast whose k rows are in the group, and before
+  T - k - k/5 or from the end of the change on for every event T. An alarm represents the k rows that it predicts: one
+  that is still on after these is the next, so that an alarm that never ends is not a rare one.
+
+Events that do not have a forecast in each of the k rows before are not counted: they could not be led by k rows.
+Persistence forecasts no change, hence never alarms.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from typing import Any
 
 import numpy as np
 
-from tacpipe.arrays import AnyFloats, Int64s
+from tacpipe.arrays import AnyArray, AnyFloats, Bools, Indices, Int64s
+from tacpipe.errors import TacpipeError
 from tacpipe.signals import holds
-from tacpipe.tasks.forward import anticipation
+from tacpipe.signals.runs import latched, runs
 from tacpipe.tasks.forward.headline import BASELINE, MODEL
-from tacpipe.tasks.forward.loads import loads
 from tacpipe.tasks.forward.params import AlarmLevels
 from tacpipe.tasks.forward.predictors import Predicted, Prediction
 from tacpipe.tasks.forward.tracks import Track
+
+ON_SD, OFF_SD = 3.0, 1.5  # differences at which a change begins and ends, in standard deviations
+ONSET_FRACTION = 0.05  # fraction of a change up to which it has not begun
+EARLY_FRACTION = 0.2  # fraction of the horizon by which an alarm may be early and still not be false
+FALSE_ALARMS_PER_MINUTE = 1.0  # rate for each feature, where nothing happens
+
+
+@dataclass(frozen=True)
+class Anticipation:
+    """How well changes were predicted, over all features; NaN where nothing states."""
+
+    events: int
+    recall: float  # fraction of the events that an alarm leads
+    median_lead_rows: float  # rows from alarm to event
+    median_lead_frames: float  # new frames from alarm to event, the event's own included
+    false_alarms_per_minute: float  # rate for each feature, in rows free of events
+
+
+def difference_sd(truth: AnyFloats, groups: AnyArray, *, horizon: int) -> AnyFloats:
+    """Return the standard deviation of z_t - z_{t-k} of each feature (feature,), over the rows that have one; else 0."""
+    _check(truth, horizon, groups=groups)
+    moved = _moved(truth.astype(np.float64), _stretches(groups), horizon)
+    finite = np.isfinite(moved)
+    count = np.maximum(finite.sum(axis=0), 1)
+    moved = np.where(finite, moved, 0)
+    mean = moved.sum(axis=0) / count
+    deviations: AnyFloats = np.sqrt(np.square(np.where(finite, moved - mean, 0)).sum(axis=0) / count)
+    return deviations
+
+
+def changes(truth: AnyFloats, groups: AnyArray, *, horizon: int, sd: AnyFloats) -> list[Indices]:
+    """Return the onset and the end, exclusive, of the changes of each feature, each (change, 2).
+
+    ``sd`` (feature,) is that of `difference_sd`; a feature whose is 0 never changes.
+    """
+    _check(truth, horizon, groups=groups, sd=sd)
+    stretches = _stretches(groups)
+    spaced = _spaced(stretches, horizon)
+    moved = _moved(truth.astype(np.float64), stretches, horizon)
+    return [
+        _changes_of(truth[:, feature], moved[:, feature], spaced, horizon, float(sd[feature]))
+        for feature in range(truth.shape[1])
+    ]
+
+
+def calibrate(
+    truth: AnyFloats,
+    ahead: AnyFloats,
+    groups: AnyArray,
+    *,
+    horizon: int,
+    sd: AnyFloats,
+    rate_hz: float,
+    per_minute: float = FALSE_ALARMS_PER_MINUTE,
+) -> AnyFloats:
+    """Return theta (feature,): the least that gives no more than ``per_minute`` false alarms a minute in this data.
+
+    ``rate_hz`` is the rate of rows. Infinite for a feature without a row that is free of events: no alarm is known to be
+    rare enough there.
+    """
+    _check(truth, horizon, groups=groups, ahead=ahead, sd=sd)
+    stretches = _stretches(groups)
+    spaced = _spaced(stretches, horizon)
+    theta = np.full(truth.shape[1], np.inf)
+    for feature, spans in enumerate(changes(truth, groups, horizon=horizon, sd=sd)):
+        deviation = np.abs(ahead[:, feature] - truth[:, feature])
+        free = _free(deviation, spans, stretches, horizon)
+        theta[feature] = _lowest_level(deviation, free, spaced, horizon, per_minute * _minutes(free, rate_hz))
+    return theta
+
+
+def level(
+    scores: AnyFloats, free: Bools, groups: AnyArray, *, horizon: int, rate_hz: float, per_minute: float
+) -> float:
+    """Return the least level of ``scores`` (time,) that gives no more than ``per_minute`` false alarms a minute.
+
+    ``free`` (time,) are the rows in which an alarm is false; of them those count that have a score. An alarm represents
+    ``horizon`` rows. Infinite where no row counts.
+
+    >>> scores, alike = np.array([1.0, 9.0, 2.0, 8.0, 3.0, 7.0]), np.zeros(6)
+    >>> level(scores, scores < 9, alike, horizon=1, rate_hz=0.1, per_minute=1.2)  # one alarm in the 50 s that are free
+    7.0
+    """
+    counted = free & np.isfinite(scores)
+    spaced = _spaced(_stretches(groups), horizon)
+    return _lowest_level(scores, counted, spaced, horizon, per_minute * _minutes(counted, rate_hz))
+
+
+def _lowest_level(deviation: AnyFloats, free: Bools, spaced: Indices, horizon: int, allowed: float) -> float:
+    """Return the least level that ``deviation`` (time,) passes in no more than ``allowed`` alarms; infinite without rows."""
+    if not free.any():
+        return float("inf")
+    levels = np.unique(deviation[free])
+    low, high = 0, len(levels) - 1  # the highest level is never passed, and what passes a lower one passes it too
+    while low < high:
+        middle = (low + high) // 2
+        if _count(spaced[free & (deviation > levels[middle])], horizon, allowed) > allowed:
+            low = middle + 1
+        else:
+            high = middle
+    return float(levels[low])
+
+
+def score(
+    truth: AnyFloats,
+    ahead: AnyFloats,
+    groups: AnyArray,
+    *,
+    horizon: int,
+    sd: AnyFloats,
+    theta: AnyFloats,
+    rate_hz: float,
+    repeated: Bools | None = None,
+) -> Anticipation:
+    """Return how well ``ahead`` predicts the changes of ``truth`` with alarms beyond ``theta`` (feature,).
+
+    ``repeated`` (time,) marks rows that repeat the frame before; None: every row is a new frame.
+    """
+    _check(truth, horizon, groups=groups, ahead=ahead, sd=sd, theta=theta)
+    stretches = _stretches(groups)
+    spaced = _spaced(stretches, horizon)
+    fresh_so_far = np.cumsum(np.ones(len(truth), dtype=bool) if repeated is None else ~repeated)
+    events, false_alarms, minutes = 0, 0, 0.0
+    leads: list[tuple[int, int]] = []  # leads in rows and in frames
+    for feature, spans in enumerate(changes(truth, groups, horizon=horizon, sd=sd)):
+        deviation = np.abs(ahead[:, feature] - truth[:, feature])
+        alarm = deviation > theta[feature]
+        for onset in spans[:, 0]:
+            first = onset - horizon
+            if first < 0 or stretches[first] != stretches[onset] or not np.isfinite(deviation[first:onset]).all():
+                continue
+            events += 1
+            if alarm[first:onset].any():
+                row = first + int(alarm[first:onset].argmax())
+                leads.append((int(onset - row), int(fresh_so_far[onset] - fresh_so_far[row])))
+        free = _free(deviation, spans, stretches, horizon)
+        false_alarms += _count(spaced[free & alarm], horizon)
+        minutes += _minutes(free, rate_hz)
+    rows, frames = (float(median) for median in np.median(leads, axis=0)) if leads else (np.nan, np.nan)
+    return Anticipation(
+        events,
+        len(leads) / events if events else np.nan,
+        rows,
+        frames,
+        false_alarms / minutes if minutes else np.nan,
+    )
+
+
+def _stretches(groups: AnyArray) -> Indices:
+    """Return the number of the group of each row (time,), so that no number comes twice."""
+    begins = np.ones(len(groups), dtype=bool)
+    begins[1:] = groups[1:] != groups[:-1]
+    return np.cumsum(begins)
+
+
+def _spaced(stretches: Indices, horizon: int) -> Indices:
+    """Return row numbers (time,) between which groups lie so far apart that nothing of one is near another."""
+    return np.arange(len(stretches)) + stretches * 2 * horizon
+
+
+def _moved(truth: AnyFloats, stretches: Indices, horizon: int) -> AnyFloats:
+    """Return z_t - z_{t-k} (time, feature), NaN in the first k rows of each group."""
+    moved = np.full(truth.shape, np.nan)
+    same_stretch = stretches[horizon:] == stretches[:-horizon]
+    moved[horizon:][same_stretch] = (truth[horizon:] - truth[:-horizon])[same_stretch]
+    return moved
+
+
+def _changes_of(truth: AnyFloats, moved: AnyFloats, spaced: Indices, horizon: int, sd: float) -> Indices:
+    """Return onset and end of the changes (change, 2) of one feature, ``truth`` and ``moved`` each (time,)."""
+    size = np.abs(moved)
+    on = (size > ON_SD * sd) & (sd > 0)
+    starts, stops = runs(latched(on, ~(size >= OFF_SD * sd)))  # a change ends where a value is missing
+    if not len(starts):
+        return np.zeros((0, 2), dtype=np.intp)
+    separate = spaced[starts[1:]] - spaced[stops[:-1] - 1] > 2 * horizon
+    starts, stops = starts[np.append(True, separate)], stops[np.append(separate, True)]
+    before = starts[:, None] + np.arange(-horizon, 0)  # (change, row)
+    has_begun = np.abs(truth[before] - truth[starts - horizon][:, None]) > ONSET_FRACTION * size[starts][:, None]
+    lasts = np.argmin(has_begun[:, ::-1], axis=1)  # rows that had begun, without a gap up to the start
+    return np.stack([starts - lasts, stops], axis=1)
+
+
+def _free(deviation: AnyFloats, spans: Indices, stretches: Indices, horizon: int) -> Bools:
+    """Return which rows (time,) have a forecast that its group holds and are not near a change of ``spans``."""
+    free: Bools = np.isfinite(deviation)
+    free[max(len(free) - horizon, 0) :] = False
+    free[:-horizon] &= stretches[horizon:] == stretches[:-horizon]
+    early = horizon + round(EARLY_FRACTION * horizon)
+    for onset, stop in spans:
+        near = slice(max(onset - early, 0), stop)
+        free[near] &= stretches[near] != stretches[onset]
+    return free
+
+
+def _count(alarms: Indices, horizon: int, enough: float = np.inf) -> int:
+    """Return how many alarms the rows ``alarms`` are, sorted: each represents the k rows after it, too.
+
+    No choice of rows more than k apart is larger, so that more rows never make fewer alarms. Counts no further than one
+    beyond ``enough``.
+    """
+    count, at = 0, 0
+    while at < len(alarms) and count <= enough:
+        count += 1
+        at = int(np.searchsorted(alarms, alarms[at] + horizon, side="right"))
+    return count
+
+
+def _minutes(rows: Bools, rate_hz: float) -> float:
+    return float(rows.sum()) / rate_hz / 60
+
+
+def _check(truth: AnyFloats, horizon: int, *, groups: AnyArray, **arrays: AnyFloats) -> None:
+    """Refuse what cannot be evaluated."""
+    if horizon < 1:
+        raise TacpipeError(f"A forecast of {horizon} rows predicts nothing; the horizon must be 1 or more.")
+    if truth.ndim != 2 or len(groups) != len(truth):
+        raise TacpipeError(
+            f"Features of {truth.shape} and {len(groups)} group numbers do not fit; there must be one a row."
+        )
+    for name, values in arrays.items():
+        expected = truth.shape if name == "ahead" else truth.shape[1:]
+        if values.shape != expected:
+            raise TacpipeError(f"{name} of {values.shape} does not fit features of {truth.shape}; give {expected}.")
+
+
+def axes(layout: Sequence[Mapping[str, str]]) -> tuple[tuple[str, str], ...]:
+    """Return stream and axis of each load of channels that lie so."""
+    return tuple(dict.fromkeys(map(_axis, layout)))
+
+
+def loads(counts: Any, layout: Sequence[Mapping[str, str]]) -> AnyFloats:
+    """Return the loads (time, load), in the order of `axes`, of ``counts`` (time, channel) of channels that lie so.
+
+    >>> layout = [{"stream": "left", "axis": axis} for axis in "xxz"]
+    >>> loads(np.array([[1.0, 3.0, 7.0]]), layout).tolist()
+    [[2.0, 7.0]]
+    """
+    places = [_axis(channel) for channel in layout]
+    return np.stack(
+        [
+            counts[:, [index for index, place in enumerate(places) if place == load_axis]].mean(axis=1)
+            for load_axis in axes(layout)
+        ],
+        axis=1,
+    )
+
+
+def _axis(channel: Mapping[str, str]) -> tuple[str, str]:
+    return channel.get("stream", ""), channel.get("axis", "")
+
 
 Layout = Sequence[Mapping[str, str]]
 
@@ -59,11 +332,9 @@ class Loads:
         if not self.truth:
             return {}
         truth, groups = np.concatenate(self.truth), np.concatenate(self.groups)
-        sd = anticipation.difference_sd(truth, groups, horizon=self.horizon)
+        sd = difference_sd(truth, groups, horizon=self.horizon)
         theta = {
-            name: anticipation.calibrate(
-                truth, ahead, groups, horizon=self.horizon, sd=sd, rate_hz=self.rate_hz
-            ).tolist()
+            name: calibrate(truth, ahead, groups, horizon=self.horizon, sd=sd, rate_hz=self.rate_hz).tolist()
             for name, ahead in self._with_forecasts()
         }
         # JSON holds no infinity: null stands in its place
@@ -80,7 +351,7 @@ class Loads:
             if name not in levels["theta"]:
                 continue
             theta = np.array([math.inf if value is None else value for value in levels["theta"][name]])
-            score = anticipation.score(
+            result = score(
                 truth,
                 ahead,
                 groups,
@@ -90,7 +361,7 @@ class Loads:
                 rate_hz=self.rate_hz,
                 repeated=holds.held(truth),
             )
-            scores[name] = {key: _number(value) for key, value in asdict(score).items()}
+            scores[name] = {key: _number(value) for key, value in asdict(result).items()}
         return scores
 
     def _with_forecasts(self) -> list[tuple[str, AnyFloats]]:

@@ -1,4 +1,4 @@
-"""A trained model that reads arrays, with its params, codec, scalings and baselines; `model` adds what reads recordings."""
+"""A trained model that reads arrays: its params, codec, scalings and baselines. `prediction` reads recordings."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from tacpipe.tasks.forward.uncertainty import Uncertainty, window_signs
 from tacpipe.tasks.opened import Chain
 
 if TYPE_CHECKING:
-    from tacpipe.tasks.forward.traced import Network
+    from tacpipe.tasks.forward.networks import Network
 
 
 TASK = "forward"
@@ -128,7 +128,7 @@ class Forecaster:
     @cached_property
     def single(self) -> Network:
         """The network for one window at a time, as live sessions and `tacpipe predict --causal` run it."""
-        from tacpipe.tasks.forward.traced import Network
+        from tacpipe.tasks.forward.networks import Network
 
         return Network(self)
 
@@ -216,7 +216,7 @@ class Forecaster:
                 raise ValueError("the baselines predict another number of steps or channels")
 
     def predict_windows(self, window: AnyFloats, plan: AnyFloats) -> AnyFloats:
-        """Return predicted counts above rest of arrays; `model.ForwardModel.predict` describes both."""
+        """Return predicted counts above rest of arrays; `prediction.ForwardModel.predict` describes both."""
         window = np.asarray(window)
         single = window.ndim == 2
         touch, arm, finger = self._parts(*((window[None], plan[None]) if single else (window, plan)))
@@ -229,7 +229,7 @@ class Forecaster:
         return calibrated.quantiles_of(self.uncertainty, percents)
 
     def predict_quantiles(self, window: AnyFloats, plan: AnyFloats, percents: Sequence[int]) -> AnyFloats:
-        """Return quantiles of counts above rest of arrays; `model.ForwardModel.predict` describes all three."""
+        """Return quantiles of counts above rest of arrays; `prediction.ForwardModel.predict` describes all three."""
         _, at = self.quantiles_of(percents)
         window = np.asarray(window)
         single = window.ndim == 2
@@ -263,7 +263,7 @@ class Forecaster:
         return self.decoded(self.features(read), touch[:, -1], latent[:, -1])
 
     def _check_levels(self, touch: AnyFloats) -> None:
-        """Refuse windows (window, context, channel) whose levels are not near rest; see `model.ForwardModel.predict`."""
+        """Refuse windows (window, context, channel) whose levels are not near rest; see `ForwardModel.predict`."""
         largest = self.largest_level
         if largest is None:
             warnings.warn(

@@ -1,10 +1,10 @@
-"""The headline of forecasts: the mean absolute error of the shown steps, relative to persistence's."""
+"""Compare forecasters with their baselines in a headline, in the unit of the tactile channels."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,7 +12,34 @@ from tacpipe.arrays import AnyFloats
 from tacpipe.metrics import intervals, pairing
 from tacpipe.metrics.headline import Headline
 from tacpipe.metrics.pairing import Measure, Sums
-from tacpipe.tasks.forward.units import COUNTS
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+COUNT, COUNTS = "count", "counts"  # the unit in columns and in texts
+MIXED = "own units"  # unit of channels, or of models, that differ
+
+
+def unit_of_channels(schema: pa.Schema, channels: Sequence[str]) -> str:
+    """Return the unit of tactile columns, `MIXED` where they have several."""
+    units = {(schema.field(name).metadata or {}).get(b"unit", b"").decode() or COUNT for name in channels}
+    return units.pop() if len(units) == 1 else MIXED
+
+
+def unit_of_model(config: Mapping[str, Any]) -> str:
+    """Return the unit in a model's configuration, as texts have it; one without is in counts.
+
+    >>> unit_of_model({"inputs": {}}), unit_of_model({"inputs": {"unit": "kPa"}})
+    ('counts', 'kPa')
+    """
+    return str(config.get("inputs", {}).get("unit", COUNTS))
+
+
+def common_unit(configs: Iterable[Mapping[str, Any]]) -> str:
+    """Return the unit that models have in common, `MIXED` where they differ."""
+    units = {unit_of_model(config) for config in configs} or {COUNTS}
+    return units.pop() if len(units) == 1 else MIXED
+
 
 TASK, MODEL, BASELINE = "forward", "model", "persistence"
 STEPS = (1, 3, 5, 10)  # those shown, as far as a model predicts them

@@ -18,9 +18,8 @@ from tacpipe.metrics import intervals, regression
 from tacpipe.metrics.headline import Headline
 from tacpipe.metrics.intervals import Interval
 from tacpipe.tasks.forward import headline as headlines
-from tacpipe.tasks.forward.headline import BASELINE, MODEL
+from tacpipe.tasks.forward.headline import BASELINE, COUNTS, MODEL
 from tacpipe.tasks.forward.predictors import Prediction
-from tacpipe.tasks.forward.units import COUNTS
 
 Masks = Mapping[str, Bools]  # name of a group of channels, (channel,)
 Tree = dict[str, Any]  # names down to numbers

@@ -1,13 +1,13 @@
-"""The task ``forward``: which tactile signals follow from the planned motion."""
+"""Define the task ``forward``: which tactile signals follow from the planned motion."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tacpipe.plugins.stage import stage
-from tacpipe.tasks.forward.params import Params
-from tacpipe.tasks.forward.requirements import REQUIREMENTS
+from tacpipe.tasks.forward.params import REQUIREMENTS, Params
 from tacpipe.tasks.task import Calibration, Demo, Files, PredictionRequest, Task
 
 if TYPE_CHECKING:
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset, Model
     from tacpipe.live.task import LiveTask
     from tacpipe.plugins.stage import Result, Workspace
-    from tacpipe.tasks.forward.model import ForwardModel
+    from tacpipe.tasks.forward.prediction import ForwardModel
     from tacpipe.tasks.opened import Chain
 
 
@@ -56,7 +56,7 @@ class Forward(Task):
 
     def load(self, files: Files, chain: Chain | None = None) -> ForwardModel:
         """Return the model among ``files``, trained behind the stages of ``chain``."""
-        from tacpipe.tasks.forward.model import ForwardModel
+        from tacpipe.tasks.forward.prediction import ForwardModel
 
         return ForwardModel.load(files, chain)
 
@@ -88,6 +88,39 @@ class Forward(Task):
 
     def demo(self, output: Path) -> Demo:
         """Return the chain on simulated recordings, for the default model and that of the paper."""
-        from tacpipe.tasks.forward.demo import demo
 
         return demo(output)
+
+
+TRIALS = 30
+
+
+def demo(output: Path) -> Demo:
+    """Return the commands from the simulation to the results, which write below ``output``."""
+    names = ("recordings", "synced", "segments", "split", "latents", "model", "results", "paper-model", "paper-results")
+    place = {name: str(output / name) for name in names}
+    split = ["--split", place["split"]]
+    paper = ["--preset", "paper", "--epochs", "6", "--batch", "128", "--stride", "3"]  # a tenth of the paper's schedule
+    commands = [
+        ["simulate", "forward", "--trials", str(TRIALS), "-o", place["recordings"]],
+        *chain(output),
+        ["compress", "pca", place["segments"], *split, "-o", place["latents"]],
+        ["train", "forward", place["latents"], *split, "-o", place["paper-model"], *paper],
+        ["evaluate", place["paper-model"], place["latents"], *split, "-o", place["paper-results"]],
+    ]
+    shortened = [f"{place['model']} (6 of 16 epochs)", f"{place['paper-model']} (6 of 50 epochs)"]
+    results = [place["results"], place["paper-results"]]
+    return Demo(commands, results, recorded=chain(output), shortened=shortened)
+
+
+def chain(output: Path) -> list[list[str]]:
+    """Return the commands from the folder ``recordings`` below ``output`` to the results of the default model."""
+    place = {name: str(output / name) for name in ("recordings", "synced", "segments", "split", "model", "results")}
+    split = ["--split", place["split"]]
+    return [
+        ["synchronize", place["recordings"], "-o", place["synced"]],
+        ["segment", "contacts", place["synced"], "-o", place["segments"]],
+        ["split", place["segments"], "-o", place["split"], "--scheme", "random"],
+        ["train", "forward", place["segments"], *split, "-o", place["model"], "--epochs", "6", "--stride", "2"],
+        ["evaluate", place["model"], place["segments"], *split, "-o", place["results"]],
+    ]

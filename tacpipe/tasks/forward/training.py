@@ -29,7 +29,7 @@ from tacpipe.models.linear import Baselines
 from tacpipe.models.windows import Windows, motion
 from tacpipe.plugins import params as params_of
 from tacpipe.tasks import trained_on
-from tacpipe.tasks.forward import networks, tracks, units
+from tacpipe.tasks.forward import headline, networks, tracks
 from tacpipe.tasks.forward.alarms import Loads
 from tacpipe.tasks.forward.forecaster import (
     BASELINES,
@@ -88,7 +88,7 @@ def train(
     first = next(iter(training.recordings.values()))
     codec = tracks.codec_of(first.table(), training.files, first.name)
     pose = tracks.pose_of(first, params.actions, params.arm)
-    unit = units.of_channels(first.table().schema, codec.channels)
+    unit = headline.unit_of_channels(first.table().schema, codec.channels)
     start = Forecaster.load(init) if init else None
     params = _resolved(params, codec, start)
     if init and start:
@@ -193,7 +193,7 @@ def _inputs(codec: codecs.Codec, pose: Pose, unit: str, reference: AnyFloats) ->
         "layout": [dict(channel) for channel in codec.layout],
         "orientation_reference": reference.tolist(),
     }
-    if unit != units.COUNT:
+    if unit != headline.COUNT:
         inputs["unit"] = unit
     if pose != NAMED:
         inputs["pose"] = {"position": pose.position, "orientation": pose.orientation}

@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tacpipe.errors import TacpipeError
-from tacpipe.tasks.forward import anticipation
-from tacpipe.tasks.forward.anticipation import Anticipation
+from tacpipe.tasks.forward import alarms
+from tacpipe.tasks.forward.alarms import Anticipation
 
 HORIZON, RATE_HZ = 10, 50.0
 MINUTE = int(60 * RATE_HZ)
@@ -59,9 +59,7 @@ def score(
     """Evaluate one feature against a noise of 1 count and alarms beyond 1 count."""
     groups = np.zeros(len(truth)) if groups is None else groups
     unit = np.ones(truth.shape[1])
-    return anticipation.score(
-        truth, ahead, groups, horizon=HORIZON, sd=unit, theta=unit, rate_hz=RATE_HZ, repeated=repeated
-    )
+    return alarms.score(truth, ahead, groups, horizon=HORIZON, sd=unit, theta=unit, rate_hz=RATE_HZ, repeated=repeated)
 
 
 def trained(forecast: str, lasts: tuple[int, int] = (1, 1)) -> Anticipation:
@@ -73,9 +71,9 @@ def trained(forecast: str, lasts: tuple[int, int] = (1, 1)) -> Anticipation:
         return np.asarray(truth + HORIZON * (truth - known_rows) / int(rows)) if kind == "trend" else known_rows
 
     (truth, groups), (fresh, fresh_groups) = touches(1, lasts=lasts), touches(2, lasts=lasts)
-    sd = anticipation.difference_sd(truth, groups, horizon=HORIZON)
-    theta = anticipation.calibrate(truth, ahead(truth, groups), groups, horizon=HORIZON, sd=sd, rate_hz=RATE_HZ)
-    return anticipation.score(
+    sd = alarms.difference_sd(truth, groups, horizon=HORIZON)
+    theta = alarms.calibrate(truth, ahead(truth, groups), groups, horizon=HORIZON, sd=sd, rate_hz=RATE_HZ)
+    return alarms.score(
         fresh, ahead(fresh, fresh_groups), fresh_groups, horizon=HORIZON, sd=sd, theta=theta, rate_hz=RATE_HZ
     )
 
@@ -116,8 +114,8 @@ def test_noise_gives_one_false_alarm_a_minute_on_fresh_noise_of_the_same_kind() 
         return level, level + rng.normal(size=level.shape) * scale
 
     sd = scale
-    theta = anticipation.calibrate(*noise(), groups, horizon=HORIZON, sd=sd, rate_hz=RATE_HZ)
-    scored = anticipation.score(*noise(), groups, horizon=HORIZON, sd=sd, theta=theta, rate_hz=RATE_HZ)
+    theta = alarms.calibrate(*noise(), groups, horizon=HORIZON, sd=sd, rate_hz=RATE_HZ)
+    scored = alarms.score(*noise(), groups, horizon=HORIZON, sd=sd, theta=theta, rate_hz=RATE_HZ)
     assert scored.events == 0
     assert math.isnan(scored.recall)
     assert 0.85 < scored.false_alarms_per_minute < 1.15  # 400 minutes: a standard error of 7 % for both together
@@ -127,12 +125,12 @@ def test_noise_gives_one_false_alarm_a_minute_on_fresh_noise_of_the_same_kind() 
 def test_theta_is_the_least_that_gives_no_more_than_one_false_alarm_a_minute() -> None:
     truth, groups = touches(3)
     ahead = truth + np.random.default_rng(4).standard_t(3, size=truth.shape)
-    sd = anticipation.difference_sd(truth, groups, horizon=HORIZON)
-    theta = anticipation.calibrate(truth, ahead, groups, horizon=HORIZON, sd=sd, rate_hz=RATE_HZ)
+    sd = alarms.difference_sd(truth, groups, horizon=HORIZON)
+    theta = alarms.calibrate(truth, ahead, groups, horizon=HORIZON, sd=sd, rate_hz=RATE_HZ)
 
     def per_minute(theta: np.ndarray, feature: int) -> float:
         column = slice(feature, feature + 1)
-        return anticipation.score(
+        return alarms.score(
             truth[:, column],
             ahead[:, column],
             groups,
@@ -170,16 +168,16 @@ def test_what_alarms_near_no_event_is_false_once_for_the_rows_that_it_foretells(
         ahead[alarm] += 5
         expected = (alarm in free) / (len(free) / RATE_HZ / 60)
         assert score(truth, ahead).false_alarms_per_minute == pytest.approx(expected)
-    for rows, alarms in ((11, 1), (12, 2), (22, 2), (23, 3)):
+    for rows, count in ((11, 1), (12, 2), (22, 2), (23, 3)):
         ahead = truth.copy()
         ahead[30 : 30 + rows] += 5
-        assert score(truth, ahead).false_alarms_per_minute == pytest.approx(alarms / (len(free) / RATE_HZ / 60))
+        assert score(truth, ahead).false_alarms_per_minute == pytest.approx(count / (len(free) / RATE_HZ / 60))
 
 
 def changes(values: np.ndarray, groups: np.ndarray | None = None) -> list[list[int]]:
     """Return onsets and ends of the changes of one feature whose differences have a deviation of 1."""
     groups = np.zeros(len(values)) if groups is None else groups
-    spans: list[list[int]] = anticipation.changes(values[:, None], groups, horizon=HORIZON, sd=np.ones(1))[0].tolist()
+    spans: list[list[int]] = alarms.changes(values[:, None], groups, horizon=HORIZON, sd=np.ones(1))[0].tolist()
     return spans
 
 
@@ -268,7 +266,7 @@ def test_alarms_are_as_many_as_can_lie_more_than_a_horizon_apart(rows: set[int],
     truth, unit = np.zeros((60, 1)), np.ones(1)
     ahead = truth.copy()
     ahead[sorted(rows)] = 5
-    scored = anticipation.score(
+    scored = alarms.score(
         truth,
         ahead,
         np.zeros(60),
@@ -285,12 +283,12 @@ def test_the_deviation_is_that_of_differences_within_groups() -> None:
     truth, groups = rng.normal(size=(100, 2)).cumsum(axis=0), np.repeat([4, 7, 4], [45, 9, 46])
     truth[20, 1] = np.nan
     differences = np.concatenate([part[HORIZON:] - part[:-HORIZON] for part in (truth[:45], truth[54:])])
-    deviations = anticipation.difference_sd(truth, groups, horizon=HORIZON)
+    deviations = alarms.difference_sd(truth, groups, horizon=HORIZON)
     assert np.allclose(deviations, np.nanstd(differences, axis=0))
 
 
 def test_a_feature_that_stood_still_in_calibration_has_no_events() -> None:
-    spans = anticipation.changes(step(100), np.zeros(200), horizon=HORIZON, sd=np.zeros(1))
+    spans = alarms.changes(step(100), np.zeros(200), horizon=HORIZON, sd=np.zeros(1))
     assert spans[0].tolist() == []
 
 
@@ -298,8 +296,8 @@ def test_a_feature_that_stood_still_in_calibration_has_no_events() -> None:
 def test_few_rows_tell_nothing(rows: int) -> None:
     truth = np.zeros((rows, 2))
     groups, unit = np.zeros(rows), np.ones(2)
-    assert anticipation.difference_sd(truth, groups, horizon=HORIZON).tolist() == [0, 0]
-    theta = anticipation.calibrate(truth, truth, groups, horizon=HORIZON, sd=unit, rate_hz=RATE_HZ)
+    assert alarms.difference_sd(truth, groups, horizon=HORIZON).tolist() == [0, 0]
+    theta = alarms.calibrate(truth, truth, groups, horizon=HORIZON, sd=unit, rate_hz=RATE_HZ)
     assert theta.tolist() == ([0, 0] if rows == 11 else [np.inf, np.inf])
     scored = score(truth, truth + 5)
     assert scored.events == 0
@@ -310,12 +308,12 @@ def test_what_does_not_fit_is_refused() -> None:
     truth, unit = np.zeros((30, 2)), np.ones(2)
     groups = np.zeros(30)
     with pytest.raises(TacpipeError, match="horizon must be 1 or more"):
-        anticipation.difference_sd(truth, groups, horizon=0)
+        alarms.difference_sd(truth, groups, horizon=0)
     with pytest.raises(TacpipeError, match="one a row"):
-        anticipation.difference_sd(truth, groups[1:], horizon=1)
+        alarms.difference_sd(truth, groups[1:], horizon=1)
     with pytest.raises(TacpipeError, match=r"sd of \(3,\)"):
-        anticipation.changes(truth, groups, horizon=1, sd=np.ones(3))
+        alarms.changes(truth, groups, horizon=1, sd=np.ones(3))
     with pytest.raises(TacpipeError, match=r"ahead of \(29, 2\)"):
-        anticipation.calibrate(truth, truth[1:], groups, horizon=1, sd=unit, rate_hz=RATE_HZ)
+        alarms.calibrate(truth, truth[1:], groups, horizon=1, sd=unit, rate_hz=RATE_HZ)
     with pytest.raises(TacpipeError, match=r"theta of \(1,\)"):
-        anticipation.score(truth, truth, groups, horizon=1, sd=unit, theta=unit[1:], rate_hz=RATE_HZ)
+        alarms.score(truth, truth, groups, horizon=1, sd=unit, theta=unit[1:], rate_hz=RATE_HZ)

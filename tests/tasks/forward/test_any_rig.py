@@ -16,7 +16,7 @@ from tacpipe.tasks.forward import evaluation as forward_evaluation
 from tacpipe.tasks.forward import prediction
 from tacpipe.tasks.forward import prediction as forward_prediction
 from tacpipe.tasks.forward import training as forward_training
-from tacpipe.tasks.forward.model import ForwardModel
+from tacpipe.tasks.forward.prediction import ForwardModel
 from tests.fake_recordings import FakeShard, dataset
 from tests.tasks.forward.trials import CONTEXT, HORIZON, params
 

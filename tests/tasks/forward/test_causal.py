@@ -8,9 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from tacpipe.models.windows import POSE
 from tacpipe.signals import kinematics
-from tacpipe.tasks.forward import planned, tracks
-from tacpipe.tasks.forward.causal import Arm
-from tacpipe.tasks.forward.planned import Plan
+from tacpipe.tasks.forward import causal, tracks
+from tacpipe.tasks.forward.causal import Arm, Plan
 from tests.tasks.forward import trials
 
 T_NS = np.arange(60) * 20_000_000
@@ -55,7 +54,7 @@ def test_a_plan_is_interpolated_and_its_end_is_kept() -> None:
     points_ns = np.array([0, 100_000_000])
     turn = Rotation.from_rotvec([0, 0, 0.5]).as_quat()
     plan = Plan(points_ns, np.array([[0.0, 0, 0.3, 0, 0, 0, 1], [0.1, 0, 0.3, *-turn]]))
-    rows = planned.rows(plan, 0, AHEAD_NS, now)
+    rows = causal.rows(plan, 0, AHEAD_NS, now)
     x = np.minimum(AHEAD_NS / 1e9, 0.1)
     np.testing.assert_allclose(rows[:, 0], x, atol=1e-6)
     np.testing.assert_allclose(Rotation.from_quat(rows[:, 3:7]).as_rotvec()[:, 2], 5 * x, atol=1e-6)
@@ -68,10 +67,10 @@ def test_a_plan_that_begins_later_is_reached_from_where_the_hand_is_and_one_that
     now = np.array([1.0, 0.0, 0.3, 0.0, 0.0, 0.0, 1.0, *np.ones(6)])
     nowhere = np.full(4, np.nan)
     later = Plan(np.array([200_000_000]), np.array([[1.2, 0.0, 0.3, *nowhere]]))
-    rows = planned.rows(later, 0, AHEAD_NS, now)
+    rows = causal.rows(later, 0, AHEAD_NS, now)
     np.testing.assert_allclose(rows[:, 0], 1 + AHEAD_NS / 1e9, atol=1e-6)
     np.testing.assert_array_equal(rows[:, 3:7], np.tile([0, 0, 0, 1], (10, 1)))
-    after_end = planned.rows(later, 300_000_000, 300_000_000 + AHEAD_NS, now)
+    after_end = causal.rows(later, 300_000_000, 300_000_000 + AHEAD_NS, now)
     np.testing.assert_array_equal(after_end[:, 0], np.ones(10))
     np.testing.assert_array_equal(after_end[:, 7:], np.zeros((10, 6)))
 
@@ -80,7 +79,7 @@ def test_a_plan_that_begins_later_is_reached_from_where_the_hand_is_and_one_that
 def test_without_a_plan_the_hand_moves_and_turns_on_as_it_does(turning: float) -> None:
     start = Rotation.from_euler("xyz", [0.4, -0.2, 0.9])
     now = np.array([0.1, 0.2, 0.3, *start.as_quat(), 0.5, 0.0, -1.0, 0.0, turning, 0.0])
-    rows = planned.without(7, 7 + AHEAD_NS, now)
+    rows = causal.without(7, 7 + AHEAD_NS, now)
     after_s = AHEAD_NS / 1e9
     np.testing.assert_allclose(rows[:, :3], now[:3] + after_s[:, None] * now[7:10], atol=1e-6)
     expected = Rotation.from_rotvec(after_s[:, None] * [0, turning, 0]) * start

@@ -18,7 +18,7 @@ from tacpipe.arrays import AnyFloats
 from tacpipe.errors import TacpipeError
 from tacpipe.io import parquet
 from tacpipe.tasks.forward import tracks
-from tacpipe.tasks.forward.model import ForwardModel
+from tacpipe.tasks.forward.prediction import ForwardModel
 from tests.fake_recordings import FakeShard, dataset
 from tests.stages.learning_fakes import CHANNELS, motion, table
 from tests.tasks.forward.trials import (

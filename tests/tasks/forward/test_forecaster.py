@@ -17,7 +17,7 @@ from tacpipe.plugins.registry import load as load_stage
 from tacpipe.plugins.stage import Source
 from tacpipe.signals import kinematics
 from tacpipe.tasks.forward import tracks
-from tacpipe.tasks.forward.model import ForwardModel
+from tacpipe.tasks.forward.prediction import ForwardModel
 from tests.conftest import sample_data
 from tests.fake_recordings import FakeRecording, FakeShard, dataset
 from tests.stages.learning_fakes import CHANNELS, REST, motion, table

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tacpipe.arrays import Int64s, Times
-from tacpipe.tasks.forward.leads import events, leads
+from tacpipe.tasks.forward.slips import events, leads
 
 MS = 1_000_000
 T_NS = np.arange(500, dtype=np.int64) * 20 * MS

@@ -9,8 +9,8 @@ import pyarrow as pa
 import pytest
 
 from tacpipe.codecs import tactile
-from tacpipe.tasks.forward import levels
-from tacpipe.tasks.forward.levels import Levels
+from tacpipe.tasks.forward import tracks
+from tacpipe.tasks.forward.tracks import Levels
 
 ROWS, REST = 50, (16000.3, 0.1)
 
@@ -31,7 +31,7 @@ def table(kind: pa.DataType) -> pa.Table:
 )
 def test_every_index_gives_the_bits_that_an_array_gives(kind: pa.DataType, bytes_each: int) -> None:
     columns = table(kind)
-    lazy, expected = levels.above_rest(columns, ["x0", "x1"]), tactile.above_rest(columns, ["x0", "x1"])
+    lazy, expected = tracks.above_rest(columns, ["x0", "x1"]), tactile.above_rest(columns, ["x0", "x1"])
     assert lazy.stored.nbytes == ROWS * 2 * bytes_each
     windows = np.arange(6)[:, None] + np.arange(4)
     for at in (slice(None), slice(3, 9), windows, np.arange(ROWS) > 7, (slice(None), [1, 0]), (windows[:, 0], 1)):
@@ -45,7 +45,7 @@ def test_every_index_gives_the_bits_that_an_array_gives(kind: pa.DataType, bytes
 def test_a_row_with_a_level_that_is_not_finite_is_known_in_every_block(
     monkeypatch: pytest.MonkeyPatch, value: float
 ) -> None:
-    monkeypatch.setattr(levels, "BLOCK_ROWS", 7)
+    monkeypatch.setattr(tracks, "BLOCK_ROWS", 7)
     stored: np.ndarray[Any, Any] = np.zeros((20, 3), np.float32)
     stored[[0, 6, 7, 19], [0, 1, 2, 0]] = value
     assert np.flatnonzero(~Levels(stored, np.zeros(3)).finite()).tolist() == [0, 6, 7, 19]

@@ -14,7 +14,7 @@ from tacpipe.tasks.forward.alarms import Loads
 from tacpipe.tasks.forward.forecaster import Forecaster
 from tacpipe.tasks.forward.metrics import Trial
 from tacpipe.tasks.forward.situations import BySituation
-from tacpipe.tasks.forward.slip_alarms import SlipAlarms
+from tacpipe.tasks.forward.slips import SlipAlarms
 from tests.fake_recordings import FakeShard
 from tests.stages.learning_fakes import motion
 from tests.tasks.forward.trials import trained

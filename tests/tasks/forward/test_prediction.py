@@ -10,7 +10,7 @@ import pytest
 from tacpipe.errors import TacpipeError
 from tacpipe.plugins import registry
 from tacpipe.tasks.forward import prediction as forward_prediction
-from tacpipe.tasks.forward.model import ForwardModel
+from tacpipe.tasks.forward.prediction import ForwardModel
 from tests.fake_recordings import FakeShard, dataset
 from tests.stages.learning_fakes import CHANNELS, motion, table
 from tests.tasks.forward.trials import HORIZON, compressed, predicted_windows, trained

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tacpipe.arrays import Floats
-from tacpipe.tasks.forward.shear import floors, pressing, rise_and_fall, shear, skins
+from tacpipe.tasks.forward.slips import floors, pressing, rise_and_fall, shear, skins
 
 # two taxels of each axis on the left, a pad that only presses, one taxel along the skin alone on the right
 LAYOUT = [

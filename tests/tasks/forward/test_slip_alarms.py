@@ -10,10 +10,8 @@ import pyarrow as pa
 import pytest
 
 from tacpipe.arrays import AnyFloats, Bools
-from tacpipe.tasks.forward.shear import Layout
-from tacpipe.tasks.forward.slip_alarms import SlipAlarms, SlipScore
-from tacpipe.tasks.forward.slip_labels import slips_of
-from tacpipe.tasks.forward.tracks import Track
+from tacpipe.tasks.forward.slips import Layout, SlipAlarms, SlipScore
+from tacpipe.tasks.forward.tracks import Track, slips_of
 from tests.stages.learning_fakes import CHANNELS, table
 from tests.tasks.forward.trials import track
 

@@ -13,7 +13,7 @@ from torch import nn
 
 from tacpipe.models.windows import ARM, Windows
 from tacpipe.tasks.forward.forecaster import Forecaster
-from tacpipe.tasks.forward.traced import Network
+from tacpipe.tasks.forward.networks import Network
 from tests.live import rigs
 
 

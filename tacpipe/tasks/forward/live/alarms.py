@@ -2,9 +2,9 @@
 
 Two scores. *Load*: by how much the mean count of an axis of a sensor is predicted to change within the horizon, over the
 level of that axis; the largest of all axes counts. *Slip*: how far the load along the skin is predicted to rise and then to
-fall again, as a fraction of what presses (`tacpipe.tasks.forward.shear`); one level for all sensors.
+fall again, as a fraction of what presses (`tacpipe.tasks.forward.slips`); one level for all sensors.
 
-Levels are set on validation recordings, as `tacpipe evaluate` sets its own (`tacpipe.tasks.forward.anticipation`): the least
+Levels are set on validation recordings, as `tacpipe evaluate` sets its own (`tacpipe.tasks.forward.alarms`): the least
 that gives no more than a number of false alarms an hour. An alarm of load is false where no load changes. Each axis gets its
 part of them; one of slip is false where the object does not slip, and wherever no recording states that.
 """
@@ -21,13 +21,13 @@ import numpy as np
 from tacpipe.arrays import AnyFloats
 from tacpipe.errors import UsageError
 from tacpipe.sensors.live import OFF, ON, UNKNOWN
-from tacpipe.tasks.forward.loads import axes, loads
-from tacpipe.tasks.forward.shear import rise_and_fall
+from tacpipe.tasks.forward.alarms import axes, loads
+from tacpipe.tasks.forward.slips import rise_and_fall
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
     from tacpipe.tasks.forward.alarms import Loads
-    from tacpipe.tasks.forward.slip_alarms import SlipAlarms
+    from tacpipe.tasks.forward.slips import SlipAlarms
 
 LOAD, SLIP = "load", "slip"
 NAMES = (LOAD, SLIP)
@@ -115,16 +115,16 @@ def _state(scores: AnyFloats, levels: AnyFloats) -> State:
 
 def set_on(changes: Loads, slipping: SlipAlarms, predictor: str, per_hour: float) -> Alarms:
     """Return alarms with levels for ``per_hour`` false alarms each, set on the recordings that were added."""
-    from tacpipe.tasks.forward import anticipation
+    from tacpipe.tasks.forward import alarms
 
     truth, groups = np.concatenate(changes.truth), np.concatenate(changes.groups)
     places = axes(changes.layout)
-    levels = anticipation.calibrate(
+    levels = alarms.calibrate(
         truth,
         np.concatenate(changes.ahead[predictor]),
         groups,
         horizon=changes.horizon,
-        sd=anticipation.difference_sd(truth, groups, horizon=changes.horizon),
+        sd=alarms.difference_sd(truth, groups, horizon=changes.horizon),
         rate_hz=changes.rate_hz,
         per_minute=per_hour / 60 / len(places),
     )
@@ -138,7 +138,7 @@ def on_recordings(model: Dataset, recordings: Dataset, per_hour: float) -> Alarm
     from tacpipe.tasks.forward.alarms import Loads
     from tacpipe.tasks.forward.forecaster import Forecaster
     from tacpipe.tasks.forward.headline import MODEL
-    from tacpipe.tasks.forward.slip_alarms import SlipAlarms
+    from tacpipe.tasks.forward.slips import SlipAlarms
     from tacpipe.tasks.opened import Chain as Stages
     from tacpipe.tasks.opened import opened
 

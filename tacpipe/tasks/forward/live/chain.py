@@ -24,13 +24,12 @@ from tacpipe.sensors.plan import NAME as PLAN
 from tacpipe.sensors.plan import POSE
 from tacpipe.signals.resampling import GAP_NS
 from tacpipe.synchronization.causal import Grid, Rows
-from tacpipe.tasks.forward import planned, units
-from tacpipe.tasks.forward.causal import Arm, Rolling
+from tacpipe.tasks.forward import causal, headline
+from tacpipe.tasks.forward.causal import Arm, Plan, Rolling
 from tacpipe.tasks.forward.forecaster import Forecaster
 from tacpipe.tasks.forward.live.inputs import Layout, plan_table
 from tacpipe.tasks.forward.live.plans import Targets, facing
 from tacpipe.tasks.forward.live.stages import causal_stages, refuse_look_ahead
-from tacpipe.tasks.forward.planned import Plan
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -243,7 +242,7 @@ class Chain:
     @property
     def unit(self) -> str:
         """Unit of the predicted channels, as ``count``."""
-        return str(self._forecaster.config["inputs"].get("unit", units.COUNT))
+        return str(self._forecaster.config["inputs"].get("unit", headline.COUNT))
 
     @property
     def forecaster(self) -> Forecaster:
@@ -371,15 +370,15 @@ class Chain:
         if self._targets is not None:
             aimed = self._targets.state(t_ns)
             cause = Cause.NO_PLAN if aimed is None else Cause.NONE
-            return planned.without(t_ns, ahead_ns, now if aimed is None else facing(aimed, now)), cause
+            return causal.without(t_ns, ahead_ns, now if aimed is None else facing(aimed, now)), cause
         while len(self._plans) > 1 and self._plans[1][0] <= t_ns:
             self._plans.popleft()
         if not self._plans or self._plans[0][0] > t_ns:
-            return planned.without(t_ns, ahead_ns, now), Cause.NO_PLAN
+            return causal.without(t_ns, ahead_ns, now), Cause.NO_PLAN
         rows = np.concatenate(self._plans[0][1])
         plan = Plan(rows[:, 0].view(np.int64), rows[:, 1:])
         cause = Cause.PLAN_ENDED if plan.t_ns[-1] < ahead_ns[-1] else Cause.NONE
-        return planned.rows(plan, t_ns, ahead_ns, now), cause
+        return causal.rows(plan, t_ns, ahead_ns, now), cause
 
     def _push_plans(self, batch: pa.RecordBatch | pa.Table | Columns) -> None:
         """Take rows of plans; rows of the same arrival are one plan, also where they come in several batches."""

@@ -26,9 +26,8 @@ from tacpipe.sensors import plan as plans
 from tacpipe.simulation import pick_and_move
 from tacpipe.simulation.emulation.emulator import Emulator
 from tacpipe.simulation.emulation.world import World
-from tacpipe.tasks.forward.leads import Leads, leads
-from tacpipe.tasks.forward.leads import events as events_of
-from tacpipe.tasks.forward.shear import shear
+from tacpipe.tasks.forward.slips import Leads, leads, shear
+from tacpipe.tasks.forward.slips import events as events_of
 
 GAP_PERIODS = 5.0  # periods without a forecast that break the line
 BEFORE_MS, AFTER_MS = 400.0, 150.0  # time around a slip that is drawn enlarged

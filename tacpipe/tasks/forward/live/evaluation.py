@@ -22,18 +22,18 @@ from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.live.stages import RecordingsInMemory, run_stages, streams_as_recorded
 from tacpipe.metrics import headline
 from tacpipe.plugins.stage import Result
-from tacpipe.tasks.forward import anticipation, evaluation, tracks, units
+from tacpipe.tasks.forward import alarms as load_alarms
+from tacpipe.tasks.forward import evaluation, tracks
 from tacpipe.tasks.forward import headline as headlines
+from tacpipe.tasks.forward.alarms import loads
 from tacpipe.tasks.forward.forecaster import Forecaster
-from tacpipe.tasks.forward.leads import Leads, events, leads
-from tacpipe.tasks.forward.levels import Levels
 from tacpipe.tasks.forward.live import measures, replay
 from tacpipe.tasks.forward.live.alarms import NAMES, Alarms
 from tacpipe.tasks.forward.live.chain import Chain, Forecast
 from tacpipe.tasks.forward.live.measures import LIVE, LIVE_STILL, OFFLINE, STILL, Session, Sums, summed
-from tacpipe.tasks.forward.loads import loads
 from tacpipe.tasks.forward.predictors import forecasts
-from tacpipe.tasks.forward.tracks import Track
+from tacpipe.tasks.forward.slips import Leads, events, leads
+from tacpipe.tasks.forward.tracks import Levels, Track
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset, Model, Recording
@@ -230,7 +230,7 @@ def _events(forecaster: Forecaster, track: Track) -> dict[str, Times]:
     sd = forecaster.config.get("anticipation", {}).get("sd")
     if sd:
         values = loads(np.where(track.usable[:, None], track.tactile[:], np.nan), forecaster.codec.layout)
-        rows = anticipation.changes(values, track.groups, horizon=forecaster.horizon, sd=np.array(sd))
+        rows = load_alarms.changes(values, track.groups, horizon=forecaster.horizon, sd=np.array(sd))
         changing = np.zeros(len(track.t_ns), bool)
         for runs in rows:
             for first, stop in runs:
@@ -270,7 +270,7 @@ def _headline(
 
     method = f"{forecaster.config['architecture']} · {forecaster.config['codec']['name']} · published live"
     baselines = {"persistence": sums(LIVE_STILL)}
-    unit = units.of_model(forecaster.config)
+    unit = headlines.unit_of_model(forecaster.config)
     line = headlines.headline(method, steps, sums(LIVE), baselines, None, unit=unit)
     return [line] if line else []
 

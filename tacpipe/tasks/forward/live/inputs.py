@@ -21,7 +21,7 @@ from tacpipe.signals.contact import rest_level, tared
 from tacpipe.synchronization import grids, methods
 from tacpipe.synchronization.causal import Reading
 from tacpipe.synchronization.streams import holds_signal
-from tacpipe.tasks.forward import tracks, units
+from tacpipe.tasks.forward import headline, tracks
 from tacpipe.tasks.forward.forecaster import Forecaster
 
 if TYPE_CHECKING:
@@ -276,8 +276,8 @@ def _check(forecaster: Forecaster, signals: Mapping[str, pa.Schema], grid: pa.Sc
             raise TacpipeError(
                 f"Channel {name} of this rig is at {has}, and of the model's recordings at {dict(trained_place)}."
             )
-    unit = units.of_channels(grid, codec.channels)
-    trained = str(forecaster.config["inputs"].get("unit", units.COUNT))
+    unit = headline.unit_of_channels(grid, codec.channels)
+    trained = str(forecaster.config["inputs"].get("unit", headline.COUNT))
     if unit != trained:
         raise TacpipeError(f"The tactile channels of this rig are in {unit}, and those of the model in {trained}.")
 

@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tacpipe.arrays import AnyFloats, Bools, Float32s, Floats, Int64s, Times
-from tacpipe.tasks.forward import leads
-from tacpipe.tasks.forward.leads import Leads
+from tacpipe.tasks.forward import slips
+from tacpipe.tasks.forward.slips import Leads
 
 
 @dataclass(frozen=True)
@@ -163,7 +163,7 @@ def _pooled(sessions: Sequence[Mapping[str, Mapping[str, Leads]]]) -> dict[str, 
     for kind in dict.fromkeys(kind for session in sessions for kind in session):
         for source in dict.fromkeys(source for session in sessions for source in session.get(kind, {})):
             parts = [session[kind][source] for session in sessions if source in session.get(kind, {})]
-            pooled.setdefault(kind, {})[source] = leads.summed(parts)
+            pooled.setdefault(kind, {})[source] = slips.summed(parts)
     return pooled
 
 

@@ -17,7 +17,7 @@ from tacpipe.report import blocks, charts
 from tacpipe.report.blocks import NONE, Cell, Chart, Charts, Fold, Note, Table, fold, number, table
 from tacpipe.report.charts import Line
 from tacpipe.report.context import Context
-from tacpipe.tasks.forward import headline, units
+from tacpipe.tasks.forward import headline
 from tacpipe.tasks.forward.headline import BASELINE
 from tacpipe.tasks.forward.report import bands, events, figures, methods, representations, skill
 from tacpipe.tasks.forward.report.methods import ACTIONS, shown_steps
@@ -313,7 +313,7 @@ def _timelines(context: Context, steps: Sequence[int], parts: Sequence[bool | No
                     else [NONE, NONE]
                 )
             rows.append([*row, str(len(method.runs))])
-    heads, unit = ["", "a step (ms)"], units.common(run.details.config for run in context.runs)
+    heads, unit = ["", "a step (ms)"], headline.common_unit(run.details.config for run in context.runs)
     for part in parts:
         place = headline.PARTS[part] or "all recordings"
         heads += [f"{place}: mean skill", f"{place}: MAE t+{steps[-1]} ({unit})"]

@@ -14,7 +14,7 @@ from tacpipe.report import blocks, charts
 from tacpipe.report.blocks import Chart, Charts, Fold, fold, number, table
 from tacpipe.report.charts import Line
 from tacpipe.report.context import Context
-from tacpipe.tasks.forward import units
+from tacpipe.tasks.forward import headline
 from tacpipe.tasks.forward.headline import PARTS
 
 if TYPE_CHECKING:
@@ -131,7 +131,7 @@ def _example_charts(run: Run) -> list[Chart]:
             Line(f"predicted {example['step']} rows before", time_s, middle, low, high, dashed=True),
         ]
         spec = charts.lines(
-            lines, "time (s)", f"{units.of_model(run.details.config)} above rest", points=False, height=190
+            lines, "time (s)", f"{headline.unit_of_model(run.details.config)} above rest", points=False, height=190
         )
         drawn.append(Chart(f"{example['recording']}: {example['channel']}", spec, wide=True))
     return drawn

@@ -15,7 +15,7 @@ from tacpipe.report import blocks, charts
 from tacpipe.report.blocks import Cell, Chart, Charts, Fold, Note, Table, counted, fold, number, table
 from tacpipe.report.charts import Line
 from tacpipe.report.context import Context, Tree, loss_chart, median_run
-from tacpipe.tasks.forward import headline, units
+from tacpipe.tasks.forward import headline
 from tacpipe.tasks.forward.report import methods
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ EXPLAINED = {
 
 def run_folds(method: str, run: Run) -> list[Fold]:
     """Return the errors of a run of a method; nothing where the result holds no errors by step."""
-    metrics, unit = run.details.metrics, units.of_model(run.details.config)
+    metrics, unit = run.details.metrics, headline.unit_of_model(run.details.config)
     names = _ordered_predictors(metrics)
     if not names:
         return []
@@ -282,7 +282,7 @@ def prediction_folds(context: Context) -> list[Fold]:
 def _unit_of_run(run: Run) -> str:
     """Return the unit of the latents of a run: that of the channels where they are not compressed, else none."""
     config = run.details.config
-    return units.of_model(config) if config["codec"]["kind"] == "raw" else "latent units"
+    return headline.unit_of_model(config) if config["codec"]["kind"] == "raw" else "latent units"
 
 
 def _paper_traces(context: Context) -> list[Chart]:

@@ -16,7 +16,7 @@ from tacpipe.comparison.specification import Kind
 from tacpipe.errors import TacpipeError
 from tacpipe.report import context
 from tacpipe.report.context import Tree, drop_duplicates
-from tacpipe.tasks.forward import headline, units
+from tacpipe.tasks.forward import headline
 from tacpipe.tasks.forward.headline import BASELINE
 from tacpipe.tasks.forward.params import Recurrent
 
@@ -333,7 +333,7 @@ def _run(run: Result, steps: Sequence[int], usual: str) -> Run:
             part = ", ".join(filter(None, (headline.PARTS[known_objects], timeline)))
             objects = object_clusters(run, known_objects)
             cluster = headline.OBJECTS if objects else headline.RECORDINGS
-            measure = headline.measure(steps, units.of_model(config), cluster)
+            measure = headline.measure(steps, headline.unit_of_model(config), cluster)
             questions[Question(part, place=2 * elsewhere + (known_objects is False))] = Errors(
                 measure, by_predictor, objects
             )
