@@ -413,6 +413,16 @@ def test_an_architecture_that_extends_none_of_the_two_is_trained_by_its_own_fit(
     assert training.train(params, recordings, None, tmp_path) == {"biotac.txt": b"3"}
 
 
+def test_reports_name_an_architecture_as_its_class_states_it_and_others_by_their_choice(package: Path) -> None:
+    from tacpipe.plugins import architectures
+    from tacpipe.tasks.material.params import Material
+
+    titles = [
+        architectures.title(Material, name) for name in ("raec", "x-lstm", "statistics", "nearest", "uninstalled")
+    ]
+    assert titles == ["RAEC", "X-LSTM", "statistics", "nearest", "uninstalled"]
+
+
 def test_a_codec_that_is_not_installed_is_named_with_its_package() -> None:
     from tacpipe.codecs import codec
 

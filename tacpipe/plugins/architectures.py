@@ -75,6 +75,12 @@ def load(base: Kind, name: str) -> Kind:
     return kind
 
 
+def title(base: Any, architecture: str) -> str:
+    """Return the name of an architecture in reports: ``TITLE`` of its class; without one, the architecture itself."""
+    named = (kind for kind in kinds(base) if architecture in fields_of.choices(kind, TAG))
+    return str(getattr(next(named, None), "TITLE", architecture))
+
+
 def require(base: Any, value: Any) -> None:
     """Raise the reason why an architecture that is installed as ``value`` is not among the choices, if it is not."""
     of = task(base)

@@ -5,10 +5,11 @@ Classes of other packages extend `Forward`, whose `build` states what a network 
 
 from __future__ import annotations
 
+import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NotRequired, TypedDict
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NotRequired, TypedDict, cast
 
 from tacpipe.channels import pose
 from tacpipe.plugins.constraints import PositiveFloat, PositiveInt, Range, Seed
@@ -64,6 +65,13 @@ class Forward(ABC):
         "Data": ("windows", "stride", "arm"),
     }
 
+    def resolved(self, layout: Sequence[Mapping[str, str]], start: Forward | None, *, changes: bool) -> Forward:
+        """Return these params with the meaning of ``auto`` for channels that lie like ``layout``; latents have none.
+
+        ``start`` are the params of the model to begin with, ``changes`` states that features are increments.
+        """
+        return self
+
     @abstractmethod
     def build(self, shape: Shape) -> nn.Module:
         """Return the network, of random weights, for what it reads and predicts (`tacpipe.models.windows.Shape`).
@@ -102,6 +110,18 @@ class Change(Forward):
     # error that training minimises; auto: absolute, and huber for latents of increments, whose median is often 0
     loss: Literal["auto", "absolute", "huber", "squared"] = "auto"
     PRESETS: ClassVar[Presets] = {"quick": {"hidden": 32, "epochs": 3}}
+
+    def resolved(self, layout: Sequence[Mapping[str, str]], start: Forward | None, *, changes: bool) -> Forward:
+        """Return these params with the meaning of ``auto``: the architecture of ``start`` if that one predicts change."""
+        from tacpipe.models import forecasts
+
+        choice = self.architecture
+        if choice == forecasts.AUTO and isinstance(start, Change):
+            choice = start.architecture
+        architecture = cast("Literal['taxelwise', 'gru', 'lstm', 'tcn']", forecasts.resolved(choice, layout))
+        return dataclasses.replace(
+            self, architecture=architecture, loss=forecasts.resolved_loss(self.loss, changes=changes)
+        )
 
     def build(self, shape: Shape) -> nn.Module:
         """Return the network; ``auto`` and the loss are resolved before."""

@@ -7,7 +7,7 @@ import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, cast
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -44,7 +44,6 @@ from tacpipe.tasks.forward.forecaster import (
 from tacpipe.tasks.forward.headline import look_ahead_notes
 from tacpipe.tasks.forward.params import (
     AlarmLevels,
-    Change,
     CodecDescription,
     ForwardConfig,
     ForwardScaling,
@@ -90,7 +89,8 @@ def train(
     pose = tracks.pose_of(first, params.actions, params.arm)
     unit = headline.unit_of_channels(first.table().schema, codec.channels)
     start = Forecaster.load(init) if init else None
-    params = _resolved(params, codec, start)
+    changes = codec.representation == INCREMENTS
+    params = params.resolved(layout(codec), start.params if start else None, changes=changes)
     if init and start:
         _check_start(start, init, params, codec, training.files)
         _check_pose(start, pose)
@@ -328,25 +328,6 @@ def _described(codec: codecs.Codec) -> CodecDescription:
 def _reference(quaternions: Iterable[AnyFloats]) -> AnyFloats:
     """Return the first usable quaternion of the training recordings (4,): the sign that all are given."""
     return next((rows[0].astype(np.float64) for rows in quaternions if len(rows)), np.array([0.0, 0.0, 0.0, 1.0]))
-
-
-def _resolved(params: Params, codec: codecs.Codec, start: Forecaster | None) -> Params:
-    """Return the params with what ``auto`` is for the representation of ``codec``.
-
-    An architecture ``auto`` is that of the model to begin with, if that one predicts change.
-    """
-    if not isinstance(params, Change):
-        return params
-    architecture = params.architecture
-    if architecture == forecasts.AUTO and start and isinstance(start.params, Change):
-        architecture = start.params.architecture
-    return dataclasses.replace(
-        params,
-        architecture=cast(
-            "Literal['taxelwise', 'gru', 'lstm', 'tcn']", forecasts.resolved(architecture, layout(codec))
-        ),
-        loss=forecasts.resolved_loss(params.loss, changes=codec.representation == INCREMENTS),
-    )
 
 
 def _check_start(

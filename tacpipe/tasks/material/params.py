@@ -100,6 +100,7 @@ class Minirocket(Material):
 
     # classifier: minirocket, random convolutions and a linear readout
     architecture: Literal["minirocket"] = "minirocket"
+    TITLE: ClassVar[str] = "MiniRocket"
     QUANTITIES: ClassVar[tuple[str, ...]] = ("tactile", "vibration")
     features: Annotated[int, Range(84)] = 10_000  # features of each sensor
     use_validation: bool = True  # learn from validation slides too: nothing is chosen by them
@@ -130,6 +131,7 @@ class Spectra(Material):
 
     # spectra: power over spatial frequency
     architecture: Literal["spectra"] = "spectra"
+    TITLE: ClassVar[str] = "spatial spectra"
     use_validation: bool = True  # learn from validation slides too: nothing is chosen by them
     hold_out: HeldOut = ""  # materials whose labels a sensor does not learn, as roboskin=17,18,19,20
     # metres a second of slides whose recordings have no speed
@@ -265,6 +267,7 @@ class Raec(Network):
 
     # raec: the paper's recurrent autoencoder
     architecture: Literal["raec"] = "raec"
+    TITLE: ClassVar[str] = "RAEC"
     ALIGNS_SENSORS: ClassVar[bool] = True
     joint: bool = True  # align the latents of unlike sensors on slides of the same material
     # sensor of the --init model whose network is frozen; the latents of the others are aligned to its own
@@ -360,6 +363,7 @@ class XLSTM(Network):
 
     # x-lstm: the paper's classifier without decoder
     architecture: Literal["x-lstm"] = "x-lstm"
+    TITLE: ClassVar[str] = "X-LSTM"
     dropout: Dropout = added(0.0)  # fraction of the last state left out of each training step; 0.2 in the paper's text
     PRESETS: ClassVar[Presets] = {"paper": _PAPER_TEXT, "quick": {"epochs": 30}}
 

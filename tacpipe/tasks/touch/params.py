@@ -190,6 +190,7 @@ class Pointnet(PointNetwork):
 
     # pointnet: the paper's network
     architecture: Literal["pointnet"] = "pointnet"
+    TITLE: ClassVar[str] = "PointNet"
     # inputs: place (xyz) or place and colour (rgb) of points, with contact points (cont) and wrist (pose)
     inputs: Literal["xyz", "rgb", "xyzcont", "rgbcont", "xyzpose", "rgbpose"] = "rgbcont"
     # normalisation of a cloud; minmax of each axis; wrist's axes

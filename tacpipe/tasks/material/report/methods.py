@@ -10,9 +10,11 @@ import numpy as np
 
 from tacpipe.comparison.runs import Errors, Method, Question, Run, marks
 from tacpipe.comparison.specification import Kind
+from tacpipe.plugins import architectures
 from tacpipe.report import context
 from tacpipe.report.context import Tree, drop_duplicates
 from tacpipe.tasks.material import headline
+from tacpipe.tasks.material.params import Material
 from tacpipe.tasks.material.report import predictions
 from tacpipe.tasks.material.report.predictions import (
     LAST,
@@ -33,13 +35,6 @@ if TYPE_CHECKING:
 
 SENSORS = {"biotac": "BioTac", "roboskin": "RoboSkin"}
 USUAL = (("elsewhere", False), ("elsewhere", True), ("layout", "time"))  # settings that no name states
-_ARCHITECTURES = {
-    "minirocket": "MiniRocket",
-    "statistics": "statistics",
-    "x-lstm": "X-LSTM",
-    "raec": "RAEC",
-    "spectra": "spatial spectra",
-}
 _PLAIN = {
     "pairing": ("random", "fixed"),
     "labels": ("true",),
@@ -207,7 +202,7 @@ def slides_kept(slides: int, batch: int, ratio: int) -> int:
 def base_name(settings: Tree, variants: bool = True) -> str:
     """Return the name that a method has before it is derived from others like it."""
     architecture = str(settings["architecture"])
-    name = _ARCHITECTURES.get(architecture, architecture)
+    name = architectures.title(Material, architecture)
     if settings["frozen_sensor"]:
         name = "mapping to known space"
     elif settings["joint"]:

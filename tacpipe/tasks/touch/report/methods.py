@@ -14,10 +14,12 @@ import numpy as np
 from tacpipe.channels import biotac_sp
 from tacpipe.comparison.runs import Errors, Method, Question, Run, distinct_names, marks
 from tacpipe.metrics import regression
+from tacpipe.plugins import architectures
 from tacpipe.plugins import params as params_of
 from tacpipe.report import blocks, context
 from tacpipe.report.context import Tree, drop_duplicates
 from tacpipe.tasks.touch import headline
+from tacpipe.tasks.touch.params import Touch
 from tacpipe.tasks.touch.report import predictions
 from tacpipe.tasks.touch.report.predictions import Predictions
 from tacpipe.tasks.touch.result_names import CONSTANT, NEAREST_IN_TIME, OBJECT_MEAN, PREDICTIONS
@@ -29,7 +31,6 @@ if TYPE_CHECKING:
 
 PAPERS = "pointnet"  # the architecture of the paper
 DEFAULT = "tree-ensemble"  # the one that is trained where none is named
-NAMES = {PAPERS: "PointNet"}
 USUAL = ("split", "simulated")  # settings that no name states: parts of questions
 _NO_METHOD = ("seed", "run_label", "baselines")  # runs of one method may differ in these; the label is shown as split
 
@@ -160,7 +161,7 @@ def _first_names(settings: Tree) -> list[str]:
     architecture, coloured = str(settings["architecture"]), settings.get("colour", True)
     if architecture == "trees":
         return ["trees on geometry and colour" if coloured else "trees on geometry"]
-    return [NAMES.get(architecture, architecture), *([] if coloured else ["without colour"])]
+    return [architectures.title(Touch, architecture), *([] if coloured else ["without colour"])]
 
 
 def _usual_settings(alike: Sequence[tuple[Tree, int]]) -> list[tuple[str, Any]]:
@@ -322,7 +323,7 @@ def _run(run: Result, name: str, splits: Sequence[tuple[str, bool]]) -> Run:
         name,
         run.settings,
         questions,
-        family=NAMES.get(run.architecture, run.architecture),
+        family=architectures.title(Touch, run.architecture),
         seed=run.params.get("seed"),
         simulated=run.simulated,
         published=run.published,
