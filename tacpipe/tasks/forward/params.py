@@ -232,7 +232,7 @@ class ForwardConfig(TypedDict):
 
     task: str
     architecture: str
-    params: dict[str, Any]
+    params: Any  # as `tacpipe.plugins.params` stores them
     codec: CodecDescription
     context: int
     horizon: int
