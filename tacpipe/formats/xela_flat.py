@@ -2,6 +2,8 @@
 
 Published as imanlab/tactile_prediction_flat_dataset. A trial is a folder of CSV files with one row a callback and no
 clock: only the mean rate is known, so the stamps are made from it and state it. Robot and marker files may lack one row.
+The published columns ``ee_state_orientation_x`` to ``_w`` hold the quaternion as w, x, y, z: only in this order does the
+hand turn with the last link of the arm.
 """
 
 from __future__ import annotations
@@ -15,6 +17,8 @@ from tacpipe.plugins.stage import Files, RecordingOutput, stage
 if TYPE_CHECKING:
     import pyarrow as pa
 
+    from tacpipe.arrays import Floats
+
 ROBOT, MARKER = "robot_state.csv", "marker.csv"
 NAMES = ("xela_sensor1.csv", "xela_sensor2.csv", ROBOT, MARKER, "meta_data.csv")
 MADE = "from mean rate"
@@ -25,7 +29,7 @@ def discover(params: Params, source: Path) -> dict[str, dict[str, Path]]:
     return trials(source, NAMES)
 
 
-@stage(version=2, discover=discover)
+@stage(version=3, discover=discover)
 def xela_flat(params: Params, files: Files) -> RecordingOutput:
     """Read published trials of two XELA uSkin, flat folder.
 
@@ -51,6 +55,7 @@ def xela_flat(params: Params, files: Files) -> RecordingOutput:
         + [f"ee_state_orientation_{part}" for part in schema.COMPONENTS],
     )  # (time, 22)
     xela.require_unit(files[ROBOT], robot[:, -4:], "ee_state_orientation")
+    robot[:, -4:] = _in_order(robot[:, :7], robot[:, -4:])
     markers = {name: xela.read_marker(files[MARKER], name) for name in ("marker1", "marker2")}
     rows = {name: len(tactile[stream][0]) for stream, name in xela.SENSORS.items()}
     xela.check_rows(trial, rows, "xela_sensor1.csv", missing_allowed=0)
@@ -82,3 +87,13 @@ def xela_flat(params: Params, files: Files) -> RecordingOutput:
             **xela.authors_role(params.authors_role),
         },
     )
+
+
+def _in_order(joint_rad: Floats, quaternions: Floats) -> Floats:
+    """Return quaternions x, y, z, w (time, 4) of columns that may hold w, x, y, z, as the joints (time, 7) show."""
+    import numpy as np
+
+    from tacpipe.signals.kinematics import PANDA, turns
+
+    w_last = np.roll(quaternions, -1, axis=1)
+    return w_last if not turns(PANDA, joint_rad, quaternions) and turns(PANDA, joint_rad, w_last) else quaternions

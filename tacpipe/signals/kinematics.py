@@ -13,9 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from tacpipe.arrays import AnyFloats, Floats, Times
+from tacpipe.signals.rotations import matrices_of
 
 BLOCK_ROWS = 1 << 14  # whose frames are computed at once
 TOOL_SPREAD_M = 0.005  # a hand that is this far from rigid against the last link hangs on another arm
+TURN_SPREAD = 0.01  # the same of the entries of its rotation matrix
 
 
 @dataclass(frozen=True)
@@ -72,12 +74,28 @@ def carries(chain: Chain, joint_rad: AnyFloats, hand_m: AnyFloats) -> bool:
 
     Rows that are not finite do not state.
     """
-    known = np.isfinite(joint_rad).all(axis=1) & np.isfinite(hand_m).all(axis=1)
-    joint_rad, hand_m = joint_rad[known], hand_m[known]
-    lasts = [joint_frames(chain, joint_rad[some])[:, -1].copy() for some in _blocks(len(joint_rad))]
-    last = np.concatenate([np.zeros((0, 4, 4)), *lasts])  # (time, 4, 4)
+    finite = np.isfinite(joint_rad).all(axis=1) & np.isfinite(hand_m).all(axis=1)
+    joint_rad, hand_m = joint_rad[finite], hand_m[finite]
+    last = _last_frames(chain, joint_rad)
     tool_m = np.einsum("tji,tj->ti", last[:, :3, :3], hand_m - last[:, :3, 3])  # (time, 3), in the last link's frame
     return bool(len(tool_m)) and bool((tool_m.std(axis=0) < TOOL_SPREAD_M).all())
+
+
+def turns(chain: Chain, joint_rad: AnyFloats, quaternions: Floats) -> bool:
+    """Return whether a hand with ``quaternions`` x, y, z, w (time, 4) turns with the chain's last link as one rigid body.
+
+    Rows that are not finite are left out.
+    """
+    finite = np.isfinite(joint_rad).all(axis=1) & np.isfinite(quaternions).all(axis=1)
+    last = _last_frames(chain, joint_rad[finite])[:, :3, :3]
+    tool = last.transpose(0, 2, 1) @ matrices_of(quaternions[finite])  # (time, 3, 3), in the last link's frame
+    return bool(len(tool)) and bool((tool.std(axis=0) < TURN_SPREAD).all())
+
+
+def _last_frames(chain: Chain, joint_rad: AnyFloats) -> AnyFloats:
+    """Return the pose of the last joint's frame in the base's (time, 4, 4)."""
+    lasts = [joint_frames(chain, joint_rad[some])[:, -1].copy() for some in _blocks(len(joint_rad))]
+    return np.concatenate([np.zeros((0, 4, 4)), *lasts])
 
 
 def hand_velocity(chain: Chain, joint_rad: AnyFloats, joint_rad_s: AnyFloats, hand_m: AnyFloats) -> AnyFloats:

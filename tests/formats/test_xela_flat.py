@@ -9,11 +9,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from tacpipe.errors import TacpipeError
 from tacpipe.formats.published import Params
 from tacpipe.formats.xela_flat import discover, xela_flat
 from tacpipe.plugins.stage import RecordingOutput
+from tacpipe.signals.kinematics import PANDA, turns
+from tests.formats import xela_files
+from tests.signals.test_kinematics import elementary
 
 SAMPLE = Path(os.environ.get("TACPIPE_SAMPLE_DATA", Path(__file__).parents[3] / "shared" / "data"))
 Trial = Callable[..., Path]
@@ -149,6 +153,22 @@ def test_a_quaternion_that_is_no_rotation_is_named_with_its_row(flat_trial: Tria
         read(folder)
 
 
+@pytest.mark.parametrize("order", ["wxyz", "xyzw"])
+def test_the_hand_is_turned_as_the_joints_of_the_arm_turn_it_in_either_order_of_its_columns(
+    flat_trial: Trial, order: str
+) -> None:
+    folder = flat_trial()
+    names, *lines = (folder / "robot_state.csv").read_text().splitlines()
+    rows = np.array([line.split(",") for line in lines], dtype=np.float64)
+    rows[:, :7] = np.linspace(-1, 1, 7) + np.linspace(0, 0.5, len(rows))[:, None]
+    turned = Rotation.from_matrix([elementary(angles)[-1][:3, :3] for angles in rows[:, :7]])
+    rows[:, -4:] = turned.as_quat(scalar_first=order == "wxyz")
+    xela_files.write(folder / "robot_state.csv", names.split(","), rows)
+    robot = read(folder).streams["robot"]
+    quaternions = np.column_stack([robot[f"orientation_{part}"].to_numpy() for part in "xyzw"])
+    assert (Rotation.from_quat(quaternions) * turned.inv()).magnitude().max() < 1e-6
+
+
 def test_files_of_one_trial_may_differ_by_one_row_at_most(flat_trial: Trial) -> None:
     folder = flat_trial()
     drop_rows(folder / "robot_state.csv", 1)
@@ -191,6 +211,12 @@ def test_the_published_trials_are_read_as_they_were_counted() -> None:
         assert {rows["robot"], rows["marker1"]} <= {rows["xela1"], rows["xela1"] - 1}
         rate_hz = recording.attributes["rate_hz"]
         assert isinstance(rate_hz, float) and 31.9 < rate_hz < 46.1
+        robot = recording.streams["robot"]
+        angles, quaternions = (
+            np.column_stack([robot[name].to_numpy() for name in robot.column_names if name.endswith(ending)])
+            for ending in (tuple(f"joint{n}_rad" for n in range(1, 8)), tuple(f"orientation_{part}" for part in "xyzw"))
+        )
+        assert turns(PANDA, angles, quaternions)
 
 
 def test_selected_streams_are_those_of_the_whole_recording(flat_trial: Trial) -> None:

@@ -93,6 +93,15 @@ def test_rows_that_are_not_finite_do_not_make_it_another_arm() -> None:
     assert not kinematics.carries(PANDA, angles, np.full_like(place, np.nan))
 
 
+def test_a_hand_turns_with_its_arm_in_the_right_order_of_its_quaternions_alone() -> None:
+    angles, _ = joints()
+    turned = Rotation.from_matrix([elementary(row)[-1][:3, :3] for row in angles]) * Rotation.from_rotvec([0.1, 2, 0.3])
+    quaternions = turned.as_quat()
+    assert kinematics.turns(PANDA, angles, quaternions)
+    assert not kinematics.turns(PANDA, angles, np.roll(quaternions, 1, axis=1))
+    assert not kinematics.turns(PANDA, angles[:0], quaternions[:0])
+
+
 @pytest.mark.parametrize("steps_ms", [np.full(49, 20), np.tile([10, 20, 30, 15, 25, 20, 20], 7)])
 def test_differences_of_steady_motion_are_its_velocity(steps_ms: AnyArray) -> None:
     t_ns = np.concatenate([[0], np.cumsum(steps_ms)]) * 1_000_000
