@@ -14,6 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tacpipe.channels import schema
 from tacpipe.codecs import tactile
 from tacpipe.codecs.codec import breaks
 from tacpipe.errors import TacpipeError
@@ -26,6 +27,7 @@ from tests.fake_recordings import FakeRecording, dataset
 from tests.live import rigs
 from tests.live.rigs import MS, T0, Made
 from tests.stage_params import fitting
+from tests.tasks.forward.trials import panda
 
 KINDS: dict[str, dict[str, Any]] = {
     "raw": {"actions": "none"},
@@ -232,6 +234,50 @@ def test_a_plan_is_read_from_its_arrival_and_replaces_the_plan_before(models: di
             assert not same([dataclasses.replace(one, cause=Cause.NO_PLAN)], [without[t_ns]])
         if t_ns < at_ns + 1000 * MS:  # after the end of both plans the hand stays where it is
             assert same([one], [twice[t_ns]]) == (t_ns < at_ns + 300 * MS)
+
+
+def swinging(seed: int, period_ms: int) -> FakeRecording:
+    """A rig whose streams share their stamps: two uSkins that feel a Panda swing, and the arm with its joints."""
+    rng = np.random.default_rng(seed)
+    pose, joints = panda(120)
+    t_ns = T0 + np.arange(len(pose)) * period_ms * MS
+    felt = np.hstack([pose[:, :3], np.diff(pose[:, :3], axis=0, prepend=pose[:1, :3])]) * 40_000
+    touch = [np.round(30_000 + felt * (t_ns > T0 + 300 * MS)[:, None] + rng.normal(0, 2, felt.shape)) for _ in range(2)]
+    angles, speeds = schema.joint_fields()
+    streams = {
+        f"xela{n + 1}": schema.stream(t_ns, values.T.astype(np.uint16), schema.uskin_fields(2))
+        for n, values in enumerate(touch)
+    }
+    arm = [*joints.values(), *pose.T]
+    streams["robot"] = schema.stream(t_ns, arm, [*angles, *speeds, *schema.pose_fields()])
+    return FakeRecording(streams, f"swing-{seed:03d}")
+
+
+def test_the_recorded_motion_as_a_plan_gives_the_forecasts_of_evaluate_at_any_rate(tmp_path: Path) -> None:
+    """The arm's joints state other velocities than its poses, and the rows are slower than those of training."""
+    training = [rigs.segmented(swinging(seed, 20)) for seed in range(3)]
+    params = fitting("train.forward", {**rigs.SMALL, "epochs": 8})
+    files = forward_training.train(params, dataset(*training[:2]), dataset(training[2]), tmp_path)
+    recording = swinging(3, 30)
+    forecaster = Forecaster.load(files)
+    track = forecaster.track(rigs.segmented(recording))  # type: ignore[arg-type]
+    assert np.abs(track.arm - track.planned(np.arange(120)))[1:, 7:10].max() > 0.05
+    fed = rigs.chain((files, [rigs.step("synchronize"), rigs.step("segment.contacts")]), recording)
+    for name, table in recording.tables.items():
+        fed.push(name, table)
+    pose = panda(120)[0]
+    for row in range(119):
+        fed.plan(int(track.t_ns[row]), track.t_ns[row : row + 5], pose[row : row + 5])
+    live = {forecast.t_ns: forecast for forecast in fed.advance(int(track.t_ns[-1])) if forecast.count is not None}
+    (batch,) = forecasts(forecaster, track, track.starts(forecaster.context, forecaster.horizon))
+    at_ns = track.t_ns[batch.now].tolist()
+    compared = [(live[t_ns], count) for t_ns, count in zip(at_ns, batch.count, strict=True) if t_ns in live]
+    farthest = 0.0
+    for forecast, count in compared:
+        assert forecast.cause is Cause.NONE and forecast.count is not None and forecast.now is not None
+        np.testing.assert_allclose(forecast.count, count, rtol=1e-4, atol=0.1)
+        farthest = max(farthest, float(np.abs(forecast.count - forecast.now).max()))
+    assert len(compared) > 90 and farthest > 20  # hardly persistence
 
 
 @pytest.mark.parametrize(

@@ -78,7 +78,7 @@ def errors_of(forecaster: Forecaster, recordings: Dataset, limit: int) -> Errors
     parts: list[tuple[Any, ...]] = []
     with progress.bar("calibrate", len(recordings.recordings)) as advance:
         for number, (name, shard) in enumerate(sorted(recordings.recordings.items())):
-            track = tracks.track(shard, forecaster.codec, forecaster.pose)
+            track = forecaster.track(shard)
             check_rate(track, forecaster)
             starts = fewer(track.starts(forecaster.context, forecaster.horizon), limit)
             for forecast in forecasts(forecaster, track, starts):

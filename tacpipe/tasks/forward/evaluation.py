@@ -204,7 +204,7 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
     by_situation, spill = BySituation(forecaster.horizon, len(forecaster.codec.channels)), Spill(KEPT_BYTES)
     with progress.bar("evaluate", len(recordings.recordings)) as advance:
         for name, shard in sorted(recordings.recordings.items()):
-            track = tracks.track(shard, forecaster.codec, forecaster.pose)
+            track = forecaster.track(shard)
             check_rate(track, forecaster)
             trial = Trial(
                 name, shard.digest in seen_digests, track.object, track.object is None or track.object in objects

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple, Self, cast
 
@@ -34,7 +34,9 @@ from tacpipe.tasks.forward.uncertainty import Uncertainty, window_signs
 from tacpipe.tasks.opened import Chain
 
 if TYPE_CHECKING:
+    from tacpipe.datasets.dataset import Recording
     from tacpipe.tasks.forward.networks import Network
+    from tacpipe.tasks.forward.tracks import Track
 
 
 TASK = "forward"
@@ -99,6 +101,15 @@ class Forecaster:
         """The columns of the arm that it was trained on; none where it was trained without one."""
         stored_pose = self.config["inputs"].get("pose")
         return NAMED if stored_pose is None else Pose(tuple(stored_pose["position"]), tuple(stored_pose["orientation"]))
+
+    def track(self, recording: Recording) -> Track:
+        """Return a recording as the model reads it; see `tacpipe.tasks.forward.tracks.track`.
+
+        Models of before version 5 of `train forward` were trained on plans with the velocities of joints.
+        """
+        track = tracks.track(recording, self.codec, self.pose)
+        stored = self.config["inputs"].get("plan_velocity") == tracks.BY_POSES
+        return track if stored else replace(track, plan_velocity=None)
 
     @property
     def window_columns(self) -> tuple[str, ...]:

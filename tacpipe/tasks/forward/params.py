@@ -193,6 +193,7 @@ class ModelInputs(TypedDict):
     tactile: list[str]
     layout: list[dict[str, str]]  # stream, taxel and axis of each channel
     orientation_reference: list[float]  # (4,): quaternions have the sign that is nearest to this one
+    plan_velocity: NotRequired[str]  # source of a plan's velocities; absent: as those of the past
     unit: NotRequired[str]  # of the channels; absent: counts
     pose: NotRequired[ArmColumns]  # absent: the columns of a Panda
 

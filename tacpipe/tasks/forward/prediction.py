@@ -14,7 +14,7 @@ from tacpipe.io.parquet import one_after_another
 from tacpipe.io.spill import Gathered, Spill
 from tacpipe.models.windows import ARM, POSE
 from tacpipe.plugins.stage import RecordingOutput, Result
-from tacpipe.tasks.forward import headline, tracks
+from tacpipe.tasks.forward import headline
 from tacpipe.tasks.forward.evaluation import KEPT_BYTES, band, check_rate
 from tacpipe.tasks.forward.forecaster import Forecaster, WindowArrays
 from tacpipe.tasks.forward.predictors import forecasts
@@ -61,7 +61,7 @@ def _gathered(
     none = np.zeros((len(steps), channels, 0), np.float32)
     empty = prediction_table(forecaster, np.zeros(0, np.int64), none, steps, dict.fromkeys(quantiles, none))
     for name, shard in sorted(recordings.recordings.items()):
-        track = tracks.track(shard, forecaster.codec, forecaster.pose)
+        track = forecaster.track(shard)
         check_rate(track, forecaster)
         starts = track.starts(forecaster.context, forecaster.horizon)
         gathered[name] = Gathered(spill, empty)
@@ -95,15 +95,16 @@ def inputs(forecaster: Forecaster, recordings: Dataset) -> WindowArrays:
     """Return the windows of a dataset's only recording, as `Forecaster.predict` reads them."""
     check_codec(forecaster.codec_files, recordings.files)
     (shard,) = recordings.recordings.values()
-    track = tracks.track(shard, forecaster.codec, forecaster.pose)
+    track = forecaster.track(shard)
     check_rate(track, forecaster)
     starts = track.starts(forecaster.context, forecaster.horizon)
     window_rows = starts[:, None] + np.arange(forecaster.context + forecaster.horizon)
     past, ahead = np.split(window_rows, [forecaster.context], axis=1)
     read = [*range(len(forecaster.pose.columns)), *(range(POSE, ARM) if forecaster.derived_columns else ())]
-    arm = track.arm[:, read].astype(np.float64)
-    window = np.concatenate([track.tactile[past], arm[past], track.finger[past][..., None]], axis=-1)
-    return WindowArrays(window, arm[ahead], track.t_ns[past[:, -1]])
+    moved = track.arm[past][..., read].astype(np.float64)
+    plan = track.planned(ahead)[..., read].astype(np.float64)
+    window = np.concatenate([track.tactile[past], moved, track.finger[past][..., None]], axis=-1)
+    return WindowArrays(window, plan, track.t_ns[past[:, -1]])
 
 
 def prediction_table(

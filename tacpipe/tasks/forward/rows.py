@@ -14,7 +14,7 @@ from tacpipe.errors import TacpipeError
 from tacpipe.io.mapped import MappedArrays
 from tacpipe.models import windows as windows_of
 from tacpipe.models.windows import Windows
-from tacpipe.tasks.forward.tracks import Track
+from tacpipe.tasks.forward.tracks import Levels, Track
 from tacpipe.training import loop
 
 ACTIONS = ("planned", "none", "shuffled")
@@ -33,6 +33,7 @@ class Rows:
     horizon: int
     actions: str = "planned"
     mapped: MappedArrays | None = None  # files that hold the rows; None: memory
+    plan_velocity: Tensor | None = None  # (time, 6), velocities of planned rows; None: those of ``arm``
 
     @property
     def part(self) -> loop.Part:
@@ -45,6 +46,8 @@ class Rows:
         steps = torch.arange(self.context + self.horizon, device=starts.device)
         rows = steps[:, None] + starts  # (row, window)
         touch, arm = (values.index_select(0, rows.flatten()).view(*rows.shape, -1) for values in (self.touch, self.arm))
+        if self.plan_velocity is not None:
+            arm[self.context :, :, windows_of.POSE :] = self.plan_velocity[rows[self.context :]]
         if self.mapped is not None:
             self.mapped.read(touch.nbytes + arm.nbytes)
         return Windows(touch[: self.context], arm, self.finger[rows[: self.context]]), touch[self.context :]
@@ -95,25 +98,33 @@ def rows(
         raise TacpipeError(f"There are no actions {actions!r}; there are {', '.join(ACTIONS)}.")
     offsets = np.cumsum([0] + [len(track.t_ns) for track in tracks])
 
-    def stacked(name: str, width: tuple[int, ...]) -> AnyFloats:
-        if len(tracks) == 1 and mapped is None:
-            return np.ascontiguousarray(getattr(tracks[0], name)[:], dtype=np.float32)
+    def stacked(parts: Sequence[AnyFloats | Levels], width: tuple[int, ...]) -> Tensor:
+        if len(parts) == 1 and mapped is None:
+            return torch.from_numpy(np.ascontiguousarray(parts[0][:], dtype=np.float32)).to(device)
         shape = (int(offsets[-1]), *width)
-        stacked_rows: AnyFloats = np.empty(shape, np.float32) if mapped is None else mapped.empty(shape, np.float32)
-        for track, first in zip(tracks, offsets, strict=False):
-            stacked_rows[first : first + len(track.t_ns)] = getattr(track, name)[:]
+        values: AnyFloats = np.empty(shape, np.float32) if mapped is None else mapped.empty(shape, np.float32)
+        for part, first in zip(parts, offsets, strict=False):
+            values[first : first + len(part)] = part[:]
             if mapped is not None:
                 mapped.release()
-        return stacked_rows
+        return torch.from_numpy(values).to(device)
 
     features = tracks[0].latent.shape[1:] if tracks else (0,)
-    begins = [track + offset for track, offset in zip(starts, offsets, strict=False)]
-    touch, arm, finger = (
-        torch.from_numpy(values).to(device)
-        for values in (stacked("latent", features), stacked("arm", (windows_of.ARM,)), stacked("finger", ()))
-    )
+    begins = [start + offset for start, offset in zip(starts, offsets, strict=False)]
+    touch = stacked([track.latent for track in tracks], features)
+    arm = stacked([track.arm for track in tracks], (windows_of.ARM,))
+    finger = stacked([track.finger for track in tracks], ())
+    plan_velocity = None
+    if any(track.plan_velocity is not None for track in tracks):
+        plan_velocity = stacked(
+            [
+                track.arm[:, windows_of.POSE :] if track.plan_velocity is None else track.plan_velocity
+                for track in tracks
+            ],
+            (windows_of.ARM - windows_of.POSE,),
+        )
     first = torch.from_numpy(np.concatenate([np.zeros(0, np.int64), *begins])).to(device)
-    return Rows(touch, arm, finger, tracks, first, context, horizon, actions, mapped)
+    return Rows(touch, arm, finger, tracks, first, context, horizon, actions, mapped, plan_velocity)
 
 
 def acted(windows: Windows, actions: str) -> Windows:

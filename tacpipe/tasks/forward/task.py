@@ -27,7 +27,7 @@ class Forward(Task):
     name = "forward"
 
     @staticmethod
-    @stage(version=4, requirements=REQUIREMENTS)
+    @stage(version=5, requirements=REQUIREMENTS)
     def train(params: Params, train: Dataset, val: Dataset, workspace: Workspace, init: Model | None = None) -> Result:
         """Train a model that predicts future tactile signals.
 

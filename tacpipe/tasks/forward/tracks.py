@@ -120,8 +120,10 @@ VELOCITY = tuple(f"robot_velocity_{axis}_m_s" for axis in "xyz")
 TURNING = tuple(f"robot_turning_{axis}_rad_s" for axis in "xyz")
 ARM = POSE + VELOCITY + TURNING
 TURNED = slice(3, 7)  # columns of ``ARM`` with the quaternion
+POSED = len(POSE)  # columns of ``ARM`` that are the pose; velocities follow
 FINGER = "robot_finger_m"
 JOINTS = 7
+BY_POSES = "differences of poses"  # source of a plan's velocities, as models state it
 TRUTH = "gt_"  # how the simulator's ground truth begins, which no model may see
 
 
@@ -141,6 +143,8 @@ class Track:
     timeline: str = "uniform"  # the grid: uniform, logged or fresh
     object: str | None = None  # the grasped object, where a label names it
     slips: Bools | None = None  # (time,), where it slips, if that is known; for evaluation alone
+    # (time, 6), velocities that a plan of these poses has; None where they are those of ``arm``
+    plan_velocity: AnyFloats | None = None
 
     def starts(self, context: int, horizon: int, stride: int = 1) -> Int64s:
         """Return the first rows of all windows of ``context + horizon`` rows (window,)."""
@@ -155,8 +159,9 @@ class Track:
         cut = {
             name: getattr(self, name)[first:last] for name in ("t_ns", "contact", "groups", "usable", "arm", "finger")
         }
-        if self.slips is not None:
-            cut["slips"] = self.slips[first:last]
+        for name in ("slips", "plan_velocity"):
+            if getattr(self, name) is not None:
+                cut[name] = getattr(self, name)[first:last]
         return replace(self, latent=part_of(self.latent), tactile=part_of(self.tactile), **cut)
 
     def put_aside(self, mapped: MappedArrays) -> Track:
@@ -170,9 +175,18 @@ class Track:
             latent = tactile.of_type(self.latent.dtype)
         else:
             latent = self.latent.put_aside(mapped)
-        names = ("t_ns", "contact", "groups", "usable", "arm", "finger")
-        arrays: dict[str, Any] = {name: mapped.kept(getattr(self, name)) for name in names}
+        names = ("t_ns", "contact", "groups", "usable", "arm", "finger", "plan_velocity")
+        arrays: dict[str, Any] = {
+            name: mapped.kept(getattr(self, name)) for name in names if getattr(self, name) is not None
+        }
         return replace(self, tactile=tactile, latent=latent, **arrays)
+
+    def planned(self, rows: Int64s) -> AnyFloats:
+        """Return the arm as a plan of its poses has it at ``rows`` (…), (…, 13): velocities are `plan_velocity`."""
+        arm = self.arm[rows]
+        if self.plan_velocity is not None:
+            arm[..., POSED:] = self.plan_velocity[rows]
+        return arm
 
     def contact_starts(self, context: int, horizon: int, stride: int) -> Int64s:
         """Return the first rows of the windows that lie within one contact (window,)."""
@@ -276,8 +290,11 @@ def track(shard: Recording, codec: codecs.Codec, pose: Pose = poses.NAMED) -> Tr
         gaps, slips = tactile.gaps(table), slips_of(table)
     except TacpipeError as error:
         raise TacpipeError(f"{shard.name}: {error}") from error
-    arm = np.hstack([placed, _velocity(table, pose, t_ns, placed)]).astype(np.float32)
-    del table
+    by_joints = _velocity_of_joints(table, pose, placed)
+    by_poses = kinematics.differences(t_ns, placed[:, :3], placed[:, 3:])
+    arm = np.hstack([placed, by_poses if by_joints is None else by_joints]).astype(np.float32)
+    plan_velocity = None if by_joints is None else by_poses.astype(np.float32)
+    del table, by_joints, by_poses
     columns.release()
     finite &= np.isfinite(arm).all(axis=1)
     timeline = str(shard.attributes.get("grid", "uniform"))
@@ -295,6 +312,7 @@ def track(shard: Recording, codec: codecs.Codec, pose: Pose = poses.NAMED) -> Tr
         timeline,
         None if labelled_object is None else str(labelled_object),
         slips,
+        plan_velocity,
     )
 
 
@@ -334,14 +352,14 @@ def opening(schema: pa.Schema) -> str:
     return columns[0] if len(columns) == 1 else ""
 
 
-def _velocity(table: pa.Table | Columns, pose: Pose, t_ns: Times, placed: AnyFloats) -> AnyFloats:
-    """Return the hand's linear and angular velocity (time, 6): from the joints where they are those of a known arm."""
+def _velocity_of_joints(table: pa.Table | Columns, pose: Pose, placed: AnyFloats) -> AnyFloats | None:
+    """Return the hand's linear and angular velocity (time, 6) from its joints; None where they are not a known arm's."""
     names, speeds = joints(table.schema, pose)
     if len(names) == len(speeds) == JOINTS:
         angles = inputs(table, names)
         if kinematics.carries(kinematics.PANDA, angles, placed[:, :3]):
             return kinematics.hand_velocity(kinematics.PANDA, angles, inputs(table, speeds), placed[:, :3])
-    return kinematics.differences(t_ns, placed[:, :3], placed[:, 3:])
+    return None
 
 
 def joints(schema: pa.Schema, pose: Pose) -> tuple[tuple[str, ...], tuple[str, ...]]:

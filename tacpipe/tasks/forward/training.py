@@ -192,6 +192,7 @@ def _inputs(codec: codecs.Codec, pose: Pose, unit: str, reference: AnyFloats) ->
         "tactile": list(codec.channels),
         "layout": [dict(channel) for channel in codec.layout],
         "orientation_reference": reference.tolist(),
+        "plan_velocity": tracks.BY_POSES,
     }
     if unit != headline.COUNT:
         inputs["unit"] = unit

@@ -116,6 +116,17 @@ def test_velocities_are_those_of_the_joints_where_the_arm_is_a_panda() -> None:
     assert np.abs(recorded).max() > 0.1
 
 
+def test_a_plan_has_the_velocities_of_its_poses_also_where_those_of_the_past_are_of_joints() -> None:
+    pose, joints = panda()
+    jointed, jointless = track(table(JOINTED, pose, extra=joints)), track(table(JOINTED, pose))
+    rows = np.array([[3, 4], [20, 21]])
+    steps = (pose[rows, :3] - pose[rows - 1, :3]) / 0.02
+    assert np.allclose(jointed.planned(rows)[..., 7:10], steps, atol=1e-5)
+    assert np.array_equal(jointed.planned(rows), jointless.planned(rows))
+    assert np.array_equal(jointed.between(3, 30).planned(rows[:1] - 3), jointed.planned(rows[:1]))
+    assert not np.allclose(jointed.planned(rows)[..., 7:], jointed.arm[rows][..., 7:], atol=1e-3)
+
+
 @pytest.mark.parametrize("broken", ["another arm", "no speeds", "no joints"])
 def test_velocities_are_differences_of_poses_on_any_other_arm(broken: str) -> None:
     pose, joints = panda()

@@ -134,7 +134,7 @@ def set_on(changes: Loads, slipping: SlipAlarms, predictor: str, per_hour: float
 
 def on_recordings(model: Dataset, recordings: Dataset, per_hour: float) -> Alarms:
     """Return alarms of a model with levels for ``per_hour`` false alarms each on recordings, each row's forecast made."""
-    from tacpipe.tasks.forward import predictors, tracks
+    from tacpipe.tasks.forward import predictors
     from tacpipe.tasks.forward.alarms import Loads
     from tacpipe.tasks.forward.forecaster import Forecaster
     from tacpipe.tasks.forward.headline import MODEL
@@ -145,7 +145,7 @@ def on_recordings(model: Dataset, recordings: Dataset, per_hour: float) -> Alarm
     forecaster = Forecaster.load(model.files)
     changes, slipping = Loads(forecaster.codec.layout, forecaster.horizon), SlipAlarms.of(forecaster)
     for shard in opened(recordings, Stages(model)).recordings.values():
-        track = tracks.track(shard, forecaster.codec, forecaster.pose)
+        track = forecaster.track(shard)
         changes.begin(track)
         slipping.begin(track)
         for batch in predictors.forecasts(forecaster, track, track.starts(forecaster.context, forecaster.horizon)):

@@ -138,14 +138,14 @@ class Chain:
         self._arm = Arm(forecaster.orientation)
         self._resting: list[_Row] | None = [] if beginning is None else None  # until the level at rest is known
         self._rest: Floats | None = None if beginning is None else np.array(beginning.rest)
-        self._last_ns: int | None = None  # time of the row before
         self._plans: deque[tuple[int, list[Floats]]] = deque()  # arrival, and rows of time and pose
         self._late_plans = 0
         self._until_ns: int | None = None
         period_ns = 1e9 / self.rate_hz
         self._apart_ns = stages.largest_step * period_ns
         self._codec_ns = CODEC_GAP * period_ns
-        self._ahead_ns = np.rint(np.arange(1, forecaster.horizon + 1) * period_ns).astype(np.int64)  # (horizon,)
+        self._period_ns = period_ns
+        self._times: deque[int] = deque(maxlen=forecaster.context)  # times of the newest rows
 
     @classmethod
     def for_model(
@@ -350,8 +350,8 @@ class Chain:
 
     def _take(self, row: _Row) -> bool:
         """Give a row to the model's window; return whether its values are finite."""
-        since_ns = None if self._last_ns is None else row.t_ns - self._last_ns
-        self._last_ns = row.t_ns
+        since_ns = row.t_ns - self._times[-1] if self._times else None
+        self._times.append(row.t_ns)
         assert self._rest is not None
         return self._rolling.add(
             row.tactile - self._rest,
@@ -364,7 +364,7 @@ class Chain:
 
     def _ahead(self, t_ns: int) -> tuple[AnyFloats, Cause]:
         """Return the arm's rows to come (horizon, 13), and what they were made without."""
-        now, ahead_ns = self._rolling.arm, t_ns + self._ahead_ns
+        now, ahead_ns = self._rolling.arm, t_ns + self._steps_ns()
         if not self.reads_plan:  # a model without plans puts the newest row there itself
             return np.broadcast_to(now, (self.horizon, ARM)), Cause.NONE
         if self._targets is not None:
@@ -379,6 +379,18 @@ class Chain:
         plan = Plan(rows[:, 0].view(np.int64), rows[:, 1:])
         cause = Cause.PLAN_ENDED if plan.t_ns[-1] < ahead_ns[-1] else Cause.NONE
         return causal.rows(plan, t_ns, ahead_ns, now), cause
+
+    def _steps_ns(self) -> Times:
+        """Return the times of the rows to come after the newest one (horizon,).
+
+        Rows at the stamps of a stream follow one another as the rows of the context did, because rates differ between
+        recordings.
+        """
+        period_ns = self._period_ns
+        if self._stages.synchronize.rate_hz is None and len(self._times) > 1:
+            period_ns = (self._times[-1] - self._times[0]) / (len(self._times) - 1)
+        steps_ns: Times = np.rint(np.arange(1, self.horizon + 1) * period_ns).astype(np.int64)
+        return steps_ns
 
     def _push_plans(self, batch: pa.RecordBatch | pa.Table | Columns) -> None:
         """Take rows of plans; rows of the same arrival are one plan, also where they come in several batches."""

@@ -23,7 +23,7 @@ from tacpipe.live.stages import RecordingsInMemory, run_stages, streams_as_recor
 from tacpipe.metrics import headline
 from tacpipe.plugins.stage import Result
 from tacpipe.tasks.forward import alarms as load_alarms
-from tacpipe.tasks.forward import evaluation, tracks
+from tacpipe.tasks.forward import evaluation
 from tacpipe.tasks.forward import headline as headlines
 from tacpipe.tasks.forward.alarms import loads
 from tacpipe.tasks.forward.forecaster import Forecaster
@@ -119,7 +119,7 @@ def _session(
         session.t_ns, session.values_and_quantiles(), made_ns, session.matching_rows(with_values)
     )
     latency = tables["latency"]
-    track = tracks.track(offline, forecaster.codec, forecaster.pose)
+    track = forecaster.track(offline)
     predicted = _offline(forecaster, track)
     rows, sums = _errors(forecaster, chain, forecasts, session, track, predicted, steps)
     late = latency.column("late").to_numpy()
