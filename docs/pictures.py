@@ -20,7 +20,7 @@ TITLES = {  # of each table: what its value is, and the column that groups its r
     "material": ("Slides named right, %, with 95 % interval", "sensor"),
     "touch": ("Skill over the constant, known objects, with 95 % interval", "target"),
 }
-VALUES = ("skill", "accuracy_percent", "rmse")
+VALUES = ("skill", "accuracy_percent")
 BLUE, GREY = "#1f6feb", "#6e7781"
 WIDTH, HEIGHT = 1280, 800  # of the first screen, pixels
 

@@ -23,40 +23,107 @@ from typing import TYPE_CHECKING, Any
 import yaml
 
 if TYPE_CHECKING:
-    from tacpipe.comparison.engine import Comparison
+    from tacpipe.comparison.engine import Comparison, Row
 
 ROOT = Path(__file__).parents[1]
+CONSTANT = "constant"  # predictor of touch
 SETS = {  # of a task: the folders that its set has in DATA
     "forward": ("xela_flat_pick_move",),
     "material": ("biotac_slide_20_50", "roboskin_slide_20_50"),
     "touch": ("vision2tactile",),
 }
-
-
 HEADS = {  # of a table: what distinguishes its rows beside the method, and the value
     "forward": ("objects", "skill"),
     "material": ("sensor", "accuracy_percent"),
-    "touch": ("target", "rmse"),
+    "touch": ("target", "skill"),
 }
+DIGITS = {"material": 1}  # after the point, else 3
 ROWS = 7  # of a table
 
 
 def table(comparisons: Sequence[Comparison]) -> str:
-    """Return the best methods of the first part of one task and the best baseline, a row each, as CSV."""
-    name = comparisons[0].task
-    first = [one for one in comparisons if one.question.place == 0]
+    """Return the main rows of the first part of one task as CSV.
+
+    Of ``forward`` all models and the best baselines; of the other tasks the best model, the paper's network and the best
+    baseline of each sensor or of each target of the thumb, and what guessing reaches.
+    """
+    task = comparisons[0].task
+    first = [comparison for comparison in comparisons if comparison.question.place == 0]
+    if task == "touch":  # the finger of the paper's tables
+        first = [comparison for comparison in first if comparison.question.target.endswith("thumb")]
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["method", *HEADS[name], "low", "high", first[0].measure.cluster])
-    for one in first:
-        where = one.question.target or one.question.part.removesuffix(" objects")
-        rows = [(row.name, row) for row in one.models[: max(ROWS // len(first) - 1, 1)]]
-        rows += [(f"{row.name} (best baseline)", row) for row in [one.best_baseline] if row]
-        rows.sort(key=lambda pair: pair[1].score.mean, reverse=one.measure.rises)
-        for method, row in rows:
-            score = row.score
-            writer.writerow([method, where, *(f"{value:.3f}" for value in (score.mean, score.low, score.high)), row.n])
+    writer.writerow(["method", *HEADS[task], "low", "high", first[0].measure.cluster])
+    for comparison in first:
+        part = comparison.question.target or comparison.question.part.removesuffix(" objects")
+        entries = all_entries(comparison) if task == "forward" else main_entries(comparison)
+        entries.sort(key=lambda entry: entry[1][0], reverse=True)
+        for method, values, count in entries:
+            writer.writerow([method, part, *(f"{value:.{DIGITS.get(task, 3)}f}" for value in values), count])
+    most = max(comparison.rows[0].n for comparison in first)
+    if task == "material":
+        materials = len(first[0].rows[0].method.details[0].config["materials"])
+        writer.writerow(["chance", "both", *[f"{100 / materials:.1f}"] * 3, most])
+    if task == "touch":
+        writer.writerow(["constant", "both", 0, 0, 0, most])
     return text.getvalue()
+
+
+Entry = tuple[str, tuple[float, float, float], int]  # name of a method; value, low and high; recordings
+
+
+def all_entries(comparison: Comparison) -> list[Entry]:
+    """Return all models, and then baselines, the best first, until there are `ROWS`."""
+    best = comparison.best_baseline
+    entries = [entry(label(row), row, comparison) for row in comparison.models]
+    baselines = comparison.of("baseline")[: max(ROWS - len(entries), 1)]
+    return entries + [
+        entry(f"{row.name} ({'best' if row is best else 'a'} baseline)", row, comparison) for row in baselines
+    ]
+
+
+def main_entries(comparison: Comparison) -> list[Entry]:
+    """Return the best model, the best one of the paper's networks, and the best baseline."""
+    chosen = {label(row): row for row in comparison.models[:1]}
+    papers = [row for row in comparison.models if schedule(row)[1]]
+    chosen |= {label(row): row for row in papers[:1]}
+    best = comparison.best_baseline
+    if best and best.predictor != CONSTANT:  # which has a row of its own
+        chosen[f"{best.name} (best baseline)"] = best
+    return [entry(name, row, comparison) for name, row in chosen.items()]
+
+
+def entry(name: str, row: Row, comparison: Comparison) -> Entry:
+    """Return a row with the value that its table states: skill over the constant for touch, else the score of its task."""
+    from tacpipe.comparison import engine
+
+    value: Any = row.score
+    if comparison.task == "touch":
+        source = next((other.method for other in comparison.rows if other.predictor == CONSTANT), row.method)
+        value = engine.difference(row.method, source, comparison.question, (row.predictor, CONSTANT))
+    return name, (value.mean, value.low, value.high), row.n
+
+
+def label(row: Row) -> str:
+    """Return a method's name, whether it is a paper's network, and its epochs where they are fewer than they could be."""
+    shortened, paper = schedule(row)
+    name = row.name.replace(f" ({shortened})", "").replace(f" · {shortened}", "") if shortened else row.name
+    if paper:
+        return f"{name} (paper's network{f', {shortened}' if shortened else ''})"
+    return " · ".join(filter(None, [name, shortened]))
+
+
+def schedule(row: Row) -> tuple[str, bool]:
+    """Return a model's epochs as "10 of 16 epochs" where the full schedule has more, and whether that is a paper's."""
+    from tacpipe.plugins import params as params_of
+    from tacpipe.plugins import registry
+
+    result = row.method.details[0]
+    kind = params_of.kind_of(registry.load(result.STAGE), result.given)
+    presets = params_of.presets_of(kind)
+    full = presets["paper"].get("epochs") if "paper" in presets else getattr(kind, "epochs", None)
+    epochs = result.params.get("epochs")
+    return f"{epochs:,} of {full:,} epochs" if epochs and full and epochs < full else "", "paper" in presets
 
 
 def write_table(task: str, results: Path) -> Path:

@@ -342,13 +342,18 @@ def test_the_tables_of_results_are_made_from_results() -> None:
     from tacpipe.comparison import engine
     from tests.tasks.touch.report.touch_fakes import result
 
-    table = module("result_pages").table(engine.compare([result(), result("trees", off=0.02)]))
-    rows = list(csv.DictReader(io.StringIO(table)))
-    assert list(rows[0]) == ["method", "target", "rmse", "low", "high", "grasps"]
-    assert [(row["method"], row["rmse"]) for row in rows[:2]] == [
-        ("trees on geometry and colour", "0.020"), ("constant (best baseline)", "0.100")
-    ]  # fmt: skip
-    assert len(rows) == 8
+    short = result("pointnet", off=0.05)
+    short.files["config.json"] = short.files["config.json"].replace(b'"epochs": 250', b'"epochs": 15')
+    text = module("result_pages").table(engine.compare([result("trees", off=0.02), short]))
+    rows = list(csv.DictReader(io.StringIO(text)))
+    assert list(rows[0]) == ["method", "target", "skill", "low", "high", "grasps"]
+    assert [(row["method"], row["target"], row["skill"]) for row in rows] == [
+        ("trees on geometry and colour", "PDC thumb", "0.800"),
+        ("PointNet (paper's network, 15 of 250 epochs)", "PDC thumb", "0.500"),
+        ("trees on geometry and colour", "electrodes thumb", "0.800"),
+        ("PointNet (paper's network, 15 of 250 epochs)", "electrodes thumb", "0.500"),
+        ("constant", "both", "0"),
+    ]
 
 
 PARSED = {  # beginnings of examples of the help that are parsed and not run, and why

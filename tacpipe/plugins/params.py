@@ -166,6 +166,11 @@ def counting(stage: AnyStage, values: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in current.items() if kind is None or name in fields_of.hints(kind)}
 
 
+def kind_of(stage: AnyStage, values: Mapping[str, Any]) -> Kind | None:
+    """Return the kind that stored params are of; None where the tag names no kind, as of a plug-in that is not installed."""
+    return _current(kinds(stage), values)[0]
+
+
 def named(stage: str, values: Mapping[str, Any]) -> dict[str, Any]:
     """Return stored params by today's names and choices; as they are where the ``stage`` is not installed."""
     from tacpipe.plugins import registry
@@ -318,7 +323,7 @@ def _joined(several: Sequence[Any]) -> Any:
     return several[0] if len(several) == 1 else typing.Union[tuple(several)]  # noqa: UP007
 
 
-def presets_of(kind: Kind) -> Mapping[str, Mapping[str, Any]]:
+def presets_of(kind: Kind | None) -> Mapping[str, Mapping[str, Any]]:
     """Return the values of each preset of a kind of params, by its name."""
     found: Mapping[str, Mapping[str, Any]] = getattr(kind, "PRESETS", {})
     return found

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 Tree = Mapping[str, Any]
 CALIBRATION = ("quantiles", "known")  # what `tacpipe calibrate` adds to a model's configuration
+SHORTENED = "shortened"  # setting of a method on the recordings of a paper: `Result.epochs_of_paper`, if not empty
 GROWS = "trained_on"  # which names the recordings of the calibration too
 
 
@@ -67,6 +68,14 @@ class Result:
         """The params that are stored with the model."""
         params: Tree = self.config.get("params", {})
         return params
+
+    @property
+    def epochs_of_paper(self) -> str:
+        """The epochs of a paper's network, where they are fewer than the paper's, as "150 of 2,000 epochs"; else empty."""
+        tagged = {"architecture": self.config.get("architecture"), **self.given}
+        presets = params_of.presets_of(params_of.kind_of(registry.load(self.STAGE), tagged))
+        epochs, printed = self.params.get("epochs"), presets.get("paper", {}).get("epochs")
+        return f"{epochs:,} of {printed:,} epochs" if epochs and printed and epochs < printed else ""
 
     @property
     def simulated(self) -> bool:

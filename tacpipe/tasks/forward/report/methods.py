@@ -18,7 +18,6 @@ from tacpipe.report import context
 from tacpipe.report.context import Tree, drop_duplicates
 from tacpipe.tasks.forward import headline
 from tacpipe.tasks.forward.headline import BASELINE
-from tacpipe.tasks.forward.params import Recurrent
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -169,13 +168,6 @@ class Result(context.Result):
         codec = self.config["codec"]["name"]
         return {**params, "codec": codec, "actions": self.actions, "timeline": self.timeline}
 
-    @property
-    def part_of_schedule(self) -> str:
-        """The epochs of the paper's network, where they are fewer than the paper's, as "12 of 50 epochs"; else empty."""
-        epochs, published = int(self.given.get("epochs", 0)), int(str(Recurrent.PRESETS["paper"]["epochs"]))
-        shortened = self.config["architecture"] == "recurrent" and 0 < epochs < published
-        return f"{epochs} of {published} epochs" if shortened else ""
-
     def name(self, usual: str) -> str:
         """Return what its method is called, with a timeline that is not the ``usual`` one and a shortened schedule."""
         parts = [str(self.config["architecture"]).replace("_", " "), str(self.config["codec"]["name"])]
@@ -183,8 +175,8 @@ class Result(context.Result):
             parts.append("no actions" if self.actions == "none" else f"{self.actions} actions")
         if self.timeline != usual:
             parts.append(self.timeline)
-        if self.part_of_schedule:
-            parts.append(self.part_of_schedule)
+        if self.epochs_of_paper:
+            parts.append(self.epochs_of_paper)
         return " · ".join(parts)
 
 

@@ -12,7 +12,7 @@ from tacpipe.comparison.runs import Errors, Method, Question, Run, marks
 from tacpipe.comparison.specification import Kind
 from tacpipe.plugins import architectures
 from tacpipe.report import context
-from tacpipe.report.context import Tree, drop_duplicates
+from tacpipe.report.context import SHORTENED, Tree, drop_duplicates
 from tacpipe.tasks.material import headline
 from tacpipe.tasks.material.params import Material
 from tacpipe.tasks.material.report import predictions
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 
 SENSORS = {"biotac": "BioTac", "roboskin": "RoboSkin"}
-USUAL = (("elsewhere", False), ("elsewhere", True), ("layout", "time"))  # settings that no name states
+USUAL = (("elsewhere", False), ("elsewhere", True), ("layout", "time"), SHORTENED)  # settings that need no mark
 _PLAIN = {
     "pairing": ("random", "fixed"),
     "labels": ("true",),
@@ -213,7 +213,7 @@ def base_name(settings: Tree, variants: bool = True) -> str:
         return name
     held_out = (text.strip().partition("=") for text in str(settings["hold_out"]).split(";") if settings["hold_out"])
     parts = [
-        name,
+        f"{name} ({settings[SHORTENED]})" if SHORTENED in settings else name,
         "with vibration" if settings["vibration"] else "",
         "permuted pairs" if settings["pairing"] == "permuted" else "",
         "permuted labels" if settings["labels"] == "permuted" else "",
@@ -233,8 +233,10 @@ def _settings(run: Result) -> dict[str, Any]:
     joint = bool(config.get("joint", architecture == "raec" and params.get("joint", False)))
     closed = _CLOSED.get(architecture)
     ratio = 100 if closed else int(params.get("subsample_percent", 100))
+    shortened = run.epochs_of_paper if run.published else ""
     idle = {
         *_NO_METHOD,
+        *(["epochs"] if shortened else []),
         "features",
         "use_validation",
         "speeds",
@@ -256,6 +258,7 @@ def _settings(run: Result) -> dict[str, Any]:
         "layout": layout,
         "split": split,
         "simulated": run.simulated,
+        **({SHORTENED: shortened} if shortened else {}),
     }
 
 

@@ -17,7 +17,7 @@ from tacpipe.metrics import regression
 from tacpipe.plugins import architectures
 from tacpipe.plugins import params as params_of
 from tacpipe.report import blocks, context
-from tacpipe.report.context import Tree, drop_duplicates
+from tacpipe.report.context import SHORTENED, Tree, drop_duplicates
 from tacpipe.tasks.touch import headline
 from tacpipe.tasks.touch.params import Touch
 from tacpipe.tasks.touch.report import predictions
@@ -73,6 +73,9 @@ class Result(context.Result):
             params.pop("wrist", None)  # nothing reads it
         if not params.get("multi_target", True):  # trees are one model of all targets
             params.pop("targets", None)  # one network a target: others beside it change nothing
+        if self.published and self.epochs_of_paper:
+            params[SHORTENED] = self.epochs_of_paper
+            params.pop("epochs")
         return {**params, "architecture": self.architecture, "split": self.split, "simulated": self.simulated}
 
 
@@ -161,7 +164,11 @@ def _first_names(settings: Tree) -> list[str]:
     architecture, coloured = str(settings["architecture"]), settings.get("colour", True)
     if architecture == "trees":
         return ["trees on geometry and colour" if coloured else "trees on geometry"]
-    return [architectures.title(Touch, architecture), *([] if coloured else ["without colour"])]
+    name = architectures.title(Touch, architecture)
+    return [
+        f"{name} ({settings[SHORTENED]})" if SHORTENED in settings else name,
+        *([] if coloured else ["without colour"]),
+    ]
 
 
 def _usual_settings(alike: Sequence[tuple[Tree, int]]) -> list[tuple[str, Any]]:
@@ -178,7 +185,7 @@ def _usual_settings(alike: Sequence[tuple[Tree, int]]) -> list[tuple[str, Any]]:
             (values.count(candidate), sum(runs for value, runs in values_and_runs if value == candidate))
             for candidate in values
         ]
-        usual_values = values if name in (*USUAL, "colour") else [values[weights.index(max(weights))]]
+        usual_values = values if name in (*USUAL, "colour", SHORTENED) else [values[weights.index(max(weights))]]
         usual += [(name, value) for value in usual_values]
     return usual
 

@@ -61,6 +61,24 @@ def test_names_say_what_keeps_a_method_from_being_plain() -> None:
     }
 
 
+def test_a_name_states_that_a_network_was_trained_for_fewer_epochs_than_in_the_paper() -> None:
+    def trained(epochs: int, architecture: str = "raec", **options: Any) -> Any:
+        dataset = result(architecture, wrong=BOTH, **options)
+        config = json.loads(dataset.files["config.json"])
+        config["params"]["epochs"] = epochs
+        dataset.files["config.json"] = json.dumps(config).encode()
+        return dataset
+
+    found = grouped(trained(150, joint=True), trained(2000, joint=True), trained(30, "x-lstm"), result(wrong=BOTH))
+    assert {name: one.family for name, one in found.items()} == {
+        "RAEC joint (150 of 2,000 epochs)": "RAEC joint",
+        "RAEC joint": "RAEC joint",
+        "X-LSTM (30 of 2,000 epochs)": "X-LSTM",
+        "RAEC independent": "RAEC independent",
+    }
+    assert list(grouped(trained(150, joint=True, published=False))) == ["RAEC joint"]
+
+
 def test_settings_are_told_only_where_they_tell_methods_apart() -> None:
     found = grouped(
         result(wrong=BOTH, joint=True, decoder="D1", pairing="fixed", epochs_most=5),

@@ -50,6 +50,18 @@ def test_a_name_tells_what_sets_a_method_apart_from_most_of_its_architecture() -
     ]
 
 
+def test_a_name_states_that_the_papers_network_was_trained_for_fewer_epochs_than_in_the_paper() -> None:
+    given = [result("pointnet", **options) for options in ({}, {"head": "fc1"}, {"published": False}, {"points": 250})]
+    for short in given[1:3]:
+        short.files["config.json"] = short.files["config.json"].replace(b'"epochs": 250', b'"epochs": 15')
+    assert [one.name for one in methods(*given)] == [
+        "PointNet",
+        "PointNet (15 of 250 epochs) · head fc1",
+        "PointNet · epochs 15",  # the paper trained on no such recordings
+        "PointNet · points 250",
+    ]
+
+
 def test_trees_are_called_by_whether_they_read_colour_and_others_say_where_they_do_not() -> None:
     kinds = ("strong", "trees", "patches")  # as they are stored
     found = methods(*(result(kind, inputs=inputs) for kind in kinds for inputs in ("rgbcont", "xyzcont", "xyz")))
