@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from tacpipe.comparison.runs import MODEL, Method, Run
-from tacpipe.metrics.intervals import wilson
-from tacpipe.report.blocks import NONE, Cell, Fold, Table, fixed, fold, number, table
+from tacpipe.report.blocks import NONE, Cell, Fold, Table, fixed, fold, notes, number, table
 from tacpipe.report.context import Context
 from tacpipe.tasks.forward.report.figures import predictor_title
 
@@ -63,12 +62,16 @@ SLIP_TITLE = "Slips that an alarm led, its level set on other recordings"
 SLIP_HEADS = {  # by name of what the alarm was worth
     "events": "slips",
     "led": "led",
-    "led_percent": "led (%), 95 % interval",
+    "led_percent": "led (%)",
     "median_lead_ms": "median lead (ms)",
     "false_alarms": "false alarms",
     "minutes": "minutes without slips",
     "false_alarms_per_hour": "false alarms an hour",
 }
+SLIP_NOTE = (
+    "Slips of one recording are alike, and results do not state the recording of each, so these are counts without an "
+    "interval."
+)
 
 
 def slip_folds(context: Context) -> list[Fold]:
@@ -78,14 +81,14 @@ def slip_folds(context: Context) -> list[Fold]:
     rows: list[Sequence[str | Cell]] = [
         [name, *(_slip_cell(scores, key) for key in SLIP_HEADS)] for name, scores in ordered
     ]
-    return fold("Slips", table(SLIP_TITLE, ["", *SLIP_HEADS.values()], rows)) if rows else []
+    heads = ["", *SLIP_HEADS.values()]
+    return fold("Slips", table(SLIP_TITLE, heads, rows), notes(SLIP_NOTE)) if rows else []
 
 
 def slip_scores(method: Method, predictor: str) -> dict[str, float] | None:
     """Return what the alarm was worth with the forecasts of a predictor, runs together; None without slips.
 
-    Counts and minutes are sums. The interval of the share that was led takes slips as independent (Wilson). The median lead
-    is the mean of the runs' medians, weighted by the slips that were led.
+    Counts and minutes are sums. The median lead is the mean of the runs' medians, weighted by the slips that were led.
     """
     described = [run.details.metrics.get("slips", {}).get(predictor) for run in method.runs]
     trees = [tree for tree in described if tree and tree["events"]]
@@ -94,15 +97,12 @@ def slip_scores(method: Method, predictor: str) -> dict[str, float] | None:
     events, led, false, minutes = (
         sum(tree[key] for tree in trees) for key in ("events", "led", "false_alarms", "minutes")
     )
-    low, high = wilson(led, events)
     leads_ms = [tree["median_lead_ms"] for tree in trees if tree["led"]]
     weights = [tree["led"] for tree in trees if tree["led"]]
     return {
         "events": events,
         "led": led,
         "led_percent": 100 * led / events,
-        "low_percent": 100 * low,
-        "high_percent": 100 * high,
         "median_lead_ms": float(np.average(leads_ms, weights=weights)) if weights else float("nan"),
         "false_alarms": false,
         "minutes": minutes,
@@ -113,7 +113,7 @@ def slip_scores(method: Method, predictor: str) -> dict[str, float] | None:
 def _slip_cell(scores: Mapping[str, float], key: str) -> str | Cell:
     value = scores[key]
     if key == "led_percent":
-        return Cell(fixed(value, 0), below=f"{fixed(scores['low_percent'], 0)} to {fixed(scores['high_percent'], 0)}")
+        return fixed(value, 0)
     return f"{value:,}" if isinstance(value, int) else number(value, 3)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +12,7 @@ from tacpipe.comparison.runs import Method, Run
 from tacpipe.metrics.intervals import wilson
 from tacpipe.report import blocks
 from tacpipe.report.blocks import NONE, Cell, Fold, Note, Table, number, p_value, signed
-from tacpipe.report.context import Tree
+from tacpipe.report.context import SHORTENED, Tree
 from tacpipe.tasks.material.report import figures, scores
 from tacpipe.tasks.material.report.methods import (
     has_usual_settings,
@@ -283,7 +283,9 @@ def _reduction_table(methods: Sequence[Method], reduced: str) -> Table:
         rows.append([*row, _reduction_cell([candidate for candidate in fewer if candidate.family == OURS], reduced)])
     heads = ["share kept", "slides"]
     for kind, sensor in columns:
-        heads += [f"{kind.removeprefix('RAEC ')}, {sensor_title(sensor)}", "paper"]
+        epochs = {str(method.settings.get(SHORTENED, "")) for method in methods if method.family == kind} - {""}
+        name = " ".join([kind.removeprefix("RAEC "), *(f"({text})" for text in sorted(epochs))])
+        heads += [f"{name}, {sensor_title(sensor)}", "paper"]
     title = (
         f"Table {TABLE_NUMBERS[reduced]} in the paper's form: accuracy (%) where {sensor_title(reduced)} has fewer "
         f"training slides"
@@ -308,7 +310,7 @@ ZERO_SHOT_NOTE = (
     "The sensor's own labels and pairs of these materials were kept from training; the other sensor's classifier names them "
     "from its latents, out of all materials or out of the held-out ones alone. Above chance here, and here alone, is "
     "evidence of something that the sensors share. Slides of one material are right or wrong together, so the interval "
-    "counts materials and runs, not slides. "
+    "counts each held-out material once, and neither slides nor runs. "
 )
 
 
@@ -321,7 +323,7 @@ class HeldOut:
     main: bool  # whether nothing else sets them apart
     sensor: str
     trees: tuple[Tree, ...]  # what metrics report on the held-out materials, one a run
-    materials: int  # that a run held out
+    materials: int  # held out by any run
 
 
 def zero_shot_folds(methods: Sequence[Method]) -> list[Fold]:
@@ -388,35 +390,27 @@ def held_out_methods(methods: Sequence[Method]) -> list[HeldOut]:
             name = first.name if len(sets) == 1 else f"{first.family} · {len(sets)} sets of materials in turn"
             trees = tuple(tree for tree, _ in evaluated)
             main = has_usual_settings(first.settings, "hold_out")
-            scored_methods.append(HeldOut(name, first.family, main, sensor, trees, _held_out(first, sensor)))
+            scored_methods.append(HeldOut(name, first.family, main, sensor, trees, _count_held_out(sets, sensor)))
     return scored_methods
 
 
 def _zero_shot_counts(trees: Sequence[Tree], sensor: str, materials: int) -> tuple[int, int, float, float]:
     """Return how many slides were named right, of how many, and the interval of that share.
 
-    Slides of one material lie together and are right or wrong together, also by chance; so a run counts as no more trials
-    than it has held-out ``materials``.
+    Slides of one material are right or wrong together, also by chance and in several runs. So there are as many trials as
+    held-out ``materials``.
     """
     correct, evaluated = (sum(int(_accuracy_at(tree, name, sensor)) for tree in trees) for name in ("correct", "n"))
     if not evaluated:
         return 0, 0, float("nan"), float("nan")
-    trials = materials * len(trees)
-    return correct, evaluated, *wilson(round(correct / evaluated * trials), trials)
+    return correct, evaluated, *wilson(round(correct / evaluated * materials), materials)
 
 
-def _held_out(method: Method, sensor: str) -> int:
-    """Return how many materials were held out of a sensor's labels, from a setting like ``roboskin=17,18``."""
-    parts = (part.strip().partition("=") for part in str(method.settings["hold_out"]).split(";"))
-    return max(
-        sum(
-            bool(material.strip())
-            for name, _, described in parts
-            if name == sensor
-            for material in described.split(",")
-        ),
-        1,
-    )
+def _count_held_out(sets: Collection[str], sensor: str) -> int:
+    """Return how many materials any of the settings held out of a sensor's labels, each like ``roboskin=17,18``."""
+    parts = (part.strip().partition("=") for setting in sets for part in setting.split(";"))
+    held_out = {material.strip() for name, _, described in parts if name == sensor for material in described.split(",")}
+    return max(len(held_out - {""}), 1)
 
 
 def _zero_shot_cells(trees: Sequence[Tree], sensor: str, materials: int) -> list[str | Cell]:
