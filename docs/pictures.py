@@ -23,6 +23,7 @@ TITLES = {  # of each table: what its value is, and the column that groups its r
 VALUES = ("skill", "accuracy_percent")
 BLUE, GREY = "#1f6feb", "#6e7781"
 WIDTH, HEIGHT = 1280, 800  # of the first screen, pixels
+FLOOR = -1.0  # rows of lower skill stand in the table alone: they would press the others together
 
 
 def rows(name: str) -> list[dict[str, str]]:
@@ -41,7 +42,7 @@ def chart(name: str) -> None:
     from matplotlib.figure import Figure
 
     title, group = TITLES[name]
-    table = rows(name)
+    table = [row for row in rows(name) if value_of(row) >= FLOOR]
     figure = Figure(figsize=(7.5, 0.36 * len(table) + 0.9), layout="constrained")
     axes: Any = figure.add_subplot()
     for place, row in enumerate(table):
