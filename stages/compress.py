@@ -126,7 +126,7 @@ def autoencoder(params: AutoencoderParams, recording: Recording, codec: Fitted) 
     are held out to stop the training. Raises `TacpipeError` where the
     recording's channels are not those the codec was fitted on.
 
-    Example: tacpipe compress autoencoder data/segments --split data/split -o data/latents
+    Example: tacpipe compress autoencoder data/segments --split data/split -o data/codes
     """
     from tacpipe.codecs import tactile
 
