@@ -1,6 +1,6 @@
 """Assign roles to recordings: train, val, calibration, test.
 
-Example: tacpipe split data/segments -o data/split
+Example: tacpipe split data/segments -o data/split --calibration 0.15
 """
 
 from __future__ import annotations
