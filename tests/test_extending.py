@@ -2,33 +2,34 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shlex
 import subprocess
 import sys
 import sysconfig
 import venv
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 
 from tests import test_docs as docs
+from tests.live.sessions import subscriber
+from tests.recording import live
 
-TITLED = (".py", ".toml")
+QUIET = ["--quiet", "--no-deps", "--no-build-isolation", "--no-index", "--disable-pip-version-check"]
 
 
-def packages(folder: Path) -> list[Path]:
-    """Write the package of each page below ``folder``, and return their folders."""
-    folders = []
-    for page in docs.EXTENDING:
-        place = folder / page.stem
-        place.mkdir(parents=True)
-        for block in docs.fenced_blocks(page.read_text()):
-            if block.title:
-                (place / block.title).write_text(block.text)
-        assert (place / "pyproject.toml").exists(), page
-        folders.append(place)
-    return folders
+def write_package(page: Path, folder: Path) -> Path:
+    """Write the package that a page prints below ``folder``, and return its folder."""
+    package = folder / page.stem
+    package.mkdir(parents=True)
+    for block in docs.fenced_blocks(page.read_text()):
+        if block.title:
+            (package / block.title).write_text(block.text)
+    assert (package / "pyproject.toml").exists(), page
+    return package
 
 
 def make_environment(folder: Path) -> Path:
@@ -44,39 +45,82 @@ def make_environment(folder: Path) -> Path:
     return folder / "bin"
 
 
+class Project:
+    """A folder with an environment in which the packages of some pages are installed."""
+
+    def __init__(self, folder: Path, pages: Sequence[Path]) -> None:
+        self.programs = make_environment(folder / "environment")
+        self.folder = folder / "project"
+        self.folder.mkdir()
+        clean = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "TACPIPE_STORE")}
+        path = f"{self.programs}{os.pathsep}{os.environ['PATH']}"
+        self.variables = {**clean, "PATH": path, "OMP_NUM_THREADS": "1"}
+        packages = [str(write_package(page, folder / "packages")) for page in pages]
+        pip = [sys.executable, "-m", "pip", "--python", str(self.programs / "python"), "install", *QUIET]
+        self.run([*pip, *packages], "pip install")
+
+    def run(self, words: Sequence[str], description: str) -> list[str]:
+        """Run a program, which must succeed, and return the lines that it prints."""
+        ran = subprocess.run(words, cwd=self.folder, env=self.variables, capture_output=True, text=True, check=False)
+        assert ran.returncode == 0, f"{description}: {ran.stderr}"
+        return [line for line in (ran.stderr + ran.stdout).splitlines() if line]
+
+    def tacpipe(self, command: str) -> list[str]:
+        """Run ``tacpipe`` with a command."""
+        return self.run([str(self.programs / "tacpipe"), *shlex.split(command)], command)
+
+    def record(self, command: str) -> list[str]:
+        """Run ``tacpipe`` with a command that records, with limits that suit a busy computer."""
+        self.variables["PYTHONPATH"] = str(docs.ROOT)
+        words = [str(self.programs / "python"), "-m", "tests.recording.patient", *shlex.split(command)]
+        return self.run(words, command)
+
+
 @pytest.mark.long
 @pytest.mark.timeout(3600)
 def test_the_package_of_every_page_installs_and_does_what_the_page_prints(tmp_path: Path) -> None:
     """One project serves all pages: what one computed is reused on the next."""
-    programs = make_environment(tmp_path / "environment")
-    project = tmp_path / "project"
-    project.mkdir()
-    clean = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "TACPIPE_STORE")}
-    around = {**clean, "PATH": f"{programs}{os.pathsep}{os.environ['PATH']}", "OMP_NUM_THREADS": "1"}
-
-    def run_program(words: list[str], label: str) -> list[str]:
-        ran = subprocess.run(words, cwd=project, env=around, capture_output=True, text=True, check=False)
-        assert ran.returncode == 0, f"{label}: {ran.stderr}"
-        return [line for line in (ran.stderr + ran.stdout).splitlines() if line]
-
-    quiet = ["--quiet", "--no-deps", "--no-build-isolation", "--no-index", "--disable-pip-version-check"]
-    pip = [sys.executable, "-m", "pip", "--python", str(programs / "python"), "install", *quiet]
-    run_program([*pip, *map(str, packages(tmp_path / "packages"))], "pip install")
-
+    project = Project(tmp_path, docs.EXTENDING)
     before: set[str] = set()
     for page in docs.EXTENDING:
-        page_commands = set()
+        commands = set()
         for block in docs.fenced_blocks(page.read_text()):
             if block.language == "python" and not block.title:
-                run_program([str(programs / "python"), "-c", block.text], page.name)
-            elif block.language == "console":
+                project.run([str(project.programs / "python"), "-c", block.text], page.name)
+            elif block.language == "console" and not block.mark:
                 for command, lines in docs.printed_commands(block.text):
-                    printed_lines = run_program(
-                        [str(programs / "tacpipe"), *shlex.split(command)[1:]], f"{page.name}: {command}"
-                    )
-                    docs.compare(f"{page.name}: {command}", lines, printed_lines, rerun=command in before)
-                    page_commands.add(command)
-        before |= page_commands
+                    printed = project.tacpipe(command.removeprefix("tacpipe "))
+                    docs.compare(f"{page.name}: {command}", lines, printed, rerun=command in before)
+                    commands.add(command)
+        before |= commands
+
+
+@pytest.mark.rig
+@pytest.mark.timeout(1800)
+def test_a_task_of_another_package_publishes_live_what_it_predicts_from_the_recording(tmp_path: Path) -> None:
+    """The task is installed as its page prints it, trained on recordings of an emulated rig, and runs live on that rig."""
+    project = Project(tmp_path, [page for page in docs.EXTENDING if page.stem == "task"])
+    with live.served(project.folder, live.SKIN), subscriber() as (port, messages):
+        project.record("acquire rig.toml -o data/recordings --trials 3 --duration-s 2 --no-tare")
+        project.tacpipe("split data/recordings -o data/split --scheme random --val 0.34 --test 0")
+        project.tacpipe("train load data/recordings --split data/split -o models/trained --stream skin --ahead 3")
+        project.tacpipe("calibrate models/trained data/recordings --split data/split -o models/load")
+        project.record(
+            f"live rig.toml --model models/load -o rec --duration-s 3 --limit 1e9 --publish udp:127.0.0.1:{port}"
+        )
+    project.tacpipe("evaluate models/load rec -o results/load")
+    assert "coverage" in json.loads((project.folder / "results/load/metrics.json").read_text())["quantiles"]
+    project.tacpipe("predict models/load rec -o predicted --causal --quantiles 10,90")
+    session = live.only(project.folder)
+    predicted = live.only(project.folder, "predicted").table()
+    by_time = dict(zip(predicted["t_ns"].to_pylist(), predicted["ahead"].to_pylist(), strict=True))
+    recorded = session.table("load")
+    assert recorded.num_rows > 50 and not set(recorded["t_device_ns"].to_pylist()) - set(by_time)
+    assert recorded["ahead"].to_pylist() == [by_time[t_ns] for t_ns in recorded["t_device_ns"].to_pylist()]
+    published = {message["t_ns"]: message["ahead"] for message in messages if message["kind"] == "load"}
+    assert published == {t_ns: by_time[t_ns] for t_ns in published} and set(published) >= set(
+        recorded["t_device_ns"].to_pylist()
+    )
 
 
 def test_every_group_of_plug_ins_has_a_page() -> None:
