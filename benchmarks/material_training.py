@@ -16,8 +16,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from tacpipe.models.minirocket import MinirocketClassifier
 from tacpipe.models.recurrent_autoencoder import RecurrentAutoencoder, Shape
-from tacpipe.tasks.material.losses import JointWork, ScaledSlides, Weights
-from tacpipe.tasks.material.pairs import Pairs
+from tacpipe.tasks.material.losses import JointWork, Pairs, ScaledSlides, Weights
 from tacpipe.training import loop
 
 SLIDES, CLASSES, BATCH, RATE = 600, 20, 32, 5e-4

@@ -24,8 +24,8 @@ from tacpipe.tasks.touch import calibration as touch_calibration
 from tacpipe.tasks.touch import evaluation as touch_evaluation
 from tacpipe.tasks.touch import headline as headlines
 from tacpipe.tasks.touch import training as touch_training
+from tacpipe.tasks.touch.headline import CONSTANT, COVERAGE, MODEL, OBJECT_MEAN
 from tacpipe.tasks.touch.report.uncertainty import Band, measure_bands
-from tacpipe.tasks.touch.result_names import CONSTANT, COVERAGE, MODEL, OBJECT_MEAN
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -27,9 +27,9 @@ from tacpipe.simulation.household import FAMILIES, MODULI_PA
 from tacpipe.simulation.slide import SPECTRA
 from tacpipe.simulation.trajectory import PROTOCOLS
 from tacpipe.tasks.forward.rows import ACTIONS
-from tacpipe.tasks.material.pairs import EVERY, PAIRINGS
+from tacpipe.tasks.material.losses import EVERY, PAIRINGS
 from tacpipe.tasks.touch.inputs import MODES, WRISTS
-from tacpipe.tasks.touch.losses import LOSSES
+from tacpipe.tasks.touch.members import LOSSES
 from tacpipe.training.scaling import KINDS
 from tests.conftest import Ran, forget, write_plugin
 

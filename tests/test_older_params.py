@@ -14,8 +14,8 @@ from tacpipe.io.hashing import digest
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
 from tacpipe.tasks.forward import prediction as forward_prediction
-from tacpipe.tasks.material import prediction as material_prediction
-from tacpipe.tasks.touch import prediction as touch_prediction
+from tacpipe.tasks.material import model as material_prediction
+from tacpipe.tasks.touch import model as touch_prediction
 from tacpipe.tasks.touch.params import Trees
 from tests.fake_recordings import FakeDataset
 from tests.stage_params import build_params

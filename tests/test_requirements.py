@@ -15,7 +15,7 @@ from tacpipe.plugins import registry
 from tacpipe.tasks.forward import tracks
 from tacpipe.tasks.forward.params import REQUIREMENTS as FORWARD
 from tacpipe.tasks.material import slides as material_slides
-from tacpipe.tasks.material.requirements import REQUIREMENTS as MATERIAL
+from tacpipe.tasks.material.task import REQUIREMENTS as MATERIAL
 from tests.conftest import Lab
 from tests.fake_recordings import FakeShard
 from tests.tasks.material.textures import dataset as slides_of

@@ -32,12 +32,12 @@ def refuse_alone(names: Sequence[str] | None, key: str, dry_run: bool) -> None:
 def run(dataset: Path, path: Path, key: str, *, dry_run: bool, as_json: bool) -> None:
     """Set the labels of a table on a dataset's recordings, or print what would change."""
     from tacpipe.datasets import labels
-    from tacpipe.formats.table import label_table
+    from tacpipe.formats.table.label_table import LabelTable, read_label_table
 
-    table: list[label_table.LabelTable] = []
+    table: list[LabelTable] = []
 
     def wanted(known: labels.ByRecording) -> labels.ByRecording:
-        table.append(label_table.read_label_table(path, key, known))
+        table.append(read_label_table(path, key, known))
         return table[-1].by_recording(known)
 
     now, changes = labels.planned(dataset, wanted)

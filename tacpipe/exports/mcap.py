@@ -136,7 +136,7 @@ def _holds_images(table: Columns, name: str) -> bool:
     """Return whether the first entry of a column of bytes is an encoded image."""
     import pyarrow as pa
 
-    from tacpipe.formats.arrays.columns import picture_encoding
+    from tacpipe.formats.arrays.tree import picture_encoding
 
     if not pa.types.is_binary(table.schema.field(name).type):
         return False

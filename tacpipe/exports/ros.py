@@ -23,7 +23,7 @@ import numpy as np
 from tacpipe.arrays import AnyArray, Int64s
 from tacpipe.channels.schema import AXES, COMPONENTS
 from tacpipe.exports.contents import TIME, field_metadata, stream_label
-from tacpipe.formats.arrays.columns import picture_encoding
+from tacpipe.formats.arrays.tree import picture_encoding
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -24,7 +24,7 @@ from tacpipe.arrays import AnyArray, Floats, Int64s, Times
 from tacpipe.channels import lsl
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.formats import xdf_chunks
-from tacpipe.formats.containers import kinds
+from tacpipe.formats.containers import container
 from tacpipe.formats.containers.container import Batched, Contents, SourceStream, Time
 from tacpipe.formats.xdf_chunks import Chunk, Damage
 from tacpipe.io import regular
@@ -162,7 +162,7 @@ class XdfFile:
         """
         read = self._read()
         sources_by_number = _stream_sources(read.streams)
-        names = kinds.identifiers(
+        names = container.identifiers(
             [name for source in sources_by_number.values() for name in (source, source + OFFSETS)]
         )
         streams: list[SourceStream] = []

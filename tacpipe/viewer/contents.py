@@ -14,7 +14,7 @@ from tacpipe.arrays import Bytes, Float32s, Floats, Times
 from tacpipe.channels.streams import COUNT, EVENTS, TRUTH, rate_hz, read_clocks
 from tacpipe.clouds.cloud import COLOUR, POSITION
 from tacpipe.datasets.streams import split_tables
-from tacpipe.formats.arrays.columns import picture_encoding
+from tacpipe.formats.arrays.tree import picture_encoding
 from tacpipe.signals import contact
 from tacpipe.traces import curves, forecasts, named, paths, spans, taxels
 from tacpipe.traces.curves import TIME, Curves, described

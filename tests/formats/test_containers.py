@@ -10,8 +10,8 @@ import pyarrow as pa
 import pytest
 
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.formats.containers import kinds
-from tacpipe.formats.containers.kinds import Kind
+from tacpipe.formats.containers import container
+from tacpipe.formats.containers.container import Kind
 from tacpipe.formats.table import contained, layout, recordings
 from tacpipe.formats.table.contained import Command, Params
 from tacpipe.plugins.stage import RecordingOutput
@@ -24,7 +24,7 @@ NONE = Params()
 @pytest.fixture(autouse=True)
 def _fake(monkeypatch: pytest.MonkeyPatch) -> None:
     kind = Kind("tests.formats.fake_container:opened", endings=(".fake", ".fake.json"), marks=("meta/mark",))
-    monkeypatch.setattr(kinds, "KINDS", {"xdf": kind})
+    monkeypatch.setattr(container, "KINDS", {"xdf": kind})
 
 
 def read(folder: Path, params: Params = NONE) -> dict[str, RecordingOutput]:
@@ -137,7 +137,9 @@ def test_a_folder_with_a_mark_is_one_container_whose_files_all_count(tmp_path: P
         (tmp_path / "set" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "set" / name).write_text("{}")
     assert (
-        kinds.find_containers("xdf", tmp_path) == kinds.find_containers("xdf", tmp_path / "set") == [tmp_path / "set"]
+        container.find_containers("xdf", tmp_path)
+        == container.find_containers("xdf", tmp_path / "set")
+        == [tmp_path / "set"]
     )
     files = contained.member_files({"container": tmp_path / "set"})
     assert sorted(files) == ["container/data/a.fake", "container/data/b.fake", "container/meta/mark"]

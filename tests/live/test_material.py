@@ -25,14 +25,15 @@ from tacpipe.sensors.sensor import Samples
 from tacpipe.simulation.slide import Rig, simulate_trial
 from tacpipe.tasks.calibrated import CalibrationRequest
 from tacpipe.tasks.material import calibration as material_calibration
-from tacpipe.tasks.material import known, prediction
+from tacpipe.tasks.material import sensor_calibration
 from tacpipe.tasks.material import training as material_training
 from tacpipe.tasks.material.classifier import Classifier
-from tacpipe.tasks.material.live import replay as material_replay
+from tacpipe.tasks.material.live import slide as material_replay
 from tacpipe.tasks.material.live.engine import RESTARTED, THROWN, MaterialEngine
 from tacpipe.tasks.material.live.messages import FINAL, SLIDING, WAITING, MaterialMessage
 from tacpipe.tasks.material.live.slide import UNLIKE
 from tacpipe.tasks.material.live.task import MaterialLive, MaterialSettings
+from tacpipe.tasks.material.model import predictions
 from tests.fake_recordings import FakeDataset, FakeRecording
 from tests.live import rigs
 from tests.sensors import made
@@ -130,7 +131,7 @@ def predicted(model: Any, table: Any, **params: Any) -> Any:
     except TacpipeError:
         return None
     shard = Slide(cut.streams, "trial", {**given.attributes, **cut.attributes})
-    scores = prediction.predictions(Classifier.load(model.files), FakeDataset({"trial": shard}, {}))  # type: ignore[arg-type]
+    scores = predictions(Classifier.load(model.files), FakeDataset({"trial": shard}, {}))  # type: ignore[arg-type]
     columns = [name for name in scores.column_names if name.startswith("score_")]
     return calibration.probabilities(np.column_stack([scores.column(name).to_numpy() for name in columns]))[0].astype(
         np.float32
@@ -173,10 +174,12 @@ def test_a_calibrated_model_names_what_predict_answers_or_states_that_the_slide_
     files = material_calibration.calibrate(
         models["statistics"].files, CalibrationRequest((10, 50, 90), False, 0.1, 0), learned, watched
     )
-    fitted = known.unpacked(files[known.FILE], {"biotac": None})
+    fitted = sensor_calibration.unpack_calibrations(files[sensor_calibration.CALIBRATION_FILE], {"biotac": None})
     for moved, cause in ((-1e9, ""), (1e9, UNLIKE)):
         bundles = {name: replace(one, threshold=one.threshold + moved) for name, one in fitted.items()}
-        session = Session(Opened({**files, known.FILE: known.packed(bundles)}))
+        session = Session(
+            Opened({**files, sensor_calibration.CALIBRATION_FILE: sensor_calibration.pack_calibrations(bundles)})
+        )
         session.begin()
         session.run(int(session.t_ns[-1]))
         last = session.end()

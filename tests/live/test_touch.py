@@ -23,7 +23,7 @@ from tacpipe.recording.station import BEGAN
 from tacpipe.sensors.framing import Chunks
 from tacpipe.sensors.grasps import is_request
 from tacpipe.sensors.live import Live
-from tacpipe.tasks.touch import prediction as touch_prediction
+from tacpipe.tasks.touch import model as touch_prediction
 from tacpipe.tasks.touch.live import requests as touch_ranking
 from tacpipe.tasks.touch.live.engine import WAITING, TouchEngine
 from tacpipe.tasks.touch.live.messages import COLUMNS, TouchMessage

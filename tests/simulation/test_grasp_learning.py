@@ -166,7 +166,7 @@ def test_more_points_of_a_cloud_make_what_a_network_tells_depend_less_on_which_w
 def _spread_over_draws(network: Any, made: Any) -> float:
     from tacpipe.tasks.touch import grasps as grasps_of
     from tacpipe.tasks.touch import members
-    from tacpipe.tasks.touch.losses import output
+    from tacpipe.tasks.touch.members import output
 
     some = grasps_of.read(made)
     (member,) = network.members

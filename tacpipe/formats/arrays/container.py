@@ -13,11 +13,21 @@ from typing import Any
 import pyarrow as pa
 
 from tacpipe.arrays import AnyArray
-from tacpipe.formats.arrays import array_names, columns, episodes, zarr
+from tacpipe.formats.arrays import episodes, zarr
 from tacpipe.formats.arrays.episodes import Episode, Part
-from tacpipe.formats.arrays.tree import MAX_TEXT, Tree, is_text, plain_attributes
-from tacpipe.formats.containers import kinds
+from tacpipe.formats.arrays.tree import (
+    MAX_TEXT,
+    Tree,
+    columns_of_array,
+    encoded_size,
+    is_encoded,
+    is_text,
+    picture_column,
+    plain_attributes,
+)
+from tacpipe.formats.containers import container
 from tacpipe.formats.containers.container import Batched, Contents, Share, SourceStream
+from tacpipe.formats.table import column_names
 from tacpipe.plugins import extras
 from tacpipe.plugins.stage import Attribute
 from tacpipe.printable import plain
@@ -130,11 +140,7 @@ def _read_contents(tree: Tree, episode: Episode, sources: Collection[str] | None
     skipped |= long
     parts_read = []
     for part in streams_and_scalars.parts:
-        if (
-            part.frames
-            and episodes.row_count(episode, part)
-            and not columns.is_encoded(tree, part.arrays[0], episode.start)
-        ):
+        if part.frames and episodes.row_count(episode, part) and not is_encoded(tree, part.arrays[0], episode.start):
             skipped[part.source] = "holds pictures that are not encoded as JPEG, PNG or WebP, which are not read"
         else:
             parts_read.append(part)
@@ -179,7 +185,7 @@ def _stream_names(parts_read: Sequence[Part]) -> dict[str, str]:
         part.source: root if part.source == episodes.ROOT else name if last.count(name) == 1 else part.source
         for part, name in zip(parts_read, last, strict=True)
     }
-    names = kinds.identifiers(list(called.values()))
+    names = container.identifiers(list(called.values()))
     return {source: names[name] for source, name in called.items()}
 
 
@@ -193,7 +199,7 @@ def _block_rows(tree: Tree, episode: Episode, part: Part) -> int:
     """Return how many rows of a stream are read at once: whole chunks, since a file gives no less."""
     row_bytes = sum(array.row_bytes + (OBJECT_BYTES if array.dtype.hasobject else 0) for array in part.all_arrays)
     if part.frames and episodes.row_count(episode, part):
-        row_bytes += columns.encoded_size(tree, part.arrays[0], episode.start)
+        row_bytes += encoded_size(tree, part.arrays[0], episode.start)
     rows = max(1, BLOCK_BYTES // row_bytes)
     chunk_rows = max(array.chunk_rows for array in part.all_arrays)
     return -(-rows // chunk_rows) * chunk_rows if chunk_rows else rows
@@ -205,12 +211,12 @@ def _rows_table(tree: Tree, episode: Episode, part: Part, start: int, stop: int)
     is_aloha = tree.is_group(f"{episode.group}/observations".strip("/"))
     for array in part.all_arrays:
         if part.frames and array is not part.time:
-            array_columns = [columns.picture_column(array, tree.read(array, start, stop))]
+            array_columns = [picture_column(array, tree.read(array, start, stop))]
         else:
             about = (
-                array_names.aloha_meanings(array.name, array.shape[-1]) if is_aloha and len(array.shape) == 2 else None
+                column_names.aloha_meanings(array.name, array.shape[-1]) if is_aloha and len(array.shape) == 2 else None
             )
-            array_columns = list(columns.columns_of_array(tree, array, start, stop, about))
+            array_columns = list(columns_of_array(tree, array, start, stop, about))
         fields += [field for field, _ in array_columns]
         values += [column for _, column in array_columns]
     return pa.table(values, pa.schema(fields))

@@ -19,11 +19,11 @@ from typing import Any
 import pyarrow as pa
 
 from tacpipe.errors import TacpipeError
-from tacpipe.formats import unique_names
-from tacpipe.formats.bags import bag_file, mcap_file, object_messages, ros, sqlite_file
-from tacpipe.formats.bags.storages import Channel, Damage, Message, Metadata, Record
-from tacpipe.formats.bags.topics import HEADER, LOG, MessageDecoder, TopicDecoder, TopicError
-from tacpipe.formats.containers import kinds
+from tacpipe.formats import source_files
+from tacpipe.formats.bags import mcap_file, ros, ros_files
+from tacpipe.formats.bags.ros_files import Channel, Damage, Message, Metadata, Record
+from tacpipe.formats.bags.topics import HEADER, LOG, Json, MessageDecoder, Protobuf, TopicDecoder, TopicError
+from tacpipe.formats.containers import container
 from tacpipe.formats.containers.container import Batched, Contents, SourceStream, Time
 from tacpipe.io import files as file_system
 from tacpipe.io import regular, yaml_text
@@ -103,7 +103,7 @@ def _texts(values: Mapping[str, Any]) -> dict[str, str]:
 
 LOOK_MESSAGES = 20_000  # messages per file that a look reads
 MAX_DESCRIPTION_BYTES = 1 << 22  # size of a metadata.yaml
-READERS = {".mcap": mcap_file.read_records, ".db3": sqlite_file.read_records, ".bag": bag_file.read_records}
+READERS = {".mcap": mcap_file.read_records, ".db3": ros_files.read_sqlite_records, ".bag": ros_files.read_bag_records}
 UNPACKED_BYTES = 1 << 20  # bytes decompressed at once
 ZSTD = ".zstd"  # the ending of a file that was compressed as a whole
 ACTIVE = ".active"  # ending of a ROS 1 bag that is being written, or whose recorder was killed
@@ -152,7 +152,7 @@ def _bag_files(path: Path, stack: contextlib.ExitStack) -> tuple[list[Path], boo
     about = _bag_description(path / "metadata.yaml")
     listing = about.get("relative_file_paths")
     names = [Path(str(name)).name for name in listing] if isinstance(listing, list) else []
-    unique_names.by_name(((name, name) for name in names), path / "metadata.yaml", "file")
+    source_files.by_name(((name, name) for name in names), path / "metadata.yaml", "file")
     missing = [name for name in names if not (path / name).is_file()]
     notes = [f"{path} lacks {listed(missing, 3)}, which its metadata.yaml names."] if missing else []
     bag_files = sorted(file for file in file_system.listed(path) if _file_ending(file) in READERS)
@@ -355,7 +355,7 @@ class _BagReading:
         streams = [
             stream if name_counts[stream.name] == 1 else replace(stream, name=stream.source) for stream in streams
         ]
-        names = kinds.identifiers([stream.name for stream in streams])
+        names = container.identifiers([stream.name for stream in streams])
         streams = [replace(stream, name=names[stream.name]) for stream in streams]
         return Contents(streams, self.attributes, self.skipped, self.notes)
 
@@ -377,9 +377,9 @@ def _decoder_for_channel(channel: Channel) -> MessageDecoder:
         name = ros.normalize_type_name(channel.type)
         return ros.RosDecoder(name, ros.parse_definitions(name, kind, text), channel.encoding == "cdr")
     if channel.encoding == "json":
-        return object_messages.Json(text)
+        return Json(text)
     if channel.encoding == "protobuf":
-        return object_messages.Protobuf(channel.type, channel.schema)
+        return Protobuf(channel.type, channel.schema)
     raise TopicError(
         f"its messages are written as {plain(channel.encoding) or 'nothing known'}, not ros1, cdr, json or protobuf"
     )

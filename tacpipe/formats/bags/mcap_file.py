@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from tacpipe.errors import TacpipeError
-from tacpipe.formats.bags.storages import (
+from tacpipe.formats.bags.ros_files import (
     CUT_OFF,
     BrokenRecordError,
     Channel,

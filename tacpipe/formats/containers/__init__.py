@@ -11,6 +11,6 @@ The layout file of ``ingest table`` is applied to that: a stream of a layout nam
 ``columns`` and ``time`` replace what the file declares, and are left out where it is right. A new format is
 
 1. a module with ``opened(path) -> Container``, which imports its library inside functions;
-2. an entry in `tacpipe.formats.containers.kinds.KINDS`, and its name in `Format` of ``tacpipe/formats/table/layout.py``;
+2. an entry in `tacpipe.formats.containers.container.KINDS`, and its name in `Format` of ``tacpipe/formats/table/layout.py``;
 3. a stage, whose functions `tacpipe.formats.table.contained.Command` makes, with an entry point ``tacpipe.formats``.
 """

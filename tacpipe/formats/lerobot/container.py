@@ -19,13 +19,13 @@ import pyarrow.parquet as pq
 
 from tacpipe.arrays import Int64s
 from tacpipe.errors import TacpipeError
-from tacpipe.formats import unique_names
-from tacpipe.formats.arrays import array_names
-from tacpipe.formats.arrays.columns import PICTURE as PICTURE
-from tacpipe.formats.containers import kinds
+from tacpipe.formats import source_files
+from tacpipe.formats.arrays.tree import PICTURE as PICTURE
+from tacpipe.formats.containers import container
 from tacpipe.formats.containers.container import Batched, Contents, Share, SourceStream, Time
 from tacpipe.formats.lerobot import description
 from tacpipe.formats.lerobot.description import Description, Episode, Feature
+from tacpipe.formats.table.column_names import NO_MEANING, meaning_from_name, meanings
 from tacpipe.io import files as file_system
 from tacpipe.io import parquet, regular
 from tacpipe.io.parquet import SOME_ROWS, ParquetTable
@@ -84,8 +84,8 @@ class LeRobotContainer:
     @functools.cached_property
     def _episodes(self) -> dict[str, Episode]:
         episodes = self._about.episodes()
-        unique_names.by_name(((str(episode.index), episode) for episode in episodes), self.path, INDEX)
-        return unique_names.by_name(((episode.name, episode) for episode in episodes), self.path, "episode named")
+        source_files.by_name(((str(episode.index), episode) for episode in episodes), self.path, INDEX)
+        return source_files.by_name(((episode.name, episode) for episode in episodes), self.path, "episode named")
 
     def _notes(self, episode: Episode) -> list[str]:
         """Return, with the first episode, whether there are as many as the dataset states."""
@@ -145,7 +145,7 @@ class LeRobotContainer:
             if feature.key not in (*COUNTING_FEATURES, EXACT) and feature.dtype != "video":
                 first = feature.key.partition(".")[0]
                 by_source.setdefault(first if first in SHARED_STREAMS else feature.key, []).append(feature)
-        names = kinds.identifiers([_stream_stem(source) for source in by_source])
+        names = container.identifiers([_stream_stem(source) for source in by_source])
         chosen = {source: features for source, features in by_source.items() if _is_selected(source, sources)}
         exact = [EXACT] if EXACT in self._about.features else []
         frames = self._frames(episode, [*exact, *(feature.key for features in chosen.values() for feature in features)])
@@ -196,15 +196,11 @@ class LeRobotContainer:
         if feature.dtype == "image":
             return [(pa.field(PICTURE, pa.binary(), metadata={"quantity": "image"}), _picture_bytes(values))]
         last = feature.key.rpartition(".")[2]
-        about = array_names.meanings(last, feature.width, feature.dtype.startswith(("int", "uint", "bool")))
+        about = meanings(last, feature.width, feature.dtype.startswith(("int", "uint", "bool")))
         names = feature.names or ([last] if feature.width == 1 else [f"{last}_{at}" for at in range(feature.width)])
         columns: list[tuple[pa.Field, pa.Array | pa.ChunkedArray]] = []
         for at, column in enumerate(self._flat(episode, feature, values)):
-            meaning = (
-                about[at]
-                if about[at] != array_names.NO_MEANING
-                else array_names.meaning_from_name(names[at], feature.dtype)
-            )
+            meaning = about[at] if about[at] != NO_MEANING else meaning_from_name(names[at], feature.dtype)
             metadata = {"quantity": meaning.quantity, "unit": meaning.unit, "component": meaning.component}
             if feature.quantities:
                 metadata = {"quantity": feature.quantities[at], "unit": feature.units[at] if feature.units else ""}

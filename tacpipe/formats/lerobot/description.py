@@ -12,7 +12,7 @@ from typing import Any
 import pyarrow.parquet as pq
 
 from tacpipe.errors import TacpipeError
-from tacpipe.formats import unique_names
+from tacpipe.formats import source_files
 from tacpipe.formats.arrays.tree import plain_attributes
 from tacpipe.io import files as file_system
 from tacpipe.io import memory, parquet, regular
@@ -269,7 +269,7 @@ def _original_attributes(path: Path, text: Any) -> dict[str, Attribute] | None:
     if not isinstance(text, str):
         return None
     try:
-        attributes = unique_names.json_value(text, path)
+        attributes = source_files.json_value(text, path)
     except (ValueError, RecursionError) as error:
         raise TacpipeError(f"{path}: {ATTRIBUTES} holds {excerpt(text)}, which is not JSON.") from error
     values = attributes.items() if isinstance(attributes, dict) else ()
@@ -285,7 +285,7 @@ def _read_json(root: Path, name: str) -> dict[str, Any]:
     with regular.failing(path):
         content = regular.content(path, MAX_META_BYTES)
     try:
-        content_json = unique_names.json_value(content, path)
+        content_json = source_files.json_value(content, path)
     except (ValueError, RecursionError) as error:
         raise TacpipeError(f"{path} is not JSON: {plain(str(error), 200)}. Copy it again.") from error
     if not isinstance(content_json, dict):
@@ -301,7 +301,7 @@ def _read_json_lines(path: Path) -> Iterator[dict[str, Any]]:
         if not line.strip():
             continue
         try:
-            entry = unique_names.json_value(line, path)
+            entry = source_files.json_value(line, path)
         except (ValueError, RecursionError) as error:
             raise TacpipeError(
                 f"{path}, line {number} is not JSON: {plain(str(error), 200)}. Copy the file again."

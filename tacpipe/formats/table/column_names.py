@@ -1,9 +1,15 @@
-"""Read quantity, unit and component from the names of columns."""
+"""Read quantity, unit and component from the names of columns and arrays.
+
+Names of arrays follow the conventions of robot learning: lengths are metres, angles radians, quaternions without unit, as
+robosuite, ALOHA, UMI, DROID and LeRobot write them. What a name does not show is left empty: a layout file states it.
+"""
 
 from __future__ import annotations
 
 import itertools
 import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 from tacpipe.formats.table.layout import UNKNOWN
 
@@ -153,3 +159,151 @@ def numbered_pattern(name: str) -> str:
         return f"{number[1]}{{{label}}}"
 
     return re.sub(r"([A-Za-z_]*[ .]?)\d+", placeholder, name)
+
+
+XYZ, QUATERNION = ("x", "y", "z"), ("x", "y", "z", "w")
+
+
+@dataclass(frozen=True)
+class ColumnMeaning:
+    """Quantity, unit and component of one column; empty where a name does not show them."""
+
+    quantity: str = ""
+    unit: str = ""
+    component: str = ""
+
+
+NO_MEANING = ColumnMeaning()
+_HAND = r"(?:.*[_./])?(?:eef?|ee|tcp|end_effector|hand|wrist|tool|robot|arm)[_./]?"
+_ANY = r"(?:.*[_./])?"
+_VECTORS: Sequence[tuple[str, int, Sequence[ColumnMeaning]]] = (  # a name, a width, and what each column is
+    (rf"{_HAND}(?:pos|position|translation|xyz|trans)", 3, [ColumnMeaning("position", "m", axis) for axis in XYZ]),
+    (rf"{_ANY}robot\d+_eef_quat", 4, [ColumnMeaning("orientation", "1", part) for part in QUATERNION]),
+    (rf"{_ANY}(?:quat|quaternion|orientation|ori)", 4, [ColumnMeaning("orientation", "1")] * 4),
+    (rf"{_HAND}(?:vel_lin|lin_vel|linear_velocity)", 3, [ColumnMeaning("velocity", "m/s", axis) for axis in XYZ]),
+    (
+        rf"{_HAND}(?:vel_ang|ang_vel|angular_velocity)",
+        3,
+        [ColumnMeaning("angular_velocity", "rad/s", axis) for axis in XYZ],
+    ),
+    (
+        rf"{_ANY}(?:rot_axis_angle|axis_angle|rotation_vector|rotvec)",
+        3,
+        [ColumnMeaning("angle", "rad", axis) for axis in XYZ],
+    ),
+    (
+        rf"{_HAND}pose|{_ANY}demo_(?:start|end)_pose",
+        6,
+        [ColumnMeaning("position", "m", axis) for axis in XYZ] + [ColumnMeaning("angle", "rad", axis) for axis in XYZ],
+    ),
+    (
+        rf"{_HAND}pose",
+        7,
+        [ColumnMeaning("position", "m", axis) for axis in XYZ] + [ColumnMeaning("orientation", "1")] * 4,
+    ),
+    (rf"{_ANY}(?:force|forces)", 3, [ColumnMeaning("force", "N", axis) for axis in XYZ]),
+    (rf"{_ANY}(?:torque|torques|moment)", 3, [ColumnMeaning("torque", "N m", axis) for axis in XYZ]),
+    (
+        rf"{_ANY}(?:wrench|force_?torque|ft|ft_sensor)",
+        6,
+        [ColumnMeaning("force", "N", axis) for axis in XYZ] + [ColumnMeaning("torque", "N m", axis) for axis in XYZ],
+    ),
+)
+_ANY_WIDTH: Sequence[tuple[str, ColumnMeaning]] = (  # a name, whatever its width
+    (rf"{_ANY}gripper[_./](?:qpos|qvel|pos|position|state|command|action)s?", ColumnMeaning("state")),
+    (rf"{_ANY}(?:joint_pos|joint_positions?|joint_angles?|joint_states?|qpos)", ColumnMeaning("joint_position", "rad")),
+    (rf"{_ANY}(?:joint_vel|joint_velocit(?:y|ies)|qvel)", ColumnMeaning("joint_velocity", "rad/s")),
+    (rf"{_ANY}(?:joint_torques?|tau)", ColumnMeaning("joint_torque", "N m")),
+    (rf"{_ANY}(?:gripper|finger)s?[_./](?:width|opening)", ColumnMeaning("finger_width", "m")),
+    (rf"{_ANY}(?:tactile|taxels?|skin|touch|uskin|xela|digit|reskin|anyskin)\w*", ColumnMeaning("tactile")),
+    (rf"{_ANY}(?:dones?|terminals?|terminated|truncated|success|timeouts?)", ColumnMeaning("label", "1")),
+    (rf"{_ANY}(?:rewards?)", ColumnMeaning("score", "1")),
+)
+_UNREAL = ("sin", "cos")  # sine and cosine of an angle are no angles
+
+
+def meanings(name: str, width: int, integers: bool = False) -> list[ColumnMeaning]:
+    """Return what each of ``width`` columns of an array called ``name`` holds; ``integers``: its values are whole numbers.
+
+    >>> meanings("robot0_eef_pos", 3)[0], meanings("obs/joint_pos", 7)[6].unit
+    (ColumnMeaning(quantity='position', unit='m', component='x'), 'rad')
+    >>> meanings("tactile_left", 48, integers=True)[0]
+    ColumnMeaning(quantity='tactile', unit='count', component='')
+    >>> meanings("tactile_slips_label", 1)[0].quantity, meanings("tactile_timestamps", 1)[0].quantity
+    ('label', '')
+    >>> meanings("object", 14)[0], meanings("robot0_joint_pos_cos", 7)[0]
+    (ColumnMeaning(quantity='', unit='', component=''), ColumnMeaning(quantity='', unit='', component=''))
+    """
+    text = name.strip().lower()
+    if is_clock(text):
+        return [NO_MEANING] * width
+    if is_label(text):
+        return [ColumnMeaning("label", "1")] * width
+    for pattern, pattern_width, column_meanings in _VECTORS:
+        if pattern_width == width and re.fullmatch(pattern, text):
+            return list(column_meanings)
+    if text.endswith(_UNREAL):
+        return [NO_MEANING] * width
+    for pattern, meaning in _ANY_WIDTH:
+        if re.fullmatch(pattern, text):
+            counted = meaning.quantity == "tactile" and integers
+            return [ColumnMeaning("tactile", "count") if counted else meaning] * width
+    return [NO_MEANING] * width
+
+
+def meaning_from_name(name: str, kind: str) -> ColumnMeaning:
+    """Return what a column of one value holds where its name states both quantity and unit.
+
+    >>> meaning_from_name("joint1_rad", "float32"), meaning_from_name("fx", "float64")
+    (ColumnMeaning(quantity='joint_position', unit='rad', component=''), ColumnMeaning(quantity='', unit='', component=''))
+    """
+    quantity, unit = meaning(name, kind)
+    return NO_MEANING if UNKNOWN in (quantity, unit) else ColumnMeaning(quantity, unit)
+
+
+def aloha_meanings(name: str, width: int) -> list[ColumnMeaning] | None:
+    """Return what the columns of an array of ALOHA are: arms of six joints and a gripper that is open at 1; else None.
+
+    ``effort`` is the current of the motors in a unit of theirs.
+
+    >>> [one.quantity for one in aloha_meanings("observations/qpos", 14)][5:8]
+    ['joint_position', 'state', 'joint_position']
+    """
+    last = name.rpartition("/")[2]
+    quantities = {"qpos": ("joint_position", "rad"), "qvel": ("joint_velocity", "rad/s"), "effort": ("current", "")}
+    quantities["action"] = ("target_joint_position", "rad")
+    if last not in quantities or width % 7:
+        return None
+    joint = ColumnMeaning(*quantities[last])
+    gripper = joint if last == "effort" else ColumnMeaning("state", "1" if last != "qvel" else "1/s")
+    return ([joint] * 6 + [gripper]) * (width // 7)
+
+
+def declared_metadata(attributes: Mapping[str, object]) -> dict[str, str]:
+    """Return what attributes of an array state of its columns, as metadata of fields.
+
+    Where a quantity is among them all texts count, as in files that tacpipe writes.
+
+    >>> declared_metadata({"units": "N", "comment": "x"})
+    {'unit': 'N'}
+    >>> declared_metadata({"unit": "count", "quantity": "tactile", "taxel": "7"})
+    {'unit': 'count', 'quantity': 'tactile', 'taxel': '7'}
+    """
+    texts = {key: value for key, value in attributes.items() if isinstance(value, str) and value}
+    if "quantity" in texts:
+        return texts
+    unit = texts.get("unit") or texts.get("units")
+    return {"unit": unit} if unit else {}
+
+
+def declared_texts(attributes: Mapping[str, object], key: str, count: int) -> list[str]:
+    """Return the text that an attribute states for each of ``count`` columns, nothing where it states another number.
+
+    >>> declared_texts({"columns": ["a", "b"]}, "columns", 2), declared_texts({"columns": ["a"]}, "columns", 2)
+    (['a', 'b'], [])
+    """
+    value = attributes.get(key)
+    if value is None or isinstance(value, str | bytes) or not hasattr(value, "__iter__"):
+        return []
+    texts = [text.decode(errors="replace") if isinstance(text, bytes) else str(text) for text in value]
+    return texts if len(texts) == count else []

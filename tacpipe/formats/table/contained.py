@@ -69,9 +69,9 @@ class Command:
 
     def guess(self, source: Path) -> str:
         """Return the text of the layout that states what the first file itself declares."""
-        from tacpipe.formats.table import declared
+        from tacpipe.formats.table.preview import declared_layout
 
-        return declared.declared_layout(self.kind, source)
+        return declared_layout(self.kind, source)
 
     def why_unread(self, params: Params, source: Path) -> Callable[[str], str]:
         """Return a function from the path of a file below ``source`` to the reason why no recording is read from it."""
@@ -140,13 +140,12 @@ class _ContainerShares:
 
     def _share(self, place: Path, names: Sequence[str], episode: str | None) -> Share | None:
         """Return what streams of a container are read from; None: all of its files."""
-        from tacpipe.formats.containers import kinds
-        from tacpipe.formats.containers.container import Sharing
+        from tacpipe.formats.containers.container import Sharing, open_container
 
         streams = {stream.name: stream for stream in self._layout.streams if stream.name in names}
         kind = next((str(stream.format) for stream in streams.values()), self._kind)
         if place not in self._opened:
-            self._opened[place] = kinds.open_container(str(kind), place)
+            self._opened[place] = open_container(str(kind), place)
         container = self._opened[place]
         requested = [stream.source for stream in streams.values()] or None
         try:
@@ -164,11 +163,11 @@ def preview_text(
     kind: layouts.Format | None = None,
 ) -> str:
     """Return what would be read of a source, and what would not, in words."""
-    from tacpipe.formats import unread
+    from tacpipe.formats import source_files
     from tacpipe.formats.table import preview
 
     paths = [path for recording in listed_sources for path in recording.files.values()]
-    left_out = unread.describe(source, paths, why_unread(layout, source, kind))
+    left_out = source_files.describe(source, paths, why_unread(layout, source, kind))
     return "\n".join([preview.describe_sources(layout, source, listed_sources, kind), *left_out])
 
 
@@ -177,10 +176,10 @@ def why_unread(layout: layouts.Layout, source: Path, kind: layouts.Format | None
 
     The reason is "" for a file of labels, and for a file within a container.
     """
-    from tacpipe.formats.containers import kinds
+    from tacpipe.formats.containers.container import KINDS, find_containers
 
-    formats = {str(stream.format) for stream in layout.streams if stream.contained} or {str(kind)} & set(kinds.KINDS)
-    folders = [path for name in formats for path in kinds.find_containers(name, source) if path.is_dir()]
+    formats = {str(stream.format) for stream in layout.streams if stream.contained} or {str(kind)} & set(KINDS)
+    folders = [path for name in formats for path in find_containers(name, source) if path.is_dir()]
 
     def reason(path: str) -> str:
         if any(pattern.match(labels.file, path) is not None for labels in layout.labels):
@@ -214,12 +213,12 @@ def read_recording(
 
 def member_files(paths: Mapping[str, Path]) -> dict[str, Path]:
     """Return all files of a recording by name: of a path that is a folder each file in it, by ``name/path within``."""
-    from tacpipe.formats.containers import kinds
+    from tacpipe.formats.containers.container import container_files
 
     return {
         f"{name}/{inner_path}" if inner_path else name: path
         for name, place in paths.items()
-        for inner_path, path in kinds.container_files(place).items()
+        for inner_path, path in container_files(place).items()
     }
 
 

@@ -13,9 +13,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from tacpipe.errors import MissingModuleError, TacpipeError, UsageError
-from tacpipe.formats import unread
-from tacpipe.formats.table import column_names, file_sample, guess_columns, label_table, pattern
+from tacpipe.formats import source_files
+from tacpipe.formats.table import column_names, file_sample, pattern
 from tacpipe.formats.table.file_sample import SAMPLE_LINES, FileSample
+from tacpipe.formats.table.label_table import RECORDING, read_label_table
 from tacpipe.formats.table.layout import EXTENSIONS, TREES, UNKNOWN, extension, quoted, why_unreadable
 from tacpipe.io import files as file_system
 from tacpipe.printable import shown
@@ -68,7 +69,7 @@ def guess_layout(folder: Path) -> str:
         '# A first layout, guessed from the files. Replace each "?", check the rest, then look at what it reads:',
         "#   tacpipe ingest table FOLDER --layout THIS --dry-run",
         *(f"# {line}" for line in VOCABULARY),
-        *(f"# {shown(line)}" for line in unread.describe(folder, read, reason)),
+        *(f"# {shown(line)}" for line in source_files.describe(folder, read, reason)),
     ]
     return "\n\n".join(["\n".join(head), *parts]) + "\n"
 
@@ -130,7 +131,7 @@ def _with_stamps(groups: Sequence[_Group]) -> tuple[list[_Group], list[_Group]]:
             if clock.pattern.rpartition("/")[0] == group.pattern.rpartition("/")[0]
             and (group.first.row_count is None or clock.first.row_count in (None, group.first.row_count))
         ]
-        if guess_columns.time_column(group.first) is None and candidates:
+        if file_sample.time_column(group.first) is None and candidates:
             clock = max(candidates, key=lambda clock: group.stream in clock.stream)
             used.append(clock)
             streams.append(replace(group, stamps=clock.pattern, clock=clock.first))
@@ -144,7 +145,7 @@ def _is_clock(group: _Group) -> bool:
     stem = group.paths[0].name.partition(".")[0]
     match = column_names.TIME_NAME.fullmatch(stem) or column_names.TIME_ENDING.fullmatch(stem)
     (values,) = group.first.values.values()
-    return bool(match) and (guess_columns.rises(values) or any(isinstance(value, str) for value in values))
+    return bool(match) and (file_sample.rises(values) or any(isinstance(value, str) for value in values))
 
 
 def _stream_name(paths: Sequence[Path], used: set[str]) -> str:
@@ -182,7 +183,7 @@ def _label_files(folder: Path, paths: Sequence[Path], streams: Sequence[_Group])
 def _is_table_of_labels(path: Path) -> bool:
     """Return whether a YAML or JSON file holds labels by the name of their recording."""
     try:
-        return bool(label_table.read_label_table(path).rows)
+        return bool(read_label_table(path).rows)
     except TacpipeError:
         return False
 
@@ -208,7 +209,7 @@ def _is_labels(sample: FileSample) -> bool:
     if sample.text is None:
         return False
     texts = any(isinstance(value, str) for values in sample.values.values() for value in values)
-    return texts and guess_columns.time_column(sample) is None and 0 < len(sample.text.rows) < SAMPLE_LINES - 1
+    return texts and file_sample.time_column(sample) is None and 0 < len(sample.text.rows) < SAMPLE_LINES - 1
 
 
 def _labels_text(group: _Group) -> str:
@@ -217,7 +218,7 @@ def _labels_text(group: _Group) -> str:
     if len(group.paths) == 1:
         sample = group.first
         keys = [name for name, values in sample.values.items() if len(set(values)) == len(values)]
-        key = next((name for name in keys if label_table.RECORDING.fullmatch(name)), keys[0] if keys else UNKNOWN)
+        key = next((name for name in keys if RECORDING.fullmatch(name)), keys[0] if keys else UNKNOWN)
         lines.append(f"key = {quoted(key)}  # the column that names recordings")
     return "\n".join(lines)
 
@@ -225,7 +226,7 @@ def _labels_text(group: _Group) -> str:
 def _stream_text(group: _Group) -> str:
     """Return the text of a ``[streams.NAME]`` entry."""
     sample = group.first
-    time = None if group.stamps else guess_columns.time_column(sample)
+    time = None if group.stamps else file_sample.time_column(sample)
     reserved = {time} if time else set()
     lines = [
         f"[streams.{group.stream}]",
@@ -236,16 +237,16 @@ def _stream_text(group: _Group) -> str:
     axis = next((array.time_axis for array in sample.arrays.values()), 0)
     if axis:
         lines.append(f"time_axis = {axis}  # of the shape {next(iter(sample.arrays.values())).shape}, the longest")
-    recording_column = next((name for name in sample.names if label_table.RECORDING.fullmatch(name)), None)
+    recording_column = next((name for name in sample.names if RECORDING.fullmatch(name)), None)
     if recording_column is not None and len(group.paths) == 1:
         lines.append(f"recording = {quoted(recording_column)}  # the column that names the recording of a row")
         reserved.add(recording_column)
     if group.clock is not None:
         file = f"file = {quoted(group.stamps)}"
-        lines.append(f"time = {guess_columns.time_entry(group.clock, group.clock.names[0], file)}")
+        lines.append(f"time = {file_sample.time_entry(group.clock, group.clock.names[0], file)}")
     else:
-        lines.append(f"time = {guess_columns.time_entry(sample, time)}")
-    rules = guess_columns.column_entries(sample, reserved)
+        lines.append(f"time = {file_sample.time_entry(sample, time)}")
+    rules = file_sample.column_entries(sample, reserved)
     rules += [f"{{ match = {quoted(f'{name}*')}, skip = true }}," for name in group.skipped]
     lines += ["columns = [", *(f"    {rule}" for rule in rules), "]"]
     return "\n".join(lines)

@@ -16,9 +16,8 @@ from typing import Any, Literal
 
 from tacpipe.channels import vocabulary
 from tacpipe.errors import UsageError
-from tacpipe.formats.containers import kinds
-from tacpipe.formats.containers.container import Time
-from tacpipe.formats.table import pattern, stamp_formats
+from tacpipe.formats.containers.container import KINDS, Time, describe_kind, has_ending
+from tacpipe.formats.table import pattern, stamps
 from tacpipe.io import regular
 from tacpipe.plugins import fields
 from tacpipe.plugins.constraints import NonNegativeInt, PositiveInt
@@ -117,7 +116,7 @@ class StreamLayout:
     @property
     def contained(self) -> bool:
         """True where the stream is one of several in a container."""
-        return self.format in kinds.KINDS
+        return self.format in KINDS
 
     def format_of(self, path: Path) -> Format:
         """Return the format of a file: the layout's, or that of its extension. Raises `UsageError` without both."""
@@ -151,12 +150,12 @@ def why_unreadable(path: str, unmatched: str, kind: str | None = None) -> str:
     >>> why_unreadable("a/b.csv", "no pattern matches"), why_unreadable("a.mcap", "no pattern matches")
     ('no pattern matches', '`tacpipe ingest mcap` reads such files')
     """
-    readable = [name for name in kinds.KINDS if kinds.has_ending(name, path)]
+    readable = [name for name in KINDS if has_ending(name, path)]
     if unmatched and (kind in readable or extension(Path(path)) in (*EXTENSIONS, *TREES)):
         return unmatched
     if readable and kind not in readable:
         return f"`tacpipe ingest {readable[0]}` reads such files"
-    reads = kinds.describe_kind(kind) if kind is not None else ", ".join(f"*{ending}" for ending in EXTENSIONS)
+    reads = describe_kind(kind) if kind is not None else ", ".join(f"*{ending}" for ending in EXTENSIONS)
     return f"the command reads {reads}"
 
 
@@ -349,7 +348,7 @@ def _expect_encoding(stream: StreamLayout, place: str) -> None:
 
 def _expect_required(values: Mapping[str, Any], place: str, container: Format | None) -> None:
     """Raise `UsageError` for an entry that is missing: a container declares what a table does not."""
-    if values.get("format") in kinds.KINDS:
+    if values.get("format") in KINDS:
         if not values.get("source"):
             raise UsageError(f"{place}: source must be given: the topic, group or stream inside the file.")
         if values.get("recording"):
@@ -360,7 +359,7 @@ def _expect_required(values: Mapping[str, Any], place: str, container: Format | 
             raise UsageError(f'{place}: files must be given, as files = "{{trial}}.{values["format"]}".')
         return
     if values.get("source"):
-        raise UsageError(f"{place}: source is for containers ({', '.join(kinds.KINDS)}). Set format to one of them.")
+        raise UsageError(f"{place}: source is for containers ({', '.join(KINDS)}). Set format to one of them.")
     if "files" not in values:
         raise UsageError(f"{place}: entry files must be given.")
     if "time" not in values:
@@ -377,7 +376,7 @@ def _parse_time(values: Mapping[str, Any], place: str) -> Time:
     if bool(time.column or time.file) == (time.rate_hz is not None):
         raise UsageError(f"{place}: give either the column or the file with the stamps, or rate_hz.")
     if time.format:
-        stamp_formats.check_format(time.format, place)
+        stamps.check_format(time.format, place)
     elif time.start and time.origin != "start" and time.rate_hz is None:
         raise UsageError(
             f'{place}: start is for stamps that count from a recording\'s start. Set origin = "start" too.'

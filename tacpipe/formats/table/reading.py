@@ -18,7 +18,7 @@ from tacpipe.arrays import AnyArray, Floats, Times
 from tacpipe.channels import schema
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.formats.containers.container import SourceStream
-from tacpipe.formats.table import columns, rows, stamp_formats
+from tacpipe.formats.table import columns, rows, stamps
 from tacpipe.formats.table.columns import CellError, ChosenColumn, Declared
 from tacpipe.formats.table.layout import StreamLayout
 from tacpipe.formats.table.rows import ContainedRows, Place, RowFile
@@ -245,7 +245,7 @@ def _check_stamps(
 ) -> Iterator[list[pa.Array]]:
     """Yield stamps and columns of blocks. Raises `TacpipeError` for stamps that run backwards and for no rows."""
     row_count, last_ns = 0, None
-    of_day = bool(stream.time.format) and not stamp_formats.has_date(stream.time.format)
+    of_day = bool(stream.time.format) and not stamps.has_date(stream.time.format)
     for t_ns, arrays in blocks:
         count = len(arrays[0])
         if not count:
@@ -271,7 +271,7 @@ def _add_days_past_midnight(t_ns: Times, last_ns: int | None) -> Times:
     >>> _add_days_past_midnight(np.array([86_399, 1]) * 10**9, None)
     array([86399000000000, 86401000000000])
     """
-    day_ns = stamp_formats.DAY_NS
+    day_ns = stamps.DAY_NS
     above_ns = int(t_ns[0]) if last_ns is None else last_ns
     first_ns = t_ns[0] + max(0, round((above_ns - int(t_ns[0])) / day_ns)) * day_ns
     t_ns = t_ns - t_ns[0] + first_ns

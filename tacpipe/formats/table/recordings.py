@@ -12,9 +12,16 @@ import pyarrow as pa
 
 from tacpipe.datasets import recording_names
 from tacpipe.errors import TacpipeError, UsageError, is_input_error
-from tacpipe.formats import unique_names
-from tacpipe.formats.containers import kinds
-from tacpipe.formats.containers.container import Contents, Naming
+from tacpipe.formats import source_files
+from tacpipe.formats.containers.container import (
+    Contents,
+    Naming,
+    container_names,
+    find_containers,
+    is_container,
+    no_container_error,
+    open_container,
+)
 from tacpipe.formats.table import pattern, rows
 from tacpipe.formats.table.columns import TIME
 from tacpipe.formats.table.layout import FILE, STAMPS, Format, Layout, StreamLayout
@@ -95,11 +102,11 @@ def find_contained(layout: Layout, kind: Format, source: Path) -> list[Source]:
     They are named after their file, and after the episode where it holds several. Raises `UsageError` where there is no
     container, and where two recordings get one name.
     """
-    paths = kinds.find_containers(kind, source)
+    paths = find_containers(kind, source)
     if not paths:
-        raise kinds.no_container_error(kind, source)
+        raise no_container_error(kind, source)
     sources = []
-    for path, stem in kinds.container_names(paths, source).items():
+    for path, stem in container_names(paths, source).items():
         stem = os.fsencode(stem).decode(errors="replace")
         files = {stream.name: path for stream in layout.streams} or {CONTAINER: path}
         episodes, names_are_complete = _episodes(kind, path)
@@ -120,7 +127,7 @@ def _episodes(kind: str, path: Path) -> tuple[Sequence[str | None], bool]:
     A container that cannot be read is one: reading it shows what is wrong, and others are not kept from being read.
     """
     try:
-        container = kinds.open_container(kind, path)
+        container = open_container(kind, path)
         return container.episodes() or [None], isinstance(container, Naming) and container.names_itself
     except TacpipeError as error:
         if not is_input_error(error):
@@ -133,7 +140,7 @@ def _candidate_paths(layout: Layout, folder: Path) -> list[Path]:
     containers = {str(stream.format) for stream in layout.streams if stream.contained}
     paths: list[Path] = []
     for place, folders, names in file_system.walk(folder):
-        if any(kinds.is_container(kind, Path(place)) for kind in containers):
+        if any(is_container(kind, Path(place)) for kind in containers):
             paths.append(Path(place))
             folders.clear()
             continue
@@ -266,15 +273,15 @@ def read_streams(
                 rows.open_rows(paths[stream.name], stream), stream, episode, shared, paths.get(f"{stream.name}{STAMPS}")
             )
     for (kind, path), container_streams in contained_streams.items():
-        contents = kinds.open_container(kind, path).read([stream.source for stream in container_streams], episode)
-        stream_by_source = unique_names.by_name(
+        contents = open_container(kind, path).read([stream.source for stream in container_streams], episode)
+        stream_by_source = source_files.by_name(
             ((stream.source, stream) for stream in contents.streams), path, "stream"
         )
         for stream in container_streams:
             if stream.source in stream_by_source:
                 tables[stream.name] = read_contained_stream(path, stream_by_source[stream.source], stream)
             elif not stream.optional:
-                raise _missing_stream_error(path, stream, contents, kinds.open_container(kind, path).look(episode))
+                raise _missing_stream_error(path, stream, contents, open_container(kind, path).look(episode))
         attributes |= contents.attributes
         prefixes = tuple(f"{stream.source}/" for stream in container_streams)
         inner = {source: problem for source, problem in contents.skipped.items() if source.startswith(prefixes)}
@@ -320,9 +327,9 @@ def read_container(kind: str, path: Path, episode: str | None) -> RecordedStream
 
     The attribute ``skipped`` of the recording names them too. Raises `TacpipeError` where nothing can be read.
     """
-    contents = kinds.open_container(kind, path).read(None, episode)
+    contents = open_container(kind, path).read(None, episode)
     notes = [*contents.notes, *_skipped_notes(path, contents.skipped)]
-    stream_by_name = unique_names.by_name(((stream.name, stream) for stream in contents.streams), path, "stream")
+    stream_by_name = source_files.by_name(((stream.name, stream) for stream in contents.streams), path, "stream")
     tables = {
         name: _with_rate_noted(
             read_contained_stream(path, stream, StreamLayout(name, source=stream.source)), name, notes

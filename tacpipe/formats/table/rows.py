@@ -24,8 +24,7 @@ from tacpipe.errors import TacpipeError
 from tacpipe.formats.containers.container import SourceStream
 from tacpipe.formats.table import binary, file_sample, stamps
 from tacpipe.formats.table.layout import EXTENSIONS, StreamLayout, extension
-from tacpipe.formats.table.text import TextTable
-from tacpipe.formats.table.workbook import Workbook
+from tacpipe.formats.table.text import TextTable, Workbook
 from tacpipe.io import regular
 from tacpipe.io.files import Draft, Hashed
 from tacpipe.io.parquet import owned

@@ -22,12 +22,13 @@ from tacpipe.models.tensors import under
 from tacpipe.models.transfer import Bands, Transfer
 from tacpipe.plugins import params as params_of
 from tacpipe.printable import plain
-from tacpipe.tasks.material import estimators, known, networks
+from tacpipe.tasks.material import estimators, networks
 from tacpipe.tasks.material import slides as slides_of
 from tacpipe.tasks.material.estimators import Fitted
 from tacpipe.tasks.material.losses import CHUNK, Network
 from tacpipe.tasks.material.naming import Naming
 from tacpipe.tasks.material.params import Estimator, Params
+from tacpipe.tasks.material.sensor_calibration import CALIBRATION_FILE, unpack_calibrations
 from tacpipe.tasks.material.slides import Layout, Slides, difference
 from tacpipe.tasks.opened import Chain
 from tacpipe.training.scaling import Affine
@@ -175,7 +176,9 @@ class Classifier:
         self.last = self._readers(files[LAST], LAST) if LAST in files else {}
         self.baselines = self._baselines(files) if BASELINES in files else {}
         # By sensor; empty unless `tacpipe calibrate` wrote the model
-        self.calibrations = known.unpacked(files[known.FILE], self.layouts) if known.FILE in files else {}
+        self.calibrations = (
+            unpack_calibrations(files[CALIBRATION_FILE], self.layouts) if CALIBRATION_FILE in files else {}
+        )
 
     @classmethod
     def load(cls, files: Mapping[str, bytes], chain: Chain | None = None) -> Self:

@@ -1,8 +1,10 @@
-"""Evaluation of a classifier of materials: on every slide, next to its baselines."""
+"""Evaluation of a classifier of materials: on every slide, next to its baselines, with intervals."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import csv
+import io
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -14,19 +16,84 @@ from tacpipe.datasets import model_files, origin
 from tacpipe.errors import TacpipeError
 from tacpipe.io import progress
 from tacpipe.metrics import headline
+from tacpipe.metrics.proportions import mcnemar, wilson
 from tacpipe.plugins.stage import RecordingOutput, Result
 from tacpipe.printable import listed
 from tacpipe.tasks.material import headline as headlines
-from tacpipe.tasks.material import metrics, naming
+from tacpipe.tasks.material import naming
+from tacpipe.tasks.material.calibration import Answers
 from tacpipe.tasks.material.classifier import CONFIG, MEAN_LEVEL, Classifier, NetworkReader, ReaderOutput, SpectraReader
-from tacpipe.tasks.material.metrics import LAST_EPOCH, MODEL, SWAPPED, Tree
 from tacpipe.tasks.material.network_training import HISTORY
 from tacpipe.tasks.material.params import XLSTM, Raec
 from tacpipe.tasks.material.slides import Slides
-from tacpipe.tasks.material.unknown import Answers
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
+
+MODEL, SWAPPED, LAST_EPOCH = "model", "swapped", "last_epoch"
+Tree = dict[str, Any]
+
+
+def accuracy(correct: Mapping[str, Bools]) -> Tree:
+    """Return accuracy, right ones, number and 95 % Wilson interval by sensor; a sensor without slides is left out.
+
+    Accuracy is the ratio of right names: equation (4) of the paper, taken literally, would be a mean squared difference
+    of labels.
+
+    >>> import numpy as np
+    >>> accuracy({"biotac": np.array([True, False])})["accuracy"]
+    {'biotac': 0.5}
+    """
+    tree: Tree = {"accuracy": {}, "correct": {}, "n": {}, "low": {}, "high": {}}
+    for sensor, right in correct.items():
+        if not len(right):
+            continue
+        count = int(right.sum())
+        low, high = wilson(count, len(right))
+        tree["accuracy"][sensor] = count / len(right)
+        tree["correct"][sensor], tree["n"][sensor] = count, len(right)
+        tree["low"][sensor], tree["high"][sensor] = low, high
+    return tree
+
+
+def chance(counts: Mapping[str, int], classes: int) -> Tree:
+    """Return what guessing one of ``classes`` gets, by sensor."""
+    shares = {sensor: 1 / classes for sensor, count in counts.items() if count}
+    return {"accuracy": shares, "n": {sensor: counts[sensor] for sensor in shares}}
+
+
+def summary(right: Mapping[str, Mapping[str, Bools]], classes: int) -> Tree:
+    """Return the metrics of predictors: ``right`` holds by predictor and sensor which slides were named rightly (slide,).
+
+    ``skill`` is the fraction of the mean level's wrong names that the model gets right; ``mcnemar`` the exact probability
+    of so unequal disagreements if both were as good.
+    """
+    tree: Tree = {name: accuracy(by_sensor) for name, by_sensor in right.items()}
+    counts = {sensor: len(is_right) for sensor, is_right in right[MODEL].items()}
+    tree["chance"] = chance(counts, classes)
+    tree["counts"] = {"slides": counts}
+    if MEAN_LEVEL in right:
+        tree["skill"], tree["mcnemar"] = {}, {"model_vs_mean_level": {}}
+        for sensor, model in right[MODEL].items():
+            level = right[MEAN_LEVEL][sensor]
+            if len(model) and not level.all():
+                tree["skill"][sensor] = float(1 - (~model).mean() / (~level).mean())
+            if len(model):
+                tree["mcnemar"]["model_vs_mean_level"][sensor] = mcnemar(model, level)
+    return tree
+
+
+def confusion_csv(sensors: Sequence[str], materials: Sequence[Any], predicted: Sequence[Any]) -> bytes:
+    """Return how often each sensor's slides of a material were given each name, as CSV."""
+    counts: dict[tuple[str, Any, Any], int] = {}
+    for key in zip(sensors, materials, predicted, strict=True):
+        counts[key] = counts.get(key, 0) + 1
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["sensor", "material", "predicted", "count"])
+    writer.writerows([*key, count] for key, count in sorted(counts.items()))
+    return text.getvalue().encode()
+
 
 PREDICTIONS = "predictions"
 
@@ -89,7 +156,7 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
     files = {
         headline.FILE: headline.write(_headlines(evaluated, classifier)),
         "metrics.json": model_files.to_json(tree),
-        "confusion.csv": metrics.confusion_csv(
+        "confusion.csv": confusion_csv(
             [sensor for sensor, _, _ in rows],
             [classifier.naming.names_for(result.slides.materials[[at]])[0] for _, result, at in rows],
             [classifier.naming.names_for(result.predicted[MODEL][[at]])[0] for _, result, at in rows],
@@ -204,7 +271,7 @@ def _summary(evaluated: Mapping[str, Evaluated], classifier: Classifier, *, seen
         }
         for name in predictors
     }
-    return metrics.summary(right, len(classifier.classes))
+    return summary(right, len(classifier.classes))
 
 
 def _headlines(evaluated: Mapping[str, Evaluated], classifier: Classifier) -> list[headline.Headline]:
@@ -237,9 +304,9 @@ def _zero_shot(evaluated: Mapping[str, Evaluated], classifier: Classifier) -> Tr
         chances[sensor] = 1 / len(classifier.config["held_out"][sensor])
     if not correct:
         return {}
-    tree = metrics.accuracy(correct)
+    tree = accuracy(correct)
     tree["chance"] = {sensor: 1 / len(classifier.classes) for sensor in correct}
-    tree["among_held_out"] = {**metrics.accuracy(correct_among_held_out), "chance": chances}
+    tree["among_held_out"] = {**accuracy(correct_among_held_out), "chance": chances}
     return tree
 
 

@@ -19,7 +19,8 @@ from tacpipe.models.readout import Level
 from tacpipe.models.recurrent_autoencoder import Shape
 from tacpipe.printable import listed
 from tacpipe.tasks import trained_on
-from tacpipe.tasks.material import held_out, networks, readouts
+from tacpipe.tasks.material import networks, readouts
+from tacpipe.tasks.material import slides as slides_of
 from tacpipe.tasks.material.classifier import (
     BASELINES,
     CONFIG,
@@ -31,9 +32,8 @@ from tacpipe.tasks.material.classifier import (
     Config,
     NetworkReader,
 )
-from tacpipe.tasks.material.losses import JointWork, ScaledSlides
+from tacpipe.tasks.material.losses import NONE, JointWork, Pairs, ScaledSlides, permuted_classes
 from tacpipe.tasks.material.naming import Naming
-from tacpipe.tasks.material.pairs import NONE, Pairs, permuted_classes
 from tacpipe.tasks.material.params import Network as NetworkParams
 from tacpipe.tasks.material.params import Params, aligning_architectures
 from tacpipe.tasks.material.slides import BySensor, Slides
@@ -78,7 +78,7 @@ def train(
     scalings = {
         name: Affine.fit(sensor_slides.frames, params.scaling) for name, sensor_slides in training_slides.items()
     }
-    held_out_materials = held_out.materials(
+    held_out_materials = slides_of.held_out_materials(
         params.hold_out, config["classes"], training_slides, Naming.from_json(config)
     )
     if start:

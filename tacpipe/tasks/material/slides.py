@@ -1,9 +1,9 @@
-"""Slides of a dataset as arrays, one bundle a sensor."""
+"""Slides of a dataset as arrays, one bundle per sensor, and the materials whose labels a sensor does not learn."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +11,9 @@ import numpy as np
 
 from tacpipe.arrays import Bools, Float32s, Floats, Int64s
 from tacpipe.channels.absent import absent
-from tacpipe.errors import TacpipeError
+from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.plugins.constraints import Assignments, CommaList
+from tacpipe.printable import listed
 from tacpipe.tasks.material.naming import NUMBERS, UNKNOWN, Naming
 
 if TYPE_CHECKING:
@@ -238,3 +240,26 @@ def quantities(text: str) -> tuple[str, ...]:
     ('tactile', 'vibration')
     """
     return tuple(part.strip() for part in text.split(",") if part.strip())
+
+
+def held_out_materials(
+    assignments: str, classes: Sequence[int], sensors: Iterable[str], naming: Naming = NUMBERS
+) -> dict[str, set[int]]:
+    """Return the materials whose labels each sensor does not learn; ``assignments`` is like ``roboskin=17,18,19,20``.
+
+    >>> held_out_materials("b=3,4", [1, 2, 3, 4], ["a", "b"])
+    {'a': set(), 'b': {3, 4}}
+    """
+    by_sensor: dict[str, set[int]] = {name: set() for name in sensors}
+    for name, numbers in Assignments(str, between=";").items(assignments).items():
+        try:
+            sensor_materials = {naming.read(word) for word in CommaList().items(numbers)}
+        except ValueError:
+            sensor_materials = {UNKNOWN}
+        if name not in by_sensor or not sensor_materials <= set(classes):
+            raise UsageError(
+                f"hold_out names {name}={numbers}; the sensors are {', '.join(by_sensor)} and the classes "
+                f"{listed(map(naming.name, classes), 20)}."
+            )
+        by_sensor[name] |= sensor_materials
+    return by_sensor

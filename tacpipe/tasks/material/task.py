@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
+from tacpipe.plugins.requirements import Channels, Label, Requirements
 from tacpipe.plugins.stage import stage
-from tacpipe.tasks.material.params import Params
-from tacpipe.tasks.material.requirements import REQUIREMENTS
+from tacpipe.tasks.material.params import KEY, Params
 from tacpipe.tasks.task import Calibration, Demo, Files, PredictionRequest, Task
 
 if TYPE_CHECKING:
@@ -18,6 +19,67 @@ if TYPE_CHECKING:
     from tacpipe.plugins.stage import Result, Workspace
     from tacpipe.tasks.material.model import MaterialModel
     from tacpipe.tasks.opened import Chain
+
+MATERIALS, SLIDES = 6, 240  # slides of each sensor on each material
+
+
+def demo(output: Path) -> Demo:
+    """Return the commands from the simulation to the results, which write below ``output``."""
+    names = ("touched", "slides", "slides-split", "materials", "materials-results", "joint", "joint-results")
+    place = {name: str(output / name) for name in names}
+    split = ["--split", place["slides-split"]]
+    simulation = ["--trials", str(SLIDES), "--materials", str(MATERIALS)]
+    paper = ["--preset", "paper", "--epochs", "12", "--align-from", "4"]  # of the paper's 2,000 epochs
+    commands = [
+        ["simulate", "material", *simulation, "-o", place["touched"]],
+        ["segment", "slides", place["touched"], "-o", place["slides"]],
+        ["split", place["slides"], "-o", place["slides-split"], "--scheme", "random", "--stratify", "sensor,material"],
+        ["train", "material", place["slides"], *split, "-o", place["materials"], "--features", "2000"],
+        ["evaluate", place["materials"], place["slides"], *split, "-o", place["materials-results"]],
+        ["train", "material", place["slides"], *split, "-o", place["joint"], *paper],
+        ["evaluate", place["joint"], place["slides"], *split, "-o", place["joint-results"]],
+    ]
+    shortened = [f"{place['joint']} (12 of 2,000 epochs)"]
+    return Demo(commands, [place["materials-results"], place["joint-results"]], shortened=shortened)
+
+
+REQUIREMENTS = Requirements(
+    "material",
+    stages=("segment slides",),
+    optional_stages=(),
+    roles="two classes or more with the role train; networks need recordings of each sensor with val too",
+    channels=(
+        Channels(
+            "tactile",
+            (),
+            "1 or more columns of one stream, any number of taxels and axes, the same in all recordings of a sensor",
+        ),
+        Channels(
+            "vibration",
+            (),
+            "any number of columns of the same stream, which minirocket and statistics read too",
+            "tactile channels alone are read",
+        ),
+        Channels(
+            "static_pressure",
+            ("count",),
+            "1 column, by which segment slides finds where a slide begins",
+            "give segment slides --trigger load, for any sensor, or recordings that are cut alike already",
+        ),
+        Channels(
+            "position",
+            ("m", "cm", "mm"),
+            "x, y and z of the finger, or velocity [m/s], by which segment slides finds where the finger moves",
+            "a slide is all of the contact",
+        ),
+    ),
+    labels=(
+        Label(KEY, "the class: a whole number from 0 or any text; --label names another label"),
+        Label("sensor", "the product, any text: recordings of one sensor are learned together"),
+        Label("rate_hz", "rows a second", "the median step of the time stamps gives it"),
+        Label("session", "the day or mounting, any text", "the report cannot distinguish materials from sessions"),
+    ),
+)
 
 
 class Material(Task):
@@ -49,10 +111,10 @@ class Material(Task):
         return evaluation.evaluate(model.files, recordings)
 
     def predict(self, model: Model, recordings: Dataset, request: PredictionRequest) -> Result:
-        """Return one table of named materials; raises as `tacpipe.tasks.material.prediction`."""
-        from tacpipe.tasks.material import prediction
+        """Return one table of named materials; raises as `tacpipe.tasks.material.model`."""
+        from tacpipe.tasks.material.model import predict
 
-        return prediction.predict(model.files, recordings, probabilities=request.probabilities)
+        return predict(model.files, recordings, probabilities=request.probabilities)
 
     def load(self, files: Files, chain: Chain | None = None) -> MaterialModel:
         """Return the model among ``files``, trained behind the stages of ``chain``."""
@@ -83,6 +145,5 @@ class Material(Task):
 
     def demo(self, output: Path) -> Demo:
         """Return the chain on simulated slides."""
-        from tacpipe.tasks.material.demo import demo
 
         return demo(output)

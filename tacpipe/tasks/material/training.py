@@ -11,7 +11,7 @@ from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins.constraints import CommaList
 from tacpipe.tasks import trained_on
-from tacpipe.tasks.material import held_out, network_training, readouts
+from tacpipe.tasks.material import network_training, readouts
 from tacpipe.tasks.material import slides as slides_of
 from tacpipe.tasks.material.classifier import TASK, Config
 from tacpipe.tasks.material.naming import Naming
@@ -51,7 +51,7 @@ class TrainingSlides:
 
     def fit_spectra(self, params: Spectra) -> dict[str, bytes]:
         """Return the files of spectra, by which sensors learn materials from one another."""
-        excluded = held_out.materials(params.hold_out, self.config["classes"], self.training, self.naming)
+        excluded = slides_of.held_out_materials(params.hold_out, self.config["classes"], self.training, self.naming)
         return readouts.spectra(params, self.config, self.training, self.validation, excluded)
 
     def fit_estimators(self, params: Estimator) -> dict[str, bytes]:

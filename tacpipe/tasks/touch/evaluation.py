@@ -1,17 +1,17 @@
-"""Evaluation of a model of touch on grasps it has not seen, next to its baselines."""
+"""Evaluation of a model of touch on grasps that it has not seen, next to its baselines."""
 
 from __future__ import annotations
 
 import csv
 import io
 import json
-from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
 
-from tacpipe.arrays import AnyArray, Bools
+from tacpipe.arrays import AnyArray, Bools, Floats
 from tacpipe.channels import biotac_sp
 from tacpipe.datasets import origin
 from tacpipe.errors import TacpipeError
@@ -20,11 +20,9 @@ from tacpipe.metrics import headline, regression
 from tacpipe.plugins.stage import RecordingOutput, Result
 from tacpipe.tasks.touch import grasps as grasps_of
 from tacpipe.tasks.touch import headline as headlines
-from tacpipe.tasks.touch import metrics, quantiles
+from tacpipe.tasks.touch import quantiles
 from tacpipe.tasks.touch.grasps import Grasps
-from tacpipe.tasks.touch.metrics import Readings, Tree
-from tacpipe.tasks.touch.predictor import CONFIG, HISTORY, Predictor
-from tacpipe.tasks.touch.result_names import (
+from tacpipe.tasks.touch.headline import (
     CONSTANT,
     COVERAGE,
     GRASPS,
@@ -34,9 +32,61 @@ from tacpipe.tasks.touch.result_names import (
     PREDICTIONS,
     TRUE,
 )
+from tacpipe.tasks.touch.predictor import CONFIG, HISTORY, Predictor
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset
+
+Readings = Mapping[str, Floats]  # target -> (grasp, value), device counts
+Tree = dict[str, Any]
+
+
+def reading_measures(readings: Readings, predicted: Readings, constant: Readings, clusters: Sequence[str]) -> Tree:
+    """Return the measures of one predictor's readings, by measure and target.
+
+    ``rmse`` and ``mae`` are in fractions of each target's range (`biotac_sp.RANGES`), over grasps and electrodes at once;
+    ``rmse_counts`` is in device counts; ``rmse_batch_mean`` is the letter's figure, the mean over batches of ten.
+    ``skill`` is 1 - RMSE / RMSE of ``constant``, its interval (95 %) over ``clusters``.
+    """
+    names = ("rmse", "rmse_counts", "rmse_batch_mean", "mae", "r2", "skill", "skill_low", "skill_high")
+    measures: Tree = {name: {} for name in names}
+    for target, values in predicted.items():
+        true, share, mean = (biotac_sp.normalised(target, counts[target]) for counts in (readings, predicted, constant))
+        measures["rmse"][target] = regression.rmse(true, share)
+        measures["rmse_counts"][target] = regression.rmse(readings[target], values)
+        measures["rmse_batch_mean"][target] = regression.batch_mean_rmse(true, share)
+        measures["mae"][target] = regression.mae(true, share)
+        measures["r2"][target] = _finite(regression.r2(true, share))
+        model, baseline = (regression.squared_sums(true, share_of_range) for share_of_range in (share, mean))
+        skill = regression.skill_interval(model, baseline, np.asarray(clusters))
+        for name, value in zip(("skill", "skill_low", "skill_high"), skill, strict=True):
+            measures[name][target] = _finite(value)
+    measures["n"] = len(clusters)
+    return measures
+
+
+def by_electrode(readings: Readings, predicted: Readings) -> Tree:
+    """Return RMSE (fraction of the range) and R2 of each electrode, by target."""
+    by_target: Tree = {}
+    for target, values in predicted.items():
+        if biotac_sp.width(target) > 1:
+            true, share = (biotac_sp.normalised(target, counts) for counts in (readings[target], values))
+            pairs = zip(regression.rmse_by_value(true, share), regression.r2_by_value(true, share), strict=True)
+            by_target[target] = {
+                f"{number:02d}": {"rmse": float(rmse), "r2": _finite(float(r2))}
+                for number, (rmse, r2) in enumerate(pairs, 1)
+            }
+    return by_target
+
+
+def select_rows(predicted: Readings, mask: Bools) -> dict[str, Floats]:
+    """Return the values of the grasps that a mask (grasp,) chooses."""
+    return {target: values[mask] for target, values in predicted.items()}
+
+
+def _finite(value: float) -> float | None:
+    """Return a measure, or None where it is not defined, for JSON."""
+    return value if np.isfinite(value) else None
 
 
 def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
@@ -150,14 +200,14 @@ def _measures(grasps: Grasps, predicted: Mapping[str, Readings], mask: Bools, is
             )
             for object_name in sorted(set(objects[mask]))
         }
-    readings, model = (metrics.chosen(one, mask) for one in (grasps.readings, predicted[MODEL]))
-    tree[MODEL]["by_electrode"] = metrics.by_electrode(readings, model)
+    readings, model = (select_rows(one, mask) for one in (grasps.readings, predicted[MODEL]))
+    tree[MODEL]["by_electrode"] = by_electrode(readings, model)
     return tree
 
 
 def _tree(grasps: Grasps, predicted: Readings, constant: Readings, mask: Bools, clusters: AnyArray) -> Tree:
-    readings, model, mean = (metrics.chosen(values, mask) for values in (grasps.readings, predicted, constant))
-    return metrics.tree(readings, model, mean, clusters[mask].tolist())
+    readings, model, mean = (select_rows(values, mask) for values in (grasps.readings, predicted, constant))
+    return reading_measures(readings, model, mean, clusters[mask].tolist())
 
 
 def _by_object_csv(tree: Tree) -> bytes:

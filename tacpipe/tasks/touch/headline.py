@@ -1,4 +1,4 @@
-"""The headline of touch: the RMSE of one target on grasps of known objects or of novel ones."""
+"""The headline of touch, the RMSE of one target on known or novel objects, and the names of the parts of a result."""
 
 from __future__ import annotations
 
@@ -89,3 +89,9 @@ def measure(range_counts: float, cluster: str) -> Measure:
         scored="RMSE (fraction of the range)",
         weight=lambda draws: draws[:, 0],
     )
+
+
+COVERAGE = "coverage.parquet"  # each value of each grasp, with the band that a calibrated model predicted
+PREDICTIONS = "predictions"  # the recording; each name below is a stream of it, with the same grasps as rows
+GRASPS, TRUE, MODEL = "grasps", "true", "model"
+CONSTANT, OBJECT_MEAN, NEAREST_IN_TIME = "constant", "object_mean", "nearest_in_time"  # the baselines

@@ -1,4 +1,4 @@
-"""The inputs of a PointNet: points drawn from the cloud of a grasp, and numbers of the grasp."""
+"""The inputs of networks: points drawn from the cloud of a grasp or about its contacts, and numbers of the grasp."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ from functools import cached_property
 
 import numpy as np
 
-from tacpipe.arrays import Float32s, Floats
-from tacpipe.clouds import frame
+from tacpipe.arrays import Float32s, Floats, Indices
+from tacpipe.clouds import frame, geometry
 from tacpipe.clouds.cloud import Cloud
+from tacpipe.clouds.frame import local_points
 from tacpipe.clouds.grasp import Grasp
 from tacpipe.clouds.normalisation import (
     NORMALISATIONS,
@@ -140,3 +141,103 @@ def _check(inputs: Inputs, name: str, cloud: Cloud, grasp: Grasp) -> None:
             f"{inputs.normalisation} need. Choose others, or --wrist estimated, which makes it of the closing axis and the "
             f"camera's line of sight."
         )
+
+
+UNIT_M = 0.05  # length that is 1 for the network
+PLACES = 3  # about g1, about g2, the whole
+
+
+@dataclass(frozen=True)
+class Patches:
+    """How large patches are, how many points are drawn of each, and whether colours and the grasp's place are read."""
+
+    points: int
+    radius_m: float
+    coloured: bool
+    placed: bool
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be."""
+        if self.points < 1:
+            raise TacpipeError(f"points is {self.points}; it must be 1 or more.")
+        if not self.radius_m > 0:
+            raise TacpipeError(f"radius_mm is {self.radius_m * 1000:g}; it must be above 0.")
+
+    @property
+    def channels(self) -> int:
+        """Numbers of a point."""
+        return 6 if self.coloured else 3
+
+    @property
+    def grasp_numbers(self) -> int:
+        """Numbers of the grasp: its opening, and where it is: both points, approach and closing."""
+        return 13 if self.placed else 1
+
+
+class PatchSources:
+    """Clouds and grasps to draw patches from."""
+
+    def __init__(
+        self, patches: Patches, names: Sequence[str], clouds: Sequence[Cloud], grasps: Sequence[Grasp]
+    ) -> None:
+        """Take clouds and grasps; raises `TacpipeError` where colours are to be read and a cloud has none."""
+        self.patches = patches
+        self.clouds: list[Float32s] = []  # (point, channel) each
+        self.near: list[list[Indices]] = []  # indices of points near g1 and near g2
+        if patches.coloured:
+            require_colours(names, clouds)
+        for cloud, grasp in zip(clouds, grasps, strict=True):
+            points = local_points(cloud.points_m, grasp)
+            self.near.append([_about(points, sign * grasp.opening_m / 2, patches.radius_m) for sign in (-1, 1)])
+            parts = [points / UNIT_M]
+            if patches.coloured and cloud.colours is not None:
+                parts.append(cloud.colours / 127.5 - 1.0)
+            self.clouds.append(np.concatenate(parts, axis=1).astype(np.float32))
+        self.numbers = _numbers(grasps, patches.placed)
+
+    def draw(self, indices: Sequence[int], rng: np.random.Generator) -> Arrays:
+        """Return patches (cloud, patch, point, channel) and the grasps' numbers (cloud, number), drawn anew."""
+        return self._arrays([(index, rng) for index in indices])
+
+    def fixed(self, indices: Sequence[int], visit: int) -> Arrays:
+        """Return the same; which points are drawn depends on those about the grasp and on ``visit`` alone."""
+        rngs = [np.random.default_rng([visit, zlib.crc32(self.clouds[index].tobytes())]) for index in indices]
+        return self._arrays(list(zip(indices, rngs, strict=True)))
+
+    def _arrays(self, draws: Sequence[tuple[int, np.random.Generator]]) -> Arrays:
+        count = self.patches.points
+        points = np.empty((len(draws), PLACES, count, self.patches.channels), np.float32)
+        for row, (index, rng) in enumerate(draws):
+            cloud = self.clouds[index]
+            for place, indices in enumerate((*self.near[index], np.arange(len(cloud)))):
+                points[row, place] = cloud[indices[_chosen(len(indices), count, rng)]]
+        return points, self.numbers[[index for index, _ in draws]]
+
+
+def require_colours(names: Sequence[str], clouds: Sequence[Cloud]) -> None:
+    """Raise `TacpipeError` naming the first whose cloud has no colours."""
+    for name, cloud in zip(names, clouds, strict=True):
+        if cloud.colours is None:
+            raise TacpipeError(
+                f"{name} has a cloud without colours, and the model reads colours. Train with inputs of xyz."
+            )
+
+
+def _about(points: Floats, place_m: float, radius_m: float) -> Indices:
+    """Return the points within the radius of a contact, or the nearest one where there is none."""
+    away = np.linalg.norm(points - np.array([0.0, place_m, 0.0]), axis=1)
+    inside = np.flatnonzero(away <= radius_m)
+    return inside if len(inside) else np.array([int(away.argmin())])
+
+
+def _chosen(total: int, count: int, rng: np.random.Generator) -> Indices:
+    """Return ``count`` draws of ``total``: each at most once as long as they last, then again."""
+    if count <= total:
+        chosen: Indices = rng.choice(total, count, replace=False, shuffle=False)
+        return chosen
+    return np.concatenate([np.arange(total), rng.integers(0, total, count - total)])
+
+
+def _numbers(grasps: Sequence[Grasp], placed: bool) -> Float32s:
+    rows = [[grasp.opening_m / UNIT_M] + (list(geometry.place(grasp).values()) if placed else []) for grasp in grasps]
+    return np.array(rows, np.float32)

@@ -2,20 +2,56 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, overload
+
+import pyarrow as pa
 
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.clouds.grasp import Grasp
-from tacpipe.errors import UsageError
+from tacpipe.errors import TacpipeError, UsageError
+from tacpipe.plugins.stage import RecordingOutput, Result
 from tacpipe.tasks.opened import opened
-from tacpipe.tasks.touch import prediction
+from tacpipe.tasks.touch import grasps as grasps_of
+from tacpipe.tasks.touch.evaluation import readings_table, simulated
+from tacpipe.tasks.touch.headline import PREDICTIONS
 from tacpipe.tasks.touch.predictor import Predictor, Touch
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
     from tacpipe.datasets.dataset import Dataset, Recording
+
+
+def predict(
+    model: Mapping[str, bytes], recordings: Dataset, steps: Sequence[int] = (), quantiles: Sequence[int] = ()
+) -> Result:
+    """Return one table, ``predictions``: a row a grasp with the recording's name and all predicted values, device counts.
+
+    Grasps need no reading; ``steps`` is for tasks that predict over time and has no effect here. Raises `TacpipeError` where
+    there are no recordings or they are not what the model reads. ``quantiles`` (percent), of a calibrated model, add columns
+    such as ``e_mf_07_q90``.
+    """
+    table = predictions(Predictor.load(model), recordings, quantiles)
+    return Result({PREDICTIONS: RecordingOutput(table, simulated(recordings))})
+
+
+def predictions(predictor: Predictor, recordings: Dataset, quantiles: Sequence[int] = ()) -> pa.Table:
+    """Return the table of `predict`, which raises the same errors."""
+    at = predictor.quantiles_of(quantiles)[1] if quantiles else []
+    grasps = grasps_of.read(recordings, with_readings=False)
+    if not len(grasps):
+        raise TacpipeError("There is no grasp to predict. Give a dataset with recordings of the role asked for.")
+    predicted = predictor.predict_grasps(grasps)
+    bands = {}
+    if quantiles and predictor.quantiles is not None:
+        quantile_readings = predictor.quantiles.quantiles(predicted)
+        bands = {
+            percent: {target: values[..., level] for target, values in quantile_readings.items()}
+            for percent, level in zip(quantiles, at, strict=True)
+        }
+    table = readings_table(predicted, bands)
+    return table.add_column(0, pa.field("recording", pa.string()), pa.array(grasps.names, pa.string()))
 
 
 class TouchModel(Predictor):
@@ -47,7 +83,7 @@ class TouchModel(Predictor):
                     "A cloud needs a grasp: the place where the fingers close. Give predict(cloud, grasp)."
                 )
             return self.predict_all(recordings, [grasp])[0]
-        return prediction.predictions(self, opened(recordings, self.chain), sorted(set(quantiles)))
+        return predictions(self, opened(recordings, self.chain), sorted(set(quantiles)))
 
 
 def grasp_values(model: TouchModel, cloud: Cloud, grasp: Grasp) -> dict[str, float]:

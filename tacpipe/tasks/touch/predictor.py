@@ -21,12 +21,11 @@ from tacpipe.printable import excerpt
 from tacpipe.tasks import calibrated
 from tacpipe.tasks.opened import Chain
 from tacpipe.tasks.touch import members
-from tacpipe.tasks.touch.baselines import Baselines
+from tacpipe.tasks.touch.baselines import Baselines, Shrinkage
 from tacpipe.tasks.touch.grasps import Grasps, check
 from tacpipe.tasks.touch.params import Params
 from tacpipe.tasks.touch.quantiles import FILE as QUANTILES
 from tacpipe.tasks.touch.quantiles import ReadingQuantiles
-from tacpipe.tasks.touch.shrinkage import Shrinkage
 from tacpipe.training import devices
 from tacpipe.training.scaling import Affine
 

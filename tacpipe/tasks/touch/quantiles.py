@@ -25,7 +25,7 @@ from tacpipe.metrics.quantiles import Sums
 from tacpipe.models.tensors import under
 from tacpipe.tasks import calibrated
 from tacpipe.tasks.touch.grasps import Grasps
-from tacpipe.tasks.touch.result_names import CONSTANT, MODEL, OBJECT_MEAN
+from tacpipe.tasks.touch.headline import CONSTANT, MODEL, OBJECT_MEAN
 
 FILE = "quantiles.safetensors"
 LEVELS = "levels"

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING
 
+from tacpipe.plugins.requirements import Channels, Label, Requirements
 from tacpipe.plugins.stage import stage
 from tacpipe.tasks.task import Calibration, Demo, Files, GraspPredictor, PredictionRequest, Task
 from tacpipe.tasks.touch.params import Params
-from tacpipe.tasks.touch.requirements import REQUIREMENTS
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -19,6 +20,68 @@ if TYPE_CHECKING:
     from tacpipe.plugins.stage import Result, Workspace
     from tacpipe.tasks.opened import Chain
     from tacpipe.tasks.touch.model import TouchModel
+
+OBJECTS, GRASPS = 1, 90  # objects of each of six families, grasps of each object
+
+
+def demo(output: Path) -> Demo:
+    """Return the commands from the simulation to the results, which write below ``output``."""
+    names = ("pinched", "grasps", "grasps-split", "touch", "touch-results", "pointnet", "pointnet-results")
+    place = {name: str(output / name) for name in names}
+    split = ["--split", place["grasps-split"]]
+    simulation = ["--trials", str(GRASPS), "--objects", str(OBJECTS)]
+    paper = ["--preset", "paper", "--epochs", "4", "--points", "128"]  # the paper has 250 epochs and 750 points
+    commands = [
+        ["simulate", "touch", *simulation, "-o", place["pinched"]],
+        ["segment", "grasps", place["pinched"], "-o", place["grasps"]],
+        ["split", place["grasps"], "-o", place["grasps-split"], "--scheme", "random", "--stratify", "object"],
+        ["train", "touch", place["grasps"], *split, "-o", place["touch"], "--preset", "quick"],
+        ["evaluate", place["touch"], place["grasps"], *split, "-o", place["touch-results"]],
+        ["train", "touch", place["grasps"], *split, "-o", place["pointnet"], *paper],
+        ["evaluate", place["pointnet"], place["grasps"], *split, "-o", place["pointnet-results"]],
+    ]
+    shortened = [f"{place['touch']} (100 of 300 trees)", f"{place['pointnet']} (4 of 250 epochs)"]
+    return Demo(commands, [place["touch-results"], place["pointnet-results"]], [place["grasps"]], shortened=shortened)
+
+
+REQUIREMENTS = Requirements(
+    "touch",
+    stages=("segment grasps",),
+    optional_stages=("ingest vision2tactile, whose recordings are grasps already",),
+    roles="one grasp or more with the role train; val where a network is chosen by it (--select best)",
+    channels=(
+        Channels(
+            "position",
+            ("m",),
+            "x_m, y_m, z_m of each point of the object's visible side, 3 points or more, in the camera's frame",
+            stream="cloud",
+        ),
+        Channels("colour", ("count",), "red, green, blue of each point", "--inputs xyz reads none", stream="cloud"),
+        Channels(
+            "grasp",
+            ("m",),
+            "one row with g1_x_m … g2_z_m, where both fingers are to close, in the frame of the cloud",
+            stream="grasp",
+        ),
+        Channels(
+            "wrist",
+            ("1",),
+            "wrist_x_x … wrist_z_z, the axes of the wrist in the frame of the cloud",
+            "the line of sight represents it, or --wrist estimated",
+            stream="grasp",
+        ),
+        Channels(
+            "tactile",
+            ("count",),
+            "one row with mf_electrode01 … th_electrode24 and the fluid's pressure mf_pdc, th_pdc, of two BioTac SP",
+            stream="reading",
+        ),
+    ),
+    labels=(
+        Label("object", "what is grasped, any text", "the mean of an object is not a baseline, and no object is novel"),
+        Label("session", "the day, any text", "days cannot be left out by split"),
+    ),
+)
 
 
 class Touch(Task):
@@ -47,10 +110,10 @@ class Touch(Task):
         return evaluation.evaluate(model.files, recordings)
 
     def predict(self, model: Model, recordings: Dataset, request: PredictionRequest) -> Result:
-        """Return one table of predicted readings; raises as `tacpipe.tasks.touch.prediction`."""
-        from tacpipe.tasks.touch import prediction
+        """Return one table of predicted readings; raises as `tacpipe.tasks.touch.model`."""
+        from tacpipe.tasks.touch.model import predict
 
-        return prediction.predict(model.files, recordings, quantiles=request.quantiles)
+        return predict(model.files, recordings, quantiles=request.quantiles)
 
     def load(self, files: Files, chain: Chain | None = None) -> TouchModel:
         """Return the model among ``files``, trained behind the stages of ``chain``."""
@@ -96,6 +159,5 @@ class Touch(Task):
 
     def demo(self, output: Path) -> Demo:
         """Return the chain on simulated grasps."""
-        from tacpipe.tasks.touch.demo import demo
 
         return demo(output)

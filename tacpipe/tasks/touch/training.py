@@ -24,14 +24,13 @@ from tacpipe.models.forest import Forest
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins.constraints import CommaList
 from tacpipe.tasks import trained_on
+from tacpipe.tasks.touch import baselines, members
 from tacpipe.tasks.touch import grasps as grasps_of
-from tacpipe.tasks.touch import members, shrinkage
 from tacpipe.tasks.touch.baselines import Baselines
 from tacpipe.tasks.touch.grasps import Grasps
-from tacpipe.tasks.touch.losses import Drawn, ScaledGrasps, TouchWork
-from tacpipe.tasks.touch.members import NetworkParams
+from tacpipe.tasks.touch.inputs import require_colours
+from tacpipe.tasks.touch.members import Drawn, NetworkParams, ScaledGrasps, TouchWork
 from tacpipe.tasks.touch.params import Params, Trees
-from tacpipe.tasks.touch.patches import require_colours
 from tacpipe.tasks.touch.predictor import BASELINES, CONFIG, FOREST, HISTORY, NETWORK, SHRINKAGE, TASK, WEIGHTS
 from tacpipe.training import devices, loop
 from tacpipe.training.scaling import Affine
@@ -155,7 +154,7 @@ def _grow_forests(params: Trees, grasps: TrainingGrasps, model: FittedModel) -> 
             found, _ = _forests(params, rows[among], own, groups)
             return members.averaged((group, forest.predict(rows[~among])) for group, forest in found)
 
-        shrunk = shrinkage.fit(readings, known.objects, predict)
+        shrunk = baselines.fit(readings, known.objects, predict)
         model.config["kept_of_novel"] = dict(shrunk.factor)
         model.tensors.update({f"{SHRINKAGE}{name}": torch.from_numpy(one) for name, one in shrunk.tensors().items()})
 

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.formats.containers.container import Time
-from tacpipe.formats.table import contained, guess, layout, reading, recordings, stamp_formats, stamps
+from tacpipe.formats.table import contained, guess, layout, reading, recordings, stamps
 from tests.formats.table import labs
 
 SHAPE = "shape = [4, 3], axes = ['x', 'y', 'z']"
@@ -253,4 +253,4 @@ def test_a_guess_finds_the_format_of_stamps_that_are_text(tmp_path: Path) -> Non
 @pytest.mark.parametrize("text", ["%d.%m.%Y", "%H:%M:%Q", "noon"])
 def test_a_format_without_an_hour_or_with_an_unknown_directive_is_refused(text: str) -> None:
     with pytest.raises(UsageError, match="format"):
-        stamp_formats.check_format(text, "here")
+        stamps.check_format(text, "here")

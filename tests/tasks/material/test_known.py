@@ -12,7 +12,7 @@ import pytest
 from tacpipe.errors import TacpipeError
 from tacpipe.tasks.calibrated import CalibrationRequest
 from tacpipe.tasks.material import calibration as material_calibration
-from tacpipe.tasks.material import prediction as material_prediction
+from tacpipe.tasks.material import model as material_prediction
 from tacpipe.tasks.material.model import MaterialModel
 from tests.tasks.material.textures import MATERIALS, dataset, evaluated, slide, slides, trained
 

@@ -10,8 +10,7 @@ from torch import Tensor, nn
 
 from tacpipe.errors import TacpipeError
 from tacpipe.models.recurrent_autoencoder import RecurrentAutoencoder, RecurrentClassifier, Shape
-from tacpipe.tasks.material.losses import JointWork, ScaledSlides, Weights
-from tacpipe.tasks.material.pairs import NONE, Pairs
+from tacpipe.tasks.material.losses import NONE, JointWork, Pairs, ScaledSlides, Weights
 
 CLASSES = torch.tensor([0, 1, 2, 0, 1, 2, 0, 1])
 SHAPES = {"a": Shape(4, 3, hidden=6, latents=5), "b": Shape(7, 3, hidden=6, latents=5)}

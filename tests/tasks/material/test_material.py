@@ -21,7 +21,7 @@ from tacpipe.plugins import given_params, registry
 from tacpipe.tasks.material import evaluation as material_evaluation
 from tacpipe.tasks.material import headline as headlines
 from tacpipe.tasks.material import losses
-from tacpipe.tasks.material import prediction as material_prediction
+from tacpipe.tasks.material import model as material_prediction
 from tacpipe.tasks.material import slides as slides_of
 from tacpipe.tasks.material.classifier import BASELINES, CONFIG, LAST, WEIGHTS
 from tacpipe.tasks.material.model import MaterialModel

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tacpipe.errors import TacpipeError, UsageError
-from tacpipe.tasks.material import prediction as material_prediction
+from tacpipe.tasks.material import model as material_prediction
 from tacpipe.tasks.material.model import MaterialModel
 from tacpipe.tasks.material.naming import UNKNOWN, Naming
 from tacpipe.tasks.material.report import figures, predictions

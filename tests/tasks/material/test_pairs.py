@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tacpipe.errors import TacpipeError
-from tacpipe.tasks.material.pairs import NONE, Pairs, permuted_classes
+from tacpipe.tasks.material.losses import NONE, Pairs, permuted_classes
 
 LABELS = torch.arange(600) % 20
 

@@ -10,8 +10,7 @@ import pytest
 from tacpipe.cli import limits as command
 from tacpipe.errors import UsageError
 from tacpipe.metrics.intervals import Estimate
-from tacpipe.tasks.touch.limits import Limits, Point
-from tacpipe.tasks.touch.repeatability import NOTHING, Repeatability
+from tacpipe.tasks.touch.limits import NOTHING, Limits, Point, Repeatability
 
 SKILL = dict.fromkeys(command.TARGETS, Estimate(0.31, 0.25, 0.38))
 NEAR = dict.fromkeys(command.TARGETS, Repeatability(19, Estimate(0.6, -0.24, 0.93), Estimate(0.55, 0.22, 0.82)))

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from tacpipe.errors import TacpipeError
 from tacpipe.tasks.touch import training
 from tacpipe.tasks.touch.inputs import Arrays
-from tacpipe.tasks.touch.losses import ScaledGrasps, TouchWork, predictions
+from tacpipe.tasks.touch.members import ScaledGrasps, TouchWork, predictions
 
 
 class Numbers:

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from tacpipe.clouds.cloud import Cloud
 from tacpipe.errors import TacpipeError
-from tacpipe.tasks.touch.patches import UNIT_M, Patches, PatchSources
+from tacpipe.tasks.touch.inputs import UNIT_M, Patches, PatchSources
 from tests.tasks.touch.handmade import POINTS, cloud, grasp
 
 

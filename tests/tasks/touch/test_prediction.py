@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from tacpipe.errors import TacpipeError
-from tacpipe.tasks.touch import prediction as touch_prediction
+from tacpipe.tasks.touch import model as touch_prediction
 from tests.tasks.touch.handmade import cloud, dataset, evaluated, recording, recordings, trained
 
 FAST = {"architecture": "trees", "targets": "pdc_th,e_mf"}

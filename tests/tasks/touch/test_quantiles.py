@@ -14,7 +14,7 @@ from tacpipe.errors import TacpipeError
 from tacpipe.tasks.calibrated import CalibrationRequest
 from tacpipe.tasks.touch import calibration as touch_calibration
 from tacpipe.tasks.touch import grasps as grasps_of
-from tacpipe.tasks.touch import prediction as touch_prediction
+from tacpipe.tasks.touch import model as touch_prediction
 from tacpipe.tasks.touch.model import TouchModel
 from tests.tasks.touch.handmade import dataset, evaluated, recording, recordings, trained
 

@@ -12,7 +12,7 @@ import pytest
 from tacpipe.errors import TacpipeError
 from tacpipe.tasks.touch import grasps as grasps_of
 from tacpipe.tasks.touch import limits as limits_of
-from tacpipe.tasks.touch.repeatability import Pairs, repeatability, variances
+from tacpipe.tasks.touch.limits import Pairs, repeatability, variances
 from tests.tasks.touch.handmade import dataset, recording
 
 ALL_MM = (0.0, math.inf)

@@ -107,9 +107,9 @@ class MaterialLive(LiveTask):
 
     def predict(self, model: Model, recordings: Dataset, request: PredictionRequest) -> Result:
         """Return the final answer of each slide."""
-        from tacpipe.tasks.material.live import replay
+        from tacpipe.tasks.material.live.slide import predict
 
-        return replay.predict(model, recordings)
+        return predict(model, recordings)
 
 
 def _material_settings(settings: Settings) -> MaterialSettings:

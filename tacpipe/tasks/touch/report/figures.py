@@ -19,6 +19,7 @@ from tacpipe.metrics import regression
 from tacpipe.report import blocks, charts, context
 from tacpipe.report.blocks import Chart, Charts, Fold, Note, fold
 from tacpipe.tasks.touch import headline as headlines
+from tacpipe.tasks.touch.headline import CONSTANT, MODEL
 from tacpipe.tasks.touch.report import methods, paper, predictions
 from tacpipe.tasks.touch.report.methods import (
     PAPERS,
@@ -28,7 +29,6 @@ from tacpipe.tasks.touch.report.methods import (
     predicted_targets,
 )
 from tacpipe.tasks.touch.report.predictions import Predictions
-from tacpipe.tasks.touch.result_names import CONSTANT, MODEL
 
 if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset, Recording

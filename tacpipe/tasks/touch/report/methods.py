@@ -19,10 +19,10 @@ from tacpipe.plugins import params as params_of
 from tacpipe.report import blocks, context
 from tacpipe.report.context import SHORTENED, Tree, drop_duplicates
 from tacpipe.tasks.touch import headline
+from tacpipe.tasks.touch.headline import CONSTANT, NEAREST_IN_TIME, OBJECT_MEAN, PREDICTIONS
 from tacpipe.tasks.touch.params import Touch
 from tacpipe.tasks.touch.report import predictions
 from tacpipe.tasks.touch.report.predictions import Predictions
-from tacpipe.tasks.touch.result_names import CONSTANT, NEAREST_IN_TIME, OBJECT_MEAN, PREDICTIONS
 
 if TYPE_CHECKING:
     from tacpipe.arrays import Floats

@@ -11,6 +11,7 @@ from tacpipe.report import blocks, charts
 from tacpipe.report.blocks import NONE, Block, Cell, Chart, Note, Table
 from tacpipe.report.charts import Dot
 from tacpipe.tasks.touch import headline as headlines
+from tacpipe.tasks.touch.headline import MODEL, OBJECT_MEAN
 from tacpipe.tasks.touch.report import predictions
 from tacpipe.tasks.touch.report.methods import (
     BASELINES,
@@ -23,7 +24,6 @@ from tacpipe.tasks.touch.report.methods import (
     predicted_targets,
 )
 from tacpipe.tasks.touch.report.predictions import Predictions, Score
-from tacpipe.tasks.touch.result_names import MODEL, OBJECT_MEAN
 
 HEADS: Mapping[object, tuple[float, float]] = {  # Table I
     "fc1": (0.02598, 0.00043),

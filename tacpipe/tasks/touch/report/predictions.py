@@ -14,7 +14,7 @@ from tacpipe.channels import biotac_sp
 from tacpipe.comparison.runs import Spread, spread
 from tacpipe.metrics import regression
 from tacpipe.metrics.intervals import Estimate
-from tacpipe.tasks.touch.result_names import CONSTANT, GRASPS, MODEL, TRUE
+from tacpipe.tasks.touch.headline import CONSTANT, GRASPS, MODEL, TRUE
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -17,9 +17,9 @@ from tacpipe.report import blocks, charts
 from tacpipe.report.blocks import NONE, Cell, Chart, Charts, Fold, fold, number, table
 from tacpipe.report.charts import Dot
 from tacpipe.tasks.touch import headline as headlines
+from tacpipe.tasks.touch.headline import CONSTANT, COVERAGE, MODEL, OBJECT_MEAN
 from tacpipe.tasks.touch.report import figures
 from tacpipe.tasks.touch.report.methods import FINGER_NAMES, describe_split, ordered_splits
-from tacpipe.tasks.touch.result_names import CONSTANT, COVERAGE, MODEL, OBJECT_MEAN
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -1,13 +1,41 @@
-"""List the files of a source that no recording is read from."""
+"""Check the names that a file gives to its parts, and list the files of a source that no recording is read from."""
 
 from __future__ import annotations
 
+import json
 import os
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from pathlib import Path
+from typing import Any, TypeVar
 
+from tacpipe.errors import UsageError
 from tacpipe.io import files as file_system
-from tacpipe.printable import listed
+from tacpipe.printable import listed, plain
+
+Part = TypeVar("Part")
+
+
+def by_name(parts: Iterable[tuple[str, Part]], path: Path, kind: str) -> dict[str, Part]:
+    """Return parts by their names. Raises `UsageError`, naming the file, where two of a ``kind`` have the same name.
+
+    >>> by_name([("a", 1), ("b", 2)], Path("x.npz"), "column")
+    {'a': 1, 'b': 2}
+    """
+    parts_by_name: dict[str, Part] = {}
+    for name, part in parts:
+        if name in parts_by_name:
+            raise UsageError(
+                f"{path} has more than one {kind} {plain(name)}. Only one of them could be kept: rename the others, or take "
+                f"them away."
+            )
+        parts_by_name[name] = part
+    return parts_by_name
+
+
+def json_value(text: str | bytes, path: Path) -> Any:
+    """Return a JSON value of a file. Raises `ValueError` or `RecursionError` where it is none, and as `by_name`."""
+    return json.loads(text, object_pairs_hook=lambda pairs: by_name(pairs, path, "entry"))
+
 
 EXAMPLES = 3  # paths named per group
 Reason = Callable[[str], str]  # maps a path within the source to the reason why it is not read, "" if it is

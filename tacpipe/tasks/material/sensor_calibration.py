@@ -17,7 +17,7 @@ from tacpipe.metrics import calibration, quantiles
 from tacpipe.models.class_distance import ClassDistance
 from tacpipe.models.tensors import under
 
-FILE = "known.safetensors"
+CALIBRATION_FILE = "known.safetensors"
 Rule = Literal["probability", "distance"]
 RULES: tuple[Rule, ...] = get_args(Rule)
 DISTANCE = "distance."  # begins the names of the tensors of `ClassDistance`
@@ -75,7 +75,7 @@ class ValidationSlides:
     labels: Ints  # (slide,), columns of ``scores``
 
 
-def fit(
+def fit_calibration(
     training: tuple[Float32s, Int64s], validation: ValidationSlides, classes: Ints, false_unknown: float
 ) -> tuple[SensorCalibration, dict[Rule, float]]:
     """Return the calibration of a sensor, and the area under the curve of each rule.
@@ -109,7 +109,7 @@ def fit(
     return SensorCalibration(temperature, rule, threshold, unset.distance), areas
 
 
-def packed(calibrations: Mapping[str, SensorCalibration]) -> bytes:
+def pack_calibrations(calibrations: Mapping[str, SensorCalibration]) -> bytes:
     """Return calibrations by sensor as a file."""
     tensors = {
         f"{name}.{key}": value
@@ -119,9 +119,9 @@ def packed(calibrations: Mapping[str, SensorCalibration]) -> bytes:
     return save({name: np.ascontiguousarray(value) for name, value in tensors.items()})
 
 
-def unpacked(content: bytes, sensors: Mapping[str, object]) -> dict[str, SensorCalibration]:
-    """Return the calibrations that `packed` wrote. Raises `TacpipeError` for another file."""
-    tensors = model_files.arrays(content, FILE)
+def unpack_calibrations(content: bytes, sensors: Mapping[str, object]) -> dict[str, SensorCalibration]:
+    """Return the calibrations that `pack_calibrations` wrote. Raises `TacpipeError` for another file."""
+    tensors = model_files.arrays(content, CALIBRATION_FILE)
     return {name: SensorCalibration.from_tensors(under(f"{name}.", tensors)) for name in sensors}
 
 

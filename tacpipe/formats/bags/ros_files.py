@@ -1,30 +1,185 @@
-"""Read the records of a ROS 1 bag (version 2.0) from the first byte on, without its index."""
+"""Read the records of ROS 1 bags and of ROS 2's SQLite files: topics with their definitions, raw messages, metadata.
+
+The readers of all three storages (MCAP, ROS 1 bags, SQLite) start at the first record, without its index, and yield the same
+types. A reader that stops early yields a `Damage` last.
+"""
 
 from __future__ import annotations
 
 import bz2
+import contextlib
 import io
+import shutil
+import sqlite3
 import struct
-from collections.abc import Iterator
+import tempfile
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple, TypeAlias
+from urllib.parse import quote
+
+import numpy as np
 
 from tacpipe.errors import TacpipeError
 from tacpipe.formats.bags import ros
-from tacpipe.formats.bags.storages import CUT_OFF, BrokenRecordError, Channel, Damage, LostChunk, Message, Record
 from tacpipe.io import memory, regular
 from tacpipe.printable import excerpt, plain
 
-MAGIC = b"#ROSBAG V2.0\n"
+CUT_OFF = "the file ends within a record: it was cut off, and what came after is missing"
+
+
+class BrokenRecordError(Exception):
+    """A record that cannot be read; the message is a clause with the reason."""
+
+
+@dataclass(frozen=True)
+class Channel:
+    """A source of messages of one topic with their type and encoding; a topic may have several channels."""
+
+    number: int  # identifies the channel in messages
+    topic: str
+    type: str  # name of the message type, of the schema
+    encoding: str  # encoding of messages: ros1, cdr, json, protobuf, …
+    schema_encoding: str  # encoding of the definition: ros1msg, ros2msg, ros2idl, jsonschema, protobuf, …
+    schema: bytes
+    metadata: Mapping[str, str] = field(default_factory=dict)
+
+
+class Message(NamedTuple):  # there are millions, and a dataclass takes three times as long to make
+    """A message as it was written."""
+
+    channel: int
+    log_ns: int
+    publish_ns: int
+    content: bytes
+
+
+@dataclass(frozen=True)
+class Metadata:
+    """Texts by name that the file states of itself."""
+
+    name: str
+    values: Mapping[str, str]
+
+
+@dataclass(frozen=True)
+class Damage:
+    """A sentence about the file with the reason why reading ended early, or with the part that was not read."""
+
+    text: str
+
+
+@dataclass
+class LostChunk:
+    """A chunk whose messages are left out, with what its header and its index state about them."""
+
+    problem: str  # completes the sentence "a chunk …"
+    first_ns: int = 0  # log times
+    last_ns: int = 0
+    count: int = 0  # 0: the file does not state it
+
+    def damage(self, path: Path) -> Damage:
+        """Return the note about it."""
+        interval = f" from {format_time(self.first_ns)} to {format_time(self.last_ns)}" if self.last_ns else ""
+        count = f"its {self.count:,} messages" if self.count else "its messages, an unknown number,"
+        return Damage(f"{path}: a chunk {self.problem}; {count}{interval} are left out.")
+
+
+def format_time(time_ns: int) -> str:
+    """Return a time since 1970 as a date, UTC.
+
+    >>> format_time(1_700_000_000_000_000_000), format_time(2**64 - 1)
+    ('2023-11-14T22:13:20.000', '18446744073709551615 ns')
+    """
+    if not 0 <= time_ns < 2**63:
+        return f"{time_ns} ns"
+    return str(np.datetime_as_string(np.datetime64(time_ns, "ns"), unit="ms"))
+
+
+Record: TypeAlias = Channel | Message | Metadata | Damage
+
+_ERRORS = (sqlite3.Error, UnicodeDecodeError)  # the second where a message of SQLite quotes damaged text
+SQLITE_MAGIC = b"SQLite format 3\0"
+
+
+def read_sqlite_records(path: Path) -> Iterator[Record]:
+    """Yield the records of a file in the order in which they were written. Raises `TacpipeError` where it is no bag."""
+    with regular.failing(path), regular.opened(path) as file:
+        magic = file.read(len(SQLITE_MAGIC))
+    if magic != SQLITE_MAGIC:
+        raise TacpipeError(f"{path} is not a SQLite file: it {'does not begin as one' if magic else 'is empty'}.")
+    with _connect(path) as connection:
+        try:
+            _expect_tables(path, connection)
+            yield from _read_channels(connection)
+        except _ERRORS as error:
+            raise TacpipeError(f"{path} is not a bag of ROS 2: {plain(str(error), 120)}.") from error
+        try:
+            for number, log_ns, content in connection.execute(
+                "SELECT topic_id, timestamp, data FROM messages ORDER BY id"
+            ):
+                if not (isinstance(number, int) and isinstance(log_ns, int) and isinstance(content, bytes)):
+                    yield Damage(f"{path} is damaged (a message has no time or no bytes): what came after is missing.")
+                    return
+                yield Message(number, log_ns, log_ns, content)
+        except _ERRORS as error:
+            yield Damage(f"{path} is damaged ({plain(str(error), 120)}): what came after is missing.")
+
+
+@contextlib.contextmanager
+def _connect(path: Path) -> Iterator[sqlite3.Connection]:
+    """Open a file without changing it; what was not yet moved from its log (-wal) is read from a copy."""
+    log = regular.inside(path.parent, f"{path.name}-wal")
+    with tempfile.TemporaryDirectory() if log.is_file() and log.stat().st_size else contextlib.nullcontext() as copies:
+        if copies is None:
+            address = f"file:{quote(str(path.absolute()))}?immutable=1"
+        else:
+            for source in (path, log):
+                shutil.copy(source, copies)
+            address = f"file:{quote(str(Path(copies, path.name)))}"
+        connection = sqlite3.connect(address, uri=True)
+        connection.text_factory = lambda content: content.decode(errors="replace")
+        try:
+            yield connection
+        finally:
+            connection.close()
+
+
+def _expect_tables(path: Path, connection: sqlite3.Connection) -> None:
+    """Raise `TacpipeError` where what holds topics or messages is no table: a view or a module runs queries of the file."""
+    definitions = dict(connection.execute("SELECT name, sql FROM sqlite_master WHERE type = 'table'"))
+    for name in ("topics", "messages"):
+        if not str(definitions.get(name, "")).upper().startswith("CREATE TABLE"):
+            raise TacpipeError(
+                f"{path} has no table {name}, which a bag of ROS 2 has; a view of this name is not read."
+            )
+
+
+def _read_channels(connection: sqlite3.Connection) -> Iterator[Record]:
+    definitions: dict[str, tuple[str, bytes]] = {}
+    tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+    if "message_definitions" in tables:
+        query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
+        definitions = {str(name): (str(kind), str(text).encode()) for name, kind, text in connection.execute(query)}
+    for number, topic, name, encoding in connection.execute("SELECT id, name, type, serialization_format FROM topics"):
+        kind, text = definitions.get(str(name), ("ros2msg", b""))
+        yield Channel(number, str(topic), ros.normalize_type_name(str(name)), str(encoding), kind, text)
+    if "schema" in tables:
+        for (distribution,) in connection.execute("SELECT ros_distro FROM schema"):
+            yield Metadata("rosbag2", {"ros_distro": str(distribution or "")})
+
+
+BAG_MAGIC = b"#ROSBAG V2.0\n"
 MESSAGE, BAG, INDEX, CHUNK, CONNECTION = 2, 3, 4, 5, 7
 MAX_HEADER_BYTES = 1 << 20
 
 
-def read_records(path: Path) -> Iterator[Record]:
+def read_bag_records(path: Path) -> Iterator[Record]:
     """Yield the records of a bag. Raises `TacpipeError` where it is not a bag of version 2.0."""
     with regular.failing(path), regular.opened(path) as file:
-        magic = file.read(len(MAGIC))
-        if magic != MAGIC:
+        magic = file.read(len(BAG_MAGIC))
+        if magic != BAG_MAGIC:
             version = magic.split(b"\n")[0]
             if magic.startswith(b"#ROSBAG"):
                 raise TacpipeError(
