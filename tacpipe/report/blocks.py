@@ -1,4 +1,4 @@
-"""What a page is made of: tables, charts, notes and folds, as data; `tacpipe.report.html` writes them."""
+"""The parts of a page as data: tables, charts, notes and folds; `tacpipe.report.html` writes them."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-TINY = 1e-12  # what rounding leaves of 0
+TINY = 1e-12  # a smaller number is a rounded 0
 NONE = "–"  # stands where there is no number
-Spec = Mapping[str, Any]  # of a chart, in Vega-Lite's grammar (`tacpipe.report.charts`)
+Spec = Mapping[str, Any]  # specification of a chart, in Vega-Lite's grammar (`tacpipe.report.charts`)
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Table:
     title: str
     heads: Sequence[str]
     groups: Sequence[Group]
-    words: bool = False  # whether cells are text, to the left
+    words: bool = False  # True: cells are text, to the left
 
     @property
     def rows(self) -> list[Row]:
@@ -94,7 +94,7 @@ Block = Table | Chart | Note | Charts | Fold
 class Section:
     """The part of the page that one task has: its first screen, then what is folded."""
 
-    name: str  # of the task
+    name: str  # name of the task
     title: str
     sentence: str
     verdict: str = ""

@@ -28,15 +28,15 @@ if TYPE_CHECKING:
 
 
 Tree = Mapping[str, Any]
-CALIBRATION = ("quantiles", "known")  # what `tacpipe calibrate` adds to a model's configuration
+CALIBRATION = ("quantiles", "known")  # parts of a model's configuration that `tacpipe calibrate` adds
 SHORTENED = "shortened"  # setting of a method on the recordings of a paper: `Result.epochs_of_paper`, if not empty
-GROWS = "trained_on"  # which names the recordings of the calibration too
+GROWS = "trained_on"  # a part that names the recordings of the calibration too
 
 
 class Result:
     """One result: a model trained once and evaluated once."""
 
-    STAGE: ClassVar[str] = ""  # that trained the model
+    STAGE: ClassVar[str] = ""  # stage that trained the model
     SETS: ClassVar[Collection[str]] = ()  # published sets whose paper's tables and figures are next to ours
 
     def __init__(self, dataset: Dataset) -> None:
@@ -44,7 +44,7 @@ class Result:
 
     @cached_property
     def config(self) -> Tree:
-        """What the model was trained and evaluated with."""
+        """The configuration of the model's training and evaluation."""
         return read_json(self.dataset, "config.json")
 
     @cached_property
@@ -54,13 +54,13 @@ class Result:
 
     @cached_property
     def history(self) -> Sequence[Tree]:
-        """What ``history.jsonl`` states, one line an epoch; empty where nothing was trained by epochs."""
+        """The lines of ``history.jsonl``, one per epoch; empty where nothing was trained by epochs."""
         lines = self.dataset.files.get("history.jsonl", b"").splitlines()
         return [json.loads(line) for line in lines if line.strip()]
 
     @cached_property
     def params(self) -> Tree:
-        """What the model was trained with, as far as it counts for its architecture."""
+        """The params of the training that count for the model's architecture."""
         return params_of.counting(registry.load(self.STAGE), self.given)
 
     @property
@@ -79,12 +79,12 @@ class Result:
 
     @property
     def simulated(self) -> bool:
-        """Whether any of its recordings was simulated."""
+        """True if any of its recordings was simulated."""
         return is_simulated(self.dataset)
 
     @property
     def published(self) -> bool:
-        """Whether its recordings are those of the task's paper."""
+        """True if its recordings are those of the task's paper."""
         return is_published(self.dataset, self.SETS)
 
 
@@ -175,7 +175,7 @@ def loss_chart(
         length = min(map(len, curves))
         mean = np.mean([curve[:length] for curve in curves], axis=0)
         lines.append(Line(name, range(1, length + 1), mean))
-    single = all(len(curve) < 2 for curves in runs.values() for curve in curves)  # of which no line can be seen
+    single = all(len(curve) < 2 for curves in runs.values() for curve in curves)  # a single value makes no line
     return charts.lines(lines, "epoch", quantity, order=order, log=log, points=single)
 
 
@@ -205,7 +205,7 @@ class Context:
     task: TaskReport
     methods: Sequence[Method]
     comparisons: Sequence[Comparison]
-    others: Sequence[Dataset] = ()  # that are not results
+    others: Sequence[Dataset] = ()  # datasets that are not results
     bare: Sequence[Dataset] = ()  # results that hold nothing to compare
     traces: int = 0  # recordings that are drawn in full
     runs: Sequence[Run] = field(default=())
@@ -220,12 +220,12 @@ class Context:
 
     @property
     def simulated(self) -> bool:
-        """Whether any run was evaluated on simulated recordings."""
+        """True if any run was evaluated on simulated recordings."""
         return any(run.simulated for run in self.runs)
 
     @property
     def published(self) -> bool:
-        """Whether all runs were evaluated on the recordings of the task's paper."""
+        """True if all runs were evaluated on the recordings of the task's paper."""
         return bool(self.runs) and all(run.published for run in self.runs)
 
     def winner(self, part: str) -> Method | None:

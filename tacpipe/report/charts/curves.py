@@ -55,7 +55,7 @@ def bars(values: Mapping[str, float], x: str, y: str, *, marked: int = 0, height
     }
 
 
-POINTS = 300  # of a line that are drawn
+POINTS = 300  # most points of a line that are drawn
 ROOM = 0.02  # beyond the ends of a diagonal, as a fraction of it
 
 
@@ -133,7 +133,7 @@ def _scales(values: Sequence[Spec], *, log: bool, floor: float | None, diagonal:
     if floor is not None:
         described = [row[key] for row in values for key in ("y", "low", "high") if row.get(key) is not None]
         up["domain"] = [max(floor, min([0.0, *described])), max([0.05, *described])]
-    if diagonal:  # what lies on its ends is drawn whole
+    if diagonal:  # points on its ends are drawn whole
         room = ROOM * (diagonal[1] - diagonal[0])
         up |= {"nice": False, "domain": [short(diagonal[0] - room), short(diagonal[1] + room)]}
         across["domain"] = up["domain"]

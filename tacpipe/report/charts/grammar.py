@@ -1,4 +1,4 @@
-"""What all charts share: their colours, legend, zoom and tips, and how numbers are written into a specification."""
+"""Parts that all charts share: their colours, legend, zoom and tips, and how numbers are written into a specification."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 Spec = dict[str, Any]
 COLOURS = tuple(f"var(--c{number})" for number in range(8))
 QUIET, INK, BETTER, WORSE = "var(--faint)", "var(--text)", "var(--c0)", "var(--c1)"
-DIGITS = 5  # of a number: more cannot be seen
+DIGITS = 5  # digits of a number: more cannot be seen
 FEW_STEPS = 12  # whole numbers on an axis, up to which each has a tick
 MARGIN = 8  # pixels between points and the ends of an axis, so that none is cut
 

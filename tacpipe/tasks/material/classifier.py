@@ -175,7 +175,7 @@ class Classifier:
             self.readers = self._readers(files[WEIGHTS], WEIGHTS)
         self.last = self._readers(files[LAST], LAST) if LAST in files else {}
         self.baselines = self._baselines(files) if BASELINES in files else {}
-        # By sensor; empty unless `tacpipe calibrate` wrote the model
+        # Sensor -> calibration; empty unless `tacpipe calibrate` wrote the model
         self.calibrations = (
             unpack_calibrations(files[CALIBRATION_FILE], self.layouts) if CALIBRATION_FILE in files else {}
         )

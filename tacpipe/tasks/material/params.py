@@ -52,7 +52,7 @@ class Material(ABC):
 
     ARCHITECTURES: ClassVar[str] = "material"  # the task, as entry points name it
     QUANTITIES: ClassVar[tuple[str, ...]] = ("tactile",)  # read where the param ``quantities`` is empty
-    ALIGNS_SENSORS: ClassVar[bool] = False  # whether networks can be aligned to the frozen one of the model of --init
+    ALIGNS_SENSORS: ClassVar[bool] = False  # True: networks can be aligned to the frozen one of the model of --init
     architecture: str = "minirocket"
     sensors: Names = ""  # sensors to learn for; empty for all
     # quantities to read; empty: tactile, and for minirocket and statistics also vibration (22 readings a frame)

@@ -29,7 +29,7 @@ def demo(output: Path) -> Demo:
     place = {name: str(output / name) for name in names}
     split = ["--split", place["slides-split"]]
     simulation = ["--trials", str(SLIDES), "--materials", str(MATERIALS)]
-    paper = ["--preset", "paper", "--epochs", "12", "--align-from", "4"]  # of the paper's 2,000 epochs
+    paper = ["--preset", "paper", "--epochs", "12", "--align-from", "4"]  # the paper has 2,000 epochs
     commands = [
         ["simulate", "material", *simulation, "-o", place["touched"]],
         ["segment", "slides", place["touched"], "-o", place["slides"]],

@@ -38,7 +38,7 @@ class TrainingSlides:
     training: BySensor
     validation: BySensor
     naming: Naming
-    workspace: Path  # where checkpoints of an interrupted training lie
+    workspace: Path  # folder of the checkpoints of an interrupted training
     init: Mapping[str, bytes] | None  # the files of the model of ``--init``
 
     def fit_rockets(self, params: Minirocket) -> dict[str, bytes]:
@@ -80,13 +80,13 @@ def train(
     only = CommaList().items(params.sensors)
     kinds = slides_of.quantities(params.quantities) or params.QUANTITIES
     naming = _naming(params.label, training, validation)
-    known = slides_of.read(training, only=only, quantities=kinds, naming=naming, labelled=True)
-    watched: BySensor = {}
+    training_slides = slides_of.read(training, only=only, quantities=kinds, naming=naming, labelled=True)
+    validation_slides: BySensor = {}
     if validation is not None and validation.recordings:
-        watched = slides_of.read(validation, only=only, quantities=kinds, naming=naming, labelled=True)
-    if not known:
+        validation_slides = slides_of.read(validation, only=only, quantities=kinds, naming=naming, labelled=True)
+    if not training_slides:
         raise TacpipeError("There is no training recording. Make a split with `tacpipe split` that has some.")
-    classes = sorted({int(one) for some in known.values() for one in some.materials})
+    classes = sorted({int(material) for slides in training_slides.values() for material in slides.materials})
     if len(classes) < 2:
         raise TacpipeError(
             f"All training slides are of {naming.key} {naming.name(classes[0])}; there is nothing to classify."
@@ -98,25 +98,29 @@ def train(
         "params": params_of.to_json(params),
         "split": params.run_label,
         "quantities": kinds,
-        "sensors": {name: some.layout.to_json() for name, some in known.items()},
+        "sensors": {name: slides.layout.to_json() for name, slides in training_slides.items()},
         "classes": classes,
         **naming.to_json(),
         **({"absent": absent} if absent else {}),
         "counts": {
-            role: {name: len(some) for name, some in part.items()}
-            for role, part in (("train", known), ("val", watched))
+            role: {name: len(slides) for name, slides in part.items()}
+            for role, part in (("train", training_slides), ("val", validation_slides))
         },
         "trained_on": trained_on.merge(
-            *(zip(some.names, some.digests, strict=True) for part in (known, watched) for some in part.values())
+            *(
+                zip(slides.names, slides.digests, strict=True)
+                for part in (training_slides, validation_slides)
+                for slides in part.values()
+            )
         ),
     }
-    return params.fit(TrainingSlides(config, known, watched, naming, workspace, init))
+    return params.fit(TrainingSlides(config, training_slides, validation_slides, naming, workspace, init))
 
 
 def _naming(key: str, *parts: Dataset | None) -> Naming:
     """Return the naming of the labels ``key`` of all recordings to learn from or to choose by."""
-    every = [shard for part in parts if part is not None for shard in part.recordings.values()]
-    return Naming.from_labels(key, (shard.attributes.get(key) for shard in every))
+    shards = [shard for part in parts if part is not None for shard in part.recordings.values()]
+    return Naming.from_labels(key, (shard.attributes.get(key) for shard in shards))
 
 
 def _check(params: Params, init: Mapping[str, bytes] | None) -> None:

@@ -31,7 +31,7 @@ class Baselines:
     t_ns: Times  # (grasp,)
 
     @classmethod
-    def of(cls, grasps: Grasps) -> Baselines:
+    def from_grasps(cls, grasps: Grasps) -> Baselines:
         """Return the baselines that training grasps give."""
         return cls(grasps.readings, grasps.objects, grasps.t_ns)
 
@@ -118,7 +118,7 @@ class Shrinkage:
         return cls(factor, {name: tensors[f"constant.{name}"].astype(np.float64) for name in targets})
 
 
-def fit(
+def fit_shrinkage(
     readings: Mapping[str, Floats],
     objects: Sequence[str],
     predict: Callable[[Bools], Mapping[str, Floats]],

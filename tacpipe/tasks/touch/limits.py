@@ -44,7 +44,7 @@ class Pairs:
     distance_mm: Floats  # (pair,): root of the mean of both contacts' squared displacement, in the camera's frame
 
     @classmethod
-    def of(cls, contacts_m: Floats, objects: Sequence[str]) -> Pairs:
+    def from_contacts(cls, contacts_m: Floats, objects: Sequence[str]) -> Pairs:
         """Return every pair; ``contacts_m`` are (grasp, finger, axis). Grasps without an object are in none."""
         first, second = np.triu_indices(len(objects), 1)
         names = np.asarray(objects)
@@ -123,7 +123,7 @@ def table(
     readings: Mapping[str, Floats], contacts_m: Floats, objects: Sequence[str]
 ) -> list[tuple[float, float, dict[str, Repeatability]]]:
     """Return `repeatability` by class of distance, each with its bounds in mm, and by target."""
-    pairs = Pairs.of(contacts_m, objects)
+    pairs = Pairs.from_contacts(contacts_m, objects)
     return [
         (low, high, {name: repeatability(values, objects, pairs, low, high) for name, values in readings.items()})
         for low, high in pairwise(EDGES_MM)

@@ -74,7 +74,7 @@ class Touch(ABC):
 
     @property
     def chooses_by_validation(self) -> bool:
-        """Whether validation grasps choose something: a network's epoch, or when its training ends."""
+        """True if validation grasps choose something: a network's epoch, or when its training ends."""
         return False
 
     @abstractmethod
@@ -130,7 +130,7 @@ class PointNetwork(Touch, ABC):
 
     @property
     def chooses_by_validation(self) -> bool:
-        """Whether validation grasps choose the epoch of a network, or when its training ends."""
+        """True if validation grasps choose the epoch of a network, or when its training ends."""
         return self.select == "best" or bool(self.patience)
 
     @abstractmethod

@@ -50,7 +50,7 @@ class TrainingGrasps:
     training: Grasps
     validation: Grasps | None
     targets: tuple[str, ...]
-    workspace: Path  # where checkpoints of an interrupted training lie
+    workspace: Path  # folder of the checkpoints of an interrupted training
 
     def grow_forests(self, params: Trees, model: FittedModel) -> None:
         """Add one forest per target to ``model`` and, in a tree-ensemble, one of all targets."""
@@ -63,7 +63,7 @@ class TrainingGrasps:
 
 @dataclass(frozen=True)
 class FittedModel:
-    """What an architecture's ``fit`` adds to: the stored parts of a model."""
+    """The stored parts of a model, to which an architecture's ``fit`` adds."""
 
     config: Config  # holds ``members``, one description for each member
     tensors: dict[str, Tensor] = field(default_factory=dict)
@@ -87,27 +87,27 @@ def train(
     Whatever is fitted is fitted on training grasps alone, and on those of ``validation`` too where ``use_validation`` is
     set and nothing is chosen by them. Raises `TacpipeError` where grasps lack what is to be read or predicted.
     """
-    asked = CommaList().items(params.targets)
-    targets = tuple(target for target in biotac_sp.TARGETS if target in asked)  # in one order whatever was asked for
-    known = grasps_of.read(training)
-    if not len(known):
+    requested = CommaList().items(params.targets)
+    targets = tuple(target for target in biotac_sp.TARGETS if target in requested)  # always in one order
+    training_grasps = grasps_of.read(training)
+    if not len(training_grasps):
         raise TacpipeError("There is no training recording. Make a split with `tacpipe split` that has some.")
-    watched = grasps_of.read(validation) if validation is not None and validation.recordings else None
-    if watched is not None and params.use_validation and not params.chooses_by_validation:
-        known, watched = known.joined(watched), None
-    model = FittedModel(_config(params, targets, known, watched))
-    params.fit(TrainingGrasps(known, watched, targets, workspace), model)
+    validation_grasps = grasps_of.read(validation) if validation is not None and validation.recordings else None
+    if validation_grasps is not None and params.use_validation and not params.chooses_by_validation:
+        training_grasps, validation_grasps = training_grasps.joined(validation_grasps), None
+    model = FittedModel(_config(params, targets, training_grasps, validation_grasps))
+    params.fit(TrainingGrasps(training_grasps, validation_grasps, targets, workspace), model)
     config = model.config
     files = {WEIGHTS: save_tensors(model.tensors)}
     if model.history:
         files[HISTORY] = "".join(json.dumps(line) + "\n" for line in model.history).encode()
     if params.baselines:
-        config["learned_objects"] = list(known.objects)
-        files[BASELINES] = save_arrays(Baselines.of(known).tensors())
+        config["learned_objects"] = list(training_grasps.objects)
+        files[BASELINES] = save_arrays(Baselines.from_grasps(training_grasps).tensors())
     return {CONFIG: model_files.to_json(config), **files}
 
 
-def _config(params: Params, targets: Sequence[str], known: Grasps, watched: Grasps | None) -> Config:
+def _config(params: Params, targets: Sequence[str], training: Grasps, validation: Grasps | None) -> Config:
     """Return the model's configuration before anything is learned."""
     stored = params_of.to_json(params)
     return {
@@ -116,10 +116,10 @@ def _config(params: Params, targets: Sequence[str], known: Grasps, watched: Gras
         "params": stored,
         "split": params.run_label,
         "targets": list(targets),
-        "objects": sorted(set(known.objects) - {""}),
-        "counts": {"train": len(known), "val": len(watched) if watched else 0},
+        "objects": sorted(set(training.objects) - {""}),
+        "counts": {"train": len(training), "val": len(validation) if validation else 0},
         "trained_on": trained_on.merge(
-            *(zip(grasps.names, grasps.digests, strict=True) for grasps in (known, watched) if grasps)
+            *(zip(grasps.names, grasps.digests, strict=True) for grasps in (training, validation) if grasps)
         ),
         "members": [],
         "parameters": None,
@@ -131,47 +131,49 @@ def _grow_forests(params: Trees, grasps: TrainingGrasps, model: FittedModel) -> 
 
     Each has the leaves of the least out-of-bag error.
     """
-    known, targets = grasps.training, grasps.targets
+    training, targets = grasps.training, grasps.targets
     coloured = members.coloured(params)
     if coloured:
-        require_colours(known.names, known.clouds)
-    rows, names = geometry.table(known.clouds, known.grasps, coloured=coloured, placed=params.place)
-    readings = {target: known.readings[target] for target in targets}
+        require_colours(training.names, training.clouds)
+    rows, names = geometry.table(training.clouds, training.grasps, coloured=coloured, placed=params.place)
+    readings = {target: training.readings[target] for target in targets}
     groups: list[tuple[str, ...]] = [(target,) for target in targets]
     if params.architecture == "tree-ensemble" and len(targets) > 1:
         groups.append(tuple(targets))
     forests, leaves = _forests(params, rows, readings, groups)
-    about: dict[str, Any] = {"kind": FOREST, "targets": list(targets), "groups": [*map(list, groups)]}
-    about |= {"features": list(names), "coloured": coloured, "placed": params.place, "leaves": leaves}
-    kept: dict[str, Tensor] = {}
+    description: dict[str, Any] = {"kind": FOREST, "targets": list(targets), "groups": [*map(list, groups)]}
+    description |= {"features": list(names), "coloured": coloured, "placed": params.place, "leaves": leaves}
+    forest_tensors: dict[str, Tensor] = {}
     for number, (_, forest) in enumerate(forests):
-        kept |= {f"{number}.{name}": tensor for name, tensor in forest.tensors().items()}
-    model.add_member(about, kept)
+        forest_tensors |= {f"{number}.{name}": tensor for name, tensor in forest.tensors().items()}
+    model.add_member(description, forest_tensors)
     if params.shrink_novel:
 
-        def predict(among: Bools) -> dict[str, Floats]:
-            own = {target: values[among] for target, values in readings.items()}
-            found, _ = _forests(params, rows[among], own, groups)
-            return members.averaged((group, forest.predict(rows[~among])) for group, forest in found)
+        def predict(in_training: Bools) -> dict[str, Floats]:
+            training_readings = {target: values[in_training] for target, values in readings.items()}
+            grown, _ = _forests(params, rows[in_training], training_readings, groups)
+            return members.averaged((group, forest.predict(rows[~in_training])) for group, forest in grown)
 
-        shrunk = baselines.fit(readings, known.objects, predict)
+        shrunk = baselines.fit_shrinkage(readings, training.objects, predict)
         model.config["kept_of_novel"] = dict(shrunk.factor)
-        model.tensors.update({f"{SHRINKAGE}{name}": torch.from_numpy(one) for name, one in shrunk.tensors().items()})
+        model.tensors.update(
+            {f"{SHRINKAGE}{name}": torch.from_numpy(array) for name, array in shrunk.tensors().items()}
+        )
 
 
 def _forests(
     params: Trees, rows: Floats, readings: Mapping[str, Floats], groups: Sequence[tuple[str, ...]]
 ) -> tuple[list[tuple[tuple[str, ...], Forest]], list[int]]:
     """Return the forest of each group of targets, which predicts their values side by side, and the sizes of leaves."""
-    found, leaves = [], []
+    forests, leaves = [], []
     for group in groups:
         values = np.concatenate([readings[target] for target in group], axis=1)
         unit = members.units(values, group)
         leaf = params.leaf or _leaf(rows, values / unit, params)
         forest = Forest.fitted(rows, values / unit, trees=params.trees, leaf=leaf, seed=params.seed)
-        found.append((group, forest.times(unit)))
+        forests.append((group, forest.times(unit)))
         leaves.append(leaf)
-    return found, leaves
+    return forests, leaves
 
 
 def _leaf(rows: Floats, values: Floats, params: Trees) -> int:
@@ -185,25 +187,25 @@ def _leaf(rows: Floats, values: Floats, params: Trees) -> int:
 
 def _train_networks(params: NetworkParams, grasps: TrainingGrasps, model: FittedModel) -> None:
     """Add networks to ``model``: one for all targets or one for each, and as many of each as ``networks`` is."""
-    known, watched, targets = grasps.training, grasps.validation, grasps.targets
-    if watched is None and params.chooses_by_validation:
+    training, validation, targets = grasps.training, grasps.validation, grasps.targets
+    if validation is None and params.chooses_by_validation:
         raise TacpipeError(
             "No recording has the role val, and select best and patience choose a network's epoch by these. Make a split "
             "with some, or train with --select last --patience 0."
         )
     device = devices.kind()
-    learned = (members.sources(params, known), known)
-    followed = (members.sources(params, watched), watched) if watched else learned  # without any, what was learned
+    training_sources = (members.sources(params, training), training)
+    validation_sources = (members.sources(params, validation), validation) if validation else training_sources
     parameters = 0
     groups = [tuple(targets)] if params.multi_target else [(target,) for target in targets]
     for at, group in enumerate(groups):
-        scale = _scale(known, group, params.loss)
-        work = _work(params, scale, (learned, followed), group, device)
+        scale = _scale(training, group, params.loss)
+        work = _work(params, scale, (training_sources, validation_sources), group, device)
         for number in range(params.networks):
             place = grasps.workspace / f"{'-'.join(group)}-{number}"
             schedule = loop.Schedule.from_params(params, params.seed + 1000 * number)
             build = functools.partial(_built, params, group, device)
-            whose = {"target": "all" if params.multi_target else group[0], "network": number}
+            labels = {"target": "all" if params.multi_target else group[0], "network": number}
             trained = loop.train(
                 build,
                 work,
@@ -212,7 +214,7 @@ def _train_networks(params: NetworkParams, grasps: TrainingGrasps, model: Fitted
                 weight_decay=params.weight_decay,
                 number=at * params.networks + number + 1,
                 count=len(groups) * params.networks,
-                labels=whose,
+                labels=labels,
             )
             kept = trained.weights if params.select == "best" else trained.last
             parameters += _weights_learned(params, group)
@@ -222,7 +224,7 @@ def _train_networks(params: NetworkParams, grasps: TrainingGrasps, model: Fitted
                 f"scale.{name}": torch.from_numpy(np.asarray(value)) for name, value in scale.to_tensors().items()
             }
             model.add_member(about, named)
-            model.history.extend({**line, **whose} for line in trained.history)
+            model.history.extend({**line, **labels} for line in trained.history)
     model.config["parameters"] = parameters
 
 
@@ -231,8 +233,8 @@ def _work(
 ) -> TouchWork:
     """Return what a network of some targets learns; of ``parts`` the first is learned from and the second watched."""
     training, watched = (
-        ScaledGrasps(drawn, torch.from_numpy(scale.apply(_side_by_side(some, group))).to(device))
-        for drawn, some in parts
+        ScaledGrasps(drawn, torch.from_numpy(scale.apply(_side_by_side(grasps, group))).to(device))
+        for drawn, grasps in parts
     )
     return TouchWork(training, watched, params.batch, params.loss, _weights(group).to(device))
 
@@ -247,14 +249,14 @@ def _weights_learned(params: NetworkParams, targets: Sequence[str]) -> int:
         return sum(weight.numel() for weight in members.network(params, targets).parameters())
 
 
-def _side_by_side(some: Grasps, group: Sequence[str]) -> Floats:
-    return np.concatenate([some.readings[target] for target in group], axis=1)
+def _side_by_side(grasps: Grasps, group: Sequence[str]) -> Floats:
+    return np.concatenate([grasps.readings[target] for target in group], axis=1)
 
 
-def _scale(known: Grasps, group: Sequence[str], loss: str) -> Affine:
+def _scale(training: Grasps, group: Sequence[str], loss: str) -> Affine:
     """Return the scale of a network's output: the letter's ranges for its loss, else mean and spread of each value."""
     if loss != "rmse":
-        return Affine.fit(_side_by_side(known, group), "standard")
+        return Affine.fit(_side_by_side(training, group), "standard")
     ranges = np.concatenate([[biotac_sp.RANGES[target]] * biotac_sp.width(target) for target in group])
     return Affine(ranges[:, 0], ranges[:, 1] - ranges[:, 0])
 

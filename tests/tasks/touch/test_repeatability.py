@@ -21,10 +21,10 @@ ALL_MM = (0.0, math.inf)
 def test_pairs_are_of_one_object_and_as_far_apart_as_both_contacts_moved() -> None:
     contacts_m = np.zeros((4, 2, 3))
     contacts_m[1] = [[0.003, 0, 0], [0, 0.004, 0]]  # mm: 3 and 4
-    pairs = Pairs.of(contacts_m, ["cup", "cup", "bowl", ""])
+    pairs = Pairs.from_contacts(contacts_m, ["cup", "cup", "bowl", ""])
     assert (pairs.first.tolist(), pairs.second.tolist()) == ([0], [1])
     np.testing.assert_allclose(pairs.distance_mm, [np.sqrt((9 + 16) / 2)])
-    assert not len(Pairs.of(contacts_m, ["", "", "", ""]).first)
+    assert not len(Pairs.from_contacts(contacts_m, ["", "", "", ""]).first)
 
 
 def test_variances_are_those_of_numpy_and_of_repeated_grasps_where_some_count_twice() -> None:
@@ -46,7 +46,7 @@ def noisy(noise: float, count: int = 400) -> tuple[np.ndarray, list[str], Pairs]
     objects = ["cup" if number % 4 < 2 else "bowl" for number in range(count)]
     contacts_m = np.repeat(place[:, None], 2, axis=1) * np.array([1.0, 0, 0])
     level = np.array([[10.0] if name == "cup" else [0.0] for name in objects])
-    return level + 3 * place + noise * rng.normal(size=(count, 1)), objects, Pairs.of(contacts_m, objects)
+    return level + 3 * place + noise * rng.normal(size=(count, 1)), objects, Pairs.from_contacts(contacts_m, objects)
 
 
 def test_equal_grasps_imply_the_skill_of_who_knows_all_but_the_noise() -> None:
@@ -72,7 +72,7 @@ def test_near_pairs_of_a_steady_object_do_not_raise_the_skill_of_others() -> Non
     values = rng.normal(size=(80, 1)) * np.repeat([1.0, 20.0], 40)[:, None]
     contacts_m = np.zeros((80, 2, 3))
     contacts_m[40:, :, 0] = np.arange(40)[:, None]  # only grasps of the steady one are near each other
-    found = repeatability(values, objects, Pairs.of(contacts_m, objects), 0, 6)
+    found = repeatability(values, objects, Pairs.from_contacts(contacts_m, objects), 0, 6)
     assert found.pairs == 40 * 39 // 2
     assert found.pair_skill.high < 0.1
 

@@ -31,7 +31,7 @@ def beyond(truth: Floats, fraction: float) -> Callable[[Bools], Mapping[str, Flo
 )
 def test_what_is_kept_is_what_makes_the_predictions_for_left_out_objects_right(fraction: float, kept: float) -> None:
     truth = np.random.default_rng(0).normal(size=(30, 1))
-    found = baselines.fit({"pdc_th": truth}, OBJECTS, beyond(truth, fraction))
+    found = baselines.fit_shrinkage({"pdc_th": truth}, OBJECTS, beyond(truth, fraction))
     assert found.factor["pdc_th"] == pytest.approx(kept)
     np.testing.assert_allclose(found.constant["pdc_th"], truth.mean(axis=0))
 
@@ -43,13 +43,13 @@ def test_no_model_of_an_object_sees_its_grasps() -> None:
         seen.append(set(np.asarray(OBJECTS)[known]))
         return {"pdc_th": np.zeros((int((~known).sum()), 1))}
 
-    baselines.fit({"pdc_th": np.ones((30, 1))}, OBJECTS, predict)
+    baselines.fit_shrinkage({"pdc_th": np.ones((30, 1))}, OBJECTS, predict)
     assert seen == [{"jar", "tin"}, {"cup", "tin"}, {"cup", "jar"}]
 
 
 def test_too_few_objects_are_refused() -> None:
     with pytest.raises(UsageError):
-        baselines.fit({"pdc_th": np.ones((20, 1))}, OBJECTS[:20], beyond(np.ones((20, 1)), 1))
+        baselines.fit_shrinkage({"pdc_th": np.ones((20, 1))}, OBJECTS[:20], beyond(np.ones((20, 1)), 1))
 
 
 def test_grasps_of_novel_objects_alone_are_shrunk(tmp_path: Path) -> None:

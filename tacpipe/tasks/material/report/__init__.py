@@ -100,7 +100,7 @@ def columns(context: Context, comparison: Comparison) -> list[tuple[str, Callabl
         return row.method.of(comparison.question)
 
     def named_right(row: Row) -> Cell:
-        counted = row.predictor != headline.CHANCE  # which names none
+        counted = row.predictor != headline.CHANCE  # chance names no material
         return scores.accuracy_cell(scores.accuracy(runs_of(row), sensor, row.predictor) if counted else None)
 
     def last(row: Row) -> Cell:

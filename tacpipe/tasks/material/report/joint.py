@@ -57,8 +57,8 @@ PRINTED_BASIS = (
 
 
 ALIKE = 2.0  # latents of permuted pairs are as close as real ones up to this factor
-APART = 0.2  # of accuracy: where exchanging classifiers costs more, there is no alignment to explain
-LOSS = 0.05  # of accuracy, that exchanging classifiers may cost more than with real pairs
+APART = 0.2  # loss of accuracy by exchanged classifiers, from which on there is no alignment to explain
+LOSS = 0.05  # accuracy that exchanged classifiers may lose beyond those of real pairs
 NO_CONTROL = (
     "No run with permuted materials is among the results, so whether labels alone drive the alignment was not tested."
 )
@@ -320,10 +320,10 @@ class HeldOut:
 
     name: str
     kind: str
-    main: bool  # whether nothing else sets them apart
+    main: bool  # True: nothing else sets them apart
     sensor: str
-    trees: tuple[Tree, ...]  # what metrics report on the held-out materials, one a run
-    materials: int  # held out by any run
+    trees: tuple[Tree, ...]  # metrics on the held-out materials, one per run
+    materials: int  # number of materials that any run held out
 
 
 def zero_shot_folds(methods: Sequence[Method]) -> list[Fold]:

@@ -50,8 +50,8 @@ _CLOSED = {  # all that has an effect on what is fitted in closed form
     "statistics": ("use_validation", "labels"),
     "spectra": ("speeds", "use_validation", "labels", "hold_out"),
 }
-_RAECS = ("decoder", "unpool", "reconstruction_weight", "latents")  # of no effect on X-LSTM
-_PAIRS = ("alignment_weight", "align_from", "alignment_loss")  # of no effect where sensors learn alone
+_RAECS = ("decoder", "unpool", "reconstruction_weight", "latents")  # params without effect on X-LSTM
+_PAIRS = ("alignment_weight", "align_from", "alignment_loss")  # params without effect where sensors learn alone
 _SAME = 0.75  # training slides in this ratio are as many: folds differ in size, some learn from validation slides too
 
 
@@ -63,7 +63,7 @@ class Result(context.Result):
 
     @cached_property
     def predictions(self) -> Predictions:
-        """What was predicted of each slide that the model has not seen."""
+        """The predictions for each slide that the model has not seen."""
         return predictions.read_predictions(self.dataset.recordings["predictions"].table(), self.config)
 
     @property

@@ -1,4 +1,4 @@
-"""What a result's model and baselines stated of each slide that the model has not seen."""
+"""The predictions of a result's model and baselines for each slide that the model has not seen."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 MODEL, LEVEL, SWAPPED, LAST = "model", "mean_level", "swapped", "last_epoch"
 SHUFFLED = "permuted_labels"
-LEVEL_ONLY, LEVEL_REMOVED = "level_only", "level_removed"  # of the architecture statistics
+LEVEL_ONLY, LEVEL_REMOVED = "level_only", "level_removed"  # baselines of the architecture statistics
 PREDICTORS = (MODEL, LEVEL, LEVEL_ONLY, LEVEL_REMOVED, SHUFFLED, SWAPPED, LAST)
 NOTHING = -1  # stands where a predictor stated nothing of a slide
 
@@ -32,9 +32,9 @@ class Predictions:
     recordings: NDArray[np.str_]  # (slide,)
     sensors: NDArray[np.str_]  # (slide,)
     materials: Int64s  # (slide,), the truth
-    predicted: Mapping[str, Int64s]  # by predictor, (slide,)
+    predicted: Mapping[str, Int64s]  # predictor -> (slide,)
     latents: AnyFloats | None  # (slide, latent); None where the model has none
-    naming: Naming = NUMBERS  # of materials
+    naming: Naming = NUMBERS  # names of the materials
     sessions: NDArray[np.str_] | None = None  # (slide,), empty where none is named; None in results that report on none
 
     def of(self, sensor: str) -> Predictions:
@@ -53,7 +53,7 @@ class Predictions:
 
     @property
     def one_session_each(self) -> bool:
-        """Whether all slides of a material that a sensor measured are of one session, so that both cannot be
+        """True if all slides of a material that a sensor measured are of one session, so that both cannot be
         distinguished."""
         if self.sessions is None or not len(self.sessions) or (self.sessions == "").any():
             return False

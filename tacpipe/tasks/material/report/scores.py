@@ -75,7 +75,7 @@ def slides_named_right(runs: Sequence[Run], sensor: str, predictor: str = MODEL)
 
 @dataclass(frozen=True)
 class Difference:
-    """What the first method has over the second on the slides that both were evaluated on."""
+    """The difference of two methods on the slides that both were evaluated on."""
 
     slides: int
     gain: Gain  # percentage points
@@ -86,7 +86,7 @@ class Difference:
 
     @property
     def word(self) -> str:
-        """Whether the first is ``better`` or ``worse``, or that is ``unclear``."""
+        """``better`` or ``worse`` for the first method, or ``unclear``."""
         return "better" if self.gain.low > 0 else "worse" if self.gain.high < 0 else "unclear"
 
 

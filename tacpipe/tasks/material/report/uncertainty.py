@@ -1,4 +1,4 @@
-"""What the page states of calibrated classifiers: whether probabilities are frequencies, and the answer ``unknown``."""
+"""The section on calibrated classifiers: whether probabilities are frequencies, and the answer ``unknown``."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     import pandas as pd
 
 ANSWERS = "answers.csv"
-UNKNOWN = "unknown"  # of the answers
+UNKNOWN = "unknown"  # the answer for a slide like no material
 FEWEST = 20  # answers of a bin of stated probabilities
-RATES = np.linspace(0, 1, 101)  # of known slides that are answered unknown, at which curves are averaged over runs
+RATES = np.linspace(0, 1, 101)  # rates of known slides answered unknown, at which curves are averaged over runs
 RELIABLE = (
     "Right against stated, in bins of as many slides each: on the thin line probabilities are frequencies. As trained: in "
     "bins of the same width. Shaded: 95 % (Wilson) over slides, each counted once."
@@ -97,7 +97,7 @@ def read_answers(method: Method, sensor: str) -> pd.DataFrame | None:
         read = read[(read.sensor == sensor) & ~read.seen]
         rows = run.details.predictions.of(sensor)
         truth = dict(zip(rows.recordings.tolist(), map(str, rows.named(rows.materials).tolist()), strict=True))
-        counted = read.recording.isin(truth) | ~read.known  # of known materials those that count elsewhere too
+        counted = read.recording.isin(truth) | ~read.known  # slides of known materials count as elsewhere on the page
         read = read[counted].assign(run=number_of, refused=read.answer == UNKNOWN)
         parts.append(read.assign(right=read.named == read.recording.map(truth)))
     return pd.concat(parts) if parts else None

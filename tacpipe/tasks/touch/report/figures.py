@@ -72,7 +72,7 @@ def _pressure_chart(method: Method, target: str) -> Chart:
 
 
 FINGERS = ("e_th", "e_mf")
-PLACES = {"median": 0.5, "best decile": 0.1, "worst decile": 0.9}  # by error, of the grasps that are drawn
+PLACES = {"median": 0.5, "best decile": 0.1, "worst decile": 0.9}  # drawn grasps, ordered by error
 FINGERTIPS = (
     "Fingertips are seen on the pad, the skin rolled out flat, the tip up. R² is about the mean of these grasps: 1 is "
     "perfect (blue), 0 as good as that mean, below 0 worse (orange). A contact lies on a few electrodes: a mean over 24 "
@@ -88,7 +88,7 @@ class Chosen:
     """A grasp that is drawn, and why."""
 
     place: str
-    row: int  # among the grasps that were chosen from
+    row: int  # row among all grasps that could be drawn
     recording: str
     error: float  # RMSE over the electrodes of both fingers, fraction of the range
 
@@ -183,9 +183,9 @@ def draw_fingertips(rows: Sequence[dict[str, object]]) -> charts.Spec:
 
 CLOUD, GRASP = "cloud", "grasp"
 MOST_CLOUDS = 3
-NEAR_MM = 10.0  # of a grasp point: about where a fingertip of 6.7 mm radius lies
-POINTS = 700  # of a cloud that are drawn
-VIEWS = {"from the camera": 0, "from the side": 2}  # which coordinate runs across; down is y in both
+NEAR_MM = 10.0  # distance to a grasp point: about where a fingertip of 6.7 mm radius lies
+POINTS = 700  # points of a cloud that are drawn
+VIEWS = {"from the camera": 0, "from the side": 2}  # coordinate that runs across; down is y in both
 CLOUD_COLOURS = (
     "Blue points lie near the first contact, orange ones near the second. What the camera did not see is not in the cloud, "
     "though a finger may touch it."

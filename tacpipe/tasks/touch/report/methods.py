@@ -43,7 +43,7 @@ class Result(context.Result):
 
     @cached_property
     def predictions(self) -> Predictions:
-        """What was predicted of each grasp that the model has not seen."""
+        """The predictions for each grasp that the model has not seen."""
         return predictions.read_predictions(self.dataset.recordings[PREDICTIONS])
 
     @property
@@ -190,7 +190,7 @@ def _usual_settings(alike: Sequence[tuple[Tree, int]]) -> list[tuple[str, Any]]:
     return usual
 
 
-EPOCHS, BATCH, LEARNING_RATE = 250, 10, 0.01  # in all tables of the paper; Figure 8 has 1,000 epochs
+EPOCHS, BATCH, LEARNING_RATE = 250, 10, 0.01  # values of all tables of the paper; Figure 8 has 1,000 epochs
 FINGER_NAMES = {"e_th": "thumb", "e_mf": "middle finger"}
 BASELINES = {  # rows that every table has
     CONSTANT: "constant: the mean of training",
@@ -201,7 +201,7 @@ RECORDED = (
     "{same} of {all} evaluated grasps follow one of the same object in time, so errors on known objects rest on when they "
     "were recorded as well: the mean of the grasps nearest in time, whatever their object, states how much."
 )
-IN_A_ROW = 0.75  # of successive grasps: from here on, objects were not taken by turns
+IN_A_ROW = 0.75  # fraction of successive grasps: from here on, objects were not taken by turns
 
 
 def caution(methods: Sequence[Method]) -> str:

@@ -83,7 +83,7 @@ SCALES = (
 )
 
 
-ROWS = ("RMSE over runs", "counts", "R²", "skill", "grasps", "runs")  # of a table in the paper's form
+ROWS = ("RMSE over runs", "counts", "R²", "skill", "grasps", "runs")  # rows of a table in the paper's form
 
 
 def tables_by_object(methods: Sequence[Method]) -> list[Table]:
@@ -118,7 +118,7 @@ def baseline_rows(methods: Sequence[Method], target: str, known_objects: bool | 
         holding = [
             runs for runs in runs_by_method.values() if any(target in run.predicted.get(predictor, ()) for run in runs)
         ]
-        most_runs = max(holding, key=len, default=[])  # of the runs of one method, because a split has the same for all
+        most_runs = max(holding, key=len, default=[])  # runs of one method: a split has the same for all
         rows.append((baseline_name(predictor), predictions.score(most_runs, target, known_objects, predictor)))
     return rows
 
@@ -156,20 +156,20 @@ def _object_cells(runs: Sequence[Predictions], target: str, known_objects: bool)
     return [Cell(blocks.fixed(scored.rmse, 4), below, scored.rmse), blocks.signed(scored.skill.mean)]
 
 
-TARGET = "pdc_th"  # on which the paper compares settings
+TARGET = "pdc_th"  # target on which the paper compares settings
 
 
 @dataclass(frozen=True)
 class Form:
     """A table of the paper: which setting varies, its values, and what was printed."""
 
-    number: str  # of the table or figure in the paper
+    number: str  # number of the table or figure in the paper
     title: str
     setting: str
-    names: Mapping[object, str]  # what a row is called, by the setting's value
+    names: Mapping[object, str]  # name of a row, by the setting's value
     printed: Mapping[object, tuple[float, float]] = field(default_factory=dict)  # mean and sd of the RMSE
     printed_s: Mapping[object, int] = field(default_factory=dict)  # seconds per epoch
-    drawn: bool = False  # whether the paper has a figure and no table
+    drawn: bool = False  # True: the paper has a figure and no table
     also: tuple[str, ...] = ()  # settings that only some of the values have
 
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Recording
 
 
-Touch = Mapping[str, Floats]  # by target, (grasp, value), device counts
+Touch = Mapping[str, Floats]  # target -> (grasp, value), device counts
 
 UNNAMED = "unnamed"  # an object of which no recording states the name
 
@@ -35,7 +35,7 @@ class Predictions:
     objects: NDArray[np.str_]  # (grasp,)
     known: Bools  # (grasp,), whether the model was trained on other grasps of the object
     true: Touch
-    predicted: Mapping[str, Touch]  # by predictor
+    predicted: Mapping[str, Touch]  # predictor -> predictions
     t_ns: Times | None = None  # (grasp,)
 
     @property
@@ -48,7 +48,7 @@ class Predictions:
 
     @property
     def targets(self) -> tuple[str, ...]:
-        """What the model predicts, in the order of tables."""
+        """The targets that the model predicts, in the order of tables."""
         return tuple(name for name in biotac_sp.TARGETS if name in self.true and name in self.predicted[MODEL])
 
     def of(self, known_objects: bool | None) -> Predictions:
@@ -92,11 +92,11 @@ def _read_targets(table: pa.Table) -> Touch:
 
 @dataclass(frozen=True)
 class Score:
-    """What one predictor does on one target; errors are fractions of the target's range (`biotac_sp.RANGES`)."""
+    """The errors of one predictor on one target; errors are fractions of the target's range (`biotac_sp.RANGES`)."""
 
     target: str
     rmse: float  # global, over the grasps of all runs
-    each: Spread  # of the RMSE of single runs
+    each: Spread  # spread of the RMSE of single runs
     batch_mean: float  # mean over runs of the mean RMSE of batches
     mae: float
     r2: float
@@ -122,7 +122,7 @@ def to_counts(target: str, fraction: float) -> float:
 
 
 class _Rows(NamedTuple):
-    """What a run reports on a target."""
+    """The rows that a run reports on a target."""
 
     true: AnyFloats  # (grasp, value), normalised
     predicted: AnyFloats  # (grasp, value)

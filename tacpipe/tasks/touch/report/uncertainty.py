@@ -1,4 +1,4 @@
-"""What the page states of quantiles of predicted touch: coverage, by target and electrode, of known and novel objects."""
+"""The section on quantiles of predicted touch: coverage, by target and electrode, of known and novel objects."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Band:
     """A predictor's band on one target."""
 
     values: int
-    coverage: tuple[float, float, float]  # with its 95 % interval
+    coverage: tuple[float, float, float]  # mean and the ends of its 95 % interval
     width: float  # counts
     pinball: float  # counts
     gain: tuple[float, float, float]  # 1 - pinball / pinball of the constant, with its 95 % interval
