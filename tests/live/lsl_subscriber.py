@@ -26,8 +26,11 @@ def forecast() -> tuple[Any, list[Any]]:
 
 def material() -> tuple[Any, list[Any]]:
     names = ("cork", "felt")
-    several = [None, *(np.array([seq / 10, 1 - seq / 10], np.float32) for seq in range(1, COUNT))]
-    messages = [MaterialMessage(seq, seq, names, one, SLIDING, 10 * seq, seq / 10) for seq, one in enumerate(several)]
+    probabilities = [None, *(np.array([seq / 10, 1 - seq / 10], np.float32) for seq in range(1, COUNT))]
+    messages = [
+        MaterialMessage(seq, seq, names, values, SLIDING, 10 * seq, seq / 10)
+        for seq, values in enumerate(probabilities)
+    ]
     return MaterialDescription(names, "biotac", 100, True, "order", 10.0, "models/material"), messages
 
 
@@ -36,8 +39,8 @@ def main(kind: str, name: str) -> None:
 
     about, messages = {"forecast": forecast, "material": material}[kind]()
     publisher: Any = publishing.publisher(f"lsl:{name}", about)
-    (found,) = pylsl.resolve_byprop("name", name, 1, SOON_S)
-    inlet = pylsl.StreamInlet(found, recover=False)
+    (stream_info,) = pylsl.resolve_byprop("name", name, 1, SOON_S)
+    inlet = pylsl.StreamInlet(stream_info, recover=False)
     info = inlet.info(SOON_S)
     inlet.open_stream(SOON_S)
     labels, units = [], []

@@ -76,16 +76,17 @@ class Persistence:
 
     def advance(self, t_ns: int, *, newest_only: bool = False) -> list[Forecast]:
         """Return a forecast for each grid point, on request for the newest alone."""
-        found = []
+        forecasts = []
         self._passed_ns = max(self._passed_ns, t_ns)
         while self._next_ns is not None and self._next_ns <= t_ns:
-            found.append(self._at(self._next_ns))
+            forecasts.append(self._at(self._next_ns))
             self._next_ns += PERIOD_NS
         if newest_only:
-            found[:-1] = [
-                replace(one, count=None, quantiles=None, cause=one.cause | Cause.SKIPPED) for one in found[:-1]
+            forecasts[:-1] = [
+                replace(forecast, count=None, quantiles=None, cause=forecast.cause | Cause.SKIPPED)
+                for forecast in forecasts[:-1]
             ]
-        return found
+        return forecasts
 
     def _at(self, point_ns: int) -> Forecast:
         while len(self._samples) > 1 and self._samples[1][0] <= point_ns:
@@ -119,34 +120,36 @@ class FakeModel:
 
 def engine(options: SessionOptions) -> ForecastEngine:
     """Return an engine of this chain, with alarms that are never on."""
-    own = options.settings.task
-    assert isinstance(own, ForwardSettings)
+    forward_settings = options.settings.task
+    assert isinstance(forward_settings, ForwardSettings)
     rig = rigs.parse(options.rig)
     layout = axes(Persistence.layout)
     levels = {"load": tuple(1e9 for _ in layout), "slip": (1e9,)}
     sensors = {name: rig.streams[name].sensor for name in options.streams}
-    opened = functools.partial(Persistence, quantiles=own.quantiles)
+    opened = functools.partial(Persistence, quantiles=forward_settings.quantiles)
     alarms = Alarms(layout, levels, 1.0, (1.0,))
-    found = ForecastEngine(sensors, opened, lambda _: alarms, own.steps or None, quantiles=own.quantiles)
+    forecast_engine = ForecastEngine(
+        sensors, opened, lambda _: alarms, forward_settings.steps or None, quantiles=forward_settings.quantiles
+    )
     behaviour, _, value = os.environ.get("BEHAVIOUR", "").partition(":")
     if behaviour:
-        _behave(found, behaviour, value)
-    return found
+        _behave(forecast_engine, behaviour, value)
+    return forecast_engine
 
 
-def _behave(found: ForecastEngine, behaviour: str, value: str) -> None:
-    step, made = found.step, [0]
+def _behave(forecast_engine: ForecastEngine, behaviour: str, value: str) -> None:
+    step, count = forecast_engine.step, [0]
 
-    def other(now_ns: int) -> Any:
+    def step_and_behave(now_ns: int) -> Any:
         messages = step(now_ns)
-        made[0] += len(messages)
+        count[0] += len(messages)
         if behaviour == "slow" and messages:
             time.sleep(float(value))
-        if behaviour == "die" and made[0] >= int(value):
+        if behaviour == "die" and count[0] >= int(value):
             os._exit(9)
         return messages
 
-    found.step = other  # type: ignore[method-assign]
+    forecast_engine.step = step_and_behave  # type: ignore[method-assign]
 
 
 def main() -> None:

@@ -22,7 +22,9 @@ from tests.stage_params import fitting
 
 T0 = 1_700_000_000_000_000_000
 MS = 1_000_000
-ASKED = CalibrationRequest((5, 10, 50, 90, 95), promise=False, false_unknown=0.05, seed=0)  # of a calibration
+ASKED = CalibrationRequest(
+    (5, 10, 50, 90, 95), promise=False, false_unknown=0.05, seed=0
+)  # the defaults of `tacpipe calibrate`
 # Four epochs of small batches: with fewer steps the weight of the forecast is 0, and every forecast is persistence.
 SMALL = {"architecture": "gru", "hidden": 8, "epochs": 4, "batch": 16, "context": 4, "horizon": 3}
 Made = tuple[Mapping[str, bytes], Sequence[Mapping[str, Any]]]
@@ -55,23 +57,23 @@ def recording(seed: int, seconds: float = 3.0, gap_ms: float = 0.0, *, wraps: bo
     return FakeRecording(streams, f"trial-{seed:03d}")
 
 
-def stage(name: str, given: Any, **values: Any) -> FakeShard:
+def stage(name: str, recording: Any, **values: Any) -> FakeShard:
     """A recording after a map stage."""
-    made = registry.load(name)(registry.load(name).params(**values), given)
-    assert isinstance(made, RecordingOutput)
-    return FakeShard(given.name, made.streams[""], {**given.attributes, **made.attributes})
+    output = registry.load(name)(registry.load(name).params(**values), recording)
+    assert isinstance(output, RecordingOutput)
+    return FakeShard(recording.name, output.streams[""], {**recording.attributes, **output.attributes})
 
 
-def segmented(given: FakeRecording, **values: Any) -> FakeShard:
+def segmented(recording: FakeRecording, **values: Any) -> FakeShard:
     """A recording after `synchronize` and `segment contacts`."""
-    return stage("segment.contacts", stage("synchronize", given, **values))
+    return stage("segment.contacts", stage("synchronize", recording, **values))
 
 
 def step(name: str, **values: Any) -> Mapping[str, Any]:
     """A link of a chain as manifests have it."""
-    found = registry.load(name)
-    params = params_of.to_json(found.params(**values))
-    return {"stage": name, "version": found.version, "params": params, "fitted": None}
+    loaded_stage = registry.load(name)
+    params = params_of.to_json(loaded_stage.params(**values))
+    return {"stage": name, "version": loaded_stage.version, "params": params, "fitted": None}
 
 
 def model(
@@ -85,11 +87,11 @@ def model(
     parts = [dataset(*shards[:2]), *map(dataset, shards[2:])]
     if codec == "pca":
         compress = registry.load("compress.pca")
-        asked = compress.params(components=3, representation=representation)
+        compression = compress.params(components=3, representation=representation)
         assert compress.fit is not None
-        files = dict(compress.fit(asked, parts[0]).files)
-        made = [FakeShard(one.name, compress(asked, one, files), one.attributes) for one in shards]
-        parts = [dataset(*made[:2], files=files), *(dataset(shard, files=files) for shard in made[2:])]
+        files = dict(compress.fit(compression, parts[0]).files)
+        compressed = [FakeShard(shard.name, compress(compression, shard, files), shard.attributes) for shard in shards]
+        parts = [dataset(*compressed[:2], files=files), *(dataset(shard, files=files) for shard in compressed[2:])]
         steps.append(step("compress.pca", components=3, representation=representation))
     trained = {name: value for name, value in values.items() if name not in names}
     params = fitting("train.forward", {**SMALL, **trained})
@@ -97,42 +99,46 @@ def model(
     return (forward_calibration.calibrate(files, ASKED, parts[0], parts[2]) if calibrated else files), steps
 
 
-def chain(made: Made, given: FakeRecording, quantiles: Sequence[int] = ()) -> Chain:
+def chain(files_and_steps: Made, recording: FakeRecording, quantiles: Sequence[int] = ()) -> Chain:
     """The chain of a model, for the streams of a recording."""
-    return Chain.for_model(*made, {name: table.schema for name, table in given.tables.items()}, quantiles=quantiles)
+    return Chain.for_model(
+        *files_and_steps, {name: table.schema for name, table in recording.tables.items()}, quantiles=quantiles
+    )
 
 
-def whole(made: Made, given: FakeRecording, quantiles: Sequence[int] = ()) -> list[Forecast]:
+def all_forecasts(files_and_steps: Made, recording: FakeRecording, quantiles: Sequence[int] = ()) -> list[Forecast]:
     """The forecasts of a recording that is given whole."""
-    fed = chain(made, given, quantiles)
-    for name, table in given.tables.items():
+    fed = chain(files_and_steps, recording, quantiles)
+    for name, table in recording.tables.items():
         fed.push(name, table)
-    return fed.advance(max(int(table["t_ns"][-1].as_py()) for table in given.tables.values()))
+    return fed.advance(max(int(table["t_ns"][-1].as_py()) for table in recording.tables.values()))
 
 
-def pieces(given: FakeRecording, cuts_ns: Sequence[int], order: Sequence[str]) -> Iterator[tuple[str, pa.Table, int]]:
+def pieces(
+    recording: FakeRecording, cuts_ns: Sequence[int], order: Sequence[str]
+) -> Iterator[tuple[str, pa.Table, int]]:
     """Yield stream, table and end of the pieces between times, those of one time in an ``order`` of streams."""
-    last = max(int(table["t_ns"][-1].as_py()) for table in given.tables.values())
+    last = max(int(table["t_ns"][-1].as_py()) for table in recording.tables.values())
     before = 0
     for cut in [*sorted({cut for cut in cuts_ns if cut < last}), last]:
         for name in order:
-            t_ns = given.tables[name]["t_ns"].to_numpy()
+            t_ns = recording.tables[name]["t_ns"].to_numpy()
             first, stop = np.searchsorted(t_ns, [before, cut], side="right").tolist()
-            yield name, given.tables[name].slice(first, stop - first), cut
+            yield name, recording.tables[name].slice(first, stop - first), cut
         before = cut
 
 
 def until(table: pa.Table, t_ns: int) -> pa.Array:
-    """Which rows of a stream had arrived by a time."""
+    """Return which rows of a stream had arrived by a time."""
     return pa.array(table["t_ns"].to_numpy() <= t_ns)
 
 
-def more(found: pa.Schema) -> pa.Schema:
+def with_another_taxel(schema_fields: pa.Schema) -> pa.Schema:
     """The schema of a uSkin with another taxel."""
-    return found.append(schema.uskin_fields(3)[6])
+    return schema_fields.append(schema.uskin_fields(3)[6])
 
 
-def unit(found: pa.Schema, wanted: str) -> pa.Schema:
+def with_unit(stream_schema: pa.Schema, unit_name: str) -> pa.Schema:
     """The schema of a stream whose first channel is in another unit."""
-    field = found.field(1)
-    return found.set(1, field.with_metadata({**field.metadata, b"unit": wanted.encode()}))
+    field = stream_schema.field(1)
+    return stream_schema.set(1, field.with_metadata({**field.metadata, b"unit": unit_name.encode()}))

@@ -19,7 +19,7 @@ import numpy as np
 from tests.conftest import Lab
 from tests.recording import live
 
-MODULES = (b"tacpipe.live.process", b"tests.live.persistent")  # that a model's process runs
+MODULES = (b"tacpipe.live.process", b"tests.live.persistent")  # modules that a model's process runs
 
 # commands that train a small forecaster, models/f, on simulated recordings
 TRAINED = (
@@ -30,7 +30,7 @@ TRAINED = (
     "train forward data/c --split data/split -o models/f --architecture gru --hidden 4 --epochs 1 --context 3 --horizon 2",
 )
 
-# and another that gives it quantiles, models/g
+# The command that gives it quantiles: models/g
 CALIBRATED = "calibrate models/f data/c --split data/split -o models/g"
 
 
@@ -64,7 +64,7 @@ def model_process(session: subprocess.Popen[str]) -> int:
             words = (folder / "cmdline").read_bytes()
         except (OSError, ValueError):
             continue
-        if parent == session.pid and any(one in words for one in MODULES):
+        if parent == session.pid and any(module in words for module in MODULES):
             return int(folder.name)
     raise AssertionError("the session has no process of a model")
 
@@ -75,14 +75,14 @@ def ended(process: subprocess.Popen[str], *, interrupt: bool = False) -> dict[st
         process.send_signal(signal.SIGINT)
     out, err = process.communicate()
     assert process.returncode == 0, err
-    found: dict[str, Any] = json.loads(out)
-    return found
+    printed: dict[str, Any] = json.loads(out)
+    return printed
 
 
 @contextmanager
 def subscriber() -> Iterator[tuple[int, list[dict[str, Any]]]]:
     """Yield the port of a subscriber, and the messages that it got so far."""
-    found: list[dict[str, Any]] = []
+    messages: list[dict[str, Any]] = []
     over = threading.Event()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as port:
         port.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 8 << 20)
@@ -92,21 +92,21 @@ def subscriber() -> Iterator[tuple[int, list[dict[str, Any]]]]:
         def listen() -> None:
             while not over.is_set():
                 try:
-                    found.append(json.loads(port.recv(1 << 16)))
+                    messages.append(json.loads(port.recv(1 << 16)))
                 except TimeoutError:
                     continue
 
         listening = threading.Thread(target=listen)
         listening.start()
         try:
-            yield port.getsockname()[1], found
+            yield port.getsockname()[1], messages
         finally:
             over.set()
             listening.join()
 
 
 def forecasts(messages: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    return [one for one in messages if one["kind"] == "forecast" and one["values"] is not None]
+    return [message for message in messages if message["kind"] == "forecast" and message["values"] is not None]
 
 
 def whole(shard: Any, name: str) -> bool:

@@ -29,8 +29,8 @@ def states(levels: Mapping[str, tuple[float, ...]], change: list[float], pressed
     now = np.tile([0.0, 0.0, pressed], 2)
     ahead = np.repeat(now[None], HORIZON, axis=0)
     ahead[-1] += np.tile(change, 2)
-    found = Alarms(axes(LAYOUT), levels, floors=FLOORS).states(ahead, now, LAYOUT)
-    return {name: state.state for name, state in found.items()}
+    alarm_states = Alarms(axes(LAYOUT), levels, floors=FLOORS).states(ahead, now, LAYOUT)
+    return {name: state.state for name, state in alarm_states.items()}
 
 
 def test_an_alarm_is_on_where_its_score_is_beyond_its_level() -> None:
@@ -38,15 +38,15 @@ def test_an_alarm_is_on_where_its_score_is_beyond_its_level() -> None:
     assert states(levels, [0, 0, 0]) == {LOAD: OFF, SLIP: OFF}
     assert states(levels, [0, -5, 0]) == {LOAD: ON, SLIP: ON}  # 5 over the floor of 10
     assert states(levels, [0, -5, 0], pressed=20.0) == {LOAD: ON, SLIP: OFF}  # 5 over 20 that press
-    assert states(levels, [0, 0, 9]) == {LOAD: ON, SLIP: OFF}  # what presses on the skin is not slip
+    assert states(levels, [0, 0, 9]) == {LOAD: ON, SLIP: OFF}  # pressing on the skin is not slip
 
 
 def test_a_score_is_in_multiples_of_its_level() -> None:
     now, ahead = np.zeros(6), np.zeros((HORIZON, 6))
     ahead[3, [0, 3]] = 6.0  # a rise of 6 and a fall of 6, over the floor of 10
-    found = Alarms(axes(LAYOUT), {LOAD: (4.0, 4.0, 8.0), SLIP: (0.4,)}, floors=FLOORS).states(ahead, now, LAYOUT)
-    assert found[SLIP].score == pytest.approx(3.0)
-    assert found[LOAD].score == 0.0  # the last step is as it is now
+    alarm_states = Alarms(axes(LAYOUT), {LOAD: (4.0, 4.0, 8.0), SLIP: (0.4,)}, floors=FLOORS).states(ahead, now, LAYOUT)
+    assert alarm_states[SLIP].score == pytest.approx(3.0)
+    assert alarm_states[LOAD].score == 0.0  # the last step is as it is now
 
 
 def test_an_alarm_without_a_level_or_with_values_that_are_not_numbers_is_unknown() -> None:
@@ -58,10 +58,10 @@ def test_an_alarm_without_a_level_or_with_values_that_are_not_numbers_is_unknown
 
 def added(truth: Floats, ahead: Floats, slips: Bools | None, shear: Floats | None = None) -> tuple[Loads, SlipAlarms]:
     """Return one recording with its loads (time, 3), what a model predicts of them, and its scores for slips (time,)."""
-    several = Loads(LAYOUT, HORIZON, [truth], [np.zeros(len(truth), np.int64)], {MODEL: [ahead]}, [1 / RATE_HZ])
+    loads = Loads(LAYOUT, HORIZON, [truth], [np.zeros(len(truth), np.int64)], {MODEL: [ahead]}, [1 / RATE_HZ])
     t_ns = np.arange(len(truth), dtype=np.int64) * round(1e9 / RATE_HZ)
     scores = {} if shear is None else {MODEL: shear}
-    return several, SlipAlarms(LAYOUT, np.array(FLOORS), HORIZON, [Rows(t_ns, slips, scores)])
+    return loads, SlipAlarms(LAYOUT, np.array(FLOORS), HORIZON, [Rows(t_ns, slips, scores)])
 
 
 def steady(seed: int, rows: int = 20_000) -> tuple[Floats, Floats]:
@@ -83,21 +83,23 @@ def false_alarms(beyond: Bools) -> int:
 def test_levels_give_no_more_false_alarms_than_were_allowed_on_what_they_were_set_on(per_hour: float) -> None:
     truth, ahead = steady(0)
     shear = np.abs(ahead - truth).max(axis=1)
-    found = alarms.set_on(*added(truth, ahead, None, shear), MODEL, per_hour)
+    fitted = alarms.set_on(*added(truth, ahead, None, shear), MODEL, per_hour)
     hours = len(truth) / RATE_HZ / 3600
-    moved: Bools = np.any(np.abs(ahead - truth) > np.array(found.levels[LOAD]), axis=1)
-    for beyond in (moved, shear > found.levels[SLIP][0]):
+    moved: Bools = np.any(np.abs(ahead - truth) > np.array(fitted.levels[LOAD]), axis=1)
+    for beyond in (moved, shear > fitted.levels[SLIP][0]):
         count = false_alarms(beyond)
         assert count / hours <= per_hour
-        assert count / hours > per_hour / 20 or per_hour < 600  # and they are not so high that there is never one
+        assert count / hours > per_hour / 20 or per_hour < 600  # levels are not so high that there is never one
 
 
 def test_fewer_allowed_alarms_set_higher_levels() -> None:
     truth, ahead = steady(1)
     shear = np.abs(ahead - truth).max(axis=1)
-    few, many = (alarms.set_on(*added(truth, ahead, None, shear), MODEL, per_hour) for per_hour in (30.0, 3000.0))
+    strict, frequent = (
+        alarms.set_on(*added(truth, ahead, None, shear), MODEL, per_hour) for per_hour in (30.0, 3000.0)
+    )
     for name in NAMES:
-        assert all(low < high for low, high in zip(many.levels[name], few.levels[name], strict=True))
+        assert all(low < high for low, high in zip(frequent.levels[name], strict.levels[name], strict=True))
 
 
 def test_rows_before_a_slip_set_no_level_of_slip() -> None:
@@ -113,10 +115,10 @@ def test_rows_before_a_slip_set_no_level_of_slip() -> None:
 
 def test_levels_are_written_and_read_again_and_an_older_score_for_slips_is_left_out() -> None:
     truth, ahead = steady(3)
-    found = alarms.set_on(*added(truth, ahead, None), MODEL, 60)
-    assert math.isinf(found.levels[SLIP][0])  # nothing was predicted of slips
-    stored = json.loads(json.dumps(found.to_json()))
-    assert stored["levels"][SLIP] == [None] and Alarms.from_json(stored) == found
+    fitted = alarms.set_on(*added(truth, ahead, None), MODEL, 60)
+    assert math.isinf(fitted.levels[SLIP][0])  # nothing was predicted of slips
+    stored = json.loads(json.dumps(fitted.to_json()))
+    assert stored["levels"][SLIP] == [None] and Alarms.from_json(stored) == fitted
     older = {"axes": stored["axes"], "levels": {LOAD: [4.0, 4.0, 8.0], SLIP: [4.0, 4.0, None]}, "per_hour": 60}
     read = Alarms.from_json(older)
     assert read.levels == {LOAD: (4.0, 4.0, 8.0), SLIP: (math.inf,)}

@@ -45,7 +45,7 @@ KINDS |= {
 }
 QUANTILES = {kind: (10, 95) for kind, values in KINDS.items() if "calibrated" in values}
 UNIFORM: dict[str, Any] = {"rate_hz": 50.0}
-ROWS: dict[str, dict[str, Any]] = {"logged": {}, "fresh": {}}  # at the stamps of the master
+ROWS: dict[str, dict[str, Any]] = {"logged": {}, "fresh": {}}  # rows at the stamps of the master
 GAPS = ("t_ns", "xela1_gap", "xela2_gap", "robot_gap")
 GIVEN = rigs.recording(20, gap_ms=200.0)
 
@@ -58,14 +58,17 @@ def models(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Made]:
     }
 
 
-def same(found: Sequence[Forecast], wanted: Sequence[Forecast]) -> bool:
-    """Whether forecasts are equal to the last bit."""
+def same(forecasts: Sequence[Forecast], expected: Sequence[Forecast]) -> bool:
+    """Return whether forecasts are equal to the last bit."""
 
-    def content(one: Forecast) -> tuple[Any, ...]:
-        arrays = (None if values is None else values.tobytes() for values in (one.count, one.now, one.quantiles))
-        return (one.t_ns, one.made_from_t_ns, *arrays, one.cause, one.gaps)
+    def content(forecast: Forecast) -> tuple[Any, ...]:
+        arrays = (
+            None if values is None else values.tobytes()
+            for values in (forecast.count, forecast.now, forecast.quantiles)
+        )
+        return (forecast.t_ns, forecast.made_from_t_ns, *arrays, forecast.cause, forecast.gaps)
 
-    return [content(one) for one in found] == [content(one) for one in wanted]
+    return [content(forecast) for forecast in forecasts] == [content(forecast) for forecast in expected]
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -75,20 +78,20 @@ def same(found: Sequence[Forecast], wanted: Sequence[Forecast]) -> bool:
 def test_any_cut_of_a_recording_gives_the_same_forecasts_to_the_last_bit(
     kind: str, models: dict[str, Made], data: st.DataObject
 ) -> None:
-    asked = QUANTILES.get(kind, ())
-    wanted = rigs.whole(models[kind], GIVEN, asked)
-    assert sum(one.count is not None for one in wanted) > 30
-    assert all((one.quantiles is None) == (one.count is None or not asked) for one in wanted)
+    levels = QUANTILES.get(kind, ())
+    expected = rigs.all_forecasts(models[kind], GIVEN, levels)
+    assert sum(forecast.count is not None for forecast in expected) > 30
+    assert all((forecast.quantiles is None) == (forecast.count is None or not levels) for forecast in expected)
     cuts = data.draw(st.lists(st.integers(T0 - 10 * MS, T0 + 3000 * MS), max_size=30))
     order = data.draw(st.permutations(sorted(GIVEN.tables)))
     chunk = data.draw(st.sampled_from([1, 7, 1000]))
-    fed, found = rigs.chain(models[kind], GIVEN, asked), []
+    fed, forecasts = rigs.chain(models[kind], GIVEN, levels), []
     for name, table, end in rigs.pieces(GIVEN, cuts, order):
         for batch in table.to_batches(max_chunksize=chunk):
             fed.push(name, batch)
         if name == order[-1]:
-            found += fed.advance(end)
-    assert same(found, wanted)
+            forecasts += fed.advance(end)
+    assert same(forecasts, expected)
     assert not any(fed.late.values())
 
 
@@ -108,30 +111,30 @@ def offline(kind: str, forecaster: Forecaster) -> Any:
 
 @pytest.mark.parametrize("kind", ["raw", "latents", "increments", "logged", "fresh", "ensemble"])
 def test_forecasts_are_those_of_the_stages_of_the_whole_recording(kind: str, models: dict[str, Made]) -> None:
-    made = models[kind]
-    forecaster = Forecaster.load(made[0])
-    whole = offline(kind, forecaster)
-    track = tracks.track(whole, forecaster.codec, forecaster.pose)
-    by_time = {one.t_ns: one for one in rigs.whole(made, GIVEN)}
-    known = sorted(t_ns for t_ns, one in by_time.items() if one.now is not None)
-    assert known == track.t_ns[-len(known) :].tolist()
+    model = models[kind]
+    forecaster = Forecaster.load(model[0])
+    offline_rows = offline(kind, forecaster)
+    track = tracks.track(offline_rows, forecaster.codec, forecaster.pose)
+    by_time = {forecast.t_ns: forecast for forecast in rigs.all_forecasts(model, GIVEN)}
+    known_ns = sorted(t_ns for t_ns, forecast in by_time.items() if forecast.now is not None)
+    assert known_ns == track.t_ns[-len(known_ns) :].tolist()
     for row, t_ns in enumerate(track.t_ns.tolist()):
-        one = by_time[t_ns]
-        if one.now is not None:
-            assert one.now.tobytes() == track.tactile[row].astype(np.float32).tobytes()
-            assert bool(one.cause & (Cause.GAP | Cause.VALUE)) != bool(track.usable[row])
+        forecast = by_time[t_ns]
+        if forecast.now is not None:
+            assert forecast.now.tobytes() == track.tactile[row].astype(np.float32).tobytes()
+            assert bool(forecast.cause & (Cause.GAP | Cause.VALUE)) != bool(track.usable[row])
     starts = track.starts(forecaster.context, forecaster.horizon)
     compared = 0
-    for some in forecasts(forecaster, track, starts):
-        for row, count in zip(some.now, some.count, strict=True):
-            one = by_time[int(track.t_ns[row])]
-            if one.cause is Cause.START:
+    for batch in forecasts(forecaster, track, starts):
+        for row, count in zip(batch.now, batch.count, strict=True):
+            forecast = by_time[int(track.t_ns[row])]
+            if forecast.cause is Cause.START:
                 continue
-            assert one.count is not None
-            np.testing.assert_allclose(one.count, count, rtol=1e-5, atol=1e-4 * np.abs(count).max())
+            assert forecast.count is not None
+            np.testing.assert_allclose(forecast.count, count, rtol=1e-5, atol=1e-4 * np.abs(count).max())
             compared += 1
     assert compared > 30
-    assert all((one.count is None) == bool(one.cause & BLOCKING) for one in by_time.values())
+    assert all((forecast.count is None) == bool(forecast.cause & BLOCKING) for forecast in by_time.values())
 
 
 @pytest.mark.parametrize("kind", ["latents with quantiles", "ensemble with quantiles"])
@@ -139,15 +142,15 @@ def test_quantiles_are_those_of_the_stages_of_the_whole_recording(kind: str, mod
     forecaster = Forecaster.load(models[kind][0])
     recordings = dataset(offline(kind, forecaster), files=forecaster.codec_files)
     table = prediction.tables(forecaster, recordings, [1, 3], QUANTILES[kind])[GIVEN.name]
-    by_time = {one.t_ns: one for one in rigs.whole(models[kind], GIVEN, QUANTILES[kind])}
+    by_time = {forecast.t_ns: forecast for forecast in rigs.all_forecasts(models[kind], GIVEN, QUANTILES[kind])}
     rows = [row for row, t_ns in enumerate(table["t_ns"].to_pylist()) if by_time[t_ns].quantiles is not None]
     assert len(rows) > 30
-    found = [by_time[table["t_ns"][row].as_py()].quantiles for row in rows]
+    live_quantiles = [by_time[table["t_ns"][row].as_py()].quantiles for row in rows]
     for channel, name in enumerate(forecaster.codec.channels):
         for step, at, percent in ((1, 0, 10), (1, 1, 95), (3, 0, 10), (3, 1, 95)):
-            wanted = table[f"{name}_t{step}_q{percent}"].to_numpy()[rows]
-            own = [one[step - 1, channel, at] for one in found if one is not None]
-            np.testing.assert_allclose(own, wanted, rtol=1e-4, atol=0.05)
+            expected = table[f"{name}_t{step}_q{percent}"].to_numpy()[rows]
+            published = [values[step - 1, channel, at] for values in live_quantiles if values is not None]
+            np.testing.assert_allclose(published, expected, rtol=1e-4, atol=0.05)
 
 
 def test_quantiles_that_a_model_does_not_have_are_refused(models: dict[str, Made]) -> None:
@@ -158,43 +161,43 @@ def test_quantiles_that_a_model_does_not_have_are_refused(models: dict[str, Made
 
 
 def test_what_comes_later_changes_no_forecast(models: dict[str, Made]) -> None:
-    wanted = rigs.whole(models["planned"], GIVEN)
+    expected = rigs.all_forecasts(models["planned"], GIVEN)
     half_ns = T0 + 1500 * MS
     cut = {name: table.filter(rigs.until(table, half_ns)) for name, table in GIVEN.tables.items()}
     fed = rigs.chain(models["planned"], GIVEN)
     for name, table in cut.items():
         fed.push(name, table)
-    found = fed.advance(half_ns)
-    assert len(found) > 60 and same(found, wanted[: len(found)])
+    forecasts = fed.advance(half_ns)
+    assert len(forecasts) > 60 and same(forecasts, expected[: len(forecasts)])
 
 
 def test_a_stream_that_is_silent_ends_forecasts_with_its_name_and_they_come_back(models: dict[str, Made]) -> None:
-    every = rigs.whole(models["raw"], GIVEN)
-    found = [one for one in every if one.now is not None and one.t_ns < T0 + 2500 * MS]
-    silent = [one for one in found if one.cause & Cause.GAP]
-    assert {one.gaps for one in silent} == {("xela2",)} and all(one.count is None for one in silent)
+    all_forecasts = rigs.all_forecasts(models["raw"], GIVEN)
+    forecasts = [forecast for forecast in all_forecasts if forecast.now is not None and forecast.t_ns < T0 + 2500 * MS]
+    silent = [forecast for forecast in forecasts if forecast.cause & Cause.GAP]
+    assert {forecast.gaps for forecast in silent} == {("xela2",)} and all(forecast.count is None for forecast in silent)
     table = GIVEN.tables["xela2"]["t_ns"].to_numpy()
     before_ns = int(table[np.diff(table).argmax()])
     assert silent[0].t_ns - before_ns <= (50 + 20) * MS  # a gap is 50 ms, a period 20
-    after = [one for one in found if one.t_ns > silent[-1].t_ns]
-    assert [one.cause for one in after[:4]] == [Cause.CONTEXT] * 3 + [Cause.NONE]
+    after = [forecast for forecast in forecasts if forecast.t_ns > silent[-1].t_ns]
+    assert [forecast.cause for forecast in after[:4]] == [Cause.CONTEXT] * 3 + [Cause.NONE]
 
 
 def test_under_overload_the_newest_grid_point_alone_is_predicted_and_the_others_stay_context(
     models: dict[str, Made],
 ) -> None:
-    wanted = {one.t_ns: one for one in rigs.whole(models["raw"], GIVEN)}
-    fed, found = rigs.chain(models["raw"], GIVEN), []
+    expected = {forecast.t_ns: forecast for forecast in rigs.all_forecasts(models["raw"], GIVEN)}
+    fed, forecasts = rigs.chain(models["raw"], GIVEN), []
     cuts = [T0 + ms * MS for ms in range(0, 3000, 70)]
     for name, table, end in rigs.pieces(GIVEN, cuts, sorted(GIVEN.tables)):
         fed.push(name, table)
         if name == max(GIVEN.tables):
-            found += fed.advance(end, newest_only=True)
-    predicted = [one for one in found if one.count is not None]
-    skipped = [one for one in found if one.cause is Cause.SKIPPED]
+            forecasts += fed.advance(end, newest_only=True)
+    predicted = [forecast for forecast in forecasts if forecast.count is not None]
+    skipped = [forecast for forecast in forecasts if forecast.cause is Cause.SKIPPED]
     assert len(skipped) > len(predicted) > 20
-    assert same(predicted, [wanted[one.t_ns] for one in predicted])
-    assert all(wanted[one.t_ns].count is not None for one in skipped)
+    assert same(predicted, [expected[forecast.t_ns] for forecast in predicted])
+    assert all(expected[forecast.t_ns].count is not None for forecast in skipped)
 
 
 def test_samples_that_come_after_their_grid_point_are_counted_and_read_from_then_on(models: dict[str, Made]) -> None:
@@ -203,18 +206,18 @@ def test_samples_that_come_after_their_grid_point_are_counted_and_read_from_then
     for name, table in GIVEN.tables.items():
         fed.push(name, table.filter(rigs.until(table, at_ns - (100 * MS if name == "xela1" else 0))))
     fed.advance(at_ns)
-    rest = GIVEN.tables["xela1"]
-    late = rest.filter(rigs.until(rest, at_ns)).slice(rest.filter(rigs.until(rest, at_ns - 100 * MS)).num_rows)
+    xela1 = GIVEN.tables["xela1"]
+    late = xela1.filter(rigs.until(xela1, at_ns)).slice(xela1.filter(rigs.until(xela1, at_ns - 100 * MS)).num_rows)
     fed.push("xela1", late)
     assert fed.late["xela1"] == late.num_rows > 1
-    fed.push("xela1", late.slice(0, 1))  # which runs backwards
+    fed.push("xela1", late.slice(0, 1))  # time runs backwards
     assert fed.late["xela1"] == late.num_rows + 1
 
 
 def test_a_plan_is_read_from_its_arrival_and_replaces_the_plan_before(models: dict[str, Made]) -> None:
     at_ns = T0 + 1000 * MS
 
-    def found(plans: Sequence[tuple[int, float]]) -> dict[int, Forecast]:
+    def forecasts_with(plans: Sequence[tuple[int, float]]) -> dict[int, Forecast]:
         fed = rigs.chain(models["planned"], GIVEN)
         for name, table in GIVEN.tables.items():
             fed.push(name, table)
@@ -222,18 +225,22 @@ def test_a_plan_is_read_from_its_arrival_and_replaces_the_plan_before(models: di
             t_ns = arrived_ns + np.arange(3) * 500 * MS
             poses = np.column_stack([np.linspace(0.5, 0.5 + far_m, 3), np.zeros(3), np.full(3, 0.3)])
             fed.plan(arrived_ns, t_ns, poses)
-        return {one.t_ns: one for one in fed.advance(T0 + 2990 * MS) if one.count is not None}
+        return {forecast.t_ns: forecast for forecast in fed.advance(T0 + 2990 * MS) if forecast.count is not None}
 
-    without, once, twice = found([]), found([(at_ns, 0.5)]), found([(at_ns, 0.5), (at_ns + 300 * MS, -0.5)])
-    assert all(one.cause is Cause.NO_PLAN for one in without.values())
-    for t_ns, one in once.items():
+    without, once, twice = (
+        forecasts_with([]),
+        forecasts_with([(at_ns, 0.5)]),
+        forecasts_with([(at_ns, 0.5), (at_ns + 300 * MS, -0.5)]),
+    )
+    assert all(forecast.cause is Cause.NO_PLAN for forecast in without.values())
+    for t_ns, forecast in once.items():
         if t_ns < at_ns:
-            assert same([one], [without[t_ns]])
+            assert same([forecast], [without[t_ns]])
         else:
-            assert one.cause == (Cause.PLAN_ENDED if t_ns + 60 * MS > at_ns + 1000 * MS else Cause.NONE)
-            assert not same([dataclasses.replace(one, cause=Cause.NO_PLAN)], [without[t_ns]])
-        if t_ns < at_ns + 1000 * MS:  # after the end of both plans the hand stays where it is
-            assert same([one], [twice[t_ns]]) == (t_ns < at_ns + 300 * MS)
+            assert forecast.cause == (Cause.PLAN_ENDED if t_ns + 60 * MS > at_ns + 1000 * MS else Cause.NONE)
+            assert not same([dataclasses.replace(forecast, cause=Cause.NO_PLAN)], [without[t_ns]])
+        if t_ns < at_ns + 1000 * MS:  # the hand stays where it is
+            assert same([forecast], [twice[t_ns]]) == (t_ns < at_ns + 300 * MS)
 
 
 def swinging(seed: int, period_ms: int) -> FakeRecording:
@@ -281,25 +288,25 @@ def test_the_recorded_motion_as_a_plan_gives_the_forecasts_of_evaluate_at_any_ra
 
 
 @pytest.mark.parametrize(
-    ("change", "named"),
+    ("change", "pattern"),
     [
         (lambda streams: {"robot": streams["robot"], "xela1": streams["xela1"]}, "xela2_taxel01_x"),
         (lambda streams: {"xela1": streams["xela1"], "xela2": streams["xela2"]}, "robot_position_x_m"),
         (lambda streams: {**streams, "xela2": streams["xela2"].remove(2)}, "xela2_taxel01_y"),
-        (lambda streams: {**streams, "xela2": rigs.more(streams["xela2"])}, "xela2_taxel03_x"),
-        (lambda streams: {**streams, "xela2": rigs.unit(streams["xela2"], "kPa")}, "own units"),
+        (lambda streams: {**streams, "xela2": rigs.with_another_taxel(streams["xela2"])}, "xela2_taxel03_x"),
+        (lambda streams: {**streams, "xela2": rigs.with_unit(streams["xela2"], "kPa")}, "own units"),
     ],
 )
 def test_a_rig_of_other_streams_than_the_models_is_refused_by_the_name_of_what_differs(
-    models: dict[str, Made], change: Any, named: str
+    models: dict[str, Made], change: Any, pattern: str
 ) -> None:
     streams = change({name: table.schema for name, table in GIVEN.tables.items()})
-    with pytest.raises(TacpipeError, match=named):
+    with pytest.raises(TacpipeError, match=pattern):
         Chain.for_model(*models["planned"], streams)
 
 
 @pytest.mark.parametrize(
-    ("steps", "named"),
+    ("steps", "pattern"),
     [
         ([rigs.step("segment.contacts")], "synchronize"),
         ([rigs.step("synchronize"), rigs.step("segment.contacts", rest="lowest")], "lowest"),
@@ -308,18 +315,18 @@ def test_a_rig_of_other_streams_than_the_models_is_refused_by_the_name_of_what_d
     ],
 )
 def test_a_model_behind_stages_that_look_ahead_is_refused_by_their_name(
-    models: dict[str, Made], steps: Any, named: str
+    models: dict[str, Made], steps: Any, pattern: str
 ) -> None:
-    with pytest.raises(TacpipeError, match=named):
+    with pytest.raises(TacpipeError, match=pattern):
         Chain.for_model(models["raw"][0], steps, {name: table.schema for name, table in GIVEN.tables.items()})
 
 
 def test_a_model_of_rows_that_look_ahead_is_refused_unless_that_is_allowed(tmp_path: Path) -> None:
     interpolated = rigs.model(tmp_path, **UNIFORM, values="interpolate")
     schemas = {name: table.schema for name, table in GIVEN.tables.items()}
-    stated = json.loads(interpolated[0]["config.json"])["look_ahead"]
-    assert 0 < stated["mean_ms"] < stated["max_ms"]
-    with pytest.raises(TacpipeError, match=f"at most {stated['max_ms']:g} ms.*--allow-look-ahead"):
+    look_ahead = json.loads(interpolated[0]["config.json"])["look_ahead"]
+    assert 0 < look_ahead["mean_ms"] < look_ahead["max_ms"]
+    with pytest.raises(TacpipeError, match=f"at most {look_ahead['max_ms']:g} ms.*--allow-look-ahead"):
         Chain.for_model(*interpolated, schemas)
     assert Chain.for_model(*interpolated, schemas, allow_look_ahead=True).rate_hz == 50.0
     older = json.loads(interpolated[0]["config.json"])
@@ -329,8 +336,8 @@ def test_a_model_of_rows_that_look_ahead_is_refused_unless_that_is_allowed(tmp_p
     contacts = rigs.step("segment.contacts")
     with pytest.raises(TacpipeError, match="interpolated"):
         Chain.for_model(files, [step, contacts], schemas)
-    held = {**step, "params": {"grid": "logged", "rate_hz": 50.0, "causal": True}}
-    assert Chain.for_model(files, [held, contacts], schemas).streams
+    causal_step = {**step, "params": {"grid": "logged", "rate_hz": 50.0, "causal": True}}
+    assert Chain.for_model(files, [causal_step, contacts], schemas).streams
 
 
 @pytest.mark.parametrize("kind", ["raw", "latents", "logged"])
@@ -338,7 +345,7 @@ def test_a_chain_that_continues_a_session_predicts_the_same_once_it_has_its_cont
     kind: str, models: dict[str, Made]
 ) -> None:
     calm = rigs.recording(21, wraps=False)
-    wanted = {one.t_ns: one for one in rigs.whole(models[kind], calm)}
+    expected = {forecast.t_ns: forecast for forecast in rigs.all_forecasts(models[kind], calm)}
     first = rigs.chain(models[kind], calm)
     half_ns = T0 + 1400 * MS
     for name, table in calm.tables.items():
@@ -349,37 +356,37 @@ def test_a_chain_that_continues_a_session_predicts_the_same_once_it_has_its_cont
     second = Chain.for_model(*models[kind], schemas, beginning=first.beginning)
     for name, table in calm.tables.items():
         second.push(name, table.slice(table.filter(rigs.until(table, half_ns)).num_rows))
-    found = [one for one in second.advance(T0 + 2900 * MS) if one.count is not None]
-    assert len(found) > 40 and found[0].t_ns < half_ns + 250 * MS
-    assert same(found, [wanted[one.t_ns] for one in found])
+    forecasts = [forecast for forecast in second.advance(T0 + 2900 * MS) if forecast.count is not None]
+    assert len(forecasts) > 40 and forecasts[0].t_ns < half_ns + 250 * MS
+    assert same(forecasts, [expected[forecast.t_ns] for forecast in forecasts])
 
 
 def test_counts_that_had_run_over_their_end_are_continued_at_the_turn_that_is_nearest_to_the_rest(
     models: dict[str, Made],
 ) -> None:
-    given = rigs.recording(21)  # whose counts run over 65,535 and back
-    wanted = {one.t_ns: one for one in rigs.whole(models["raw"], given)}
-    first = rigs.chain(models["raw"], given)
+    recording = rigs.recording(21)  # its counts run over 65,535 and back
+    expected = {forecast.t_ns: forecast for forecast in rigs.all_forecasts(models["raw"], recording)}
+    first = rigs.chain(models["raw"], recording)
     half_ns = T0 + 1400 * MS
-    for name, table in given.tables.items():
+    for name, table in recording.tables.items():
         first.push(name, table.filter(rigs.until(table, half_ns)))
     first.advance(half_ns)
-    schemas = {name: table.schema for name, table in given.tables.items()}
+    schemas = {name: table.schema for name, table in recording.tables.items()}
     beginning = first.beginning
     assert beginning is not None
     assert Beginning.from_json(json.loads(json.dumps(beginning.to_json()))) == beginning
     second = Chain.for_model(*models["raw"], schemas, beginning=beginning)
-    for name, table in given.tables.items():
+    for name, table in recording.tables.items():
         second.push(name, table.slice(table.filter(rigs.until(table, half_ns)).num_rows))
-    found = [one for one in second.advance(T0 + 2900 * MS) if one.count is not None]
-    assert len(found) > 40 and same(found, [wanted[one.t_ns] for one in found])
+    forecasts = [forecast for forecast in second.advance(T0 + 2900 * MS) if forecast.count is not None]
+    assert len(forecasts) > 40 and same(forecasts, [expected[forecast.t_ns] for forecast in forecasts])
 
 
 def test_a_chain_takes_from_the_model_how_long_slow_streams_may_pause(tmp_path: Path) -> None:
     """The rows of sensors at 9 Hz follow one another by the gap of the training recordings, not by that of the session."""
     slow = {name: table.take(np.arange(0, table.num_rows, 5)) for name, table in rigs.recording(4, 20.0).tables.items()}
-    given = FakeRecording(slow, "slow")
-    shards = [rigs.segmented(given) for _ in range(2)]
+    recording = FakeRecording(slow, "slow")
+    shards = [rigs.segmented(recording) for _ in range(2)]
     stages = [rigs.step("synchronize"), rigs.step("segment.contacts")]
     files = forward_training.train(
         fitting("train.forward", rigs.SMALL), dataset(shards[0]), dataset(shards[1]), tmp_path
@@ -387,7 +394,7 @@ def test_a_chain_takes_from_the_model_how_long_slow_streams_may_pause(tmp_path: 
     gap_ms = json.loads(files["config.json"])["gap_ms"]
     steps = np.diff(slow["xela1"]["t_ns"].to_numpy()) / MS
     assert gap_ms["xela1"] == pytest.approx(2.5 * np.median(steps)) and gap_ms["robot"] == pytest.approx(50.0, abs=90)
-    forecasts = rigs.whole((files, stages), given)
+    forecasts = rigs.all_forecasts((files, stages), recording)
     gaps = {forecast.t_ns: bool(forecast.gaps) for forecast in forecasts if Cause.START not in forecast.cause}
     masks = {
         t_ns: any(row)

@@ -19,8 +19,8 @@ PAGE = ROOT / "docs" / "howto" / "subscribe.md"
 
 def client() -> str:
     """Return the program that the page prints."""
-    _, _, rest = PAGE.read_text().partition('```python title="client.py"\n')
-    return rest.partition("```")[0]
+    _, _, after_title = PAGE.read_text().partition('```python title="client.py"\n')
+    return after_title.partition("```")[0]
 
 
 def test_the_client_is_short() -> None:

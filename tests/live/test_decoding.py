@@ -16,9 +16,9 @@ ROW_NS = 10**12
 
 
 def decoder_and_packets(sensor: str) -> tuple[Decoder, list[bytes]]:
-    of = rigs.build_sensor(sensor, {}, "stream")
-    samples = made.samples(sensor, of, 4, 1)
-    return Decoder(of), made.pieces(of, of.encode(samples))
+    stream_sensor = rigs.build_sensor(sensor, {}, "stream")
+    samples = made.samples(sensor, stream_sensor, 4, 1)
+    return Decoder(stream_sensor), made.pieces(stream_sensor, stream_sensor.encode(samples))
 
 
 @pytest.mark.parametrize(("arrived_ns", "waits"), [(ROW_NS - 1, True), (ROW_NS, True), (ROW_NS + 1, False)])
@@ -38,7 +38,7 @@ def test_a_row_waits_for_the_rest_of_a_frame_that_began_before_it() -> None:
     assert not decoder.may_hold(ROW_NS)  # nothing more came
     decoder.take(Chunks.of([(ROW_NS + 1, data[cut:])]))
     assert decoder.may_hold(ROW_NS)
-    stamps = np.concatenate([one.t_ns for one in decoder.batches()])
+    stamps = np.concatenate([batch.t_ns for batch in decoder.batches()])
     assert stamps[0] <= ROW_NS + 1
 
 

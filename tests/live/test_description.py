@@ -1,4 +1,4 @@
-"""What a live session is asked for is compared with what its model has, before the session begins."""
+"""Requested quantiles are compared with those of the model before the session begins."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MATERIAL = model_of("material", classes=[0, 1])
 
 
 @pytest.mark.parametrize(
-    ("about", "asked", "named"),
+    ("about", "levels", "sentence"),
     [
         (PLAIN, "10,90", "tacpipe calibrate MODEL"),
         (CALIBRATED, "10,25", "10,50,90, not 25"),
@@ -28,9 +28,9 @@ MATERIAL = model_of("material", classes=[0, 1])
     ],
 )
 def test_quantiles_that_a_model_does_not_have_are_refused_before_the_session_begins(
-    about: LiveModel, asked: str, named: str, lab: Lab, monkeypatch: pytest.MonkeyPatch
+    about: LiveModel, levels: str, sentence: str, lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(preparation, "open_model", lambda path: about)
     Path("rig.toml").write_text(RIG.read_text())
-    ran = lab.call(f"live rig.toml --model models/f --quantiles {asked}")
-    assert ran.code == 2 and named in ran.err.replace("\n", " ")
+    ran = lab.call(f"live rig.toml --model models/f --quantiles {levels}")
+    assert ran.code == 2 and sentence in ran.err.replace("\n", " ")

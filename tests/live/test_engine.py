@@ -55,9 +55,9 @@ class Session:
 
 @pytest.fixture
 def session() -> Session:
-    made = Session()
-    made.begin()
-    return made
+    started = Session()
+    started.begin()
+    return started
 
 
 def test_each_row_is_predicted_from_the_newest_sample_at_every_step(session: Session) -> None:
@@ -75,7 +75,7 @@ def test_nothing_is_published_before_what_belongs_to_a_row_has_settled(session: 
     assert len(session.engine.step(START_NS + SETTLE_NS)) == 1
     assert session.engine.step(START_NS + PERIOD_NS + SETTLE_NS - 1) == []
     due_ns = START_NS + PERIOD_NS + SETTLE_NS
-    assert session.engine.due_ns(START_NS + SETTLE_NS) == due_ns - EARLY_NS  # what came by then is decoded
+    assert session.engine.due_ns(START_NS + SETTLE_NS) == due_ns - EARLY_NS  # samples that came by then are decoded
     assert session.engine.step(due_ns - EARLY_NS) == []
     assert session.engine.due_ns(due_ns - EARLY_NS) == due_ns
 
@@ -100,25 +100,27 @@ def test_quantiles_that_were_asked_for_are_published_at_the_steps_that_are() -> 
     assert message.levels == (10, 90) and message.quantiles is not None and message.values is not None
     assert message.quantiles.shape == (2, 2, len(CHANNELS)) and message.quantiles.flags["C_CONTIGUOUS"]
     assert (message.quantiles[1] == message.values + 40).all()
-    found = [one for periods in range(1, 10) for one in session.at(periods)]
-    assert any(one.values is None for one in found)
-    assert all(one.levels == (10, 90) and (one.quantiles is None) == (one.values is None) for one in found)
+    messages = [later for periods in range(1, 10) for later in session.at(periods)]
+    assert any(later.values is None for later in messages)
+    assert all(later.levels == (10, 90) and (later.quantiles is None) == (later.values is None) for later in messages)
     assert engine.describe("m").quantiles == (10, 90)
 
 
 @pytest.mark.parametrize("cut", [1, 3, 7, 50])
 def test_how_the_bytes_were_cut_changes_no_forecast(cut: int) -> None:
-    one, other = Session(), Session()
+    whole, cut_session = Session(), Session()
     published: list[list[Message]] = []
-    for each, size in ((one, 1), (other, cut)):
-        each.begin()
-        found = []
+    for running, size in ((whole, 1), (cut_session, cut)):
+        running.begin()
+        messages = []
         for row in range(0, 100 // size * size, size):
-            each.send(row, row + size)
-            found += each.at(row + size - 1)
-        published.append(found)
+            running.send(row, row + size)
+            messages += running.at(row + size - 1)
+        published.append(messages)
     by_time = {message.t_ns: message.values for message in published[0]}
-    assert published[1] and all(np.array_equal(by_time[one.t_ns], one.values) for one in published[1])  # type: ignore[arg-type]
+    assert published[1] and all(
+        np.array_equal(by_time[published_message.t_ns], published_message.values) for published_message in published[1]
+    )  # type: ignore[arg-type]
 
 
 def test_what_came_before_the_recording_is_not_part_of_it() -> None:
@@ -134,8 +136,8 @@ def test_what_came_before_the_recording_is_not_part_of_it() -> None:
 def test_a_stream_that_stalls_makes_alarms_unknown_with_its_name_within_two_periods(session: Session) -> None:
     session.send(0, 10)
     session.at(9)
-    found = [message for tenths in range(91, 131) for message in session.at(tenths / 10)]
-    unknown = next(message for message in found if message.values is None)
+    messages = [message for tenths in range(91, 131) for message in session.at(tenths / 10)]
+    unknown = next(message for message in messages if message.values is None)
     due = START_NS + OFFSET_NS + 10 * PERIOD_NS  # when the sample that is missing should have come
     assert unknown.t_ns - due <= 2 * PERIOD_NS
     assert "skin" in unknown.cause and Cause.GAP in Cause(unknown.flags)
@@ -147,9 +149,9 @@ def test_a_stream_that_stalls_makes_alarms_unknown_with_its_name_within_two_peri
 
 def test_where_no_row_can_be_made_at_all_that_is_reported_with_the_silent_stream(session: Session) -> None:
     assert session.at(0) == []
-    found = [message for periods in range(1, 10) for message in session.at(periods)]
-    assert found and all(message.values is None and "skin" in message.cause for message in found)
-    assert found[0].t_ns - (START_NS + OFFSET_NS) <= 4 * PERIOD_NS
+    messages = [message for periods in range(1, 10) for message in session.at(periods)]
+    assert messages and all(message.values is None and "skin" in message.cause for message in messages)
+    assert messages[0].t_ns - (START_NS + OFFSET_NS) <= 4 * PERIOD_NS
 
 
 def test_a_link_that_is_lost_and_back_goes_on_without_a_new_session(session: Session) -> None:
@@ -168,8 +170,8 @@ def test_after_blocks_were_thrown_away_a_new_chain_begins_and_the_cause_is_repor
     before = session.engine.chain
     session.engine.take("", Note(START_NS, "", wire.OVERFLOW))
     assert session.engine.chain is not before and session.engine.overflows == 1
-    found = [message for periods in range(5, 10) for message in session.at(periods)]
-    assert found and "overload" in found[0].cause and found[0].values is None
+    messages = [message for periods in range(5, 10) for message in session.at(periods)]
+    assert messages and "overload" in messages[0].cause and messages[0].values is None
     session.send(10, 11)
     assert session.at(10)[0].values is not None
 
@@ -216,12 +218,12 @@ def test_after_blocks_were_thrown_away_and_after_a_process_that_ended_the_grid_i
     assert beginning is not None and beginning.origin_ns == START_NS + OFFSET_NS
     session.engine.take("", Note(START_NS, "", wire.OVERFLOW))
     assert session.engine.chain.beginning == beginning
-    other = Session()
-    other.engine.take("", Note(START_NS, "", wire.CONTINUE, json.dumps(beginning.to_json())))
-    other.begin()
+    restarted = Session()
+    restarted.engine.take("", Note(START_NS, "", wire.CONTINUE, json.dumps(beginning.to_json())))
+    restarted.begin()
     late = START_NS + 7 * PERIOD_NS + PERIOD_NS // 3
-    other.engine.take("skin", Chunks.of([(late, other.packets[7])]))
-    (message,) = other.at(8)
+    restarted.engine.take("skin", Chunks.of([(late, restarted.packets[7])]))
+    (message,) = restarted.at(8)
     assert message.t_ns == START_NS + OFFSET_NS + 8 * PERIOD_NS and message.values is not None
-    other.begin()  # another recording has a grid of its own
-    assert other.engine.chain.beginning is None
+    restarted.begin()  # another recording has a grid of its own
+    assert restarted.engine.chain.beginning is None

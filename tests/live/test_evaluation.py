@@ -30,7 +30,7 @@ def recorded(recording: Any, predictions: pa.Table) -> FakeRecording:
     columns[list(columns)[-1]][CHANGED_ROW + 1] += 1  # a quantile
     clocks = {"t_ns": t_ns + 5_000_000, "t_device_ns": t_ns}
     late = (np.arange(len(t_ns)) >= LATE_ROW).astype(np.float32)
-    own = {
+    session_streams = {
         "forecast": pa.table({**clocks, **columns}),
         "alarm": pa.table(
             {**clocks, "load_state": np.full(len(t_ns), -1, np.int8), "slip_state": np.full(len(t_ns), -1, np.int8)}
@@ -40,7 +40,7 @@ def recorded(recording: Any, predictions: pa.Table) -> FakeRecording:
         ),
     }
     tables = {name: recording.table(name) for name in recording.streams}
-    return FakeRecording({**tables, **own}, recording.name, recording.attributes)
+    return FakeRecording({**tables, **session_streams}, recording.name, recording.attributes)
 
 
 @pytest.mark.long
@@ -50,14 +50,14 @@ def test_published_forecasts_are_compared_with_the_offline_chain_and_recomputed(
     lab.run("predict models/g data/r -o data/p --steps 1,2 --causal --quantiles 10,90")
     model, name = tacpipe.open("models/g"), "trial-000"
     session = recorded(tacpipe.open("data/r")[name], tacpipe.open("data/p")[name].table())
-    given: Any = type("Given", (), {"recordings": {name: session}, "files": {}})()
-    result = evaluation.evaluate(model, given)
+    recordings: Any = type("Given", (), {"recordings": {name: session}, "files": {}})()
+    result = evaluation.evaluate(model, recordings)
     live = json.loads(result.files["metrics.json"])["live"]
     rows = live["rows"]
     assert rows["compared"] == rows["published"] == rows["recomputed"] == session.table("forecast").num_rows
     assert rows["equal"] == rows["compared"] - 2 and rows["differ_after_late_samples"] == 2
-    uncalibrated = json.loads(evaluation.evaluate(tacpipe.open("models/f"), given).files["metrics.json"])["live"]
-    assert uncalibrated["rows"]["equal"] == rows["compared"] - 1  # which has no quantiles to compare
+    uncalibrated = json.loads(evaluation.evaluate(tacpipe.open("models/f"), recordings).files["metrics.json"])["live"]
+    assert uncalibrated["rows"]["equal"] == rows["compared"] - 1  # the uncalibrated model has no quantiles to compare
     assert rows["late_samples"] == 1 and rows["skipped"] == 0 and 0 < rows["of_errors"] < rows["published"]
     assert live["latency"]["median_ms"] == LATENCY_MS
     assert set(live["mae"]) == set(worth.PREDICTORS)
@@ -76,14 +76,14 @@ class Session:
 
 
 def test_a_session_of_another_model_is_refused_with_both_digests() -> None:
-    mine, other = "ab" * 32, "cd" * 32
-    given: Any = type("Given", (), {"recordings": {"one": Session(mine), "two": Session(other)}})()
+    own_digest, other_digest = "ab" * 32, "cd" * 32
+    recordings: Any = type("Given", (), {"recordings": {"one": Session(own_digest), "two": Session(other_digest)}})()
     with pytest.raises(UsageError) as raised:
-        evaluation.check(mine, given)
+        evaluation.check(own_digest, recordings)
     assert "session of two ran the model cdcdcdcdcdcd, and this one is abababababab" in str(raised.value)
     assert "leave --live out" in str(raised.value)
-    given.recordings = {"one": Session(mine), "stated by nobody": Session(None)}
-    evaluation.check(mine, given)
+    recordings.recordings = {"one": Session(own_digest), "stated by nobody": Session(None)}
+    evaluation.check(own_digest, recordings)
 
 
 @pytest.mark.long
@@ -91,12 +91,12 @@ def test_the_model_of_the_session_is_known_by_the_digest_that_tacpipe_live_recor
     for command in TRAINED:
         lab.run(command)
     lab.run(TRAINED[-1].replace("models/f", "models/g").replace("--hidden 4", "--hidden 5"))
-    digest, other = (open_model(model).dataset.digest for model in ("models/f", "models/g"))
-    given: Any = type("Given", (), {"recordings": {"one": Session(digest)}})()
-    assert digest != other
-    evaluation.check(tacpipe.open("models/f").digest, given)
+    digest, other_digest = (open_model(model).dataset.digest for model in ("models/f", "models/g"))
+    recordings: Any = type("Given", (), {"recordings": {"one": Session(digest)}})()
+    assert digest != other_digest
+    evaluation.check(tacpipe.open("models/f").digest, recordings)
     with pytest.raises(UsageError, match="ran the model"):
-        evaluation.evaluate(tacpipe.open("models/g"), given)
+        evaluation.evaluate(tacpipe.open("models/g"), recordings)
 
 
 @pytest.mark.long

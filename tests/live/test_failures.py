@@ -1,4 +1,4 @@
-"""What fails in a live session costs forecasts with a stated cause; the recording continues, and so does the session.
+"""A failure in a live session costs forecasts with a stated cause; the recording continues, and so does the session.
 
 Nothing here goes by the clock: a forecast is held against the arrival of what it was made from, in the recording.
 """
@@ -35,7 +35,11 @@ def patience(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def without(messages: list[dict[str, Any]], stream: str) -> list[dict[str, Any]]:
     """Return the messages without a forecast whose cause names a stream."""
-    return [one for one in messages if one["kind"] == "forecast" and one["values"] is None and stream in one["cause"]]
+    return [
+        message
+        for message in messages
+        if message["kind"] == "forecast" and message["values"] is None and stream in message["cause"]
+    ]
 
 
 def test_a_stream_that_stalls_costs_the_forecasts_of_that_time_and_alarms_are_unknown(lab: Lab) -> None:
@@ -47,12 +51,12 @@ def test_a_stream_that_stalls_costs_the_forecasts_of_that_time_and_alarms_are_un
         live.awaited(lambda: len(forecasts(messages[count:])) > 20)
         printed = ended(process, interrupt=True)
     silent = without(messages, "skin")
-    assert {alarm["state"] for one in silent for alarm in one["alarms"].values()} == {"unknown"}
+    assert {alarm["state"] for message in silent for alarm in message["alarms"].values()} == {"unknown"}
     shard = live.only(lab.folder)
     arrivals = shard.table("skin").column("t_ns").to_numpy()
     points = shard.table("forecast").column("t_device_ns").to_numpy()
     newest = arrivals[np.searchsorted(arrivals, points, side="right") - 1]
-    assert ((points - newest) <= GAP_NS).all()  # and a sample was due a period after the newest
+    assert ((points - newest) <= GAP_NS).all()  # a sample was due a period after the newest
     assert GAP_NS <= 3 * PERIOD_NS and 0 < len(points) <= printed["live"]["forecasts"]
     assert whole(shard, "skin") and whole(shard, "wrench")
 
@@ -66,11 +70,11 @@ def test_a_device_whose_clock_is_set_anew_changes_no_forecast(lab: Lab) -> None:
     shard = live.only(lab.folder)
     steps_ns = np.diff(shard.table("skin").column("t_device_ns").to_numpy())
     assert (np.abs(steps_ns) > 10**9).any()
-    assert {one["cause"] for one in forecasts(messages)} == {""}
+    assert {message["cause"] for message in forecasts(messages)} == {""}
     points = shard.table("forecast").column("t_device_ns").to_numpy()
     skipped = printed["live"]["skipped"]
     assert (np.diff(points) > 0).all() and ((points - points[0]) % PERIOD_NS == 0).all()
-    gaps = len([one for one in messages if one["kind"] == "forecast" and one["values"] is None])
+    gaps = len([message for message in messages if message["kind"] == "forecast" and message["values"] is None])
     assert (points[-1] - points[0]) // PERIOD_NS + 1 <= len(points) + skipped + gaps
 
 
@@ -80,13 +84,13 @@ def test_a_model_process_that_is_killed_is_replaced_by_one_that_continues_its_gr
         live.awaited(lambda: len(forecasts(messages)) > 30)
         os.kill(model_process(process), signal.SIGKILL)
         count = len(messages)
-        live.awaited(lambda: any(one["kind"] == "description" for one in messages[count:]))
+        live.awaited(lambda: any(message["kind"] == "description" for message in messages[count:]))
         live.awaited(lambda: len(forecasts(messages[count:])) > 30)
         printed = ended(process, interrupt=True)
     shard = live.only(lab.folder)
     assert printed["live"]["restarts"] == 1
     assert [cause for cause, _ in live.events(shard, "forecast")][:2] == [DIED, RESTARTED]
-    points = np.array([one["t_ns"] for one in forecasts(messages)])
+    points = np.array([message["t_ns"] for message in forecasts(messages)])
     assert ((points - points[0]) % PERIOD_NS == 0).all() and (np.diff(points) > 0).all()
     assert whole(shard, "skin") and whole(shard, "wrench")
 
@@ -95,7 +99,7 @@ def test_a_subscriber_that_never_reads_keeps_no_message_from_the_others(lab: Lab
     from websockets.sync.client import connect
 
     (place,) = free_ports(1)
-    found: list[dict[str, Any]] = []
+    received: list[dict[str, Any]] = []
     with live.served(lab.folder, SKIN), subscriber() as (port, messages):
         process = started(lab, f"-o rec --json --publish ws:127.0.0.1:{place} --publish udp:127.0.0.1:{port}")
         live.awaited(lambda: bool(forecasts(messages)))
@@ -105,19 +109,19 @@ def test_a_subscriber_that_never_reads_keeps_no_message_from_the_others(lab: Lab
             slow.sendall(HANDSHAKE)
 
             def listen() -> None:
-                while len(found) < 200:
-                    found.append(json.loads(quick.recv(600)))
+                while len(received) < 200:
+                    received.append(json.loads(quick.recv(600)))
 
             listening = threading.Thread(target=listen, daemon=True)
             listening.start()
-            live.awaited(lambda: len(found) == 200)
+            live.awaited(lambda: len(received) == 200)
             ended(process, interrupt=True)
             listening.join()
-    assert found[0]["kind"] == "description"
-    for heard in (found[1:], [one for one in messages if one["kind"] == "forecast"]):
-        assert (np.diff([one["seq"] for one in heard]) == 1).all()
+    assert received[0]["kind"] == "description"
+    for heard in (received[1:], [message for message in messages if message["kind"] == "forecast"]):
+        assert (np.diff([message["seq"] for message in heard]) == 1).all()
     shard = live.only(lab.folder)
     assert whole(shard, "skin")
     recorded = shard.table("forecast").column("t_device_ns").to_pylist()
-    assert len(recorded) > 100  # but for the last ones, which left when the recording was over
-    assert recorded == [one["t_ns"] for one in forecasts(messages)][: len(recorded)]
+    assert len(recorded) > 100  # the last ones left when the recording was over
+    assert recorded == [message["t_ns"] for message in forecasts(messages)][: len(recorded)]

@@ -1,4 +1,4 @@
-"""What is published by LSL reaches pylsl's own inlet, described channel by channel."""
+"""Messages published by LSL reach pylsl's own inlet, described channel by channel."""
 
 from __future__ import annotations
 
@@ -27,28 +27,28 @@ def heard(folder: Path, kind: str) -> dict[str, Any]:
     words = [sys.executable, "-m", "tests.live.lsl_subscriber", kind, f"tacpipe-{uuid.uuid4()}"]
     ran = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
     assert ran.returncode == 0 and not ran.stderr, ran.stderr
-    found: dict[str, Any] = json.loads(ran.stdout)
-    return found
+    outlet: dict[str, Any] = json.loads(ran.stdout)
+    return outlet
 
 
 def test_forecasts_come_with_each_channel_and_step_and_nan_where_there_is_none(tmp_path: Path) -> None:
     pytest.importorskip("pylsl")
-    found = heard(tmp_path, "forecast")
-    assert (found["type"], found["rate"]) == ("Forecast", 50.0)
-    assert found["labels"] == ["a_t1", "b_t1", "a_t2", "b_t2", "load_state", "slip_state"]
-    assert found["units"] == ["count"] * 4 + ["1"] * 2
-    rows = np.array(found["rows"], np.float32)
+    outlet = heard(tmp_path, "forecast")
+    assert (outlet["type"], outlet["rate"]) == ("Forecast", 50.0)
+    assert outlet["labels"] == ["a_t1", "b_t1", "a_t2", "b_t2", "load_state", "slip_state"]
+    assert outlet["units"] == ["count"] * 4 + ["1"] * 2
+    rows = np.array(outlet["rows"], np.float32)
     for seq, message in enumerate(forecast()[1]):
-        wanted = np.full(4, np.nan, np.float32) if message.values is None else message.values.ravel()
-        assert np.array_equal(rows[seq], [*wanted, 0, 1], equal_nan=True)
+        expected = np.full(4, np.nan, np.float32) if message.values is None else message.values.ravel()
+        assert np.array_equal(rows[seq], [*expected, 0, 1], equal_nan=True)
 
 
 def test_materials_come_with_their_probabilities_and_how_much_was_seen(tmp_path: Path) -> None:
     pytest.importorskip("pylsl")
-    found = heard(tmp_path, "material")
-    assert found["type"] == "Material" and found["labels"][-2:] == ["probability_cork", "probability_felt"]
-    rows = np.array(found["rows"], np.float32)
+    outlet = heard(tmp_path, "material")
+    assert outlet["type"] == "Material" and outlet["labels"][-2:] == ["probability_cork", "probability_felt"]
+    rows = np.array(outlet["rows"], np.float32)
     description, messages = material()
-    wanted = np.array([message.numbers(description) for message in messages])
-    assert len(rows) == COUNT and np.array_equal(rows, wanted, equal_nan=True)
+    expected = np.array([message.numbers(description) for message in messages])
+    assert len(rows) == COUNT and np.array_equal(rows, expected, equal_nan=True)
     assert rows[0, 0] == -1 and np.isnan(rows[0, -1]) and rows[1, 0] == 1

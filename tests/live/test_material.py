@@ -66,12 +66,16 @@ class Opened:
 
 @pytest.fixture(scope="module")
 def models(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Opened]:
-    parts = [slides(RIG, indices(RIG, ["biotac"], some), frames=FRAMES) for some in (TRAINED, [UNSEEN])]
-    found = {}
+    parts = [
+        slides(RIG, indices(RIG, ["biotac"], chosen_trials), frames=FRAMES) for chosen_trials in (TRAINED, [UNSEEN])
+    ]
+    loaded = {}
     for kind, params in KINDS.items():
-        asked = fitting("train.material", params)
-        found[kind] = Opened(material_training.train(asked, parts[0], parts[1], tmp_path_factory.mktemp(kind), None))
-    return found
+        train_params = fitting("train.material", params)
+        loaded[kind] = Opened(
+            material_training.train(train_params, parts[0], parts[1], tmp_path_factory.mktemp(kind), None)
+        )
+    return loaded
 
 
 def opened(model: Any, sensors: dict[str, Any], **changed: Any) -> MaterialEngine:
@@ -106,14 +110,14 @@ class Session:
 
     def run(self, until_ns: int, cut: int = 7) -> list[MaterialMessage]:
         """Have all arrive up to a time, some at once, and return what is published meanwhile."""
-        found = []
+        messages = []
         while self.sent < len(self.t_ns) and self.t_ns[self.sent] <= until_ns:
             stop = min(self.sent + cut, int(np.searchsorted(self.t_ns, until_ns, side="right")))
-            some = [(int(self.t_ns[row]), self.packets[row]) for row in range(self.sent, stop)]
-            self.engine.take("finger", Chunks.of(some))
+            chunks = [(int(self.t_ns[row]), self.packets[row]) for row in range(self.sent, stop)]
+            self.engine.take("finger", Chunks.of(chunks))
             self.sent = stop
-            found += self.engine.step(int(self.t_ns[stop - 1]) + SETTLE_NS)
-        return found
+            messages += self.engine.step(int(self.t_ns[stop - 1]) + SETTLE_NS)
+        return messages
 
     def end(self) -> MaterialMessage:
         """End the recording and return the last message."""
@@ -125,12 +129,12 @@ class Session:
 def predicted(model: Any, table: Any, **params: Any) -> Any:
     """Return the probabilities that `tacpipe predict` gives a recording of this stream, None where it refuses it."""
     stage = registry.load("segment.slides")
-    given = Slide({"finger": table}, "trial", {"sensor": "biotac"})
+    recording = Slide({"finger": table}, "trial", {"sensor": "biotac"})
     try:
-        cut = stage(stage.params(frames=FRAMES, **params), given)
+        cut = stage(stage.params(frames=FRAMES, **params), recording)
     except TacpipeError:
         return None
-    shard = Slide(cut.streams, "trial", {**given.attributes, **cut.attributes})
+    shard = Slide(cut.streams, "trial", {**recording.attributes, **cut.attributes})
     scores = predictions(Classifier.load(model.files), FakeDataset({"trial": shard}, {}))  # type: ignore[arg-type]
     columns = [name for name in scores.column_names if name.startswith("score_")]
     return calibration.probabilities(np.column_stack([scores.column(name).to_numpy() for name in columns]))[0].astype(
@@ -142,15 +146,15 @@ def predicted(model: Any, table: Any, **params: Any) -> Any:
 def test_the_answer_at_the_end_is_that_of_predict_however_the_bytes_were_cut(
     kind: str, models: dict[str, Opened]
 ) -> None:
-    wanted = None
+    expected = None
     for cut in (1, 13):
         session = Session(models[kind])
         session.begin()
         session.run(10**19, cut)
         last = session.end()
-        wanted = predicted(models[kind], session.table) if wanted is None else wanted
+        expected = predicted(models[kind], session.table) if expected is None else expected
         assert last.state == FINAL and last.seen == 1.0 and last.probabilities is not None
-        assert last.probabilities.tobytes() == wanted.tobytes()
+        assert last.probabilities.tobytes() == expected.tobytes()
         assert not session.engine.running and session.engine.late <= 1  # the first frame, which the next one confirms
 
 
@@ -158,25 +162,30 @@ def test_the_answer_at_the_end_is_that_of_predict_however_the_bytes_were_cut(
 def test_each_answer_is_that_of_a_recording_which_ends_then(kind: str, models: dict[str, Opened]) -> None:
     session = Session(models[kind])
     session.begin()
-    found = session.run(10**19)
-    whole = [one for one in found if one.seen == 1.0]
-    assert len(whole) > 20 and all(one.state == SLIDING for one in whole)
-    for one in whole[:: len(whole) // 4]:
-        rows = int((session.t_ns <= one.t_ns - OFFSET_NS).sum())
-        wanted = predicted(models[kind], session.table.slice(0, rows))
-        assert one.probabilities is not None and one.probabilities.tobytes() == wanted.tobytes()
+    messages = session.run(10**19)
+    complete = [message for message in messages if message.seen == 1.0]
+    assert len(complete) > 20 and all(message.state == SLIDING for message in complete)
+    for message in complete[:: len(complete) // 4]:
+        rows = int((session.t_ns <= message.t_ns - OFFSET_NS).sum())
+        expected = predicted(models[kind], session.table.slice(0, rows))
+        assert message.probabilities is not None and message.probabilities.tobytes() == expected.tobytes()
 
 
 def test_a_calibrated_model_names_what_predict_answers_or_states_that_the_slide_is_like_none(
     models: dict[str, Opened],
 ) -> None:
-    learned, watched = (slides(RIG, indices(RIG, ["biotac"], some), frames=FRAMES) for some in (TRAINED, range(4, 8)))
+    training, validation = (
+        slides(RIG, indices(RIG, ["biotac"], chosen_trials), frames=FRAMES) for chosen_trials in (TRAINED, range(4, 8))
+    )
     files = material_calibration.calibrate(
-        models["statistics"].files, CalibrationRequest((10, 50, 90), False, 0.1, 0), learned, watched
+        models["statistics"].files, CalibrationRequest((10, 50, 90), False, 0.1, 0), training, validation
     )
     fitted = sensor_calibration.unpack_calibrations(files[sensor_calibration.CALIBRATION_FILE], {"biotac": None})
     for moved, cause in ((-1e9, ""), (1e9, UNLIKE)):
-        bundles = {name: replace(one, threshold=one.threshold + moved) for name, one in fitted.items()}
+        bundles = {
+            name: replace(fitted_calibration, threshold=fitted_calibration.threshold + moved)
+            for name, fitted_calibration in fitted.items()
+        }
         session = Session(
             Opened({**files, sensor_calibration.CALIBRATION_FILE: sensor_calibration.pack_calibrations(bundles)})
         )
@@ -192,17 +201,17 @@ def test_a_calibrated_model_names_what_predict_answers_or_states_that_the_slide_
 def test_a_material_is_unknown_until_enough_of_the_slide_has_come(kind: str, models: dict[str, Opened]) -> None:
     session = Session(models[kind])
     session.begin()
-    found = session.run(10**19)
-    before = [one for one in found if one.state == WAITING]
-    assert before and {one.cause for one in before} == {"no slide has begun"}
-    least = 1.0 if kind == "minirocket" else 0.5
-    for one in found[len(before) :]:
-        assert (one.probabilities is None) == (one.seen < least) == bool(one.cause)
-        content = one.to_dict()
-        assert (content["material"] == "unknown") == (one.probabilities is None)
-        assert one.probabilities is None or abs(sum(content["probabilities"].values()) - 1) < 1e-5
-    seen = [one.seen for one in found]
-    assert seen == sorted(seen) and 0 < seen[len(before)] < 1
+    messages = session.run(10**19)
+    before = [message for message in messages if message.state == WAITING]
+    assert before and {message.cause for message in before} == {"no slide has begun"}
+    enough = 1.0 if kind == "minirocket" else 0.5
+    for message in messages[len(before) :]:
+        assert (message.probabilities is None) == (message.seen < enough) == bool(message.cause)
+        content = message.to_dict()
+        assert (content["material"] == "unknown") == (message.probabilities is None)
+        assert message.probabilities is None or abs(sum(content["probabilities"].values()) - 1) < 1e-5
+    fractions = [message.seen for message in messages]
+    assert fractions == sorted(fractions) and 0 < fractions[len(before)] < 1
 
 
 def test_a_finger_that_falls_silent_is_named_and_the_material_is_unknown_until_it_is_back(
@@ -217,22 +226,25 @@ def test_a_finger_that_falls_silent_is_named_and_the_material_is_unknown_until_i
     assert session.run(10**19)[-1].probabilities is not None
 
 
-PAUSE_NS, FREE_ROWS = 400_000_000, 120  # of a pause; rows in which nothing is touched between two slides, at 100 Hz
+PAUSE_NS, FREE_ROWS = (
+    400_000_000,
+    120,
+)  # duration of a pause; rows in which nothing is touched between two slides, at 100 Hz
 
 
 def touches() -> tuple[Any, list[int]]:
     """Return a stream of three slides with rows between in which nothing is touched, and the last row of each slide."""
-    several, ends, rows = [], [], 0
+    parts, ends, rows = [], [], 0
     for kind in range(3):
         table = trial(kind)
         begins = int((table.column("pdc").to_numpy() > 20).argmax())
         free = table.slice(0, begins)
         assert begins > 10
-        several += [table, *[free] * (FREE_ROWS // begins)]
+        parts += [table, *[free] * (FREE_ROWS // begins)]
         rows += table.num_rows
         ends.append(rows - 1)
         rows += begins * (FREE_ROWS // begins)
-    joined = pa.concat_tables(several).combine_chunks()
+    joined = pa.concat_tables(parts).combine_chunks()
     t_ns = joined.column("t_ns")[0].as_py() + np.arange(joined.num_rows, dtype=np.int64) * 10_000_000
     place = joined.column_names.index("t_ns")
     return joined.set_column(place, joined.schema.field("t_ns"), pa.array(t_ns)), ends
@@ -248,24 +260,33 @@ def test_each_of_several_slides_has_its_final_answer_which_is_that_of_predict(
     session.begin()
     published = session.run(10**19, cut)
     published.append(session.end())
-    finals = [one for one in published if one.state == FINAL]
-    assert [one.slide for one in finals] == [1, 2, 3, 4]  # behind the last slide a pause is left, in which none began
+    finals = [message for message in published if message.state == FINAL]
+    assert [message.slide for message in finals] == [
+        1,
+        2,
+        3,
+        4,
+    ]  # a pause is left behind the last slide, in which none began
     assert finals[-1].probabilities is None and finals[-1].cause == "no slide has begun"
     t_ns, begins = table.column("t_ns").to_numpy(), 0
     answered: list[bytes] = []
-    for one, last in zip(finals[:3], ends, strict=True):
-        stop = int(np.searchsorted(t_ns, one.t_ns, side="right"))
-        assert 0 < one.t_ns - t_ns[last] <= PAUSE_NS + 10**8  # in the pause: the finger leaves within the trial
-        wanted = predicted(model, table.slice(begins, stop - begins), trigger="load")
-        assert one.probabilities is not None and one.probabilities.tobytes() == wanted.tobytes()
-        answered.append(one.probabilities.tobytes())
-        assert all(other.slide == one.slide for other in published if t_ns[begins] < other.t_ns <= one.t_ns)
+    for message, last in zip(finals[:3], ends, strict=True):
+        stop = int(np.searchsorted(t_ns, message.t_ns, side="right"))
+        assert (
+            0 < message.t_ns - t_ns[last] <= PAUSE_NS + 10**8
+        )  # the end lies in the pause: the finger leaves within the trial
+        expected = predicted(model, table.slice(begins, stop - begins), trigger="load")
+        assert message.probabilities is not None and message.probabilities.tobytes() == expected.tobytes()
+        answered.append(message.probabilities.tobytes())
+        assert all(
+            earlier.slide == message.slide for earlier in published if t_ns[begins] < earlier.t_ns <= message.t_ns
+        )
         begins = stop
-    given: Any = type("Given", (), {"recordings": {"rec": FakeRecording({"finger": table}, "rec", RECORDED)}})()
-    (replayed,) = material_replay.predict(model, given).recordings.values()  # type: ignore[arg-type]
+    recordings: Any = type("Given", (), {"recordings": {"rec": FakeRecording({"finger": table}, "rec", RECORDED)}})()
+    (replayed,) = material_replay.predict(model, recordings).recordings.values()  # type: ignore[arg-type]
     rows = replayed.streams[""]
     assert rows.column("slide").to_pylist() == [1, 2, 3, 4]
-    assert rows.column("t_ns").to_pylist()[:3] == [one.t_ns for one in finals[:3]]
+    assert rows.column("t_ns").to_pylist()[:3] == [message.t_ns for message in finals[:3]]
     names = [name for name in rows.column_names if name.startswith("probability_")]
     likely = np.column_stack([rows.column(name).to_numpy() for name in names]).astype(np.float32)
     assert likely[:3].tobytes() == b"".join(answered)
@@ -280,7 +301,7 @@ def test_without_a_pause_a_recording_is_one_slide(models: dict[str, Opened]) -> 
     table, _ = touches()
     session = Session(model, table=table)
     session.begin()
-    assert all(one.slide == 1 and one.state != FINAL for one in session.run(10**19, 50))
+    assert all(message.slide == 1 and message.state != FINAL for message in session.run(10**19, 50))
     assert session.end().state == FINAL
 
 
@@ -293,14 +314,14 @@ def test_what_was_lost_makes_this_recording_unknown_and_not_the_next(models: dic
     session = Session(models["statistics"])
     session.engine.take("", Note(0, "", wire.CONTINUE, "{}"))
     session.begin()
-    found = session.run(int(session.t_ns[300]))
-    assert found and {one.cause for one in found} == {RESTARTED}
+    messages = session.run(int(session.t_ns[300]))
+    assert messages and {message.cause for message in messages} == {RESTARTED}
     session.begin()
     session.engine.take("", Note(0, "", wire.OVERFLOW))
-    assert {one.cause for one in session.run(int(session.t_ns[400]))} == {THROWN}
-    other = Session(models["statistics"])
-    other.begin()
-    assert other.run(10**19)[-1].cause == ""
+    assert {message.cause for message in session.run(int(session.t_ns[400]))} == {THROWN}
+    next_session = Session(models["statistics"])
+    next_session.begin()
+    assert next_session.run(10**19)[-1].cause == ""
 
 
 def test_rows_of_the_sessions_stream_hold_what_was_published() -> None:
@@ -312,26 +333,26 @@ def test_rows_of_the_sessions_stream_hold_what_was_published() -> None:
     for probabilities in (None, np.array([0.25, 0.75], np.float32)):
         message = MaterialMessage(1, 5, ("cork", "felt"), probabilities, SLIDING, 60, 0.5)
         (sent,) = packets(message, sensor, 7)
-        found = sensor.decode(np.frombuffer(sent, np.uint8)[None])
-        assert found.seq is not None and found.t_device_ns is not None
-        assert (found.seq[0], found.t_device_ns[0]) == (7, 5)
+        samples = sensor.decode(np.frombuffer(sent, np.uint8)[None])
+        assert samples.seq is not None and samples.t_device_ns is not None
+        assert (samples.seq[0], samples.t_device_ns[0]) == (7, 5)
         number = -1 if probabilities is None else 1
-        assert found.values[0][0][:5].tolist() == [number, 60, 0.5, 0, 1]
+        assert samples.values[0][0][:5].tolist() == [number, 60, 0.5, 0, 1]
         likely = [np.nan, np.nan] if probabilities is None else probabilities
-        assert np.array_equal(found.values[0][0][5:], likely, equal_nan=True)
+        assert np.array_equal(samples.values[0][0][5:], likely, equal_nan=True)
 
 
 def test_a_rig_that_the_model_cannot_read_is_refused_by_what_is_missing(models: dict[str, Opened]) -> None:
     model: Any = models["statistics"]
     biotac, range_finder = (rigs_of.build_sensor(kind, {}, kind) for kind in ("biotac", "tfmini"))
     two = rigs_of.build_sensor("biotac", {"fingers": 2}, "biotac")
-    for sensors, changed, named in (
+    for sensors, changed, sentence in (
         ({"range": range_finder}, {}, "tactile"),
         ({"a": biotac, "b": biotac}, {}, "2 streams"),
         ({"finger": two}, {}, "other channels"),
         ({"finger": biotac}, {"sensor": "roboskin"}, "roboskin"),
     ):
-        with pytest.raises(TacpipeError, match=named):
+        with pytest.raises(TacpipeError, match=sentence):
             opened(model, sensors, **changed)
     lowest: Any = Opened(model.files, trigger="load", rest="lowest")
     with pytest.raises(TacpipeError, match="lowest"):
@@ -340,7 +361,10 @@ def test_a_rig_that_the_model_cannot_read_is_refused_by_what_is_missing(models: 
 
 def test_a_model_of_several_sensors_needs_the_name_of_the_rigs(tmp_path: Path) -> None:
     rig = Rig(materials=2, pac=False, arm_every=0)
-    parts = [slides(rig, indices(rig, ["biotac", "roboskin"], some), frames=FRAMES) for some in (range(2), [2])]
+    parts = [
+        slides(rig, indices(rig, ["biotac", "roboskin"], chosen_trials), frames=FRAMES)
+        for chosen_trials in (range(2), [2])
+    ]
     model: Any = Opened(
         material_training.train(fitting("train.material", KINDS["statistics"]), parts[0], parts[1], tmp_path, None)
     )

@@ -1,4 +1,4 @@
-"""What is published is what was predicted, in every format."""
+"""Published messages hold the predictions, in every format."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ def message(values: Float32s | None = VALUES) -> Message:
 
 
 def test_json_holds_each_value_to_the_bit_and_null_where_nothing_is_known() -> None:
-    found = json.loads(messages.to_json(message().to_dict()))
-    assert np.array_equal(np.array(found["values"], dtype=np.float32), VALUES)
-    assert found["alarms"] == {"load": {"state": "on", "score": 2.5}, "slip": {"state": "unknown", "score": None}}
-    assert (found["version"], found["seq"], found["t_ns"], found["cause"]) == (1, 7, 10**18, "why")
+    content = json.loads(messages.to_json(message().to_dict()))
+    assert np.array_equal(np.array(content["values"], dtype=np.float32), VALUES)
+    assert content["alarms"] == {"load": {"state": "on", "score": 2.5}, "slip": {"state": "unknown", "score": None}}
+    assert (content["version"], content["seq"], content["t_ns"], content["cause"]) == (1, 7, 10**18, "why")
     assert json.loads(messages.to_json(message(None).to_dict()))["values"] is None
 
 
@@ -39,19 +39,19 @@ def test_quantiles_are_in_messages_of_sessions_that_publish_them_alone() -> None
     about = Description(CHANNELS, (1, 2, 3), "count", 50.0, "m")
     assert not {"quantiles"} & {*message().to_dict(), *about.to_dict(), *about.schema()}
     plain, about = message(), replace(about, quantiles=(10, 90))
-    found = replace(plain, levels=(10, 90), quantiles=np.stack([VALUES - 1, VALUES + 1]))
-    sent = json.loads(messages.to_json(found.to_dict()))
+    with_quantiles = replace(plain, levels=(10, 90), quantiles=np.stack([VALUES - 1, VALUES + 1]))
+    sent = json.loads(messages.to_json(with_quantiles.to_dict()))
     assert list(sent["quantiles"]) == ["10", "90"] and sent.pop("quantiles")["90"] == (VALUES + 1).tolist()
     assert sent == json.loads(messages.to_json(plain.to_dict()))
     assert replace(message(None), levels=(10, 90)).to_dict()["quantiles"] is None
-    assert about.to_dict()["quantiles"] == [10, 90] and set(about.schema()) == set(found.to_dict())
-    columns = dict(zip([name for name, _ in about.columns()], found.numbers(about).tolist(), strict=True))
+    assert about.to_dict()["quantiles"] == [10, 90] and set(about.schema()) == set(with_quantiles.to_dict())
+    columns = dict(zip([name for name, _ in about.columns()], with_quantiles.numbers(about).tolist(), strict=True))
     assert columns["c4_t3"] == VALUES[2, 4] and columns["c4_t3_q10"] == VALUES[2, 4] - 1 and columns["load_state"] == 1
     sensor = Live(task="forward", output="forecast", channels=CHANNELS, steps=(1, 2, 3), quantiles=(10, 90))
-    (packet,) = messages.packets(found, sensor, 41)
-    values = [one for block in decoded(sensor, packet)[0] for one in block]
-    named = dict(zip([field.name for field in sensor.fields()], values, strict=True))
-    assert named == {name: value for name, value in columns.items() if not name.endswith("state")}
+    (packet,) = messages.packets(with_quantiles, sensor, 41)
+    values = [number for block in decoded(sensor, packet)[0] for number in block]
+    by_column = dict(zip([field.name for field in sensor.fields()], values, strict=True))
+    assert by_column == {name: value for name, value in columns.items() if not name.endswith("state")}
     assert sensor.fields()[-1].metadata[b"quantile"] == b"0.9"
 
 
@@ -91,8 +91,8 @@ def test_alarms_and_latencies_have_packets_too_and_a_missing_forecast_has_none()
 def test_packets_of_another_output_or_version_are_refused() -> None:
     (sent,) = messages.packets(message(), Live(task="forward", output="alarm", alarms=("load", "slip")), 3)
     assert sent is not None
-    other = sent[:4] + b"\x02" + sent[5:]
-    for wrong in (other, sent[:-1], b"x" + sent[1:]):
+    other_version = sent[:4] + b"\x02" + sent[5:]
+    for wrong in (other_version, sent[:-1], b"x" + sent[1:]):
         assert (
             Live(task="forward", output="alarm", alarms=("load", "slip")).framer().feed(Chunks.of([(0, wrong)]))[0]
             == []

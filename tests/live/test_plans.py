@@ -68,13 +68,13 @@ def planner(scheme: str) -> Iterator[tuple[str, threading.Event]]:
         return
     from websockets.sync.server import serve
 
-    gone = threading.Event()
+    is_over = threading.Event()
 
     def answer(connection: Any) -> None:
-        with contextlib.suppress(Exception):  # of a session that ends
+        with contextlib.suppress(Exception):  # the session ends
             while not over.wait(0.05):
                 connection.send(packet().decode())
-            gone.wait()
+            is_over.wait()
 
     with serve(answer, "127.0.0.1", port) as server:
         thread = threading.Thread(target=server.serve_forever)
@@ -83,7 +83,7 @@ def planner(scheme: str) -> Iterator[tuple[str, threading.Event]]:
             yield f"ws:127.0.0.1:{port}", over
         finally:
             over.set()
-            gone.set()
+            is_over.set()
             server.shutdown()
             thread.join()
 
@@ -94,8 +94,17 @@ def awaited(messages: list[dict[str, Any]], process: subprocess.Popen[str], caus
 
     def there() -> bool:
         assert process.poll() is None, process.communicate()[1]
-        found = [one["cause"] for one in forecasts(messages[first:])]
-        return len([one for one in found if (one.startswith(cause) if cause else not one)]) >= count
+        causes = [message["cause"] for message in forecasts(messages[first:])]
+        return (
+            len(
+                [
+                    message_cause
+                    for message_cause in causes
+                    if (message_cause.startswith(cause) if cause else not message_cause)
+                ]
+            )
+            >= count
+        )
 
     live.awaited(there)
 
@@ -126,13 +135,13 @@ def test_set_points_of_the_arm_are_the_plan_and_predict_gives_the_same_from_the_
     trained.run("predict models/f rec -o predicted --causal --steps 1,2")
     (predicted,) = tacpipe.open("predicted")
     table = predicted.table()
-    given = dict(zip(table["t_ns"].to_pylist(), range(table.num_rows), strict=True))
+    row_by_time = dict(zip(table["t_ns"].to_pylist(), range(table.num_rows), strict=True))
     names = [name for name in table.column_names if name != "t_ns"]
     values = np.column_stack([table[name].to_numpy() for name in names])
     shard = live.only(trained.folder)
     recorded = shard.table("forecast")
     published = np.column_stack([recorded[name].to_numpy() for name in names])
-    rows = [given[t_ns] for t_ns in recorded["t_device_ns"].to_pylist()]
+    rows = [row_by_time[t_ns] for t_ns in recorded["t_device_ns"].to_pylist()]
     differ = (values[rows] != published).any(axis=1).sum()
     assert len(rows) >= 60 and differ <= 4 * printed["live"]["late"]  # each is read by context rows, and the next point
     assert shard.attributes["live_plan"] == "rig:robot"
@@ -141,10 +150,10 @@ def test_set_points_of_the_arm_are_the_plan_and_predict_gives_the_same_from_the_
 def test_a_rig_without_a_stream_that_the_model_needs_or_with_another_layout_ends_with_2_and_a_sentence(
     trained: Lab,
 ) -> None:
-    other = live.stream("xela2", "optoforce", "serial:/dev/ttyS9", "{ rate_hz = 333 }")
-    for streams, named in (((SKINS[0], ARM), "xela2"), ((SKINS[0], other, ARM), "xela2"), (SKINS, "robot")):
+    other_sensor = live.stream("xela2", "optoforce", "serial:/dev/ttyS9", "{ rate_hz = 333 }")
+    for streams, missing in (((SKINS[0], ARM), "xela2"), ((SKINS[0], other_sensor, ARM), "xela2"), (SKINS, "robot")):
         (trained.folder / "rig.toml").write_text("".join(streams))
         process = started(trained, "--duration-s 1")
         _, err = process.communicate()
-        assert process.returncode == 2 and named in err and "Traceback" not in err
+        assert process.returncode == 2 and missing in err and "Traceback" not in err
         assert not (trained.folder / "rec").exists()

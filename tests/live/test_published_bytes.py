@@ -85,18 +85,18 @@ def fields(sensor: Live) -> list[Any]:
 
 @pytest.mark.parametrize("name", CASES)
 def test_every_format_has_the_bytes_of_before(name: str) -> None:
-    about, several, streams = CASES[name]()
+    about, published, streams = CASES[name]()
     streams |= {"latency": Live(task=streams[next(iter(streams))].task)}
     expected = EXPECTED[name]
     assert to_json(about.to_dict()).decode() == expected["description"]
     assert about.schema() == expected["schema"]
     assert [list(column) for column in about.columns()] == expected["columns"]
-    assert [to_json(message.to_dict()).decode() for message in several] == expected["json"]
-    assert [msgpack.packb(message.to_dict()).hex() for message in several] == expected["msgpack"]
-    assert [message.numbers(about).tobytes().hex() for message in several] == expected["numbers"]
-    assert [dict(message.states) for message in several] == expected["states"]
+    assert [to_json(message.to_dict()).decode() for message in published] == expected["json"]
+    assert [msgpack.packb(message.to_dict()).hex() for message in published] == expected["msgpack"]
+    assert [message.numbers(about).tobytes().hex() for message in published] == expected["numbers"]
+    assert [dict(message.states) for message in published] == expected["states"]
     for stream, sensor in streams.items():
-        sent = [[packet.hex() for packet in packets(message, sensor, 41)] for message in several]
+        sent = [[packet.hex() for packet in packets(message, sensor, 41)] for message in published]
         assert sent == expected["packets"][stream]
         assert fields(sensor) == expected["fields"][stream]
 

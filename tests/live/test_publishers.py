@@ -35,10 +35,10 @@ def message(seq: int, values: Any = VALUES) -> Message:
 
 @pytest.fixture
 def heard() -> Iterator[socket.socket]:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
-        one.bind(("127.0.0.1", 0))
-        one.settimeout(60)
-        yield one
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+        receiver.bind(("127.0.0.1", 0))
+        receiver.settimeout(60)
+        yield receiver
 
 
 @pytest.mark.parametrize("kind", ["json", "msgpack"])
@@ -70,9 +70,9 @@ def test_nobody_who_listens_costs_nothing_but_a_count(heard: socket.socket) -> N
 
 
 def free_port() -> int:
-    with socket.socket() as one:
-        one.bind(("127.0.0.1", 0))
-        return int(one.getsockname()[1])
+    with socket.socket() as free_socket:
+        free_socket.bind(("127.0.0.1", 0))
+        return int(free_socket.getsockname()[1])
 
 
 @pytest.fixture
@@ -117,8 +117,8 @@ def test_connections_beyond_the_limit_are_ended_and_neither_threads_nor_messages
     publisher, port = served
     with subscribed(port) as client, contextlib.ExitStack() as opened:
         threads = threading.active_count()
-        others = [opened.enter_context(socket.create_connection(("127.0.0.1", port))) for _ in range(100)]
-        assert all(ended_by_server(other) for other in others[CONNECTIONS:])
+        connections = [opened.enter_context(socket.create_connection(("127.0.0.1", port))) for _ in range(100)]
+        assert all(ended_by_server(connection) for connection in connections[CONNECTIONS:])
         assert threading.active_count() == threads
         publisher.publish(message(1))
         assert json.loads(client.recv(60))["seq"] == 1
@@ -179,14 +179,16 @@ def test_each_websocket_client_gets_the_description_and_every_message() -> None:
 
     port = free_port()
     publisher = WebsocketPublisher(f"127.0.0.1:{port}", ABOUT)
-    with connect(f"ws://127.0.0.1:{port}") as one, connect(f"ws://127.0.0.1:{port}") as other:
+    with connect(f"ws://127.0.0.1:{port}") as first_client, connect(f"ws://127.0.0.1:{port}") as second_client:
         awaited(lambda: publisher.subscribers == 2)
         for seq in range(5):
             publisher.publish(message(seq))
-        for client in (one, other):
-            found = [json.loads(client.recv(60)) for _ in range(6)]
-            assert found[0]["channels"] == ["a", "b"] and [each["seq"] for each in found[1:]] == list(range(5))
-            assert np.array_equal(np.array(found[3]["values"], dtype=np.float32), VALUES)
+        for client in (first_client, second_client):
+            received = [json.loads(client.recv(60)) for _ in range(6)]
+            assert received[0]["channels"] == ["a", "b"] and [content["seq"] for content in received[1:]] == list(
+                range(5)
+            )
+            assert np.array_equal(np.array(received[3]["values"], dtype=np.float32), VALUES)
     publisher.close()
 
 
@@ -204,12 +206,12 @@ def test_a_client_that_does_not_read_is_cut_off_and_others_get_everything() -> N
     with connect(f"ws://127.0.0.1:{port}", max_size=None) as quick:
         awaited(lambda: publisher.subscribers == 2)
         quick.recv(60)
-        found: list[int] = []
+        numbers: list[int] = []
         read = threading.Event()
 
         def keep_up() -> None:
             for _ in range(count):
-                found.append(json.loads(quick.recv(60))["seq"])
+                numbers.append(json.loads(quick.recv(60))["seq"])
                 read.set()
 
         reader = threading.Thread(target=keep_up)
@@ -219,7 +221,7 @@ def test_a_client_that_does_not_read_is_cut_off_and_others_get_everything() -> N
             publisher.publish(message(seq, large))
             assert read.wait(60)  # the quick one has it, whatever the slow one does
         reader.join(60)
-    assert found == list(range(count)) and publisher.dropped >= BEHIND
+    assert numbers == list(range(count)) and publisher.dropped >= BEHIND
     assert publisher.subscribers <= 1  # the quick one has gone too, which shows with the next message
     publisher.publish(message(count))
     awaited(lambda: publisher.subscribers == 0)
@@ -236,11 +238,12 @@ def test_an_mcap_file_holds_each_message_at_its_time(tmp_path: Path) -> None:
         publisher.publish(message(seq))
     publisher.close()
     with path.open("rb") as file:
-        found = [
-            (channel.topic, one.log_time, json.loads(one.data)) for _, channel, one in make_reader(file).iter_messages()
+        records = [
+            (channel.topic, record.log_time, json.loads(record.data))
+            for _, channel, record in make_reader(file).iter_messages()
         ]
-    assert sorted(topic for topic, _, _ in found) == ["/description", *["/forecast"] * 3]
-    for topic, t_ns, content in found:
+    assert sorted(topic for topic, _, _ in records) == ["/description", *["/forecast"] * 3]
+    for topic, t_ns, content in records:
         if topic == "/forecast":
             assert t_ns == content["t_ns"] == 10**18 + content["seq"]
             assert np.array_equal(np.array(content["values"], dtype=np.float32), VALUES)
@@ -267,10 +270,10 @@ def test_what_is_no_address_is_refused(address: str) -> None:
 
 
 def test_a_port_that_is_taken_is_refused_with_its_address() -> None:
-    with socket.socket() as one:
-        one.bind(("127.0.0.1", 0))
-        one.listen()
-        port = one.getsockname()[1]
+    with socket.socket() as taken_socket:
+        taken_socket.bind(("127.0.0.1", 0))
+        taken_socket.listen()
+        port = taken_socket.getsockname()[1]
         with pytest.raises(DeviceError, match=str(port)):
             publishing.publisher(f"ws:127.0.0.1:{port}", ABOUT)
 
@@ -284,11 +287,12 @@ def test_an_mcap_file_of_materials_has_a_topic_and_a_schema_of_its_own(tmp_path:
     publisher.publish(MaterialMessage(1, 7, ("cork", "felt"), np.array([0.25, 0.75], np.float32), SLIDING, 50, 0.5))
     publisher.close()
     with path.open("rb") as file:
-        found = [
-            (schema, channel.topic, json.loads(one.data)) for schema, channel, one in make_reader(file).iter_messages()
+        records = [
+            (schema, channel.topic, json.loads(record.data))
+            for schema, channel, record in make_reader(file).iter_messages()
         ]
-    assert [topic for _, topic, _ in found] == ["/description", "/material"]
-    schema, _, content = found[1]
+    assert [topic for _, topic, _ in records] == ["/description", "/material"]
+    schema, _, content = records[1]
     assert schema is not None and schema.name == "tacpipe.Material"
     assert set(content) == set(json.loads(schema.data)["properties"])
     assert content["material"] == "felt" and content["probabilities"] == {"cork": 0.25, "felt": 0.75}

@@ -30,17 +30,19 @@ def test_what_a_session_published_is_what_predict_causal_writes_to_the_last_bit(
     for recording in tacpipe.open("data/r"):
         published = session({name: recording.table(name) for name in recording.streams})
         table = predictions[recording.name].table()
-        assert table["t_ns"].to_pylist() == [one.t_ns for one in published] != []
+        assert table["t_ns"].to_pylist() == [forecast.t_ns for forecast in published] != []
         for step in (1, 2):
             for index, name in enumerate(table.schema.names[1::6]):
                 name = f"{name.removesuffix('_t1')}_t{step}"
-                assert table[name].to_numpy().tobytes() == b"".join(one.count[step - 1, index] for one in published)
+                assert table[name].to_numpy().tobytes() == b"".join(
+                    forecast.count[step - 1, index] for forecast in published
+                )
                 for at, level in enumerate(QUANTILES):
-                    wanted = b"".join(one.quantiles[step - 1, index, at] for one in published)
-                    assert table[f"{name}_q{level}"].to_numpy().tobytes() == wanted
+                    expected = b"".join(forecast.quantiles[step - 1, index, at] for forecast in published)
+                    assert table[f"{name}_q{level}"].to_numpy().tobytes() == expected
         assert predictions[recording.name].attributes["forecast_no_plan"] == len(published)
     ran = lab.call("predict models/f data/c -o data/after --causal")
-    assert ran.code == 2 and "trial-000" in ran.err  # what had arrived when cannot be seen after a stage
+    assert ran.code == 2 and "trial-000" in ran.err  # arrivals cannot be seen after a stage
     ran = lab.call("predict models/f data/r -o data/without --causal --quantiles 10")
     assert ran.code == 1 and "tacpipe calibrate MODEL" in ran.err
     lab.run("predict models/f data/r -o data/without --steps 1,2 --causal")
@@ -60,20 +62,20 @@ def session(tables: dict[str, pa.Table]) -> list[Any]:
         if name in chain.streams
         for row, t_ns in enumerate(table["t_ns"].to_pylist())
     )
-    found = []
+    forecasts = []
     for t_ns, name, row in arrivals:
-        found += chain.advance(t_ns - 2 * MS)
+        forecasts += chain.advance(t_ns - 2 * MS)
         chain.push(name, tables[name].slice(row, 1).to_batches()[0])
-    found += chain.advance(arrivals[-1][0])
-    return [one for one in found if one.count is not None]
+    forecasts += chain.advance(arrivals[-1][0])
+    return [forecast for forecast in forecasts if forecast.count is not None]
 
 
 def test_a_plan_of_another_shape_or_order_is_refused_by_what_is_wrong() -> None:
-    for t_ns, poses, named in (
+    for t_ns, poses, pattern in (
         ([1, 2], np.zeros((2, 4)), r"\(2, 4\)"),
         ([1], np.zeros((2, 3)), "1 times"),
         ([2, 2], np.zeros((2, 3)), "ascend"),
         ([1, 2], np.full((2, 3), np.nan), "finite"),
     ):
-        with pytest.raises(tacpipe.TacpipeError, match=named):
+        with pytest.raises(tacpipe.TacpipeError, match=pattern):
             plan_table(0, np.array(t_ns), poses)

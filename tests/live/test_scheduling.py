@@ -11,13 +11,13 @@ from tacpipe.live import scheduling
 
 
 def test_a_system_that_does_not_allow_it_is_named_before_the_session(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refused(*given: object) -> None:
+    def refused(*arguments: object) -> None:
         raise PermissionError(1, "Operation not permitted")
 
     monkeypatch.setattr(os, "sched_setscheduler", refused)
     with pytest.raises(UsageError, match="rtprio 20"):
         scheduling.check()
-    scheduling.realtime(scheduling.MODEL)  # of a process whose rights ended meanwhile: it goes on as ever
+    scheduling.realtime(scheduling.MODEL)  # a process whose rights ended meanwhile goes on as ever
     scheduling.ordinary()
 
 

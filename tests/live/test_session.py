@@ -33,15 +33,15 @@ def test_what_is_published_is_recorded_to_the_bit_and_predicted_from_what_was_re
         printed = ended(started(lab, options))
     shard = live.only(lab.folder)
     table = shard.table("forecast")
-    assert next(one for one in messages if one["kind"] == "description")["quantiles"] == [10, 90]
-    published = {one["t_ns"]: np.array(one["values"], dtype=np.float32) for one in forecasts(messages)}
+    assert next(message for message in messages if message["kind"] == "description")["quantiles"] == [10, 90]
+    published = {message["t_ns"]: np.array(message["values"], dtype=np.float32) for message in forecasts(messages)}
     names = [f"{channel}_t{step}" for step in range(1, HORIZON + 1) for channel in CHANNELS]
     recorded = np.column_stack([table.column(name).to_numpy() for name in names]).reshape(-1, HORIZON, len(CHANNELS))
     points = table.column("t_device_ns").to_numpy()
     assert len(points) > 10 and set(points.tolist()) <= set(published)
     assert all((published[t_ns] == values).all() for t_ns, values in zip(points.tolist(), recorded, strict=True))
-    bands = {one["t_ns"]: np.array(one["quantiles"]["90"], dtype=np.float32) for one in forecasts(messages)}
-    for level, above in ((10, -40), (90, 40)):  # what is published as that level, and what was recorded of it
+    bands = {message["t_ns"]: np.array(message["quantiles"]["90"], dtype=np.float32) for message in forecasts(messages)}
+    for level, above in ((10, -40), (90, 40)):  # the published level and the recorded one
         levels = np.column_stack([table.column(f"{name}_q{level}").to_numpy() for name in names])
         assert (levels == recorded.reshape(len(points), -1) + np.float32(above)).all()
     assert all((bands[t_ns].ravel() == row).all() for t_ns, row in zip(points.tolist(), levels, strict=True))
@@ -51,7 +51,9 @@ def test_what_is_published_is_recorded_to_the_bit_and_predicted_from_what_was_re
     values = np.column_stack([skin.column(name.removeprefix("skin_")).to_numpy() for name in CHANNELS])
     newest = values[np.searchsorted(arrivals, points, side="right") - 1].astype(np.float32)
     late = printed["live"]["late"]
-    assert int((recorded[:, 0] != newest).any(axis=1).sum()) <= late  # but for rows whose sample came too late
+    assert (
+        int((recorded[:, 0] != newest).any(axis=1).sum()) <= late
+    )  # other rows differ only where a sample came too late
     assert set(shard.streams) >= {"alarm", "latency"} and "live_model" in shard.attributes
     assert (shard.table("latency").column("latency_ms").drop_null().to_numpy() != 0).all()
     assert whole(shard, "skin") and whole(shard, "wrench")
@@ -60,7 +62,7 @@ def test_what_is_published_is_recorded_to_the_bit_and_predicted_from_what_was_re
 def test_a_model_process_that_dies_is_started_anew_and_no_sample_is_lost(lab: Lab) -> None:
     with live.served(lab.folder, SKIN, live.WRENCH), subscriber() as (port, messages):
         process = started(lab, f"-o rec --json --publish udp:127.0.0.1:{port}", "die:40")
-        live.awaited(lambda: len({one["seq"] for one in forecasts(messages)}) < len(forecasts(messages)) - 5)
+        live.awaited(lambda: len({message["seq"] for message in forecasts(messages)}) < len(forecasts(messages)) - 5)
         printed = ended(process, interrupt=True)
     shard = live.only(lab.folder)
     causes = [cause for cause, _ in live.events(shard, "forecast")]
@@ -110,11 +112,11 @@ def test_packets_that_are_no_plan_or_of_another_sender_are_counted_and_not_kept(
             lab, f"-o rec --json --plan udp::{place} --plan-from 127.0.0.2 --publish udp:127.0.0.1:{port}"
         )
         live.awaited(lambda: len(forecasts(messages)) > 5)
-        named, other = (opened.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(2))
-        named.bind(("127.0.0.2", 0))
+        allowed, foreign = (opened.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(2))
+        allowed.bind(("127.0.0.2", 0))
         for _ in range(10):
             plan = plans.packet((time.time_ns() + np.arange(4) * 10**8).tolist(), poses)
-            for sender, data in ((named, plan), (other, plan), *[(named, garbage)] * 100):
+            for sender, data in ((allowed, plan), (foreign, plan), *[(allowed, garbage)] * 100):
                 sender.sendto(data, ("127.0.0.1", place))
             time.sleep(0.05)  # the kernel's queue holds 8 MB where it grants that
         assert sum((path / "bytes").stat().st_size for path in live.spools(lab.folder)) < 1_000_000

@@ -1,4 +1,4 @@
-"""What a live session is asked for: by the rig file, over it by the command; what is wrong is named with its place."""
+"""Settings of a live session come from the rig file and, over it, from the command; errors name the place."""
 
 from __future__ import annotations
 
@@ -35,28 +35,28 @@ FULL = {
 }
 
 
-def settings(stated: dict[str, Any], **given: Any) -> Settings:
-    return Settings.from_sources(ForwardSettings, stated, "rig.toml", given)
+def settings(file_settings: dict[str, Any], **options: Any) -> Settings:
+    return Settings.from_sources(ForwardSettings, file_settings, "rig.toml", options)
 
 
-def forward_settings(stated: dict[str, Any], **given: Any) -> ForwardSettings:
-    own = settings(stated, **given).task
-    assert isinstance(own, ForwardSettings)
-    return own
+def forward_settings(file_settings: dict[str, Any], **options: Any) -> ForwardSettings:
+    task_settings = settings(file_settings, **options).task
+    assert isinstance(task_settings, ForwardSettings)
+    return task_settings
 
 
 def test_what_the_file_states_counts_and_options_of_the_command_win() -> None:
-    found = settings(FULL, plan=None, realtime=False, publish=("lsl:touch",), settle_ms=1.5)
-    own = ForwardSettings("rig:robot", "", (1, 5), (10, 90), 6.0, "data/c", "data/split")
-    assert found == Settings("models/f", ("lsl:touch",), 1.5, realtime=False, task=own)
+    merged = settings(FULL, plan=None, realtime=False, publish=("lsl:touch",), settle_ms=1.5)
+    expected = ForwardSettings("rig:robot", "", (1, 5), (10, 90), 6.0, "data/c", "data/split")
+    assert merged == Settings("models/f", ("lsl:touch",), 1.5, realtime=False, task=expected)
     assert settings({}, model="models/g") == Settings("models/g", task=ForwardSettings())
 
 
 def test_alarms_of_the_file_are_switched_off_by_the_option_and_a_split_belongs_to_its_recordings() -> None:
     off = forward_settings(FULL, alarms_per_hour=0.0)
     assert (off.alarms_per_hour, off.alarms_on, off.split) == (0.0, "", "")
-    others = forward_settings(FULL, alarms_on="data/others")
-    assert (others.alarms_per_hour, others.alarms_on, others.split) == (6.0, "data/others", "")
+    moved = forward_settings(FULL, alarms_on="data/others")
+    assert (moved.alarms_per_hour, moved.alarms_on, moved.split) == (6.0, "data/others", "")
 
 
 @pytest.mark.parametrize(
@@ -139,13 +139,13 @@ def test_the_table_stays_in_the_text_of_a_rig_and_recorders_do_not_look_at_it() 
 @pytest.mark.parametrize("page", ["docs/rig.md", "docs/howto/live.md"])
 def test_the_examples_of_the_pages_are_read(page: str) -> None:
     texts = [block.text for block in fenced_blocks((ROOT / page).read_text()) if block.language == "toml"]
-    found = [text for text in texts if "[live]" in text]
-    assert found
-    for text in found:
-        stated = tomllib.loads(text)["live"]
-        assert settings(stated).model == stated["model"]
+    examples = [text for text in texts if "[live]" in text]
+    assert examples
+    for text in examples:
+        file_settings = tomllib.loads(text)["live"]
+        assert settings(file_settings).model == file_settings["model"]
         if "[[stream]]" in text:
-            assert rigs.parse(text).live == stated
+            assert rigs.parse(text).live == file_settings
 
 
 def test_the_page_of_the_rig_file_names_every_key() -> None:
@@ -156,18 +156,18 @@ def test_the_page_of_the_rig_file_names_every_key() -> None:
 
 @pytest.mark.long
 def test_a_session_is_what_the_file_states_but_for_the_options_given(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
-    for one in TRAINED:
-        lab.run(one)
-    stated = 'model = "models/f"\nplan = "udp::9100"\nsteps = [2]\nsettle_ms = 3\n'
+    for training_command in TRAINED:
+        lab.run(training_command)
+    table = 'model = "models/f"\nplan = "udp::9100"\nsteps = [2]\nsettle_ms = 3\n'
     alarms = 'alarms_per_hour = 60\nalarms_on = "data/c"\nsplit = "data/split"\n'
-    Path("rig.toml").write_text(f"{STREAM}[live]\n{stated}{alarms}")
-    asked: list[Any] = []
-    monkeypatch.setattr(command, "_run", lambda prepared, *rest, **more: asked.append(prepared))
+    Path("rig.toml").write_text(f"{STREAM}[live]\n{table}{alarms}")
+    prepared_sessions: list[Any] = []
+    monkeypatch.setattr(command, "_run", lambda prepared, *arguments, **keywords: prepared_sessions.append(prepared))
     lab.run("live rig.toml --settle-ms 1 --publish udp:127.0.0.1:9000")
-    (prepared,) = asked
-    common, own = prepared.options.settings, prepared.options.settings.task
-    assert common.model == str(Path("models/f").absolute()) and own.steps == (2,) and common.settle_ms == 1.0
-    assert own.alarms_per_hour == 60 and own.split == str(Path("data/split").absolute())
+    (prepared,) = prepared_sessions
+    common, task_settings = prepared.options.settings, prepared.options.settings.task
+    assert common.model == str(Path("models/f").absolute()) and task_settings.steps == (2,) and common.settle_ms == 1.0
+    assert task_settings.alarms_per_hour == 60 and task_settings.split == str(Path("data/split").absolute())
     assert common.publish == ("udp:127.0.0.1:9000",) and "plan" in prepared.options.streams
     assert prepared.attributes["live_plan"] == "udp::9100" and prepared.attributes["live_alarms_per_hour"] == 60
     assert SessionOptions.from_json(prepared.options.to_json()) == prepared.options
@@ -175,8 +175,8 @@ def test_a_session_is_what_the_file_states_but_for_the_options_given(lab: Lab, m
 
 @pytest.mark.long
 def test_a_value_of_the_file_that_the_session_refuses_is_named_with_the_file(lab: Lab) -> None:
-    for one in TRAINED:
-        lab.run(one)
+    for training_command in TRAINED:
+        lab.run(training_command)
     for line, sentence in (
         ('plan = "carrier pigeon"', "rig.toml, live: plan 'carrier pigeon' is not a source of plans"),
         ('plan = "rig:arm"', "rig.toml, live: plan 'rig:arm': the rig has no stream"),

@@ -1,4 +1,4 @@
-"""What the links gave reaches the model's process in order, or is thrown away and counted; nobody waits for it."""
+"""Bytes of the links reach the model's process in order, or are thrown away and counted; nobody waits for it."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ def chunk(number: int, size: int = 10) -> Chunks:
 
 def received(theirs: socket.socket, blocks: wire.Blocks) -> list[tuple[str, Chunks | Note]]:
     theirs.setblocking(False)
-    found: list[tuple[str, Chunks | Note]] = []
+    blocks_received: list[tuple[str, Chunks | Note]] = []
     while True:
         try:
-            found += blocks.feed(theirs.recv(777))
+            blocks_received += blocks.feed(theirs.recv(777))
         except BlockingIOError:
-            return found
+            return blocks_received
 
 
-def numbers(found: list[tuple[str, Chunks | Note]]) -> list[int]:
-    return [int(block.t_ns[0]) for _, block in found if isinstance(block, Chunks)]
+def numbers(blocks_received: list[tuple[str, Chunks | Note]]) -> list[int]:
+    return [int(block.t_ns[0]) for _, block in blocks_received if isinstance(block, Chunks)]
 
 
 def test_what_is_put_arrives_in_order_with_its_stream_stamps_and_bytes(pair: Pair) -> None:
@@ -58,12 +58,12 @@ def test_what_the_socket_does_not_take_waits_and_loses_no_byte(pair: Pair) -> No
     tap.connect(pair[0])
     for number in range(400):  # several times what a socket holds
         tap.put("a", chunk(number, 5000))
-    found = received(pair[1], blocks)
-    assert 0 < len(numbers(found)) < 400
-    while len(numbers(found)) < 400:
+    blocks_received = received(pair[1], blocks)
+    assert 0 < len(numbers(blocks_received)) < 400
+    while len(numbers(blocks_received)) < 400:
         tap.flush()
-        found += received(pair[1], blocks)
-    assert numbers(found) == list(range(400)) and tap.overflows == 0
+        blocks_received += received(pair[1], blocks)
+    assert numbers(blocks_received) == list(range(400)) and tap.overflows == 0
 
 
 def test_a_queue_that_is_full_is_thrown_away_counted_and_reported_to_the_model(pair: Pair) -> None:
@@ -72,15 +72,15 @@ def test_a_queue_that_is_full_is_thrown_away_counted_and_reported_to_the_model(p
     for number in range(400):
         tap.put("a", chunk(number, 5000))
     assert tap.overflows > 0 and tap.bytes_lost > 0
-    found = received(pair[1], blocks)
+    blocks_received = received(pair[1], blocks)
     for _ in range(100):
         tap.flush()
-        found += received(pair[1], blocks)
-    kept = numbers(found)
-    assert kept == sorted(kept) and kept[-1] == 399 and len(kept) < 400
-    overflows = [place for place, (_, block) in enumerate(found) if isinstance(block, Note)]
-    assert {found[place][1].what for place in overflows} == {wire.OVERFLOW}  # type: ignore[union-attr]
-    gaps = [place for place in range(1, len(kept)) if kept[place] != kept[place - 1] + 1]
+        blocks_received += received(pair[1], blocks)
+    retained = numbers(blocks_received)
+    assert retained == sorted(retained) and retained[-1] == 399 and len(retained) < 400
+    overflows = [place for place, (_, block) in enumerate(blocks_received) if isinstance(block, Note)]
+    assert {blocks_received[place][1].what for place in overflows} == {wire.OVERFLOW}  # type: ignore[union-attr]
+    gaps = [place for place in range(1, len(retained)) if retained[place] != retained[place - 1] + 1]
     assert len(gaps) == len(overflows)  # each gap is reported where it is
 
 

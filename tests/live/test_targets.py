@@ -1,4 +1,4 @@
-"""Where an arm's controller aims at is read from the arm's own stream, and taken to go on as it did."""
+"""The set-point of an arm's controller is read from the arm's own stream, and taken to go on as it did."""
 
 from __future__ import annotations
 
@@ -44,14 +44,18 @@ def test_the_set_points_of_an_arm_are_read_as_pose_and_velocities(kind: str) -> 
     t_ns, poses = moving(40)
     names = [field.name for field in sensor.fields()]
     first = names.index("target_position_x_m")
-    block = next(number for number, one in enumerate(samples.values) if one.shape[1] > 1 or len(samples.values) == 1)
+    block = next(
+        number
+        for number, block_values in enumerate(samples.values)
+        if block_values.shape[1] > 1 or len(samples.values) == 1
+    )
     before = 0
-    for number, one in enumerate(samples.values):
-        if before <= first < before + one.shape[1]:
+    for number, block_values in enumerate(samples.values):
+        if before <= first < before + block_values.shape[1]:
             block = number
-            one[:, first - before : first - before + 7] = poses
+            block_values[:, first - before : first - before + 7] = poses
             break
-        before += one.shape[1]
+        before += block_values.shape[1]
     assert samples.values[block].shape[0] == 40
     packets = made.pieces(sensor, sensor.encode(samples))
     batch = Reading(sensor).feed(Chunks.of(list(zip(t_ns.tolist(), packets, strict=True))))
@@ -80,57 +84,63 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Made:
 
 def aimed(seed: int) -> FakeRecording:
     """A recording whose arm states its set-points too: 30 ms ahead of where it is."""
-    given = rigs.recording(seed)
-    robot = given.tables["robot"]
+    recording = rigs.recording(seed)
+    robot = recording.tables["robot"]
     t_ns = robot["t_ns"].to_numpy()
     names = [field.name for field in schema.pose_fields()]
     ahead = [np.interp(t_ns + 30 * MS, t_ns, robot[name].to_numpy()) for name in names]
     columns = [robot[name].to_numpy() for name in names]
     table = schema.stream(t_ns, [*columns, *ahead], [*schema.pose_fields(), *schema.target_pose_fields()])
-    return FakeRecording({**given.tables, "robot": table}, given.name)
+    return FakeRecording({**recording.tables, "robot": table}, recording.name)
 
 
-def fed(model: Made, given: FakeRecording, cuts: list[int], plan_from: str = "robot") -> list[Any]:
-    chain = Chain.for_model(*model, {name: table.schema for name, table in given.tables.items()}, plan_from=plan_from)
-    found = []
-    for name, table, cut in rigs.pieces(given, cuts, list(given.tables)):
+def fed(model: Made, recording: FakeRecording, cuts: list[int], plan_from: str = "robot") -> list[Any]:
+    chain = Chain.for_model(
+        *model, {name: table.schema for name, table in recording.tables.items()}, plan_from=plan_from
+    )
+    forecasts = []
+    for name, table, cut in rigs.pieces(recording, cuts, list(recording.tables)):
         chain.push(name, table)
-        if name == list(given.tables)[-1]:
-            found += chain.advance(cut)
-    return found
+        if name == list(recording.tables)[-1]:
+            forecasts += chain.advance(cut)
+    return forecasts
 
 
 def test_a_forecast_reads_set_points_as_its_plan_however_they_came(model: Made) -> None:
-    given = aimed(5)
-    whole = fed(model, given, [])
-    cut = fed(model, given, [T0 + at * MS for at in range(100, 2900, 37)])
-    ready = [one for one in whole if one.count is not None]
-    assert ready and all(one.cause == Cause.NONE for one in ready)
-    assert [one.t_ns for one in whole] == [one.t_ns for one in cut]
-    for one, other in zip(whole, cut, strict=True):
-        assert (one.count is None) == (other.count is None)
-        assert one.count is None or other.count is None or one.count.tobytes() == other.count.tobytes()
-    without = {one.t_ns: one for one in fed(model, given, [], plan_from="")}
-    assert {Cause.NO_PLAN} == {one.cause for one in without.values() if one.count is not None}
-    assert any((one.count != without[one.t_ns].count).any() for one in ready)
+    recording = aimed(5)
+    uncut = fed(model, recording, [])
+    cut = fed(model, recording, [T0 + at * MS for at in range(100, 2900, 37)])
+    ready = [forecast for forecast in uncut if forecast.count is not None]
+    assert ready and all(forecast.cause == Cause.NONE for forecast in ready)
+    assert [forecast.t_ns for forecast in uncut] == [forecast.t_ns for forecast in cut]
+    for forecast, cut_forecast in zip(uncut, cut, strict=True):
+        assert (forecast.count is None) == (cut_forecast.count is None)
+        assert (
+            forecast.count is None
+            or cut_forecast.count is None
+            or forecast.count.tobytes() == cut_forecast.count.tobytes()
+        )
+    without = {forecast.t_ns: forecast for forecast in fed(model, recording, [], plan_from="")}
+    assert {Cause.NO_PLAN} == {forecast.cause for forecast in without.values() if forecast.count is not None}
+    assert any((forecast.count != without[forecast.t_ns].count).any() for forecast in ready)
 
 
 def test_the_plan_is_what_the_set_point_did_last_taken_to_continue(
     model: Made, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    seen: list[Any] = []
+    calls: list[Any] = []
     used = causal.without
 
-    def without(*given: Any) -> Any:
-        seen.append(given)
-        return used(*given)
+    def without(*arguments: Any) -> Any:
+        calls.append(arguments)
+        return used(*arguments)
 
     monkeypatch.setattr(causal, "without", without)
-    given = aimed(6)
-    fed(model, given, [])
-    robot = given.tables["robot"]
+    recording = aimed(6)
+    fed(model, recording, [])
+    robot = recording.tables["robot"]
     t_ns, x_m = robot["t_ns"].to_numpy(), robot["target_position_x_m"].to_numpy()
-    for at_ns, _, state in seen[:: max(1, len(seen) // 5)]:
+    for at_ns, _, state in calls[:: max(1, len(calls) // 5)]:
         assert abs(state[0] - x_m[np.searchsorted(t_ns, at_ns, side="right") - 1]) < 1e-6
 
 

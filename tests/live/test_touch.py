@@ -52,8 +52,12 @@ def candidates() -> list[Grasp]:
 def request(cloud: Any = None, grasps: list[Grasp] | None = None, number: int = 7) -> dict[str, Any]:
     """Return a request as a planner sends it."""
     listed = [
-        {"g1": one.g1_m.tolist(), "g2": one.g2_m.tolist(), "wrist": None if one.wrist is None else one.wrist.tolist()}
-        for one in (candidates() if grasps is None else grasps)
+        {
+            "g1": grasp.g1_m.tolist(),
+            "g2": grasp.g2_m.tolist(),
+            "wrist": None if grasp.wrist is None else grasp.wrist.tolist(),
+        }
+        for grasp in (candidates() if grasps is None else grasps)
     ]
     points = cloud
     if isinstance(cloud, Cloud):
@@ -72,41 +76,41 @@ class Session:
         self.engine.take("", Note(0, "", wire.BEGIN, str(OFFSET_NS)))
         self.engine.take("requests", Note(0, "requests", BEGAN))
 
-    def send(self, *several: Any) -> None:
+    def send(self, *requests: Any) -> None:
         """Have requests arrive, a millisecond apart."""
-        for one in several:
+        for content in requests:
             self.t_ns += 1_000_000
-            self.engine.take("requests", Chunks.of([(self.t_ns, json.dumps(one).encode())]))
+            self.engine.take("requests", Chunks.of([(self.t_ns, json.dumps(content).encode())]))
 
-    def ask(self, one: Any) -> TouchMessage:
+    def ask(self, content: Any) -> TouchMessage:
         """Return the answer to a request."""
-        self.send(one)
-        (found,) = self.engine.step(self.t_ns)
-        return found
+        self.send(content)
+        (message,) = self.engine.step(self.t_ns)
+        return message
 
 
 def predicted(files: Files, cloud: Cloud) -> Any:
     """Return what `tacpipe predict` gives the candidates (grasp, value)."""
     shards = [
-        handmade.recording(number, "unseen", felt=False, cloud=cloud, grasp=one)
-        for number, one in enumerate(candidates())
+        handmade.recording(number, "unseen", felt=False, cloud=cloud, grasp=grasp)
+        for number, grasp in enumerate(candidates())
     ]
     table = touch_prediction.predict(files, handmade.dataset(*shards)).recordings["predictions"].streams[""]
-    there = [name for name in COLUMNS if name in table.column_names]
-    return there, np.column_stack([table.column(name).to_numpy() for name in there])
+    columns = [name for name in COLUMNS if name in table.column_names]
+    return columns, np.column_stack([table.column(name).to_numpy() for name in columns])
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_touch_of_each_candidate_is_that_of_predict(kind: str, models: dict[str, Files]) -> None:
     cloud = handmade.cloud(3)
-    found = Session(models[kind]).ask(request(cloud))
-    there, wanted = predicted(models[kind], cloud)
-    assert found.touch is not None and found.touch.shape == (COUNT, len(COLUMNS))
-    values = found.touch[:, [COLUMNS.index(name) for name in there]].astype(np.float32)
-    assert values.tobytes() == wanted.astype(np.float32).tobytes()
-    missing = [COLUMNS.index(name) for name in COLUMNS if name not in there]
-    assert np.isnan(found.touch[:, missing]).all()
-    assert found.t_ns == OFFSET_NS + 1_000_000 and found.request == 7
+    message = Session(models[kind]).ask(request(cloud))
+    columns, expected = predicted(models[kind], cloud)
+    assert message.touch is not None and message.touch.shape == (COUNT, len(COLUMNS))
+    values = message.touch[:, [COLUMNS.index(name) for name in columns]].astype(np.float32)
+    assert values.tobytes() == expected.astype(np.float32).tobytes()
+    missing = [COLUMNS.index(name) for name in COLUMNS if name not in columns]
+    assert np.isnan(message.touch[:, missing]).all()
+    assert message.t_ns == OFFSET_NS + 1_000_000 and message.request == 7
 
 
 def test_candidates_are_ranked_by_contact_balance_or_a_level_as_computed_by_hand(models: dict[str, Files]) -> None:
@@ -121,18 +125,18 @@ def test_candidates_are_ranked_by_contact_balance_or_a_level_as_computed_by_hand
         fallen = 1 - (values[:, first : first + 24].astype(np.float64) - low) / (high - low)
         level[finger] = (pressed + fallen.mean(axis=1)) / 2
     mean = (level["th"] + level["mf"]) / 2
-    wanted = {
+    expected = {
         "contact": mean,
         "balance": -np.abs(level["th"] - level["mf"]),
         "level:0.45": -np.abs(mean - 0.45),
     }
-    for rank, scores in wanted.items():
-        found = Session(models["tree-ensemble"], rank).ask(request(cloud))
-        assert np.allclose(found.scores, scores, atol=1e-6)
-        assert found.ranks.index(1) == int(scores.argmax())
-        content = found.to_dict()
+    for rank, scores in expected.items():
+        message = Session(models["tree-ensemble"], rank).ask(request(cloud))
+        assert np.allclose(message.scores, scores, atol=1e-6)
+        assert message.ranks.index(1) == int(scores.argmax())
+        content = message.to_dict()
         assert content["best"] == int(scores.argmax()) and content["criterion"] == rank
-        assert [one["rank"] for one in content["candidates"]] == list(found.ranks)
+        assert [candidate["rank"] for candidate in content["candidates"]] == list(message.ranks)
         assert json.loads(json.dumps(content, allow_nan=False)) == content
 
 
@@ -146,9 +150,9 @@ def test_a_cloud_comes_as_points_as_a_file_of_the_folder_or_from_the_request_bef
     session = Session(models["tree-ensemble"], folder=tmp_path)
     first = session.ask(request(cloud)).touch
     assert first is not None
-    for given in ("egg.ply", "egg.npz", None):
-        found = session.ask(request(given)).touch
-        assert found is not None and found.tobytes() == first.tobytes()
+    for cloud_reference in ("egg.ply", "egg.npz", None):
+        message = session.ask(request(cloud_reference)).touch
+        assert message is not None and message.tobytes() == first.tobytes()
 
 
 def test_a_request_that_cannot_be_answered_gets_a_cause_and_the_next_one_is_answered(
@@ -159,7 +163,7 @@ def test_a_request_that_cannot_be_answered_gets_a_cause_and_the_next_one_is_answ
     same: Any = {"version": 1, "request": 1, "cloud": None, "grasps": [{"g1": [0, 0, 0], "g2": [0, 0, 0]}]}
     (tmp_path / "bad.npz").write_bytes(b"no")
     session = Session(models["tree-ensemble"], folder=tmp_path)
-    for given, named in (
+    for content, sentence in (
         (request(None), "no cloud"),
         (request("absent.ply"), "absent.ply"),
         (request("../x.ply"), "not within"),
@@ -169,9 +173,9 @@ def test_a_request_that_cannot_be_answered_gets_a_cause_and_the_next_one_is_answ
         (same, "two different points"),
         (request([[0.0, 0.0, 0.0]]), "cloud of 1 points"),
     ):
-        found = session.ask(given)
-        assert found.touch is None and named in found.cause, found.cause
-        assert found.to_dict()["candidates"] is None and packets(found, live(), 0) == []
+        message = session.ask(content)
+        assert message.touch is None and sentence in message.cause, message.cause
+        assert message.to_dict()["candidates"] is None and packets(message, live(), 0) == []
     assert session.ask(request(cloud)).answers
     closed = Session(models["tree-ensemble"]).ask(request("egg.ply"))
     assert "option folder" in closed.cause
@@ -180,11 +184,11 @@ def test_a_request_that_cannot_be_answered_gets_a_cause_and_the_next_one_is_answ
 def test_of_more_requests_than_can_wait_the_oldest_are_left_out_and_counted(models: dict[str, Files]) -> None:
     session = Session(models["tree-ensemble"])
     session.send(*(request(handmade.cloud(3), number=number) for number in range(WAITING + 3)))
-    found = []
-    while some := session.engine.step(session.t_ns):
-        found += some
-    assert [one.request for one in found] == list(range(3, WAITING + 3))
-    assert session.engine.skipped == found[-1].skipped == 3
+    messages = []
+    while answered := session.engine.step(session.t_ns):
+        messages += answered
+    assert [message.request for message in messages] == list(range(3, WAITING + 3))
+    assert session.engine.skipped == messages[-1].skipped == 3
 
 
 @pytest.mark.parametrize(
@@ -208,20 +212,20 @@ def test_what_is_no_request_is_no_frame(change: dict[str, Any]) -> None:
 
 
 def live() -> Live:
-    found = rigs_of.build_sensor("live", {"task": "touch", "output": "touch", "channels": list(COLUMNS)}, "live")
-    assert isinstance(found, Live)
-    return found
+    sensor = rigs_of.build_sensor("live", {"task": "touch", "output": "touch", "channels": list(COLUMNS)}, "live")
+    assert isinstance(sensor, Live)
+    return sensor
 
 
 def test_the_sessions_stream_has_a_row_a_candidate(models: dict[str, Files]) -> None:
     message = Session(models["tree-ensemble"]).ask(request(handmade.cloud(3)))
     sensor = live()
     sent = packets(message, sensor, 3)
-    found = sensor.decode(np.stack([np.frombuffer(one, np.uint8) for one in sent]))
-    assert found.seq is not None and found.seq.tolist() == [3, 4, 5, 6, 7]
-    assert found.values[0].tolist() == [[7, row, rank] for row, rank in enumerate(message.ranks)]
+    samples = sensor.decode(np.stack([np.frombuffer(packet, np.uint8) for packet in sent]))
+    assert samples.seq is not None and samples.seq.tolist() == [3, 4, 5, 6, 7]
+    assert samples.values[0].tolist() == [[7, row, rank] for row, rank in enumerate(message.ranks)]
     assert message.touch is not None
-    assert np.array_equal(found.values[1][:, 3:], message.touch.astype(np.float32))
+    assert np.array_equal(samples.values[1][:, 3:], message.touch.astype(np.float32))
 
 
 def test_a_rig_without_requests_and_a_criterion_that_cannot_be_are_refused(models: dict[str, Files]) -> None:
@@ -229,7 +233,7 @@ def test_a_rig_without_requests_and_a_criterion_that_cannot_be_are_refused(model
     with pytest.raises(TacpipeError, match="sensor grasps"):
         TouchEngine(sensors, Predictor.load(models["tree-ensemble"]), touch_ranking.criterion("contact"))
     with pytest.raises(TacpipeError, match="both fingers"):
-        Session(models["pointnet"], "balance")  # which predicts the thumb's pressure alone
+        Session(models["pointnet"], "balance")  # this model predicts the thumb's pressure alone
     for text in ("", "best", "level", "level:x", "level:nan", "contact:1"):
         with pytest.raises(UsageError, match="--rank"):
             touch_ranking.criterion(text)

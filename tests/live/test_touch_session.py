@@ -44,13 +44,17 @@ def test_a_request_is_answered_with_what_predict_gives_and_both_are_recorded(lab
     (lab.folder / "rig.toml").write_text(live.stream("requests", "grasps", f"udp:127.0.0.1:{port}", options))
     assert grasp.wrist is not None
     turned = Grasp(grasp.g2_m, grasp.g1_m, grasp.wrist @ np.diag([1.0, -1.0, -1.0]))
-    asked: dict[str, Any] = {
+    content: dict[str, Any] = {
         "version": 1,
         "request": 7,
         "cloud": "cup.ply",
         "grasps": [
-            {"g1": one.g1_m.tolist(), "g2": one.g2_m.tolist(), "wrist": np.asarray(one.wrist).tolist()}
-            for one in (grasp, turned)
+            {
+                "g1": candidate.g1_m.tolist(),
+                "g2": candidate.g2_m.tolist(),
+                "wrist": np.asarray(candidate.wrist).tolist(),
+            }
+            for candidate in (grasp, turned)
         ],
     }
     with subscriber() as (heard, messages), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as planner:
@@ -59,26 +63,30 @@ def test_a_request_is_answered_with_what_predict_gives_and_both_are_recorded(lab
 
         def answered() -> bool:
             assert process.poll() is None, process.communicate()[1]
-            planner.sendto(json.dumps(asked).encode(), ("127.0.0.1", port))
-            return any(one["kind"] == "touch" for one in messages)
+            planner.sendto(json.dumps(content).encode(), ("127.0.0.1", port))
+            return any(message["kind"] == "touch" for message in messages)
 
         live.awaited(answered)
         os.kill(model_process(process), signal.SIGKILL)
         count = len(messages)
-        live.awaited(lambda: answered() and any(one["kind"] == "touch" for one in messages[count:]))
+        live.awaited(lambda: answered() and any(message["kind"] == "touch" for message in messages[count:]))
         ended(process, interrupt=True)
-    answer = next(one for one in messages if one["kind"] == "touch")
+    answer = next(message for message in messages if message["kind"] == "touch")
     assert answer["cause"] == "" and answer["criterion"] == "balance"
     lab.run("predict models/t data/g -o predicted")
     (predicted,) = tacpipe.open(lab.folder / "predicted")
     table = predicted.table()
     row = table.column("recording").to_pylist().index(name)
-    wanted = np.array([table.column(one)[row].as_py() for one in COLUMNS], np.float32)
-    found = np.array([answer["candidates"][0]["touch"][one] for one in COLUMNS], np.float32)
-    assert found.tobytes() == wanted.tobytes()
+    expected = np.array([table.column(column)[row].as_py() for column in COLUMNS], np.float32)
+    touch = np.array([answer["candidates"][0]["touch"][column] for column in COLUMNS], np.float32)
+    assert touch.tobytes() == expected.tobytes()
     shard = live.only(lab.folder)
     assert [cause for cause, _ in live.events(shard, "touch")][:2] == [DIED, RESTARTED]
     rows = shard.table("touch").to_pylist()
-    assert rows and {one["request"] for one in rows} == {7} and sorted({one["grasp"] for one in rows}) == [0, 1]
-    assert next(one for one in rows if one["rank"] == 1)["grasp"] == answer["best"]
-    assert shard.table("requests")["g1_x_m"].to_pylist()[0] == asked["grasps"][0]["g1"][0]
+    assert (
+        rows
+        and {recorded_row["request"] for recorded_row in rows} == {7}
+        and sorted({recorded_row["grasp"] for recorded_row in rows}) == [0, 1]
+    )
+    assert next(recorded_row for recorded_row in rows if recorded_row["rank"] == 1)["grasp"] == answer["best"]
+    assert shard.table("requests")["g1_x_m"].to_pylist()[0] == content["grasps"][0]["g1"][0]
