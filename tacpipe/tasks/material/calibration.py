@@ -15,8 +15,7 @@ from tacpipe.datasets import model_files
 from tacpipe.errors import TacpipeError, UsageError
 from tacpipe.metrics import calibration
 from tacpipe.metrics.headline import FEWEST
-from tacpipe.metrics.intervals import share_interval
-from tacpipe.metrics.proportions import wilson
+from tacpipe.metrics.intervals import share_interval, wilson
 from tacpipe.tasks.material.classifier import CONFIG, UNKNOWN_ANSWER, Classifier
 from tacpipe.tasks.material.sensor_calibration import (
     CALIBRATION_FILE,

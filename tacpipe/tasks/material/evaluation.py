@@ -16,7 +16,7 @@ from tacpipe.datasets import model_files, origin
 from tacpipe.errors import TacpipeError
 from tacpipe.io import progress
 from tacpipe.metrics import headline
-from tacpipe.metrics.proportions import mcnemar, wilson
+from tacpipe.metrics.intervals import mcnemar, wilson
 from tacpipe.plugins.stage import RecordingOutput, Result
 from tacpipe.printable import listed
 from tacpipe.tasks.material import headline as headlines
