@@ -19,7 +19,7 @@ from tacpipe.report.charts import Line
 from tests.fake_recordings import FakeDataset, FakeRecording, FakeShard
 from tests.promises.counts import count
 from tests.promises.limits import sample_cases
-from tests.report.test_page import check, other
+from tests.report.test_page import check, unknown_result
 from tests.tasks.forward.report import result_fakes
 from tests.tasks.material.report import material_fakes
 from tests.tasks.touch.report import touch_fakes
@@ -123,7 +123,7 @@ RESULTS: dict[str, tuple[Callable[[], list[Any]], tuple[str, ...]]] = {  # resul
         ("bleach", "drill", "segment.grasps"),
     ),
     "of another task": (
-        lambda: [other("touch2", simulated=True)],
+        lambda: [unknown_result("touch2", simulated=True)],
         ("touch2", "graph_net", "near", "model", "evaluate"),
     ),
 }

@@ -56,9 +56,9 @@ class Browser:
         self.run("document.fonts.ready.then(() => true)")
         self.run("(window.drawn ? window.drawn() : Promise.resolve()).then(() => true)")
 
-    def dark(self, wanted: bool) -> None:
+    def dark(self, is_dark: bool) -> None:
         """Show pages as those who prefer dark ones see them."""
-        feature = {"name": "prefers-color-scheme", "value": "dark" if wanted else "light"}
+        feature = {"name": "prefers-color-scheme", "value": "dark" if is_dark else "light"}
         self._call("Emulation.setEmulatedMedia", {"features": [feature]})
 
     def media(self, name: str) -> None:
@@ -67,8 +67,8 @@ class Browser:
 
     def run(self, script: str) -> Any:
         """Return the value of a JavaScript expression, a promise's once it is kept."""
-        told = {"expression": script, "awaitPromise": True, "returnByValue": True}
-        answer = self._call("Runtime.evaluate", told)
+        request = {"expression": script, "awaitPromise": True, "returnByValue": True}
+        answer = self._call("Runtime.evaluate", request)
         assert "exceptionDetails" not in answer, answer["exceptionDetails"]
         return answer["result"].get("value")
 
@@ -93,22 +93,22 @@ class Browser:
         self._commands.write(json.dumps(message).encode() + b"\0")
         answer = self._wait(lambda message: message.get("id") == number)
         assert "error" not in answer, (method, answer["error"])
-        found: dict[str, Any] = answer["result"]
-        return found
+        result: dict[str, Any] = answer["result"]
+        return result
 
-    def _wait(self, wanted: Any) -> dict[str, Any]:
+    def _wait(self, is_answer: Any) -> dict[str, Any]:
         """Return the next message that is wanted; others are events that nobody asked for."""
         while True:
             while b"\0" not in self._unread:
                 ready, _, _ = select.select([self._answers], [], [], LIMIT_S)
                 assert ready, f"Chromium hangs: it has not answered for {LIMIT_S:g} s"
-                some = self._answers.read(1 << 16)
-                if not some:
+                received = self._answers.read(1 << 16)
+                if not received:
                     raise AssertionError("Chromium ended before it answered")
-                self._unread += some
+                self._unread += received
             first, _, self._unread = self._unread.partition(b"\0")
             message: dict[str, Any] = json.loads(first)
-            if wanted(message):
+            if is_answer(message):
                 return message
 
 

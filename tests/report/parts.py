@@ -25,48 +25,48 @@ def methods(task: str, *results: Any) -> list[Method]:
 
 def context(task: str, *results: Any) -> Context:
     """The results of one task, compared."""
-    of = report_on(task)
-    runs = of.read(results)
-    found = grouped(runs, of.usual)
-    return Context(of, found, engine.comparisons(of, found), runs=runs)
+    task_report = report_on(task)
+    runs = task_report.read(results)
+    method_list = grouped(runs, task_report.usual)
+    return Context(task_report, method_list, engine.comparisons(task_report, method_list), runs=runs)
 
 
-def blocks(given: Section | Iterable[Block]) -> Iterator[Block]:
+def blocks(page_part: Section | Iterable[Block]) -> Iterator[Block]:
     """All blocks, those of folds too."""
-    if isinstance(given, Section):
-        yield from (one for one in (given.chart, given.table) if one)
-        given = given.folds
-    for one in given:
-        yield one
-        if isinstance(one, Fold):
-            yield from blocks(one.blocks)
-        elif isinstance(one, Charts):
-            yield from one.charts
+    if isinstance(page_part, Section):
+        yield from (block for block in (page_part.chart, page_part.table) if block)
+        page_part = page_part.folds
+    for block in page_part:
+        yield block
+        if isinstance(block, Fold):
+            yield from blocks(block.blocks)
+        elif isinstance(block, Charts):
+            yield from block.charts
 
 
-def charts(given: Section | Iterable[Block]) -> list[Chart]:
-    return [one for one in blocks(given) if isinstance(one, Chart)]
+def charts(page_part: Section | Iterable[Block]) -> list[Chart]:
+    return [block for block in blocks(page_part) if isinstance(block, Chart)]
 
 
-def tables(given: Section | Iterable[Block]) -> list[Table]:
-    return [one for one in blocks(given) if isinstance(one, Table)]
+def tables(page_part: Section | Iterable[Block]) -> list[Table]:
+    return [block for block in blocks(page_part) if isinstance(block, Table)]
 
 
-def folds(given: Section) -> dict[str, Fold]:
-    return {one.title: one for one in given.folds}
+def folds(task_section: Section) -> dict[str, Fold]:
+    return {section_fold.title: section_fold for section_fold in task_section.folds}
 
 
 def text(cell: str | Cell) -> str:
-    """What a cell shows, small print behind a bar."""
+    """Return the text of a cell, with small print behind a bar."""
     return cell if isinstance(cell, str) else f"{cell.text} | {cell.below}" if cell.below else cell.text
 
 
-def cells(given: Table | Iterable[Table], name: str) -> list[str]:
+def cells(page_tables: Table | Iterable[Table], name: str) -> list[str]:
     """The cells of the first row that begins with ``name``."""
-    for table in [given] if isinstance(given, Table) else given:
+    for table in [page_tables] if isinstance(page_tables, Table) else page_tables:
         for row in table.rows:
             if text(row.cells[0]) == name:
-                return [text(one) for one in row.cells[1:]]
+                return [text(row_cell) for row_cell in row.cells[1:]]
     raise AssertionError(name)
 
 
@@ -74,23 +74,23 @@ def cell(table: Table, name: str, head: str) -> str:
     return dict(zip(table.heads[1:], cells(table, name), strict=True))[head]
 
 
-def words(given: Section | Iterable[Block]) -> str:
+def words(page_part: Section | Iterable[Block]) -> str:
     """All that a section says, but for the data of charts."""
-    found = [given.title, given.sentence, *given.counts] if isinstance(given, Section) else []
-    for one in blocks(given):
-        if isinstance(one, Fold):
-            found += [one.title, one.about]
-        elif isinstance(one, Note):
-            found.append(one.text)
-        elif isinstance(one, Chart):
-            found += [one.title, one.caption]
-        elif isinstance(one, Table):
-            found += [one.title, *one.heads, *(text(cell) for row in one.rows for cell in row.cells)]
-            found += [group.title for group in one.groups]
-    return "\n".join(found)
+    texts = [page_part.title, page_part.sentence, *page_part.counts] if isinstance(page_part, Section) else []
+    for block in blocks(page_part):
+        if isinstance(block, Fold):
+            texts += [block.title, block.about]
+        elif isinstance(block, Note):
+            texts.append(block.text)
+        elif isinstance(block, Chart):
+            texts += [block.title, block.caption]
+        elif isinstance(block, Table):
+            texts += [block.title, *block.heads, *(text(cell) for row in block.rows for cell in row.cells)]
+            texts += [group.title for group in block.groups]
+    return "\n".join(texts)
 
 
 def values(chart: Chart) -> list[dict[str, Any]]:
     """The rows of a chart's own data."""
-    found: list[dict[str, Any]] = chart.spec["data"]["values"]
-    return found
+    rows: list[dict[str, Any]] = chart.spec["data"]["values"]
+    return rows

@@ -29,9 +29,9 @@ def test_what_is_not_defined_is_null_and_no_specification_holds_nan() -> None:
         charts.grid(np.array([[2.0, -0.5], [-0.5, 0.0]]), "latent"),
         charts.plane([{"panel": "p", "x": 0.0, "y": 1.0, "strength": 0.5, "text": "1"}], ["p"], size=9),
     ]
-    for one in specs:
-        assert json.loads(json.dumps(one, allow_nan=False)) == one
-        assert "http" not in json.dumps(one)
+    for spec in specs:
+        assert json.loads(json.dumps(spec, allow_nan=False)) == spec
+        assert "http" not in json.dumps(spec)
 
 
 def test_names_keep_their_colour_from_chart_to_chart() -> None:
@@ -67,20 +67,23 @@ def test_a_long_line_is_thinned_and_keeps_its_extremes_and_its_gaps() -> None:
     spec = charts.lines([Line("a", np.arange(100_000.0), y)], "x", "y", points=False)
     drawn = [row["y"] for row in spec["data"]["values"]]
     assert len(drawn) <= charts.POINTS + 4
-    assert max(one for one in drawn if one is not None) == 7.0 and min(one for one in drawn if one is not None) == -7.0
+    assert (
+        max(value for value in drawn if value is not None) == 7.0
+        and min(value for value in drawn if value is not None) == -7.0
+    )
     assert None in drawn
 
 
 def test_a_covariance_shows_its_sign_by_colour_and_nothing_by_none() -> None:
     cells = charts.grid(np.array([[4.0, -1.0], [-1.0, 0.0]]), "latent")["data"]["values"]
-    assert [(one["row"], one["column"], one["above"], one["strength"]) for one in cells] == [
+    assert [(cell["row"], cell["column"], cell["above"], cell["strength"]) for cell in cells] == [
         (1, 1, True, 1.0), (1, 2, False, 0.5), (2, 1, False, 0.5)
     ]  # fmt: skip
 
 
 def test_a_confusion_matrix_holds_its_counts() -> None:
     cells = charts.matrix(np.array([[3, 1], [0, 4]]), ["cork", "foam"], "true", "named")["data"]["values"]
-    assert [(one["row"], one["column"], one["count"], one["right"]) for one in cells] == [
+    assert [(cell["row"], cell["column"], cell["count"], cell["right"]) for cell in cells] == [
         ("cork", "cork", 3, True), ("cork", "foam", 1, False), ("foam", "foam", 4, True)
     ]  # fmt: skip
 

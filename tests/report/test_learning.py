@@ -19,4 +19,4 @@ def test_a_training_of_one_epoch_is_seen_as_points() -> None:
         [layer["mark"]["type"] for layer in context.loss_chart({"training": [curve]}, "loss")["layer"]]
         for curve in ([0.5], [0.5, 0.4])
     ]
-    assert ["circle" in one for one in marks] == [True, False]
+    assert ["circle" in layer_marks for layer_marks in marks] == [True, False]

@@ -71,12 +71,12 @@ def check(content: bytes) -> str:
     elements = Elements()
     elements.feed(content.decode())
     assert elements.open == []
-    assert all(one.startswith("#") for one in elements.loads)
+    assert all(reference.startswith("#") for reference in elements.loads)
     assert not re.search(r"\bnan\b", elements.text, re.IGNORECASE)
     return elements.text
 
 
-def other(task: str, **attributes: Any) -> Any:
+def unknown_result(task: str, **attributes: Any) -> Any:
     """A result of a task that the page knows nothing about."""
     files = {
         "metrics.json": json.dumps(
@@ -88,7 +88,7 @@ def other(task: str, **attributes: Any) -> Any:
     return FakeDataset(shards, files, result_fakes.MANIFEST)
 
 
-def everything() -> list[Any]:
+def all_results() -> list[Any]:
     wrong = {"biotac": 1, "roboskin": 2}
     return [
         result_fakes.result(ratio={"r1": 0.5, "r2": 0.25, "r3": 1.5, "r4": 0.5}),
@@ -98,21 +98,21 @@ def everything() -> list[Any]:
         material_fakes.recorded(),
         touch_fakes.result(novel=touch_fakes.NOVEL),
         touch_fakes.recorded(),
-        other("graph"),
+        unknown_result("graph"),
     ]
 
 
 def test_a_page_of_all_tasks_is_whole_and_the_same_results_give_the_same_bytes() -> None:
-    content = page.render(everything(), title="a <b>")
+    content = page.render(all_results(), title="a <b>")
     text = check(content)
-    assert content == page.render(everything(), title="a <b>")
+    assert content == page.render(all_results(), title="a <b>")
     ids = re.findall(r'<section id="(\w+)"', content.decode())
     assert ids == ["forward", "material", "touch", "graph"]
     assert "a <b>" in text
 
 
 def test_each_section_opens_with_one_sentence_one_chart_and_one_table_of_at_most_seven_rows() -> None:
-    content = page.render(everything()).decode()
+    content = page.render(all_results()).decode()
     for name in ("forward", "material", "touch"):
         section = content[content.index(f'<section id="{name}"') :]
         first = section[: section.index('<div class="folds">')]
@@ -121,20 +121,20 @@ def test_each_section_opens_with_one_sentence_one_chart_and_one_table_of_at_most
 
 
 def test_every_fold_has_its_place_in_the_contents() -> None:
-    content = page.render(everything()).decode()
+    content = page.render(all_results()).decode()
     linked = set(re.findall(r'<li><a href="#([\w-]+)"', content))
     assert linked and linked == set(re.findall(r'<details class="fold" id="([\w-]+)"', content))
 
 
 def test_a_task_without_a_specification_has_its_numbers_by_name_and_where_they_come_from() -> None:
-    text = check(page.render([other("weighing", simulated=True), other("weighing")]))
+    text = check(page.render([unknown_result("weighing", simulated=True), unknown_result("weighing")]))
     assert "model, error, near" in text and "0.25" in text and "simulated" in text and "cd" * 32 in text
     assert "1. weighing: graph net" in text and "2. weighing: graph net" in text
 
 
 @pytest.mark.parametrize("task", ["page", "blocks", "", "material.methods"])
 def test_a_task_named_like_a_module_of_the_page_is_one_without_a_specification(task: str) -> None:
-    assert "counts, trials" in check(page.render([other(task)]))
+    assert "counts, trials" in check(page.render([unknown_result(task)]))
 
 
 @pytest.fixture
@@ -152,12 +152,14 @@ def weighing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 def weighed(name: str, off: float, seed: int = 0) -> Any:
-    things = [f"w{place}" for place in range(9)]
-    model = {thing: off + 0.01 * place for place, thing in enumerate(things)}
-    errors = {"model": model, "mean_weight": dict.fromkeys(things, 1.0)}
+    weights = [f"w{place}" for place in range(9)]
+    model = {thing: off + 0.01 * place for place, thing in enumerate(weights)}
+    errors = {"model": model, "mean_weight": dict.fromkeys(weights, 1.0)}
     config = {"task": "weighing", "architecture": name, "params": {"springs": 2}, "seed": seed}
     files = {"metrics.json": {}, "config.json": config, "errors.json": errors}
-    return FakeDataset({}, {path: json.dumps(one).encode() for path, one in files.items()}, result_fakes.MANIFEST)
+    return FakeDataset(
+        {}, {path: json.dumps(content).encode() for path, content in files.items()}, result_fakes.MANIFEST
+    )
 
 
 @pytest.mark.usefixtures("weighing")
@@ -167,13 +169,16 @@ def test_a_third_partys_task_gets_the_same_page_by_its_specification() -> None:
     assert "Weights of things" in text and "light things" in text and "mean weight" in text
     assert '<p class="answer better">' in content.decode() and "tacpipe view DATASET w8" in content.decode()
     (compared,) = engine.compare([weighed("scale", 0.54), weighed("scale", 0.56, seed=1), weighed("spring", 1.5)])
-    assert [(one.name, one.runs) for one in compared.models] == [("scale", 2), ("spring", 1)]
+    assert [(compared_method.name, compared_method.runs) for compared_method in compared.models] == [
+        ("scale", 2),
+        ("spring", 1),
+    ]
     assert compared.models[0].gain.mean == pytest.approx(1 - 0.59)
 
 
 def test_the_documentation_shows_that_very_specification() -> None:
-    shown = (PLUGIN.parents[1] / "docs" / "howto" / "report.md").read_text()
-    assert (PLUGIN / "toy_report.py").read_text() in shown
+    page_text = (PLUGIN.parents[1] / "docs" / "howto" / "report.md").read_text()
+    assert (PLUGIN / "toy_report.py").read_text() in page_text
 
 
 def test_what_is_not_a_result_is_refused() -> None:
@@ -183,9 +188,9 @@ def test_what_is_not_a_result_is_refused() -> None:
 
 def test_a_dataset_that_no_task_on_the_page_can_use_is_refused() -> None:
     material = material_fakes.result("minirocket", wrong={"biotac": 1})
-    for one, besides in ((material, result_fakes.codec(8)), (result_fakes.result(), material_fakes.recorded())):
+    for result, unused in ((material, result_fakes.codec(8)), (result_fakes.result(), material_fakes.recorded())):
         with pytest.raises(TacpipeError, match=r"no metrics\.json"):
-            page.render([one, besides], title="t")
+            page.render([result, unused], title="t")
 
 
 def test_text_that_looks_like_markup_stays_text() -> None:

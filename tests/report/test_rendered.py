@@ -12,7 +12,7 @@ from tacpipe.report import page
 from tests.fake_recordings import FakeDataset, FakeShard
 from tests.report import browser
 from tests.report.browser import Browser
-from tests.report.test_page import other
+from tests.report.test_page import unknown_result
 from tests.tasks.forward.report import result_fakes
 from tests.tasks.material.report import material_fakes
 from tests.tasks.touch.report import touch_fakes
@@ -36,25 +36,25 @@ def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 
 
 def forward_single() -> list[Any]:
-    one = result_fakes.result(ratio={"r1": 0.5, "r2": 0.25, "r3": 1.5, "r4": 0.5}, attributes={"simulated": True})
+    base = result_fakes.result(ratio={"r1": 0.5, "r2": 0.25, "r3": 1.5, "r4": 0.5}, attributes={"simulated": True})
     lines = [
         f'{{"epoch": {epoch}, "train_loss": {0.4 / epoch**0.5}, "val_loss": {0.42 / epoch**0.5}}}'
         for epoch in range(1, 9)
     ]
-    return [FakeDataset(one.recordings, {**one.files, "history.jsonl": "\n".join(lines).encode()}, one.manifest)]
+    return [FakeDataset(base.recordings, {**base.files, "history.jsonl": "\n".join(lines).encode()}, base.manifest)]
 
 
 def forward_of_long_names() -> list[Any]:
-    one = result_fakes.result(ratio={"r1": 0.5, "r2": 0.25, "r3": 1.5, "r4": 0.5})
-    trials = one.files["trials.csv"].decode().replace("\nr", f"\n{LONG}-r").encode()
-    shards = {f"{LONG}-{name}": FakeShard(f"{LONG}-{name}", shard.content) for name, shard in one.recordings.items()}
-    return [FakeDataset(shards, {**one.files, "trials.csv": trials}, one.manifest)]
+    base = result_fakes.result(ratio={"r1": 0.5, "r2": 0.25, "r3": 1.5, "r4": 0.5})
+    trials = base.files["trials.csv"].decode().replace("\nr", f"\n{LONG}-r").encode()
+    shards = {f"{LONG}-{name}": FakeShard(f"{LONG}-{name}", shard.content) for name, shard in base.recordings.items()}
+    return [FakeDataset(shards, {**base.files, "trials.csv": trials}, base.manifest)]
 
 
 def forward_many() -> list[Any]:
     ratios = (("PCA-20", 1.5), ("AE-C1-8", 1.2), ("raw", 0.5))
-    several = [result_fakes.result(name, seed, ratio=ratio) for name, ratio in ratios for seed in range(2)]
-    return [*several, result_fakes.codec(2, loss=0.75), result_fakes.codec(4, loss=0.5)]
+    results = [result_fakes.result(name, seed, ratio=ratio) for name, ratio in ratios for seed in range(2)]
+    return [*results, result_fakes.codec(2, loss=0.75), result_fakes.codec(4, loss=0.5)]
 
 
 def forward_with_codecs() -> list[Any]:
@@ -82,12 +82,12 @@ def touch_single() -> list[Any]:
 
 def touch_many() -> list[Any]:
     heads = [touch_fakes.result("pointnet", head=head, epochs=12, off=0.06) for head in ("fc1", "fc2")]
-    inputs = [touch_fakes.result("pointnet", inputs=one, epochs=12) for one in ("xyz", "rgbpose")]
+    inputs = [touch_fakes.result("pointnet", inputs=columns, epochs=12) for columns in ("xyz", "rgbpose")]
     return [touch_fakes.result(), touch_fakes.result(seed=1), touch_fakes.result("trees", off=0.02), *heads, *inputs]
 
 
 def mixed() -> list[Any]:
-    return [*forward_single(), *material_single(), *touch_single(), other("graph")]
+    return [*forward_single(), *material_single(), *touch_single(), unknown_result("graph")]
 
 
 PAGES: dict[str, Callable[[], list[Any]]] = {
@@ -107,12 +107,12 @@ PAGES: dict[str, Callable[[], list[Any]]] = {
 
 
 def inspected(chromium: Browser, content: bytes, width: int, *, dark: bool) -> list[str]:
-    """What is wrong with a page as it opens, and again with all folds open."""
+    """Return the problems of a page as it opens, and again with all folds open."""
     chromium.dark(dark)
     chromium.show(content, width)
-    found: list[str] = chromium.run(INSPECTION)
+    problems: list[str] = chromium.run(INSPECTION)
     chromium.run("showAll().then(() => true)")
-    return [*found, *chromium.run(INSPECTION)]
+    return [*problems, *chromium.run(INSPECTION)]
 
 
 def test_a_page_of_all_tasks_is_whole_as_a_reader_sees_it(chromium: Browser) -> None:
@@ -138,8 +138,11 @@ def test_the_answer_is_on_the_first_screen_at_both_widths(chromium: Browser) -> 
         content = page.render(PAGES[name](), title="")
         for width in WIDTHS:
             chromium.show(content, width)
-            wanted = (".answer", "figure .plot", *(["table"] if width > 400 else []))
-            ends = [chromium.run(f"document.querySelector('{one}').getBoundingClientRect().bottom") for one in wanted]
+            selectors = (".answer", "figure .plot", *(["table"] if width > 400 else []))
+            ends = [
+                chromium.run(f"document.querySelector('{selector}').getBoundingClientRect().bottom")
+                for selector in selectors
+            ]
             assert max(ends) <= 800, (name, width, ends)
 
 
@@ -150,14 +153,16 @@ def test_tables_sort_families_unfold_and_charts_answer_the_cursor(chromium: Brow
     chromium.show(content, 1280)
     chromium.run("showAll().then(() => true)")
     table = "document.querySelector('#forward-1 table')"
-    shown = f"[...{table}.tBodies[0].rows].filter((row) => !row.hidden).map((row) => row.cells[0].firstChild.data)"
-    assert [one.rpartition(" ")[2] for one in chromium.run(shown)] == ["25"]
+    visible_rows = (
+        f"[...{table}.tBodies[0].rows].filter((row) => !row.hidden).map((row) => row.cells[0].firstChild.data)"
+    )
+    assert [row_name.rpartition(" ")[2] for row_name in chromium.run(visible_rows)] == ["25"]
     chromium.run(f"{table}.querySelector('button.more').click()")
-    assert [one.rpartition(" ")[2] for one in chromium.run(shown)] == ["25", "50", "75"]
+    assert [row_name.rpartition(" ")[2] for row_name in chromium.run(visible_rows)] == ["25", "50", "75"]
     chromium.run(f"{table}.tHead.rows[0].cells[1].click()")
-    assert [one.rpartition(" ")[2] for one in chromium.run(shown)] == ["75", "50", "25"]
+    assert [row_name.rpartition(" ")[2] for row_name in chromium.run(visible_rows)] == ["75", "50", "25"]
     chromium.run(f"{table}.tHead.rows[0].cells[1].click()")
-    assert [one.rpartition(" ")[2] for one in chromium.run(shown)] == ["25", "50", "75"]
+    assert [row_name.rpartition(" ")[2] for row_name in chromium.run(visible_rows)] == ["25", "50", "75"]
     script = """(() => {
       const point = document.querySelector(".plot svg .mark-symbol path"), box = point.getBoundingClientRect();
       const at = { bubbles: true, clientX: box.left + 3, clientY: box.top + 3 };
@@ -185,7 +190,7 @@ def test_charts_drawn_for_a_wide_screen_fit_the_paper(chromium: Browser) -> None
     chromium.run("showAll().then(() => true)")
     chromium.media("print")
     try:
-        chromium.run("document.body.style.width = '700px'")  # of an A4 page within its margins
+        chromium.run("document.body.style.width = '700px'")  # the width of an A4 page within its margins
         over = """[...document.querySelectorAll('.plot svg')].filter((one) => one.getBoundingClientRect().right
           > one.closest('figure').getBoundingClientRect().right + 1).length"""
         assert chromium.run(over) == 0
@@ -194,7 +199,7 @@ def test_charts_drawn_for_a_wide_screen_fit_the_paper(chromium: Browser) -> None
 
 
 @pytest.mark.parametrize(
-    ("content", "told"),
+    ("content", "problem"),
     [
         ("<p>$\\mathdefault{10^{-1}}$</p>", "raw mathtext"),
         ("<svg width=80 height=20><text y=15>$\\times$</text></svg>", "raw mathtext"),
@@ -218,9 +223,9 @@ def test_charts_drawn_for_a_wide_screen_fit_the_paper(chromium: Browser) -> None
         ),
     ],
 )
-def test_the_inspection_finds_what_is_wrong(chromium: Browser, content: str, told: str) -> None:
+def test_the_inspection_finds_what_is_wrong(chromium: Browser, content: str, problem: str) -> None:
     chromium.show(f"<!doctype html><meta charset=utf-8><body>{content}".encode(), 400)
-    assert any(one.startswith(told) for one in chromium.run(INSPECTION))
+    assert any(message.startswith(problem) for message in chromium.run(INSPECTION))
 
 
 def test_the_inspection_finds_nothing_in_a_sound_page(chromium: Browser) -> None:

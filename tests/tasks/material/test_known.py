@@ -21,13 +21,13 @@ SENSORS = ("biotac", "roboskin")
 ASKED = CalibrationRequest((10, 50, 90), False, 0.1, 0)
 
 
-def others(**attributes: Any) -> Any:
+def foreign_slides(**attributes: Any) -> Any:
     """Slides of a material that the model does not know."""
     return dataset(*(slide(sensor, FOREIGN, trial, **attributes) for sensor in SENSORS for trial in range(4)))
 
 
-def both(known: Any, unknown: Any) -> Any:
-    return dataset(*known.recordings.values(), *unknown.recordings.values())
+def joined(known_slides: Any, unknown: Any) -> Any:
+    return dataset(*known_slides.recordings.values(), *unknown.recordings.values())
 
 
 @pytest.fixture(scope="module")
@@ -43,37 +43,37 @@ def model(plain: dict[str, bytes]) -> dict[str, bytes]:
 def test_a_calibrated_model_names_the_same_and_adds_probabilities_and_answers(
     plain: dict[str, bytes], model: dict[str, bytes]
 ) -> None:
-    asked = slides(40, 2)
+    requested = slides(40, 2)
     before, after = (
-        material_prediction.predict(one, asked).recordings["predictions"].streams[""] for one in (plain, model)
+        material_prediction.predict(files, requested).recordings["predictions"].streams[""] for files in (plain, model)
     )
     assert before.equals(after)
-    found = material_prediction.predict(model, asked, probabilities=True).recordings["predictions"].streams[""]
-    assert found.select(before.column_names).equals(before)
-    each = np.column_stack([found[f"probability_{kind:02d}"].to_numpy() for kind in MATERIALS])
-    assert each.sum(axis=1) == pytest.approx(1, abs=1e-5)
-    assert [MATERIALS[at] for at in each.argmax(axis=1)] == found["material"].to_pylist()
-    answered = zip(found["answer"].to_pylist(), found["material"].to_pylist(), strict=True)
-    assert all(answer in ("unknown", str(named)) for answer, named in answered)
+    calibrated = material_prediction.predict(model, requested, probabilities=True).recordings["predictions"].streams[""]
+    assert calibrated.select(before.column_names).equals(before)
+    probabilities = np.column_stack([calibrated[f"probability_{kind:02d}"].to_numpy() for kind in MATERIALS])
+    assert probabilities.sum(axis=1) == pytest.approx(1, abs=1e-5)
+    assert [MATERIALS[at] for at in probabilities.argmax(axis=1)] == calibrated["material"].to_pylist()
+    answered = zip(calibrated["answer"].to_pylist(), calibrated["material"].to_pylist(), strict=True)
+    assert all(answer in ("unknown", str(material)) for answer, material in answered)
 
 
 def test_evaluation_reports_calibration_and_unknown_next_to_the_accuracy_on_known_slides(
     model: dict[str, bytes],
 ) -> None:
-    alone, _ = evaluated(model, slides(40, 5))
-    tree, result = evaluated(model, both(slides(40, 5), others()))
-    assert tree["model"] == alone["model"]  # slides of materials that the model does not know are counted apart
+    known_tree, _ = evaluated(model, slides(40, 5))
+    tree, result = evaluated(model, joined(slides(40, 5), foreign_slides()))
+    assert tree["model"] == known_tree["model"]  # slides of materials that the model does not know are counted apart
     for sensor in SENSORS:
-        found = tree["unknown"][sensor]
-        assert (found["false_unknown_n"], found["false_known_n"]) == (20, 4)
+        unknown = tree["unknown"][sensor]
+        assert (unknown["false_unknown_n"], unknown["false_known_n"]) == (20, 4)
         assert (
-            found["false_known_materials"] == 1 and "false_known_low" not in found
+            unknown["false_known_materials"] == 1 and "false_known_low" not in unknown
         )  # one material says nothing of others
-        assert set(found["auroc"]) == {"probability", "distance"} and found["auroc"][found["rule"]] > 0.8
-        stated = tree["calibration"][sensor]
-        assert stated["n"] == 20
-        assert sum(one["n"] for one in stated["after"]["reliability"]) == 20
-        assert stated["after"]["log_loss"] < stated["before"]["log_loss"]
+        assert set(unknown["auroc"]) == {"probability", "distance"} and unknown["auroc"][unknown["rule"]] > 0.8
+        calibration = tree["calibration"][sensor]
+        assert calibration["n"] == 20
+        assert sum(bin_tree["n"] for bin_tree in calibration["after"]["reliability"]) == 20
+        assert calibration["after"]["log_loss"] < calibration["before"]["log_loss"]
     rows = list(csv.DictReader(result.files["answers.csv"].decode().splitlines()))
     assert len(rows) == 48 and {row["known"] for row in rows} == {"true", "false"}
     assert all(row["answer"] in ("unknown", row["named"]) for row in rows)
@@ -81,35 +81,46 @@ def test_evaluation_reports_calibration_and_unknown_next_to_the_accuracy_on_know
 
 def test_at_most_the_asked_fraction_of_calibration_slides_is_unknown(model: dict[str, bytes]) -> None:
     loaded = MaterialModel.load(model)
-    for sensor, some in loaded.read(slides(20, 5)).items():
-        assert sum(one == "unknown" for one in loaded.answers(some.frames, sensor)) <= ASKED.false_unknown * len(some)
+    for sensor, sensor_slides in loaded.read(slides(20, 5)).items():
+        assert sum(
+            answer == "unknown" for answer in loaded.answers(sensor_slides.frames, sensor)
+        ) <= ASKED.false_unknown * len(sensor_slides)
 
 
 def test_slides_of_unknown_materials_whose_labels_are_text_are_evaluated_too(tmp_path: Path) -> None:
-    def named(shards: Any) -> Any:
+    def with_text_labels(shards: Any) -> Any:
         return dataset(
             *(
-                slide(one["sensor"], one["material"], one["trial"], object=f"m{one['material']}")
-                for one in (shard.attributes for shard in shards.recordings.values())
+                slide(
+                    attributes["sensor"],
+                    attributes["material"],
+                    attributes["trial"],
+                    object=f"m{attributes['material']}",
+                )
+                for attributes in (shard.attributes for shard in shards.recordings.values())
             )
         )
 
-    files = trained(tmp_path, named(slides(0, 8)), named(slides(20, 5)), use_validation=False, label="object")
-    made = material_calibration.calibrate(files, ASKED, named(slides(0, 8)), named(slides(20, 5)))
-    tree, _ = evaluated(made, both(named(slides(40, 2)), named(others())))
+    files = trained(
+        tmp_path, with_text_labels(slides(0, 8)), with_text_labels(slides(20, 5)), use_validation=False, label="object"
+    )
+    calibrated = material_calibration.calibrate(
+        files, ASKED, with_text_labels(slides(0, 8)), with_text_labels(slides(20, 5))
+    )
+    tree, _ = evaluated(calibrated, joined(with_text_labels(slides(40, 2)), with_text_labels(foreign_slides())))
     assert tree["unknown"]["biotac"]["false_known_n"] == 4
 
 
 def test_slides_of_unknown_materials_alone_leave_no_accuracy_to_report(model: dict[str, bytes]) -> None:
     with pytest.raises(TacpipeError, match="no slide to evaluate"):
-        evaluated(model, others())
+        evaluated(model, foreign_slides())
 
 
 def test_a_model_that_is_not_calibrated_has_no_answers_and_refuses_other_materials(plain: dict[str, bytes]) -> None:
     with pytest.raises(TacpipeError, match="tacpipe calibrate"):
         material_prediction.predict(plain, slides(40, 1), probabilities=True)
     with pytest.raises(TacpipeError, match="not one of those the model names"):
-        evaluated(plain, both(slides(40, 1), others()))
+        evaluated(plain, joined(slides(40, 1), foreign_slides()))
 
 
 def test_validation_slides_that_the_model_learned_from_are_refused(tmp_path: Path) -> None:
@@ -119,15 +130,16 @@ def test_validation_slides_that_the_model_learned_from_are_refused(tmp_path: Pat
 
 
 def test_too_few_slides_for_the_asked_fraction_are_refused(plain: dict[str, bytes]) -> None:
-    how = CalibrationRequest((10, 50, 90), False, 0.01, 0)
+    request = CalibrationRequest((10, 50, 90), False, 0.01, 0)
     with pytest.raises(TacpipeError, match=r"20 validation slides cannot set a threshold .* takes 99 or more"):
-        material_calibration.calibrate(plain, how, slides(0, 8), slides(20, 5))
+        material_calibration.calibrate(plain, request, slides(0, 8), slides(20, 5))
 
 
 def test_a_network_is_calibrated_as_any_architecture(tmp_path: Path) -> None:
     files = trained(tmp_path, slides(0, 8), slides(20, 5), architecture="x-lstm", scaling="standard")
     tree, _ = evaluated(
-        material_calibration.calibrate(files, ASKED, slides(0, 8), slides(20, 5)), both(slides(40, 2), others())
+        material_calibration.calibrate(files, ASKED, slides(0, 8), slides(20, 5)),
+        joined(slides(40, 2), foreign_slides()),
     )
     assert set(tree["calibration"]) == set(SENSORS)
 
@@ -135,7 +147,7 @@ def test_a_network_is_calibrated_as_any_architecture(tmp_path: Path) -> None:
 def test_probabilities_of_arrays_are_those_of_the_table(model: dict[str, bytes]) -> None:
     loaded = MaterialModel.load(model)
     table = material_prediction.predict(model, slides(40, 1), probabilities=True).recordings["predictions"].streams[""]
-    ((_, some),) = list(loaded.read(slides(40, 1, ("roboskin",))).items())
+    ((_, sensor_slides),) = list(loaded.read(slides(40, 1, ("roboskin",))).items())
     rows = [at for at, name in enumerate(table["sensor"].to_pylist()) if name == "roboskin"]
-    wanted = np.column_stack([table[f"probability_{kind:02d}"].to_numpy()[rows] for kind in MATERIALS])
-    assert np.allclose(loaded.probabilities(some.frames, "roboskin"), wanted, atol=1e-5)
+    expected = np.column_stack([table[f"probability_{kind:02d}"].to_numpy()[rows] for kind in MATERIALS])
+    assert np.allclose(loaded.probabilities(sensor_slides.frames, "roboskin"), expected, atol=1e-5)

@@ -32,8 +32,8 @@ RAEC = {"architecture": "raec", "epochs": 3}
 
 
 def predictions(result: Any) -> dict[str, list[Any]]:
-    found: dict[str, list[Any]] = result.recordings["predictions"].tables.to_pydict()
-    return found
+    columns: dict[str, list[Any]] = result.recordings["predictions"].tables.to_pydict()
+    return columns
 
 
 @pytest.mark.parametrize(
@@ -47,8 +47,8 @@ def test_every_unseen_slide_of_every_sensor_is_counted(tmp_path: Path, changed: 
     for predictor in ("model", "mean_level", "permuted_labels"):
         for sensor in ("biotac", "roboskin"):
             right = sum(
-                told == known
-                for told, known, felt in zip(rows[predictor], rows["material"], rows["sensor"], strict=True)
+                named == truth
+                for named, truth, felt in zip(rows[predictor], rows["material"], rows["sensor"], strict=True)
                 if felt == sensor
             )
             assert metrics[predictor]["correct"][sensor] == right
@@ -67,14 +67,16 @@ def test_the_strong_classifier_names_textures_that_it_can_tell_apart(tmp_path: P
 
 def test_statistics_are_compared_with_the_same_readout_of_the_level_alone_and_without_it(tmp_path: Path) -> None:
     metrics, result = evaluated(trained(tmp_path, architecture="statistics"), slides(8, 3))
-    learned, unseen = (slides_of.read(slides(*some), labelled=True) for some in ((0, 8), (8, 3)))
+    training, unseen = (slides_of.read(slides(*numbers), labelled=True) for numbers in ((0, 8), (8, 3)))
     kinds: dict[str, View] = {"model": "all", "level_only": "level", "level_removed": "level_removed"}
-    for sensor, some in unseen.items():
+    for sensor, sensor_slides in unseen.items():
         for name, view in kinds.items():
-            own = StatisticsClassifier.fit(learned[sensor].frames, learned[sensor].materials, view=view)
-            assert metrics[name]["correct"][sensor] == int((own.predict(some.frames) == some.materials).sum())
-    for one in headline.read(result.files[headline.FILE]):
-        assert headlines.BASELINES["level_only"] in {baseline.name for baseline in one.baselines}
+            readout = StatisticsClassifier.fit(training[sensor].frames, training[sensor].materials, view=view)
+            assert metrics[name]["correct"][sensor] == int(
+                (readout.predict(sensor_slides.frames) == sensor_slides.materials).sum()
+            )
+    for sensor_headline in headline.read(result.files[headline.FILE]):
+        assert headlines.BASELINES["level_only"] in {baseline.name for baseline in sensor_headline.baselines}
 
 
 @pytest.mark.long
@@ -120,13 +122,13 @@ def test_scores_and_latents_of_a_network_lie_beside_what_it_names(tmp_path: Path
 def test_a_loaded_model_says_what_evaluate_says(tmp_path: Path) -> None:
     files = trained(tmp_path, **RAEC)
     _, result = evaluated(files, slides(8, 1))
-    rows, found = predictions(result), MaterialModel.load(files)
+    rows, loaded = predictions(result), MaterialModel.load(files)
     frames = np.column_stack(
         [slide("biotac", 2, 8).table("slide").column(f"channel{number:02d}").to_numpy() for number in range(1, 6)]
     )
-    assert found.predict(frames, "biotac").tolist() == [rows["model"][rows["recording"].index("biotac-m02-t008")]]
-    told = predictions(material_prediction.predict(files, slides(8, 1, material=None)))
-    assert told["material"] == rows["model"]
+    assert loaded.predict(frames, "biotac").tolist() == [rows["model"][rows["recording"].index("biotac-m02-t008")]]
+    predicted = predictions(material_prediction.predict(files, slides(8, 1, material=None)))
+    assert predicted["material"] == rows["model"]
 
 
 @pytest.mark.parametrize("select", ["best", "last"])
@@ -136,13 +138,15 @@ def test_both_the_best_and_the_last_weights_are_kept(tmp_path: Path, select: str
     assert len(history) == 6
     assert (LAST in files) == (select == "best")
     config = json.loads(files[CONFIG])
-    best = max(history, key=lambda line: (sum(one["accuracy"] for one in line["val"].values()), line["epoch"]))
+    best = max(
+        history, key=lambda line: (sum(sensor_line["accuracy"] for sensor_line in line["val"].values()), line["epoch"])
+    )
     assert config["validation"]["epoch"] == dict.fromkeys(("biotac", "roboskin"), best["epoch"])
     assert ("last_epoch" in evaluated(files, slides(8, 1))[0]) == (select == "best")
 
 
 @cache
-def whole() -> dict[str, bytes]:
+def uninterrupted() -> dict[str, bytes]:
     """A joint run of 36 steps that nobody ended."""
     with tempfile.TemporaryDirectory() as folder:
         return trained(Path(folder), **{**RAEC, "epochs": 12})
@@ -153,26 +157,26 @@ def whole() -> dict[str, bytes]:
 def test_a_joint_run_killed_at_any_epoch_ends_with_the_same_weights(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, calls: int
 ) -> None:
-    real, left = losses.JointWork.loss, iter(range(calls))
+    real, remaining = losses.JointWork.loss, iter(range(calls))
 
     def dies(*args: Any) -> Any:
-        if next(left, None) is None:
+        if next(remaining, None) is None:
             raise KeyboardInterrupt
         return real(*args)
 
     with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
         patched.setattr(losses.JointWork, "loss", dies)
         trained(tmp_path / "killed", **{**RAEC, "epochs": 12})
-    again = trained(tmp_path / "killed", **{**RAEC, "epochs": 12})
-    assert again[WEIGHTS] == whole()[WEIGHTS]
-    assert again[LAST] == whole()[LAST]
-    assert again["history.jsonl"] == whole()["history.jsonl"]
+    resumed = trained(tmp_path / "killed", **{**RAEC, "epochs": 12})
+    assert resumed[WEIGHTS] == uninterrupted()[WEIGHTS]
+    assert resumed[LAST] == uninterrupted()[LAST]
+    assert resumed["history.jsonl"] == uninterrupted()["history.jsonl"]
 
 
 def test_mapping_to_a_known_space_leaves_the_known_sensor_as_it_was(tmp_path: Path) -> None:
-    known = trained(tmp_path / "known", **RAEC, joint=False)
-    mapped = trained(tmp_path / "mapped", **RAEC, frozen_sensor="roboskin", init=known, reconstruction_weight=0.01)
-    before, after = load_tensors(known[WEIGHTS]), load_tensors(mapped[WEIGHTS])
+    start = trained(tmp_path / "known", **RAEC, joint=False)
+    mapped = trained(tmp_path / "mapped", **RAEC, frozen_sensor="roboskin", init=start, reconstruction_weight=0.01)
+    before, after = load_tensors(start[WEIGHTS]), load_tensors(mapped[WEIGHTS])
     for name, value in before.items():
         if name.startswith("roboskin."):
             assert torch.equal(after[name], value)
@@ -182,8 +186,8 @@ def test_mapping_to_a_known_space_leaves_the_known_sensor_as_it_was(tmp_path: Pa
 
 
 def test_slides_of_the_model_that_a_mapping_began_with_count_as_seen(tmp_path: Path) -> None:
-    known = trained(tmp_path / "known", slides(20, 6), **RAEC, joint=False)
-    mapped = trained(tmp_path / "mapped", **RAEC, frozen_sensor="roboskin", init=known)
+    start = trained(tmp_path / "known", slides(20, 6), **RAEC, joint=False)
+    mapped = trained(tmp_path / "mapped", **RAEC, frozen_sensor="roboskin", init=start)
     metrics, _ = evaluated(mapped, slides(20, 2))
     assert metrics["seen"]["counts"]["slides"] == {"biotac": 8, "roboskin": 8}
     assert metrics["counts"]["slides"] == {"biotac": 0, "roboskin": 0}
@@ -201,16 +205,22 @@ def test_materials_held_out_are_named_by_the_other_sensors_classifier_alone(tmp_
 
 def test_swapped_names_go_through_the_permutation_that_sensors_were_aligned_by(tmp_path: Path) -> None:
     files = trained(tmp_path, **RAEC, pairing="permuted")
-    partners = {int(one): other for one, other in json.loads(files[CONFIG])["partners"].items()}
+    partners = {
+        int(first_class): partner_class for first_class, partner_class in json.loads(files[CONFIG])["partners"].items()
+    }
     assert sorted(partners.values()) == list(MATERIALS)
     _, result = evaluated(files, slides(8, 2))
-    rows, found = predictions(result), MaterialModel.load(files)
+    rows, loaded = predictions(result), MaterialModel.load(files)
     latents = np.array([rows[f"z{number:02d}"] for number in range(1, 7)], np.float32).T
     for sensor, partner in (("biotac", "roboskin"), ("roboskin", "biotac")):
-        at = [i for i, one in enumerate(rows["sensor"]) if one == sensor]
-        named = found.best_classes(found.readers[partner].scores_of(latents[at]))  # type: ignore[union-attr]
-        back = {other: one for one, other in partners.items()} if sensor == "biotac" else partners
-        assert [rows["swapped"][i] for i in at] == [back[int(one)] for one in named]
+        at = [i for i, sensor_name in enumerate(rows["sensor"]) if sensor_name == sensor]
+        best_classes = loaded.best_classes(loaded.readers[partner].scores_of(latents[at]))  # type: ignore[union-attr]
+        original = (
+            {partner_class: first_class for first_class, partner_class in partners.items()}
+            if sensor == "biotac"
+            else partners
+        )
+        assert [rows["swapped"][i] for i in at] == [original[int(one)] for one in best_classes]
 
 
 def test_one_sensor_alone_is_trained_where_only_it_is_asked_for(tmp_path: Path) -> None:
@@ -223,10 +233,10 @@ def test_one_sensor_alone_is_trained_where_only_it_is_asked_for(tmp_path: Path) 
 
 
 def test_the_strong_classifier_needs_no_validation_slides_and_learns_from_those_there_are(tmp_path: Path) -> None:
-    alone = trained(tmp_path, validation=dataset())
-    beside = trained(tmp_path)
-    assert alone[WEIGHTS] != beside[WEIGHTS]
-    assert alone[WEIGHTS] == trained(tmp_path, use_validation=False)[WEIGHTS]
+    without_validation = trained(tmp_path, validation=dataset())
+    with_validation = trained(tmp_path)
+    assert without_validation[WEIGHTS] != with_validation[WEIGHTS]
+    assert without_validation[WEIGHTS] == trained(tmp_path, use_validation=False)[WEIGHTS]
 
 
 def test_baselines_can_be_left_out(tmp_path: Path) -> None:
@@ -311,13 +321,13 @@ def test_recordings_of_an_unknown_layout_are_refused_when_judged(tmp_path: Path)
 
 
 def test_slides_of_another_shape_are_refused_by_a_loaded_model(tmp_path: Path) -> None:
-    found = MaterialModel.load(trained(tmp_path))
+    loaded = MaterialModel.load(trained(tmp_path))
     with pytest.raises(TacpipeError, match=r"Slides of biotac are \(slide, 40, 5\), not \(1, 40, 4\)"):
-        found.predict(np.zeros((40, 4)), "biotac")
+        loaded.predict(np.zeros((40, 4)), "biotac")
     with pytest.raises(UsageError, match="biotac, roboskin"):
-        found.predict(np.zeros((40, 5)))
+        loaded.predict(np.zeros((40, 5)))
     with pytest.raises(TacpipeError, match="not finite"):
-        found.predict(np.full((40, 5), np.nan), "biotac")
+        loaded.predict(np.full((40, 5), np.nan), "biotac")
 
 
 def test_the_published_code_with_its_quirks_is_a_preset() -> None:
@@ -335,5 +345,5 @@ def test_the_published_quirks_train_and_are_judged_on_whole_batches(tmp_path: Pa
     metrics, _ = evaluated(files, slides(8, 3))
     assert metrics["model"]["n"] == {"biotac": 8, "roboskin": 8}
     assert json.loads(files[CONFIG])["shapes"]["roboskin"]["unpool"] == "last"
-    few, _ = evaluated(trained(tmp_path / "few", validation=slides(6, 1), **RAEC, **quirks), slides(8, 1))
-    assert few["model"]["n"] == {"biotac": 4, "roboskin": 4}
+    metrics_of_few, _ = evaluated(trained(tmp_path / "few", validation=slides(6, 1), **RAEC, **quirks), slides(8, 1))
+    assert metrics_of_few["model"]["n"] == {"biotac": 4, "roboskin": 4}

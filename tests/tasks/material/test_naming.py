@@ -22,10 +22,10 @@ WORDS = {1: "cork", 2: "felt", 3: "foam, soft", 4: "über-rubber"}  # in the ord
 
 def worded(first: int, count: int, key: str = "material") -> Any:
     """The slides ``first`` to ``first + count``, whose classes have words for names."""
-    found = slides(first, count, ("biotac",), material=None)
-    for shard in found.recordings.values():
+    with_words = slides(first, count, ("biotac",), material=None)
+    for shard in with_words.recordings.values():
         shard.attributes[key] = WORDS[int(shard.name.split("-m")[1][:2])]
-    return found
+    return with_words
 
 
 def numbered(first: int, count: int) -> Any:
@@ -57,21 +57,26 @@ def test_a_label_that_no_model_knows_is_refused_with_those_that_it_does() -> Non
 def test_words_give_the_predictions_of_numbers_in_words(tmp_path: Path, key: str) -> None:
     by_number = trained(tmp_path / "n", numbered(0, 4), numbered(4, 1), architecture="minirocket")
     by_word = trained(tmp_path / "w", worded(0, 4, key), worded(4, 1, key), architecture="minirocket", label=key)
-    (first, found), (second, other) = evaluated(by_number, numbered(5, 2)), evaluated(by_word, worded(5, 2, key))
+    (first, numbered_result), (second, worded_result) = (
+        evaluated(by_number, numbered(5, 2)),
+        evaluated(by_word, worded(5, 2, key)),
+    )
     assert first == second
-    tables = [result.recordings["predictions"].streams[""] for result in (found, other)]
+    tables = [result.recordings["predictions"].streams[""] for result in (numbered_result, worded_result)]
     for column in ("material", "model", "mean_level"):
-        assert [WORDS[one] for one in tables[0].column(column).to_pylist()] == tables[1].column(column).to_pylist()
+        assert [WORDS[number] for number in tables[0].column(column).to_pylist()] == tables[1].column(
+            column
+        ).to_pylist()
     assert "score_cork" in tables[1].column_names and "score_01" in tables[0].column_names
-    assert "cork" in other.files["confusion.csv"].decode()
+    assert "cork" in worded_result.files["confusion.csv"].decode()
     predicted = material_prediction.predict(by_word, worded(5, 2, key)).recordings["predictions"].streams[""]
     assert predicted.column("material").to_pylist() == tables[1].column("model").to_pylist()
 
 
 def test_arrays_are_named_in_words_too(tmp_path: Path) -> None:
     model = MaterialModel.load(trained(tmp_path, worded(0, 4), worded(4, 1), architecture="minirocket"))
-    ((sensor, found),) = model.read(dataset(worded(5, 1).recordings["biotac-m02-t005"])).items()
-    frames = found.frames
+    ((sensor, sensor_slides),) = model.read(dataset(worded(5, 1).recordings["biotac-m02-t005"])).items()
+    frames = sensor_slides.frames
     assert model.predict(frames, sensor).tolist() == ["felt"]
     assert model.names == tuple(WORDS.values())
     assert model.probabilities(frames, sensor).shape == (1, len(WORDS))
@@ -93,7 +98,7 @@ def test_networks_and_held_out_classes_go_by_their_words(tmp_path: Path) -> None
     assert tree["zero_shot"]["n"]["roboskin"] == 4
     table = result.recordings["predictions"].streams[""]
     read = predictions.read_predictions(table, MaterialModel.load(files).config)
-    assert {WORDS[one + 1] for one in read.of("roboskin").materials.tolist()} == {"felt", "foam, soft"}
+    assert {WORDS[number + 1] for number in read.of("roboskin").materials.tolist()} == {"felt", "foam, soft"}
     with pytest.raises(UsageError, match=r"hold_out names roboskin=tin.*cork"):
         trained(tmp_path / "other", both[0], both[1], architecture="raec", hold_out="roboskin=tin")
 
@@ -104,12 +109,12 @@ def test_a_report_has_the_words(tmp_path: Path) -> None:
     shards = {"predictions": FakeShard("predictions", result.recordings["predictions"].streams[""])}
     given: Any = FakeDataset(shards, result.files, {})
     (method,) = parts.methods("material", given)
-    counts, named = figures.count_confusions(method, "biotac")
-    assert named == sorted(WORDS.values()) and counts.sum() == 3 * len(MATERIALS)
+    counts, names = figures.count_confusions(method, "biotac")
+    assert names == sorted(WORDS.values()) and counts.sum() == 3 * len(MATERIALS)
 
 
 def _skin(first: int, count: int) -> list[Any]:
-    found = slides(first, count, ("roboskin",))
-    for shard in found.recordings.values():
+    sensor_slides = slides(first, count, ("roboskin",))
+    for shard in sensor_slides.recordings.values():
         shard.attributes["material"] = WORDS[shard.attributes["material"]]
-    return list(found.recordings.values())
+    return list(sensor_slides.recordings.values())

@@ -18,7 +18,7 @@ def two(**changed: Any) -> Pairs:
 
 
 def visited(pairs: Pairs, sensor: str) -> list[int]:
-    return [int(one) for batch in pairs.epoch() for one in batch[sensor] if one != NONE]
+    return [int(row) for batch in pairs.epoch() for row in batch[sensor] if row != NONE]
 
 
 @pytest.mark.parametrize("percent, count", [(100, 576), (90, 512), (50, 288), (25, 160), (17, 96), (11, 64)])
@@ -28,7 +28,7 @@ def test_a_reduced_sensor_learns_from_the_same_few_slides_in_every_epoch(percent
     order = visited(whole, "b")
     every = {100: 1, 50: 2, 25: 4, 17: 6, 11: 9}.get(percent)
     kept = [n for n in range(18) if (n % every == 0 if every else n % 10)]
-    assert visited(reduced, "b") == [one for n in kept for one in order[32 * n : 32 * n + 32]]
+    assert visited(reduced, "b") == [row for n in kept for row in order[32 * n : 32 * n + 32]]
     assert len(visited(reduced, "b")) == count
     assert visited(reduced, "b") == visited(reduced, "b")
     assert visited(reduced, "a") == visited(whole, "a")
@@ -47,23 +47,23 @@ def test_dropping_the_last_batch_leaves_whole_ones() -> None:
 
 
 @given(st.lists(st.integers(0, 3), min_size=1, max_size=30), st.lists(st.integers(-1, 3), min_size=1, max_size=30))
-def test_the_slides_of_a_row_are_of_the_same_class(one: list[int], other: list[int]) -> None:
-    pairs = Pairs({"a": torch.tensor(one), "b": torch.tensor(other)}, 4)
+def test_the_slides_of_a_row_are_of_the_same_class(first_classes: list[int], second_classes: list[int]) -> None:
+    pairs = Pairs({"a": torch.tensor(first_classes), "b": torch.tensor(second_classes)}, 4)
     rows = [row for batch in pairs.epoch() for row in zip(batch["a"].tolist(), batch["b"].tolist(), strict=True)]
     for first, second in rows:
         if NONE not in (first, second):
-            assert one[first] == other[second]
-    assert sorted(first for first, _ in rows if first != NONE) == list(range(len(one)))
-    assert sorted(second for _, second in rows if second != NONE) == list(range(len(other)))
+            assert first_classes[first] == second_classes[second]
+    assert sorted(first for first, _ in rows if first != NONE) == list(range(len(first_classes)))
+    assert sorted(second for _, second in rows if second != NONE) == list(range(len(second_classes)))
     assert (NONE, NONE) not in rows
     both = sum(NONE not in row for row in rows)
-    assert both == sum(min(one.count(kind), other.count(kind)) for kind in range(4))
+    assert both == sum(min(first_classes.count(kind), second_classes.count(kind)) for kind in range(4))
 
 
 def test_permuted_pairs_are_of_the_partner_class_and_of_no_class_with_itself() -> None:
     partners = permuted_classes(range(20), seed=3)
     assert sorted(partners) == sorted(partners.values()) == list(range(20))
-    assert all(one != other for one, other in partners.items())
+    assert all(row != partner for row, partner in partners.items())
     pairs = two(pairing="permuted", partners=partners)
     for batch in pairs.epoch():
         for first, second in zip(batch["a"].tolist(), batch["b"].tolist(), strict=True):
@@ -95,7 +95,7 @@ def test_three_sensors_are_dealt_side_by_side() -> None:
     rows = [row for batch in pairs.epoch() for row in zip(*(batch[name].tolist() for name in "abc"), strict=True)]
     assert len(rows) == 60
     for row in rows:
-        assert len({one % 20 for one in row if one != NONE}) == 1
+        assert len({number % 20 for number in row if number != NONE}) == 1
 
 
 @pytest.mark.parametrize(

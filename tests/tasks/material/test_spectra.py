@@ -32,10 +32,10 @@ def slide(felt: str, kind: int, trial: int, speed_m_s: float = 0.0, **attributes
         values += 9 * rng.uniform(0.7, 1.3) * np.sin(2 * np.pi * per_m * at_m + rng.uniform(0, 2 * np.pi, channels))
     about = {"quantity": "tactile", "unit": "count"}
     schema = pa.schema([pa.field(f"channel{number:02d}", pa.float32(), metadata=about) for number in range(channels)])
-    table = pa.Table.from_arrays([pa.array(one.astype(np.float32)) for one in values.T], schema=schema)
-    told = {"sensor": felt, "material": kind, "trial": trial, "rate_hz": rate_hz, **attributes}
-    told |= {"speed_m_s": speed_m_s} if speed_m_s else {}
-    return Slide({"slide": table}, f"{felt}-m{kind:02d}-t{trial:03d}", told)
+    table = pa.Table.from_arrays([pa.array(item.astype(np.float32)) for item in values.T], schema=schema)
+    predicted = {"sensor": felt, "material": kind, "trial": trial, "rate_hz": rate_hz, **attributes}
+    predicted |= {"speed_m_s": speed_m_s} if speed_m_s else {}
+    return Slide({"slide": table}, f"{felt}-m{kind:02d}-t{trial:03d}", predicted)
 
 
 def slides(first: int, count: int, **attributes: Any) -> Any:
@@ -51,13 +51,13 @@ def slides(first: int, count: int, **attributes: Any) -> Any:
 
 
 def trained(folder: Path, training: Any = None, validation: Any = None, **changed: Any) -> dict[str, bytes]:
-    asked = params(**{**SPECTRA, **changed})
-    return material_training.train(asked, training or slides(0, 5), validation or dataset(), folder)
+    spectra_params = params(**{**SPECTRA, **changed})
+    return material_training.train(spectra_params, training or slides(0, 5), validation or dataset(), folder)
 
 
 def predictions(result: Any) -> dict[str, list[Any]]:
-    found: dict[str, list[Any]] = result.recordings["predictions"].tables.to_pydict()
-    return found
+    fitted: dict[str, list[Any]] = result.recordings["predictions"].tables.to_pydict()
+    return fitted
 
 
 def test_a_sensor_names_materials_whose_labels_only_the_other_one_was_told(tmp_path: Path) -> None:
@@ -72,7 +72,11 @@ def test_a_sensor_names_materials_whose_labels_only_the_other_one_was_told(tmp_p
     assert metrics["model"]["accuracy"]["biotac"] > 0.95
     assert metrics["model"]["accuracy"]["roboskin"] > 0.9
     rows = predictions(result)
-    held = [told == known for told, known in zip(rows["model"], rows["material"], strict=True) if known in (3, 6)]
+    held = [
+        predicted == training
+        for predicted, training in zip(rows["model"], rows["material"], strict=True)
+        if training in (3, 6)
+    ]
     assert np.mean(held) > 0.7
 
 
@@ -90,22 +94,22 @@ def test_the_labels_of_held_out_materials_reach_nothing_that_is_fitted(tmp_path:
 
 
 def test_a_material_that_a_sensor_never_felt_is_as_one_held_out(tmp_path: Path) -> None:
-    some = [
-        one
-        for one in slides(0, 5).recordings.values()
-        if (one.attributes["sensor"], one.attributes["material"]) != ("roboskin", 4)
+    chosen = [
+        item
+        for item in slides(0, 5).recordings.values()
+        if (item.attributes["sensor"], item.attributes["material"]) != ("roboskin", 4)
     ]
-    files = trained(tmp_path, dataset(*some))
+    files = trained(tmp_path, dataset(*chosen))
     assert json.loads(files[CONFIG])["held_out"] == {"biotac": [], "roboskin": [4]}
     assert evaluated(files, slides(5, 3))[0]["zero_shot"]["n"] == {"roboskin": 3}
 
 
 def test_the_speed_is_that_which_recordings_tell_and_else_that_of_params(tmp_path: Path) -> None:
-    told = json.loads(trained(tmp_path)[CONFIG])["spectra"]["speed_m_s"]
-    assert told == {"biotac": 0.025, "roboskin": 0.05}
-    some = [*slides(0, 4).recordings.values(), *(slide("biotac", kind, 9, speed_m_s=0.03) for kind in WAVES)]
-    told = json.loads(trained(tmp_path, dataset(*some), speeds="roboskin=0.04")[CONFIG])["spectra"]["speed_m_s"]
-    assert told == {"biotac": 0.03, "roboskin": 0.04}
+    predicted = json.loads(trained(tmp_path)[CONFIG])["spectra"]["speed_m_s"]
+    assert predicted == {"biotac": 0.025, "roboskin": 0.05}
+    chosen = [*slides(0, 4).recordings.values(), *(slide("biotac", kind, 9, speed_m_s=0.03) for kind in WAVES)]
+    predicted = json.loads(trained(tmp_path, dataset(*chosen), speeds="roboskin=0.04")[CONFIG])["spectra"]["speed_m_s"]
+    assert predicted == {"biotac": 0.03, "roboskin": 0.04}
 
 
 def test_the_wrong_speed_takes_what_sensors_share(tmp_path: Path) -> None:
@@ -119,7 +123,7 @@ def test_the_wrong_speed_takes_what_sensors_share(tmp_path: Path) -> None:
 def test_one_sensor_alone_learns_its_own_materials(tmp_path: Path) -> None:
     metrics, _ = evaluated(
         trained(tmp_path, sensors="roboskin"),
-        dataset(*(one for one in slides(5, 3).recordings.values() if one.attributes["sensor"] == "roboskin")),
+        dataset(*(item for item in slides(5, 3).recordings.values() if item.attributes["sensor"] == "roboskin")),
     )
     assert metrics["model"]["accuracy"]["roboskin"] > 0.9
     assert metrics["permuted_labels"]["accuracy"]["roboskin"] < 0.5
@@ -129,11 +133,11 @@ def test_one_sensor_alone_learns_its_own_materials(tmp_path: Path) -> None:
 def test_a_loaded_model_says_what_evaluate_says(tmp_path: Path) -> None:
     files = trained(tmp_path)
     rows = predictions(evaluated(files, slides(5, 1))[1])
-    one = slide("roboskin", 2, 5)
-    table = one.table("slide")
+    item = slide("roboskin", 2, 5)
+    table = item.table("slide")
     frames = np.column_stack([table.column(name).to_numpy() for name in table.column_names])
     assert MaterialModel.load(files).predict(frames, "roboskin").tolist() == [
-        rows["model"][rows["recording"].index(one.name)]
+        rows["model"][rows["recording"].index(item.name)]
     ]
     assert np.isfinite([rows[f"z{number:02d}"] for number in range(1, 18)]).all()
 

@@ -42,11 +42,11 @@ def slide(felt: str, kind: int, trial: int, **attributes: Any) -> Slide:
     names = [f"channel{number:02d}" for number in range(1, CHANNELS[felt] + 1)]
     fields = [pa.field("t_ns", pa.int64(), metadata={"quantity": "time", "unit": "ns"})]
     fields += [pa.field(name, pa.float32(), metadata={"quantity": "tactile", "unit": "count"}) for name in names]
-    columns = [pa.array(time[:, 0] * 10_000_000)] + [pa.array(one.astype(np.float32)) for one in values.T]
+    columns = [pa.array(time[:, 0] * 10_000_000)] + [pa.array(column.astype(np.float32)) for column in values.T]
     table = pa.Table.from_arrays(columns, schema=pa.schema(fields))
-    told = {"sensor": felt, "material": kind, "trial": trial, "rate_hz": 100.0, **attributes}
-    told = {name: value for name, value in told.items() if value is not None}
-    return Slide({"slide": table}, f"{felt}-m{kind:02d}-t{trial:03d}", told)
+    labels = {"sensor": felt, "material": kind, "trial": trial, "rate_hz": 100.0, **attributes}
+    labels = {name: value for name, value in labels.items() if value is not None}
+    return Slide({"slide": table}, f"{felt}-m{kind:02d}-t{trial:03d}", labels)
 
 
 def dataset(*shards: Any, files: Mapping[str, bytes] | None = None) -> Any:

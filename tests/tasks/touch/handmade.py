@@ -59,26 +59,29 @@ def grasp(number: int, size_m: float = 0.03, *, wrist: bool = True) -> Grasp:
 
 
 def reading(number: int, size_m: float) -> pa.Table:
-    """What is felt: the larger the object, the more."""
+    """Return a reading: the larger the object, the stronger."""
     rng = np.random.default_rng(number)
     values = {field.name: 1000 for field in biotac_sp.fields()}
     for target, (low, high) in biotac_sp.RANGES.items():
         for index, name in enumerate(biotac_sp.columns(target)):
             share = 0.2 + 8 * size_m + 0.01 * index + rng.normal(0, 0.02)
             values[name] = round(low + share * (high - low))
-    return schema.stream(np.array([number]), [np.array([one]) for one in values.values()], biotac_sp.fields())
+    return schema.stream(np.array([number]), [np.array([count]) for count in values.values()], biotac_sp.fields())
 
 
-def recording(number: int, kind: str = "ball", *, felt: bool = True, **given: Any) -> GraspShard:
-    """A grasp as `tacpipe ingest vision2tactile` gives it; ``given`` are a cloud, a grasp or attributes."""
+def recording(number: int, kind: str = "ball", *, felt: bool = True, **overrides: Any) -> GraspShard:
+    """A grasp as `tacpipe ingest vision2tactile` gives it; ``overrides`` are a cloud, a grasp or attributes."""
     size_m = OBJECTS.get(kind, 0.04)
-    held, made = given.pop("cloud", cloud(number, size_m)), given.pop("grasp", grasp(number, size_m))
-    tables = {"cloud": held.table(), "grasp": made.table(number * 60_000_000_000)}
+    grasp_cloud, planned_grasp = (
+        overrides.pop("cloud", cloud(number, size_m)),
+        overrides.pop("grasp", grasp(number, size_m)),
+    )
+    tables = {"cloud": grasp_cloud.table(), "grasp": planned_grasp.table(number * 60_000_000_000)}
     if felt:
         tables["reading"] = reading(number, size_m)
-    told = {"sensor": "biotac-sp", "object": kind, "session": f"{kind}-s01", **given}
+    attributes = {"sensor": "biotac-sp", "object": kind, "session": f"{kind}-s01", **overrides}
     return GraspShard(
-        tables, f"{kind}-{number:03d}", {name: value for name, value in told.items() if value is not None}
+        tables, f"{kind}-{number:03d}", {name: value for name, value in attributes.items() if value is not None}
     )
 
 
@@ -86,13 +89,13 @@ def dataset(*shards: Any, files: Mapping[str, bytes] | None = None) -> Any:
     return FakeDataset({shard.name: shard for shard in shards}, files or {})
 
 
-def recordings(first: int = 0, count: int = 6, kinds: Sequence[str] = tuple(OBJECTS), **given: Any) -> Any:
+def recordings(first: int = 0, count: int = 6, kinds: Sequence[str] = tuple(OBJECTS), **overrides: Any) -> Any:
     """The grasps ``first`` to ``first + count`` of each object."""
-    return dataset(*(recording(n, kind, **given) for kind in kinds for n in range(first, first + count)))
+    return dataset(*(recording(n, kind, **overrides) for kind in kinds for n in range(first, first + count)))
 
 
-def grasps(first: int = 0, count: int = 6, **given: Any) -> Grasps:
-    return grasps_of.read(recordings(first, count, **given))
+def grasps(first: int = 0, count: int = 6, **overrides: Any) -> Grasps:
+    return grasps_of.read(recordings(first, count, **overrides))
 
 
 def params(**changed: Any) -> Any:
@@ -104,15 +107,15 @@ def trained(folder: Path, training: Any = None, validation: Any = None, **change
     return touch_training.train(params(**changed), training or recordings(), validation or dataset(), folder)
 
 
-def evaluated(model: Mapping[str, bytes], given: Any) -> tuple[dict[str, Any], Result]:
+def evaluated(model: Mapping[str, bytes], overrides: Any) -> tuple[dict[str, Any], Result]:
     """``metrics.json`` and the result of evaluating a model."""
-    result: Result = touch_evaluation.evaluate(model, given)
+    result: Result = touch_evaluation.evaluate(model, overrides)
     return json.loads(result.files["metrics.json"]), result
 
 
 def config(files: Mapping[str, bytes]) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads(files["config.json"])
-    return found
+    content: dict[str, Any] = json.loads(files["config.json"])
+    return content
 
 
 def history(files: Mapping[str, bytes]) -> list[dict[str, Any]]:

@@ -46,8 +46,8 @@ def result(model: dict[str, bytes], asked: Any) -> Result:
 
 @pytest.fixture(scope="module")
 def metrics(result: Result) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads(result.files["metrics.json"])
-    return found
+    tree: dict[str, Any] = json.loads(result.files["metrics.json"])
+    return tree
 
 
 def columns(target: str) -> list[str]:
@@ -55,14 +55,14 @@ def columns(target: str) -> list[str]:
 
 
 def rows(table: pa.Table, target: str) -> np.ndarray:
-    """What a stream tells of a target (grasp, value), counts."""
+    """Return the values of a stream for a target (grasp, value), counts."""
     return np.column_stack([table.column(name).to_numpy() for name in columns(target)]).astype(float)
 
 
 def masks(result: Result) -> dict[str, np.ndarray]:
     about = result.recordings["predictions"].streams["grasps"].to_pydict()
-    seen, known = np.array(about["seen"]), np.array(about["known"])
-    return {"": ~seen, "seen": seen, "known": known & ~seen, "novel": ~known & ~seen}
+    in_training, is_known = np.array(about["seen"]), np.array(about["known"])
+    return {"": ~in_training, "seen": in_training, "known": is_known & ~in_training, "novel": ~is_known & ~in_training}
 
 
 @pytest.mark.parametrize("part", ["", "seen", "known", "novel"])
@@ -75,29 +75,29 @@ def test_measures_are_scikit_learns_on_the_predictions_written(
     true = rows(streams["true"], target)[mask]
     low, high = biotac_sp.RANGES[target]
     for name in PREDICTORS:
-        told = rows(streams[name], target)[mask]
-        one = tree[name]
-        rmse = root_mean_squared_error(true.ravel(), told.ravel())
-        assert one["n"] == mask.sum()
-        assert one["rmse_counts"][target] == pytest.approx(rmse, rel=1e-5)
-        assert one["rmse"][target] == pytest.approx(rmse / (high - low), rel=1e-5)
-        mae = mean_absolute_error(true.ravel(), told.ravel()) / (high - low)
-        assert one["mae"][target] == pytest.approx(mae, rel=1e-4)
-        r2 = r2_score(true, told, multioutput="variance_weighted")
-        assert one["r2"][target] == pytest.approx(r2, rel=1e-3, abs=1e-4)
+        predicted = rows(streams[name], target)[mask]
+        measured = tree[name]
+        rmse = root_mean_squared_error(true.ravel(), predicted.ravel())
+        assert measured["n"] == mask.sum()
+        assert measured["rmse_counts"][target] == pytest.approx(rmse, rel=1e-5)
+        assert measured["rmse"][target] == pytest.approx(rmse / (high - low), rel=1e-5)
+        mae = mean_absolute_error(true.ravel(), predicted.ravel()) / (high - low)
+        assert measured["mae"][target] == pytest.approx(mae, rel=1e-4)
+        r2 = r2_score(true, predicted, multioutput="variance_weighted")
+        assert measured["r2"][target] == pytest.approx(r2, rel=1e-3, abs=1e-4)
         constant = root_mean_squared_error(true.ravel(), rows(streams["constant"], target)[mask].ravel())
-        assert one["skill"][target] == pytest.approx(1 - rmse / constant, abs=1e-5)
+        assert measured["skill"][target] == pytest.approx(1 - rmse / constant, abs=1e-5)
         if mask.sum() <= 10:  # one batch
-            assert one["rmse_batch_mean"][target] == pytest.approx(one["rmse"][target])
+            assert measured["rmse_batch_mean"][target] == pytest.approx(measured["rmse"][target])
 
 
 def test_the_letters_figure_is_no_larger_than_the_error_over_all(model: dict[str, bytes]) -> None:
     tree, result = evaluated(model, recordings(10, 20))  # four batches of ten
-    true, told = (result.recordings["predictions"].streams[name] for name in ("true", "model"))
+    true, predicted = (result.recordings["predictions"].streams[name] for name in ("true", "model"))
     for target in biotac_sp.TARGETS:
         mine, batch = (tree["model"][name][target] for name in ("rmse", "rmse_batch_mean"))
         assert 0 < batch <= mine
-        shares = [biotac_sp.normalised(target, rows(table, target)) for table in (true, told)]
+        shares = [biotac_sp.normalised(target, rows(table, target)) for table in (true, predicted)]
         by_hand = [
             root_mean_squared_error(shares[0][at : at + 10].ravel(), shares[1][at : at + 10].ravel())
             for at in range(0, 40, 10)
@@ -109,24 +109,24 @@ def test_the_letters_figure_is_no_larger_than_the_error_over_all(model: dict[str
 def test_each_electrode_is_told_alone(target: str, result: Result, metrics: dict[str, Any]) -> None:
     streams, mask = result.recordings["predictions"].streams, masks(result)[""]
     shares = [biotac_sp.normalised(target, rows(streams[name], target)[mask]) for name in ("true", "model")]
-    told = metrics["model"]["by_electrode"][target]
-    assert list(told) == [f"{n:02d}" for n in range(1, 25)]
-    for index, one in enumerate(told.values()):
+    by_electrode = metrics["model"]["by_electrode"][target]
+    assert list(by_electrode) == [f"{n:02d}" for n in range(1, 25)]
+    for index, measured in enumerate(by_electrode.values()):
         true, model = (values[:, index] for values in shares)
-        assert one["rmse"] == pytest.approx(root_mean_squared_error(true, model), rel=1e-4)
-        assert one["r2"] == pytest.approx(r2_score(true, model), rel=1e-3, abs=1e-3)
+        assert measured["rmse"] == pytest.approx(root_mean_squared_error(true, model), rel=1e-4)
+        assert measured["r2"] == pytest.approx(r2_score(true, model), rel=1e-3, abs=1e-3)
     assert "by_electrode" not in metrics["constant"]
 
 
 def test_seen_known_and_novel_grasps_are_told_apart(result: Result, metrics: dict[str, Any]) -> None:
     about = result.recordings["predictions"].streams["grasps"].to_pydict()
     assert about["recording"] == sorted(about["recording"])
-    assert [name for name, seen in zip(about["recording"], about["seen"], strict=True) if seen] == [
+    assert [name for name, in_training in zip(about["recording"], about["seen"], strict=True) if in_training] == [
         "ball-000",
         "ball-001",
     ]
-    known = {name for name, is_known in zip(about["object"], about["known"], strict=True) if is_known}
-    assert known == {"ball", "melon"}
+    known_objects = {name for name, is_known in zip(about["object"], about["known"], strict=True) if is_known}
+    assert known_objects == {"ball", "melon"}
     assert about["object"][about["recording"].index("ball-040")] == ""
     assert metrics["counts"] == {"grasps": 11, "objects": 4}
     counts = {part: metrics[part]["counts"]["grasps"] for part in ("known", "novel", "seen")}
@@ -135,18 +135,18 @@ def test_seen_known_and_novel_grasps_are_told_apart(result: Result, metrics: dic
 
 def test_each_object_has_measures_of_its_own_also_as_rows(result: Result, metrics: dict[str, Any]) -> None:
     tree = metrics["model"]["by_object"]
-    assert {name: one["n"] for name, one in tree.items()} == {"unnamed": 1, "egg": 2, "shoe": 2, "melon": 6}
+    assert {name: measured["n"] for name, measured in tree.items()} == {"unnamed": 1, "egg": 2, "shoe": 2, "melon": 6}
     streams = result.recordings["predictions"].streams
     mask = np.array([name == "egg" for name in streams["grasps"].to_pydict()["object"]])
     rmse = root_mean_squared_error(*(rows(streams[name], "pdc_mf")[mask] for name in ("true", "model")))
     assert tree["egg"]["rmse_counts"]["pdc_mf"] == pytest.approx(rmse, rel=1e-5)
     lines = list(csv.DictReader(io.StringIO(result.files["by_object.csv"].decode())))
     assert len(lines) == 4 * 4 * 4  # objects, predictors, targets
-    line = next(one for one in lines if (one["object"], one["predictor"], one["target"]) == ("egg", "model", "pdc_mf"))
+    line = next(row for row in lines if (row["object"], row["predictor"], row["target"]) == ("egg", "model", "pdc_mf"))
     assert int(line["n"]) == 2
     assert float(line["rmse_counts"]) == pytest.approx(rmse, rel=1e-4)
-    alone = next(one for one in lines if one["object"] == "unnamed")
-    assert alone["r2"] == ""  # of one grasp nothing varies
+    single = next(row for row in lines if row["object"] == "unnamed")
+    assert single["r2"] == ""  # a single grasp does not vary
 
 
 def test_novel_objects_are_resampled_whole_and_known_ones_by_grasp(result: Result, metrics: dict[str, Any]) -> None:
@@ -154,14 +154,14 @@ def test_novel_objects_are_resampled_whole_and_known_ones_by_grasp(result: Resul
     about = streams["grasps"].to_pydict()
     for part, by in (("novel", "object"), ("known", "recording")):
         mask = masks(result)[part]
-        true, told, constant = (
+        true, predicted, constant = (
             biotac_sp.normalised("pdc_th", rows(streams[name], "pdc_th")[mask])
             for name in ("true", "model", "constant")
         )
-        model, baseline = (regression.squared_sums(true, one) for one in (told, constant))
-        known = regression.skill_interval(model, baseline, np.array(about[by])[mask])
-        found = [metrics[part]["model"][name]["pdc_th"] or math.nan for name in ("skill", "skill_low", "skill_high")]
-        assert found == pytest.approx(list(known), abs=1e-4, nan_ok=True)
+        model, baseline = (regression.squared_sums(true, share) for share in (predicted, constant))
+        expected = regression.skill_interval(model, baseline, np.array(about[by])[mask])
+        reported = [metrics[part]["model"][name]["pdc_th"] or math.nan for name in ("skill", "skill_low", "skill_high")]
+        assert reported == pytest.approx(list(expected), abs=1e-4, nan_ok=True)
 
 
 def test_the_metrics_are_json_without_values_that_are_not_numbers(model: dict[str, bytes]) -> None:
@@ -177,21 +177,21 @@ def test_the_metrics_are_json_without_values_that_are_not_numbers(model: dict[st
 
 
 def test_the_streams_have_the_columns_and_types_that_are_promised(result: Result, asked: Any) -> None:
-    found = result.recordings["predictions"]
-    assert set(found.streams) == {"grasps", "true", *PREDICTORS}
+    output = result.recordings["predictions"]
+    assert set(output.streams) == {"grasps", "true", *PREDICTORS}
     names = [name for target in biotac_sp.TARGETS for name in columns(target)]
     for stream in ("true", *PREDICTORS):
-        assert found.streams[stream].column_names == names
-        assert {str(field.type) for field in found.streams[stream].schema} == {"float"}  # of 32 bits
-        assert found.streams[stream].num_rows == len(asked.recordings)
-    about = found.streams["grasps"]
+        assert output.streams[stream].column_names == names
+        assert {str(field.type) for field in output.streams[stream].schema} == {"float"}  # 32 bits
+        assert output.streams[stream].num_rows == len(asked.recordings)
+    about = output.streams["grasps"]
     assert [(field.name, str(field.type)) for field in about.schema] == [
         *(("recording", "string"), ("object", "string"), ("session", "string")),
         *(("t_ns", "int64"), ("seen", "bool"), ("known", "bool")),
     ]
     felt = asked.recordings["egg-030"].tables["reading"].column("th_pdc")[0].as_py()
-    assert rows(found.streams["true"], "pdc_th")[about.to_pydict()["recording"].index("egg-030")] == felt
-    assert dict(found.attributes) == {}
+    assert rows(output.streams["true"], "pdc_th")[about.to_pydict()["recording"].index("egg-030")] == felt
+    assert dict(output.attributes) == {}
 
 
 def test_grasps_all_seen_leave_nothing_to_judge_but_what_was_seen(model: dict[str, bytes]) -> None:

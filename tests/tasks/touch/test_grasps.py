@@ -30,45 +30,45 @@ def with_table(shard: GraspShard, stream: str, table: pa.Table) -> GraspShard:
 
 
 def test_grasps_come_in_the_order_of_their_names_with_all_that_was_felt() -> None:
-    one, other = recording(7, "melon"), recording(3)
-    found = grasps_of.read(dataset(one, other))
-    assert found.names == ("ball-003", "melon-007")
-    assert found.objects == ("ball", "melon")
-    assert found.sessions == ("ball-s01", "melon-s01")
-    assert found.t_ns.tolist() == [180_000_000_000, 420_000_000_000]
-    assert found.digests == (other.digest, one.digest)
-    assert {target: felt.shape for target, felt in found.readings.items()} == {
+    later, earlier = recording(7, "melon"), recording(3)
+    grasps = grasps_of.read(dataset(later, earlier))
+    assert grasps.names == ("ball-003", "melon-007")
+    assert grasps.objects == ("ball", "melon")
+    assert grasps.sessions == ("ball-s01", "melon-s01")
+    assert grasps.t_ns.tolist() == [180_000_000_000, 420_000_000_000]
+    assert grasps.digests == (earlier.digest, later.digest)
+    assert {target: felt.shape for target, felt in grasps.readings.items()} == {
         "pdc_th": (2, 1),
         "pdc_mf": (2, 1),
         "e_th": (2, 24),
         "e_mf": (2, 24),
     }
-    row = one.tables["reading"].to_pylist()[0]
-    assert found.readings["pdc_mf"][1].tolist() == [row["mf_pdc"]]
-    assert found.readings["e_th"][1].tolist() == [row[f"th_electrode{n:02d}"] for n in range(1, 25)]
-    np.testing.assert_array_equal(found.clouds[0].points_m, cloud(3).points_m)
+    row = later.tables["reading"].to_pylist()[0]
+    assert grasps.readings["pdc_mf"][1].tolist() == [row["mf_pdc"]]
+    assert grasps.readings["e_th"][1].tolist() == [row[f"th_electrode{n:02d}"] for n in range(1, 25)]
+    np.testing.assert_array_equal(grasps.clouds[0].points_m, cloud(3).points_m)
 
 
 def test_grasps_need_no_reading_where_none_is_asked_for() -> None:
-    found = grasps_of.read(recordings(felt=False), with_readings=False)
-    assert len(found) == 12
-    assert found.readings == {}
+    grasps = grasps_of.read(recordings(felt=False), with_readings=False)
+    assert len(grasps) == 12
+    assert grasps.readings == {}
 
 
 def test_objects_and_sessions_that_are_not_told_are_empty() -> None:
-    found = grasps_of.read(dataset(recording(0, object=None, session=None)))
-    assert (found.objects, found.sessions) == (("",), ("",))
+    grasps = grasps_of.read(dataset(recording(0, object=None, session=None)))
+    assert (grasps.objects, grasps.sessions) == (("",), ("",))
 
 
 def test_joined_grasps_stand_one_after_the_other() -> None:
-    one, other = grasps_of.read(recordings(0, 2)), grasps_of.read(recordings(5, 1))
-    both = one.joined(other)
-    assert both.names == one.names + other.names
-    assert len(both.clouds) == len(both.grasps) == len(both.digests) == len(both) == 6
-    np.testing.assert_array_equal(both.t_ns[-2:], other.t_ns)
+    first, second = grasps_of.read(recordings(0, 2)), grasps_of.read(recordings(5, 1))
+    joined = first.joined(second)
+    assert joined.names == first.names + second.names
+    assert len(joined.clouds) == len(joined.grasps) == len(joined.digests) == len(joined) == 6
+    np.testing.assert_array_equal(joined.t_ns[-2:], second.t_ns)
     for target in biotac_sp.TARGETS:
         np.testing.assert_array_equal(
-            both.readings[target], np.concatenate([one.readings[target], other.readings[target]])
+            joined.readings[target], np.concatenate([first.readings[target], second.readings[target]])
         )
 
 
@@ -122,10 +122,10 @@ def test_a_reading_that_is_not_finite_is_refused_by_column(value: Any) -> None:
 
 
 def test_a_grasp_point_may_lie_on_a_hidden_side_but_not_beyond() -> None:
-    seen = Cloud(np.array([[0, 0, 1.0], [0.01, 0, 1.0], [0, 0.01, 1.0]], np.float32))
+    surface = Cloud(np.array([[0, 0, 1.0], [0.01, 0, 1.0], [0, 0.01, 1.0]], np.float32))
     limit = grasps_of.FARTHEST_M
-    made = Grasp(np.array([0, 0, 1.0]), np.array([0, 0, 1.0 + 0.99 * limit]))
-    grasps_of.check("The grasp", seen, made)
+    hidden = Grasp(np.array([0, 0, 1.0]), np.array([0, 0, 1.0 + 0.99 * limit]))
+    grasps_of.check("The grasp", surface, hidden)
     far = Grasp(np.array([0, 0, 1.0 - 1.01 * limit]), np.array([0, 0, 1.0]))
     with pytest.raises(TacpipeError, match=f"The grasp: grasp point g1 lies {1010 * limit:.0f} mm from the nearest"):
-        grasps_of.check("The grasp", seen, far)
+        grasps_of.check("The grasp", surface, far)

@@ -1,4 +1,4 @@
-"""What a PointNet reads of a grasp, in all six modes."""
+"""The inputs of a PointNet, in all six modes."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ COUNTS = {"xyz": (3, 0), "rgb": (6, 0), "xyzcont": (3, 6), "rgbcont": (6, 6), "x
 
 
 def sources(
-    mode: str = "xyzcont", points: int = 10, normalisation: str = "none", count: int = 3, **given: Any
+    mode: str = "xyzcont", points: int = 10, normalisation: str = "none", count: int = 3, **options: Any
 ) -> Sources:
     numbers = range(count)
-    inputs = Inputs(mode, points, normalisation, **given)
+    inputs = Inputs(mode, points, normalisation, **options)
     return Sources(inputs, [f"g{n}" for n in numbers], [cloud(n) for n in numbers], [grasp(n) for n in numbers])
 
 
@@ -43,28 +43,28 @@ def test_each_mode_has_the_channels_and_numbers_of_the_letter(mode: str, normali
         assert points.dtype == grasps.dtype == np.float32
 
 
-def rows_of(points: np.ndarray, among: np.ndarray) -> list[int]:
-    """Which of the cloud's points these are."""
-    return [int(np.flatnonzero((among == point).all(axis=1))[0]) for point in points]
+def rows_of(points: np.ndarray, cloud_points: np.ndarray) -> list[int]:
+    """Return the rows of points in the cloud."""
+    return [int(np.flatnonzero((cloud_points == point).all(axis=1))[0]) for point in points]
 
 
 def test_points_are_drawn_without_replacement_and_anew_at_each_visit() -> None:
     drawn, generator = sources("rgbcont", 30), rng()
-    first, again = (drawn.draw([1], generator)[0][0] for _ in range(2))
-    one, other = (rows_of(points[:, :3], cloud(1).points_m) for points in (first, again))
-    assert len(set(one)) == len(set(other)) == 30
-    assert set(one) != set(other)
+    first, second = (drawn.draw([1], generator)[0][0] for _ in range(2))
+    first_rows, second_rows = (rows_of(points[:, :3], cloud(1).points_m) for points in (first, second))
+    assert len(set(first_rows)) == len(set(second_rows)) == 30
+    assert set(first_rows) != set(second_rows)
     colours = cloud(1).colours
     assert colours is not None
-    np.testing.assert_allclose(first[:, 3:], colours[one] / 255.0, atol=1e-6)
+    np.testing.assert_allclose(first[:, 3:], colours[first_rows] / 255.0, atol=1e-6)
 
 
 def test_every_point_is_as_likely_as_any_other() -> None:
     drawn, generator = sources(points=10), rng(4)
-    seen = np.zeros(40)
+    counts = np.zeros(40)
     for _ in range(400):
-        seen[rows_of(drawn.draw([0], generator)[0][0], cloud(0).points_m)] += 1
-    assert np.abs(seen - 100).max() < 5 * np.sqrt(400 * 0.25 * 0.75)  # 5 standard deviations
+        counts[rows_of(drawn.draw([0], generator)[0][0], cloud(0).points_m)] += 1
+    assert np.abs(counts - 100).max() < 5 * np.sqrt(400 * 0.25 * 0.75)  # 5 standard deviations
 
 
 def test_fixed_draws_depend_on_the_cloud_and_the_visit_alone() -> None:
@@ -73,58 +73,58 @@ def test_fixed_draws_depend_on_the_cloud_and_the_visit_alone() -> None:
     np.testing.assert_array_equal(drawn.fixed([1], 0)[0][0], points[1])
     np.testing.assert_array_equal(drawn.fixed([0, 1, 2, 3], 0)[0][3], points[0])
     assert not np.array_equal(drawn.fixed([3], 1)[0][0], points[0])
-    alone = Sources(Inputs("xyzcont", 10, "none"), ["other"], [cloud(3)], [grasp(3)])
-    np.testing.assert_array_equal(alone.fixed([0], 0)[0][0], points[0])
+    single = Sources(Inputs("xyzcont", 10, "none"), ["other"], [cloud(3)], [grasp(3)])
+    np.testing.assert_array_equal(single.fixed([0], 0)[0][0], points[0])
     np.testing.assert_array_equal(numbers[0], np.concatenate([grasp(3).g1_m, grasp(3).g2_m]).astype(np.float32))
 
 
 def test_the_grasps_points_are_normalised_with_the_clouds_own_constants() -> None:
-    seen, made = cloud(2), grasp(2)
-    whole = seen.points_m.astype(float)
-    low, high = whole.min(axis=0), whole.max(axis=0)
+    grasp_cloud, planned = cloud(2), grasp(2)
+    points = grasp_cloud.points_m.astype(float)
+    low, high = points.min(axis=0), points.max(axis=0)
     numbers = sources("xyzcont", 10, "minmax").draw([2], rng())[1][0]
-    np.testing.assert_allclose(numbers[:3], 2 * (made.g1_m - low) / (high - low) - 1, atol=1e-5)
-    np.testing.assert_allclose(numbers[3:], 2 * (made.g2_m - low) / (high - low) - 1, atol=1e-5)
-    centre = whole.mean(axis=0)
-    radius = np.linalg.norm(whole - centre, axis=1).max()
+    np.testing.assert_allclose(numbers[:3], 2 * (planned.g1_m - low) / (high - low) - 1, atol=1e-5)
+    np.testing.assert_allclose(numbers[3:], 2 * (planned.g2_m - low) / (high - low) - 1, atol=1e-5)
+    centre = points.mean(axis=0)
+    radius = np.linalg.norm(points - centre, axis=1).max()
     numbers = sources("xyzcont", 10, "sphere").draw([2], rng())[1][0]
-    np.testing.assert_allclose(numbers[:3], (made.g1_m - centre) / radius, atol=1e-5)
+    np.testing.assert_allclose(numbers[:3], (planned.g1_m - centre) / radius, atol=1e-5)
     numbers = sources("xyzpose", 10, "wrist").draw([2], rng())[1][0]
-    assert made.wrist is not None
-    np.testing.assert_allclose(numbers[3:6], made.wrist.T @ made.g2_m, atol=1e-6)
-    np.testing.assert_allclose(numbers[6:], made.wrist.ravel(), atol=1e-6)
+    assert planned.wrist is not None
+    np.testing.assert_allclose(numbers[3:6], planned.wrist.T @ planned.g2_m, atol=1e-6)
+    np.testing.assert_allclose(numbers[6:], planned.wrist.ravel(), atol=1e-6)
 
 
 @pytest.mark.parametrize("method", ["minmax", "sphere"])
 def test_a_cloud_is_scaled_the_same_way_whichever_points_are_drawn(method: str) -> None:
     drawn = sources("rgbcont", 10, method)
-    whole = Sources(Inputs("rgbcont", 40, method), ["all"], [cloud(1)], [grasp(1)]).draw([0], rng())[0][0]
+    all_points = Sources(Inputs("rgbcont", 40, method), ["all"], [cloud(1)], [grasp(1)]).draw([0], rng())[0][0]
     for seed in range(5):
         for point in drawn.draw([1], rng(seed))[0][0]:
-            assert np.abs(whole - point).max(axis=1).min() < 1e-6
+            assert np.abs(all_points - point).max(axis=1).min() < 1e-6
 
 
 @settings(deadline=None, max_examples=25)
 @given(st.integers(0, 2**32 - 1), st.sampled_from(["none", "sphere", "minmax"]))
 def test_a_random_turn_takes_cloud_grasp_and_wrist_along(seed: int, method: str) -> None:
     drawn = sources("xyzpose", 40, method, rotation_deg=180.0)
-    points, numbers = (one[0].astype(float) for one in drawn.draw([0], rng(seed)))
-    made, seen = grasp(0), cloud(0).points_m.astype(float)
+    points, numbers = (arrays[0].astype(float) for arrays in drawn.draw([0], rng(seed)))
+    planned, cloud_points = grasp(0), cloud(0).points_m.astype(float)
     turn = normalisation.random_rotation(rng(seed), 180.0)  # the first that is drawn
-    assert made.wrist is not None
-    np.testing.assert_allclose(numbers[6:].reshape(3, 3), turn @ made.wrist, atol=1e-6)
-    known = normalisation.normalised(method, seen @ turn.T, Extent.of(cloud(0)), turn, None)
-    np.testing.assert_allclose(np.sort(points, axis=0), np.sort(known, axis=0), atol=1e-5)
+    assert planned.wrist is not None
+    np.testing.assert_allclose(numbers[6:].reshape(3, 3), turn @ planned.wrist, atol=1e-6)
+    expected = normalisation.normalised(method, cloud_points @ turn.T, Extent.of(cloud(0)), turn, None)
+    np.testing.assert_allclose(np.sort(points, axis=0), np.sort(expected, axis=0), atol=1e-5)
     if method == "none":
-        ends = np.stack([made.g1_m, made.g2_m])
+        ends = np.stack([planned.g1_m, planned.g2_m])
         np.testing.assert_allclose(numbers[:6].reshape(2, 3), ends @ turn.T, atol=1e-6)
-        np.testing.assert_allclose(np.sort(pdist(points)), np.sort(pdist(seen)), atol=1e-6)
+        np.testing.assert_allclose(np.sort(pdist(points)), np.sort(pdist(cloud_points)), atol=1e-6)
 
 
 def test_in_the_wrists_axes_turns_are_not_seen() -> None:
-    still, turned = (sources("xyzcont", 40, "wrist", rotation_deg=deg) for deg in (0.0, 180.0))
-    one, other = (drawn.draw([1], rng(1))[0][0] for drawn in (still, turned))
-    np.testing.assert_allclose(np.sort(other, axis=0), np.sort(one, axis=0), atol=1e-6)
+    unturned, turned = (sources("xyzcont", 40, "wrist", rotation_deg=deg) for deg in (0.0, 180.0))
+    first_points, turned_points = (drawn.draw([1], rng(1))[0][0] for drawn in (unturned, turned))
+    np.testing.assert_allclose(np.sort(turned_points, axis=0), np.sort(first_points, axis=0), atol=1e-6)
 
 
 def test_an_estimated_wrist_stands_for_the_one_that_is_told() -> None:

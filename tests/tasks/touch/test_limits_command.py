@@ -30,7 +30,7 @@ def test_tables_hold_every_number_that_was_measured() -> None:
 
 def test_json_has_null_where_nothing_was_measured() -> None:
     tree = json.loads(json.dumps(FOUND.to_json(), allow_nan=False))
-    assert [one["high_mm"] for one in tree["repeatability"]] == [6, None]
+    assert [row["high_mm"] for row in tree["repeatability"]] == [6, None]
     assert tree["repeatability"][1]["pair_skill"]["e_mf"] == {"mean": None, "low": None, "high": None}
     assert tree["learning_curve"] == [
         {"grasps": 4, "trained": 8.0, "skill": {name: one._asdict() for name, one in SKILL.items()}}

@@ -1,4 +1,4 @@
-"""What a network of touch learns: batches, losses by hand, and draws that repeat."""
+"""The learning of a network of touch: batches, losses by hand, and draws that repeat."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ class Numbers:
     def fixed(self, indices: Sequence[int], visit: int) -> Arrays:
         return self._of(indices, np.full(len(indices), 10.0 * visit))
 
-    def _of(self, indices: Sequence[int], beside: np.ndarray) -> Arrays:
-        return np.array(indices, np.float32)[:, None], beside.astype(np.float32)[:, None]
+    def _of(self, indices: Sequence[int], values: np.ndarray) -> Arrays:
+        return np.array(indices, np.float32)[:, None], values.astype(np.float32)[:, None]
 
 
 class Sum(nn.Module):
@@ -51,19 +51,19 @@ def work(count: int = 7, batch: int = 3, loss: str = "rmse", weights: tuple[floa
 )
 def test_a_single_grasp_that_is_left_over_joins_the_batch_before_it(count: int, batch: int, sizes: list[int]) -> None:
     batches = work(count, batch).batches(0)
-    assert [len(one) for one in batches] == sizes
+    assert [len(batch_rows) for batch_rows in batches] == sizes
     assert sorted(torch.cat(batches).tolist()) == list(range(count))
 
 
 def test_batches_are_others_every_epoch() -> None:
     torch.manual_seed(0)
-    one = work(50, 10)
-    assert not torch.equal(torch.cat(one.batches(0)), torch.cat(one.batches(1)))
+    touch_work = work(50, 10)
+    assert not torch.equal(torch.cat(touch_work.batches(0)), torch.cat(touch_work.batches(1)))
 
 
 def test_the_papers_loss_is_the_root_of_the_mean_square_over_grasps_and_values() -> None:
-    found = torch.tensor([[1.0, 2.0], [0.0, 4.0]])
-    loss = work()._loss(found, torch.zeros(2, 2))
+    predicted = torch.tensor([[1.0, 2.0], [0.0, 4.0]])
+    loss = work()._loss(predicted, torch.zeros(2, 2))
     assert loss.item() == pytest.approx(np.sqrt((1 + 4 + 16) / 4 + 1e-6), rel=1e-7)
     exact = torch.zeros(2, 2, requires_grad=True)
     loss = work()._loss(exact, torch.zeros(2, 2))
@@ -79,24 +79,24 @@ def test_the_balanced_loss_counts_every_target_alike() -> None:
     assert weights.mean().item() == pytest.approx(1)
     assert weights[0].item() == pytest.approx(weights[1:].sum().item())
     felt = ScaledGrasps(Numbers(), torch.zeros(4, 25))
-    one = TouchWork(felt, felt, 2, "balanced", weights)
+    touch_work = TouchWork(felt, felt, 2, "balanced", weights)
     off = [torch.zeros(3, 25), torch.zeros(3, 25)]
     off[0][:, 0] = 0.5  # all of the pressure
     off[1][:, 1:] = 0.5  # all electrodes
-    losses = [one._loss(found, torch.zeros(3, 25)).item() for found in off]
+    losses = [touch_work._loss(predicted, torch.zeros(3, 25)).item() for predicted in off]
     assert losses[0] == pytest.approx(losses[1])
     assert sum(losses) == pytest.approx(0.25)
 
 
 def test_the_loss_of_a_batch_draws_points_anew_and_what_is_watched_stays() -> None:
     torch.manual_seed(1)
-    one, model, batch = work(), Sum(), torch.tensor([4, 0])
-    (first, count), (again, _) = one.loss(model, batch, 0), one.loss(model, batch, 0)
+    touch_work, model, batch = work(), Sum(), torch.tensor([4, 0])
+    (first, count), (second, _) = touch_work.loss(model, batch, 0), touch_work.loss(model, batch, 0)
     assert count == 2
-    assert first.item() != again.item()
-    known = np.sqrt(np.mean(np.arange(7.0) ** 2) + 1e-6)
-    assert [one.watch(model)["val_loss"] for _ in range(2)] == pytest.approx([known] * 2)
-    assert one.ranks({"val_loss": 0.25}) == {"": (0.25,)}
+    assert first.item() != second.item()
+    expected = np.sqrt(np.mean(np.arange(7.0) ** 2) + 1e-6)
+    assert [touch_work.watch(model)["val_loss"] for _ in range(2)] == pytest.approx([expected] * 2)
+    assert touch_work.ranks({"val_loss": 0.25}) == {"": (0.25,)}
 
 
 def test_the_same_generator_draws_the_same_points() -> None:
@@ -109,8 +109,8 @@ def test_the_same_generator_draws_the_same_points() -> None:
 
 @pytest.mark.parametrize("count", [3, 64, 130])
 def test_what_is_predicted_is_the_mean_over_visits_of_every_grasp(count: int) -> None:
-    found = predictions(Sum(), Numbers(), count, draws=3)
-    np.testing.assert_allclose(found, np.repeat(np.arange(count)[:, None] + 10.0, 2, axis=1))
+    predicted = predictions(Sum(), Numbers(), count, draws=3)
+    np.testing.assert_allclose(predicted, np.repeat(np.arange(count)[:, None] + 10.0, 2, axis=1))
 
 
 @pytest.mark.parametrize(

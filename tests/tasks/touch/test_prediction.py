@@ -1,4 +1,4 @@
-"""What is told of grasps whose touch nobody knows."""
+"""Predictions for grasps without a reading."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ def test_grasps_without_reading_are_told_what_evaluate_tells(tmp_path: Path) -> 
     table = touch_prediction.predict(files, recordings(6, 2, felt=False)).recordings["predictions"].streams[""]
     assert table.column_names == ["recording", "pdc_th", *(f"e_mf_{n:02d}" for n in range(1, 25))]
     assert table.column("recording").to_pylist() == ["ball-006", "ball-007", "melon-006", "melon-007"]
-    told = evaluated(files, recordings(6, 2))[1].recordings["predictions"].streams["model"]
-    assert table.drop_columns(["recording"]).equals(told)
+    evaluated_table = evaluated(files, recordings(6, 2))[1].recordings["predictions"].streams["model"]
+    assert table.drop_columns(["recording"]).equals(evaluated_table)
 
 
 def test_what_is_not_what_the_model_reads_is_refused(tmp_path: Path) -> None:

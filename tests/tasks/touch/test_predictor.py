@@ -35,57 +35,57 @@ def models(tmp_path_factory: pytest.TempPathFactory) -> dict[str, TouchModel]:
     return {name: TouchModel.load(trained(tmp_path_factory.mktemp(name), **changed)) for name, changed in KINDS.items()}
 
 
-def flat(one: Touch) -> np.ndarray:
-    return np.concatenate([[one.pdc_th, one.pdc_mf], one.e_th, one.e_mf])
+def flat(touch: Touch) -> np.ndarray:
+    return np.concatenate([[touch.pdc_th, touch.pdc_mf], touch.e_th, touch.e_mf])
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_grasp_alone_feels_as_it_does_among_others(kind: str, models: dict[str, TouchModel]) -> None:
-    some = grasps(6, 2)
-    told = models[kind].predict_grasps(some)
-    rows = np.concatenate([told[target] for target in ("pdc_th", "pdc_mf", "e_th", "e_mf")], axis=1)
+    batch = grasps(6, 2)
+    readings = models[kind].predict_grasps(batch)
+    rows = np.concatenate([readings[target] for target in ("pdc_th", "pdc_mf", "e_th", "e_mf")], axis=1)
     assert rows.shape == (4, 50)
-    for row, seen, made in zip(rows, some.clouds, some.grasps, strict=True):
-        found = models[kind].predict(seen, made)
-        assert isinstance(found.pdc_th, float)
-        assert found.e_th.shape == found.e_mf.shape == (24,)
-        np.testing.assert_allclose(flat(found), row, rtol=1e-5)
+    for row, scene, planned in zip(rows, batch.clouds, batch.grasps, strict=True):
+        touch = models[kind].predict(scene, planned)
+        assert isinstance(touch.pdc_th, float)
+        assert touch.e_th.shape == touch.e_mf.shape == (24,)
+        np.testing.assert_allclose(flat(touch), row, rtol=1e-5)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_several_grasps_on_one_cloud_feel_as_each_alone(kind: str, models: dict[str, TouchModel]) -> None:
-    made = [grasp(1), grasp(2), grasp(3).swapped]
-    together = models[kind].predict_all(cloud(1), made)
-    for found, each in zip(together, made, strict=True):
-        np.testing.assert_allclose(flat(found), flat(models[kind].predict(cloud(1), each)), rtol=1e-5)
+    planned = [grasp(1), grasp(2), grasp(3).swapped]
+    together = models[kind].predict_all(cloud(1), planned)
+    for touch, single in zip(together, planned, strict=True):
+        np.testing.assert_allclose(flat(touch), flat(models[kind].predict(cloud(1), single)), rtol=1e-5)
     assert models[kind].predict_all(cloud(1), []) == []
 
 
 def test_a_model_says_the_same_each_time(models: dict[str, TouchModel]) -> None:
-    one, other = (flat(models["tree-ensemble"].predict(cloud(1), grasp(1))) for _ in range(2))
-    np.testing.assert_array_equal(one, other)
+    first, second = (flat(models["tree-ensemble"].predict(cloud(1), grasp(1))) for _ in range(2))
+    np.testing.assert_array_equal(first, second)
 
 
 def test_the_model_is_the_mean_of_its_members(models: dict[str, TouchModel]) -> None:
-    some = grasps(6, 1)
-    told = models["patches"].predict_grasps(some)
-    one, other = (member.predict(some) for member in models["patches"].members)
-    assert not np.allclose(one, other, atol=0.1)
-    np.testing.assert_allclose(told["pdc_mf"], (one[:, 1:2] + other[:, 1:2]) / 2)
-    np.testing.assert_allclose(told["e_mf"], (one[:, 26:] + other[:, 26:]) / 2)
+    batch = grasps(6, 1)
+    readings = models["patches"].predict_grasps(batch)
+    first, second = (member.predict(batch) for member in models["patches"].members)
+    assert not np.allclose(first, second, atol=0.1)
+    np.testing.assert_allclose(readings["pdc_mf"], (first[:, 1:2] + second[:, 1:2]) / 2)
+    np.testing.assert_allclose(readings["e_mf"], (first[:, 26:] + second[:, 26:]) / 2)
 
 
 def test_a_tree_ensemble_predicts_the_mean_of_a_targets_own_forest_and_that_of_all(
     models: dict[str, TouchModel],
 ) -> None:
-    some = grasps(6, 1)
+    batch = grasps(6, 1)
     (member,) = models["tree-ensemble"].members
     assert isinstance(member, members.ForestMember)
-    rows, _ = geometry.table(some.clouds, some.grasps, coloured=True)
-    own = [forest.predict(rows) for _, forest in member.forests]
-    told = models["tree-ensemble"].predict_grasps(some)
-    np.testing.assert_allclose(told["pdc_th"], (own[0] + own[4][:, :1]) / 2)
-    np.testing.assert_allclose(told["e_th"], (own[2] + own[4][:, 2:26]) / 2)
+    rows, _ = geometry.table(batch.clouds, batch.grasps, coloured=True)
+    forest_values = [forest.predict(rows) for _, forest in member.forests]
+    readings = models["tree-ensemble"].predict_grasps(batch)
+    np.testing.assert_allclose(readings["pdc_th"], (forest_values[0] + forest_values[4][:, :1]) / 2)
+    np.testing.assert_allclose(readings["e_th"], (forest_values[2] + forest_values[4][:, 2:26]) / 2)
 
 
 def test_values_side_by_side_part_into_their_targets() -> None:
@@ -100,15 +100,15 @@ def test_in_their_units_every_target_varies_the_same() -> None:
     scaled = values / members.units(values, ("pdc_th", "e_th"))
     assert scaled[:, 0].tolist() == values[:, 0].tolist()
     np.testing.assert_allclose(scaled[:, 1:].var(axis=0), 1 / 24)
-    one = values[:, 1:2]
-    np.testing.assert_allclose(members.units(one, ("pdc_th",)), one.std())
+    column = values[:, 1:2]
+    np.testing.assert_allclose(members.units(column, ("pdc_th",)), column.std())
 
 
 def test_what_a_model_does_not_foretell_is_not_a_number(tmp_path: Path) -> None:
-    found = TouchModel.load(trained(tmp_path, **POINTNET)).predict(cloud(0), grasp(0))
-    assert np.isfinite(found.pdc_th)
-    assert np.isnan(found.pdc_mf)
-    assert np.isnan(found.e_th).all() and found.e_mf.shape == (24,)
+    touch = TouchModel.load(trained(tmp_path, **POINTNET)).predict(cloud(0), grasp(0))
+    assert np.isfinite(touch.pdc_th)
+    assert np.isnan(touch.pdc_mf)
+    assert np.isnan(touch.e_th).all() and touch.e_mf.shape == (24,)
 
 
 @settings(deadline=None, max_examples=10)
@@ -118,11 +118,11 @@ def test_trees_say_the_same_wherever_cloud_grasp_and_wrist_lie_together(
 ) -> None:
     random = np.random.default_rng(seed)
     turn, shift = Rotation.random(rng=random).as_matrix(), random.uniform(-1, 1, 3)
-    seen = cloud(1)
-    there: Any = Cloud(seen.points_m.astype(float) @ turn.T + shift, seen.colours)
-    one = models["tree-ensemble"].predict(seen, grasp(1))
-    other = models["tree-ensemble"].predict(there, grasp(1).moved(turn, shift))
-    np.testing.assert_allclose(flat(other), flat(one), rtol=1e-3)
+    scene = cloud(1)
+    moved_scene: Any = Cloud(scene.points_m.astype(float) @ turn.T + shift, scene.colours)
+    original = models["tree-ensemble"].predict(scene, grasp(1))
+    moved = models["tree-ensemble"].predict(moved_scene, grasp(1).moved(turn, shift))
+    np.testing.assert_allclose(flat(moved), flat(original), rtol=1e-3)
 
 
 def test_points_that_are_not_finite_are_no_cloud() -> None:
@@ -144,9 +144,9 @@ def test_a_grasp_far_from_the_cloud_is_refused_with_the_distance(kind: str, mode
 @pytest.mark.parametrize("points", [0, 1, 2])
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_cloud_of_next_to_no_points_is_refused(kind: str, points: int, models: dict[str, TouchModel]) -> None:
-    few = Cloud(np.tile(grasp(0).g1_m, (points, 1)).astype(np.float32), np.zeros((points, 3), np.uint8))
+    tiny = Cloud(np.tile(grasp(0).g1_m, (points, 1)).astype(np.float32), np.zeros((points, 3), np.uint8))
     with pytest.raises(TacpipeError, match=f"The grasp has a cloud of {points} points; there must be 3 or more"):
-        models[kind].predict(few, grasp(0))
+        models[kind].predict(tiny, grasp(0))
 
 
 def test_a_cloud_of_fewer_points_than_are_drawn_is_refused(models: dict[str, TouchModel]) -> None:
@@ -181,5 +181,5 @@ def test_features_that_this_version_does_not_tell_are_refused(models: dict[str, 
 def test_the_touch_of_an_object_lies_among_what_was_felt_of_it(models: dict[str, TouchModel]) -> None:
     for kind, size_m in OBJECTS.items():
         felt = grasps(0, 6, kinds=[kind]).readings["pdc_th"]
-        found = models["tree-ensemble"].predict(cloud(9, size_m), grasp(9, size_m))
-        assert felt.min() - 60 < found.pdc_th < felt.max() + 60
+        touch = models["tree-ensemble"].predict(cloud(9, size_m), grasp(9, size_m))
+        assert felt.min() - 60 < touch.pdc_th < felt.max() + 60

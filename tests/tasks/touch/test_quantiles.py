@@ -41,15 +41,15 @@ def model(plain: dict[str, bytes], watched: Any) -> dict[str, bytes]:
 def test_a_calibrated_model_predicts_the_same_and_adds_its_quantiles(
     plain: dict[str, bytes], model: dict[str, bytes]
 ) -> None:
-    asked = recordings(80, 2)
+    requested = recordings(80, 2)
     before, after = (
-        touch_prediction.predict(one, asked).recordings["predictions"].streams[""] for one in (plain, model)
+        touch_prediction.predict(files, requested).recordings["predictions"].streams[""] for files in (plain, model)
     )
     assert before.equals(after)
-    found = touch_prediction.predict(model, asked, (), [10, 90]).recordings["predictions"].streams[""]
-    assert found.select(before.column_names).equals(before)
-    assert found.column_names[1:4] == ["pdc_th", "pdc_th_q10", "pdc_th_q90"]
-    assert (found["e_mf_07_q10"].to_numpy() < found["e_mf_07_q90"].to_numpy()).all()
+    with_quantiles = touch_prediction.predict(model, requested, (), [10, 90]).recordings["predictions"].streams[""]
+    assert with_quantiles.select(before.column_names).equals(before)
+    assert with_quantiles.column_names[1:4] == ["pdc_th", "pdc_th_q10", "pdc_th_q90"]
+    assert (with_quantiles["e_mf_07_q10"].to_numpy() < with_quantiles["e_mf_07_q90"].to_numpy()).all()
     assert TouchModel.load(model).quantiles.percents == PERCENTS  # type: ignore[union-attr]
 
 
@@ -71,21 +71,21 @@ def test_evaluation_reports_quantiles_of_known_and_novel_objects(model: dict[str
         *(recording(n, kind) for kind in ("egg", "shoe") for n in (30, 31)),
     ]
     tree, result = evaluated(model, dataset(*shards))
-    found = tree["quantiles"]
+    reported = tree["quantiles"]
     rows = pq.read_table(io.BytesIO(result.files["coverage.parquet"])).to_pandas()
-    assert len(rows) == 3 * 50 * (found["known"]["n"] + found["novel"]["n"])  # a predictor, value and grasp
-    for (known, predictor, target), one in rows.groupby(["known", "predictor", "target"]):
-        measured = found["known" if known else "novel"][predictor]
+    assert len(rows) == 3 * 50 * (reported["known"]["n"] + reported["novel"]["n"])  # a predictor, value and grasp
+    for (is_known, predictor, target), group in rows.groupby(["known", "predictor", "target"]):
+        measured = reported["known" if is_known else "novel"][predictor]
         for name, column in (("coverage", "covered"), ("width", "width"), ("pinball", "pinball")):
-            assert one[column].mean() == pytest.approx(measured[name][target], rel=1e-5)
-    assert found["levels"] == [10, 50, 90] and set(found["known"]) >= {"model", "constant", "object_mean"}
+            assert group[column].mean() == pytest.approx(measured[name][target], rel=1e-5)
+    assert reported["levels"] == [10, 50, 90] and set(reported["known"]) >= {"model", "constant", "object_mean"}
     for part in ("known", "novel"):
         for predictor in ("model", "constant", "object_mean"):
-            one = found[part][predictor]
-            assert set(one["coverage"]) == {"pdc_th", "pdc_mf", "e_th", "e_mf"}
-            assert all(0 <= value <= 1 for value in one["coverage"].values())
-        assert list(found[part]["constant"]["pinball_skill"].values()) == pytest.approx([0] * 4)
-    assert found["novel"]["n"] == 4
+            by_measure = reported[part][predictor]
+            assert set(by_measure["coverage"]) == {"pdc_th", "pdc_mf", "e_th", "e_mf"}
+            assert all(0 <= value <= 1 for value in by_measure["coverage"].values())
+        assert list(reported[part]["constant"]["pinball_skill"].values()) == pytest.approx([0] * 4)
+    assert reported["novel"]["n"] == 4
 
 
 def test_a_model_without_quantiles_is_evaluated_as_before_and_has_none_to_give(plain: dict[str, bytes]) -> None:
@@ -102,6 +102,6 @@ def test_grasps_that_the_model_learned_from_are_refused(tmp_path: Path, watched:
 
 
 def test_too_few_grasps_cannot_promise_the_band(plain: dict[str, bytes]) -> None:
-    how = CalibrationRequest(PERCENTS, True, 0.05, 0)
+    request = CalibrationRequest(PERCENTS, True, 0.05, 0)
     with pytest.raises(TacpipeError, match="3 calibration grasps can promise a band that holds 75 %"):
-        touch_calibration.calibrate(plain, how, recordings(), dataset(*(recording(n) for n in (60, 61, 62))))
+        touch_calibration.calibrate(plain, request, recordings(), dataset(*(recording(n) for n in (60, 61, 62))))

@@ -29,14 +29,16 @@ def test_pairs_are_of_one_object_and_as_far_apart_as_both_contacts_moved() -> No
 
 def test_variances_are_those_of_numpy_and_of_repeated_grasps_where_some_count_twice() -> None:
     values, kind = np.random.default_rng(0).normal(size=(6, 2)), np.array([0, 0, 0, 1, 1, 2])
-    within, total = variances(values, kind, np.ones(6))
-    np.testing.assert_allclose(within, [values[:3].var(axis=0, ddof=1).sum(), values[3:5].var(axis=0, ddof=1).sum(), 0])
+    variance_within, total = variances(values, kind, np.ones(6))
+    np.testing.assert_allclose(
+        variance_within, [values[:3].var(axis=0, ddof=1).sum(), values[3:5].var(axis=0, ddof=1).sum(), 0]
+    )
     np.testing.assert_allclose(total, values.var(axis=0).sum())
-    twice = np.array([2.0, 1, 1, 1, 0, 0])
-    within, total = variances(values, kind, twice)
-    again = np.concatenate([values[:1], values[:4]])
-    np.testing.assert_allclose(within, [again[:4].var(axis=0, ddof=1).sum(), 0, 0])
-    np.testing.assert_allclose(total, again.var(axis=0).sum())
+    weights = np.array([2.0, 1, 1, 1, 0, 0])
+    variance_within, total = variances(values, kind, weights)
+    repeated = np.concatenate([values[:1], values[:4]])
+    np.testing.assert_allclose(variance_within, [repeated[:4].var(axis=0, ddof=1).sum(), 0, 0])
+    np.testing.assert_allclose(total, repeated.var(axis=0).sum())
 
 
 def noisy(noise: float, count: int = 400) -> tuple[np.ndarray, list[str], Pairs]:
@@ -51,11 +53,11 @@ def noisy(noise: float, count: int = 400) -> tuple[np.ndarray, list[str], Pairs]
 
 def test_equal_grasps_imply_the_skill_of_who_knows_all_but_the_noise() -> None:
     values, objects, pairs = noisy(2.0)
-    found = repeatability(values, objects, pairs, 0, 1e-6)
-    assert found.pairs == 200
-    assert found.likeness.low < 9 / (9 + 4) < found.likeness.high
-    assert found.pair_skill.mean == pytest.approx(1 - 2 / np.sqrt(25 + 9 + 4), abs=0.04)
-    assert found.pair_skill.low < found.pair_skill.mean < found.pair_skill.high
+    measured = repeatability(values, objects, pairs, 0, 1e-6)
+    assert measured.pairs == 200
+    assert measured.likeness.low < 9 / (9 + 4) < measured.likeness.high
+    assert measured.pair_skill.mean == pytest.approx(1 - 2 / np.sqrt(25 + 9 + 4), abs=0.04)
+    assert measured.pair_skill.low < measured.pair_skill.mean < measured.pair_skill.high
 
 
 def test_pairs_at_any_distance_are_as_unlike_as_the_object_varies() -> None:
@@ -72,16 +74,16 @@ def test_near_pairs_of_a_steady_object_do_not_raise_the_skill_of_others() -> Non
     values = rng.normal(size=(80, 1)) * np.repeat([1.0, 20.0], 40)[:, None]
     contacts_m = np.zeros((80, 2, 3))
     contacts_m[40:, :, 0] = np.arange(40)[:, None]  # only grasps of the steady one are near each other
-    found = repeatability(values, objects, Pairs.from_contacts(contacts_m, objects), 0, 6)
-    assert found.pairs == 40 * 39 // 2
-    assert found.pair_skill.high < 0.1
+    measured = repeatability(values, objects, Pairs.from_contacts(contacts_m, objects), 0, 6)
+    assert measured.pairs == 40 * 39 // 2
+    assert measured.pair_skill.high < 0.1
 
 
 def test_no_pair_implies_nothing() -> None:
     values, objects, pairs = noisy(1.0, 8)
-    found = repeatability(values, objects, pairs, 1e9, math.inf)
-    assert found.pairs == 0
-    assert math.isnan(found.pair_skill.mean)
+    measured = repeatability(values, objects, pairs, 1e9, math.inf)
+    assert measured.pairs == 0
+    assert math.isnan(measured.pair_skill.mean)
 
 
 def test_folds_spread_each_object_and_a_size_is_of_each_object() -> None:
@@ -89,11 +91,11 @@ def test_folds_spread_each_object_and_a_size_is_of_each_object() -> None:
     folds = limits_of.stratified(objects, np.random.default_rng(0))
     assert np.bincount(folds[:10]).tolist() == [2] * 5
     assert sorted(np.bincount(folds[10:]).tolist()) == [1, 1, 1, 2, 2]
-    among = np.flatnonzero(folds != 0)
-    chosen = limits_of.drawn(among, objects, 3, np.random.default_rng(0))
+    candidates = np.flatnonzero(folds != 0)
+    chosen = limits_of.drawn(candidates, objects, 3, np.random.default_rng(0))
     assert sorted(objects[at] for at in chosen) == ["bowl"] * 3 + ["cup"] * 3
-    assert set(chosen) <= set(among)
-    assert len(limits_of.drawn(among, objects, 99, np.random.default_rng(0))) == len(among)
+    assert set(chosen) <= set(candidates)
+    assert len(limits_of.drawn(candidates, objects, 99, np.random.default_rng(0))) == len(candidates)
 
 
 @pytest.mark.long
@@ -101,15 +103,17 @@ def test_limits_of_grasps_whose_touch_follows_from_their_geometry_rise_with_the_
     shards = [recording(n, kind) for kind in ("ball", "melon") for n in range(15)]
     grasps = grasps_of.read(dataset(*shards))
     advanced: list[str] = []
-    found = limits_of.limits(grasps, sizes=(1, 12, 40), draws=1, trees=5, advance=lambda note="": advanced.append(note))
-    assert found.counts == {"ball": 15, "melon": 15}
-    assert [one.grasps for one in found.curve] == [1, 12]
-    assert [one.trained for one in found.curve] == [2, 24]
-    assert found.curve[1].skill["pdc_th"].mean > found.curve[0].skill["pdc_th"].mean
+    limits = limits_of.limits(
+        grasps, sizes=(1, 12, 40), draws=1, trees=5, advance=lambda note="": advanced.append(note)
+    )
+    assert limits.counts == {"ball": 15, "melon": 15}
+    assert [item.grasps for item in limits.curve] == [1, 12]
+    assert [item.trained for item in limits.curve] == [2, 24]
+    assert limits.curve[1].skill["pdc_th"].mean > limits.curve[0].skill["pdc_th"].mean
     assert len(advanced) == limits_of.steps((1, 12), 1)
-    tree = json.loads(json.dumps(found.to_json(), allow_nan=False))
+    tree = json.loads(json.dumps(limits.to_json(), allow_nan=False))
     assert tree["repeatability"][-1]["high_mm"] is None
-    assert sum(one["pairs"] for one in tree["repeatability"]) == 2 * 15 * 14 // 2
+    assert sum(item["pairs"] for item in tree["repeatability"]) == 2 * 15 * 14 // 2
 
 
 @pytest.mark.long
@@ -119,9 +123,9 @@ def test_the_reading_of_the_other_finger_is_used_and_never_the_own() -> None:
     hidden = rng.normal(size=(20, 1))
     readings = {name: rng.normal(size=values.shape) for name, values in grasps.readings.items()}
     readings |= {"pdc_th": hidden, "pdc_mf": hidden.copy()}
-    found = limits_of.limits(dataclasses.replace(grasps, readings=readings), sizes=(8,), draws=2, trees=20)
-    assert found.other_finger["pdc_th"].mean > found.curve[0].skill["pdc_th"].mean + 0.1
-    assert found.other_finger["e_th"].mean < 0.1
+    measured = limits_of.limits(dataclasses.replace(grasps, readings=readings), sizes=(8,), draws=2, trees=20)
+    assert measured.other_finger["pdc_th"].mean > measured.curve[0].skill["pdc_th"].mean + 0.1
+    assert measured.other_finger["e_th"].mean < 0.1
 
 
 @pytest.mark.parametrize("objects", [["ball"] * 4, [None] * 6, ["ball"] * 8 + ["melon"]])

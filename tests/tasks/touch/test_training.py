@@ -41,33 +41,36 @@ def test_a_model_holds_what_it_was_trained_on_and_how(tmp_path: Path) -> None:
     files = trained(tmp_path, run_label="blocked")
     assert set(files) == {CONFIG, WEIGHTS, BASELINES}
     assert set(trained(tmp_path, **PATCHES)) == {CONFIG, WEIGHTS, BASELINES, HISTORY}
-    told = config(files)
-    assert told["task"] == "touch"
-    assert told["architecture"] == "strong"
-    assert told["split"] == "blocked"
-    assert told["params"] == to_json(params(run_label="blocked"))
-    assert told["targets"] == ["pdc_th", "pdc_mf", "e_th", "e_mf"]
-    assert told["objects"] == ["ball", "melon"]
-    assert told["counts"] == {"train": 12, "val": 0}
-    assert told["trained_on"] == {name: shard.digest for name, shard in recordings().recordings.items()}
-    assert [one["kind"] for one in told["members"]] == ["forest"]
+    content = config(files)
+    assert content["task"] == "touch"
+    assert content["architecture"] == "strong"
+    assert content["split"] == "blocked"
+    assert content["params"] == to_json(params(run_label="blocked"))
+    assert content["targets"] == ["pdc_th", "pdc_mf", "e_th", "e_mf"]
+    assert content["objects"] == ["ball", "melon"]
+    assert content["counts"] == {"train": 12, "val": 0}
+    assert content["trained_on"] == {name: shard.digest for name, shard in recordings().recordings.items()}
+    assert [member["kind"] for member in content["members"]] == ["forest"]
 
 
 def test_strong_trees_are_a_forest_a_target_and_one_of_all(tmp_path: Path) -> None:
-    strong, trees = (config(trained(tmp_path, architecture=one))["members"][0] for one in ("tree-ensemble", "trees"))
-    alone = [["pdc_th"], ["pdc_mf"], ["e_th"], ["e_mf"]]
-    assert trees["groups"] == alone
-    assert strong["groups"] == [*alone, ["pdc_th", "pdc_mf", "e_th", "e_mf"]]
+    strong, trees = (
+        config(trained(tmp_path, architecture=architecture))["members"][0]
+        for architecture in ("tree-ensemble", "trees")
+    )
+    single_targets = [["pdc_th"], ["pdc_mf"], ["e_th"], ["e_mf"]]
+    assert trees["groups"] == single_targets
+    assert strong["groups"] == [*single_targets, ["pdc_th", "pdc_mf", "e_th", "e_mf"]]
     assert config(trained(tmp_path, targets="e_th"))["members"][0]["groups"] == [["e_th"]]
 
 
 @pytest.mark.parametrize("changed", [{}, TREES, PATCHES, pytest.param(POINTNET, marks=pytest.mark.long)])
 def test_training_again_gives_the_same_bytes_and_another_seed_does_not(changed: dict[str, Any], tmp_path: Path) -> None:
-    one, same, other = (
+    first, same, reseeded = (
         trained(tmp_path / name, **{**changed, "seed": seed}) for name, seed in (("a", 0), ("b", 0), ("c", 1))
     )
-    assert one == same
-    assert one[WEIGHTS] != other[WEIGHTS]
+    assert first == same
+    assert first[WEIGHTS] != reseeded[WEIGHTS]
 
 
 @pytest.mark.long
@@ -79,8 +82,8 @@ def test_training_again_gives_the_same_bytes_and_another_seed_does_not(changed: 
 def test_an_interrupted_training_goes_on_where_it_was(
     changed: dict[str, Any], epochs: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked = {**changed, "epochs": 2}
-    whole = trained(tmp_path / "whole", **asked)
+    options = {**changed, "epochs": 2}
+    uninterrupted = trained(tmp_path / "whole", **options)
     written, write = iter(range(epochs)), loop.write_checkpoint
 
     def killed(*args: Any) -> None:
@@ -90,8 +93,8 @@ def test_an_interrupted_training_goes_on_where_it_was(
 
     with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
         patched.setattr(loop, "write_checkpoint", killed)
-        trained(tmp_path / "killed", **asked)
-    assert trained(tmp_path / "killed", **asked) == whole
+        trained(tmp_path / "killed", **options)
+    assert trained(tmp_path / "killed", **options) == uninterrupted
 
 
 @pytest.mark.parametrize(
@@ -109,25 +112,27 @@ def test_validation_grasps_are_learned_from_where_nothing_is_chosen_by_them(
     changed: dict[str, Any], joined: bool, tmp_path: Path
 ) -> None:
     files = trained(tmp_path, validation=recordings(6, 1, kinds=["ball", "egg"]), **changed)
-    told = config(files)
-    assert told["counts"] == ({"train": 14, "val": 0} if joined else {"train": 12, "val": 2})
-    assert ("egg" in told["objects"]) == joined
-    assert len(told["trained_on"]) == 14
+    content = config(files)
+    assert content["counts"] == ({"train": 14, "val": 0} if joined else {"train": 12, "val": 2})
+    assert ("egg" in content["objects"]) == joined
+    assert len(content["trained_on"]) == 14
     assert len(TouchModel.load(files).baselines.objects) == (14 if joined else 12)  # type: ignore[union-attr]
 
 
 def test_of_grasps_kept_for_validation_the_loss_is_told_and_else_that_of_training(tmp_path: Path) -> None:
     far = dataset(recording(9, "egg"), recording(8, "egg"))
-    apart = history(trained(tmp_path / "a", validation=far, use_validation=False, **PATCHES))
-    alone = history(trained(tmp_path / "b", **PATCHES))
-    assert [line["train_loss"] for line in apart] == [line["train_loss"] for line in alone]
-    assert apart[-1]["val_loss"] != alone[-1]["val_loss"]
+    validated = history(trained(tmp_path / "a", validation=far, use_validation=False, **PATCHES))
+    unvalidated = history(trained(tmp_path / "b", **PATCHES))
+    assert [line["train_loss"] for line in validated] == [line["train_loss"] for line in unvalidated]
+    assert validated[-1]["val_loss"] != unvalidated[-1]["val_loss"]
 
 
 def test_the_weights_of_the_best_epoch_or_of_the_last_are_kept(tmp_path: Path) -> None:
-    asked = {**PATCHES, "epochs": 6, "learning_rate": 0.05, "cycle": False, "dropout": 0.0, "use_validation": False}
+    options = {**PATCHES, "epochs": 6, "learning_rate": 0.05, "cycle": False, "dropout": 0.0, "use_validation": False}
     watched = dataset(recording(9, "melon"), recording(8, "egg"))
-    best, last = (trained(tmp_path / one, validation=watched, select=one, **asked) for one in ("best", "last"))
+    best, last = (
+        trained(tmp_path / selection, validation=watched, select=selection, **options) for selection in ("best", "last")
+    )
     assert best[HISTORY] == last[HISTORY]
     lines = history(best)
     at = int(np.argmin([line["val_loss"] for line in lines]))
@@ -135,7 +140,7 @@ def test_the_weights_of_the_best_epoch_or_of_the_last_are_kept(tmp_path: Path) -
     assert not any(line["best"] for line in lines[at + 1 :])
     assert at < 5, "choose params by which the last epoch is not the best"
     assert best[WEIGHTS] != last[WEIGHTS]
-    schedule = {**asked, "epochs": at + 1}
+    schedule = {**options, "epochs": at + 1}
     assert (
         load(trained(tmp_path / "until", validation=watched, **schedule)[WEIGHTS]).keys() == load(best[WEIGHTS]).keys()
     )
@@ -150,8 +155,8 @@ def test_what_is_chosen_by_validation_grasps_needs_some(changed: dict[str, Any],
 
 
 def test_patience_ends_a_training_whose_validation_loss_no_longer_falls(tmp_path: Path) -> None:
-    asked = {**PATCHES, "epochs": 40, "learning_rate": 0.05, "cycle": False, "patience": 2}
-    lines = history(trained(tmp_path, validation=dataset(recording(9, "egg"), recording(8, "egg")), **asked))
+    options = {**PATCHES, "epochs": 40, "learning_rate": 0.05, "cycle": False, "patience": 2}
+    lines = history(trained(tmp_path, validation=dataset(recording(9, "egg"), recording(8, "egg")), **options))
     assert len(lines) < 40
     assert [line["best"] for line in lines[-3:]] == [True, False, False]
 
@@ -159,14 +164,14 @@ def test_patience_ends_a_training_whose_validation_loss_no_longer_falls(tmp_path
 @pytest.mark.long
 def test_one_network_a_target_makes_four_members_each_with_its_history(tmp_path: Path) -> None:
     files = trained(tmp_path, **{**POINTNET, "targets": "e_mf, pdc_th,e_th,pdc_mf", "multi_target": False})
-    told = config(files)
-    assert [one["targets"] for one in told["members"]] == [["pdc_th"], ["pdc_mf"], ["e_th"], ["e_mf"]]
+    content = config(files)
+    assert [member["targets"] for member in content["members"]] == [["pdc_th"], ["pdc_mf"], ["e_th"], ["e_mf"]]
     assert [(line["target"], line["network"], line["epoch"]) for line in history(files)] == [
         (target, 0, epoch) for target in ("pdc_th", "pdc_mf", "e_th", "e_mf") for epoch in (1, 2)
     ]
-    alone = trained(tmp_path / "alone", **POINTNET)
+    single = trained(tmp_path / "alone", **POINTNET)
     weights = load(files[WEIGHTS])
-    assert all((value == weights[name]).all() for name, value in load(alone[WEIGHTS]).items())
+    assert all((value == weights[name]).all() for name, value in load(single[WEIGHTS]).items())
 
 
 def test_several_networks_have_other_first_weights(tmp_path: Path) -> None:
@@ -184,8 +189,8 @@ def test_several_networks_have_other_first_weights(tmp_path: Path) -> None:
 def test_some_targets_alone_are_told_where_only_they_are_asked_for(changed: dict[str, Any], tmp_path: Path) -> None:
     files = trained(tmp_path, **{**changed, "targets": "e_th,pdc_mf"})
     assert config(files)["targets"] == ["pdc_mf", "e_th"]
-    told = TouchModel.load(files).predict_grasps(grasps(6, 1))
-    assert {target: values.shape for target, values in told.items()} == {"pdc_mf": (2, 1), "e_th": (2, 24)}
+    readings = TouchModel.load(files).predict_grasps(grasps(6, 1))
+    assert {target: values.shape for target, values in readings.items()} == {"pdc_mf": (2, 1), "e_th": (2, 24)}
     metrics, result = evaluated(files, recordings(6, 2))
     assert list(metrics["model"]["rmse"]) == ["e_th", "pdc_mf"]
     streams = result.recordings["predictions"].streams
@@ -212,27 +217,29 @@ def test_the_weights_are_counted_by_hand(changed: dict[str, Any], weights: int |
 def test_a_forest_has_the_leaves_that_err_least_on_rows_it_was_not_shown(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked: list[int] = []
+    tried: list[int] = []
 
     def error(*_: Any, leaf: int, seed: int) -> float:
-        asked.append(leaf)
+        tried.append(leaf)
         return {2: 3.0, 4: 1.0, 8: 2.0}[leaf]
 
     monkeypatch.setattr(Forest, "out_of_bag_error", staticmethod(error))
     files = trained(tmp_path / "a", recordings(0, 8), **TREES, leaf=0, targets="pdc_th")
-    assert (asked, config(files)["members"][0]["leaves"]) == ([2, 4, 8], [4])
-    del asked[:]
-    few = trained(tmp_path / "b", recordings(0, 4), **TREES, leaf=0, targets="pdc_th")  # 8 grasps: no two leaves of 8
-    assert (asked, config(few)["members"][0]["leaves"]) == ([2, 4], [4])
-    del asked[:]
-    one = trained(tmp_path / "c", dataset(recording(0)), **TREES, leaf=0, targets="pdc_th")
-    assert (asked, config(one)["members"][0]["leaves"]) == ([], [2])
+    assert (tried, config(files)["members"][0]["leaves"]) == ([2, 4, 8], [4])
+    del tried[:]
+    smaller = trained(
+        tmp_path / "b", recordings(0, 4), **TREES, leaf=0, targets="pdc_th"
+    )  # 8 grasps: no two leaves of 8
+    assert (tried, config(smaller)["members"][0]["leaves"]) == ([2, 4], [4])
+    del tried[:]
+    single = trained(tmp_path / "c", dataset(recording(0)), **TREES, leaf=0, targets="pdc_th")
+    assert (tried, config(single)["members"][0]["leaves"]) == ([], [2])
 
 
 def test_trees_read_place_and_colours_where_params_say_so(tmp_path: Path) -> None:
-    asked = {**TREES, "targets": "pdc_th"}
+    options = {**TREES, "targets": "pdc_th"}
     grey, full = (
-        config(trained(tmp_path, **asked, inputs=inputs, place=place))["members"][0]["features"]
+        config(trained(tmp_path, **options, inputs=inputs, place=place))["members"][0]["features"]
         for inputs, place in (("xyz", False), ("rgb", True))
     )
     assert set(full) - set(grey) >= {"g1_m_x", "closing_z", "colour_mean_r"}
@@ -248,10 +255,10 @@ def test_the_papers_networks_learn_shares_of_its_ranges_and_the_balanced_loss_st
     paper = load(trained(tmp_path / "a", **POINTNET)[WEIGHTS])
     assert paper["0.scale.offset"].tolist() == [2500]
     assert paper["0.scale.scale"].tolist() == [900]
-    other = load(trained(tmp_path / "b", **PATCHES, targets="pdc_th")[WEIGHTS])
+    balanced = load(trained(tmp_path / "b", **PATCHES, targets="pdc_th")[WEIGHTS])
     felt = grasps().readings["pdc_th"]
-    assert other["0.scale.offset"].tolist() == pytest.approx([felt.mean()])
-    assert other["0.scale.scale"].tolist() == pytest.approx([felt.std()])
+    assert balanced["0.scale.offset"].tolist() == pytest.approx([felt.mean()])
+    assert balanced["0.scale.scale"].tolist() == pytest.approx([felt.std()])
 
 
 def test_trees_tell_large_objects_from_small_ones(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import pyarrow as pa
 
 from tests.fake_recordings import FakeDataset, FakeRecording, FakeShard
 
-MATERIALS, TRIALS = 4, 5  # of the test slides of a sensor
+MATERIALS, TRIALS = 4, 5  # materials, and test slides of a sensor on each
 MANIFEST = {
     "stage": "evaluate",
     "version": 2,
@@ -34,9 +34,9 @@ def slides(
 def said(truth: Sequence[int], wrong: int, materials: int = MATERIALS) -> list[int]:
     """Return what names all but the first ``wrong`` slides, by turns of the materials, right; wrong ones are the next."""
     order = np.argsort(np.arange(len(truth)) % (len(truth) // materials), kind="stable")
-    told = np.array(truth)
-    told[order[:wrong]] = told[order[:wrong]] % materials + 1
-    return [int(one) for one in told]
+    named = np.array(truth)
+    named[order[:wrong]] = named[order[:wrong]] % materials + 1
+    return [int(number) for number in named]
 
 
 def result(
@@ -67,7 +67,7 @@ def result(
     """
     sensors = list(wrong)
     rows: dict[str, list[Any]] = {name: [] for name in ("recording", "sensor", "material", "seen", "session")}
-    told: dict[str, list[int | None]] = {}
+    named_by_predictor: dict[str, list[int | None]] = {}
     latents = []
     rng = np.random.default_rng(fold or 0)
     for place, sensor in enumerate(sensors):
@@ -79,15 +79,15 @@ def result(
         rows["session"] += [f"{sensor}-{material}-{at % sessions}" for at, material in enumerate([*truth, 1])]
         for predictor, mistakes in {"model": wrong, **(also or {})}.items():
             column: list[int | None] = [*said(truth, mistakes[sensor], materials), 2] if sensor in mistakes else []
-            told.setdefault(predictor, []).extend(column or [None] * (len(names) + 1))
-        back = {other: one for one, other in (partners or {}).items()} if place else {}
+            named_by_predictor.setdefault(predictor, []).extend(column or [None] * (len(names) + 1))
+        original = {partner: first_class for first_class, partner in (partners or {}).items()} if place else {}
         corners = np.random.default_rng(1).normal(0, 1, (materials + 1, 40)) * 0.7 ** np.arange(40)
-        at = corners[[back.get(material, material) for material in [*truth, 1]]]
+        at = corners[[original.get(material, material) for material in [*truth, 1]]]
         latents.append(at + rng.normal(0, 0.15, at.shape) * 0.7 ** np.arange(40))
-    columns = {**rows, **{name: pa.array(values, pa.int32()) for name, values in told.items()}}
+    columns = {**rows, **{name: pa.array(values, pa.int32()) for name, values in named_by_predictor.items()}}
     if epochs:
         columns |= {f"z{index + 1:02d}": np.vstack(latents)[:, index].astype(np.float32) for index in range(40)}
-    shown = {
+    content = {
         "task": "material",
         "architecture": architecture,
         "sensors": {
@@ -101,10 +101,14 @@ def result(
         },
         "params": {"architecture": architecture, "seed": 0, "joint": False, "known": "", **params},
         **({} if fold is None else {"fold": fold}),
-        **({} if partners is None else {"partners": {str(one): other for one, other in partners.items()}}),
+        **(
+            {}
+            if partners is None
+            else {"partners": {str(first_class): partner for first_class, partner in partners.items()}}
+        ),
     }
     files = {
-        "config.json": json.dumps(shown).encode(),
+        "config.json": json.dumps(content).encode(),
         "metrics.json": json.dumps({"counts": {"slides": dict.fromkeys(sensors, trials)}, **(metrics or {})}).encode(),
     }
     if epochs:
@@ -112,7 +116,9 @@ def result(
         files["history.jsonl"] = "\n".join([*lines, ""]).encode()
     attributes: dict[str, Any] = {"simulated": True} if simulated else {}
     if published and not simulated:
-        attributes["published"] = ",".join(sorted({"biotac": "biotac-slide"}.get(one, one) for one in sensors))
+        attributes["published"] = ",".join(
+            sorted({"biotac": "biotac-slide"}.get(first_class, first_class) for first_class in sensors)
+        )
     return FakeDataset({"predictions": FakeShard("predictions", pa.table(columns), attributes)}, files, MANIFEST)
 
 
@@ -151,13 +157,13 @@ def recorded(count: int = 3, outside: int = 1) -> Any:
                 "phase": phase,
             }
         )
-        why = {"outside_protocol_why": "moved at 12 mm/s"} if index < outside else {}
+        cause = {"outside_protocol_why": "moved at 12 mm/s"} if index < outside else {}
         attributes: dict[str, Any] = {
             "published": "biotac-slide",
             "sensor": "biotac",
             "force_n": 1.0 + index,
             "outside_protocol": index < outside,
-            **why,
+            **cause,
         }
         shards[f"biotac-m01-t{index:03d}"] = FakeRecording(
             {"slide": profile, "profile": profile}, f"biotac-m01-t{index:03d}", attributes

@@ -18,83 +18,83 @@ BOTH = {"biotac": 1, "roboskin": 2}
 
 def method(*wrong: int, fold: int | None = 0, **params: Any) -> Method:
     """A method of runs, a fold each, that name so many slides wrong."""
-    return of(
+    return method_of(
         *(
-            result(wrong={"biotac": one}, fold=None if fold is None else index, **params)
-            for index, one in enumerate(wrong)
+            result(wrong={"biotac": count}, fold=None if fold is None else index, **params)
+            for index, count in enumerate(wrong)
         )
     )
 
 
-def of(*results: Any) -> Method:
-    (found,) = parts.methods("material", *results)
-    return found
+def method_of(*results: Any) -> Method:
+    (single_method,) = parts.methods("material", *results)
+    return single_method
 
 
 def test_a_difference_is_over_slides_that_both_were_judged_on() -> None:
-    found = scores.compare_runs(method(2), method(6), "biotac")
-    assert found is not None
-    assert (found.slides, found.first_only, found.second_only) == (20, 4, 0)
-    assert found.gain.mean == pytest.approx(20.0)
-    assert found.mcnemar == pytest.approx(2 * 0.5**4)  # four disagreements, all for the first
-    assert found.gain.low > 0 and found.word == "better"
-    other = scores.compare_runs(method(2), of(result(wrong={"biotac": 2}, first=50)), "biotac")
-    assert other is None
+    difference = scores.compare_runs(method(2), method(6), "biotac")
+    assert difference is not None
+    assert (difference.slides, difference.first_only, difference.second_only) == (20, 4, 0)
+    assert difference.gain.mean == pytest.approx(20.0)
+    assert difference.mcnemar == pytest.approx(2 * 0.5**4)  # four disagreements, all for the first
+    assert difference.gain.low > 0 and difference.word == "better"
+    without_shared = scores.compare_runs(method(2), method_of(result(wrong={"biotac": 2}, first=50)), "biotac")
+    assert without_shared is None
 
 
 def test_the_interval_covers_what_drawing_slides_anew_gives() -> None:
-    found = scores.compare_runs(method(2), method(6), "biotac")
-    assert found is not None
+    difference = scores.compare_runs(method(2), method(6), "biotac")
+    assert difference is not None
     sd = math.sqrt(0.2 * 0.8 / 20)  # four gains of 1 among 20 slides
-    assert found.gain.low == pytest.approx(20 - 196 * sd, abs=5)
-    assert found.gain.high == pytest.approx(20 + 196 * sd, abs=5)
+    assert difference.gain.low == pytest.approx(20 - 196 * sd, abs=5)
+    assert difference.gain.high == pytest.approx(20 + 196 * sd, abs=5)
 
 
 def test_methods_that_are_as_good_cannot_be_representative_method() -> None:
-    found = scores.compare_runs(method(3), method(3), "biotac")
-    assert found is not None
-    assert (found.gain.mean, found.mcnemar, found.word) == (0, 1, "unclear")
+    difference = scores.compare_runs(method(3), method(3), "biotac")
+    assert difference is not None
+    assert (difference.gain.mean, difference.mcnemar, difference.word) == (0, 1, "unclear")
 
 
 def test_folds_are_paired_where_there_are_several() -> None:
-    found = scores.compare_runs(method(2, 3, 4), method(4, 6, 5), "biotac")
-    assert found is not None
-    assert (found.runs.unit, found.runs.units) == ("folds", 3)
-    assert found.runs.p == pytest.approx(stats.ttest_rel([0.9, 0.85, 0.8], [0.8, 0.7, 0.75]).pvalue)
+    difference = scores.compare_runs(method(2, 3, 4), method(4, 6, 5), "biotac")
+    assert difference is not None
+    assert (difference.runs.unit, difference.runs.units) == ("folds", 3)
+    assert difference.runs.p == pytest.approx(stats.ttest_rel([0.9, 0.85, 0.8], [0.8, 0.7, 0.75]).pvalue)
 
 
 def test_folds_that_only_one_method_has_are_not_paired() -> None:
-    found = scores.compare_runs(method(2, 3, 4), method(4, 6), "biotac")
-    assert found is not None and found.runs.units == 2
-    assert found.runs.p == pytest.approx(stats.ttest_rel([0.9, 0.85], [0.8, 0.7]).pvalue)
+    difference = scores.compare_runs(method(2, 3, 4), method(4, 6), "biotac")
+    assert difference is not None and difference.runs.units == 2
+    assert difference.runs.p == pytest.approx(stats.ttest_rel([0.9, 0.85], [0.8, 0.7]).pvalue)
 
 
 def test_folds_that_are_not_told_are_known_by_their_test_slides() -> None:
     first, second = (
-        of(*(result(wrong={"biotac": n}, fold=None, first=at) for n, at in zip(wrong, (1, 100), strict=True)))
+        method_of(*(result(wrong={"biotac": n}, fold=None, first=at) for n, at in zip(wrong, (1, 100), strict=True)))
         for wrong in ((1, 2), (3, 7))
     )
-    found = scores.compare_runs(first, second, "biotac")
-    assert found is not None and (found.runs.unit, found.runs.units) == ("folds", 2)
+    difference = scores.compare_runs(first, second, "biotac")
+    assert difference is not None and (difference.runs.unit, difference.runs.units) == ("folds", 2)
 
 
 def test_seeds_are_paired_where_there_is_one_fold() -> None:
     first, second = (
-        of(*(result(wrong={"biotac": n}, fold=None, seed=seed) for seed, n in enumerate(wrong)))
+        method_of(*(result(wrong={"biotac": n}, fold=None, seed=seed) for seed, n in enumerate(wrong)))
         for wrong in ((1, 2), (3, 7))
     )
-    found = scores.compare_runs(first, second, "biotac")
-    assert found is not None and (found.runs.unit, found.runs.units) == ("seeds", 2)
+    difference = scores.compare_runs(first, second, "biotac")
+    assert difference is not None and (difference.runs.unit, difference.runs.units) == ("seeds", 2)
 
 
 def test_one_run_each_and_gains_without_spread_have_no_t_test() -> None:
     for first, second in (((1,), (2,)), ((1, 2), (3, 4))):
-        found = scores.compare_runs(method(*first), method(*second), "biotac")
-        assert found is not None and math.isnan(found.runs.p)
+        difference = scores.compare_runs(method(*first), method(*second), "biotac")
+        assert difference is not None and math.isnan(difference.runs.p)
 
 
 def test_joint_learning_is_compared_with_the_same_network_alone_the_control_and_the_readout() -> None:
-    given = [
+    results = [
         result(wrong=BOTH, joint=True, decoder="D1"),
         result(wrong=BOTH, joint=True, decoder="D2"),
         result(wrong=BOTH, decoder="D1"),
@@ -103,8 +103,8 @@ def test_joint_learning_is_compared_with_the_same_network_alone_the_control_and_
         result("minirocket", wrong=BOTH),
         result("minirocket", wrong=BOTH, train=dict.fromkeys(BOTH, 64)),
     ]
-    found = scores.method_pairs(parts.methods("material", *given))
-    assert [pair.name for pair in found] == [
+    difference = scores.method_pairs(parts.methods("material", *results))
+    assert [pair.name for pair in difference] == [
         "RAEC joint · decoder D1 − RAEC independent · decoder D1",
         "RAEC joint · decoder D1 − RAEC joint · permuted pairs",
         "MiniRocket − RAEC joint · decoder D1",

@@ -1,4 +1,4 @@
-"""What is stated of joint learning and its controls."""
+"""Sentences on joint learning and its controls."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ def trained(swapped: dict[str, int], alignment: float, **params: Any) -> Any:
     ("alone", "told"), [(12, ("helps", "BioTac", "+55.0")), (2, ("makes no difference", "BioTac", "+5.0"))]
 )
 def test_what_joint_learning_does_is_stated_no_more_surely_than_the_slides_allow(alone: int, told: Any) -> None:
-    found = joint.joint_effects(grouped(trained(BOTH, 0.01), result(wrong={"biotac": alone, "roboskin": 2})))
-    assert all(one in found[0] for one in told)
+    sentences = joint.joint_effects(grouped(trained(BOTH, 0.01), result(wrong={"biotac": alone, "roboskin": 2})))
+    assert all(part in sentences[0] for part in told)
 
 
 def test_joint_learning_that_hurts_is_stated() -> None:
-    found = joint.joint_effects(grouped(result(wrong={"biotac": 9}, joint=True), result(wrong={"biotac": 0})))
-    assert "hurts" in found[0] and "−45.0" in found[0]
+    sentences = joint.joint_effects(grouped(result(wrong={"biotac": 9}, joint=True), result(wrong={"biotac": 0})))
+    assert "hurts" in sentences[0] and "−45.0" in sentences[0]
 
 
 def test_a_control_that_aligns_and_swaps_as_well_makes_the_alignment_label_driven() -> None:
@@ -52,15 +52,15 @@ def test_a_control_that_aligns_and_swaps_as_well_makes_the_alignment_label_drive
     ],
 )
 def test_a_control_that_does_worse_does_not(swapped: dict[str, int], alignment: float, told: str) -> None:
-    given = grouped(trained(BOTH, 0.01), trained(swapped, alignment, pairing="permuted", partners=PARTNERS))
-    control = joint.joint_effects(given)[-1]
+    methods_by_name = grouped(trained(BOTH, 0.01), trained(swapped, alignment, pairing="permuted", partners=PARTNERS))
+    control = joint.joint_effects(methods_by_name)[-1]
     assert told in control and "label-driven" not in control
 
 
 def test_a_control_is_no_evidence_where_real_pairs_have_not_aligned() -> None:
     swapped = {"biotac": 1, "roboskin": 12}
-    given = grouped(trained(swapped, 0.01), trained(swapped, 0.01, pairing="permuted", partners=PARTNERS))
-    control = joint.joint_effects(given)[-1]
+    methods_by_name = grouped(trained(swapped, 0.01), trained(swapped, 0.01, pairing="permuted", partners=PARTNERS))
+    control = joint.joint_effects(methods_by_name)[-1]
     assert "50.0 points" in control and "label-driven" not in control
 
 
@@ -74,8 +74,8 @@ def test_a_missing_control_and_a_missing_counterpart_are_stated() -> None:
 def test_materials_that_a_sensor_never_saw_are_named_from_the_other_sensors_classifier(correct: int, word: str) -> None:
     counts = {"accuracy": correct / 20, "correct": correct, "n": 20, "chance": 0.05}
     zero = {name: {"roboskin": value} for name, value in counts.items()}
-    given = grouped(
+    methods_by_name = grouped(
         trained(BOTH, 0.01), result(wrong=BOTH, joint=True, hold_out="roboskin=3,4", metrics={"zero_shot": zero})
     )
-    (told,) = joint.zero_shot_sentences(given)
-    assert word in told and f"{correct} of 20" in told
+    (sentence,) = joint.zero_shot_sentences(methods_by_name)
+    assert word in sentence and f"{correct} of 20" in sentence

@@ -1,4 +1,4 @@
-"""Which results are runs of one method, and what it is called."""
+"""Results are grouped into methods, which get names."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ BOTH = {"biotac": 1, "roboskin": 2}
 
 
 def grouped(*results: Any) -> dict[str, Method]:
-    return {one.name: one for one in parts.methods("material", *results)}
+    return {method.name: method for method in parts.methods("material", *results)}
 
 
 def test_seeds_folds_and_sensors_that_were_trained_alone_make_one_method() -> None:
-    found = grouped(
+    by_name = grouped(
         *(
             result(wrong={sensor: 1}, fold=fold, seed=seed, sensors=sensor)
             for sensor in BOTH
@@ -29,13 +29,13 @@ def test_seeds_folds_and_sensors_that_were_trained_alone_make_one_method() -> No
             for seed in (0, 1)
         )
     )
-    assert {name: len(one.runs) for name, one in found.items()} == {"RAEC independent": 8}
-    assert methods.sensors_of([found["RAEC independent"]]) == ("biotac", "roboskin")
-    assert len(methods.runs_on(found["RAEC independent"], "biotac")) == 4
+    assert {name: len(single_method.runs) for name, single_method in by_name.items()} == {"RAEC independent": 8}
+    assert methods.sensors_of([by_name["RAEC independent"]]) == ("biotac", "roboskin")
+    assert len(methods.runs_on(by_name["RAEC independent"], "biotac")) == 4
 
 
 def test_names_say_what_keeps_a_method_from_being_plain() -> None:
-    found = grouped(
+    by_name = grouped(
         result("minirocket", wrong=BOTH),
         result("x-lstm", wrong=BOTH),
         result(wrong=BOTH),
@@ -47,7 +47,7 @@ def test_names_say_what_keeps_a_method_from_being_plain() -> None:
         result("minirocket", wrong=BOTH, train={"biotac": 64, "roboskin": 64}),
         result(wrong=BOTH, known="biotac"),
     )
-    assert {name: methods.has_usual_settings(one.settings) for name, one in found.items()} == {
+    assert {name: methods.has_usual_settings(single_method.settings) for name, single_method in by_name.items()} == {
         "MiniRocket": True,
         "X-LSTM": True,
         "RAEC independent": True,
@@ -80,16 +80,16 @@ def test_a_name_states_that_a_network_was_trained_for_fewer_epochs_than_in_the_p
 
 
 def test_settings_are_told_only_where_they_tell_methods_apart() -> None:
-    found = grouped(
+    by_name = grouped(
         result(wrong=BOTH, joint=True, decoder="D1", pairing="fixed", epochs_most=5),
         result(wrong=BOTH, joint=True, decoder="D2", pairing="fixed", epochs_most=5),
         result(wrong=BOTH, decoder="D1", epochs_most=5),
     )
-    assert list(found) == ["RAEC independent", "RAEC joint · decoder D1", "RAEC joint · decoder D2"]
+    assert list(by_name) == ["RAEC independent", "RAEC joint · decoder D1", "RAEC joint · decoder D2"]
 
 
 def test_settings_without_effect_make_no_other_method() -> None:
-    found = grouped(
+    by_name = grouped(
         result("minirocket", wrong=BOTH, joint=True, decoder="D1", epochs_most=1, reduce="biotac", ratio=11),
         result("minirocket", wrong=BOTH, joint=False, decoder="D2", epochs_most=2),
         result("x-lstm", wrong=BOTH, joint=True, pairing="fixed", decoder="D1"),
@@ -97,27 +97,33 @@ def test_settings_without_effect_make_no_other_method() -> None:
         result(wrong=BOTH, pairing="fixed", alignment_weight=1.0),
         result(wrong=BOTH, pairing="random", alignment_weight=2.0),
     )
-    assert {name: len(one.runs) for name, one in found.items()} == {"MiniRocket": 2, "X-LSTM": 2, "RAEC independent": 2}
+    assert {name: len(single_method.runs) for name, single_method in by_name.items()} == {
+        "MiniRocket": 2,
+        "X-LSTM": 2,
+        "RAEC independent": 2,
+    }
 
 
 def test_results_of_another_split_stand_apart_from_what_most_have() -> None:
     def placed(split: str, fold: int) -> Any:
-        made = result("minirocket", wrong=BOTH, fold=fold)
-        made.files["config.json"] = json.dumps({**json.loads(made.files["config.json"]), "split": split}).encode()
-        return made
+        fake_result = result("minirocket", wrong=BOTH, fold=fold)
+        fake_result.files["config.json"] = json.dumps(
+            {**json.loads(fake_result.files["config.json"]), "split": split}
+        ).encode()
+        return fake_result
 
-    found = grouped(placed("", 0), placed("", 1), placed("last to first", 2))
-    assert {name: methods.has_usual_settings(one.settings) for name, one in found.items()} == {
+    by_name = grouped(placed("", 0), placed("", 1), placed("last to first", 2))
+    assert {name: methods.has_usual_settings(split_method.settings) for name, split_method in by_name.items()} == {
         "MiniRocket": True,
         "MiniRocket · split last to first": False,
     }
-    assert methods.has_usual_settings(found["MiniRocket · split last to first"].settings, "elsewhere")
+    assert methods.has_usual_settings(by_name["MiniRocket · split last to first"].settings, "elsewhere")
 
 
 def test_folds_of_nearly_one_size_pool_and_fewer_slides_do_not() -> None:
     sizes = (600, 599, 585, 430, 96, 100, 64)
-    found = grouped(*(result(wrong=BOTH, train=dict.fromkeys(BOTH, size), fold=size) for size in sizes))
-    assert {name: len(one.runs) for name, one in found.items()} == {
+    by_name = grouped(*(result(wrong=BOTH, train=dict.fromkeys(BOTH, size), fold=size) for size in sizes))
+    assert {name: len(single_method.runs) for name, single_method in by_name.items()} == {
         "RAEC independent": 3,
         "RAEC independent · 430 slides": 1,
         "RAEC independent · 96 slides": 2,
@@ -126,31 +132,31 @@ def test_folds_of_nearly_one_size_pool_and_fewer_slides_do_not() -> None:
 
 
 def test_a_sensor_with_fewer_slides_than_another_has_all_of_its_own() -> None:
-    found = grouped(
+    by_name = grouped(
         result(wrong={"biotac": 1}, train={"biotac": 100}), result(wrong={"roboskin": 1}, train={"roboskin": 60})
     )
-    assert list(found) == ["RAEC independent"]
+    assert list(by_name) == ["RAEC independent"]
 
 
 def test_one_sensor_with_fewer_slides_than_the_other_is_a_method_of_its_own() -> None:
-    found = grouped(
+    by_name = grouped(
         result(wrong=BOTH, joint=True),
         result(wrong=BOTH, joint=True, train={"biotac": 576, "roboskin": 64}),
         result(wrong=BOTH, joint=True, train={"biotac": 64, "roboskin": 64}),
     )
-    assert list(found) == ["RAEC joint", "RAEC joint · 64 slides", "RAEC joint · RoboSkin 64 slides"]
-    assert methods.method_title(found["RAEC joint · RoboSkin 64 slides"]) == "RAEC joint · other sensor whole"
-    assert methods.method_title(found["RAEC joint · 64 slides"]) == "RAEC joint"
+    assert list(by_name) == ["RAEC joint", "RAEC joint · 64 slides", "RAEC joint · RoboSkin 64 slides"]
+    assert methods.method_title(by_name["RAEC joint · RoboSkin 64 slides"]) == "RAEC joint · other sensor whole"
+    assert methods.method_title(by_name["RAEC joint · 64 slides"]) == "RAEC joint"
 
 
 def test_simulated_slides_and_scrambled_ones_are_kept_apart() -> None:
-    found = grouped(result(wrong=BOTH), result(wrong=BOTH, simulated=True))
-    assert {one.simulated for one in found.values()} == {True, False}
+    by_name = grouped(result(wrong=BOTH), result(wrong=BOTH, simulated=True))
+    assert {single_method.simulated for single_method in by_name.values()} == {True, False}
 
 
 def test_a_mapped_method_tells_of_the_sensor_that_was_mapped() -> None:
-    found = grouped(result(wrong=BOTH, known="biotac"), result(wrong=BOTH, known="roboskin"))
-    (method,) = found.values()
+    by_name = grouped(result(wrong=BOTH, known="biotac"), result(wrong=BOTH, known="roboskin"))
+    (method,) = by_name.values()
     assert [run.details.sensors for run in methods.runs_on(method, "roboskin")] == [("roboskin",)]
     assert [run.details.sensors for run in methods.runs_on(method, "biotac")] == [("biotac",)]
 
@@ -162,5 +168,5 @@ def test_a_reduced_sensor_learns_from_its_share_of_the_batches(params: dict[str,
 
 
 def test_a_readout_learns_from_validation_slides_too_where_it_says_so() -> None:
-    given = result("minirocket", wrong=BOTH, use_validation=True, validation_slides=200)
-    assert Result(given).learned == {"biotac": 776, "roboskin": 776}
+    fake_result = result("minirocket", wrong=BOTH, use_validation=True, validation_slides=200)
+    assert Result(fake_result).learned == {"biotac": 776, "roboskin": 776}

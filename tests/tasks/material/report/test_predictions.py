@@ -1,4 +1,4 @@
-"""Which slides count."""
+"""The slides that count."""
 
 from __future__ import annotations
 
@@ -12,36 +12,36 @@ from tests.tasks.material.report.material_fakes import result
 BOTH = {"biotac": 1, "roboskin": 2}
 
 
-def read(given: Any, **config: Any) -> Predictions:
-    told = {**json.loads(given.files["config.json"]), **config}
-    return predictions.read_predictions(given.recordings["predictions"].table(), told)
+def read(fake_result: Any, **config: Any) -> Predictions:
+    content = {**json.loads(fake_result.files["config.json"]), **config}
+    return predictions.read_predictions(fake_result.recordings["predictions"].table(), content)
 
 
 def test_slides_of_training_are_left_out() -> None:
-    found = read(result(wrong=BOTH))
-    assert len(found.recordings) == 40
-    assert "biotac-seen" not in found.recordings
+    read_rows = read(result(wrong=BOTH))
+    assert len(read_rows.recordings) == 40
+    assert "biotac-seen" not in read_rows.recordings
 
 
 def test_materials_held_out_of_a_sensors_labels_do_not_count_for_it() -> None:
-    found = read(result(wrong=BOTH), held_out={"biotac": [], "roboskin": [2, 4]})
-    assert set(found.of("roboskin").materials.tolist()) == {1, 3}
-    assert set(found.of("biotac").materials.tolist()) == {1, 2, 3, 4}
+    read_rows = read(result(wrong=BOTH), held_out={"biotac": [], "roboskin": [2, 4]})
+    assert set(read_rows.of("roboskin").materials.tolist()) == {1, 3}
+    assert set(read_rows.of("biotac").materials.tolist()) == {1, 2, 3, 4}
 
 
 def test_the_last_batch_does_not_count_where_the_model_leaves_it_out() -> None:
-    found = read(result(wrong=BOTH, drop_last=True, batch=8))  # of 20 slides and one of training
-    assert [len(found.of(sensor).recordings) for sensor in BOTH] == [16, 16]
+    read_rows = read(result(wrong=BOTH, drop_last=True, batch=8))  # 20 slides, and one of training
+    assert [len(read_rows.of(sensor).recordings) for sensor in BOTH] == [16, 16]
 
 
 def test_a_predictor_that_says_nothing_of_a_sensor_has_no_names_there() -> None:
-    found = read(result(wrong=BOTH, also={"swapped": {"biotac": 0}}))
-    assert (found.of("roboskin").predicted["swapped"] == predictions.NOTHING).all()
-    assert (found.of("biotac").predicted["swapped"] == found.of("biotac").materials).all()
-    assert found.latents is None
+    read_rows = read(result(wrong=BOTH, also={"swapped": {"biotac": 0}}))
+    assert (read_rows.of("roboskin").predicted["swapped"] == predictions.NOTHING).all()
+    assert (read_rows.of("biotac").predicted["swapped"] == read_rows.of("biotac").materials).all()
+    assert read_rows.latents is None
 
 
 def test_latents_keep_their_order() -> None:
-    found = read(result(wrong=BOTH, epochs=3))
-    assert found.latents is not None and found.latents.shape == (40, 40)
-    assert found.latents[:, 0].std() > found.latents[:, 39].std()  # as the fakes make them
+    read_rows = read(result(wrong=BOTH, epochs=3))
+    assert read_rows.latents is not None and read_rows.latents.shape == (40, 40)
+    assert read_rows.latents[:, 0].std() > read_rows.latents[:, 39].std()  # the fakes order them so

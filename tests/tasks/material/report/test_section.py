@@ -25,44 +25,48 @@ def grouped(*results: Any) -> list[Method]:
     return parts.methods("material", *results)
 
 
-def everything(**kind: Any) -> list[Any]:
+def all_results(**kind: Any) -> list[Any]:
     level = {"mean_level": {"biotac": 4, "roboskin": 8}, "permuted_labels": {"biotac": 15, "roboskin": 20}}
     joint = {**level, "swapped": BOTH, "last_epoch": BOTH}
-    found = []
+    results = []
     for fold in (0, 1):
-        how: dict[str, Any] = {"fold": fold, "epochs": 3, **kind}
-        found += [
+        options: dict[str, Any] = {"fold": fold, "epochs": 3, **kind}
+        results += [
             result("minirocket", wrong=BOTH, also=level, fold=fold, **kind),
             result("minirocket", wrong=BOTH, train=dict.fromkeys(BOTH, 64), fold=fold, **kind),
-            result("x-lstm", wrong=BOTH, **how),
-            result(wrong={"biotac": 2 + fold}, **how),
-            result(wrong={"roboskin": 3}, **how),
-            result(wrong=BOTH, also=joint, joint=True, **how),
-            result(wrong=BOTH, also=joint, joint=True, pairing="permuted", partners=PARTNERS, **how),
-            result(wrong={"roboskin": 3}, known="biotac", **how),
+            result("x-lstm", wrong=BOTH, **options),
+            result(wrong={"biotac": 2 + fold}, **options),
+            result(wrong={"roboskin": 3}, **options),
+            result(wrong=BOTH, also=joint, joint=True, **options),
+            result(wrong=BOTH, also=joint, joint=True, pairing="permuted", partners=PARTNERS, **options),
+            result(wrong={"roboskin": 3}, known="biotac", **options),
         ]
-    return [*found, result(wrong=BOTH, joint=True, reduce="biotac", ratio=25, shuffle=False, epochs=3, **kind)]
+    return [*results, result(wrong=BOTH, joint=True, reduce="biotac", ratio=25, shuffle=False, epochs=3, **kind)]
 
 
 @pytest.fixture(scope="module")
-def whole() -> Section:
-    return parts.section("material", *everything(), others=[material_fakes.recorded()])
+def full_section() -> Section:
+    return parts.section("material", *all_results(), others=[material_fakes.recorded()])
 
 
-def test_the_first_screen_is_about_both_sensors(whole: Section) -> None:
-    assert "BioTac" in whole.sentence and "RoboSkin" in whole.sentence and "20 slides" in whole.sentence
-    assert whole.table is not None and len(whole.table.rows) <= 7
-    assert whole.counts == ["8 methods", "17 results", "40 slides"]
+def test_the_first_screen_is_about_both_sensors(full_section: Section) -> None:
+    assert (
+        "BioTac" in full_section.sentence
+        and "RoboSkin" in full_section.sentence
+        and "20 slides" in full_section.sentence
+    )
+    assert full_section.table is not None and len(full_section.table.rows) <= 7
+    assert full_section.counts == ["8 methods", "17 results", "40 slides"]
 
 
-def test_all_that_there_is_has_its_fold(whole: Section) -> None:
-    assert list(parts.folds(whole)) == [
+def test_all_that_there_is_has_its_fold(full_section: Section) -> None:
+    assert list(parts.folds(full_section)) == [
         "All methods and baselines", "Joint learning", "Fewer slides of one sensor", "Few slides",
         "Which materials are confused", "Latents", "Training", "The slides", "Recordings", "Every run",
         "What these numbers rest on", "Where it comes from",
     ]  # fmt: skip
-    text = parts.words(whole)
-    for told in (
+    text = parts.words(full_section)
+    for sentence in (
         "Table II in",
         "Table III in",
         "Figure 5",
@@ -72,50 +76,50 @@ def test_all_that_there_is_has_its_fold(whole: Section) -> None:
         "label-driven",
         "cd" * 32,
     ):
-        assert told in text, told
+        assert sentence in text, sentence
     assert "20 slides of biotac after training on 64, 160 and 576" in text
 
 
 @pytest.mark.parametrize("simulated", [False, True])
 def test_a_labs_own_slides_get_nothing_that_the_paper_states_of_its_own(simulated: bool) -> None:
     level = {"mean_level": {"biotac": 4, "roboskin": 8}, "swapped": BOTH}
-    how: dict[str, Any] = {"published": False, "simulated": simulated, "sessions": 2}
-    given = [
-        result("minirocket", wrong=BOTH, also=level, **how),
-        result(wrong=BOTH, also=level, joint=True, epochs=3, **how),
-        result(wrong=BOTH, also=level, joint=True, reduce="biotac", ratio=25, epochs=3, **how),
+    options: dict[str, Any] = {"published": False, "simulated": simulated, "sessions": 2}
+    results = [
+        result("minirocket", wrong=BOTH, also=level, **options),
+        result(wrong=BOTH, also=level, joint=True, epochs=3, **options),
+        result(wrong=BOTH, also=level, joint=True, reduce="biotac", ratio=25, epochs=3, **options),
     ]
     slides = material_fakes.recorded()
     for shard in slides.recordings.values():
         del shard.attributes["published"]
-    found = parts.section("material", *given, others=[slides])
-    text = parts.words(found)
-    for told in ("paper", "192 slides", "one session", "mapping to known space", "X-LSTM", "Figure"):
-        assert told not in text, told
-    assert (found.simulated, text.count(context.SIMULATED)) == (simulated, int(simulated))
+    section = parts.section("material", *results, others=[slides])
+    text = parts.words(section)
+    for sentence in ("paper", "192 slides", "one session", "mapping to known space", "X-LSTM", "Figure"):
+        assert sentence not in text, sentence
+    assert (section.simulated, text.count(context.SIMULATED)) == (simulated, int(simulated))
 
 
-@pytest.mark.parametrize(("sessions", "told"), [(1, True), (2, False)])
-def test_that_each_material_has_one_session_is_stated_where_it_is_so(sessions: int, told: bool) -> None:
-    given = result("minirocket", wrong=BOTH, published=False, sessions=sessions)
-    assert (scores.SESSIONS in parts.words(parts.section("material", given))) == told
+@pytest.mark.parametrize(("sessions", "sentence"), [(1, True), (2, False)])
+def test_that_each_material_has_one_session_is_stated_where_it_is_so(sessions: int, sentence: bool) -> None:
+    results = result("minirocket", wrong=BOTH, published=False, sessions=sessions)
+    assert (scores.SESSIONS in parts.words(parts.section("material", results))) == sentence
 
 
 def test_one_result_alone_has_no_comparison_of_methods() -> None:
-    found = parts.section("material", result("minirocket", wrong={"biotac": 1}))
-    assert "Joint learning" not in parts.folds(found) and "MiniRocket" in found.sentence
+    section = parts.section("material", result("minirocket", wrong={"biotac": 1}))
+    assert "Joint learning" not in parts.folds(section) and "MiniRocket" in section.sentence
 
 
 def test_results_that_are_all_variants_have_no_best_method() -> None:
-    given = [result(wrong=BOTH, labels="permuted"), result(wrong=BOTH, joint=True, pairing="permuted")]
-    found = parts.section("material", *given)
-    assert (found.sentence, found.table) == ("", None)
-    assert "RAEC joint · permuted pairs" in parts.words(found)
+    results = [result(wrong=BOTH, labels="permuted"), result(wrong=BOTH, joint=True, pairing="permuted")]
+    section = parts.section("material", *results)
+    assert (section.sentence, section.table) == ("", None)
+    assert "RAEC joint · permuted pairs" in parts.words(section)
 
 
 def test_a_result_without_unseen_slides_is_reported_as_its_metrics_name_it() -> None:
-    given = result("minirocket", wrong=BOTH, metrics={"seen": {"n": 7}})
-    bare: Any = FakeDataset({}, given.files, given.manifest)
+    results = result("minirocket", wrong=BOTH, metrics={"seen": {"n": 7}})
+    bare: Any = FakeDataset({}, results.files, results.manifest)
     assert parts.cells(parts.tables(parts.section("material", bare)), "seen, n") == ["7"]
 
 
@@ -135,7 +139,7 @@ def test_confusion_matrices_hold_every_count_of_the_best_method_and_of_the_joint
             parts.context("material", result("minirocket", wrong={"biotac": 1}), result(wrong=BOTH, joint=True))
         )
     )
-    assert [one.title for one in drawn] == ["BioTac: MiniRocket", "BioTac: RAEC joint", "RoboSkin: RAEC joint"]
+    assert [item.title for item in drawn] == ["BioTac: MiniRocket", "BioTac: RAEC joint", "RoboSkin: RAEC joint"]
     cells = {(row["row"], row["column"]): (row["count"], row["right"]) for row in parts.values(drawn[0])}
     assert cells == {("1", "1"): (4, True), ("1", "2"): (1, False), **{(n, n): (5, True) for n in "234"}}
 
@@ -145,10 +149,10 @@ def test_projections_keep_what_lies_in_a_plane() -> None:
     plane = rng.normal(size=(2, 5))
     points = [rng.normal(size=(count, 2)) @ plane for count in (4, 7)]
     flat = figures.project_on_plane(points)
-    assert [one.shape for one in flat] == [(4, 2), (7, 2)]
-    together = np.vstack(points), np.vstack(flat)
-    apart = [np.linalg.norm(one[:, None] - one[None], axis=2) for one in together]
-    assert np.allclose(*apart)
+    assert [item.shape for item in flat] == [(4, 2), (7, 2)]
+    stacked = np.vstack(points), np.vstack(flat)
+    distances = [np.linalg.norm(item[:, None] - item[None], axis=2) for item in stacked]
+    assert np.allclose(*distances)
 
 
 def test_a_projection_does_not_depend_on_the_sign_that_a_decomposition_takes() -> None:
@@ -158,13 +162,13 @@ def test_a_projection_does_not_depend_on_the_sign_that_a_decomposition_takes() -
 
 
 def test_materials_lie_together_with_those_that_they_were_paired_with() -> None:
-    same, other = (
+    unpermuted, permuted = (
         Result(result(wrong=BOTH, joint=True, epochs=2, partners=partners, pairing="permuted")).predictions
         for partners in (None, PARTNERS)
     )
-    assert figures.count_nearest_partners(same.of("biotac"), same.of("roboskin"), {}) == (4, 4)
-    assert figures.count_nearest_partners(other.of("biotac"), other.of("roboskin"), {}) == (0, 4)
-    assert figures.count_nearest_partners(other.of("biotac"), other.of("roboskin"), PARTNERS) == (4, 4)
+    assert figures.count_nearest_partners(unpermuted.of("biotac"), unpermuted.of("roboskin"), {}) == (4, 4)
+    assert figures.count_nearest_partners(permuted.of("biotac"), permuted.of("roboskin"), {}) == (0, 4)
+    assert figures.count_nearest_partners(permuted.of("biotac"), permuted.of("roboskin"), PARTNERS) == (4, 4)
 
 
 def test_latents_of_a_joint_run_are_next_to_the_control_and_two_that_learned_alone() -> None:
@@ -179,22 +183,22 @@ def test_latents_of_a_joint_run_are_next_to_the_control_and_two_that_learned_alo
         )
     )
     names = ["RAEC joint", "RAEC joint · permuted pairs", "RAEC independent"]
-    assert [one.title.split(":")[0] for one in drawn] == names
+    assert [item.title.split(":")[0] for item in drawn] == names
     assert "4 of 4 materials" in drawn[1].caption and "paired" in drawn[1].caption
     assert {row["shape"] for row in parts.values(drawn[0])} == {"BioTac", "RoboSkin"}
     lines = drawn[1].spec["layer"][-1]["data"]["values"]
-    assert [one["text"] for one in lines] == ["1", "2", "3", "4"]
+    assert [item["text"] for item in lines] == ["1", "2", "3", "4"]
     assert figures.latent_folds(grouped(result("minirocket", wrong=BOTH))) == []
 
 
 def test_convergence_is_drawn_for_each_sensor_and_the_alignment_with_its_control() -> None:
-    given = grouped(
+    results = grouped(
         result(wrong=BOTH, joint=True, epochs=4, fold=0),
         result(wrong=BOTH, joint=True, epochs=5, fold=1),
         result(wrong=BOTH, joint=True, epochs=4, pairing="permuted"),
         result(wrong={"roboskin": 1}, epochs=4),
     )
-    biotac, roboskin = figures.validation_charts(given)
+    biotac, roboskin = figures.validation_charts(results)
     assert "BioTac" in biotac.title and "RoboSkin" in roboskin.title
     rows = parts.values(biotac)
     assert {row["name"] for row in rows} == {"RAEC joint"}
@@ -203,7 +207,7 @@ def test_convergence_is_drawn_for_each_sensor_and_the_alignment_with_its_control
         4,
         5,
     ]  # the mean last
-    (pairs,) = figures.alignment_charts(given)
+    (pairs,) = figures.alignment_charts(results)
     assert {row["name"] for row in parts.values(pairs)} == {"RAEC joint", "RAEC joint · permuted pairs"}
     assert figures.validation_charts(grouped(result("minirocket", wrong=BOTH))) == []
     assert figures.alignment_charts(grouped(result(wrong=BOTH, epochs=3))) == []
@@ -221,26 +225,26 @@ def test_curves_over_slides_are_those_of_methods_with_several_numbers() -> None:
         )
     )
     joint = "RAEC joint · other sensor whole"
-    names = [{row["name"] for row in parts.values(one)} for one in drawn]
+    names = [{row["name"] for row in parts.values(item)} for item in drawn]
     assert names == [{"MiniRocket", f"{joint} · fixed batches"}, {"MiniRocket", joint}]
     assert {row["x"] for row in parts.values(drawn[0]) if row["name"] == "MiniRocket"} == {64, 576}
     assert figures.few_slides_folds(grouped(result("minirocket", wrong=BOTH))) == []
 
 
 def test_slides_are_counted_and_the_one_of_median_force_is_drawn() -> None:
-    found = figures.profile_folds([material_fakes.recorded(5, outside=2)])
-    text = parts.words(found)
+    section = figures.profile_folds([material_fakes.recorded(5, outside=2)])
+    text = parts.words(section)
     assert "5 slides of BioTac, 2 of them outside the protocol (2 moved at 12 mm/s)." in text
     assert "1 slide of RoboSkin, 0 of them outside the protocol." in text
-    drawn = parts.charts(found)
+    drawn = parts.charts(section)
     assert len(drawn) == 2 and "biotac-m01-t003" in drawn[0].caption  # forces of 3, 4 and 5 N kept to the protocol
     assert {row["name"] for row in parts.values(drawn[1])} == {"as measured", "median of 3"}
 
 
 @pytest.mark.parametrize("lacking", ["force_n", "speed_m_s"])
 def test_what_was_not_measured_is_not_drawn(lacking: str) -> None:
-    given = material_fakes.recorded(1, outside=0)
-    shard = given.recordings["biotac-m01-t000"]
+    results = material_fakes.recorded(1, outside=0)
+    shard = results.recordings["biotac-m01-t000"]
     short = shard.tables["profile"].drop_columns([lacking] if lacking == "force_n" else [lacking, "speed_raw_m_s"])
     shard.tables = {**shard.tables, "profile": short}
-    assert len(parts.charts(figures.profile_folds([given]))) == 1
+    assert len(parts.charts(figures.profile_folds([results]))) == 1

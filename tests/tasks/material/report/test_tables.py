@@ -22,64 +22,66 @@ def grouped(*results: Any) -> list[Method]:
 
 def test_accuracies_have_counts_the_last_epoch_skill_and_the_papers_numbers() -> None:
     last = {"last_epoch": {"biotac": 5, "roboskin": 2}}
-    found = parts.section(
+    tables = parts.section(
         "material",
         result("minirocket", wrong=BOTH, also=LEVEL),
         result(wrong=BOTH, joint=True, also=last, fold=0),
         result(wrong={"biotac": 3, "roboskin": 2}, joint=True, also=last, fold=1),
     )
-    table = parts.tables([parts.folds(found)["All methods and baselines"]])[0]
+    table = parts.tables([parts.folds(tables)["All methods and baselines"]])[0]
     assert table.title == "BioTac"
-    assert parts.cell(table, "RAEC joint", "slides named right").startswith("90.0 ± 7.1 | 36/40 · ")  # of 95 and 85
+    assert parts.cell(table, "RAEC joint", "slides named right").startswith(
+        "90.0 ± 7.1 | 36/40 · "
+    )  # deviation of 95 and 85
     assert parts.cell(table, "RAEC joint", "last epoch (%)") == "75.0"
     assert parts.cell(table, "RAEC joint", "paper, Table I (%)") == "96.01"
     assert parts.cell(table, "MiniRocket", "skill over the mean level") == "0.75"
     assert parts.cell(table, "mean level alone", "slides named right").startswith("80.0 | 16/20")
     assert parts.cell(table, "trained on shuffled labels", "slides named right").startswith("25.0 | 5/20")
-    assert parts.cell(table, "chance", "accuracy (%)") == "25"  # of four materials
-    assert "X-LSTM: BioTac 94.50 %" in parts.words(found)  # which was not run
+    assert parts.cell(table, "chance", "accuracy (%)") == "25"  # one of four materials
+    assert "X-LSTM: BioTac 94.50 %" in parts.words(tables)  # X-LSTM was not run
 
 
 def test_without_any_baseline_chance_remains() -> None:
-    (found, *_) = engine.compare([result(wrong=BOTH)])
-    assert [one.name for one in found.of("baseline")] == ["chance"]
+    (tables, *_) = engine.compare([result(wrong=BOTH)])
+    assert [item.name for item in tables.of("baseline")] == ["chance"]
 
 
 def test_controls_and_fewer_slides_do_not_compete() -> None:
     also = {"permuted_labels": {"biotac": 0}, "swapped": {"biotac": 0}, "last_epoch": {"biotac": 0}}
-    (found,) = engine.compare(
+    (tables,) = engine.compare(
         [
             result("x-lstm", wrong={"biotac": 2}, also=also),
             result("x-lstm", wrong={"biotac": 0}, train={"biotac": 32}),
             result("raec", wrong={"biotac": 0}, labels="permuted"),
         ]
     )
-    assert [one.name for one in found.models] == ["X-LSTM"]
-    assert [one.name for one in found.of("baseline")] == ["chance"]
-    assert {one.name for one in found.of("control")} == {
+    assert [item.name for item in tables.models] == ["X-LSTM"]
+    assert [item.name for item in tables.of("baseline")] == ["chance"]
+    assert {item.name for item in tables.of("control")} == {
         "trained on shuffled labels", "X-LSTM · 32 slides", "RAEC independent · permuted labels"
     }  # fmt: skip
 
 
 def test_table_2_tells_what_exchanging_classifiers_costs() -> None:
-    found = swap_table(
+    tables = swap_table(
         grouped(
             result(wrong=BOTH, joint=True, also={"swapped": {"biotac": 3, "roboskin": 2}}),
             result(wrong=BOTH, joint=True, pairing="permuted", also={"swapped": {"biotac": 2, "roboskin": 1}}),
             result("minirocket", wrong=BOTH),
         )
     )
-    assert found is not None
-    joint = parts.cells(found, "RAEC joint")
+    assert tables is not None
+    joint = parts.cells(tables, "RAEC joint")
     assert [joint[0][:4], joint[1][:4], joint[2]] == ["95.0", "85.0", "−10.0"]
-    assert parts.cells(found, "RAEC joint · permuted pairs")[5] == "+5.0"
-    assert parts.cells(found, "paper: RAEC joint") == ["96.01", "95.31", "−0.7", "93.23", "93.23", "+0.0", "–"]
-    assert "MiniRocket" not in parts.words([found])
+    assert parts.cells(tables, "RAEC joint · permuted pairs")[5] == "+5.0"
+    assert parts.cells(tables, "paper: RAEC joint") == ["96.01", "95.31", "−0.7", "93.23", "93.23", "+0.0", "–"]
+    assert "MiniRocket" not in parts.words([tables])
     assert swap_table(grouped(result("minirocket", wrong=BOTH))) is None
 
 
 def test_tables_3_and_4_stand_beside_the_papers_and_a_readout_of_as_many_slides() -> None:
-    found = reduction_tables(
+    tables = reduction_tables(
         grouped(
             result(wrong=BOTH, joint=True, reduce="roboskin", ratio=11, shuffle=False),
             result(wrong={"roboskin": 10}, reduce="roboskin", ratio=11, shuffle=False),
@@ -87,11 +89,11 @@ def test_tables_3_and_4_stand_beside_the_papers_and_a_readout_of_as_many_slides(
             result("minirocket", wrong={"roboskin": 6}, train={"roboskin": 64}),
         )
     )
-    assert [one.title.split(" in ")[0] for one in found] == ["Table IV"]
-    row = parts.cells(found, "11 %")
+    assert [item.title.split(" in ")[0] for item in tables] == ["Table IV"]
+    row = parts.cells(tables, "11 %")
     assert row[0] == "64"
     assert [cell[:5].strip() for cell in row[1:]] == ["95.0", "96.88", "90.0", "45.31", "50.0", "46.35", "70.0"]
-    assert parts.cells(found, "50 %") == ["288", "–", "96.88", "–", "86.98", "–", "82.29", "–"]
+    assert parts.cells(tables, "50 %") == ["288", "–", "96.88", "–", "86.98", "–", "82.29", "–"]
     assert reduction_tables(grouped(result(wrong=BOTH, joint=True))) == []
 
 
@@ -111,7 +113,7 @@ def test_heads_of_tables_3_and_4_state_epochs_that_are_fewer_than_the_papers() -
 
 def test_a_sensor_that_a_split_gave_fewer_slides_stands_in_for_one_that_learns_from_fewer_batches() -> None:
     fewer = {"biotac": 96, "roboskin": 576}
-    found = reduction_tables(
+    tables = reduction_tables(
         grouped(
             result(wrong=BOTH, joint=True),
             result(wrong={"biotac": 4, "roboskin": 2}, joint=True, train=fewer),
@@ -120,8 +122,8 @@ def test_a_sensor_that_a_split_gave_fewer_slides_stands_in_for_one_that_learns_f
             result(wrong={"biotac": 8, "roboskin": 2}, joint=True, train=dict.fromkeys(BOTH, 96)),
         )
     )
-    assert [one.title.split(" in ")[0] for one in found] == ["Table III"]
-    assert [cell[:5].strip() for cell in parts.cells(found, "17 %")] == [
+    assert [item.title.split(" in ")[0] for item in tables] == ["Table III"]
+    assert [cell[:5].strip() for cell in parts.cells(tables, "17 %")] == [
         "96",
         "80.0",
         "77.08",
@@ -134,14 +136,14 @@ def test_a_sensor_that_a_split_gave_fewer_slides_stands_in_for_one_that_learns_f
 
 
 def test_paired_comparisons_tell_points_disagreements_and_tests() -> None:
-    found = difference_table(
+    tables = difference_table(
         grouped(
             *(result(wrong={"biotac": wrong}, joint=True, fold=wrong) for wrong in (1, 2)),
             *(result(wrong={"biotac": 6}, fold=fold) for fold in (1, 2)),
         )
     )
-    assert found is not None
-    row = parts.cells(found, "BioTac: RAEC joint − RAEC independent")
+    assert tables is not None
+    row = parts.cells(tables, "BioTac: RAEC joint − RAEC independent")
     assert row[0].startswith("+22.5 | ")
     # slides that one of two joint runs names right count as right, and the five others only the joint one does
     assert row[1:4] == ["20", "5 : 0", "0.062"]
@@ -151,8 +153,8 @@ def test_paired_comparisons_tell_points_disagreements_and_tests() -> None:
 
 def test_every_run_is_listed() -> None:
     validation: dict[str, Any] = {"use_validation": True, "validation_slides": 100}
-    given = [result("minirocket", wrong=BOTH, fold=3, **validation), result(wrong={"roboskin": 4}, epochs=5)]
-    (table,) = parts.tables([parts.folds(parts.section("material", *given))["Every run"]])
+    results = [result("minirocket", wrong=BOTH, fold=3, **validation), result(wrong={"roboskin": 4}, epochs=5)]
+    (table,) = parts.tables([parts.folds(parts.section("material", *results))["Every run"]])
     assert parts.cells(table, "MiniRocket") == ["3", "0", "95", "20", "90", "20", "676 + 676", "–", "–", "–"]
     assert parts.cells(table, "RAEC independent") == ["0", "0", "–", "–", "80", "20", "576", "–", "5", "–"]
 
@@ -164,27 +166,27 @@ def test_held_out_materials_are_told_out_of_all_and_out_of_themselves() -> None:
         "n": {"roboskin": 40},
         "chance": {"roboskin": 0.05},
     }
-    among = {
+    held_out = {
         "accuracy": {"roboskin": 0.5},
         "correct": {"roboskin": 20},
         "n": {"roboskin": 40},
         "chance": {"roboskin": 0.25},
     }
-    given = [
+    results = [
         result(
             wrong=BOTH,
             joint=True,
             hold_out="roboskin=3,4",
             seed=seed,
-            metrics={"zero_shot": {**zero, "among_held_out": among}},
+            metrics={"zero_shot": {**zero, "among_held_out": held_out}},
         )
         for seed in (0, 1)
     ]
-    found = parts.tables(zero_shot_folds(grouped(*given)))
+    tables = parts.tables(zero_shot_folds(grouped(*results)))
     name = "RAEC joint · RoboSkin without 3, 4"
-    assert parts.cells(found, f"{name}, out of all")[1].startswith("20.0 ± 0.0 | 16/80")
-    assert parts.cells(found, f"{name}, out of all")[2:] == ["5.0", "2"]
+    assert parts.cells(tables, f"{name}, out of all")[1].startswith("20.0 ± 0.0 | 16/80")
+    assert parts.cells(tables, f"{name}, out of all")[2:] == ["5.0", "2"]
     low, high = wilson(0, 2)  # two materials, each once however many runs there are, a fifth of which is right
-    assert parts.cells(found, f"{name}, out of all")[1].endswith(f"· {100 * low:.1f} to {100 * high:.1f}")
-    assert parts.cells(found, f"{name}, out of those held out")[1].startswith("50.0 ± 0.0 | 40/80")
+    assert parts.cells(tables, f"{name}, out of all")[1].endswith(f"· {100 * low:.1f} to {100 * high:.1f}")
+    assert parts.cells(tables, f"{name}, out of those held out")[1].startswith("50.0 ± 0.0 | 40/80")
     assert zero_shot_folds(grouped(result(wrong=BOTH))) == []

@@ -1,4 +1,4 @@
-"""What the section of materials holds of calibrated classifiers: rates worked by hand, curves, and the answer unknown."""
+"""The section of materials on calibrated classifiers: rates worked by hand, curves, and the answer unknown."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ AFTER = {"calibration_error": 0.02, "log_loss": 0.1, "reliability": []}
 OTHERS = 8  # slides of a material that was left out
 
 
-def calibrated(sensor: str = "biotac", **how: Any) -> Any:
+def calibrated(sensor: str = "biotac", **options: Any) -> Any:
     """A result that names one of 20 slides wrong, refuses 2 of them, and names 2 of 8 slides of another material."""
     names, truth = slides(sensor)
     rows = [
@@ -34,18 +34,22 @@ def calibrated(sensor: str = "biotac", **how: Any) -> Any:
         "calibration": {sensor: {"n": 20, "temperature": 0.1, "before": BEFORE, "after": AFTER}},
         "unknown": {sensor: {"rule": "distance", "auroc": {"probability": 0.7, "distance": 0.9}}},
     }
-    one = result(wrong={sensor: 1}, metrics=tree, **how)
-    files = {**one.files, "answers.csv": (HEAD + "\n".join(rows) + "\n").encode()}
-    return FakeDataset(one.recordings, files, one.manifest)
+    base = result(wrong={sensor: 1}, metrics=tree, **options)
+    files = {**base.files, "answers.csv": (HEAD + "\n".join(rows) + "\n").encode()}
+    return FakeDataset(base.recordings, files, base.manifest)
 
 
 def folds(*results: Any) -> list[Fold]:
-    return [one for one in parts.section("material", *results).folds if one.title == "Uncertainty"]
+    return [
+        section_fold
+        for section_fold in parts.section("material", *results).folds
+        if section_fold.title == "Uncertainty"
+    ]
 
 
 def test_rates_of_slides_are_pooled_over_runs_and_each_slide_counts_once() -> None:
-    (found,) = folds(calibrated(fold=0), calibrated(fold=1))
-    (table,) = [one for one in found.blocks if isinstance(one, Table)]
+    (uncertainty_fold,) = folds(calibrated(fold=0), calibrated(fold=1))
+    (table,) = [block for block in uncertainty_fold.blocks if isinstance(block, Table)]
     (row,) = table.rows
     cells = [getattr(cell, "text", cell) for cell in row.cells]
     assert cells == ["BioTac: RAEC independent", "20", "0.02", "0.1", "10.0", "25.0", "0.9", "100.0"]
@@ -53,35 +57,39 @@ def test_rates_of_slides_are_pooled_over_runs_and_each_slide_counts_once() -> No
 
 
 def test_reliability_is_drawn_of_as_many_slides_a_bin_and_unknown_with_its_threshold() -> None:
-    (found,) = folds(calibrated(fold=0), calibrated(fold=1))
-    reliable, refused = (chart for block in found.blocks if isinstance(block, Charts) for chart in block.charts)
+    (uncertainty_fold,) = folds(calibrated(fold=0), calibrated(fold=1))
+    reliable, refused = (
+        chart for block in uncertainty_fold.blocks if isinstance(block, Charts) for chart in block.charts
+    )
     assert reliable.title == "BioTac: RAEC independent" and refused.title == "Unknown: BioTac"
     lines = {
-        name: [one for one in reliable.spec["data"]["values"] if one["name"] == name]
+        name: [mark for mark in reliable.spec["data"]["values"] if mark["name"] == name]
         for name in ("calibrated", "as trained")
     }
-    assert [(one["x"], one["y"]) for one in lines["as trained"]] == [(0.05, 0.95)]
-    assert len(lines["calibrated"]) == 2  # of 40 answers
-    assert np.mean([one["y"] for one in lines["calibrated"]]) == pytest.approx(0.95)
+    assert [(mark["x"], mark["y"]) for mark in lines["as trained"]] == [(0.05, 0.95)]
+    assert len(lines["calibrated"]) == 2  # two bins of 40 answers
+    assert np.mean([mark["y"] for mark in lines["calibrated"]]) == pytest.approx(0.95)
     (point,) = refused.spec["layer"][-1]["data"]["values"]
     assert (point["x"], point["y"]) == (10, 75)
 
 
 def test_a_curve_states_which_fraction_of_unknown_slides_lies_below_each_threshold() -> None:
     rng = np.random.default_rng(0)
-    known, unknown = rng.normal(1, 1, 300), rng.normal(0, 1, 200)
-    found = uncertainty.unknown_curve(known, unknown)
+    known_scores, unknown = rng.normal(1, 1, 300), rng.normal(0, 1, 200)
+    curve = uncertainty.unknown_curve(known_scores, unknown)
     for at in (10, 50, 90):  # thresholds below which so many percent of known slides lie
-        threshold = np.sort(known)[3 * at]
-        assert found[at] == pytest.approx(np.mean(unknown < threshold), abs=1e-12)
-    assert found[0] == pytest.approx(np.mean(unknown < known.min())) and found[-1] == 1
+        threshold = np.sort(known_scores)[3 * at]
+        assert curve[at] == pytest.approx(np.mean(unknown < threshold), abs=1e-12)
+    assert curve[0] == pytest.approx(np.mean(unknown < known_scores.min())) and curve[-1] == 1
 
 
 def test_results_without_answers_have_no_such_part_and_those_without_unknown_slides_no_curve() -> None:
     assert folds(result(wrong={"biotac": 1})) == []
-    one = calibrated()
-    known = b"\n".join(line for line in one.files["answers.csv"].splitlines() if b",false,false," not in line)
-    (found,) = folds(FakeDataset(one.recordings, {**one.files, "answers.csv": known + b"\n"}, one.manifest))
-    assert [chart.title for block in found.blocks if isinstance(block, Charts) for chart in block.charts] == [
-        "BioTac: RAEC independent"
-    ]
+    base = calibrated()
+    known_answers = b"\n".join(line for line in base.files["answers.csv"].splitlines() if b",false,false," not in line)
+    (uncertainty_fold,) = folds(
+        FakeDataset(base.recordings, {**base.files, "answers.csv": known_answers + b"\n"}, base.manifest)
+    )
+    assert [
+        chart.title for block in uncertainty_fold.blocks if isinstance(block, Charts) for chart in block.charts
+    ] == ["BioTac: RAEC independent"]

@@ -1,4 +1,4 @@
-"""Which results are runs of one method, and what it is called."""
+"""Results are grouped into methods, which get names."""
 
 from __future__ import annotations
 
@@ -15,33 +15,35 @@ def methods(*results: Any) -> list[Method]:
 
 
 def test_runs_that_differ_in_seed_words_or_other_networks_targets_are_one_method() -> None:
-    found = methods(
+    method_list = methods(
         result("patches", seed=0),
         result("patches", seed=1, setting="random"),
         result("patches", seed=2, baselines={}),
         result("patches", targets=("pdc_th",)),
     )
-    assert [(one.name, len(one.runs)) for one in found] == [("patches", 4)]
+    assert [(method.name, len(method.runs)) for method in method_list] == [("patches", 4)]
 
 
 def test_options_that_another_architecture_has_set_no_method_apart() -> None:
-    found = methods(result(trees=300), result(trees=300, points=64, head="fc1"), result(trees=300, wrist="estimated"))
-    assert [(one.name, len(one.runs)) for one in found] == [("tree-ensemble", 3)]
+    method_list = methods(
+        result(trees=300), result(trees=300, points=64, head="fc1"), result(trees=300, wrist="estimated")
+    )
+    assert [(method.name, len(method.runs)) for method in method_list] == [("tree-ensemble", 3)]
 
 
 def test_one_network_for_other_targets_is_another_method() -> None:
-    found = methods(result(together=True), result(together=True), result(together=True, targets=("pdc_th",)))
-    assert [one.name for one in found] == ["tree-ensemble", "tree-ensemble · targets pdc_th"]
+    method_list = methods(result(together=True), result(together=True), result(together=True, targets=("pdc_th",)))
+    assert [method.name for method in method_list] == ["tree-ensemble", "tree-ensemble · targets pdc_th"]
 
 
 def test_a_name_tells_what_sets_a_method_apart_from_most_of_its_architecture() -> None:
-    found = methods(
+    method_list = methods(
         *(result("pointnet", head=head) for head in ("fc3", "fc1")),
         result("pointnet", points=250),
         result("pointnet", transform=False),
         result("trees", head="fc6"),
     )
-    assert [one.name for one in found] == [
+    assert [method.name for method in method_list] == [
         "PointNet",
         "PointNet · head fc1",
         "PointNet · no transform",
@@ -63,9 +65,9 @@ def test_a_name_states_that_the_papers_network_was_trained_for_fewer_epochs_than
 
 
 def test_trees_are_called_by_whether_they_read_colour_and_others_say_where_they_do_not() -> None:
-    kinds = ("strong", "trees", "patches")  # as they are stored
-    found = methods(*(result(kind, inputs=inputs) for kind in kinds for inputs in ("rgbcont", "xyzcont", "xyz")))
-    assert [(one.name, len(one.runs)) for one in found] == [
+    kinds = ("strong", "trees", "patches")  # stored names
+    method_list = methods(*(result(kind, inputs=inputs) for kind in kinds for inputs in ("rgbcont", "xyzcont", "xyz")))
+    assert [(method.name, len(method.runs)) for method in method_list] == [
         ("patches", 1),
         ("patches · without colour", 2),  # contacts are read whatever the inputs
         ("tree-ensemble", 1),
@@ -73,16 +75,18 @@ def test_trees_are_called_by_whether_they_read_colour_and_others_say_where_they_
         ("trees on geometry", 2),
         ("trees on geometry and colour", 1),
     ]
-    assert [one.name for one in methods(result(inputs="xyz"))] == ["tree-ensemble · without colour"]  # alone, too
-    assert [one.name for one in methods(result("pointnet", inputs="xyz"), result("pointnet"), result("pointnet"))] == [
+    assert [method.name for method in methods(result(inputs="xyz"))] == ["tree-ensemble · without colour"]  # alone, too
+    assert [
+        method.name for method in methods(result("pointnet", inputs="xyz"), result("pointnet"), result("pointnet"))
+    ] == [
         "PointNet",
         "PointNet · inputs xyz",
     ]
 
 
 def test_marks_of_other_settings_come_behind_the_colour() -> None:
-    found = methods(result(leaf=0), *(result(inputs="xyz", leaf=leaf) for leaf in (0, 4)))
-    assert [one.name for one in found] == [
+    method_list = methods(result(leaf=0), *(result(inputs="xyz", leaf=leaf) for leaf in (0, 4)))
+    assert [method.name for method in method_list] == [
         "tree-ensemble",
         "tree-ensemble · without colour",
         "tree-ensemble · without colour · leaf 4",
@@ -91,12 +95,12 @@ def test_marks_of_other_settings_come_behind_the_colour() -> None:
 
 def test_the_wrist_makes_a_method_only_where_it_is_read() -> None:
     pairs = [("rgbcont", "given"), ("rgbcont", "estimated"), ("rgbpose", "given"), ("rgbpose", "estimated")]
-    found = methods(*(result("pointnet", inputs=inputs, wrist=wrist) for inputs, wrist in pairs))
-    assert sorted(len(one.runs) for one in found) == [1, 1, 2]
+    method_list = methods(*(result("pointnet", inputs=inputs, wrist=wrist) for inputs, wrist in pairs))
+    assert sorted(len(method.runs) for method in method_list) == [1, 1, 2]
 
 
 def test_methods_are_compared_on_one_split_alone_recorded_grasps_first() -> None:
-    found = grouped_by_split(
+    groups = grouped_by_split(
         methods(
             *(result("pointnet", split="folds", seed=seed, targets=("pdc_th",)) for seed in range(5)),
             result(split="random"),
@@ -104,13 +108,15 @@ def test_methods_are_compared_on_one_split_alone_recorded_grasps_first() -> None
             result(simulated=True),
         )
     )
-    assert [(one[0].settings["split"], one[0].settings["simulated"]) for one in found] == [
+    assert [
+        (first_methods[0].settings["split"], first_methods[0].settings["simulated"]) for first_methods in groups
+    ] == [
         ("random", False),
         ("folds", False),
         ("random", True),
     ]
-    assert [one.name for one in found[0]] == ["tree-ensemble", "trees on geometry and colour"]
-    assert {one.name for group in found for one in group} == {
+    assert [method.name for method in groups[0]] == ["tree-ensemble", "trees on geometry and colour"]
+    assert {method.name for group in groups for method in group} == {
         "tree-ensemble",
         "PointNet",
         "trees on geometry and colour",
@@ -118,14 +124,14 @@ def test_methods_are_compared_on_one_split_alone_recorded_grasps_first() -> None
 
 
 def test_the_default_stands_for_a_group_and_else_the_method_of_most_runs() -> None:
-    (both,) = grouped_by_split(methods(result(), result("trees", seed=0), result("trees", seed=1)))
-    assert default_method(both).name == "tree-ensemble"
-    (others,) = grouped_by_split(methods(result("pointnet"), result("trees", seed=0), result("trees", seed=1)))
-    assert default_method(others).name == "trees on geometry and colour"
+    (group,) = grouped_by_split(methods(result(), result("trees", seed=0), result("trees", seed=1)))
+    assert default_method(group).name == "tree-ensemble"
+    (other_group,) = grouped_by_split(methods(result("pointnet"), result("trees", seed=0), result("trees", seed=1)))
+    assert default_method(other_group).name == "trees on geometry and colour"
 
 
 def test_one_method_an_architecture_is_told_in_detail() -> None:
     (group,) = grouped_by_split(methods(*(result("pointnet", head=head) for head in ("fc1", "fc3", "fc3")), result()))
-    assert [one.name for one in one_per_architecture(group)] == ["PointNet", "tree-ensemble"]
-    (both,) = grouped_by_split(methods(result("trees", inputs="xyzcont"), result("trees")))
-    assert [one.name for one in one_per_architecture(both)] == ["trees on geometry and colour"]
+    assert [method.name for method in one_per_architecture(group)] == ["PointNet", "tree-ensemble"]
+    (tree_group,) = grouped_by_split(methods(result("trees", inputs="xyzcont"), result("trees")))
+    assert [method.name for method in one_per_architecture(tree_group)] == ["trees on geometry and colour"]

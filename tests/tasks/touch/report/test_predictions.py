@@ -1,4 +1,4 @@
-"""What is read of a result, against what the fakes hold."""
+"""Predictions that are read of a result are those of the fakes."""
 
 from __future__ import annotations
 
@@ -11,30 +11,30 @@ from tests.tasks.touch.report.touch_fakes import KNOWN, NOVEL, PER_OBJECT, resul
 
 
 def test_grasps_that_the_model_has_seen_are_left_out() -> None:
-    found = predictions.read_predictions(result().recordings["predictions"])
-    assert len(found.recordings) == len(KNOWN) * PER_OBJECT
-    assert "bleach-seen" not in found.recordings
-    assert max(one.max() for one in found.true.values()) < 1e5
+    read = predictions.read_predictions(result().recordings["predictions"])
+    assert len(read.recordings) == len(KNOWN) * PER_OBJECT
+    assert "bleach-seen" not in read.recordings
+    assert max(values.max() for values in read.true.values()) < 1e5
 
 
 def test_values_are_device_counts_by_target_with_electrodes_side_by_side() -> None:
-    found = predictions.read_predictions(result(off=0.1).recordings["predictions"])
-    assert found.targets == biotac_sp.TARGETS
-    assert found.true["e_mf"].shape == (24, 24)
-    np.testing.assert_allclose(found.true["pdc_th"][:2, 0], [3040, 2860])  # 0.6 and 0.4 of 2500 to 3400
-    np.testing.assert_allclose(found.predicted["model"]["pdc_th"][:2, 0], [3130, 2950])  # a tenth more
+    read = predictions.read_predictions(result(off=0.1).recordings["predictions"])
+    assert read.targets == biotac_sp.TARGETS
+    assert read.true["e_mf"].shape == (24, 24)
+    np.testing.assert_allclose(read.true["pdc_th"][:2, 0], [3040, 2860])  # 0.6 and 0.4 of 2500 to 3400
+    np.testing.assert_allclose(read.predicted["model"]["pdc_th"][:2, 0], [3130, 2950])  # a tenth more
 
 
 def test_known_and_novel_objects_are_told_apart() -> None:
-    found = predictions.read_predictions(result(novel=NOVEL).recordings["predictions"])
-    assert set(found.of(True).objects) == set(KNOWN)
-    assert set(found.of(False).objects) == set(NOVEL)
-    assert len(found.of(None).recordings) == len(found.recordings)
+    read = predictions.read_predictions(result(novel=NOVEL).recordings["predictions"])
+    assert set(read.of(True).objects) == set(KNOWN)
+    assert set(read.of(False).objects) == set(NOVEL)
+    assert len(read.of(None).recordings) == len(read.recordings)
 
 
 def test_what_a_model_does_not_foretell_is_no_target_though_its_truth_is_there() -> None:
-    given = result(targets=("pdc_th", "e_th"))
-    shard = given.recordings["predictions"]
+    fake_result = result(targets=("pdc_th", "e_th"))
+    shard = fake_result.recordings["predictions"]
     shard.tables = {**shard.tables, "true": result().recordings["predictions"].tables["true"]}
     assert predictions.read_predictions(shard).targets == ("pdc_th", "e_th")
 

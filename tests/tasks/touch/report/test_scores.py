@@ -16,70 +16,70 @@ from tests.tasks.touch.report.touch_fakes import KNOWN, NOVEL, result
 
 
 def runs(*results: Any) -> list[Predictions]:
-    return [Result(one).predictions for one in results]
+    return [Result(dataset).predictions for dataset in results]
 
 
 @pytest.mark.parametrize("target", biotac_sp.TARGETS)
 def test_errors_are_shares_of_the_range_and_counts_and_skill_is_over_the_constant(target: str) -> None:
-    found = predictions.score(runs(result(off=0.05)), target, True)
-    assert found is not None
+    scored = predictions.score(runs(result(off=0.05)), target, True)
+    assert scored is not None
     low, high = biotac_sp.RANGES[target]
-    assert found.rmse == pytest.approx(0.05, abs=1e-6)
-    assert found.counts == pytest.approx(0.05 * (high - low), abs=1e-3)
-    assert found.mae == pytest.approx(0.05, abs=1e-6)
-    assert found.skill.mean == pytest.approx(0.5, abs=1e-4)
-    assert found.r2 == pytest.approx(0.75, abs=1e-3)  # 1 - 0.05² / 0.1²
-    assert (found.grasps, found.objects, found.runs) == (24, 3, 1)
+    assert scored.rmse == pytest.approx(0.05, abs=1e-6)
+    assert scored.counts == pytest.approx(0.05 * (high - low), abs=1e-3)
+    assert scored.mae == pytest.approx(0.05, abs=1e-6)
+    assert scored.skill.mean == pytest.approx(0.5, abs=1e-4)
+    assert scored.r2 == pytest.approx(0.75, abs=1e-3)  # 1 - 0.05² / 0.1²
+    assert (scored.grasps, scored.objects, scored.runs) == (24, 3, 1)
 
 
 def test_runs_on_the_same_grasps_are_pooled_but_claim_no_more_grasps() -> None:
-    found = predictions.score(runs(result(off=0.03, seed=0), result(off=0.05, seed=1)), "pdc_th", True)
-    assert found is not None
-    assert found.rmse == pytest.approx(math.sqrt((0.03**2 + 0.05**2) / 2), abs=1e-6)
-    assert found.each.mean == pytest.approx(0.04, abs=1e-6)
-    assert found.each.sd == pytest.approx(0.02 / math.sqrt(2), abs=1e-6)
-    assert (found.grasps, found.runs) == (24, 2)
+    scored = predictions.score(runs(result(off=0.03, seed=0), result(off=0.05, seed=1)), "pdc_th", True)
+    assert scored is not None
+    assert scored.rmse == pytest.approx(math.sqrt((0.03**2 + 0.05**2) / 2), abs=1e-6)
+    assert scored.each.mean == pytest.approx(0.04, abs=1e-6)
+    assert scored.each.sd == pytest.approx(0.02 / math.sqrt(2), abs=1e-6)
+    assert (scored.grasps, scored.runs) == (24, 2)
 
 
 def test_runs_of_other_folds_add_their_grasps() -> None:
-    found = predictions.score(runs(result(), result(first=50)), "pdc_th", True)
-    assert found is not None and found.grasps == 48
+    scored = predictions.score(runs(result(), result(first=50)), "pdc_th", True)
+    assert scored is not None and scored.grasps == 48
 
 
 def test_a_batch_mean_is_no_larger_than_the_error_over_all() -> None:
-    found = predictions.score(runs(result(off={"bleach": 0.01, "coffee": 0.05, "spam": 0.2})), "pdc_th", True)
-    assert found is not None
-    assert found.batch_mean < found.rmse == pytest.approx(math.sqrt((0.01**2 + 0.05**2 + 0.2**2) / 3), abs=1e-6)
+    scored = predictions.score(runs(result(off={"bleach": 0.01, "coffee": 0.05, "spam": 0.2})), "pdc_th", True)
+    assert scored is not None
+    assert scored.batch_mean < scored.rmse == pytest.approx(math.sqrt((0.01**2 + 0.05**2 + 0.2**2) / 3), abs=1e-6)
 
 
 def test_objects_are_drawn_where_they_are_novel_and_grasps_where_they_are_known() -> None:
-    apart = {"bleach": 0.02, "coffee": 0.02, "spam": 0.02, "drill": 0.01, "shoe": 0.09}
-    novel = predictions.score(runs(result(off=apart, novel=NOVEL)), "pdc_th", False)
-    known = predictions.score(runs(result(off=apart, known=(*KNOWN, *NOVEL))), "pdc_th", True)
-    assert novel is not None and known is not None
+    offs = {"bleach": 0.02, "coffee": 0.02, "spam": 0.02, "drill": 0.01, "shoe": 0.09}
+    novel = predictions.score(runs(result(off=offs, novel=NOVEL)), "pdc_th", False)
+    known_score = predictions.score(runs(result(off=offs, known=(*KNOWN, *NOVEL))), "pdc_th", True)
+    assert novel is not None and known_score is not None
     assert math.isnan(novel.skill.low)  # two objects show nothing of how much objects vary
-    assert known.skill.high - known.skill.low < 0.5
+    assert known_score.skill.high - known_score.skill.low < 0.5
     assert novel.objects == 2
 
 
 def test_one_novel_object_gives_no_interval() -> None:
-    found = predictions.score(runs(result(novel=("drill",))), "pdc_th", False)
-    assert found is not None and math.isnan(found.skill.low)
+    scored = predictions.score(runs(result(novel=("drill",))), "pdc_th", False)
+    assert scored is not None and math.isnan(scored.skill.low)
 
 
 def test_where_nothing_is_said_there_is_no_score() -> None:
-    given = runs(result(targets=("pdc_th",)))
-    assert predictions.score(given, "e_th", True) is None
-    assert predictions.score(given, "pdc_th", False) is None
-    assert predictions.score(given, "pdc_th", True, "nearest_in_time") is None
+    runs_of_one_target = runs(result(targets=("pdc_th",)))
+    assert predictions.score(runs_of_one_target, "e_th", True) is None
+    assert predictions.score(runs_of_one_target, "pdc_th", False) is None
+    assert predictions.score(runs_of_one_target, "pdc_th", True, "nearest_in_time") is None
 
 
 def test_without_a_constant_there_is_no_skill() -> None:
-    given = result()
-    del given.recordings["predictions"].tables["constant"]
-    found = predictions.score(runs(given), "pdc_th", True)
-    assert found is not None and math.isnan(found.skill.mean)
-    assert found.rmse == pytest.approx(0.05, abs=1e-6)
+    without_constant = result()
+    del without_constant.recordings["predictions"].tables["constant"]
+    scored = predictions.score(runs(without_constant), "pdc_th", True)
+    assert scored is not None and math.isnan(scored.skill.mean)
+    assert scored.rmse == pytest.approx(0.05, abs=1e-6)
 
 
 def test_baselines_come_from_the_method_of_most_runs() -> None:
@@ -89,8 +89,8 @@ def test_baselines_come_from_the_method_of_most_runs() -> None:
         result("trees", off=0.04, baselines={"object_mean": 0.08}, seed=0),
         result("trees", off=0.04, baselines={"object_mean": 0.08}, seed=1),
     )
-    found = dict(paper.baseline_rows(methods, "pdc_th", True))
-    assert list(found) == [baseline_name(one) for one in ("constant", "object_mean", "nearest_in_time")]
-    mean = found[baseline_name("object_mean")]
+    rows = dict(paper.baseline_rows(methods, "pdc_th", True))
+    assert list(rows) == [baseline_name(predictor) for predictor in ("constant", "object_mean", "nearest_in_time")]
+    mean = rows[baseline_name("object_mean")]
     assert mean is not None and mean.runs == 2 and mean.rmse == pytest.approx(0.08, abs=1e-6)
-    assert found[baseline_name("nearest_in_time")] is None
+    assert rows[baseline_name("nearest_in_time")] is None

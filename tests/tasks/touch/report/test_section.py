@@ -28,12 +28,12 @@ def methods(*results: Any) -> list[Method]:
     return parts.methods("touch", *results)
 
 
-def touch(*results: Any, **how: Any) -> Section:
-    return parts.section("touch", *results, **how)
+def touch(*results: Any, **options: Any) -> Section:
+    return parts.section("touch", *results, **options)
 
 
 @pytest.fixture(scope="module")
-def whole() -> Section:
+def full_section() -> Section:
     return touch(
         *(result(seed=seed, **FULL) for seed in (0, 1)),
         result("trees", off=0.06, **FULL),
@@ -43,44 +43,44 @@ def whole() -> Section:
     )
 
 
-def test_the_first_screen_has_a_row_a_target_on_known_and_on_novel_objects(whole: Section) -> None:
-    assert whole.table is not None
-    assert [parts.text(row.cells[0]) for row in whole.table.rows] == [
-        headlines.TARGETS[one] for one in biotac_sp.TARGETS
+def test_the_first_screen_has_a_row_a_target_on_known_and_on_novel_objects(full_section: Section) -> None:
+    assert full_section.table is not None
+    assert [parts.text(row.cells[0]) for row in full_section.table.rows] == [
+        headlines.TARGETS[item] for item in biotac_sp.TARGETS
     ]
-    assert len(whole.table.heads) == 7
-    assert whole.counts[:2] == ["4 methods", "5 results"]
+    assert len(full_section.table.heads) == 7
+    assert full_section.counts[:2] == ["4 methods", "5 results"]
 
 
-def test_all_that_there_is_has_its_fold(whole: Section) -> None:
-    assert list(parts.folds(whole)) == [
+def test_all_that_there_is_has_its_fold(full_section: Section) -> None:
+    assert list(parts.folds(full_section)) == [
         "All methods and baselines", "The pressure, predicted and true", "Electrodes", "Clouds and their grasps",
         "The paper's tables and figures", "By object", "Training", "Recordings", "Every run",
         "What these numbers rest on", "Where it comes from",
     ]  # fmt: skip
-    text = parts.words(whole)
-    for told in ("R² of each electrode, novel objects", "worst decile by error", "Table I in", "Figures 10 and 11 in",
+    text = parts.words(full_section)
+    for sentence in ("R² of each electrode, novel objects", "worst decile by error", "Table I in", "Figures 10 and 11 in",
                  "Figure 8 in", "By object, tree-ensemble", "cd" * 32):  # fmt: skip
-        assert told in text, told
+        assert sentence in text, sentence
 
 
 def test_the_verdict_is_better_only_where_every_target_is() -> None:
-    known = touch(result(baselines={"object_mean": 0.2}))
-    assert known.verdict == "better" and "24 grasps" in known.sentence
+    known_section = touch(result(baselines={"object_mean": 0.2}))
+    assert known_section.verdict == "better" and "24 grasps" in known_section.sentence
     assert touch(result(baselines={"object_mean": 0.04})).verdict == "worse"
-    given = result(baselines={"object_mean": 0.04})
-    other = result(targets=("pdc_th",), baselines={"object_mean": 0.04})
-    rows = given.recordings["predictions"].tables
-    rows["object_mean"] = other.recordings["predictions"].tables["object_mean"]  # of one target alone
-    mixed = touch(given)
+    fake_result = result(baselines={"object_mean": 0.04})
+    one_target = result(targets=("pdc_th",), baselines={"object_mean": 0.04})
+    rows = fake_result.recordings["predictions"].tables
+    rows["object_mean"] = one_target.recordings["predictions"].tables["object_mean"]  # readings of one target
+    mixed = touch(fake_result)
     assert mixed.verdict == "unclear"
     assert mixed.sentence.index("better") < mixed.sentence.index("worse") < mixed.sentence.index("PDC thumb")
 
 
 def test_where_nothing_is_better_than_the_baselines_on_novel_objects_it_is_stated() -> None:
     worse = {**APART, **dict.fromkeys(MANY, 0.12)}
-    found = touch(result(off=worse, novel=MANY), result("trees", off=0.11, novel=MANY))
-    assert NO_EVIDENCE in found.sentence and found.verdict != "better"
+    section = touch(result(off=worse, novel=MANY), result("trees", off=0.11, novel=MANY))
+    assert NO_EVIDENCE in section.sentence and section.verdict != "better"
     evident = touch(result(off=worse, novel=MANY), result("trees", off=0.05, novel=MANY, targets=("pdc_th",)))
     assert NO_EVIDENCE not in evident.sentence
     assert NO_EVIDENCE not in touch(result()).sentence
@@ -88,83 +88,83 @@ def test_where_nothing_is_better_than_the_baselines_on_novel_objects_it_is_state
 
 @pytest.mark.parametrize("novel", [("drill",), NOVEL, tuple("abcde")])
 def test_a_gain_on_few_novel_objects_is_no_evidence(novel: tuple[str, ...]) -> None:
-    found = touch(result(off=0.01, novel=novel))
-    assert "too few" in found.sentence and NO_EVIDENCE in found.sentence and found.verdict == "unclear"
+    section = touch(result(off=0.01, novel=novel))
+    assert "too few" in section.sentence and NO_EVIDENCE in section.sentence and section.verdict == "unclear"
 
 
 @pytest.mark.parametrize("simulated", [False, True])
 def test_a_labs_own_grasps_get_nothing_that_the_paper_states_of_its_own(simulated: bool) -> None:
-    how: dict[str, Any] = {"published": False, "simulated": simulated}
-    found = touch(
-        result(**how, **FULL),
-        result("pointnet", off=0.07, epochs=4, **how, **FULL),
-        *(result("pointnet", head=head, targets=("pdc_th",), epochs=4, **how, **FULL) for head in ("fc1", "fc2")),
-        *(result("pointnet", inputs=one, targets=("pdc_th",), epochs=4, **how) for one in ("xyz", "rgbpose")),
+    options: dict[str, Any] = {"published": False, "simulated": simulated}
+    section = touch(
+        result(**options, **FULL),
+        result("pointnet", off=0.07, epochs=4, **options, **FULL),
+        *(result("pointnet", head=head, targets=("pdc_th",), epochs=4, **options, **FULL) for head in ("fc1", "fc2")),
+        *(result("pointnet", inputs=item, targets=("pdc_th",), epochs=4, **options) for item in ("xyz", "rgbpose")),
     )
-    text = parts.words(found)
-    for told in ("paper", "RGBPose, trained on", "9,000 grasps", "FC6"):
-        assert told not in text, told
+    text = parts.words(section)
+    for sentence in ("paper", "RGBPose, trained on", "9,000 grasps", "FC6"):
+        assert sentence not in text, sentence
     assert "Number of hidden layers of the head" in text
-    assert (found.simulated, text.count(context.SIMULATED) > 0) == (simulated, simulated)
+    assert (section.simulated, text.count(context.SIMULATED) > 0) == (simulated, simulated)
 
 
 def test_that_an_objects_grasps_follow_one_another_is_stated_where_they_do() -> None:
-    told = "of 23 evaluated grasps follow one of the same object in time"
-    assert f"21 {told}" in parts.words(touch(result(published=False)))
+    sentence = "of 23 evaluated grasps follow one of the same object in time"
+    assert f"21 {sentence}" in parts.words(touch(result(published=False)))
     turns = result(published=False)
     tables = turns.recordings["predictions"].tables
     t_ns = pa.array([index % 8 * 3 + index // 8 for index in range(24)] + [99], pa.int64())
     place = tables["grasps"].column_names.index("t_ns")
     tables["grasps"] = tables["grasps"].set_column(place, "t_ns", t_ns)
-    assert told not in parts.words(touch(turns))
+    assert sentence not in parts.words(touch(turns))
 
 
 def test_simulated_results_next_to_recorded_ones_are_questions_of_their_own() -> None:
-    found = touch(result(), result(simulated=True))
-    text = parts.words(found)
+    section = touch(result(), result(simulated=True))
+    text = parts.words(section)
     assert "PDC thumb, known objects, random" in text and "PDC thumb, known objects, random, simulated" in text
     assert "What is marked simulated is not evidence about a real sensor." in text
-    assert "simulated" not in found.sentence
+    assert "simulated" not in section.sentence
 
 
 def test_one_result_of_one_target_has_nothing_that_it_lacks() -> None:
-    found = touch(result("trees", targets=("pdc_mf",), known=(), novel=("drill",)))
-    assert "trees on geometry and colour" in found.sentence
-    assert not {"Electrodes", "Clouds and their grasps", "The paper's tables and figures"} & set(parts.folds(found))
-    assert "known objects" not in parts.words(found)
+    section = touch(result("trees", targets=("pdc_mf",), known=(), novel=("drill",)))
+    assert "trees on geometry and colour" in section.sentence
+    assert not {"Electrodes", "Clouds and their grasps", "The paper's tables and figures"} & set(parts.folds(section))
+    assert "known objects" not in parts.words(section)
 
 
 def test_a_result_without_a_constant_has_no_skill() -> None:
-    given = result()
-    del given.recordings["predictions"].tables["constant"]
-    found = touch(given)
-    table = parts.tables([parts.folds(found)["All methods and baselines"]])[0]
+    fake_result = result()
+    del fake_result.recordings["predictions"].tables["constant"]
+    section = touch(fake_result)
+    table = parts.tables([parts.folds(section)["All methods and baselines"]])[0]
     assert parts.cell(table, "tree-ensemble", "skill over the constant") == "–"
-    assert found.verdict == ""
+    assert section.verdict == ""
 
 
 def test_a_result_without_unseen_grasps_is_reported_as_its_metrics_name_it() -> None:
-    given = result(metrics={"seen": {"n": 7}})
-    bare: Any = FakeDataset({}, given.files, given.manifest)
+    fake_result = result(metrics={"seen": {"n": 7}})
+    bare: Any = FakeDataset({}, fake_result.files, fake_result.manifest)
     assert parts.cells(parts.tables(touch(bare)), "seen, n") == ["7"]
 
 
 def test_grasps_are_chosen_by_their_error_whatever_the_order_of_rows() -> None:
     names = [f"object{number:02d}" for number in range(11)]
     off = {name: 0.01 * (11 - number) for number, name in enumerate(names)}
-    given = result(off=off, known=names, per_object=1)
-    chosen = figures.choose_grasps(Result(given).predictions)
-    assert [(one.place, one.recording) for one in chosen] == [
+    fake_result = result(off=off, known=names, per_object=1)
+    chosen = figures.choose_grasps(Result(fake_result).predictions)
+    assert [(item.place, item.recording) for item in chosen] == [
         ("median", "object05-000"),
         ("best decile", "object09-000"),
         ("worst decile", "object01-000"),
     ]
-    assert [one.error for one in chosen] == pytest.approx([0.06, 0.02, 0.10], abs=1e-5)
-    shard = given.recordings["predictions"]
+    assert [item.error for item in chosen] == pytest.approx([0.06, 0.02, 0.10], abs=1e-5)
+    shard = fake_result.recordings["predictions"]
     back = list(range(len(names)))[::-1]
     shard.tables = {name: table.take(back) for name, table in shard.tables.items()}
-    assert [one.recording for one in figures.choose_grasps(Result(given).predictions)] == [
-        one.recording for one in chosen
+    assert [item.recording for item in figures.choose_grasps(Result(fake_result).predictions)] == [
+        item.recording for item in chosen
     ]
 
 
@@ -202,11 +202,11 @@ def test_a_cloud_is_drawn_with_its_grasp_and_the_chosen_ones_first() -> None:
 
 
 def test_a_dataset_without_clouds_or_grasps_is_not_read() -> None:
-    given = recorded(["a"])
-    assert figures.holds_grasps(given)
-    shard = given.recordings["a"]
+    fake_result = recorded(["a"])
+    assert figures.holds_grasps(fake_result)
+    shard = fake_result.recordings["a"]
     shard.tables = {name: table for name, table in shard.tables.items() if name != "grasp"}
-    assert not figures.holds_grasps(given)
+    assert not figures.holds_grasps(fake_result)
 
 
 def test_losses_are_of_one_target_and_the_mean_of_its_networks() -> None:
@@ -216,18 +216,18 @@ def test_losses_are_of_one_target_and_the_mean_of_its_networks() -> None:
         for network, losses in enumerate(([4.0, 2.0, 1.0], [2.0, 1.0]))
         for epoch, loss in enumerate(losses, 1)
     ]
-    several = Result(run.dataset)
-    several.__dict__["history"] = [*run.history, *lines]
-    assert figures.losses_by_epoch(several, "all", "train_loss") == [3.0, 1.5]
-    assert figures.losses_by_epoch(several, "all", "val_loss") == []
-    assert len(figures.losses_by_epoch(several, "e_th", "train_loss")) == 4
-    assert figures.losses_by_epoch(several, "pdc_mf", "train_loss") == []
+    with_networks = Result(run.dataset)
+    with_networks.__dict__["history"] = [*run.history, *lines]
+    assert figures.losses_by_epoch(with_networks, "all", "train_loss") == [3.0, 1.5]
+    assert figures.losses_by_epoch(with_networks, "all", "val_loss") == []
+    assert len(figures.losses_by_epoch(with_networks, "e_th", "train_loss")) == 4
+    assert figures.losses_by_epoch(with_networks, "pdc_mf", "train_loss") == []
 
 
 def test_figure_8_is_of_the_papers_network_trained_longest() -> None:
     heads = (("fc3", 3), ("fc1", 8))
-    given = [result("pointnet", head=head, epochs=epochs, targets=("pdc_th",)) for head, epochs in heads]
-    (chart,) = figures.figure_8(methods(*given, result(epochs=20)))
+    fake_result = [result("pointnet", head=head, epochs=epochs, targets=("pdc_th",)) for head, epochs in heads]
+    (chart,) = figures.figure_8(methods(*fake_result, result(epochs=20)))
     assert "PointNet · head fc1" in chart.title and "paper schedule" in chart.caption
     assert figures.figure_8(methods(result(epochs=20))) == []
 
@@ -235,6 +235,6 @@ def test_figure_8_is_of_the_papers_network_trained_longest() -> None:
 def test_losses_without_validation_grasps_are_reported_as_such() -> None:
     watched, unwatched = result(epochs=3), result(epochs=3)
     unwatched.files["config.json"] = unwatched.files["config.json"].replace(b'"val": 10', b'"val": 0')
-    drawn = [figures.loss_charts(methods(one))[0] for one in (watched, unwatched)]
-    assert [figures.UNWATCHED in one.caption for one in drawn] == [False, True]
+    drawn = [figures.loss_charts(methods(item))[0] for item in (watched, unwatched)]
+    assert [figures.UNWATCHED in item.caption for item in drawn] == [False, True]
     assert figures.loss_charts(methods(result())) == []

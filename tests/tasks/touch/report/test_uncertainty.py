@@ -1,4 +1,4 @@
-"""What the section of touch holds of quantiles: coverage pooled over runs, by target and electrode, worked by hand."""
+"""The section of touch on quantiles: coverage pooled over runs, by target and electrode, worked by hand."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from tests.report import parts
 from tests.tasks.touch.report.touch_fakes import result
 
 PINBALL = {"model": 3.0, "constant": 4.0, "object_mean": 3.5}
-OBJECTS = ("bleach", "coffee", "drill", "shoe")  # of these the first two are known
+OBJECTS = ("bleach", "coffee", "drill", "shoe")  # the first two are known
 
 
 def rows(seed: int = 0) -> pd.DataFrame:
     """A row a value of ten grasps an object; of electrode 3 of the thumb the model's band holds none."""
     rng = np.random.default_rng(seed)
-    found = [
+    values = [
         {
             **{"recording": f"{name}-{grasp:03d}", "object": name, "known": name in OBJECTS[:2]},
             **{"predictor": predictor, "target": target, "value": value},
@@ -39,45 +39,47 @@ def rows(seed: int = 0) -> pd.DataFrame:
         for target in biotac_sp.TARGETS
         for value in range(1, biotac_sp.width(target) + 1)
     ]
-    return pd.DataFrame(found)
+    return pd.DataFrame(values)
 
 
-def calibrated(seed: int = 0, **how: Any) -> Any:
-    one = result(novel=OBJECTS[2:], seed=seed, metrics={"quantiles": {"levels": [10, 50, 90]}}, **how)
+def calibrated(seed: int = 0, **options: Any) -> Any:
+    base = result(novel=OBJECTS[2:], seed=seed, metrics={"quantiles": {"levels": [10, 50, 90]}}, **options)
     file = io.BytesIO()
     rows(seed).to_parquet(file)
-    return FakeDataset(one.recordings, {**one.files, "coverage.parquet": file.getvalue()}, one.manifest)
+    return FakeDataset(base.recordings, {**base.files, "coverage.parquet": file.getvalue()}, base.manifest)
 
 
 def folds(*results: Any) -> list[Fold]:
-    return [one for one in parts.section("touch", *results).folds if one.title == "Uncertainty"]
+    return [
+        section_fold for section_fold in parts.section("touch", *results).folds if section_fold.title == "Uncertainty"
+    ]
 
 
 def test_coverage_is_pooled_over_runs_and_certain_by_grasp_or_by_novel_object() -> None:
-    several = pd.concat([rows(0), rows(1)])
-    for known, cluster in ((True, "recording"), (False, "object")):
-        some = several[several.known == known]
-        one = uncertainty.measure_bands(some, known)["e_mf", "model"]
-        own = some[(some.target == "e_mf") & (some.predictor == "model")]
-        assert one.values == len(own) == 2 * 2 * 10 * 24
-        assert one.coverage[0] == own.covered.mean()
-        means = own.groupby(cluster).covered.mean().to_numpy()  # clusters are of one size
+    runs = pd.concat([rows(0), rows(1)])
+    for is_known, cluster in ((True, "recording"), (False, "object")):
+        part = runs[runs.known == is_known]
+        band = uncertainty.measure_bands(part, is_known)["e_mf", "model"]
+        model_rows = part[(part.target == "e_mf") & (part.predictor == "model")]
+        assert band.values == len(model_rows) == 2 * 2 * 10 * 24
+        assert band.coverage[0] == model_rows.covered.mean()
+        means = model_rows.groupby(cluster).covered.mean().to_numpy()  # clusters are of one size
         ends = (
             stats.t.interval(0.95, len(means) - 1, means.mean(), stats.sem(means)) if len(means) > 2 else (np.nan,) * 2
         )
-        assert one.coverage[1:] == pytest.approx(np.clip(ends, 0, 1), nan_ok=True)
+        assert band.coverage[1:] == pytest.approx(np.clip(ends, 0, 1), nan_ok=True)
         gains = (0.25, 0.25, 0.25) if len(means) > 2 else (0.25, np.nan, np.nan)
-        assert one.gain == pytest.approx(gains, nan_ok=True) and (one.width, one.pinball) == (90, 3)
+        assert band.gain == pytest.approx(gains, nan_ok=True) and (band.width, band.pinball) == (90, 3)
 
 
 def test_the_part_has_coverage_by_target_a_table_and_the_electrodes_of_known_and_novel_objects() -> None:
-    (found,) = folds(calibrated(), calibrated(1))
-    titles = [chart.title for block in found.blocks if isinstance(block, Charts) for chart in block.charts]
+    (uncertainty_fold,) = folds(calibrated(), calibrated(1))
+    titles = [chart.title for block in uncertainty_fold.blocks if isinstance(block, Charts) for chart in block.charts]
     assert titles == [
         "Coverage: known objects", "Coverage: novel objects",
         "Coverage of each electrode, known objects", "Coverage of each electrode, novel objects",
     ]  # fmt: skip
-    (table,) = [one for one in found.blocks if isinstance(one, Table)]
+    (table,) = [table_block for table_block in uncertainty_fold.blocks if isinstance(table_block, Table)]
     assert len(table.rows) == 2 * 4 * 3
     cells = [getattr(cell, "text", cell) for cell in table.rows[0].cells]
     assert cells[0] == "known objects, PDC thumb: model" and cells[1] == "40"
@@ -85,10 +87,10 @@ def test_the_part_has_coverage_by_target_a_table_and_the_electrodes_of_known_and
 
 
 def test_an_electrode_whose_band_holds_nothing_is_drawn_so() -> None:
-    (found,) = folds(calibrated())
-    *_, electrodes = [block for block in found.blocks if isinstance(block, Charts)]
+    (uncertainty_fold,) = folds(calibrated())
+    *_, electrodes = [block for block in uncertainty_fold.blocks if isinstance(block, Charts)]
     for chart in electrodes.charts:
-        drawn = {(one["panel"], one["Electrode"]): one for one in chart.spec["data"]["values"]}
+        drawn = {(mark["panel"], mark["Electrode"]): mark for mark in chart.spec["data"]["values"]}
         assert len(drawn) == 2 * 24
         assert drawn["thumb", 3]["text"] == "0" and drawn["thumb", 3]["side"] == "b"
 

@@ -37,7 +37,7 @@ PARAMS = {
     "batch": 10,
     "learning_rate": 0.01,
 }
-Errors = Mapping[str, float]  # by object; how far what is said lies from the truth, as a share of the range
+Errors = Mapping[str, float]  # object -> distance of the prediction from the truth, as a fraction of the range
 
 
 def truth(target: str, grasps: int, seed: int = 0) -> AnyArray:
@@ -81,8 +81,11 @@ def result(
     shares = {"true": {target: truth(target, rows, seed=3) for target in targets}}
     true = shares["true"]
     shares["constant"] = {target: np.full_like(one, 0.5) for target, one in true.items()}
-    said = {"model": offs, **{name: np.full(rows, value) for name, value in (baselines or {}).items()}}
-    shares |= {name: {one: values + (side * by)[:, None] for one, values in true.items()} for name, by in said.items()}
+    offs_by_predictor = {"model": offs, **{name: np.full(rows, value) for name, value in (baselines or {}).items()}}
+    shares |= {
+        name: {target: values + (side * by)[:, None] for target, values in true.items()}
+        for name, by in offs_by_predictor.items()
+    }
     grasps = {
         "recording": [*(f"{name}-{index:03d}" for name, index in zip(objects, number, strict=True)), "bleach-seen"],
         "object": [*objects, "bleach"],
@@ -121,8 +124,8 @@ def history(target: str, epochs: int, seed: int) -> list[dict[str, Any]]:
     lines = []
     for epoch in range(1, epochs + 1):
         loss = 0.05 + 0.1 * float(np.exp(-4 * epoch / epochs)) + 0.005 * np.sin(epoch + seed)
-        told = {"epoch": epoch, "train_loss": loss, "val_loss": 1.2 * loss, "best": epoch == epochs, "target": target}
-        lines.append(told)
+        line = {"epoch": epoch, "train_loss": loss, "val_loss": 1.2 * loss, "best": epoch == epochs, "target": target}
+        lines.append(line)
     return lines
 
 
@@ -142,9 +145,9 @@ def recorded(names: Sequence[str] = ("bleach-001", "drill-002")) -> Any:
 
 def _table(touch: Mapping[str, AnyArray]) -> pa.Table:
     """Return shares of ranges as the stream that holds them, in device counts, with a row of the seen grasp."""
-    found: dict[str, Any] = {}
+    columns: dict[str, Any] = {}
     for target, shares in touch.items():
         counts = np.vstack([biotac_sp.counts(target, shares), np.full((1, shares.shape[1]), 1e6)])
         names = biotac_sp.value_columns(target)
-        found |= {name: counts[:, index].astype(np.float32) for index, name in enumerate(names)}
-    return pa.table(found)
+        columns |= {name: counts[:, index].astype(np.float32) for index, name in enumerate(names)}
+    return pa.table(columns)
