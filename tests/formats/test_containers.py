@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 import pytest
@@ -24,7 +25,10 @@ NONE = Params()
 @pytest.fixture(autouse=True)
 def _fake(monkeypatch: pytest.MonkeyPatch) -> None:
     kind = Kind("tests.formats.fake_container:opened", endings=(".fake", ".fake.json"), marks=("meta/mark",))
-    monkeypatch.setattr(container, "KINDS", {"xdf": kind})
+    kinds: Any = container.KINDS  # one mapping, which every module of formats reads
+    for name in list(kinds):
+        monkeypatch.delitem(kinds, name)
+    monkeypatch.setitem(kinds, "xdf", kind)
 
 
 def read(folder: Path, params: Params = NONE) -> dict[str, RecordingOutput]:
