@@ -17,8 +17,8 @@ needs_machine = [
 
 @pytest.mark.parametrize("kind", [pytest.param(kind, marks=needs_machine) for kind in machine.MAKE])
 def test_what_was_answered_outlasts_a_loss_of_power_at_any_write(kind: str, tmp_path: Path) -> None:
-    tried = trials.trial(kind, tmp_path, step=int(os.environ.get("TACPIPE_TEST_POWER") or 1))
-    assert tried.states and not tried.wrong, "\n".join(tried.wrong)
+    results = trials.trial(kind, tmp_path, step=int(os.environ.get("TACPIPE_TEST_POWER") or 1))
+    assert results.states and not results.wrong, "\n".join(results.wrong)
 
 
 def entry(sector: int, flags: int = 0, data: bytes = b"") -> block_log.Entry:

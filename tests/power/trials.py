@@ -25,7 +25,7 @@ PLUGIN = Path(__file__).parents[1] / "plugin"
 
 
 @dataclass
-class Tried:
+class PowerResults:
     """How many states of a disk were looked at, and what was wrong with which."""
 
     kind: str
@@ -40,7 +40,7 @@ def plugin(folder: Path) -> Path:
     return folder
 
 
-def trial(kind: str, scratch: Path, step: int = 1, seed: int = 0) -> Tried:
+def trial(kind: str, scratch: Path, step: int = 1, seed: int = 0) -> PowerResults:
     """Return what came of commands on a file system of this kind, whose disk loses power at any moment."""
     environment = {"PYTHONPATH": str(plugin(scratch / "plugin"))}
     base = machine.format_disk(scratch / "base.img", kind)
@@ -51,17 +51,17 @@ def trial(kind: str, scratch: Path, step: int = 1, seed: int = 0) -> Tried:
     entries = block_log.read(log)
     log.unlink()
     states = [state for state in block_log.states(entries, seed) if "prepared" in state.passed][::step]
-    tried = Tried(kind)
+    results = PowerResults(kind)
     for first in range(0, len(states), TOGETHER):
         batch = states[first : first + TOGETHER]
         disks = [copy_disk(base, scratch / f"state{number}.img") for number in range(len(batch))]
         for state, image in zip(batch, disks, strict=True):
             block_log.write(state, image)
         answers = look(kind, batch, disks, scratch, environment)
-        tried.states += len(answers)
-        tried.wrong += [f"{kind}, after {answer['passed']}: {answer['wrong']}" for answer in answers if answer["wrong"]]
-    count("losses of power replayed on blocks", tried.states)
-    return tried
+        results.states += len(answers)
+        results.wrong += [f"{kind}, after {answer['passed']}: {answer['wrong']}" for answer in answers if answer["wrong"]]
+    count("losses of power replayed on blocks", results.states)
+    return results
 
 
 def look(
@@ -98,9 +98,9 @@ def main() -> None:
     wrong: list[str] = []
     for kind in options.kinds:
         with tempfile.TemporaryDirectory() as scratch:
-            tried = trial(kind, Path(scratch), options.every, options.seed)
-        print(f"{kind}: {tried.states} states, {len(tried.wrong)} wrong", flush=True)
-        wrong += tried.wrong
+            results = trial(kind, Path(scratch), options.every, options.seed)
+        print(f"{kind}: {results.states} states, {len(results.wrong)} wrong", flush=True)
+        wrong += results.wrong
     print("\n".join(wrong))
     sys.exit(bool(wrong))
 

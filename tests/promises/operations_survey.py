@@ -14,7 +14,7 @@ POWERS = 3  # seeds of what a loss of power takes along
 
 
 @dataclass(frozen=True)
-class Left:
+class Aftermath:
     """State of the folder after one fault, and how the run ended."""
 
     state: State
@@ -32,14 +32,14 @@ class Survey:
 
     def __init__(self, disk: Disk, chosen: range) -> None:
         self.disk, self._chosen, self._number = disk, chosen, 0  # numbers of calls
-        self.remains: list[Left] = []
+        self.remains: list[Aftermath] = []
         self.kills: dict[int, State] = {}  # Each state that a kill leaves, by the number of its call.
 
     def before(self, call: Call) -> None:
         self._number += 1
         if call.changes and self._number in self._chosen:
             self.kills[self._number] = self.disk.killed()
-            self.remains.append(Left(self.kills[self._number], f"a kill before {self._described(call)}", "killed"))
+            self.remains.append(Aftermath(self.kills[self._number], f"a kill before {self._described(call)}", "killed"))
             self._lose(f"before {self._described(call)}", "dark")
 
     def after(self, call: Call) -> None:
@@ -47,7 +47,7 @@ class Survey:
         if call.name == "write" and self._number in self._chosen:
             torn = self.disk.torn(call.path)
             if torn is not None:
-                self.remains.append(Left(torn, f"a kill amid {self._described(call)}", "killed"))
+                self.remains.append(Aftermath(torn, f"a kill amid {self._described(call)}", "killed"))
 
     def end(self) -> None:
         """Note what a loss of power leaves of a command that has ended."""
@@ -55,7 +55,7 @@ class Survey:
 
     def _lose(self, when: str, outcome: str) -> None:
         for seed in range(POWERS):
-            self.remains.append(Left(self.disk.lost(seed), f"loss of power ({seed}) {when}", outcome))
+            self.remains.append(Aftermath(self.disk.lost(seed), f"loss of power ({seed}) {when}", outcome))
 
     def _described(self, call: Call) -> str:
         return f"call {self._number}, {call.name} {call.path.removeprefix(f'{self.disk.root}/')}"

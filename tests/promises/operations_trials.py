@@ -33,7 +33,7 @@ from tests.promises.operations import Call, Shim
 from tests.promises.operations_cases import CASES, Case
 from tests.promises.operations_power import Disk
 from tests.promises.operations_replay import Replay
-from tests.promises.operations_survey import Killer, Left, Survey
+from tests.promises.operations_survey import Aftermath, Killer, Survey
 from tests.promises.operations_tree import Place, State
 
 CODES = (0, 1, 2, 3, 4, 5, 6, 130)
@@ -51,7 +51,7 @@ class Ran:
 
 
 @dataclass
-class Tried:
+class CaseResults:
     """Results of all trials of a case."""
 
     case: str
@@ -89,7 +89,7 @@ class Trials:
 
     def __init__(self, case: Case, lab: Path) -> None:
         self.case, self.lab = case, lab
-        self.tried = Tried(case.name)
+        self.results = CaseResults(case.name)
         self._proven: dict[tuple[str, str], list[str]] = {}
         (lab / ".tacpipe").mkdir(parents=True)
         os.chdir(lab)
@@ -105,7 +105,7 @@ class Trials:
         replay.listening = False
         self.clean_files, self.clean_store = self._files_outside_stores(self.place.look()), self._store_content()
 
-    def run(self, chosen: range) -> Tried:
+    def run(self, chosen: range) -> CaseResults:
         """Try every fault at the calls of the ``chosen`` numbers, and a loss of power at the end."""
         self.place.restore()
         survey = Survey(Disk.from_state(self.lab, self.place.before), chosen)
@@ -115,15 +115,15 @@ class Trials:
         problems = _differences("the folder", _plain(survey.disk.killed()), _plain(self.place.look()))
         assert not problems, f"a change was not seen: {problems}"
         survey.end()
-        self.tried.calls = len(shim.calls)
+        self.results.calls = len(shim.calls)
         self._die(survey)
         for remaining in survey.remains:
             self._evaluate(remaining, [])
         for number in range(chosen.start, len(shim.calls) + 1, chosen.step):
             for fault in shim.calls[number - 1].errors:
                 self._fail(number, shim.calls[number - 1], fault)
-        self.tried.states = len(self._proven)
-        return self.tried
+        self.results.states = len(self._proven)
+        return self.results
 
     def _fail(self, number: int, expected: Call, fault: str) -> None:
         """Run the command with one call failing."""
@@ -133,7 +133,7 @@ class Trials:
         met = shim.calls[number - 1] if len(shim.calls) >= number else Call("none", "")
         assert met.name == expected.name, f"call {number} is {met} now, and was {expected}"
         description = f"{fault} at call {number}, {met.name} {met.path.removeprefix(f'{self.lab}/')}"
-        self._evaluate(Left(self.place.look(), description, "failed" if ran.code else "done"), _wrong(ran))
+        self._evaluate(Aftermath(self.place.look(), description, "failed" if ran.code else "done"), _wrong(ran))
 
     def _die(self, survey: Survey) -> None:
         """Kill the command in earnest at some calls, and see that this leaves what the survey says."""
@@ -152,14 +152,14 @@ class Trials:
                 f"a kill at call {number} leaves something else than the calls before it made"
             )
 
-    def _evaluate(self, remaining: Left, problems: list[str]) -> None:
-        self.tried.failed += 1
+    def _evaluate(self, remaining: Aftermath, problems: list[str]) -> None:
+        self.results.failed += 1
         key = remaining.state.described(self.place.before), remaining.outcome
         if key not in self._proven:
             self._proven[key] = self._disproved(remaining)
-        self.tried.problems += [f"{remaining.fault}: {problem}" for problem in [*problems, *self._proven[key]]]
+        self.results.problems += [f"{remaining.fault}: {problem}" for problem in [*problems, *self._proven[key]]]
 
-    def _disproved(self, remaining: Left) -> list[str]:
+    def _disproved(self, remaining: Aftermath) -> list[str]:
         """Return which promises do not hold for what a fault left behind."""
         store, problems = Store(self.lab / ".tacpipe"), []
         files_now = self._files_outside_stores(remaining.state)
