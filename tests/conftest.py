@@ -12,7 +12,7 @@ import signal
 import subprocess
 import sys
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
@@ -244,11 +244,12 @@ def forget() -> None:
 
 def tacpipe(folder: Path, command: str, **environment: str) -> subprocess.CompletedProcess[str]:
     """Run a command in a process of its own."""
-    return subprocess.run(
-        [sys.executable, "-m", "tacpipe", *shlex.split(command)],
-        cwd=folder,
-        env={**os.environ, **environment},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    return run_python(folder, "-m", "tacpipe", *shlex.split(command), environment=environment)
+
+
+def run_python(
+    folder: Path, *arguments: str, environment: Mapping[str, str] | None = None, check: bool = False
+) -> subprocess.CompletedProcess[str]:
+    """Run Python with these arguments in a process of its own, and keep what it prints."""
+    command, variables = [sys.executable, *arguments], {**os.environ, **(environment or {})}
+    return subprocess.run(command, cwd=folder, env=variables, capture_output=True, text=True, check=check)

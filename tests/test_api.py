@@ -6,8 +6,6 @@ import html
 import inspect
 import json
 import pickle
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +22,7 @@ from tacpipe.datasets.dataset import Dataset
 from tacpipe.engine import calling
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
-from tests.conftest import Lab, write_source
+from tests.conftest import Lab, run_python, write_source
 from tests.fake_recordings import publish_dataset
 
 STEP_NS = 20_000_000
@@ -81,7 +79,7 @@ def test_importing_tacpipe_imports_nothing_heavy_and_every_public_name_is_there(
         "missing = [name for name in tacpipe.__all__ if not hasattr(tacpipe, name) or name not in dir(tacpipe)];"
         "print(json.dumps([before, missing, sorted(name.partition('.')[0] for name in sys.modules)]))"
     )
-    process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    process = run_python(Path(), "-c", code, check=True)
     before, missing, after = json.loads(process.stdout)
     assert not set(before) & HEAVY and not missing
     assert not set(after) & HEAVY  # the classes of datasets are light too
@@ -185,7 +183,7 @@ def test_run_shows_no_progress_and_warns_of_recordings_that_it_left_out(
 def test_a_script_without_a_guard_runs_once_and_its_workers_do_not_run_it(lab: Lab) -> None:
     script = "import tacpipe\nprint('once')\ntacpipe.run('simulate.toy', output='data/r', trials=9, jobs=2)\n"
     (lab.folder / "script.py").write_text(script)
-    process = subprocess.run([sys.executable, "script.py"], capture_output=True, text=True)
+    process = run_python(Path(), "script.py")
     assert (process.returncode, process.stdout, process.stderr) == (0, "once\n", "")
     assert len(tacpipe.open("data/r")) == 9
 

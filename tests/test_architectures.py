@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import io
 import json
-import subprocess
 import sys
 import zipfile
 from collections.abc import Callable, Iterator
@@ -18,7 +17,7 @@ import pytest
 from tacpipe.errors import ResultWarning, TacpipeError
 from tacpipe.plugins import architectures, given_params, registry
 from tacpipe.plugins import params as params_of
-from tests.conftest import Ran, forget, write_plugin
+from tests.conftest import Ran, forget, run_python, write_plugin
 
 MODULE = '''
 from dataclasses import dataclass
@@ -244,7 +243,7 @@ def test_the_help_shows_it_in_a_panel_and_imports_nothing_heavy(
         "assert not {'torch', 'sklearn', 'pyarrow', 'pandas', 'numpy'} & set(sys.modules)\n"
     )
     monkeypatch.setenv("PYTHONPATH", str(package))
-    subprocess.run([sys.executable, "-c", probe], check=True, capture_output=True)
+    run_python(Path(), "-c", probe, check=True)
 
 
 def test_name_and_version_of_the_package_are_in_keys_and_those_of_built_in_ones_are_as_before(package: Path) -> None:

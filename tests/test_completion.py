@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from tacpipe.cli import commands
 from tacpipe.plugins import registry
-from tests.conftest import tacpipe
+from tests.conftest import run_python, tacpipe
 
 HEAVY = {"torch", "pyarrow", "pandas", "sklearn", "open3d", "numpy", "scipy", "matplotlib"}
 PROBE = """
@@ -57,14 +54,7 @@ def test_a_group_of_commands_completes_its_verbs(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("line", ["tacpipe ", "tacpipe train forward --", "tacpipe synchronize --r"])
 def test_completion_imports_nothing_heavy(tmp_path: Path, line: str) -> None:
-    process = subprocess.run(
-        [sys.executable, "-c", PROBE],
-        cwd=tmp_path,
-        env={**os.environ, **completion_variables("bash", line)},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    process = run_python(tmp_path, "-c", PROBE, environment=completion_variables("bash", line), check=True)
     printed, _, imported = process.stdout.partition("IMPORTED ")
     assert printed.strip()
     assert set(imported.split()) & HEAVY == set()

@@ -23,7 +23,7 @@ import yaml
 from tacpipe.cli import commands
 from tacpipe.plugins import params as params_of
 from tacpipe.plugins import registry
-from tests.conftest import Lab, tacpipe, write_plugin
+from tests.conftest import Lab, run_python, tacpipe, write_plugin
 
 ROOT = Path(__file__).parents[1]
 DOCS = sorted(page for page in (ROOT / "docs").rglob("*.md") if page.name != "0000-template.md")
@@ -157,7 +157,7 @@ def test_the_commands_and_python_of_every_page_run_and_print_what_it_says(tmp_pa
             if block.title:
                 (tmp_path if block.title.endswith(".py") else project).joinpath(block.title).write_text(block.text)
             elif block.language == "python":
-                run_python(page, block.text, project, environment)
+                run_block(page, block.text, project, environment)
             elif block.language == "console":
                 for command, lines in printed_commands(block.text):
                     ran = tacpipe(project, command.removeprefix("tacpipe "), **environment)
@@ -184,16 +184,9 @@ def compare(name: str, lines: list[str], printed_lines: list[str], *, rerun: boo
     assert actual == expected, name
 
 
-def run_python(page: Path, text: str, folder: Path, environment: dict[str, str]) -> None:
+def run_block(page: Path, text: str, folder: Path, environment: dict[str, str]) -> None:
     """Require that a Python block runs."""
-    process = subprocess.run(
-        [sys.executable, "-c", text],
-        cwd=folder,
-        env={**os.environ, **environment},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    process = run_python(folder, "-c", text, environment=environment)
     assert process.returncode == 0, f"{page.name}: {process.stderr}"
 
 
@@ -522,14 +515,7 @@ def test_the_notebook_opens_a_dataset_and_fits_a_model(tmp_path: Path) -> None:
         assert ran.returncode == 0, ran.stderr
     cells = json.loads((ROOT / "docs" / "tutorials" / "explore.ipynb").read_text())["cells"]
     code = "\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
-    process = subprocess.run(
-        [sys.executable, "-c", code],
-        cwd=tmp_path,
-        env={**os.environ, "MPLBACKEND": "Agg"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    process = run_python(tmp_path, "-c", code, environment={"MPLBACKEND": "Agg"})
     assert process.returncode == 0, process.stderr
     assert re.fullmatch(r"own model [\d.]+ counts, persistence [\d.]+ counts, skill \+0\.\d\d\n", process.stdout)
 
@@ -537,14 +523,8 @@ def test_the_notebook_opens_a_dataset_and_fits_a_model(tmp_path: Path) -> None:
 @pytest.mark.long
 @pytest.mark.skipif(importlib.util.find_spec("mkdocs") is None, reason="the extra docs is not installed")
 def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
-    process = subprocess.run(
-        [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "-d", str(tmp_path / "site")],
-        cwd=ROOT,
-        env={**os.environ, "NO_MKDOCS_2_WARNING": "1"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    build = ("-m", "mkdocs", "build", "--strict", "--quiet", "-d", str(tmp_path / "site"))
+    process = run_python(ROOT, *build, environment={"NO_MKDOCS_2_WARNING": "1"})
     assert process.returncode == 0, process.stderr
     assert "tacpipe synchronize" in (tmp_path / "site" / "reference" / "cli.html").read_text()
     assert (tmp_path / "site" / "reference" / "python.html").read_text().count("doc-heading") > 5

@@ -7,8 +7,6 @@ import os
 import re
 import shutil
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from importlib.metadata import Distribution
@@ -23,7 +21,7 @@ from tacpipe.plugins import extras, registry
 from tests import without_extras
 from tests.clouds import shapes
 from tests.commands import run as run_all
-from tests.conftest import Lab, forget, write_plugin
+from tests.conftest import Lab, forget, run_python, write_plugin
 from tests.formats import grasp_files, slide_files, xdf_writer, xela_files
 from tests.formats.arrays import files as array_files
 from tests.formats.lerobot import files as lerobot_files
@@ -262,14 +260,8 @@ except ImportError as error:
     [('tacpipe.load("models/forward")', "A model"), ('tacpipe.open("data/split").to_torch()', "to_torch")],
 )
 def test_python_gets_the_same_sentence(chained: Path, tmp_path: Path, call: str, needed_by: str) -> None:
-    process = subprocess.run(
-        [sys.executable, "-c", LIBRARY.format(call)],
-        cwd=chained,
-        env={**os.environ, "PYTHONPATH": str(without_extras.hide(tmp_path / "hiding"))},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    environment = {"PYTHONPATH": str(without_extras.hide(tmp_path / "hiding"))}
+    process = run_python(chained, "-c", LIBRARY.format(call), environment=environment, check=True)
 
     start = f"MissingModuleError {needed_by} needs torch, which is not installed: install it with the extra learn, by `"
     assert process.stdout.startswith(start) and process.stdout.count("\n") == 1

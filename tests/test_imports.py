@@ -1,13 +1,12 @@
 """Starting the command line imports no library that a rerun does not use."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from tests import chain, commands
+from tests.conftest import run_python
 
 HEAVY = {"torch", "pyarrow", "pandas", "sklearn", "open3d", "numpy", "scipy", "matplotlib"}
 COMPILERS = {"torch._dynamo", "torch._inductor", "torch.onnx", "sympy"}  # each takes as long as a small evaluation
@@ -25,9 +24,7 @@ print(json.dumps(sorted(sys.modules)))
 
 def imported_modules(folder: Path, words: str) -> set[str]:
     """Return the full names of all modules that a command imports."""
-    process = subprocess.run(
-        [sys.executable, "-c", PROBE, *words.split()], cwd=folder, capture_output=True, text=True, check=True
-    )
+    process = run_python(folder, "-c", PROBE, *words.split(), check=True)
     return set(json.loads(process.stdout.splitlines()[-1]))
 
 
@@ -77,7 +74,7 @@ def test_the_report_of_a_task_imports_no_torch(task: str) -> None:
         "    importlib.import_module(module.name)",
         "print('torch' in sys.modules)",
     )
-    process = subprocess.run([sys.executable, "-c", "\n".join(lines)], capture_output=True, text=True, check=True)
+    process = run_python(Path(), "-c", "\n".join(lines), check=True)
     assert process.stdout == "False\n"
 
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import os
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from tacpipe.engine import processor, provenance
 from tacpipe.errors import UsageError
+from tests.conftest import run_python
 
 CPUINFO = """processor\t: 0
 model name\t: Zen 4
@@ -47,8 +47,7 @@ def test_threads_are_those_that_torch_and_blas_use(threads: int) -> None:
         "from tacpipe.engine import processor; before = processor.threads(); import torch;"
         "print(before, processor.threads())"
     )
-    environment = {**os.environ, "OMP_NUM_THREADS": str(threads)}
-    ran = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True)
+    ran = run_python(Path(), "-c", program, environment={"OMP_NUM_THREADS": str(threads)}, check=True)
     assert ran.stdout.split() == [str(threads)] * 2
 
 

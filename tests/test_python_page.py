@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
-from tests.conftest import tacpipe
+from tests.conftest import run_python, tacpipe
 from tests.test_docs import PYTHON, ROOT, fenced_blocks, printed_commands, section
 
 FIRST_COMMANDS = "From data to a report"  # section of the README
@@ -51,5 +49,5 @@ def test_the_python_of_the_page_runs_as_printed_and_predicts_what_the_command_wr
         process = tacpipe(tmp_path, command, OMP_NUM_THREADS="1")
         assert process.returncode == 0, f"{command}: {process.stderr}"
     code = "\n".join([*(block.text for block in fenced_blocks(PYTHON.read_text()) if not block.mark), CHECKS])
-    ran = subprocess.run([sys.executable, "-W", "error", "-c", code], cwd=tmp_path, capture_output=True, text=True)
+    ran = run_python(tmp_path, "-W", "error", "-c", code)
     assert ran.returncode == 0, ran.stderr

@@ -59,7 +59,9 @@ def trial(kind: str, scratch: Path, step: int = 1, seed: int = 0) -> PowerResult
             block_log.write(state, image)
         answers = look(kind, batch, disks, scratch, environment)
         results.states += len(answers)
-        results.wrong += [f"{kind}, after {answer['passed']}: {answer['wrong']}" for answer in answers if answer["wrong"]]
+        results.wrong += [
+            f"{kind}, after {answer['passed']}: {answer['wrong']}" for answer in answers if answer["wrong"]
+        ]
     count("losses of power replayed on blocks", results.states)
     return results
 
