@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import re
 import struct
 import termios
+import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from tacpipe.errors import DeviceError, UsageError
 from tacpipe.io.files import listed
@@ -25,6 +27,13 @@ EXTENDED = 1 << 31  # flag of an identifier with 29 bits
 SEND_S = 1.0
 INTERFACES = Path("/sys/class/net")
 IS_CAN = "280"  # ARPHRD_CAN of <linux/if_arp.h>
+DIGIT = "[0-9A-Fa-f]"
+SLCAN_FRAME = re.compile(
+    rf"(?P<kind>[tdb][0-7]{DIGIT}{{2}}|[TxDB][01]{DIGIT}{{7}})(?P<length>{DIGIT})(?P<data>(?:{DIGIT}{{2}})*)"
+)
+SLCAN_REPLY = re.compile(
+    rf"|[zZA]|F{DIGIT}{{2}}|[VvN]{DIGIT}{{4}}|(?:r[0-7]{DIGIT}{{2}}|R[01]{DIGIT}{{7}})[0-8]{DIGIT}*"
+)
 
 
 def open_can(place: str, sensor: Sensor, name: str) -> CanLink:
@@ -37,12 +46,59 @@ def open_can(place: str, sensor: Sensor, name: str) -> CanLink:
         import can
     if kind == "slcan":
         serial_port.refuse_missing(channel, name)
-    options: dict[str, Any] = {"bitrate": bitrate} if bitrate and kind == "slcan" else {}
+    damaged: Arrived = []
     try:
-        bus = can.Bus(interface=kind, channel=channel, ignore_config=True, **options)
+        if kind == "slcan":
+            bus = _open_slcan(channel, bitrate, damaged)
+        else:
+            bus = can.Bus(interface=kind, channel=channel, ignore_config=True)
     except (can.CanError, OSError, ValueError) as error:
         raise _open_error(error, kind, channel, bitrate, name) from error
-    return CanLink(name, bus)
+    return CanLink(name, bus, damaged)
+
+
+def _open_slcan(channel: str, bitrate: int | None, damaged: Arrived) -> can.BusABC:
+    """Return an open slcan adapter that puts damaged lines into ``damaged`` as (UTC in ns, bytes).
+
+    python-can itself raises an error for some of them, leaves some out, and takes some for shorter frames.
+    """
+    from can import CanOperationError
+    from can.interfaces.slcan import slcanBus
+
+    class CheckedBus(slcanBus):
+        def _read(self, timeout: float | None) -> str | None:
+            try:
+                line = super()._read(timeout)
+            except CanOperationError as error:
+                if not isinstance(error.__cause__, UnicodeDecodeError):
+                    raise
+                damaged.append((time.time_ns(), _odd_sized(error.__cause__.object)))
+                self._buffer.clear()
+                return None
+            if line and not is_slcan_line(line[:-1]):
+                damaged.append((time.time_ns(), _odd_sized(line.encode())))
+                return None
+            return line
+
+    return CheckedBus(channel, bitrate=bitrate)
+
+
+def is_slcan_line(line: str) -> bool:
+    """Return whether an adapter may send this line, given without its end.
+
+    >>> [is_slcan_line(line) for line in ("t1232AABB", "t1232AAB", "t1232AA", "z")]
+    [True, False, False, True]
+    """
+    frame = SLCAN_FRAME.fullmatch(line)
+    if frame is None:
+        return SLCAN_REPLY.fullmatch(line) is not None
+    length = int(frame["length"], 16)
+    return (length <= 8 or frame["kind"][0] in "dDbB") and len(frame["data"]) >= 2 * min(length, 8)
+
+
+def _odd_sized(line: bytes) -> bytes:
+    """Return a damaged line with a size that is not one of CAN frames."""
+    return line if len(line) % FRAME.size else line[:-1]
 
 
 def parse_place(place: str) -> tuple[str, str, int | None]:
@@ -90,9 +146,10 @@ class CanLink(Opened):
 
     packets = True
 
-    def __init__(self, name: str, bus: can.BusABC) -> None:
+    def __init__(self, name: str, bus: can.BusABC, damaged: Arrived) -> None:
         super().__init__(name)
         self.bus = bus
+        self._damaged = damaged  # lines of the bus that are no frame; a framer counts them as lost bytes
         self._arrivals = Arrivals()
 
     def _receive(self, timeout_s: float) -> Arrived:
@@ -102,14 +159,23 @@ class CanLink(Opened):
         try:
             message = self.bus.recv(timeout_s)
             while message is not None:
+                entries += self._damaged_lines()
                 if not message.is_error_frame and not message.is_remote_frame and len(message.data) <= 8:
                     self._arrivals.look()
                     entries.append((self._arrivals.to_monotonic(int(message.timestamp * 1e9)), pack_frame(message)))
                 message = self.bus.recv(0)
+            entries += self._damaged_lines()
         except (can.CanError, OSError, ValueError) as error:
             if not entries:
                 raise self.lost(str(error)) from error
         return entries
+
+    def _damaged_lines(self) -> Arrived:
+        """Return the damaged lines since the last call."""
+        lines, self._damaged[:] = list(self._damaged), []
+        if lines:
+            self._arrivals.look()
+        return [(self._arrivals.to_monotonic(utc_ns), line) for utc_ns, line in lines]
 
     def _send(self, data: bytes) -> None:
         import can

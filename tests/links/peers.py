@@ -36,6 +36,7 @@ class Peer:
     heard: Callable[[int], bytes]  # the next so many bytes that the link wrote
     leave: Callable[[], None]  # go away, as an unplugged device does
     packets: bool = True
+    send_raw: Callable[[bytes], None] | None = None  # write bytes to the line as they are
     stack: ExitStack = field(default_factory=ExitStack)
 
     def came(self, count: int) -> list[tuple[int, bytes]]:
@@ -192,7 +193,9 @@ def can_slcan(monkeypatch: pytest.MonkeyPatch) -> Iterator[Peer]:
             _whole(master, f"t{message.arbitration_id:03X}{len(message.data)}{payload}\r".encode())
 
     with ends:
-        yield Peer(link, send, lambda count: _slcan_frame(master), ends.close)
+        yield Peer(
+            link, send, lambda count: _slcan_frame(master), ends.close, send_raw=lambda data: _whole(master, data)
+        )
         link.close()
 
 

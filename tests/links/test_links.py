@@ -19,6 +19,8 @@ from websockets.exceptions import ConnectionClosedOK
 from tacpipe.links.can import CanLink
 from tacpipe.links.link import LinkLostError
 from tacpipe.links.websocket import WebsocketLink
+from tacpipe.sensors.framing import Chunks
+from tacpipe.sensors.icub_skin import IcubSkin
 from tests.links import peers
 from tests.links.peers import Peer
 
@@ -123,6 +125,53 @@ def test_an_adapter_that_is_gone_can_still_be_closed(error: Exception, monkeypat
         monkeypatch.undo()
         with contextlib.suppress(CanError):
             bus.shutdown()
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        b"t12\r",
+        b"t123\r",
+        b"t1238AABB\r",
+        b"t1232AAXB\r",
+        b"t1232AAB\r",
+        b"t1239AABBCCDDEEFF001122\r",
+        b"q1232AABB\r",
+        b"t12\xff2AABB\r",
+        b"T0000012\r",
+        b"t1238AABBCCD\r",
+        b"\xff\x80\x07",
+    ],
+)
+def test_a_damaged_line_of_an_slcan_adapter_costs_the_bytes_of_that_line_only(
+    line: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with peers.can_slcan(monkeypatch) as peer:
+        assert peer.send_raw is not None
+        peer.send(FRAMES[0])
+        peer.send_raw(line)
+        peer.send(FRAMES[1])
+        size = len(line) - (len(line) % 13 == 0)
+        entries = peer.came(2 * 13 + size)
+
+    assert [data for _, data in entries] == [FRAMES[0], line[:size], FRAMES[1]]
+    stamps = [t_ns for t_ns, _ in entries]
+    assert stamps == sorted(stamps)
+    framer = IcubSkin().framer()
+    framer.feed(Chunks.of(entries))
+    assert (framer.account.framed, framer.account.lost) == (2 * 13, size)
+
+
+@pytest.mark.parametrize("reply", [b"\r", b"\a", b"z\r", b"Z\r", b"F00\r", b"V1013\r", b"r1232\r", b"t1232AABB1F40\r"])
+def test_replies_and_time_stamps_of_an_slcan_adapter_are_not_damage(
+    reply: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with peers.can_slcan(monkeypatch) as peer:
+        assert peer.send_raw is not None
+        peer.send_raw(reply)
+        peer.send(FRAMES[1])
+        count = 2 if reply.startswith(b"t") else 1
+        assert {len(data) for _, data in peer.came(13 * count)} == {13}
 
 
 @pytest.mark.parametrize("data", [b"text", b"\xff\x00"])
