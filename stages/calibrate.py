@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from tacpipe.datasets.dataset import Dataset, Model
     from tacpipe.plugins.stage import Result
 
-LEVELS = CommaList(PositiveInt, least=1)
+LEVELS = CommaList(PositiveInt, min_items=1)
 
 
 @dataclass(frozen=True)

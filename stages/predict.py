@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from tacpipe.plugins.stage import Result
     from tacpipe.tasks.task import Task
 
-STEPS = CommaList(PositiveInt, least=1)
+STEPS = CommaList(PositiveInt, min_items=1)
 
 
 @dataclass(frozen=True)

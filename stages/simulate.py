@@ -19,7 +19,9 @@ from tacpipe.plugins.constraints import (
 )
 from tacpipe.plugins.stage import RecordingOutput, Trial, stage
 
-Families = Annotated[str, CommaList(Literal["all", "box", "cylinder", "sphere", "ellipsoid", "cone", "bow"], least=1)]
+Families = Annotated[
+    str, CommaList(Literal["all", "box", "cylinder", "sphere", "ellipsoid", "cone", "bow"], min_items=1)
+]
 
 
 @dataclass(frozen=True)

@@ -176,7 +176,7 @@ def load(path: str | PathLike[str]) -> Any:
     from tacpipe.plugins import extras
 
     model = open(path)
-    with extras.named("A model"):
+    with extras.explain_missing("A model"):
         from tacpipe.tasks.opened import Chain
 
         return model_files.task(model.files, str(path)).load(model.files, Chain(model))

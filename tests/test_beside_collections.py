@@ -61,7 +61,7 @@ def test_what_a_collection_removed_since_it_was_listed_is_not_damaged(
 def test_what_a_collection_has_moved_aside_is_sound(littered: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
     store = littered.store
     path = next(layout.entries(store.root, "objects"))
-    between(monkeypatch, "objects", lambda: path.rename(store.aside(path.name)))
+    between(monkeypatch, "objects", lambda: path.rename(store.aside_path(path.name)))
     assert repair.verify(store).clean
 
 

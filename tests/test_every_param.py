@@ -93,8 +93,8 @@ def values_outside(annotation: Any) -> Iterator[Any]:
     is_integer = fields.bare(annotation) is int
     for constraint in fields.constraints(annotation):
         if isinstance(constraint, Range):
-            yield from () if constraint.least is None else (constraint.least - (1 if is_integer else 0.001),)
-            yield from () if constraint.most is None else (constraint.most + (1 if is_integer else 0.001),)
+            yield from () if constraint.minimum is None else (constraint.minimum - (1 if is_integer else 0.001),)
+            yield from () if constraint.maximum is None else (constraint.maximum + (1 if is_integer else 0.001),)
             yield from () if constraint.above is None else (constraint.above,)
             yield from () if constraint.below is None else (constraint.below,)
             yield from () if is_integer else (math.nan, math.inf)
@@ -127,7 +127,7 @@ def test_every_param_is_a_choice_a_range_a_list_a_truth_or_free_for_a_reason() -
         if fields.bare(annotation) is not bool
         and get_origin(fields.bare(annotation)) is not Literal
         and not any(
-            not (isinstance(constraint, CommaList) and constraint.of is str)
+            not (isinstance(constraint, CommaList) and constraint.item_type is str)
             for constraint in fields.constraints(annotation)
         )
     }
@@ -154,7 +154,9 @@ def test_a_number_out_of_its_range_ends_with_code_2_before_anything_is_read(
         ran = call(command(name, {**tag_option(name, kind), field: value}))
         assert (ran.code, ran.out) == (2, ""), ran
         flag = f"--{field.replace('_', '-')}"
-        assert ran.err == f"tacpipe: {flag} is {fields.shown(value)}; it must be {fields.describe(RANGED[key])}.\n"
+        assert (
+            ran.err == f"tacpipe: {flag} is {fields.format_value(value)}; it must be {fields.describe(RANGED[key])}.\n"
+        )
         with pytest.raises(UsageError, match=f"{field} is "):
             given_params.build(
                 name, stage, sets=[*(f"{k}={v}" for k, v in tag_option(name, kind).items()), f"{field}={value}"]
@@ -169,7 +171,9 @@ def test_a_number_out_of_its_range_ends_with_code_2_before_anything_is_read(
 def test_the_ends_of_a_range_belong_to_it_or_not_as_it_says(key: tuple[str, Any, str]) -> None:
     for constraint in fields.constraints(RANGED[key]):
         if isinstance(constraint, Range):
-            assert all(fields.fits(end, RANGED[key]) for end in (constraint.least, constraint.most) if end is not None)
+            assert all(
+                fields.fits(end, RANGED[key]) for end in (constraint.minimum, constraint.maximum) if end is not None
+            )
             assert not any(
                 fields.fits(end, RANGED[key]) for end in (constraint.above, constraint.below) if end is not None
             )
@@ -269,9 +273,9 @@ def test_choices_are_those_that_the_code_behind_them_knows(name: str, field: str
 
 def test_lists_and_limits_are_those_that_the_code_behind_them_knows() -> None:
     families = fields.constraints(params_of.fields(registry.load("simulate.touch"))["families"])[0]
-    assert isinstance(families, CommaList) and set(get_args(families.of)) == {"all", *FAMILIES}
+    assert isinstance(families, CommaList) and set(get_args(families.item_type)) == {"all", *FAMILIES}
     search = fields.constraints(params_of.fields(registry.load("compress.autoencoder"))["search"])[0]
-    assert isinstance(search, Range) and search.most == MOST
+    assert isinstance(search, Range) and search.maximum == MOST
 
 
 UNITS = {  # the end of a name and the unit that help must show
@@ -485,7 +489,7 @@ class Hard:
     way: Literal["hard"] = "hard"
     trials: PositiveInt = 1
     # newton; what it takes
-    force_n: Annotated[float, Range(above=0, most=5)] = 1.0
+    force_n: Annotated[float, Range(above=0, maximum=5)] = 1.0
     PRESETS: ClassVar[dict[str, dict[str, object]]] = {"strong": {"force_n": 5.0}}
 
 

@@ -324,15 +324,15 @@ def test_modules_belong_to_the_extra_whose_package_brings_them(tmp_path: Path, m
     }
     extra_by_module |= {"obstore": "bucket", "websockets": "devices", "rerun": "view", "rerun_cli": "view"}
 
-    assert {module: extras.of(module) for module in extra_by_module} == extra_by_module
-    assert extras.of("numpy") is None and extras.of("nobody") is None
+    assert {module: extras.extra_for(module) for module in extra_by_module} == extra_by_module
+    assert extras.extra_for("numpy") is None and extras.extra_for("nobody") is None
     install_from_url(tmp_path, monkeypatch, None)
-    assert (extras.of("sklearn"), extras.of("scipy")) == ("learn", "dev")
+    assert (extras.extra_for("sklearn"), extras.extra_for("scipy")) == ("learn", "dev")
 
 
 def test_a_mistake_of_our_own_is_no_missing_extra() -> None:
     for statement in ("import tacpipe.nothing", "from torch import nothing_of_this_name", "import numpy.nothing"):
-        with pytest.raises(ImportError) as raised, extras.named("This"):
+        with pytest.raises(ImportError) as raised, extras.explain_missing("This"):
             exec(statement)
         assert not isinstance(raised.value, MissingModuleError)
 

@@ -164,14 +164,14 @@ def opening(store: Store, folder: Path) -> dict[str, Callable[[], Any]]:
         "records.naming": lambda: list(records.naming(store, name, 0)),
         "roots.all": lambda: store.roots.all(),
         "roots.get": lambda: store.roots.get(folder / "data/s"),
-        "projects.known": lambda: projects.known(store, folder),
+        "projects.known": lambda: projects.identity_of(store, folder),
         "layout.check": lambda: layout.check(store.root),
         "checkout.known": lambda: checkout.known(store),
         "garbage.live": lambda: garbage.live(store),
         "pushed.lasting": lambda: pushed.lasting(store, root["manifest"]),
         "unnamed.kept": lambda: unnamed.kept(store, objects, ()),
         "manifest.find": lambda: manifest.find(folder / "data/s"),
-        "adoption.beside": lambda: adoption.beside("ab" * 32, "manifest.json", (str(folder / "data/s"),)),
+        "adoption.beside": lambda: adoption.verified_copy("ab" * 32, "manifest.json", (str(folder / "data/s"),)),
         "leases.runs": lambda: store.leases.runs(),
     }
 
@@ -220,7 +220,7 @@ def test_a_mark_that_cannot_be_looked_at_chooses_no_other_store(full: Lab, numbe
 def test_an_object_that_is_aside_and_cannot_be_put_back_is_not_gone(full: Lab, number: int) -> None:
     store = full.store
     path = next(store.root.glob("objects/*/*"))
-    path.rename(store.aside(path.name))
+    path.rename(store.aside_path(path.name))
     with failing(number, lambda opened: "/tmp/gc-" in opened, ("rename",)), pytest.raises(StorageError):
         store.has(path.name)
     assert store.has(path.name)

@@ -124,7 +124,7 @@ def test_what_a_killed_collection_had_moved_aside_is_found_and_put_back(lab: Lab
     store = lab.store
     names = [name for _, name in lab.manifest("data/r").objects()]
     for name in names:
-        Path(store.object_path(name)).rename(store.aside(name))
+        Path(store.object_path(name)).rename(store.aside_path(name))
     assert store.read(names[0]) and store.has(names[1])
     age(lab)
     collect_garbage(lab)

@@ -273,12 +273,12 @@ def test_a_file_is_not_written_through_a_link_within_a_store(tmp_path: Path) -> 
     (store.root / "objects" / name[:2]).symlink_to(theirs)
     with pytest.raises(StorageError, match="symbolic link"):
         store.put(b"touch")
-    Path(store.aside(name)).write_bytes(b"touch")
-    assert not store.has(name) and Path(store.aside(name)).exists()  # it is not put back through the link either
+    Path(store.aside_path(name)).write_bytes(b"touch")
+    assert not store.has(name) and Path(store.aside_path(name)).exists()  # it is not put back through the link either
     (theirs / name).write_bytes(b"damaged")
     assert not store.quarantine(store.object_path(name)) and (theirs / name).exists()
     (store.root / "leases" / "gc.lock").symlink_to(theirs / name)
-    with pytest.raises(StorageError), store.leases.alone("gc"):
+    with pytest.raises(StorageError), store.leases.exclusive("gc"):
         pass
     assert (theirs / name).read_bytes() == b"damaged"
 

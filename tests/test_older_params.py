@@ -127,7 +127,7 @@ def test_a_renamed_param_is_stored_under_its_first_name_and_read_back(
     assert {key: values[key] for key in stored} == stored
     assert params_of.from_json(stage, values) == built
     assert {key: params_of.counting(stage, values)[key] for key in options} == options
-    assert {key: params_of.named(name, values)[key] for key in options} == options
+    assert {key: params_of.with_current_names(name, values)[key] for key in options} == options
     assert {key: params_of.to_input(built)[key] for key in options} == options
     with pytest.raises(UsageError):  # a former name is not an option
         build_params(name, **{**options, **stored})
@@ -142,7 +142,7 @@ def test_people_read_a_renamed_param_of_a_chain_by_its_name_of_today() -> None:
     assert opened._command(step) == "compress pca --components 3 --representation increments"
     renamed_step = {**step, "params": {**stored, "of": "levels"}}
     assert "representation" in chain_difference([step], [renamed_step])
-    assert params_of.named("no.such.stage", {"of": "levels"}) == {"of": "levels"}
+    assert params_of.with_current_names("no.such.stage", {"of": "levels"}) == {"of": "levels"}
 
 
 def test_a_method_that_was_renamed_is_shown_by_its_name_of_today() -> None:

@@ -15,7 +15,7 @@ from tacpipe.datasets.manifest import Manifest
 from tacpipe.engine import processor, provenance
 from tacpipe.io.hashing import digest, file_digest
 from tacpipe.io.parquet import to_parquet
-from tacpipe.store.records import named
+from tacpipe.store.records import digests
 from tests.conftest import Lab, write_source
 
 
@@ -237,7 +237,7 @@ def test_a_dataset_copied_without_its_store_opens_and_is_adopted(lab: Lab, monke
     monkeypatch.setenv("TACPIPE_STORE", str(lab.folder / "other"))
     lab.run("scale data/r -o data/s")
     lab.run("store verify")
-    names = set(named({"recordings": lab.manifest("data/r").recordings, "files": {}}))
+    names = set(digests({"recordings": lab.manifest("data/r").recordings, "files": {}}))
     assert any((lab.folder / "other" / "objects" / name[:2] / name).exists() for name in names)
 
 

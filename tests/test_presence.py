@@ -234,7 +234,7 @@ def test_where_folders_changed_a_moment_ago_their_names_are_looked_at_and_their_
     monkeypatch.setattr(presence, "SETTLED_NS", 2 * DAY_NS)
     lab.run("simulate toy --trials 2 --rows 3 -o data/r")
     lab.run(SCALE)
-    note = notes.known(lab.store, lab.folder / "data/s")
+    note = notes.read(lab.store, lab.folder / "data/s")
     assert note is not None and note.head.directory is None
     assert {state for state, *_ in note.shelves.values()} == {None}
     shows.clear()

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from tacpipe.datasets import manifest, pages
-from tacpipe.engine.previous import Previous, Taken
+from tacpipe.engine.previous import Previous, Reusable
 from tacpipe.errors import DAMAGED
 from tacpipe.io.hashing import file_digest
 from tacpipe.store import presence
@@ -32,14 +32,14 @@ NOTES = ("a", 'say ": this', "é", "\\", "a\nb")
 def reused_counts(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
     """How many results each command took over; all datasets are large, a group has two recordings in the mean."""
     counts: list[int] = []
-    take = Previous.taken
+    take = Previous.reusable
 
-    def taking(self: Previous, *arguments: Any) -> Taken | None:
+    def taking(self: Previous, *arguments: Any) -> Reusable | None:
         previous_results = take(self, *arguments)
         counts.append(0 if previous_results is None else previous_results.count)
         return previous_results
 
-    monkeypatch.setattr(Previous, "taken", taking)
+    monkeypatch.setattr(Previous, "reusable", taking)
     monkeypatch.setattr(pages, "INLINE", 1)
     monkeypatch.setattr(pages, "GROUPED", 2)
     monkeypatch.setattr(manifest, "_parsed", {})

@@ -30,14 +30,14 @@ def test_the_first_core_says_model_and_instructions(tmp_path: Path, monkeypatch:
     (tmp_path / "cpuinfo").write_text(CPUINFO)
     monkeypatch.setattr(processor, "_CPUINFO", tmp_path / "cpuinfo")
     monkeypatch.setenv("OPENBLAS_CORETYPE", "Haswell")
-    described = processor.here()
+    described = processor.describe()
     assert described["model"] == "Zen 4" and described["instructions"] == ["avx", "avx2", "fma", "avx512f"]
     assert described["chosen"] == {"OPENBLAS_CORETYPE": "Haswell"}
 
 
 def test_without_a_list_of_cores_the_machine_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(processor, "_CPUINFO", tmp_path / "none")
-    assert processor.here()["model"] and processor.here()["instructions"] == []
+    assert processor.describe()["model"] and processor.describe()["instructions"] == []
 
 
 @pytest.mark.long
@@ -52,8 +52,8 @@ def test_threads_are_those_that_torch_and_blas_use(threads: int) -> None:
 
 
 def test_computers_differ_in_processor_threads_device_and_libraries() -> None:
-    stored = provenance.of(1.0)
-    assert provenance.unlike(stored, provenance.of(2.0)) == []
+    stored = provenance.describe(1.0)
+    assert provenance.unlike(stored, provenance.describe(2.0)) == []
     other_computer = {
         **stored,
         "device": "cuda",
@@ -69,13 +69,13 @@ def test_a_git_that_does_not_answer_leaves_the_commit_out(monkeypatch: pytest.Mo
         raise subprocess.TimeoutExpired("git", 5)
 
     monkeypatch.setattr(subprocess, "run", hangs)
-    provenance._here.cache_clear()
-    assert provenance.of(0.0)["git_commit"] is None
-    provenance._here.cache_clear()
+    provenance._environment.cache_clear()
+    assert provenance.describe(0.0)["git_commit"] is None
+    provenance._environment.cache_clear()
 
 
 def test_a_record_that_does_not_say_is_unlike_nothing() -> None:
-    assert provenance.unlike({"threads": 2}, provenance.of(0.0)) == []
+    assert provenance.unlike({"threads": 2}, provenance.describe(0.0)) == []
 
 
 def test_each_of_several_processes_gets_its_part_of_the_cores_unless_the_environment_states_threads(

@@ -171,7 +171,7 @@ def _explain(program: typer.Typer) -> None:
     def explain(dataset: Annotated[Path, typer.Argument(help="A dataset or report.")], as_json: AsJson = False) -> None:
         from tacpipe.datasets import lineage
 
-        _print(lineage.of(dataset), lineage.to_text, as_json=as_json)
+        _print(lineage.trace(dataset), lineage.to_text, as_json=as_json)
 
 
 def _demo(program: typer.Typer) -> None:

@@ -30,7 +30,7 @@ def read(content: bytes) -> list[Headline]:
 
 def method(task: object, stored: object) -> str:
     """Return today's name of a method of a task, an architecture that may have been renamed since it was stored."""
-    return str(params_of.named(f"train.{task}", {"architecture": stored})["architecture"])
+    return str(params_of.with_current_names(f"train.{task}", {"architecture": stored})["architecture"])
 
 
 def table(headlines: Sequence[Headline]) -> Table:

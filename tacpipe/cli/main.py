@@ -152,7 +152,7 @@ def _call(arguments: Sequence[str]) -> tuple[int, str]:
     addresses.refuse(program)
     plain_help.apply(program, brief="-h" in arguments)
     try:
-        with extras.named("This command"):
+        with extras.explain_missing("This command"):
             code = typer.main.get_command(program).main(arguments, prog_name="tacpipe", standalone_mode=False)
     except typer.Abort:
         return FAILED, ""

@@ -44,7 +44,7 @@ def of_model(opened: Dataset, store: Store) -> dict[str, Any]:
         "parameters": config.get("parameters") or _parameters(opened),
         "epochs": len(history) or None,
         "validation": config.get("validation") or _best(history),
-        "params": params_of.named(opened.source.stage, config.get("params", opened.source.params)),
+        "params": params_of.with_current_names(opened.source.stage, config.get("params", opened.source.params)),
         "inputs": _inputs(opened.source.inputs, store),
         "chain": [f"{step['stage']} {step['version']}" for step in opened.source.chain],
     }
@@ -64,7 +64,7 @@ def of_result(opened: Dataset, found: Found, store: Store) -> dict[str, Any]:
         "fold": identity.get("fold"),
         "role": (identity.get("role") or "test") if "split" in opened.source.inputs else None,
         "trained_on": _learned(config)["trained_on"],
-        "params": params_of.named(f"train.{config.get('task')}", config.get("params", {})),
+        "params": params_of.with_current_names(f"train.{config.get('task')}", config.get("params", {})),
         "inputs": _inputs(opened.source.inputs, store),
     }
 

@@ -52,7 +52,7 @@ def of(path: Path, *, most: int | None = None) -> dict[str, Any]:
         return {
             "kind": "split",
             **about,
-            "params": params_of.named(opened.source.stage, opened.source.params),
+            "params": params_of.with_current_names(opened.source.stage, opened.source.params),
             "folds": folds,
         }
     return {

@@ -157,7 +157,7 @@ def _estimate(requests: Sequence[Request]) -> None:
     """Print how long the models that are missing take, as far as it can be known before."""
     from tacpipe.engine import estimate
 
-    sentence = estimate.of(requests, requests[0].jobs)
+    sentence = estimate.estimate_duration(requests, requests[0].jobs)
     if sentence is not None:
         terminal.note(f"tacpipe: {sentence}")
 

@@ -70,7 +70,7 @@ def view(
         )
     if len(shown) < len(chosen):
         terminal.note(f"{len(shown)} of {len(chosen)} recordings; --limit {len(chosen)} shows all.")
-    with tempfile.TemporaryDirectory(prefix="tacpipe-view-") as folder, extras.named("tacpipe view"):
+    with tempfile.TemporaryDirectory(prefix="tacpipe-view-") as folder, extras.explain_missing("tacpipe view"):
         from tacpipe.viewer import session
 
         drawn = _drawn(shown, _predictions(predictions))

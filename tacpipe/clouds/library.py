@@ -12,7 +12,7 @@ from tacpipe.plugins import extras
 @contextmanager
 def open3d() -> Iterator[Any]:
     """Yield the module open3d; within, it prints nothing but errors. Raises `MissingModuleError` without it."""
-    with extras.named("A cloud of points"):
+    with extras.explain_missing("A cloud of points"):
         import open3d as module
     with module.utility.VerbosityContextManager(module.utility.VerbosityLevel.Error):
         yield module

@@ -29,7 +29,7 @@ def draw(cloud: Cloud, found: Sequence[Candidate], path: Path) -> None:
     The ending states the format: .pdf, .png or .svg. Raises `TacpipeError` if matplotlib is not installed or the file
     cannot be written.
     """
-    with extras.named("A picture"):
+    with extras.explain_missing("A picture"):
         import matplotlib
         from matplotlib.figure import Figure
 

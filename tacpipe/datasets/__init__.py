@@ -1,1 +1,1 @@
-"""What a user opens: datasets, their manifests, labels, splits and lineage."""
+"""Open datasets: recordings, manifests, labels, splits and lineage."""

@@ -10,7 +10,7 @@ from tacpipe.io.files import unread
 from tacpipe.io.hashing import bytes_digest
 
 
-def beside(name: str, path: str, directories: tuple[str, ...], size: int | None = None) -> bytes | None:
+def verified_copy(name: str, path: str, directories: tuple[str, ...], size: int | None = None) -> bytes | None:
     """Return the object ``name`` from ``path`` in one of the dataset directories, verified; None if none has it.
 
     It may be a link, as DVC and git-annex make them: its digest is what counts. ``size`` is what its manifest declares.

@@ -50,20 +50,20 @@ class Arrays:
 
         Raises `UsageError` where no common type holds every value: an integer beyond 2^53 next to a float.
         """
-        found = {name: self.by_column[name] for name in self.columns}
-        kinds: list[Any] = [array.dtype for array in found.values()]
-        if any(np.ma.isMaskedArray(array) for array in found.values()):
+        channels = {name: self.by_column[name] for name in self.columns}
+        kinds: list[Any] = [array.dtype for array in channels.values()]
+        if any(np.ma.isMaskedArray(array) for array in channels.values()):
             kinds.append(np.float32)
         common = np.result_type(*kinds) if kinds else np.dtype(np.float64)
         rows = max(map(len, self.by_column.values()), default=0)
-        values = np.empty((rows, len(found)), common)  # (time, channel)
-        for index, (name, array) in enumerate(found.items()):
+        values = np.empty((rows, len(channels)), common)  # (time, channel)
+        for index, (name, array) in enumerate(channels.items()):
             if common.kind == "f" and array.dtype.kind in "iu" and _beyond(array):
                 raise UsageError(
                     f"The channel {name} ({array.dtype}) holds integers beyond 2^53, which {common} would round, so "
                     f"there is no one matrix of these channels. Read it alone: arrays[{name!r}] has its own type."
                 )
-            with np.errstate(invalid="ignore"):  # of a signalling NaN, which is NaN in any type
+            with np.errstate(invalid="ignore"):  # A signalling NaN is NaN in any type
                 values[:, index] = np.ma.getdata(array)
             if np.ma.isMaskedArray(array):
                 values[np.ma.getmaskarray(array), index] = np.nan
@@ -127,5 +127,5 @@ def _array(column: pa.ChunkedArray) -> AnyArray:
 
 
 def _beyond(array: AnyArray) -> bool:
-    held = np.ma.getdata(array)
-    return held.dtype.itemsize == 8 and bool(((held > EXACT) | (held < -EXACT)).any())
+    values = np.ma.getdata(array)
+    return values.dtype.itemsize == 8 and bool(((values > EXACT) | (values < -EXACT)).any())

@@ -143,16 +143,17 @@ class Recording:
         file: Path | None = large_file and large_file(name, path, LARGE_BYTES)
         return file or self._read(name, path)
 
-    def _without(self, stream: str, within: Sequence[str]) -> UsageError:
-        if self.streams == ("",) and not within:
+    def _without(self, stream: str, columns_of_streams: Sequence[str]) -> UsageError:
+        if self.streams == ("",) and not columns_of_streams:
             return UsageError(f"Recording {self.name} has no stream {stream!r}; it is one table.")
-        there = ", ".join(map(repr, within or self.streams))
-        if not stream and not within:
+        existing = ", ".join(map(repr, columns_of_streams or self.streams))
+        if not stream and not columns_of_streams:
             return UsageError(
-                f"Recording {self.name} has the streams {there} and is not one table yet. Run `tacpipe synchronize` on it "
+                f"Recording {self.name} has the streams {existing} and is not one table yet. Run `tacpipe "
+                f"synchronize` on it "
                 f"first, or name a stream."
             )
-        return UsageError(f"Recording {self.name} has no stream {stream!r}; it has {there}.")
+        return UsageError(f"Recording {self.name} has no stream {stream!r}; it has {existing}.")
 
 
 class LazyFiles(Mapping[str, bytes]):
@@ -189,7 +190,7 @@ class Dataset:
         opener: Callable[[Path | str], Dataset] | None = None,
     ) -> None:
         self.source = manifest
-        self.path = directory  # where it was opened; None for one that a stage was given
+        self.path = directory  # Its directory; None for the input of a stage
         self.recordings: Mapping[str, Recording] = _Recordings(self, manifest.included, read, names)
         self.files: Mapping[str, bytes] = LazyFiles(manifest.files, read)
         self._read, self._opener = read, opener
@@ -204,7 +205,7 @@ class Dataset:
         """Return the recording of this name. Raises `UsageError` where there is none."""
         if name not in self.recordings:
             raise UsageError(
-                f"There is no recording {name!r} in {self._where}; it has {listed(self.recordings, _NAMED)}."
+                f"There is no recording {name!r} in {self._place}; it has {listed(self.recordings, _NAMED)}."
                 f"{suggestion(name, self.recordings)}"
             )
         return self.recordings[name]
@@ -229,7 +230,7 @@ class Dataset:
         return overview.html(self)
 
     @property
-    def _where(self) -> str:
+    def _place(self) -> str:
         return "this dataset" if self.path is None else str(self.path)
 
     @property
@@ -253,9 +254,9 @@ class Dataset:
         role: Literal["train", "val", "calibration", "test"] | str | None = None,
         fold: int = 0,
         labels: Mapping[str, Wanted] | None = None,
-        **more: Wanted,
+        **conditions: Wanted,
     ) -> Dataset:
-        """Return the dataset with those recordings alone that meet every condition; nothing is read but the split.
+        """Return the dataset with only the recordings that meet every condition; only the split is read.
 
         ``names`` are names or patterns (``"trial-00?"``), of which one must match. ``split`` and ``role`` choose by the
         role in ``fold`` of a split, or, without ``role``, all recordings that have one. Each further keyword is a label: its
@@ -268,7 +269,7 @@ class Dataset:
 
         opened = self._open(split) if isinstance(split, str | Path) else split
         roles = selection.roles_of(opened, role, fold)
-        return self.only(selection.chosen(self, names, roles, role, {**(labels or {}), **more}))
+        return self.only(selection.chosen(self, names, roles, role, {**(labels or {}), **conditions}))
 
     def _open(self, path: Path | str) -> Dataset:
         if self._opener is None:
@@ -307,7 +308,7 @@ class Dataset:
         name = self._only_stream() if stream is None else stream
         if not self.recordings:
             raise TacpipeError("This dataset has no recordings to read; `tacpipe show` lists what it holds.")
-        tables = {one.name: one.table(name, columns) for one in self}
+        tables = {recording.name: recording.table(name, columns) for recording in self}
         if labels is not False:
             from tacpipe.datasets import frames
 
@@ -340,12 +341,12 @@ class Dataset:
         labels: bool | Sequence[str] = False,
     ) -> pl.DataFrame:
         """Return all recordings in one polars frame; arguments are those of `table`."""
-        with extras.named("to_polars"):
+        with extras.explain_missing("to_polars"):
             import polars as pl
 
-            found = pl.from_arrow(self.table(stream, columns, labels=labels))
-        assert isinstance(found, pl.DataFrame)
-        return found
+            frame = pl.from_arrow(self.table(stream, columns, labels=labels))
+        assert isinstance(frame, pl.DataFrame)
+        return frame
 
     def duckdb(self) -> duckdb.DuckDBPyConnection:
         """Return a DuckDB connection, in memory, that has a view a stream, named as it, and a view ``labels``.
@@ -355,7 +356,7 @@ class Dataset:
         """
         from tacpipe.datasets import frames
 
-        with extras.named("duckdb"):
+        with extras.explain_missing("duckdb"):
             return frames.connected(self)
 
     def windows(
@@ -382,7 +383,7 @@ class Dataset:
         recording. ``scale`` subtracts each channel's mean and divides by its standard deviation: of these windows (True), or
         of other ones, such as those to train on.
         """
-        with extras.named("windows"):
+        with extras.explain_missing("windows"):
             from tacpipe.datasets.windows import Windows
 
         return Windows(
@@ -410,9 +411,9 @@ class Dataset:
         name = self._only_stream() if stream is None else stream
         order = columns and [*dict.fromkeys(columns)]
         return {
-            one.name: arrays.of_table(table if order is None else table.select(order))
-            for one in self
-            for table in [one.table(name, order)]
+            recording.name: arrays.of_table(table if order is None else table.select(order))
+            for recording in self
+            for table in [recording.table(name, order)]
         }
 
     def to_torch(self, stream: str | None = None, columns: Sequence[str] | None = None) -> dict[str, Tensors]:
@@ -422,11 +423,14 @@ class Dataset:
         """
         from tacpipe.datasets import arrays
 
-        with extras.named("to_torch"):
-            return {name: arrays.to_tensors(found) for name, found in self.to_numpy(stream, columns).items()}
+        with extras.explain_missing("to_torch"):
+            return {
+                name: arrays.to_tensors(recording_arrays)
+                for name, recording_arrays in self.to_numpy(stream, columns).items()
+            }
 
     def _only_stream(self) -> str:
-        streams = {stream for one in self for stream in one.streams}
+        streams = {stream for recording in self for stream in recording.streams}
         if len(streams) > 1:
             raise UsageError(f"Name the stream to read: the recordings have {', '.join(sorted(streams))}.")
         return next(iter(streams), "")
@@ -471,5 +475,5 @@ def _reopened(
     return Dataset(manifest, read, names, directory=directory, opener=opener)
 
 
-Model = Dataset  # whose files hold weights and configuration
+Model = Dataset  # A dataset whose files hold weights and configuration
 Datasets = tuple[Dataset, ...]

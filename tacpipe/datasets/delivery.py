@@ -15,21 +15,21 @@ from tacpipe.store.store import MissingError, Store
 
 
 def deliver(store: Store, directory: Path, manifest: Manifest, *, lasting: bool = False) -> None:
-    """Have the bucket behind a store keep what ``directory`` (or one file) is about to show; nothing for a folder.
+    """Upload the dataset that ``directory`` (or one file) is about to show, if the store has a bucket.
 
-    Recordings cannot be recomputed, so they are kept here even if the bucket cannot be reached, and a note reports that.
-    Raises `StorageError` for what is computed from others. Call it before the root of the directory is set.
+    Recordings cannot be recomputed, so they are kept locally if the bucket cannot be reached, and a note reports that.
+    For computed datasets `StorageError` is raised. Call this before the root of the directory is set.
     """
     if not store.distant:
         return
     from tacpipe.store.cached import CachedStore
 
     assert isinstance(store, CachedStore)
-    wanted = bytes_digest(manifest.content)
-    known = store.roots.get(directory)
+    manifest_digest = bytes_digest(manifest.content)
+    root = store.roots.get(directory)
 
     def needs(name: str) -> Mapping[str, int]:
-        if name == wanted:
+        if name == manifest_digest:
             return _needs(store, manifest)
         try:
             return _needs(store, parse(b"".join(store.read_here(name)), name, StoredPages(store), verified=True))
@@ -42,9 +42,9 @@ def deliver(store: Store, directory: Path, manifest: Manifest, *, lasting: bool 
         store.keep(
             path,
             {"id": owner.id, "name": owner.name},
-            wanted,
+            manifest_digest,
             needs,
-            before=known["manifest"] if known else "",
+            before=root["manifest"] if root else "",
             lasting=lasting,
         )
     except StorageError as error:
@@ -56,10 +56,10 @@ def deliver(store: Store, directory: Path, manifest: Manifest, *, lasting: bool 
 
 
 def _needs(store: Store, manifest: Manifest) -> dict[str, int]:
-    """Return name and bytes of what a dataset needs: shards, files, its manifest, and those that it was made from."""
-    found = dict(manifest.sizes()) | {bytes_digest(manifest.content): len(manifest.content)}
-    for given in (one["manifest"] for several in manifest.inputs.values() for one in several):
-        there = store.files.stat(f"objects/{given[:2]}/{given}")
-        if there is not None:
-            found[given] = there.bytes
-    return found
+    """Return the sizes of all objects of a dataset: shards, files, its manifest, and the manifests of its inputs."""
+    sizes = dict(manifest.sizes()) | {bytes_digest(manifest.content): len(manifest.content)}
+    for digest in (dataset["manifest"] for datasets in manifest.inputs.values() for dataset in datasets):
+        entry = store.files.stat(f"objects/{digest[:2]}/{digest}")
+        if entry is not None:
+            sizes[digest] = entry.bytes
+    return sizes

@@ -30,7 +30,7 @@ _OURS = re.compile(rf"\.(?P<name>.+)\.[0-9a-f]{{12}}{_DRAFT}|\.{re.escape(NAME)}
 
 @dataclass(frozen=True)
 class Change:
-    """What a directory is to show.
+    """Planned content of a directory.
 
     Shards at the paths ``may_lack`` stay as they are where they are damaged: a lost recording must not hinder the next one.
     Where a dataset was only ``relabelled`` nothing goes and no shard is looked at: a label costs what it changes. Where it
@@ -41,7 +41,7 @@ class Change:
     manifest: Manifest
     may_lack: Collection[str] = ()
     relabelled: bool = False
-    whole: bool = False
+    is_complete: bool = False
     replace: bool = False
     key: str = ""
 
@@ -62,19 +62,19 @@ def shows(store: Store, manifest: Manifest, directory: Path) -> bool:
 
 
 def showing(store: Store, manifest: Manifest, directory: Path) -> Literal["", "files", "links"]:
-    """Return how ``directory`` shows ``manifest``, with all that it names; empty where it does not.
+    """Return how ``directory`` shows ``manifest`` and all its files; empty if it does not.
 
-    With ``links`` all lies in the directory itself, as links to the objects of the store; else some is a copy, or within a
-    folder.
+    ``links``: all files are directly in the directory, as links to objects of the store. ``files``: some are copies or in
+    folders.
     """
     if not _current(directory, manifest):
         return ""
     linked = True
     for path, name in manifest.objects():
-        how = _matches(f"{directory}/{path}", store, name)
-        if not how:
+        match = _matches(f"{directory}/{path}", store, name)
+        if not match:
             return ""
-        linked = linked and how == "links" and "/" not in path
+        linked = linked and match == "links" and "/" not in path
     return "links" if linked else "files"
 
 
@@ -88,44 +88,42 @@ def change(store: Store, directory: Path, decide: Callable[[], Change]) -> Manif
     """
     directory = directory.absolute()
     with changing(store, directory):
-        wanted = decide()
-        if wanted.manifest.recorded:
-            wanted.manifest.keep(store, durable=True)
-        _show(store, wanted, directory)
-    return wanted.manifest
+        planned = decide()
+        if planned.manifest.recorded:
+            planned.manifest.keep(store, durable=True)
+        _show(store, planned, directory)
+    return planned.manifest
 
 
 @contextlib.contextmanager
 def changing(store: Store, directory: Path) -> Iterator[None]:
     """Change what ``directory`` shows while nobody else does, whoever reads its manifest first to change it included."""
     directory = directory.absolute()
-    with store.leases.hold(digest(["output", *store.roots.named(directory)]), f"the output {directory}"):
+    with store.leases.hold(digest(["output", *store.roots.kind_and_name(directory)]), f"the output {directory}"):
         yield
 
 
-def _show(store: Store, wanted: Change, directory: Path) -> None:
-    manifest, relabelled = wanted.manifest, wanted.relabelled
+def _show(store: Store, planned: Change, directory: Path) -> None:
+    manifest, relabelled = planned.manifest, planned.relabelled
     check_output(store, directory)
     current = _current(directory, manifest)
     stale: dict[str, str] = {}
-    gone: set[str] = set()
-    if current or (
-        manifest.exported and not relabelled
-    ):  # files of an export are large copies: those that are right stay
+    removed: set[str] = set()
+    if current or (manifest.exported and not relabelled):  # Files of an export are large copies: correct ones stay
         stale = dict(_stale(store, manifest, directory))
     if not current and relabelled:
-        stale, gone = _pages_compared(_shown(directory), manifest, directory)
-    elif not current:  # what was named already stays, so that a recording that comes costs itself
-        before = _shown(directory)
-        unlike, gone = _compared(before, manifest, directory, whole=wanted.whole)
-        if before is None:  # its pages have other names than those of the manifest that was there
-            gone |= _pages_compared(replacing.former(store, directory), manifest, directory)[1]
+        stale, removed = _pages_compared(_current_manifest(directory), manifest, directory)
+    elif not current:  # Existing files stay, so a new recording costs only itself
+        before = _current_manifest(directory)
+        unlike, removed = _compared(before, manifest, directory, is_complete=planned.is_complete)
+        if before is None:  # Its pages have other names than those of the former manifest
+            removed |= _pages_compared(replacing.former(store, directory), manifest, directory)[1]
         stale = stale if manifest.exported else unlike
-    refuse_links(directory, {*stale, *gone})
+    refuse_links(directory, {*stale, *removed})
     edited = []
-    if manifest.exported or wanted.replace:  # nothing else replaces an export
-        edited = _edited(store, manifest, directory, {*stale, *gone})
-    if edited and not wanted.replace:
+    if manifest.exported or planned.replace:  # nothing else replaces an export
+        edited = _edited(store, manifest, directory, {*stale, *removed})
+    if edited and not planned.replace:
         raise replacing.edited(directory, edited)
     with writing(directory):
         before = None if current else replacing.outgoing(store, directory)
@@ -136,14 +134,14 @@ def _show(store: Store, wanted: Change, directory: Path) -> None:
         if before is not None and lasting:
             _adopt(store, directory, before)
         deliver(store, directory, manifest, lasting=lasting)
-        key = (store.roots.get(directory) or {}).get("key", "") if relabelled else wanted.key
+        key = (store.roots.get(directory) or {}).get("key", "") if relabelled else planned.key
         store.roots.set(directory, manifest.content_digest, durable=True, lasting=lasting, key=key)
         store.fetch(stale.values())
         sweep(directory, shards=any("/" in path for path in stale), deep=manifest.exported)
         for path in stale:
-            with contextlib.suppress(*([MissingError] if path in wanted.may_lack else [])):
+            with contextlib.suppress(*([MissingError] if path in planned.may_lack else [])):
                 place(store, stale[path], directory / path, copy=manifest.copied)
-        _remove(directory, gone)
+        _remove(directory, removed)
         if not current:
             write_whole(str(directory / NAME), manifest.content, str(directory / f".{NAME}{_DRAFT}"))
         if manifest.recorded:
@@ -153,7 +151,7 @@ def _show(store: Store, wanted: Change, directory: Path) -> None:
 def _adopt(store: Store, directory: Path, manifest: Manifest) -> None:
     """Store what ``manifest`` names and lies in its directory alone, as after a copy of a dataset without its store."""
     for path, name, size in manifest.contents():
-        content = None if store.has(name) else adoption.beside(name, path, (str(directory),), size)
+        content = None if store.has(name) else adoption.verified_copy(name, path, (str(directory),), size)
         if content is not None:
             store.put(content, durable=True)
 
@@ -162,13 +160,13 @@ def edited_files(store: Store, manifest: Manifest, directory: Path) -> list[str]
     """Return the files in ``directory`` that were edited, and that making it show the export ``manifest`` would replace."""
     directory = directory.absolute()
     stale = dict(_stale(store, manifest, directory))
-    _, removed = _compared(_shown(directory), manifest, directory, whole=False)
+    _, removed = _compared(_current_manifest(directory), manifest, directory, is_complete=False)
     return _edited(store, manifest, directory, {*stale, *removed})
 
 
 def _edited(store: Store, manifest: Manifest, directory: Path, paths: Iterable[str]) -> list[str]:
     """Return the files of an export that hold neither what was written there last nor an object of the store."""
-    current = _shown(directory)
+    current = _current_manifest(directory)
     if not (current or manifest).exported:  # shards are links: what differs is damage
         return []
     digests_written = {} if current is None else {path: file["digest"] for path, file in current.files.items()}
@@ -184,7 +182,7 @@ def _keep_edited(store: Store, manifest: Manifest, directory: Path, paths: Itera
         with regular.opened(directory / path) as file:
             stored = store.put_written(lambda draft, file=file: shutil.copyfileobj(file, draft), durable=True)  # type: ignore[misc]
         files[path] = vars(stored)
-    before = _shown(directory) or manifest
+    before = _current_manifest(directory) or manifest
     edited = replace(before, files=dict(sorted({**before.files, **files}.items())))
     edited.keep(store, durable=True)
     store.roots.set(directory, edited.content_digest)
@@ -206,10 +204,10 @@ def sweep(directory: Path, *, shards: bool = True, deep: bool = False) -> None:
 
 
 def _folders(folder: Path) -> list[Path]:
-    """Return the folders in a folder, links left out; of a hundred thousand files none is looked at."""
+    """Return the folders in a folder without links; files are not opened, because there may be a hundred thousand."""
     try:
-        with os.scandir(folder) as found:
-            return sorted(folder / one.name for one in found if one.is_dir(follow_symlinks=False))
+        with os.scandir(folder) as entries:
+            return sorted(folder / entry.name for entry in entries if entry.is_dir(follow_symlinks=False))
     except (FileNotFoundError, NotADirectoryError):
         return []
 
@@ -248,40 +246,40 @@ def writing(path: Path) -> Iterator[None]:
 
 
 def _stale(store: Store, manifest: Manifest, directory: Path) -> Iterator[tuple[str, str]]:
-    """Yield path and digest of what ``directory`` does not hold as the store does."""
-    return (one for one in manifest.objects() if not _matches(f"{directory}/{one[0]}", store, one[1]))
+    """Yield path and digest of the objects that ``directory`` lacks or holds differently."""
+    return (item for item in manifest.objects() if not _matches(f"{directory}/{item[0]}", store, item[1]))
 
 
 def _compared(
-    shown: Manifest | None, manifest: Manifest, directory: Path, *, whole: bool
+    current: Manifest | None, manifest: Manifest, directory: Path, *, is_complete: bool
 ) -> tuple[dict[str, str], set[str]]:
-    """Return what is to be placed in ``directory``, path and digest, and the paths that are to go.
+    """Return path and digest of the files to place in ``directory``, and the paths to remove.
 
-    Placed is what it lacks, in this size, and what ``shown``, its manifest, has otherwise. Where all that it names was found
-    there, ``whole``, pages that both have are passed over.
+    Placed are files that it lacks in this size, and those that differ in ``current``, its current manifest. If all files of
+    ``current`` exist (``is_complete``), pages that both manifests have are skipped.
     """
-    stale, gone = _pages_compared(shown, manifest, directory)
-    files = {} if shown is None else shown.files
-    both = {} if shown is None else shown.recordings, manifest.recordings
-    for name, before, now in pages.compared(*(pages.differing(*both) if whole else both)):
-        old, new = ({} if one is None else one["shards"] for one in (before, now))
-        gone.update(shard_path(name, stream) for stream in old if stream not in new)
+    stale, removed = _pages_compared(current, manifest, directory)
+    files = {} if current is None else current.files
+    manifests = {} if current is None else current.recordings, manifest.recordings
+    for name, before, now in pages.compared(*(pages.differing(*manifests) if is_complete else manifests)):
+        old, new = ({} if entry is None else entry["shards"] for entry in (before, now))
+        removed.update(shard_path(name, stream) for stream in old if stream not in new)
         for stream, shard in new.items():
             path = shard_path(name, stream)
             if not (_same(old.get(stream), shard) and _lies(directory, path, shard["bytes"])):
                 stale[path] = shard["digest"]
-    gone.update(path for path in files if path not in manifest.files)
+    removed.update(path for path in files if path not in manifest.files)
     for path, file in manifest.files.items():
         if not (_same(files.get(path), file) and _lies(directory, path, file["bytes"])):
             stale[path] = file["digest"]
-    return stale, {path for path in gone if manifest.at(path) is None}
+    return stale, {path for path in removed if manifest.at(path) is None}
 
 
-def _pages_compared(shown: Manifest | None, manifest: Manifest, directory: Path) -> tuple[dict[str, str], set[str]]:
-    """Do as `_compared` for the pages of a manifest alone."""
+def _pages_compared(current: Manifest | None, manifest: Manifest, directory: Path) -> tuple[dict[str, str], set[str]]:
+    """Do as `_compared` for the pages of a manifest only."""
     before, now = (
-        {} if one is None or one.pages is None else {page.path: page for page in one.pages.pages}
-        for one in (shown, manifest)
+        {} if side is None or side.pages is None else {page.path: page for page in side.pages.pages}
+        for side in (current, manifest)
     )
     lies = {path for path, page in now.items() if path in before and _lies(directory, path, page.bytes)}
     return {path: page.digest for path, page in now.items() if path not in lies}, before.keys() - now.keys()
@@ -305,7 +303,7 @@ def _remove(directory: Path, paths: set[str]) -> None:
         with contextlib.suppress(FileNotFoundError, IsADirectoryError, NotADirectoryError):
             (directory / path).unlink()
     folders = {directory / folder for path in paths for folder in list(Path(path).parents)[:-1]}
-    for folder in sorted(folders, key=lambda one: len(one.parts), reverse=True):  # the deepest first
+    for folder in sorted(folders, key=lambda path_: len(path_.parts), reverse=True):  # the deepest first
         with contextlib.suppress(OSError):  # not empty, or gone already
             folder.rmdir()
 
@@ -371,26 +369,26 @@ def _link(source: str, target: Path) -> bool:
 
 
 def _matches(path: str, store: Store, name: str) -> Literal["", "files", "links"]:
-    """Return whether ``path`` holds the object ``name``: known by its inode where it is linked, else by its content."""
+    """Return whether ``path`` holds the object ``name``: a link by its inode, otherwise by its content."""
     try:
-        there = os.lstat(path)
-        symbolic = stat.S_ISLNK(there.st_mode)
-        if symbolic:  # what it leads through may change, and the directory not
-            there = os.stat(path)  # noqa: PTH116  (once a shard)
+        status = os.lstat(path)
+        symbolic = stat.S_ISLNK(status.st_mode)
+        if symbolic:  # Its target may change without a change of the directory
+            status = os.stat(path)  # noqa: PTH116  (once a shard)
         stored = os.lstat(store.object_path(name))
     except (FileNotFoundError, NotADirectoryError):
         return ""
-    if (there.st_dev, there.st_ino) == (stored.st_dev, stored.st_ino):
+    if (status.st_dev, status.st_ino) == (stored.st_dev, stored.st_ino):
         return "files" if symbolic else "links"
-    return "files" if there.st_size == stored.st_size and file_digest(path) == name else ""
+    return "files" if status.st_size == stored.st_size and file_digest(path) == name else ""
 
 
 def _current(directory: Path, manifest: Manifest) -> bool:
     try:
         file = directory / NAME
-        there = file.stat()
-        regular.require(file, there.st_mode)
-        if len(manifest.content) != there.st_size <= regular.JSON_BYTES:  # what is larger is refused below
+        status = file.stat()
+        regular.require(file, status.st_mode)
+        if len(manifest.content) != status.st_size <= regular.JSON_BYTES:  # Larger files are refused below
             return False
         return regular.content(file, regular.JSON_BYTES) == manifest.content
     except (FileNotFoundError, NotADirectoryError):
@@ -400,13 +398,13 @@ def _current(directory: Path, manifest: Manifest) -> bool:
 def _lies(directory: Path, path: str, size: int) -> bool:
     """Return whether a regular file of this size lies at a path of a dataset."""
     try:
-        there = os.lstat(f"{directory}/{path}")
+        status = os.lstat(f"{directory}/{path}")
     except (FileNotFoundError, NotADirectoryError):
         return False
-    return stat.S_ISREG(there.st_mode) and there.st_size == size
+    return stat.S_ISREG(status.st_mode) and status.st_size == size
 
 
-def _shown(directory: Path) -> Manifest | None:
+def _current_manifest(directory: Path) -> Manifest | None:
     """Return the manifest in ``directory``; None if there is no readable one."""
     try:
         return find(directory).manifest

@@ -29,7 +29,7 @@ def labels(dataset: Dataset) -> pd.DataFrame:
 
     index = pd.Index(list(dataset.recordings), name="recording", dtype=object)
     columns = {
-        name: _series(pd.Series([one.attributes.get(name) for one in dataset], index=index, dtype=object))
+        name: _series(pd.Series([recording.attributes.get(name) for recording in dataset], index=index, dtype=object))
         for name in _names(dataset)
     }
     return pd.DataFrame(columns, index=index)
@@ -41,49 +41,49 @@ def _series(values: pd.Series[Any]) -> pd.Series[Any]:
 
 def _names(dataset: Dataset) -> list[str]:
     """Return the names of all attributes, in the order in which recordings have them."""
-    return list(dict.fromkeys(name for one in dataset for name in one.attributes))
+    return list(dict.fromkeys(name for recording in dataset for name in recording.attributes))
 
 
 def labelled(
     dataset: Dataset, tables: Mapping[str, pa.Table], names: Sequence[str] | None = None
 ) -> dict[str, pa.Table]:
-    """Return the tables of recordings with a last column an attribute, of all (None) or of those ``names``.
+    """Return the tables of recordings with one more column per attribute: all (None) or those in ``names``.
 
     A recording without an attribute has nulls there. Raises `UsageError` for an attribute that no recording has, and for
     one that shares its name with a column.
     """
     import pyarrow as pa
 
-    known = _names(dataset)
-    wanted = known if names is None else list(dict.fromkeys(names))
-    for name in wanted:
-        if name not in known:
+    existing = _names(dataset)
+    chosen = existing if names is None else list(dict.fromkeys(names))
+    for name in chosen:
+        if name not in existing:
             raise selection.unknown_label(dataset, name)
         if any(name in table.column_names for table in tables.values()):
-            others = [one for one in known if not any(one in table.column_names for table in tables.values())]
+            addable = [label for label in existing if not any(label in table.column_names for table in tables.values())]
             raise UsageError(
-                f"{plain(name)} is a label and a column of the recordings. Name the labels to add, as labels={others!r}."
+                f"{plain(name)} is a label and a column of the recordings. Name the labels to add, as labels={addable!r}."
             )
-    found = {}
-    kinds = {name: _kind([dataset[one].attributes.get(name) for one in tables]) for name in wanted}
+    labelled_tables = {}
+    kinds = {name: _kind([dataset[recording].attributes.get(name) for recording in tables]) for name in chosen}
     for recording, table in tables.items():
-        for name in wanted:
+        for name in chosen:
             value = pa.scalar(_as(dataset[recording].attributes.get(name), kinds[name]), kinds[name])
             table = table.append_column(name, pa.repeat(value, table.num_rows))
-        found[recording] = table
-    return found
+        labelled_tables[recording] = table
+    return labelled_tables
 
 
 def _kind(values: Sequence[Attribute]) -> pa.DataType:
     """Return the arrow type that holds all of these values: text where they are of several kinds."""
     import pyarrow as pa
 
-    there = {type(value) for value in values if value is not None}
-    if there <= {bool} and there:
+    types = {type(value) for value in values if value is not None}
+    if types <= {bool} and types:
         return pa.bool_()
-    if there <= {int} and there:
+    if types <= {int} and types:
         return pa.int64()
-    return pa.float64() if there <= {int, float} and there else pa.string()
+    return pa.float64() if types <= {int, float} and types else pa.string()
 
 
 def _as(value: Attribute, kind: pa.DataType) -> Any:
@@ -106,16 +106,16 @@ def to_pandas(table: pa.Table) -> pd.DataFrame:
 
 
 def connected(dataset: Dataset) -> duckdb.DuckDBPyConnection:
-    """Return a DuckDB connection with a view a stream and the view ``labels``; see `Dataset.duckdb`."""
+    """Return a DuckDB connection with one view per stream and the view ``labels``; see `Dataset.duckdb`."""
     import duckdb
     import pyarrow as pa
 
     connection = duckdb.connect()
-    for stream in sorted({stream for one in dataset for stream in one.streams}):
-        having = dataset.only(one.name for one in dataset if stream in one.streams)
+    for stream in sorted({stream for recording in dataset for stream in recording.streams}):
+        having = dataset.only(recording.name for recording in dataset if stream in recording.streams)
         connection.register(stream or ONE_TABLE, having.table(stream))
     names = pa.table({"recording": pa.array(list(dataset.recordings), pa.string())})
-    rows = {one.name: names.slice(place, 1) for place, one in enumerate(dataset)}
-    shown = [name for name in _names(dataset) if name != "recording"]
-    connection.register(LABELS, pa.concat_tables(labelled(dataset, rows, shown).values()) if rows else names)
+    rows = {recording.name: names.slice(place, 1) for place, recording in enumerate(dataset)}
+    label_names = [name for name in _names(dataset) if name != "recording"]
+    connection.register(LABELS, pa.concat_tables(labelled(dataset, rows, label_names).values()) if rows else names)
     return connection

@@ -1,4 +1,4 @@
-"""What a lab notices afterwards: labels set by hand, without touching a shard."""
+"""Set labels by hand after recording, without changing a shard."""
 
 from __future__ import annotations
 
@@ -40,16 +40,16 @@ def parse(sets: Sequence[str], exclude: str | None, *, include: bool) -> dict[st
 
 
 def of_text(text: str) -> Attribute:
-    """Return the value of a text, where that is a number, true, false or null; else the text."""
+    """Return the value of a text that is a number, true, false or null; otherwise the text."""
     from tacpipe.io import yaml_text
 
     try:
-        found = yaml_text.load(text)
+        value = yaml_text.load(text)
     except ValueError:
         return text
-    if isinstance(found, float) and not isfinite(found):
+    if isinstance(value, float) and not isfinite(value):
         return text
-    return found if isinstance(found, str | int | float | None) else text
+    return value if isinstance(value, str | int | float | None) else text
 
 
 @dataclass(frozen=True)
@@ -68,23 +68,25 @@ def change(path: Path, patterns: Sequence[str], labels: Mapping[str, Attribute])
 
     Raises `UsageError` if a pattern matches no recording.
     """
-    return _change(path, lambda found: dict.fromkeys(_matching(found, patterns), labels))
+    return _change(path, lambda dataset: dict.fromkeys(_matching(dataset, patterns), labels))
 
 
-def change_each(path: Path, wanted: Callable[[ByRecording], ByRecording]) -> Changed:
-    """Set other labels on each recording: ``wanted`` returns them by name, given the attributes of all.
+def change_each(path: Path, new_labels: Callable[[ByRecording], ByRecording]) -> Changed:
+    """Set different labels on each recording: ``new_labels`` maps the attributes of all recordings to labels by name.
 
-    Recordings whose labels are so already stay untouched, and nothing is computed again for them.
+    Recordings that already have the labels are not changed, so nothing is recomputed for them.
     """
-    return _change(path, lambda found: differing(attributes(found.manifest), wanted(attributes(found.manifest))))
+    return _change(
+        path, lambda dataset: differing(attributes(dataset.manifest), new_labels(attributes(dataset.manifest)))
+    )
 
 
-def planned(path: Path, wanted: Callable[[ByRecording], ByRecording]) -> tuple[ByRecording, ByRecording]:
+def planned(path: Path, new_labels: Callable[[ByRecording], ByRecording]) -> tuple[ByRecording, ByRecording]:
     """Return the attributes of all recordings and the labels that `change_each` would set, by name; nothing is changed."""
-    found = manifest_of.find(path)
-    _refuse_made(found.manifest, found.directory)
-    now = attributes(found.manifest)
-    return now, differing(now, wanted(now))
+    dataset = manifest_of.find(path)
+    _refuse_made(dataset.manifest, dataset.directory)
+    now = attributes(dataset.manifest)
+    return now, differing(now, new_labels(now))
 
 
 def attributes(manifest: Manifest) -> ByRecording:
@@ -93,37 +95,37 @@ def attributes(manifest: Manifest) -> ByRecording:
     return {name: entry["attributes"] for part in parts for name, entry in part.items()}
 
 
-def differing(now: ByRecording, wanted: ByRecording) -> dict[str, dict[str, Attribute]]:
-    """Return the labels in ``wanted`` that are others than ``now``, of the recordings that have some; 1 is not true.
+def differing(now: ByRecording, labels_by_name: ByRecording) -> dict[str, dict[str, Attribute]]:
+    """Return the labels in ``labels_by_name`` that differ from ``now``, by recording; 1 differs from true.
 
     >>> differing({"a": {"n": 1}, "b": {"n": 1}}, {"a": {"n": 1}, "b": {"n": True, "m": None}})
     {'b': {'n': True}}
     """
-    found = {
-        name: {key: value for key, value in labels.items() if _apart(now[name].get(key), value)}
-        for name, labels in wanted.items()
+    differences = {
+        name: {key: value for key, value in labels.items() if _differ(now[name].get(key), value)}
+        for name, labels in labels_by_name.items()
     }
-    return {name: labels for name, labels in found.items() if labels}
+    return {name: labels for name, labels in differences.items() if labels}
 
 
-def _apart(one: Attribute, other: Attribute) -> bool:
-    return one != other or type(one) is not type(other)
+def _differ(value: Attribute, current: Attribute) -> bool:
+    return value != current or type(value) is not type(current)
 
 
-def _change(path: Path, wanted: Callable[[Found], ByRecording]) -> Changed:
-    found = manifest_of.find(path)
-    store, directory = locate(found.directory), found.directory
-    _refuse_made(found.manifest, directory)
+def _change(path: Path, new_labels: Callable[[Found], ByRecording]) -> Changed:
+    dataset = manifest_of.find(path)
+    store, directory = locate(dataset.directory), dataset.directory
+    _refuse_made(dataset.manifest, directory)
     names: list[str] = []
 
     def labelled() -> directory_of.Change:
-        here = manifest_of.find(directory)  # once more: another process may have changed it while this one waited
-        labels = {name: dict(values) for name, values in wanted(here).items()}
+        current = manifest_of.find(directory)  # Read again: another process may have changed it meanwhile
+        labels = {name: dict(values) for name, values in new_labels(current).items()}
         names.extend(labels)
-        here.manifest.keep(store)
-        return directory_of.Change(here.manifest.labelled(labels), relabelled=True)
+        current.manifest.keep(store)
+        return directory_of.Change(current.manifest.labelled(labels), relabelled=True)
 
-    with store.at_work([found.digest]):
+    with store.at_work([dataset.digest]):
         directory_of.change(store, directory, labelled)
     return Changed(directory, names)
 
@@ -136,17 +138,17 @@ def _refuse_made(manifest: Manifest, directory: Path) -> None:
         )
 
 
-def _matching(found: Found, patterns: Sequence[str]) -> list[str]:
-    recordings = found.manifest.recordings
+def _matching(dataset: Found, patterns: Sequence[str]) -> list[str]:
+    recordings = dataset.manifest.recordings
     names: set[str] = set()
     for pattern in patterns:
-        if pattern in recordings:  # of a large dataset, one page is read
+        if pattern in recordings:  # Reads only one page of a large dataset
             names.add(pattern)
             if not any(mark in pattern for mark in "*?["):
                 continue
         matching = {name for name in recordings if fnmatchcase(name, pattern)}
         if not matching:
-            there = listed(sorted(recordings), _NAMED)
-            raise UsageError(f"{found.directory} has no recording {plain(pattern)}; it has {there}.")
+            existing = listed(sorted(recordings), _NAMED)
+            raise UsageError(f"{dataset.directory} has no recording {plain(pattern)}; it has {existing}.")
         names |= matching
     return sorted(names)

@@ -1,4 +1,4 @@
-"""Where a dataset comes from, down to the raw files, and which part of its key changed against the last run."""
+"""Trace a dataset to its raw files, and report which part of its key changed since the last run."""
 
 from __future__ import annotations
 
@@ -23,40 +23,42 @@ from tacpipe.store.store import Store
 _SHOWN = 5  # names listed before the rest is counted
 
 
-def of(path: Path) -> dict[str, Any]:
-    """Return the lineage of the dataset (or report) at ``path`` as a tree, and what changed against the run before."""
+def trace(path: Path) -> dict[str, Any]:
+    """Return the lineage of the dataset (or report) at ``path`` as a tree, with the changes since the previous run."""
     store = locate(path if path.is_dir() else path.absolute().parent)
     root = store.roots.get((path.parent if path.name == manifest_of.NAME else path).absolute())
     if path.is_file() and path.name != manifest_of.NAME:
         if root is None:
             raise UsageError(f"{path} was not written by tacpipe, or into another store than {store.root}.")
-        found = manifest_of.Found(path.parent, store.read(root["manifest"]), store)
+        dataset = manifest_of.Found(path.parent, store.read(root["manifest"]), store)
     else:
-        found = manifest_of.find(path)
-    places = {other["manifest"]: other["path"] for other in store.roots.all()}
-    tree = _node(store, found.manifest, found.digest, places)
-    changed = _changes(store, root, found.manifest)
+        dataset = manifest_of.find(path)
+    places = {entry["manifest"]: entry["path"] for entry in store.roots.all()}
+    tree = _node(store, dataset.manifest, dataset.digest, places)
+    changed = _changes(store, root, dataset.manifest)
     written_s = 0 if root is None else int(root.get("written_s", 0))
-    provenance = _provenance(store, found.digest, written_s, "" if root is None else root.get("key", ""))
+    provenance = _provenance(store, dataset.digest, written_s, "" if root is None else root.get("key", ""))
     return {**tree, "provenance": provenance, "changes": changed}
 
 
 def _node(store: Store, manifest: Manifest, name: str, places: dict[str, str]) -> dict[str, Any]:
     inputs: dict[str, list[dict[str, Any]]] = {}
-    for argument, several in manifest.inputs.items():
+    for argument, datasets in manifest.inputs.items():
         inputs[argument] = []
-        for given in several:
+        for dataset in datasets:
             try:
-                found = manifest_of.stored(store, given["manifest"])
-                inputs[argument].append(_node(store, found, given["manifest"], places))
+                source = manifest_of.stored(store, dataset["manifest"])
+                inputs[argument].append(_node(store, source, dataset["manifest"], places))
             except StorageError:
                 raise
             except TacpipeError as error:
-                inputs[argument].append({"manifest": given["manifest"], "digest": given["dataset"], "lost": str(error)})
+                inputs[argument].append(
+                    {"manifest": dataset["manifest"], "digest": dataset["dataset"], "lost": str(error)}
+                )
     return {
         "stage": manifest.stage,
         "version": manifest.version,
-        "params": params_of.named(manifest.stage, manifest.params),
+        "params": params_of.with_current_names(manifest.stage, manifest.params),
         "digest": manifest.digest,
         "manifest": name,
         "path": places.get(name),
@@ -98,97 +100,103 @@ def _changes(store: Store, root: dict[str, Any] | None, now: Manifest) -> list[s
 
 
 def changes(store: Store, before: Manifest, now: Manifest) -> list[str]:
-    """Return in words in which parts of their keys two datasets differ: stage, version, params, inputs, labels."""
-    found = []
+    """Describe how the keys of two datasets differ: stage, version, params, inputs, labels."""
+    lines = []
     if before.stage != now.stage:
-        found.append(f"stage: {before.stage} became {now.stage}")
+        lines.append(f"stage: {before.stage} became {now.stage}")
     if before.version != now.version:
-        found.append(f"version: {before.version} became {now.version}")
-    old, new = (_leaves(params_of.named(manifest.stage, manifest.params)) for manifest in (before, now))
-    found += [
+        lines.append(f"version: {before.version} became {now.version}")
+    old, new = (_leaves(params_of.with_current_names(manifest.stage, manifest.params)) for manifest in (before, now))
+    lines += [
         f"params.{name}: {old.get(name)} became {new.get(name)}"
         for name in sorted({*old, *new})
         if old.get(name) != new.get(name)
     ]
-    found += _compared("sources", *pages.differing(before.sources, now.sources))
+    lines += _compared("sources", *pages.differing(before.sources, now.sources))
     for argument in sorted({*before.inputs, *now.inputs}):
-        found += _input_changes(store, argument, before.inputs.get(argument, []), now.inputs.get(argument, []))
-    found += _compared("labels", *pages.differing(before.labels, now.labels))
-    if not found and before.digest != now.digest and not _alike(before, now):
-        found.append("result: the same key gave other bytes")
-    return found
+        lines += _input_changes(store, argument, before.inputs.get(argument, []), now.inputs.get(argument, []))
+    lines += _compared("labels", *pages.differing(before.labels, now.labels))
+    if not lines and before.digest != now.digest and not _alike(before, now):
+        lines.append("result: the same key gave other bytes")
+    return lines
 
 
 def _alike(before: Manifest, now: Manifest) -> bool:
-    """Return whether two manifests hold the same, of which one lists pages and the other has no pages yet."""
+    """Return whether a manifest with pages and one without hold the same content."""
     if (before.pages is None) == (now.pages is None) or len(before.recordings) != len(now.recordings):
         return False
-    every = pages.compared(before.recordings, now.recordings)
-    return before.files == now.files and all(old == new for _, old, new in every)
+    entries = pages.compared(before.recordings, now.recordings)
+    return before.files == now.files and all(old == new for _, old, new in entries)
 
 
 def _input_changes(store: Store, argument: str, before: list[dict[str, str]], now: list[dict[str, str]]) -> list[str]:
-    if [given["dataset"] for given in before] == [given["dataset"] for given in now]:
+    if [dataset["dataset"] for dataset in before] == [dataset["dataset"] for dataset in now]:
         return []
     try:
         old, new = (
-            [manifest_of.stored(store, given["manifest"], argument) for given in some] for some in (before, now)
+            [manifest_of.stored(store, dataset["manifest"], argument) for dataset in datasets]
+            for datasets in (before, now)
         )
     except StorageError:
         raise
     except TacpipeError:
         return [f"inputs.{argument}: another dataset, whose manifest is no longer in the store"]
-    found = _recordings_compared(f"inputs.{argument}", *(_together(several) for several in (old, new)))
-    files = ({name: file for manifest in several for name, file in manifest.files.items()} for several in (old, new))
-    return [*found, *_compared(f"inputs.{argument}.files", *files)]
+    lines = _recordings_compared(f"inputs.{argument}", *(_merged_recordings(manifests) for manifests in (old, new)))
+    files = (
+        {name: file for manifest in manifests for name, file in manifest.files.items()} for manifests in (old, new)
+    )
+    return [*lines, *_compared(f"inputs.{argument}.files", *files)]
 
 
-def _together(manifests: Sequence[Manifest]) -> Mapping[str, Entry]:
+def _merged_recordings(manifests: Sequence[Manifest]) -> Mapping[str, Entry]:
     if len(manifests) == 1:
         return manifests[0].recordings
     return {name: entry for manifest in manifests for name, entry in manifest.recordings.items()}
 
 
-def _recordings_compared(what: str, before: Mapping[str, Entry], now: Mapping[str, Entry]) -> list[str]:
-    """Return in words in which recordings two datasets differ; those of pages that both have are alike."""
+def _recordings_compared(subject: str, before: Mapping[str, Entry], now: Mapping[str, Entry]) -> list[str]:
+    """Describe in which recordings two datasets differ; recordings in shared pages are equal."""
     new: list[str] = []
-    gone: list[str] = []
-    others: dict[str, list[str]] = {"shards": [], "attributes": []}
+    removed: list[str] = []
+    changed: dict[str, list[str]] = {"shards": [], "attributes": []}
     for name, old, entry in pages.compared(*pages.differing(before, now)):
         if old is None or entry is None:
-            (new if old is None else gone).append(name)
+            (new if old is None else removed).append(name)
             continue
-        for part, names in others.items():
+        for part, names in changed.items():
             names += [name] if old[part] != entry[part] else []
-    shards = {"new": new, "gone": gone, "other": others["shards"]}
-    return [*_counted(f"{what}.shards", shards), *_counted(f"{what}.attributes", {"other": others["attributes"]})]
+    shards = {"new": new, "gone": removed, "other": changed["shards"]}
+    return [
+        *_counted(f"{subject}.shards", shards),
+        *_counted(f"{subject}.attributes", {"other": changed["attributes"]}),
+    ]
 
 
-def _compared(what: str, before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+def _compared(subject: str, before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
     groups = {
         "new": sorted(set(now) - set(before)),
         "gone": sorted(set(before) - set(now)),
         "other": sorted(name for name in set(before) & set(now) if before[name] != now[name]),
     }
-    return _counted(what, groups)
+    return _counted(subject, groups)
 
 
-def _counted(what: str, groups: Mapping[str, Sequence[str]]) -> list[str]:
-    return [f"{what}: {len(names)} {kind} ({listed(names, _SHOWN)})" for kind, names in groups.items() if names]
+def _counted(subject: str, groups: Mapping[str, Sequence[str]]) -> list[str]:
+    return [f"{subject}: {len(names)} {kind} ({listed(names, _SHOWN)})" for kind, names in groups.items() if names]
 
 
 def to_text(tree: dict[str, Any]) -> str:
-    """Return the tree as indented lines, what changed before it."""
+    """Return the tree as indented lines, after the changes."""
     lines = []
     if tree["changes"] is None:
         lines.append("First run here: there is nothing to compare with.")
     else:
         lines.append("Against the last run: " + ("; ".join(tree["changes"]) or "nothing changed."))
-    made = tree["provenance"]
-    if made:
-        libraries = ", ".join(f"{name} {version}" for name, version in made["libraries"].items())
-        commit = f" at commit {made['git_commit'][:10]}" if made["git_commit"] else ""
-        lines.append(f"Made on {made['host']}{commit} with {libraries}.")
+    provenance = tree["provenance"]
+    if provenance:
+        libraries = ", ".join(f"{name} {version}" for name, version in provenance["libraries"].items())
+        commit = f" at commit {provenance['git_commit'][:10]}" if provenance["git_commit"] else ""
+        lines.append(f"Made on {provenance['host']}{commit} with {libraries}.")
     return printable.lines([*lines, "", *_lines(tree, 0, set())])
 
 
@@ -248,7 +256,7 @@ def _files(node: dict[str, Any]) -> str:
 
 
 def _lines(node: dict[str, Any], depth: int, described: set[str], argument: str = "") -> list[str]:
-    """Return the lines of a node and what it descends from; one that was ``described`` already is only named."""
+    """Return the lines of a node and its ancestors; nodes already ``described`` are only named."""
     pad = "  " * depth
     label = f"{argument}: " if argument else ""
     if "lost" in node:
@@ -270,7 +278,7 @@ def _lines(node: dict[str, Any], depth: int, described: set[str], argument: str 
         *(f"{pad}    {line}" for name, tree in nested.items() for line in _nested_lines(name, tree)),
     ]
     if node["sources"]:
-        files = [digest for several in node["sources"].values() for digest in several.values()]
+        files = [digest for digests in node["sources"].values() for digest in digests.values()]
         first = next(iter(sorted(node["sources"])))
         name, digest = next(iter(sorted(node["sources"][first].items())))
         lines.append(
@@ -281,7 +289,7 @@ def _lines(node: dict[str, Any], depth: int, described: set[str], argument: str 
         lines.append(f"{pad}  labelled by hand: {listed(sorted(node['labels']), _SHOWN)}")
     if node["skipped"]:
         lines.append(f"{pad}  left out: {listed(sorted(node['skipped']), _SHOWN)}")
-    for name, several in node["inputs"].items():
-        for given in several:
-            lines += _lines(given, depth + 1, described, name)
+    for name, sources in node["inputs"].items():
+        for source in sources:
+            lines += _lines(source, depth + 1, described, name)
     return lines

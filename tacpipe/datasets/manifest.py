@@ -24,7 +24,7 @@ from tacpipe.store.store import Object, Store
 
 FORMAT, PAGED_FORMAT = 1, 2  # 1: the manifest holds its recordings; 2: it lists pages of them
 NAME = MANIFEST
-VALUES = "{values}"  # among the files of a source: the digest of what was read beside them, as labels
+VALUES = "{values}"  # Name for the digest of a source's other values, such as labels
 EXPORT = "export."  # begins the names of stages whose result is other tools' files
 ACQUIRE = "acquire"  # the command that records a rig; it stands where others name their stage, and has no key
 Entry = pages_of.Entry
@@ -35,7 +35,7 @@ _parsed: dict[tuple[str, str], Manifest] = {}  # keys: digest, place of pages; t
 
 @dataclass(frozen=True)
 class Manifest:
-    """What a dataset is: recordings, files, and how they came to be."""
+    """Content of a dataset: recordings, files, and their origin."""
 
     stage: str
     version: int
@@ -80,8 +80,10 @@ class Manifest:
             inline = {name: dict(values[name]) for name in _PER_RECORDING}
             return (_indented({**values, **inline, "format": FORMAT}) + "\n").encode()
         lines = ",\n".join(f"  {json.dumps(page.to_json(), sort_keys=True)}" for page in self.pages.pages)
-        stated = {name: value for name, value in values.items() if name not in _PER_RECORDING}
-        head, empty, tail = _indented({**stated, "format": PAGED_FORMAT, "pages": []}).partition('\n "pages": []')
+        shared_values = {name: value for name, value in values.items() if name not in _PER_RECORDING}
+        head, empty, tail = _indented({**shared_values, "format": PAGED_FORMAT, "pages": []}).partition(
+            '\n "pages": []'
+        )
         assert empty
         return f'{head}\n "pages": [\n{lines}\n ]{tail}\n'.encode()
 
@@ -98,17 +100,17 @@ class Manifest:
 
     @property
     def recorded(self) -> bool:
-        """Whether this is a dataset of recordings: it was made from no other dataset."""
+        """Return whether this is a dataset of recordings, made from no other dataset."""
         return bool(self.recordings) and not self.inputs
 
     @property
     def exported(self) -> bool:
-        """Whether its files are those of another tool."""
+        """Return whether its files are exports for other tools."""
         return self.stage.startswith(EXPORT)
 
     @property
     def copied(self) -> bool:
-        """Whether its directory holds copies, not links: recordings, and exports, in which other tools may write."""
+        """Return whether its directory holds copies instead of links, as for recordings and exports."""
         return self.recorded or self.exported
 
     @cached_property
@@ -123,14 +125,14 @@ class Manifest:
 
     @cached_property
     def excluded(self) -> Mapping[str, Attribute]:
-        """The reason by name of each recording that somebody excluded."""
+        """Reasons for exclusion by name of recording."""
         recordings = self.recordings
-        some: Iterable[Mapping[str, Entry]] = [recordings]
+        parts: Iterable[Mapping[str, Entry]] = [recordings]
         if isinstance(recordings, pages_of.Recordings):
             pages = recordings.pages
-            some = (pages.load(number).recordings for number, page in enumerate(pages.pages) if page.excluded)
-        found = ((name, entry["attributes"].get(pages_of.EXCLUDED)) for part in some for name, entry in part.items())
-        return {name: why for name, why in found if why}
+            parts = (pages.load(number).recordings for number, page in enumerate(pages.pages) if page.excluded)
+        reasons = ((name, entry["attributes"].get(pages_of.EXCLUDED)) for part in parts for name, entry in part.items())
+        return {name: reason for name, reason in reasons if reason}
 
     def with_recordings(self, items: Mapping[str, Item | None]) -> Manifest:
         """Return the manifest with recordings added or replaced; None leaves one out."""
@@ -165,9 +167,9 @@ class Manifest:
                 continue
             item = self.item(name)
             attributes = {**item.entry["attributes"], **(item.labels or {}), **values}
-            known = {key: value for key, value in attributes.items() if value is not None}
+            set_attributes = {key: value for key, value in attributes.items() if value is not None}
             items[name] = item._replace(
-                entry={**item.entry, "attributes": known}, labels={**(item.labels or {}), **values}
+                entry={**item.entry, "attributes": set_attributes}, labels={**(item.labels or {}), **values}
             )
         return self.with_recordings(items) if items else self
 
@@ -222,14 +224,14 @@ class Manifest:
         bare = path.removesuffix(".parquet")
         parts = bare.split("/")
         places = [(bare, ""), *(("/".join(parts[:at]), "/".join(parts[at:])) for at in range(1, len(parts)))]
-        known = (one for one in places if bare != path and one[0] in self.recordings)
-        shards = (self.recordings[one]["shards"].get(stream) for one, stream in known)
+        candidates = (candidate for candidate in places if bare != path and candidate[0] in self.recordings)
+        shards = (self.recordings[name]["shards"].get(stream) for name, stream in candidates)
         return next((shard for shard in shards if shard is not None), None)
 
     def size_of(self, name: str, path: str) -> int | None:
-        """Return how many bytes the page, shard or file of this digest has at ``path``, None where there is none."""
-        found = self.at(path)
-        return found["bytes"] if found is not None and found["digest"] == name else None
+        """Return the size in bytes of the page, shard or file of this digest at ``path``; None if there is none."""
+        content = self.at(path)
+        return content["bytes"] if content is not None and content["digest"] == name else None
 
     @cached_property
     def shard_bytes(self) -> int:
@@ -255,7 +257,7 @@ def _indented(value: Mapping[str, Any]) -> str:
     return json.dumps(value, sort_keys=True, indent=1, allow_nan=False)
 
 
-def parse(content: bytes, where: str, read: PageReader | None = None, *, verified: bool = False) -> Manifest:
+def parse(content: bytes, source: str, read: PageReader | None = None, *, verified: bool = False) -> Manifest:
     """Return the manifest of these bytes, whose pages ``read`` reads; ``verified`` ones come from the store.
 
     Raises `DamagedError` if they are not a manifest, or if what they name does not give their digest.
@@ -264,27 +266,28 @@ def parse(content: bytes, where: str, read: PageReader | None = None, *, verifie
     place = name, "" if read is None else read.place
     if place in _parsed:  # a command meets the same manifest several times
         return _parsed[place]
-    regular.expect_parsed(where, len(content))
+    regular.expect_parsed(source, len(content))
     try:
-        manifest, stated = _read(json.loads(content), where, read)
+        manifest, declared = _read(json.loads(content), source, read)
         if manifest.pages is not None or not verified:
             check(manifest)
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise DamagedError(
-            f"{where} is not a manifest of tacpipe ({plain(str(error), 200)}). Restore it, or run the stage that made it "
+            f"{source} is not a manifest of tacpipe ({plain(str(error), 200)}). Restore it, or run the stage that made it "
             f"again."
         ) from None
-    computed = stated
+    computed = declared
     if manifest.pages is not None:
         computed = manifest.digest
     elif not verified:
         computed = _inline_digest(manifest)
-    if computed != stated:
+    if computed != declared:
         raise DamagedError(
-            f"{where} was edited by hand: what it names has the digest {computed[:12]}, it states {excerpt(stated)[1:13]}. "
+            f"{source} was edited by hand: what it names has the digest {computed[:12]}, it states "
+            f"{excerpt(declared)[1:13]}. "
             f"Run the stage that made it again; labels are changed with `tacpipe label`."
         )
-    manifest.__dict__.update(content=content, content_digest=name, digest=stated)  # primes cached properties
+    manifest.__dict__.update(content=content, content_digest=name, digest=declared)  # primes cached properties
     if not verified:  # all of it was looked at
         _parsed[place] = manifest
         for oldest in list(_parsed)[:-_REMEMBERED]:
@@ -292,32 +295,32 @@ def parse(content: bytes, where: str, read: PageReader | None = None, *, verifie
     return manifest
 
 
-def _read(value: dict[str, Any], where: str, read: PageReader | None) -> tuple[Manifest, str]:
-    """Return the manifest that a JSON value holds, and the digest that it states."""
-    written, stated = value.pop("format"), value.pop("digest")
-    if type(written) is not int or written < FORMAT:
-        raise ValueError(f"its format is {excerpt(written)}")
-    if written > PAGED_FORMAT:
+def _read(value: dict[str, Any], source: str, read: PageReader | None) -> tuple[Manifest, str]:
+    """Return the manifest in a JSON value, and the digest that it declares."""
+    format_version, declared = value.pop("format"), value.pop("digest")
+    if type(format_version) is not int or format_version < FORMAT:
+        raise ValueError(f"its format is {excerpt(format_version)}")
+    if format_version > PAGED_FORMAT:
         raise UsageError(
-            f"{where} has manifest format {written}; this tacpipe reads formats {FORMAT} and {PAGED_FORMAT}. "
+            f"{source} has manifest format {format_version}; this tacpipe reads formats {FORMAT} and {PAGED_FORMAT}. "
             f"Install a newer tacpipe."
         )
-    if written == FORMAT:
+    if format_version == FORMAT:
         manifest = Manifest(**value)
         manifest.__dict__["pages"] = None  # however many recordings it holds
-        return manifest, stated
+        return manifest, declared
     pages = Pages([Page.from_json(page) for page in value.pop("pages")], read, {})
     if pages.total("recordings") <= pages_of.INLINE:
         raise ValueError(f"it lists pages of {pages.total('recordings')} recordings, which a manifest holds itself")
     if not value.keys().isdisjoint(_PER_RECORDING):
         raise ValueError("it holds recordings next to pages of them")
     views: Any = pages_of.Recordings(pages), pages_of.Labels(pages), pages_of.Sources(pages)
-    return Manifest(**value, **dict(zip(_PER_RECORDING, views, strict=True))), stated
+    return Manifest(**value, **dict(zip(_PER_RECORDING, views, strict=True))), declared
 
 
-def stored(store: ObjectReader, name: str, where: str = "") -> Manifest:
+def stored(store: ObjectReader, name: str, source: str = "") -> Manifest:
     """Return the manifest of this digest from a store. Raises `MissingError`, and as `parse` does."""
-    return parse(store.read(name, regular.JSON_BYTES), where or name, StoredPages(store), verified=True)
+    return parse(store.read(name, regular.JSON_BYTES), source or name, StoredPages(store), verified=True)
 
 
 def _inline_digest(manifest: Manifest) -> str:
@@ -337,8 +340,8 @@ class Found:
     @cached_property
     def manifest(self) -> Manifest:
         """The manifest, checked. Raises `DamagedError` if it was edited by hand."""
-        where = str(self.directory / NAME)
-        return parse(self.content, where, StoredPages(self._store, self.directory.absolute()))
+        source = str(self.directory / NAME)
+        return parse(self.content, source, StoredPages(self._store, self.directory.absolute()))
 
 
 def find(path: Path | str) -> Found:
@@ -346,16 +349,16 @@ def find(path: Path | str) -> Found:
 
     Raises `UsageError` where there is none, and `StorageError` where the system fails to read it.
     """
-    given = files_of.local(path)
-    file = given if given.name == NAME else given / NAME
+    location = files_of.local(path)
+    file = location if location.name == NAME else location / NAME
     try:
         return Found(file.parent, regular.content(file, regular.JSON_BYTES))
     except regular.IrregularError as error:
         raise UsageError(f"{error} There is no dataset.") from None
     except (FileNotFoundError, NotADirectoryError):
-        what = "is empty or not there" if not given.exists() else f"has no {NAME}"
+        problem = "does not exist or is empty" if not location.exists() else f"has no {NAME}"
         raise UsageError(
-            f"{given} {what}, so it is not a dataset. Give the directory that a tacpipe command wrote with -o."
+            f"{location} {problem}, so it is not a dataset. Give the directory that a tacpipe command wrote with -o."
         ) from None
     except OSError as error:
         raise unread(file, error) from error
@@ -391,10 +394,10 @@ def check_pages(manifest: Manifest, *, fresh: bool = False) -> None:
 
 
 def _check_lineage(manifest: Manifest) -> None:
-    for several in manifest.inputs.values():
-        for given in several:
-            _expect_digest(given["manifest"])
-            _expect_digest(given["dataset"])
+    for sources in manifest.inputs.values():
+        for source in sources:
+            _expect_digest(source["manifest"])
+            _expect_digest(source["dataset"])
     for step in ({"stage": manifest.stage, "version": manifest.version, "params": manifest.params}, *manifest.chain):
         if not isinstance(step["stage"], str) or not isinstance(step["version"], int):
             raise TypeError("a stage or its version is not named")
@@ -407,9 +410,9 @@ def _check_lineage(manifest: Manifest) -> None:
     _expect_mapping(manifest.sources, "sources")
 
 
-def _expect_mapping(value: object, what: str) -> None:
+def _expect_mapping(value: object, noun: str) -> None:
     if not isinstance(value, Mapping):
-        raise TypeError(f"its {what} are a {type(value).__name__}")
+        raise TypeError(f"its {noun} are a {type(value).__name__}")
 
 
 def _expect_digest(name: object) -> None:

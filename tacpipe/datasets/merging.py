@@ -35,8 +35,8 @@ def merge(manifests: Sequence[Manifest]) -> Manifest:
     return Manifest(first.stage, first.version, first.params, {}, first.chain, recordings, files)
 
 
-def chain_difference(wanted: Sequence[Mapping[str, Any]], found: Sequence[Mapping[str, Any]]) -> str:
-    """Return in words where two chains of stages part.
+def chain_difference(expected: Sequence[Mapping[str, Any]], chain: Sequence[Mapping[str, Any]]) -> str:
+    """Describe the first difference between two chains of stages.
 
     >>> step = {"stage": "synchronize", "version": 1, "params": {"rate_hz": 50.0}, "fitted": None}
     >>> chain_difference([step], [{**step, "params": {"rate_hz": 100.0}}])
@@ -44,19 +44,21 @@ def chain_difference(wanted: Sequence[Mapping[str, Any]], found: Sequence[Mappin
     """
     from tacpipe.plugins import params as params_of
 
-    for ours, theirs in zip(wanted, found, strict=False):
+    for ours, theirs in zip(expected, chain, strict=False):
         if ours["stage"] != theirs["stage"]:
             return f"{theirs['stage']} is where {ours['stage']} should be"
         if ours["version"] != theirs["version"]:
             return f"{ours['stage']} has version {theirs['version']} instead of {ours['version']}"
-        mine, other = (params_of.named(step["stage"], step["params"]) for step in (ours, theirs))
-        for name in sorted({*mine, *other}):
-            left, right = mine.get(name), other.get(name)
-            if left != right:
-                return f"{ours['stage']} has {name} {right} instead of {left}"
+        our_params, their_params = (
+            params_of.with_current_names(step["stage"], step["params"]) for step in (ours, theirs)
+        )
+        for name in sorted({*our_params, *their_params}):
+            expected_value, value = our_params.get(name), their_params.get(name)
+            if expected_value != value:
+                return f"{ours['stage']} has {name} {value} instead of {expected_value}"
         if ours["fitted"] != theirs["fitted"]:
             return f"{ours['stage']} was fitted on other recordings"
-    if len(wanted) != len(found):
-        longer = wanted if len(wanted) > len(found) else found
-        return f"only one of them went through {longer[min(len(wanted), len(found))]['stage']}"
+    if len(expected) != len(chain):
+        longer = expected if len(expected) > len(chain) else chain
+        return f"only one of them went through {longer[min(len(expected), len(chain))]['stage']}"
     return "they are the same"

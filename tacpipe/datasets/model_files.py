@@ -48,8 +48,8 @@ Kind = type | tuple[type, ...]
 
 
 @contextlib.contextmanager
-def validated(what: str) -> Iterator[None]:
-    """Turn what goes wrong with files that were made or changed by hand into a sentence that names ``what`` they are of."""
+def validated(noun: str) -> Iterator[None]:
+    """Turn errors of files that were made or changed by hand into one sentence about ``noun``."""
     try:
         yield
     except TacpipeError:
@@ -57,17 +57,17 @@ def validated(what: str) -> Iterator[None]:
     except (*_MISFITS, RecursionError) as error:
         described = f"{type(error).__name__}: {' '.join(str(error).split())}"
         raise TacpipeError(
-            f"The files of {what} do not fit one another ({plain(described, 200)}). Copy them again from whoever made them, "
+            f"The files of {noun} do not fit one another ({plain(described, 200)}). Copy them again from whoever made them, "
             f"or train one."
         ) from error
 
 
-def task(files: Mapping[str, bytes], where: str = "This") -> Task:
+def task(files: Mapping[str, bytes], place: str = "This") -> Task:
     """Return the task that a model among ``files`` was trained for. Raises `TacpipeError` where none is."""
     from tacpipe.plugins import registry
 
     if CONFIG not in files:
-        raise UsageError(f"{where} is not a model: it has no {CONFIG}. Give what `tacpipe train` wrote with -o.")
+        raise UsageError(f"{place} is not a model: it has no {CONFIG}. Give what `tacpipe train` wrote with -o.")
     return registry.load_task(tree(files, CONFIG, {"task": str})["task"])
 
 
@@ -77,14 +77,14 @@ def tree(files: Mapping[str, bytes], name: str, needed: Mapping[str, Kind] | Non
     Raises `TacpipeError` where it holds none, and for what is missing, of another kind, or absurdly large.
     """
     try:
-        found = json.loads(files[name])
+        content = json.loads(files[name])
     except (ValueError, RecursionError) as error:
         raise TacpipeError(f"{name} is not JSON ({plain(str(error), 100)}). Copy the model again.") from error
-    if not isinstance(found, dict):
-        raise TacpipeError(f"{name} holds {excerpt(found)}; it must be a mapping. Copy the model again.")
+    if not isinstance(content, dict):
+        raise TacpipeError(f"{name} holds {excerpt(content)}; it must be a mapping. Copy the model again.")
     for path, kind in (needed or {}).items():
-        _require(name, path, _at(found, path), kind)
-    return found
+        _require(name, path, _at(content, path), kind)
+    return content
 
 
 def to_json(tree: Mapping[str, Any]) -> bytes:
@@ -102,9 +102,9 @@ def tensors(content: bytes, name: str) -> dict[str, torch.Tensor]:
     from safetensors.torch import load
 
     with _readable(name, SafetensorError):
-        found: dict[str, torch.Tensor] = load(content)
-        _require_finite(name, {key: bool(value.isfinite().all()) for key, value in found.items()})
-    return found
+        tensors_by_name: dict[str, torch.Tensor] = load(content)
+        _require_finite(name, {key: bool(value.isfinite().all()) for key, value in tensors_by_name.items()})
+    return tensors_by_name
 
 
 def arrays(content: bytes, name: str, *, but: str | None = None) -> dict[str, AnyArray]:
@@ -116,29 +116,29 @@ def arrays(content: bytes, name: str, *, but: str | None = None) -> dict[str, An
     from safetensors.numpy import load
 
     with _readable(name, SafetensorError):
-        found: dict[str, AnyArray] = load(content)
-        described = {key: value for key, value in found.items() if but is None or not key.endswith(but)}
+        arrays_by_name: dict[str, AnyArray] = load(content)
+        described = {key: value for key, value in arrays_by_name.items() if but is None or not key.endswith(but)}
         _require_finite(name, {key: bool(np.isfinite(value).all()) for key, value in described.items()})
-    return found
+    return arrays_by_name
 
 
 def filled(build: Callable[[], torch.nn.Module], weights: Mapping[str, torch.Tensor]) -> torch.nn.Module:
-    """Return the network that ``build`` makes, with these ``weights``; what it makes takes no memory until they fit.
+    """Return the network of ``build`` with these ``weights``; it takes no memory until they fit.
 
     Raises `TacpipeError` where a tensor is missing, too many, or of another shape.
     """
     import torch
 
     with validated("the model"), torch.device("meta"), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of layers of no width, which fit nothing
+        warnings.simplefilter("ignore")  # Layers without width, which are refused below
         network = build()
-    wanted = {name: tuple(value.shape) for name, value in network.state_dict().items()}
-    there = {name: tuple(value.shape) for name, value in weights.items()}
-    for name in sorted({*wanted, *there}):
-        if wanted.get(name) != there.get(name):
+    expected = {name: tuple(value.shape) for name, value in network.state_dict().items()}
+    shapes = {name: tuple(value.shape) for name, value in weights.items()}
+    for name in sorted({*expected, *shapes}):
+        if expected.get(name) != shapes.get(name):
             raise TacpipeError(
-                f"The model's weights do not fit its {CONFIG}: {plain(name)} is {there.get(name, 'not there')} and should "
-                f"be {wanted.get(name, 'not there')}. Copy its files again from whoever made them."
+                f"The model's weights do not fit its {CONFIG}: {plain(name)} is {shapes.get(name, 'missing')} and should "
+                f"be {expected.get(name, 'missing')}. Copy its files again from whoever made them."
             )
     kinds = {name: value.dtype for name, value in network.state_dict().items()}
     # `to_empty` imports sympy, which takes as long as a small network's evaluation
@@ -166,20 +166,20 @@ def _require_finite(name: str, finite: Mapping[str, bool]) -> None:
         )
 
 
-def _at(found: Any, path: str) -> Any:
+def _at(value: Any, path: str) -> Any:
     for part in path.split("."):
-        found = found.get(part) if isinstance(found, dict) else None
-    return found
+        value = value.get(part) if isinstance(value, dict) else None
+    return value
 
 
 def _require(name: str, path: str, value: Any, kind: Kind) -> None:
     kinds = kind if isinstance(kind, tuple) else (kind,)
-    right = any(_is(value, one) for one in kinds)
+    right = any(_is(value, allowed) for allowed in kinds)
     if not right:
         described = "is missing" if value is None else f"is {excerpt(value)}"
-        wanted = " or ".join(_KINDS[one] for one in kinds if one is not NONE)
+        description = " or ".join(_KINDS[allowed] for allowed in kinds if allowed is not NONE)
         raise TacpipeError(
-            f"{name}: {path} {described}; it must be {wanted}. Copy the model again from whoever made it."
+            f"{name}: {path} {described}; it must be {description}. Copy the model again from whoever made it."
         )
     if isinstance(value, int) and not 0 <= value <= MOST:
         raise TacpipeError(f"{name}: {path} is {excerpt(value)}; it must be from 0 to {MOST}.")

@@ -1,4 +1,4 @@
-"""Which published set a recording is of, and whether it was simulated: attributes that results carry on.
+"""Keep the attributes of results that state the published set of recordings, and whether they were simulated.
 
 ``tacpipe ingest`` marks the recordings of a published set with the name of its format. What a paper printed stands next to
 results on its own data alone, and a lab's own recordings have no such mark.
@@ -13,15 +13,17 @@ from tacpipe.plugins.stage import Attribute
 PUBLISHED, SIMULATED = "published", "simulated"
 
 
-def together(recordings: Iterable[Mapping[str, Attribute]]) -> dict[str, Attribute]:
-    """Return the attributes of what several recordings led to, given theirs: simulated if any is, published if all are.
+def combined(recordings: Iterable[Mapping[str, Attribute]]) -> dict[str, Attribute]:
+    """Return the attributes of a result of several recordings: simulated if any is, published if all are.
 
-    >>> together([{"published": "b"}, {"published": "a"}]), together([{"published": "a"}, {"simulated": True}])
+    >>> combined([{"published": "b"}, {"published": "a"}]), combined([{"published": "a"}, {"simulated": True}])
     ({'published': 'a,b'}, {'simulated': True})
     """
-    every = list(recordings)
-    found: dict[str, Attribute] = {SIMULATED: True} if any(one.get(SIMULATED) for one in every) else {}
-    sets = {str(one.get(PUBLISHED) or "") for one in every}
+    attributes = list(recordings)
+    origin: dict[str, Attribute] = (
+        {SIMULATED: True} if any(recording.get(SIMULATED) for recording in attributes) else {}
+    )
+    sets = {str(recording.get(PUBLISHED) or "") for recording in attributes}
     if sets and "" not in sets:
-        found[PUBLISHED] = ",".join(sorted(sets))
-    return found
+        origin[PUBLISHED] = ",".join(sorted(sets))
+    return origin

@@ -1,4 +1,4 @@
-"""What an opened dataset holds, in a few lines: its stage, recordings, streams with rates, labels and files."""
+"""Summarize an open dataset in a few lines: its stage, recordings, streams with rates, labels and files."""
 
 from __future__ import annotations
 
@@ -22,33 +22,33 @@ _VALUES = 5  # values of a label, above which it is counted alone
 
 
 def lines(dataset: Dataset) -> list[tuple[str, str]]:
-    """Return (what, text) of each line; streams and rates are those of the first recording, which alone is read."""
-    made = dataset.source
-    params = listed([f"{name}={value}" for name, value in made.params.items()], _PARAMS)
-    found = [("made by", f"{made.stage} version {made.version}{f' ({params})' if params else ''}")]
+    """Return (title, text) of each line; streams and rates are those of the first recording, the only one that is read."""
+    manifest = dataset.source
+    params = listed([f"{name}={value}" for name, value in manifest.params.items()], _PARAMS)
+    rows = [("made by", f"{manifest.stage} version {manifest.version}{f' ({params})' if params else ''}")]
     names = list(dataset.recordings)
-    count = f"{len(names)} of {len(made.included)}" if len(names) < len(made.included) else str(len(names))
-    found.append(("recordings", f"{count}: {listed(names, _NAMED)}" if names else "none"))
+    count = f"{len(names)} of {len(manifest.included)}" if len(names) < len(manifest.included) else str(len(names))
+    rows.append(("recordings", f"{count}: {listed(names, _NAMED)}" if names else "none"))
     if names:
-        found.append(("streams", _streams(dataset[names[0]])))
+        rows.append(("streams", _streams(dataset[names[0]])))
         labels = _labels(dataset)
-        found += [("labels", labels)] if labels else []
-    if made.files:
-        found.append(("files", listed(sorted(made.files), _NAMED)))
-    return [(what, printable.lines([text])) for what, text in found]
+        rows += [("labels", labels)] if labels else []
+    if manifest.files:
+        rows.append(("files", listed(sorted(manifest.files), _NAMED)))
+    return [(title, printable.lines([text])) for title, text in rows]
 
 
 def text(dataset: Dataset) -> str:
     """Return the overview as plain text, a line each."""
-    body = [f"  {what:<11}{line}" for what, line in lines(dataset)]
+    body = [f"  {title:<11}{line}" for title, line in lines(dataset)]
     return "\n".join([f"<tacpipe.Dataset {_title(dataset)}>", *body])
 
 
 def html(dataset: Dataset) -> str:
     """Return the overview as a small table for a notebook; every text is escaped."""
     rows = "".join(
-        f'<tr><th style="text-align:left">{escape(what)}</th><td style="text-align:left">{escape(line)}</td></tr>'
-        for what, line in lines(dataset)
+        f'<tr><th style="text-align:left">{escape(title)}</th><td style="text-align:left">{escape(line)}</td></tr>'
+        for title, line in lines(dataset)
     )
     return f"<table><caption>tacpipe.Dataset {escape(_title(dataset))}</caption>{rows}</table>"
 
@@ -57,8 +57,10 @@ def recording_html(recording: Recording) -> str:
     """Return a recording for a notebook: its labels and a small picture of its streams; every text is escaped."""
     from tacpipe.traces import curves, sparkline, taxels
 
-    known = [f"{name}={value}" for name, value in recording.attributes.items() if not name.startswith(streams.TRUTH)]
-    labels = escape(printable.lines([listed(known, _LABELS)])) if known else ""
+    labels_shown = [
+        f"{name}={value}" for name, value in recording.attributes.items() if not name.startswith(streams.TRUTH)
+    ]
+    labels = escape(printable.lines([listed(labels_shown, _LABELS)])) if labels_shown else ""
     title = f"<b>{escape(printable.shown(recording.name))}</b> {labels}"
     try:
         tables = (
@@ -72,16 +74,16 @@ def recording_html(recording: Recording) -> str:
 
 
 def _title(dataset: Dataset) -> str:
-    where = "" if dataset.path is None else f"{printable.shown(str(dataset.path))} "
-    return f"{where}[{dataset.digest[:12]}]"
+    place = "" if dataset.path is None else f"{printable.shown(str(dataset.path))} "
+    return f"{place}[{dataset.digest[:12]}]"
 
 
 def _streams(recording: Recording) -> str:
     try:
         if recording.streams == ("",):
             table = recording.table()
-            within = [name for name in streams_of(recording) if name]
-            return f"one table ({_size(table)}){' of ' if within else ''}{', '.join(within)}"
+            names = [name for name in streams_of(recording) if name]
+            return f"one table ({_size(table)}){' of ' if names else ''}{', '.join(names)}"
         return ", ".join(f"{name} ({_size(recording.table(name))})" for name in recording.streams)
     except TacpipeError as error:
         return f"not readable: {error}"
@@ -103,12 +105,12 @@ def counted(count: int, noun: str) -> str:
 
 def _labels(dataset: Dataset) -> str:
     """Return the labels that take few values, with how many recordings have each; the others are counted."""
-    names = list(dict.fromkeys(name for one in dataset for name in one.attributes))
-    found = []
+    names = list(dict.fromkeys(name for recording in dataset for name in recording.attributes))
+    descriptions = []
     for name in names:
-        values = Counter(str(one.attributes[name]) for one in dataset if name in one.attributes)
+        values = Counter(str(recording.attributes[name]) for recording in dataset if name in recording.attributes)
         if len(values) <= _VALUES and not name.startswith(streams.TRUTH):
-            found.append(f"{name}: {', '.join(f'{value} ({count})' for value, count in sorted(values.items()))}")
-    shown = found[:_LABELS]
-    rest = len(names) - len(shown)
-    return "; ".join([*shown, *([f"{rest} more"] if rest else [])])
+            descriptions.append(f"{name}: {', '.join(f'{value} ({count})' for value, count in sorted(values.items()))}")
+    listed_labels = descriptions[:_LABELS]
+    remaining = len(names) - len(listed_labels)
+    return "; ".join([*listed_labels, *([f"{remaining} more"] if remaining else [])])

@@ -189,7 +189,7 @@ class StoredPages:
         except MissingError as error:
             copy = None
             if self._directory is not None:
-                copy = adoption.beside(page.digest, page.path, (str(self._directory),), page.bytes)
+                copy = adoption.verified_copy(page.digest, page.path, (str(self._directory),), page.bytes)
             if copy is None:
                 raise MissingPageError(
                     f"{error} It is the page of the manifest that holds {plain(page.first)} and {page.recordings - 1} "
@@ -352,9 +352,9 @@ class Pages:
         """Return the sum of a count over all pages."""
         return sum(map(attrgetter(count), self.pages))
 
-    def differing(self, other: Pages) -> Pages:
-        """Return the pages that the other dataset does not have."""
-        theirs = {page.digest for page in other.pages}
+    def differing(self, before: Pages) -> Pages:
+        """Return the pages that the dataset ``before`` does not have."""
+        theirs = {page.digest for page in before.pages}
         return Pages([page for page in self.pages if page.digest not in theirs], self._read, self.fresh)
 
     def missing(self, has: Callable[[str, int], bool]) -> list[Page]:
@@ -426,7 +426,7 @@ class KeyRecordings(Recordings, Written):
 
     def __init__(self, pages: Pages) -> None:
         super().__init__(pages)
-        self._written: dict[int, bytes] = {}  # JSON by number of the page, up to `_WRITTEN_BYTES`
+        self._json_by_page: dict[int, bytes] = {}  # JSON by number of the page, up to `_WRITTEN_BYTES`
         self._written_bytes = 0
 
     def __getitem__(self, name: str) -> Entry:
@@ -441,12 +441,12 @@ class KeyRecordings(Recordings, Written):
         """Yield the canonical JSON of all recordings, a page at a time; a key and its record ask several times for it."""
         yield b"{"
         for number in range(len(self.pages)):
-            text = self._written.get(number)
+            text = self._json_by_page.get(number)
             if text is None:
                 entries = self.pages.load(number).recordings
                 text = canonical({name: key_entry(entry) for name, entry in entries.items()})[1:-1]
                 if self._written_bytes + len(text) <= _WRITTEN_BYTES:
-                    self._written[number] = text
+                    self._json_by_page[number] = text
                     self._written_bytes += len(text)
             yield b"," * bool(number) + text
         yield b"}"
@@ -512,20 +512,20 @@ def differing(before: Mapping[str, Any], now: Mapping[str, Any]) -> tuple[Mappin
 
 
 def compared(before: Mapping[str, Entry], now: Mapping[str, Entry]) -> Iterator[tuple[str, Entry | None, Entry | None]]:
-    """Yield name and entry, before and now, of all recordings of two datasets, in the order of names."""
-    left, right = (iter(_in_order(recordings)) for recordings in (before, now))
-    old, new = next(left, None), next(right, None)
+    """Yield name, entry before and entry now of all recordings of two datasets, in the order of names."""
+    before_items, now_items = (iter(_in_order(recordings)) for recordings in (before, now))
+    old, new = next(before_items, None), next(now_items, None)
     while old is not None or new is not None:
         if new is None or (old is not None and old[0] < new[0]):
             assert old is not None
             yield old[0], old[1], None
-            old = next(left, None)
+            old = next(before_items, None)
         elif old is None or new[0] < old[0]:
             yield new[0], None, new[1]
-            new = next(right, None)
+            new = next(now_items, None)
         else:
             yield old[0], old[1], new[1]
-            old, new = next(left, None), next(right, None)
+            old, new = next(before_items, None), next(now_items, None)
 
 
 def _in_order(recordings: Mapping[str, Entry]) -> Iterator[tuple[str, Entry]]:

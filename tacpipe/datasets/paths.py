@@ -6,7 +6,7 @@ import re
 from collections.abc import Collection, Sequence
 
 MANIFEST = "manifest.json"
-NAME_BYTES = 200  # of a part of a path; file systems take 255, and drafts add to it
+NAME_BYTES = 200  # Longest part of a path; file systems allow 255, and drafts add to it
 _PART = r"(?:[^./\\\x00-\x1f\x7f][^/\\\x00-\x1f\x7f]*|\.z(?:array|attrs|group|metadata))"  # the last: of Zarr
 _PATH = re.compile(rf"{_PART}(?:/{_PART})*")
 _PATHS = re.compile(rf"(?:{_PATH.pattern}(?:\n{_PATH.pattern})*)?")
@@ -35,8 +35,8 @@ def safe_path(path: str) -> bool:
     return short and _PATH.fullmatch(path) is not None
 
 
-def check(paths: Sequence[str], others: Collection[str]) -> None:
-    """Raise `ValueError` where a path is not safe, or is there twice, or among ``others``."""
+def check(paths: Sequence[str], taken_paths: Collection[str]) -> None:
+    """Raise `ValueError` where a path is not safe, or is there twice, or among ``taken_paths``."""
     text = "\n".join(paths)  # hundreds at once: a hit does not wait for a thousand calls
     plain = text and text.isascii() and text.count("\n") == len(paths) - 1 and _PATHS.fullmatch(text)
     if not plain or max(map(len, paths), default=0) > NAME_BYTES:
@@ -44,7 +44,7 @@ def check(paths: Sequence[str], others: Collection[str]) -> None:
             if not safe_path(path):
                 raise ValueError(f"the path {path[:80]!r} leads out of the dataset, or no file can have it")
     refuse_shared(paths)
-    if MANIFEST in paths or (others and not set(others).isdisjoint(paths)):
+    if MANIFEST in paths or (taken_paths and not set(taken_paths).isdisjoint(paths)):
         raise ValueError(_SHARED)
 
 

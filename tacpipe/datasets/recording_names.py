@@ -30,8 +30,8 @@ def valid(text: str) -> str:
     ('cup-1', '木', 'new-line', '')
     """
     composed = unicodedata.normalize("NFC", text)
-    kept = "".join(c if c in _ASCII or (c.isprintable() and not c.isascii()) else " " for c in composed)
-    name = "-".join(kept.split()).strip("-.")
+    printable_text = "".join(c if c in _ASCII or (c.isprintable() and not c.isascii()) else " " for c in composed)
+    name = "-".join(printable_text.split()).strip("-.")
     if len(name.encode()) <= LONGEST:
         return name
     cut = name.encode()[: LONGEST - _MARK - 1].decode(errors="ignore")
@@ -47,15 +47,15 @@ def folded(name: str) -> str:
     return unicodedata.normalize("NFC", unicodedata.normalize("NFC", name).casefold())
 
 
-def refuse_shared(named: Iterable[tuple[str, Path]]) -> None:
-    """Raise `UsageError` where two of the recordings ``named``, (name, its folder or file), have one name but for case."""
-    seen: dict[str, tuple[str, Path]] = {}
-    for one in named:
-        other = seen.setdefault(folded(one[0]), one)
-        if other is not one:
-            first, second = plain(str(other[1]), 200), plain(str(one[1]), 200)
-            name = plain(one[0])
-            names = name if other[0] == one[0] else f"{plain(other[0])} and {name}, which differ only in case"
+def refuse_shared(recordings: Iterable[tuple[str, Path]]) -> None:
+    """Raise `UsageError` if two recordings, each (name, folder or file), have names that differ at most in case."""
+    by_folded_name: dict[str, tuple[str, Path]] = {}
+    for recording in recordings:
+        earlier = by_folded_name.setdefault(folded(recording[0]), recording)
+        if earlier is not recording:
+            first, second = plain(str(earlier[1]), 200), plain(str(recording[1]), 200)
+            name = plain(recording[0])
+            names = name if earlier[0] == recording[0] else f"{plain(earlier[0])} and {name}, which differ only in case"
             raise UsageError(
                 f"{first} and {second} would both be named {names}. Rename one, or give a folder that holds one alone."
             )

@@ -1,4 +1,4 @@
-"""What a command would replace at its output, and whether it may: recordings and labels cannot be computed again.
+"""Decide whether a command may replace its output: recordings and labels cannot be recomputed.
 
 The rules, each with exit code 2:
 
@@ -46,12 +46,12 @@ class Losses:
 
 @dataclass(frozen=True)
 class Plan:
-    """What a command knows of its result before it computes anything."""
+    """Properties of a result that are known before it is computed."""
 
     stage: str
     version: int
     params: Mapping[str, Any] = field(default_factory=dict)
-    sources: Mapping[str, Any] = field(default_factory=dict)  # of ingest: recording to file to digest
+    sources: Mapping[str, Any] = field(default_factory=dict)  # Sources of ingest: recording to file to digest
 
 
 def refuse_inputs(output: Path, inputs: Iterable[Path]) -> None:
@@ -65,27 +65,27 @@ def refuse_inputs(output: Path, inputs: Iterable[Path]) -> None:
             )
 
 
-def _same(output: Path, given: Path) -> bool:
-    return output.resolve() == given.resolve()
+def _same(output: Path, path: Path) -> bool:
+    return output.resolve() == path.resolve()
 
 
 def refuse_foreign(path: Path, mark: bytes) -> None:
-    """Raise `UsageError` if there is a file at ``path`` whose first 64 KiB lack ``mark``: another program wrote it."""
+    """Raise `UsageError` if the file at ``path`` lacks ``mark`` in its first 64 KiB: another program wrote it."""
     if not path.exists():
         return
-    found = b""
+    beginning = b""
     if path.is_file():
         with regular.opened(path) as file:
-            found = file.read(2**16)
-    if mark not in found:
+            beginning = file.read(2**16)
+    if mark not in beginning:
         raise UsageError(f"{path} is there already and this command did not write it. Give -o another place.")
 
 
 def occupant(store: Store, output: Path) -> Manifest | None:
     """Return the manifest of the dataset at ``output``, None if there is none.
 
-    One that is damaged is read from the store. Raises `DamagedError` where that is not possible: nobody knows then what
-    would be replaced.
+    A damaged one is read from the store. Raises `DamagedError` if that is not possible, because the content to replace is
+    then unknown.
     """
     if not (output / manifest_of.NAME).exists():
         return None
@@ -94,13 +94,13 @@ def occupant(store: Store, output: Path) -> Manifest | None:
     except StorageError:
         raise
     except TacpipeError as error:
-        known = former(store, output)
-        if known is None:
+        former_manifest = former(store, output)
+        if former_manifest is None:
             raise DamagedError(
                 f"{error} Labels that were set by hand may be in it, and would be lost: bring it back with git, or remove "
                 f"it to continue without them."
             ) from None
-        return known
+        return former_manifest
 
 
 def former(store: Store, output: Path) -> Manifest | None:
@@ -149,56 +149,57 @@ def losses(before: Manifest, after: Manifest) -> Losses:
         return Losses()
     lost: dict[bool, list[str]] = {True: [], False: []}  # names by whether the recording is lost, or labels alone
     for name in pages.differing(before.recordings, after.recordings)[0]:
-        if irreplaceable(before) and _gone(name, before, after):
+        if irreplaceable(before) and _is_gone(name, before, after):
             lost[True].append(name)
         elif any(after.labels.get(name, {}).get(key) != value for key, value in before.labels.get(name, {}).items()):
             lost[False].append(name)
     return Losses(sorted(lost[True]), sorted(lost[False]))
 
 
-def _gone(name: str, before: Manifest, after: Manifest) -> bool:
+def _is_gone(name: str, before: Manifest, after: Manifest) -> bool:
     """Return whether ``after`` lacks a recording: neither its content nor its raw files are there under the name.
 
     An acquired recording has no raw files: its source is the rig file, which it shares with others.
     """
     if name not in after.recordings:
         return True
-    earlier, now = (_raw(one.sources.get(name, {})) for one in (before, after))
+    earlier, now = (_raw(manifest.sources.get(name, {})) for manifest in (before, after))
     same_files = name in before.sources and earlier == now and before.stage != ACQUIRE
     return not same_files and before.recordings[name]["shards"] != after.recordings[name]["shards"]
 
 
 def _raw(source: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the digests of a recording's raw files, without that of the labels that were read with them."""
-    return {file: one for file, one in source.items() if file != VALUES}
+    """Return the digests of a recording's raw files, without the digest of its labels."""
+    return {file: digest for file, digest in source.items() if file != VALUES}
 
 
 def refuse_plan(before: Manifest | None, output: Path, plan: Plan) -> None:
-    """Raise `UsageError` if ``plan`` would replace what it must not, as far as that is known before anything is computed."""
+    """Raise `UsageError` if ``plan`` would replace recordings or labels; this is checked before anything is computed."""
     if before is None:
         return
     if before.stage != plan.stage:
         raise UsageError(f"{output} holds {_described(before)}; {plan.stage} would replace it. {_KEEP}")
-    given = {name: (_raw(before.sources.get(name, source)), _raw(source)) for name, source in plan.sources.items()}
-    changed = [name for name, (earlier, now) in given.items() if earlier != now]
-    alone = f"or --replace, after which {output} holds the recordings of this source alone. {_BACK}"
+    sources = {name: (_raw(before.sources.get(name, source)), _raw(source)) for name, source in plan.sources.items()}
+    changed = [name for name, (earlier, now) in sources.items() if earlier != now]
+    hint = f"or --replace, after which {output} holds the recordings of this source alone. {_BACK}"
     if changed:
         raise UsageError(
             f"{output} holds recordings of the same name that came from other files: {listed(sorted(changed), _SHOWN)}. "
-            f"Rename the new ones, or give -o another directory, {alone}"
+            f"Rename the new ones, or give -o another directory, {hint}"
         )
-    _refuse_alike(before, output, plan, alone)
-    others = sorted(set(before.recordings) - set(plan.sources)) if plan.sources else []
-    if others and (before.version, dict(before.params)) != (plan.version, dict(plan.params)):
+    _refuse_alike(before, output, plan, hint)
+    other_names = sorted(set(before.recordings) - set(plan.sources)) if plan.sources else []
+    if other_names and (before.version, dict(before.params)) != (plan.version, dict(plan.params)):
         raise UsageError(
-            f"{output} holds {len(others)} recordings that this source does not have ({listed(others, _SHOWN)}), and they "
+            f"{output} holds {len(other_names)} recordings that this source does not have "
+            f"({listed(other_names, _SHOWN)}), and they "
             f"were made by version {before.version} of {before.stage} with {_params(before.params)}. Ingest all of them "
-            f"together, or give -o another directory, {alone}"
+            f"together, or give -o another directory, {hint}"
         )
 
 
-def _refuse_alike(before: Manifest, output: Path, plan: Plan, alone: str) -> None:
-    """Raise `UsageError` where a new recording has the raw files of one at ``output``, or its name but for case."""
+def _refuse_alike(before: Manifest, output: Path, plan: Plan, hint: str) -> None:
+    """Raise `UsageError` if a new recording has the raw files of an existing one, or its name except for case."""
     new = [name for name in plan.sources if name not in before.recordings]
     if not new:
         return
@@ -209,12 +210,12 @@ def _refuse_alike(before: Manifest, output: Path, plan: Plan, alone: str) -> Non
         if same is not None:
             raise UsageError(
                 f"{output} holds the files of {plain(name)} already, as the recording {plain(same)}. Name the folder as it "
-                f"was, or give -o another directory, {alone}"
+                f"was, or give -o another directory, {hint}"
             )
-        if (other := names.get(recording_names.folded(name))) is not None:
+        if (existing := names.get(recording_names.folded(name))) is not None:
             raise UsageError(
-                f"{output} holds the recording {plain(other)}, which differs from {plain(name)} only in case. Rename the "
-                f"new one, or give -o another directory, {alone}"
+                f"{output} holds the recording {plain(existing)}, which differs from {plain(name)} only in case. Rename the "
+                f"new one, or give -o another directory, {hint}"
             )
 
 
@@ -245,65 +246,79 @@ def edited(output: Path, paths: Sequence[str]) -> UsageError:
     )
 
 
-def appended(before: Manifest, made: Manifest) -> Manifest:
-    """Return the ingested recordings ``made`` with those of ``before``; where both have a name, ``made`` holds.
+def appended(before: Manifest, ingested: Manifest) -> Manifest:
+    """Return the recordings of ``before`` and ``ingested``, which takes precedence.
 
     Recordings that could not be read this time stay as they were.
     """
-    items = {name: Item(entry, None, made.sources.get(name)) for name, entry in made.recordings.items()}
-    kept = before.with_recordings(items)
-    skipped = {name: why for name, why in {**before.skipped, **made.skipped}.items() if name not in kept.recordings}
-    return replace(made, recordings=kept.recordings, skipped=skipped, sources=kept.sources, labels=kept.labels)
+    items = {name: Item(entry, None, ingested.sources.get(name)) for name, entry in ingested.recordings.items()}
+    combined = before.with_recordings(items)
+    skipped = {
+        name: reason
+        for name, reason in {**before.skipped, **ingested.skipped}.items()
+        if name not in combined.recordings
+    }
+    return replace(
+        ingested, recordings=combined.recordings, skipped=skipped, sources=combined.sources, labels=combined.labels
+    )
 
 
 def returning_labels(
-    store: Store, output: Path, before: Manifest | None, made: Manifest
+    store: Store, output: Path, before: Manifest | None, result: Manifest
 ) -> dict[str, Mapping[str, Any]]:
-    """Return hand-set labels of recordings that are in ``made``, not the same in ``before``, and lay at ``output`` earlier.
+    """Return the hand-set labels of recordings that return to ``output``: they were there earlier, but not in ``before``.
 
-    A recording that comes back, with the same content or raw files, has the labels that it had there last.
+    A recording returns if it has the same content or raw files; it gets the labels that it had last.
     """
     coming = {
-        one for one in made.recordings if before is None or one not in before.recordings or _gone(one, before, made)
+        name
+        for name in result.recordings
+        if before is None or name not in before.recordings or _is_gone(name, before, result)
     }
     root = store.roots.get(output.absolute()) if coming else None
     if root is None:
         return {}
-    # what a manifest held that is not lasting, the one after it holds too
-    names = [root["manifest"], *(one["manifest"] for one in root.get("history", []) if one["lasting"])]
-    found: dict[str, Mapping[str, Any]] = {}
+    # The successor of a manifest that is not lasting holds the same recordings
+    names = [root["manifest"], *(version["manifest"] for version in root.get("history", []) if version["lasting"])]
+    labels: dict[str, Mapping[str, Any]] = {}
     for name in names if before is None else [name for name in names if name != before.content_digest]:
         try:
-            known = manifest_of.stored(store, name, "the stored manifest")
+            former_manifest = manifest_of.stored(store, name, "the stored manifest")
         except StorageError:
             raise
         except TacpipeError:
             continue
-        if known.stage == made.stage:
-            back = {one for one in coming & set(known.recordings) if not _gone(one, known, made)}
-            found |= {one: known.labels[one] for one in back & set(known.labels)}
+        if former_manifest.stage == result.stage:
+            back = {
+                recording
+                for recording in coming & set(former_manifest.recordings)
+                if not _is_gone(name, former_manifest, result)
+            }
+            labels |= {name: former_manifest.labels[name] for name in back & set(former_manifest.labels)}
             coming -= back
-    return found
+    return labels
 
 
 def outgoing(store: Store, directory: Path) -> Manifest | None:
     """Return the manifest that a publication at ``directory`` replaces, None if there is none.
 
-    It is known to the store afterwards, so that it can be checked out: one that git brought, or a copy, is stored.
+    The store has it afterwards, so that it can be checked out: a manifest from git, or a copy, is stored.
     """
     try:
-        found = manifest_of.find(directory)
-        here = found.manifest
+        dataset = manifest_of.find(directory)
+        manifest = dataset.manifest
     except StorageError:
         raise
     except TacpipeError:
         return former(store, directory)
     root = store.roots.get(directory)
-    if root is None or root["manifest"] != found.digest:
-        known = former(store, directory)
-        here.keep(store, durable=here.recorded)
-        store.roots.set(directory, found.digest, lasting=known is not None and bool(losses(known, here)))
-    return here
+    if root is None or root["manifest"] != dataset.digest:
+        former_manifest = former(store, directory)
+        manifest.keep(store, durable=manifest.recorded)
+        store.roots.set(
+            directory, dataset.digest, lasting=former_manifest is not None and bool(losses(former_manifest, manifest))
+        )
+    return manifest
 
 
 def _described(manifest: Manifest) -> str:

@@ -11,12 +11,12 @@ FILE = "split.parquet"
 _RECORDING = "split"  # the name of a split's only recording
 
 
-def digest(manifest: Manifest, where: str) -> str:
-    """Return the digest of the table of a split. Raises `UsageError`, which names ``where``, for any other dataset."""
+def digest(manifest: Manifest, place: str) -> str:
+    """Return the digest of the table of a split. Raises `UsageError`, which names ``place``, for any other dataset."""
     if set(manifest.recordings) != {_RECORDING}:
-        raise UsageError(f"{where} is not a split; make one with `tacpipe split`.")
-    found: str = manifest.recordings[_RECORDING]["shards"][""]["digest"]
-    return found
+        raise UsageError(f"{place} is not a split; make one with `tacpipe split`.")
+    shard_digest: str = manifest.recordings[_RECORDING]["shards"][""]["digest"]
+    return shard_digest
 
 
 def read(content: bytes) -> dict[tuple[str, int], str]:
@@ -27,9 +27,9 @@ def read(content: bytes) -> dict[tuple[str, int], str]:
     return dict(zip(zip(rows["recording"], rows["fold"], strict=True), rows["role"], strict=True))
 
 
-def in_fold(roles: Mapping[tuple[str, int], str], fold: int, where: str) -> dict[str, str]:
-    """Return recording to role in a fold of the split ``where``. Raises `UsageError` where it has no such fold."""
+def in_fold(roles: Mapping[tuple[str, int], str], fold: int, place: str) -> dict[str, str]:
+    """Return recording to role in a fold of the split ``place``. Raises `UsageError` where it has no such fold."""
     folds = sorted({number for _, number in roles})
     if fold not in folds:
-        raise UsageError(f"The split {where} has the folds {folds}, not {fold}.")
+        raise UsageError(f"The split {place} has the folds {folds}, not {fold}.")
     return {recording: role for (recording, number), role in roles.items() if number == fold}

@@ -1,4 +1,4 @@
-"""Which recordings of a dataset meet conditions on their names, their role in a split and their labels."""
+"""Select recordings of a dataset by their names, their role in a split and their labels."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ def roles_of(split: Dataset | None, role: str | None, fold: int) -> dict[str, st
                 "A role and a fold are those of a split: give split too, as in select(split=PATH, role='test')."
             )
         return None
-    where = str(split.path or "this dataset")
-    roles.digest(split.source, where)
+    place = str(split.path or "this dataset")
+    roles.digest(split.source, place)
     (only,) = split
     rows = only.table(columns=["recording", "fold", "role"]).to_pydict()
     table = dict(zip(zip(rows["recording"], rows["fold"], strict=True), rows["role"], strict=True))
-    return roles.in_fold(table, fold, where)
+    return roles.in_fold(table, fold, place)
 
 
 def chosen(
@@ -48,44 +48,48 @@ def chosen(
 
     Raises `UsageError` where none does, and for a label that no recording has.
     """
-    names = [name for name in dataset.recordings if not patterns or any(fnmatchcase(name, one) for one in patterns)]
+    names = [
+        name for name in dataset.recordings if not patterns or any(fnmatchcase(name, pattern) for pattern in patterns)
+    ]
     if not names:
-        there = listed(dataset.recordings, _SHOWN)
-        raise UsageError(f"No recording is named {' or '.join(patterns) or 'anything'}; there are {there}.")
+        existing = listed(dataset.recordings, _SHOWN)
+        raise UsageError(f"No recording is named {' or '.join(patterns) or 'anything'}; there are {existing}.")
     if roles is not None:
         names = [name for name in names if name in roles and role in (None, roles[name])]
         if not names:
-            there = ", ".join(sorted(set(roles.values())))
-            raise UsageError(f"No recording has the role {role or 'of any kind'} in this split; its roles are {there}.")
-    for label, wanted in labels.items():
-        names = _labelled(dataset, names, label, wanted)
+            existing = ", ".join(sorted(set(roles.values())))
+            raise UsageError(
+                f"No recording has the role {role or 'of any kind'} in this split; its roles are {existing}."
+            )
+    for label, condition in labels.items():
+        names = _labelled(dataset, names, label, condition)
     return names
 
 
 def unknown_label(dataset: Dataset, label: str) -> UsageError:
-    """Return the error for a label that no recording has, which lists those that recordings have."""
-    known = sorted({one for recording in dataset for one in recording.attributes if not one.startswith(TRUTH)})
+    """Return the error for a label that no recording has; it lists the existing labels."""
+    existing = sorted({name for recording in dataset for name in recording.attributes if not name.startswith(TRUTH)})
     return UsageError(
-        f"No recording has the label {plain(label)}; there are {listed(known, _LABELS)}.{suggestion(label, known)}"
+        f"No recording has the label {plain(label)}; there are {listed(existing, _LABELS)}.{suggestion(label, existing)}"
     )
 
 
-def _labelled(dataset: Dataset, names: Sequence[str], label: str, wanted: Wanted) -> list[str]:
+def _labelled(dataset: Dataset, names: Sequence[str], label: str, condition: Wanted) -> list[str]:
     values = {name: dataset[name].attributes[label] for name in names if label in dataset[name].attributes}
     if not values:
         raise unknown_label(dataset, label)
-    meets = _test(wanted)
-    found = [name for name, value in values.items() if meets(value)]
-    if not found:
-        there = listed(sorted({str(value) for value in values.values()}), _SHOWN)
-        asked = "a value that meets the condition" if callable(wanted) else excerpt(wanted)
-        raise UsageError(f"No recording has {asked} for the label {plain(label)}; its values are {there}.")
-    return found
+    meets = _test(condition)
+    matching = [name for name, value in values.items() if meets(value)]
+    if not matching:
+        existing = listed(sorted({str(value) for value in values.values()}), _SHOWN)
+        description = "a value that meets the condition" if callable(condition) else excerpt(condition)
+        raise UsageError(f"No recording has {description} for the label {plain(label)}; its values are {existing}.")
+    return matching
 
 
-def _test(wanted: Wanted) -> Callable[[Attribute], Any]:
-    if callable(wanted):
-        return wanted
-    several = isinstance(wanted, Collection) and not isinstance(wanted, str)
-    values: Collection[Attribute] = wanted if several else (wanted,)  # type: ignore[assignment]
+def _test(condition: Wanted) -> Callable[[Attribute], Any]:
+    if callable(condition):
+        return condition
+    is_collection = isinstance(condition, Collection) and not isinstance(condition, str)
+    values: Collection[Attribute] = condition if is_collection else (condition,)  # type: ignore[assignment]
     return lambda value: value in values

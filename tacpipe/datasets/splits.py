@@ -1,4 +1,4 @@
-"""Who is trained on, who is watched, who is tested: roles of whole recordings, never of windows.
+"""Assign roles of training, validation and test to whole recordings, never to windows.
 
 Windows of one recording overlap and resemble each other, so a split among them would test on what was trained on.
 Everything here follows from names, attributes and a seed; the order in which names are given does not matter.
@@ -19,7 +19,7 @@ from tacpipe.plugins.stage import ROLES, Attribute
 from tacpipe.printable import listed, plain, suggestion
 
 SCHEMES = ("random", "kfold", "blocked", "leave-one-out", "authors")
-SHARES = (0.2, 0.25, 0.3, 0.35, 0.4, 0.5, 0.6)  # of validation recordings, that are advised where there are too few
+SHARES = (0.2, 0.25, 0.3, 0.35, 0.4, 0.5, 0.6)  # Shares of validation recordings that errors suggest
 _NAMED = 12  # attributes that an error names
 UNUSED = "unused"  # role of those that a few-shot split takes out of training
 Attributes = Mapping[str, Attribute]
@@ -35,13 +35,15 @@ class Scheme:
     calibration: float = 0.0  # fraction to calibrate on, of the same recordings as val
     test: float = 0.15  # fraction of the recordings; of no effect where the scheme picks them
     seed: int = 0
-    folds: int = 5  # of kfold
+    folds: int = 5  # Number of folds of kfold
     by: str = "object"  # attribute whose values leave-one-out leaves out one by one
     stratify: str = ""  # attributes, with commas between, whose values are spread evenly over the roles; empty for none
-    apart: str = ""  # of kfold: attribute whose values are dealt into the folds too, there unknown; empty for none
-    repeats: int = 1  # of random: folds, each another draw
-    reverse: bool = False  # of blocked: test the first and train on the last
-    few: int = 0  # at most so many train, all others that would are unused; 0 for all
+    apart: str = (
+        ""  # For kfold: attribute whose values are divided among the folds too, unknown in their fold; empty for none
+    )
+    repeats: int = 1  # For random: number of folds, each another draw
+    reverse: bool = False  # For blocked: test the first and train on the last
+    few: int = 0  # Number of training recordings, others are unused; 0 for all
     few_by: str = ""  # attribute of whose every value ``few`` train; empty for ``few`` altogether
     few_of: str = ""  # attribute=value of those that ``few`` is about, as sensor=roboskin; empty for all
 
@@ -87,11 +89,11 @@ def assign(attributes: Mapping[str, Attributes], scheme: Scheme, keep: Mapping[t
         folds = _kfold(fresh, attributes, scheme, keep)
     else:
         folds = _leave_one_out(attributes, scheme, keep)
-    roles = {(name, fold): role for fold, found in enumerate(folds) for name, role in found.items()}
-    kept = _kept(attributes, keep, len(folds), scheme)
-    roles |= kept
+    roles = {(name, fold): role for fold, roles_by_name in enumerate(folds) for name, role in roles_by_name.items()}
+    older_roles = _older_roles(attributes, keep, len(folds), scheme)
+    roles |= older_roles
     if scheme.few:
-        roles |= _few(roles, kept, attributes, scheme)
+        roles |= _limit_training(roles, older_roles, attributes, scheme)
     for fold in range(len(folds)):
         if not any(role == "train" for (_, at), role in roles.items() if at == fold):
             raise TacpipeError(
@@ -121,7 +123,7 @@ def sufficient_val(
         try:
             if val > scheme.val and not without_val(assign(attributes, replace(scheme, val=val), keep)):
                 return val
-        except TacpipeError:  # so large a share leaves nothing to train on
+        except TacpipeError:  # Such a large share leaves nothing to train on
             continue
     return None
 
@@ -195,22 +197,22 @@ def _order(
     return sorted(names, key=lambda name: (places[name], ties[name]))
 
 
-def _few(
-    roles: Roles, kept: Mapping[tuple[str, int], str], attributes: Mapping[str, Attributes], scheme: Scheme
+def _limit_training(
+    roles: Roles, older_roles: Mapping[tuple[str, int], str], attributes: Mapping[str, Attributes], scheme: Scheme
 ) -> Roles:
     """Return the role ``unused`` for those that would train beyond ``few``; what an older split trains on counts."""
     attribute, _, value = scheme.few_of.partition("=")
-    meant = [name for name in sorted(attributes) if not attribute or _value(name, attributes, attribute) == value]
-    if not meant:
+    candidates = [name for name in sorted(attributes) if not attribute or _value(name, attributes, attribute) == value]
+    if not candidates:
         raise TacpipeError(f"No recording has {attribute} {value}, of which few was to leave {scheme.few} to train on.")
     groups: dict[str, list[str]] = {}
-    for name in meant:
+    for name in candidates:
         groups.setdefault(_value(name, attributes, scheme.few_by) if scheme.few_by else "", []).append(name)
     unused: Roles = {}
     for fold in sorted({fold for _, fold in roles}):
         for group in _ordered(set(groups)):
             trained = [name for name in groups[group] if roles.get((name, fold)) == "train"]
-            fresh = [name for name in trained if (name, fold) not in kept]
+            fresh = [name for name in trained if (name, fold) not in older_roles]
             room = max(scheme.few - (len(trained) - len(fresh)), 0)
             order = _order(fresh, attributes, scheme, np.random.default_rng([scheme.seed, fold, 1]))
             unused |= {(name, fold): UNUSED for name in order[room:]}
@@ -238,9 +240,9 @@ def _authors(names: Sequence[str], attributes: Mapping[str, Attributes], scheme:
     for name in names:
         role = attributes[name].get("authors_role")
         if role not in ROLES:
-            held = f"has authors_role {role!r}" if role is not None else "has no attribute authors_role"
+            problem = f"has authors_role {role!r}" if role is not None else "has no attribute authors_role"
             raise TacpipeError(
-                f"Recording {name} {held}; the scheme authors needs {', '.join(ROLES)} there. Ingest with "
+                f"Recording {name} {problem}; the scheme authors needs {', '.join(ROLES)} there. Ingest with "
                 f"--authors-role, set it with `tacpipe label`, or choose another scheme."
             )
         roles[name] = str(role)
@@ -251,22 +253,24 @@ def _authors(names: Sequence[str], attributes: Mapping[str, Attributes], scheme:
 def _authors_folds(
     names: Sequence[str], attributes: Mapping[str, Attributes], scheme: Scheme, blocks: Sequence[int]
 ) -> list[dict[str, str]]:
-    """Return a fold a block: the block is val where the authors name whom to test, and tested where they do not."""
-    own = {name: attributes[name].get("authors_role") for name in names}
-    fixed = {name: str(own[name]) for name in names if own[name] == "test"}
-    fixed |= {name: str(own[name]) for name in names if own[name] in ROLES and not _has_block(attributes[name])}
-    published = any(one.get("authors_role") == "test" for one in attributes.values())
+    """Return one fold per block: the block is val if the authors name the test recordings, and test otherwise."""
+    declared = {name: attributes[name].get("authors_role") for name in names}
+    fixed = {name: str(declared[name]) for name in names if declared[name] == "test"}
+    fixed |= {
+        name: str(declared[name]) for name in names if declared[name] in ROLES and not _has_block(attributes[name])
+    }
+    published = any(recording.get("authors_role") == "test" for recording in attributes.values())
     part = {name: blocks.index(_block(name, attributes)) for name in names if _has_block(attributes[name])}
     part |= _parts([name for name in names if name not in part and name not in fixed], attributes, scheme, len(blocks))
     folds = []
     for fold in range(len(blocks)):
         turn = [name for name in names if name not in fixed and part[name] == fold]
-        rest = [name for name in names if name not in fixed and part[name] != fold]
+        remaining = [name for name in names if name not in fixed and part[name] != fold]
         if published:
-            trained = _val_of(rest, attributes, replace(scheme, val=0), fold + 1)
+            trained = _val_of(remaining, attributes, replace(scheme, val=0), fold + 1)
             folds.append(fixed | trained | dict.fromkeys(turn, "val"))
         else:
-            folds.append(fixed | _val_of(rest, attributes, scheme, fold + 1) | dict.fromkeys(turn, "test"))
+            folds.append(fixed | _val_of(remaining, attributes, scheme, fold + 1) | dict.fromkeys(turn, "test"))
     return folds
 
 
@@ -289,8 +293,8 @@ def _kfold(
     folds = []
     for fold in range(scheme.folds):
         tested = {name for name in names if fold in (part[name], unknown.get(name))}
-        rest = _val_of([name for name in names if name not in tested], attributes, scheme, fold + 1)
-        folds.append(rest | dict.fromkeys(tested, "test"))
+        roles = _val_of([name for name in names if name not in tested], attributes, scheme, fold + 1)
+        folds.append(roles | dict.fromkeys(tested, "test"))
     return folds
 
 
@@ -305,7 +309,7 @@ def _parts(names: Sequence[str], attributes: Mapping[str, Attributes], scheme: S
 def _unknown(
     attributes: Mapping[str, Attributes], scheme: Scheme, keep: Mapping[tuple[str, int], str]
 ) -> dict[str, int]:
-    """Return the fold in which the value of ``apart`` that a recording has is unknown, by recording.
+    """Return, by recording, the fold in which the recording's value of ``apart`` is unknown.
 
     Values are shuffled, and each goes to the fold that has fewest; those of an older split stay where they were.
     """
@@ -317,11 +321,11 @@ def _unknown(
             f"would have none; make at most {len(distinct)} folds."
         )
     fold_of = _unknown_before(values, scheme, keep)
-    held = Counter(fold_of.values())
+    counts = Counter(fold_of.values())
     for i in np.random.default_rng([scheme.seed, 0]).permutation(len(distinct)):
         if distinct[i] not in fold_of:
-            fold_of[distinct[i]] = min(range(scheme.folds), key=lambda fold: (held[fold], fold))
-            held[fold_of[distinct[i]]] += 1
+            fold_of[distinct[i]] = min(range(scheme.folds), key=lambda fold: (counts[fold], fold))
+            counts[fold_of[distinct[i]]] += 1
     return {name: fold_of[value] for name, value in values.items()}
 
 
@@ -334,10 +338,11 @@ def _unknown_before(values: Mapping[str, str], scheme: Scheme, keep: Mapping[tup
     tested: dict[str, set[int]] = {}
     for name, folds in sorted(folds_of.items()):
         tested[values[name]] = tested.get(values[name], folds) & folds
-    known = [value for value, folds in tested.items() if not folds]
-    if known:
+    values_in_training = [value for value, folds in tested.items() if not folds]
+    if values_in_training:
         raise TacpipeError(
-            f"The older split has no fold that tests all recordings of {scheme.apart} {known[0]}, so it did not keep "
+            f"The older split has no fold that tests all recordings of {scheme.apart} {values_in_training[0]}, "
+            f"so it did not keep "
             f"{scheme.apart} apart. Make a split anew, or leave apart as it was."
         )
     return {value: min(folds) for value, folds in tested.items()}
@@ -346,7 +351,7 @@ def _unknown_before(values: Mapping[str, str], scheme: Scheme, keep: Mapping[tup
 def _leave_one_out(
     attributes: Mapping[str, Attributes], scheme: Scheme, keep: Mapping[tuple[str, int], str]
 ) -> list[dict[str, str]]:
-    """One fold a value, sorted; values that an older split tested keep their fold."""
+    """Return one fold per value, sorted; values that an older split tested keep their fold."""
     values = {name: _value(name, attributes, scheme.by) for name in sorted(attributes)}
     old = {fold: values[name] for (name, fold), role in sorted(keep.items()) if role == "test" and name in values}
     left_out = [old[fold] for fold in sorted(old)]
@@ -355,15 +360,15 @@ def _leave_one_out(
         raise TacpipeError(f"All recordings have {scheme.by} {left_out[0]}; leaving it out leaves none to train on.")
     folds = []
     for fold, value in enumerate(left_out):
-        rest = _val_of([name for name in values if values[name] != value], attributes, scheme, fold + 1)
-        folds.append(rest | {name: "test" for name in values if values[name] == value})
+        roles = _val_of([name for name in values if values[name] != value], attributes, scheme, fold + 1)
+        folds.append(roles | {name: "test" for name in values if values[name] == value})
     return folds
 
 
-def _kept(
+def _older_roles(
     attributes: Mapping[str, Attributes], keep: Mapping[tuple[str, int], str], folds: int, scheme: Scheme
 ) -> Roles:
-    """Return the older roles of recordings that are still there. Raises where they do not fit the scheme."""
+    """Return the older roles of recordings that still exist. Raises `TacpipeError` if they do not fit the scheme."""
     old = {fold for _, fold in keep}
     grown = scheme.name == "leave-one-out" and len(old) <= folds  # a new value adds a fold
     if keep and old != set(range(folds)) and not grown:
@@ -378,11 +383,11 @@ def _strata(
     names: Sequence[str], attributes: Mapping[str, Attributes], scheme: Scheme
 ) -> dict[tuple[str, ...], list[str]]:
     """Return the recordings of each value of the attributes ``stratify``, values and names sorted."""
-    wanted = [attribute.strip() for attribute in scheme.stratify.split(",") if attribute.strip()]
+    stratified = [attribute.strip() for attribute in scheme.stratify.split(",") if attribute.strip()]
     strata: dict[tuple[str, ...], list[str]] = {}
     for name in sorted(names):
-        strata.setdefault(tuple(_value(name, attributes, attribute) for attribute in wanted), []).append(name)
-    return {values: strata[values] for values in sorted(strata, key=lambda values: [_place(one) for one in values])}
+        strata.setdefault(tuple(_value(name, attributes, attribute) for attribute in stratified), []).append(name)
+    return {values: strata[values] for values in sorted(strata, key=lambda values: [_place(value) for value in values])}
 
 
 def _value(name: str, attributes: Mapping[str, Attributes], attribute: str) -> str:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from tacpipe.datasets.dataset import Dataset, Recording
 
-KEPT_BYTES = 1 << 30  # of decoded recordings that stay in memory, in each process
+KEPT_BYTES = 1 << 30  # Decoded recordings in memory, per process
 TACTILE = "tactile"  # quantity of the channels that have a level at rest
 
 

@@ -26,7 +26,7 @@ Answer = Mapping[str, Entry] | pages.Pages  # results of a group of recordings
 
 
 @dataclass(frozen=True)
-class _Asked:
+class _Group:
     """A group of recordings: what its key is the digest of, and the recordings."""
 
     identity: Mapping[str, Any]
@@ -35,94 +35,102 @@ class _Asked:
 
 @dataclass(frozen=True)
 class ByRecording:
-    """What a request wants of results recording by recording; what was done is added to ``outcome``."""
+    """Results of a request recording by recording; counts and notes are added to ``outcome``."""
 
     store: Store
     request: Request
     outcome: Outcome
     chosen: Chosen
-    previous: Previous | None = None  # of which results are taken over
+    previous: Previous | None = None  # Earlier run whose unchanged results are reused
 
-    def mapped(self, given: Manifest, step: Mapping[str, Any], beside: tuple[str, ...]) -> Mapping[str, Entry]:
-        """Return what the map stage of a link of a chain gives for each recording of ``given``; raises as `run`.
+    def run_step(self, source: Manifest, step: Mapping[str, Any], dataset_dirs: tuple[str, ...]) -> Mapping[str, Entry]:
+        """Return the result of a map stage, one link of a chain, for each recording of ``source``; raises as `run`.
 
-        A group of recordings has a record of its own, besides those of its recordings. So a dataset of which one recording
-        changed takes one record a group, and one for each recording of the group that changed. What is answered is kept in
-        pages where recordings are many.
+        A group of recordings has its own record, in addition to those of its recordings. If one recording changed, one
+        record per group is read, and one for each recording of the changed group. Results of many recordings are kept
+        in pages.
         """
-        entries, name, stage = given.included, step["stage"], execution.stage_of(step["stage"])
-        answered: list[Answer | _Asked] = []
+        entries, name, stage = source.included, step["stage"], execution.stage_of(step["stage"])
+        answered: list[Answer | _Group] = []
         missing: list[Task] = []
-        stored: dict[str, Mapping[str, Any]] = {}  # of groups of which something is missing
-        taken = None if self.previous is None else self.previous.taken(entries, step)
-        known: Mapping[str, pages.Pages] = {}
-        if taken is not None:
-            known = taken.pages
-            self.outcome.reused += taken.count
-            self.outcome.add_group(taken.stated)
+        stored: dict[str, Mapping[str, Any]] = {}  # Records of groups that are incomplete
+        reusable = None if self.previous is None else self.previous.reusable(entries, step)
+        reusable_pages: Mapping[str, pages.Pages] = {}
+        if reusable is not None:
+            reusable_pages = reusable.pages
+            self.outcome.reused += reusable.count
+            self.outcome.add_group(reusable.summary)
         else:
             self.store.expect(digest(keys.of_group(step, stage, group.entries())) for group in pages.groups(entries))
-        many = len(entries) > pages.INLINE
+        is_paged = len(entries) > pages.INLINE
 
-        def answer(made: Mapping[str, Entry]) -> Answer:
-            return pages.Pages.from_items((one, Item(entry)) for one, entry in made.items()) if many else made
+        def answer(results: Mapping[str, Entry]) -> Answer:
+            return (
+                pages.Pages.from_items((recording, Item(entry)) for recording, entry in results.items())
+                if is_paged
+                else results
+            )
 
         for group in pages.groups(entries):
-            if group.page in known:
-                answered.append(known[group.page])
+            if group.page in reusable_pages:
+                answered.append(reusable_pages[group.page])
                 continue
-            some = group.entries()
-            asked = _Asked(keys.of_group(step, stage, some), some)
-            made = None if self.request.compare or self._reruns(name) else self._of_group(asked)
-            if made is None:
-                tasks = keys.shard_tasks(self.store, replace(given, recordings=some), step, beside)
-                found, lacking = self._stored(name, tasks)
+            group_entries = group.entries()
+            pending = _Group(keys.of_group(step, stage, group_entries), group_entries)
+            group_results = None if self.request.compare or self._reruns(name) else self._of_group(pending)
+            if group_results is None:
+                tasks = keys.shard_tasks(self.store, replace(source, recordings=group_entries), step, dataset_dirs)
+                group_records, lacking = self._stored(name, tasks)
                 if lacking:
-                    stored |= found
+                    stored |= group_records
                     missing += lacking
-                    answered.append(asked)
+                    answered.append(pending)
                     continue
-                made = self._remember_group(name, asked, found)
-            answered.append(answer(_after(made, some)))
+                group_results = self._remember_group(name, pending, group_records)
+            answered.append(answer(_after(group_results, group_entries)))
         computed = self._computed(name, missing, stored, len(entries))
 
         def parts() -> Iterator[Answer]:
-            for one in answered:
-                if not isinstance(one, _Asked):
-                    yield one
+            for answer_or_pending in answered:
+                if not isinstance(answer_or_pending, _Group):
+                    yield answer_or_pending
                     continue
-                records_of = {recording: computed[recording] for recording in one.entries if recording in computed}
-                made = self._remember_group(name, one, records_of)
-                yield answer(_after(made, one.entries))
+                records_of = {
+                    recording: computed[recording] for recording in answer_or_pending.entries if recording in computed
+                }
+                group_results = self._remember_group(name, answer_or_pending, records_of)
+                yield answer(_after(group_results, answer_or_pending.entries))
 
-        if many:
+        if is_paged:
             return pages.Recordings(pages.Pages.joined(part for part in parts() if isinstance(part, pages.Pages)))
-        return {one: entry for part in parts() if isinstance(part, Mapping) for one, entry in part.items()}
+        return {name: entry for part in parts() if isinstance(part, Mapping) for name, entry in part.items()}
 
-    def _of_group(self, asked: _Asked) -> Mapping[str, Entry] | None:
-        """Return what the record of a group holds, None where there is none or an object is gone."""
-        record = self.store.record(digest(asked.identity))
+    def _of_group(self, group: _Group) -> Mapping[str, Entry] | None:
+        """Return the entries in the record of a group; None if there is no record or an object is missing."""
+        record = self.store.record(digest(group.identity))
         if record is None or not records.complete(self.store, record):
             return None
-        self.outcome.reused += len(asked.entries)
+        self.outcome.reused += len(group.entries)
         self.outcome.add_group(record["provenance"])
-        made: Mapping[str, Entry] = record["result"]["recordings"]
-        return made
+        entries: Mapping[str, Entry] = record["result"]["recordings"]
+        return entries
 
     def run(self, name: str, tasks: Sequence[Task]) -> dict[str, Entry]:
-        """Return what each task of stage ``name`` gives.
+        """Return the entry of each task of stage ``name``, by recording.
 
         Raises `TacpipeError` where recordings could not be read, and `WouldChangeError` with ``--check`` where the stage
         would run.
         """
-        return _after({one: result["recordings"][""] for one, result in self.results(name, tasks).items()}, {})
+        return _after(
+            {recording: result["recordings"][""] for recording, result in self.results(name, tasks).items()}, {}
+        )
 
     def results(self, name: str, tasks: Sequence[Task]) -> dict[str, Mapping[str, Any]]:
         """Return what the record of each task of stage ``name`` holds as its result, by recording; raises as `run`."""
         return {recording: record["result"] for recording, record in self._records(name, tasks).items()}
 
     def _reruns(self, name: str) -> bool:
-        return self.request.rerun and registry.whole(name) == self.request.name
+        return self.request.rerun and registry.stage_name(name) == self.request.name
 
     def _records(self, name: str, tasks: Sequence[Task]) -> dict[str, Mapping[str, Any]]:
         """Return the record of each task, by recording."""
@@ -130,142 +138,146 @@ class ByRecording:
         return self._computed(name, missing, stored, len(tasks))
 
     def _stored(self, name: str, tasks: Sequence[Task]) -> tuple[dict[str, Mapping[str, Any]], list[Task]]:
-        """Return the records that the store has, by recording, and the tasks that are to be computed."""
-        found: dict[str, Mapping[str, Any]] = {}
+        """Return the stored records by recording, and the tasks that must be computed."""
+        stored: dict[str, Mapping[str, Any]] = {}
         missing: list[Task] = []
         rerun = self._reruns(name)
         self.store.expect(digest(task.identity) for task in tasks)
         for task in tasks:
             record = self.store.record(digest(task.identity))
             if record is not None and not rerun and records.complete(self.store, record):
-                found[task.recording] = record
+                stored[task.recording] = record
                 self.outcome.add_record(name, task.recording, record)
             else:
                 missing.append(replace(task, replace=record is not None, rerun=rerun, run=self.store.run))
         if self.request.compare:
             missing = [replace(task, dry=True) for task in tasks]
         self.outcome.reused += len(tasks) - len(missing)
-        return found, missing
+        return stored, missing
 
     def _computed(
         self, name: str, missing: Sequence[Task], stored: Mapping[str, Mapping[str, Any]], count: int
     ) -> dict[str, Mapping[str, Any]]:
-        """Return the records that are ``stored`` and those of the tasks that are ``missing``, of ``count`` in all."""
+        """Return the ``stored`` records and those of the ``missing`` tasks, which are computed; ``count`` is their total."""
         if missing and self.request.check:
-            raise WouldChangeError(f"{registry.whole(name)} would run for {len(missing)} of {count} recordings.")
-        found = {**stored, **self._compute(name, missing, stored)}
-        if missing and not found and len(missing) == count:
+            raise WouldChangeError(f"{registry.stage_name(name)} would run for {len(missing)} of {count} recordings.")
+        complete = {**stored, **self._compute(name, missing, stored)}
+        if missing and not complete and len(missing) == count:
             lines = _lines(self.outcome.bad)
-            raise error(FAILED, f"{registry.whole(name)} could not read any of the {count} recordings:\n{lines}")
-        return found
+            raise error(FAILED, f"{registry.stage_name(name)} could not read any of the {count} recordings:\n{lines}")
+        return complete
 
-    def _remember_group(self, name: str, asked: _Asked, made: Mapping[str, Mapping[str, Any]]) -> dict[str, Entry]:
-        """Return what the records of a group's recordings hold, and store it under the key of the group if all are there."""
-        result = {one: record["result"]["recordings"][""] for one, record in made.items()}
-        if self.store.run and len(asked.entries) > 1 and len(made) == len(asked.entries):
-            stated = Outcome(self.outcome.output)
-            for recording, record in made.items():
-                stated.add_record(name, recording, record)
-            made_by = {**provenance.of(0.0), **stated.of_results()}
-            self.store.commit(asked.identity, {"recordings": result, "files": {}}, made_by, replace=True)
+    def _remember_group(
+        self, name: str, group: _Group, records_by_name: Mapping[str, Mapping[str, Any]]
+    ) -> dict[str, Entry]:
+        """Return the entries of a group's recordings, and store them under the key of the group if the group is complete."""
+        result = {recording: record["result"]["recordings"][""] for recording, record in records_by_name.items()}
+        if self.store.run and len(group.entries) > 1 and len(records_by_name) == len(group.entries):
+            summary = Outcome(self.outcome.output)
+            for recording, record in records_by_name.items():
+                summary.add_record(name, recording, record)
+            made_by = {**provenance.describe(0.0), **summary.of_results()}
+            self.store.commit(group.identity, {"recordings": result, "files": {}}, made_by, replace=True)
         return result
 
-    def replay(self, given: Manifest, model: Manifest, beside: tuple[str, ...], where: str) -> Manifest:
-        """Return ``given`` after the stages that a model was trained behind, from wherever it is among them now.
+    def replay(self, source: Manifest, model: Manifest, dataset_dirs: tuple[str, ...], dataset_name: str) -> Manifest:
+        """Return ``source`` after the stages that precede a model's training, run from the stage that it has reached.
 
-        ``beside`` are directories whose shards can be adopted, the model's too; ``where`` names the dataset in errors.
-        Raises `UsageError` where it went through other stages, or where a stage has another version now.
+        Shards can be adopted from ``dataset_dirs``, which include the model's directory.
+        Raises `UsageError` if it went through other stages, or if a stage has another version now.
         """
-        wanted = model.chain
-        if list(given.chain) != list(wanted[: len(given.chain)]):
+        model_chain = model.chain
+        if list(source.chain) != list(model_chain[: len(source.chain)]):
             raise UsageError(
-                f"The model was trained behind other stages than {where} went through: "
-                f"{merging.chain_difference(wanted, given.chain)}. Give the recordings themselves: the model's own "
+                f"The model was trained behind other stages than {dataset_name} went through: "
+                f"{merging.chain_difference(model_chain, source.chain)}. Give the recordings themselves: the model's own "
                 f"stages are then run on them."
             )
-        for step in wanted[len(given.chain) :]:
+        for step in model_chain[len(source.chain) :]:
             stage = registry.load(step["stage"])
             if stage.version != step["version"]:
                 raise UsageError(
                     f"The model was trained behind version {step['version']} of {step['stage']}; this tacpipe has version "
                     f"{stage.version}. Train it again."
                 )
-            recordings = self.mapped(given, step, beside)
+            recordings = self.run_step(source, step, dataset_dirs)
             files = {name: model.files[name] for name in step["fitted"] or {}}
-            given = Manifest(
-                step["stage"], step["version"], step["params"], {}, [*given.chain, step], recordings, files
+            source = Manifest(
+                step["stage"], step["version"], step["params"], {}, [*source.chain, step], recordings, files
             )
-        return given
+        return source
 
     def _compute(
         self, name: str, tasks: Sequence[Task], stored: Mapping[str, Mapping[str, Any]]
     ) -> dict[str, Mapping[str, Any]]:
-        """Return the records of tasks that are computed, and compare them with those that are ``stored``."""
-        found: dict[str, Mapping[str, Any]] = {}
+        """Compute tasks and return their records; with ``--recompute-and-compare`` compare them with the ``stored`` ones."""
+        computed: dict[str, Mapping[str, Any]] = {}
         if not tasks:
-            return found
+            return computed
         bad: dict[str, Done] = {}
         executor = self.chosen.opened()
-        module = registry.stages()[registry.whole(name)].partition(":")[0]
+        module = registry.stages()[registry.stage_name(name)].partition(":")[0]
         preload = ["tacpipe.io.parquet", "tacpipe.engine.computing", module]
-        with progress.bar(registry.whole(name), len(tasks)) as advance:
-            for done in executor.run(computing.compute, tasks, preload):
-                advance(note=done.recording)
-                if done.record is None:
-                    bad[done.recording] = done
+        with progress.bar(registry.stage_name(name), len(tasks)) as advance:
+            for result in executor.run(computing.compute, tasks, preload):
+                advance(note=result.recording)
+                if result.record is None:
+                    bad[result.recording] = result
                     continue
-                self.outcome.ran += done.made
-                self.outcome.reused += not done.made
-                self.outcome.add_record(name, done.recording, done.record)
-                made_by = done.record["provenance"]
-                found[done.recording] = {  # what is needed of it: of a million there is no room for more
-                    "result": done.record["result"],
+                self.outcome.ran += result.is_new
+                self.outcome.reused += not result.is_new
+                self.outcome.add_record(name, result.recording, result.record)
+                made_by = result.record["provenance"]
+                computed[result.recording] = {  # Only what is needed: memory must hold a million of these
+                    "result": result.record["result"],
                     "provenance": {name: made_by[name] for name in ("notes", "code", "packages") if name in made_by},
                 }
-                if self.request.compare and done.recording in stored:
-                    self.outcome.compare(stored[done.recording], done.record, done.recording)
+                if self.request.compare and result.recording in stored:
+                    self.outcome.compare(stored[result.recording], result.record, result.recording)
         self._refuse(name, bad)
-        return found
+        return computed
 
     def _refuse(self, name: str, bad: Mapping[str, Done]) -> None:
-        source = f"{self.request.source}/"  # where the files lay is no part of a manifest
+        source = f"{self.request.source}/"  # The location of files is not part of a manifest
         self.outcome.bad.update({name: bad[name].error.replace(source, "") for name in sorted(bad)})
-        others = sorted({(-done.exit_code, done.error) for done in bad.values() if not done.at_fault})
-        if others and all(code == -FAILED for code, _ in others):  # the disk fails all alike: once is enough
-            raise error(FAILED, others[0][1])
-        if not bad or (self.request.skip_bad and not others):
+        other_errors = sorted({(-failure.exit_code, failure.error) for failure in bad.values() if not failure.at_fault})
+        if other_errors and all(
+            code == -FAILED for code, _ in other_errors
+        ):  # A failing disk gives the same error each time: report it once
+            raise error(FAILED, other_errors[0][1])
+        if not bad or (self.request.skip_bad and not other_errors):
             return
-        waited = [done.error for done in bad.values() if done.exit_code == LOCKED]
-        if waited:  # nothing is wrong with the recording, which another process works on
+        waited = [failure.error for failure in bad.values() if failure.exit_code == LOCKED]
+        if waited:  # Another process computes the recording; nothing is wrong with it
             raise LockedError(waited[0])
         lines = _lines({recording: bad[recording].error for recording in bad})
         plural = "recordings" if len(bad) > 1 else "recording"
-        advice = "fix these." if others else "fix these, or leave them out with --skip-bad."
+        advice = "fix these." if other_errors else "fix these, or leave them out with --skip-bad."
         raise error(
-            max(done.exit_code for done in bad.values()),
-            f"{registry.whole(name)} could not read {len(bad)} {plural}:\n{lines}\nWhat is good is kept in the store; "
+            max(failure.exit_code for failure in bad.values()),
+            f"{registry.stage_name(name)} could not read {len(bad)} {plural}:\n{lines}\nWhat is good is kept in the store; "
             f"{advice}",
         )
 
 
-def _after(made: Mapping[str, Entry], entries: Mapping[str, Entry]) -> dict[str, Entry]:
-    """Return what a stage made of recordings, with the attributes of ``entries`` before its own, in the order of names."""
+def _after(results: Mapping[str, Entry], entries: Mapping[str, Entry]) -> dict[str, Entry]:
+    """Return the results of a stage in the order of names, each with the attributes of ``entries`` before its own."""
     return {
         name: {
-            "attributes": {**entries[name]["attributes"], **one["attributes"]}
+            "attributes": {**entries[name]["attributes"], **entry["attributes"]}
             if name in entries
-            else one["attributes"],
-            "shards": one["shards"],
+            else entry["attributes"],
+            "shards": entry["shards"],
         }
-        for name, one in sorted(made.items())
+        for name, entry in sorted(results.items())
     }
 
 
 def error(exit_code: int, sentence: str) -> TacpipeError:
-    """Return an error with the exit code of what it reports."""
-    found = TacpipeError(sentence)
-    found.exit_code = exit_code
-    return found
+    """Return an error with a sentence and an exit code."""
+    failure = TacpipeError(sentence)
+    failure.exit_code = exit_code
+    return failure
 
 
 def _lines(bad: Mapping[str, str]) -> str:

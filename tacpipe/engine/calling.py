@@ -45,51 +45,53 @@ def call(
     name: str,
     datasets: Sequence[Given],
     output: str | PathLike[str],
-    named: Mapping[str, Given],
+    arguments: Mapping[str, Given],
     params: Mapping[str, Any],
-    how: How,
+    options: How,
 ) -> Dataset | Path:
     """Run stage ``name`` and return its output: see `tacpipe.run`, whose arguments these are."""
     stage = registry.load(name)
     for flag, kind in OPTIONS.items():
-        fields.check(getattr(how, flag), kind, flag)
-    _refuse_unread(name, stage, datasets, named, how)
-    paths: dict[str, Any] = {key: _path(given) for key, given in named.items()}
-    read = [_path(given) for given in datasets]
+        fields.check(getattr(options, flag), kind, flag)
+    _refuse_unread(name, stage, datasets, arguments, options)
+    paths: dict[str, Any] = {key: _path(dataset) for key, dataset in arguments.items()}
+    read = [_path(dataset) for dataset in datasets]
     request = Request(
         name,
         given_params.build(
             name,
             stage,
-            file=None if how.params_file is None else Path(how.params_file),
-            block=how.block,
-            preset=how.preset,
+            file=None if options.params_file is None else Path(options.params_file),
+            block=options.block,
+            preset=options.preset,
             options=params,
         ),
         Path(output),
         datasets=[] if stage.source else read,
         source=read[0] if stage.source else None,
-        fold=how.fold,
-        role=how.role,
-        jobs=how.jobs,
-        executor=how.executor,
-        device=how.device,
-        skip_bad=how.skip_bad,
-        rerun=how.rerun,
-        replace=how.replace,
-        track=tuple(how.track),
+        fold=options.fold,
+        role=options.role,
+        jobs=options.jobs,
+        executor=options.executor,
+        device=options.device,
+        skip_bad=options.skip_bad,
+        rerun=options.rerun,
+        replace=options.replace,
+        track=tuple(options.track),
         **paths,
     )
-    with progress.showing_progress(how.progress):
+    with progress.showing_progress(options.progress):
         outcome = pipeline.run(request)
     for note in outcome.notes:
         warnings.warn(note, ResultWarning, stacklevel=_STACK)
-    for recording, why in outcome.bad.items():
-        warnings.warn(f"left out {recording}: {why}", ResultWarning, stacklevel=_STACK)
+    for recording, reason in outcome.bad.items():
+        warnings.warn(f"left out {recording}: {reason}", ResultWarning, stacklevel=_STACK)
     return request.output if request.single_file else pipeline.open_dataset(request.output)
 
 
-def _refuse_unread(name: str, stage: AnyStage, datasets: Sequence[Given], named: Mapping[str, Given], how: How) -> None:
+def _refuse_unread(
+    name: str, stage: AnyStage, datasets: Sequence[Given], arguments: Mapping[str, Given], options: How
+) -> None:
     """Raise `UsageError` for an argument that the stage does not read, and for datasets too few or too many."""
     kinds = set(stage.arguments.values())
     reads = {
@@ -99,8 +101,8 @@ def _refuse_unread(name: str, stage: AnyStage, datasets: Sequence[Given], named:
         "init": "init" in stage.arguments,
         "extend": "extend" in stage.arguments,
     }
-    is_set = {**dict.fromkeys(named, True), "fold": how.fold != 0, "role": how.role is not None}
-    is_set |= {"track": bool(how.track), "device": how.device != AUTO}
+    is_set = {**dict.fromkeys(arguments, True), "fold": options.fold != 0, "role": options.role is not None}
+    is_set |= {"track": bool(options.track), "device": options.device != AUTO}
     reads |= {"fold": reads["split"], "role": stage.reads_model and not stage.needs_split, "track": stage.tracked}
     reads |= {"device": stage.trains}
     for key in is_set:
@@ -112,15 +114,15 @@ def _refuse_unread(name: str, stage: AnyStage, datasets: Sequence[Given], named:
         raise UsageError(f"The stage {name} reads no dataset; leave {datasets[0]} out.")
 
 
-def _path(given: Given) -> Path:
-    """Return where a dataset lies. Raises `UsageError` for one that is nowhere, or of which a part was selected."""
-    if not isinstance(given, Dataset):
-        return Path(given)
-    if given.path is None:
+def _path(dataset: Given) -> Path:
+    """Return the path of a dataset. Raises `UsageError` if it has none, or if only some of its recordings are selected."""
+    if not isinstance(dataset, Dataset):
+        return Path(dataset)
+    if dataset.path is None:
         raise UsageError("A dataset that a stage was given has no path; give one that tacpipe.open returned.")
-    if len(given) < len(given.source.included):
+    if len(dataset) < len(dataset.source.included):
         raise UsageError(
-            f"A stage reads whole datasets, and {len(given)} of the {len(given.source.included)} recordings of {given.path} "
-            f"were selected. Give the path, and a split for the roles of recordings."
+            f"A stage reads whole datasets, and {len(dataset)} of the {len(dataset.source.included)} recordings of "
+            f"{dataset.path} were selected. Give the path, and a split for the roles of recordings."
         )
-    return given.path
+    return dataset.path

@@ -35,21 +35,21 @@ _MANY = 4  # tasks for which threads are started
 
 
 class _Computing:
-    """What `compute` is: a function of one task, which takes several where they wait for a store that is kept elsewhere."""
+    """Compute one task, or several that overlap their requests to a remote store."""
 
     def __call__(self, task: Task) -> Done:
         """Make the task's key and return its record; a `TacpipeError` becomes a `Done` with its sentence."""
         store = opened(task.store, task.run)
         try:
-            return _begun(task, store)()
+            return _begin(task, store)()
         finally:
             store.close()
 
-    def each(self, tasks: Sequence[Task]) -> Iterator[Done]:
-        """Yield what this gives for each task, in their order.
+    def compute_all(self, tasks: Sequence[Task]) -> Iterator[Done]:
+        """Yield the outcome of each task, in order.
 
-        Of a store that is kept elsewhere the records of the next tasks are looked for, and the results of those before are
-        sent, while one is computed: each of these requests takes as long as a small recording.
+        While a task is computed, the records of the next tasks are read from a remote store and results of earlier tasks
+        are sent: each of these requests takes as long as a small recording.
         """
         stores: dict[tuple[str, str], Store] = {}
         for task in tasks:
@@ -70,38 +70,38 @@ compute = _Computing()
 
 def _overlapped(tasks: Sequence[tuple[Task, Store]]) -> Iterator[Done]:
     """Yield what becomes of each task. Stages run in this thread alone."""
-    from concurrent.futures import ThreadPoolExecutor  # which a hit does not load
+    from concurrent.futures import ThreadPoolExecutor  # Not loaded for a cache hit
 
     pool = ThreadPoolExecutor(AT_ONCE)
     looks: deque[Future[None]] = deque()
     sent: deque[Future[Done]] = deque()
-    begun: list[Callable[[], Done]] = []
+    unsent: list[Callable[[], Done]] = []
     try:
         for task, store in tasks[:AT_ONCE]:
             looks.append(pool.submit(store.seek, digest(task.identity)))
         for place, (task, store) in enumerate(tasks):
-            with contextlib.suppress(TacpipeError):  # what it was is found by who looks again
+            with contextlib.suppress(TacpipeError):  # The next look reports the error
                 looks.popleft().result()
             if place + AT_ONCE < len(tasks):
                 later, its_store = tasks[place + AT_ONCE]
                 looks.append(pool.submit(its_store.seek, digest(later.identity)))
-            begun.append(_begun(task, store))
-            sent.append(pool.submit(begun[-1]))
+            unsent.append(_begin(task, store))
+            sent.append(pool.submit(unsent[-1]))
             while sent and (sent[0].done() or len(sent) > AT_ONCE):
-                begun.pop(0)
+                unsent.pop(0)
                 yield sent.popleft().result()
         while sent:
-            begun.pop(0)
+            unsent.pop(0)
             yield sent.popleft().result()
     finally:
         pool.shutdown(cancel_futures=True)
-        for finish, future in zip(begun, sent, strict=False):
+        for finish, future in zip(unsent, sent, strict=False):
             if future.cancelled() and isinstance(finish, _Sending):
                 finish.leases.close()
 
 
-def _begun(task: Task, store: Store) -> Callable[[], Done]:
-    """Compute the task where its record is not stored; return what stores the result and returns what became of it."""
+def _begin(task: Task, store: Store) -> Callable[[], Done]:
+    """Compute the task unless its record is stored; return a function that stores the result and returns the outcome."""
     key = digest(task.identity)
     try:
         with ExitStack() as leases:
@@ -111,8 +111,8 @@ def _begun(task: Task, store: Store) -> Callable[[], Done]:
                 return _Sending(task, store, outcome, leases.pop_all())
     except TacpipeError as error:
         outcome = _failed(task, store, error)
-    done: Done = outcome
-    return lambda: done
+    failure: Done = outcome
+    return lambda: failure
 
 
 def _failed(task: Task, store: Store, error: TacpipeError) -> Done:
@@ -122,7 +122,7 @@ def _failed(task: Task, store: Store, error: TacpipeError) -> Done:
 
 @dataclass(frozen=True)
 class _Made:
-    """What a stage gave, its content put into the store, before there is a record of it."""
+    """Result of a stage whose content is stored, before its record is written."""
 
     result: Mapping[str, Any]
     provenance: Mapping[str, Any]
@@ -132,19 +132,23 @@ class _Made:
 
 @dataclass(frozen=True)
 class _Sending:
-    """What commits a result; the leases end with that."""
+    """Commit a result when called; the leases end with that."""
 
     task: Task
     store: Store
-    made: _Made
+    computed: _Made
     leases: ExitStack
 
     def __call__(self) -> Done:
-        task, store, made = self.task, self.store, self.made
+        task, store, computed = self.task, self.store, self.computed
         try:
             with self.leases:
                 record = store.commit(
-                    task.identity, made.result, made.provenance, replace=made.replace, durable=made.durable
+                    task.identity,
+                    computed.result,
+                    computed.provenance,
+                    replace=computed.replace,
+                    durable=computed.durable,
                 )
                 shutil.rmtree(execution.workspace(store, digest(task.identity)), ignore_errors=True)
         except TacpipeError as error:
@@ -155,18 +159,18 @@ class _Sending:
 def _computed(task: Task, store: Store, key: str, leases: ExitStack) -> Done | _Made:
     if task.dry:
         result, _ = execution.execute(task, store, Scratch())
-        return Done(task.recording, {"result": result, "provenance": provenance.of(0.0)})
+        return Done(task.recording, {"result": result, "provenance": provenance.describe(0.0)})
     leases.enter_context(store.leases.hold(key, f"{task.name} {task.recording}".strip()))
     record = store.record(key)
     if record is not None and not task.rerun and records.complete(store, record):
-        return Done(task.recording, record, made=False)
+        return Done(task.recording, record, is_new=False)
     started = time.perf_counter()
     replace = task.replace or record is not None
     with registry.collect_packages() as packages:
         stage = execution.stage_of(task.name)
         code = provenance.code(stage)  # The file may be edited while the stage runs
         result, notes = execution.execute(task, store, store)
-    origin = {**provenance.of(round(time.perf_counter() - started, 4)), "irreplaceable": stage.source}
+    origin = {**provenance.describe(round(time.perf_counter() - started, 4)), "irreplaceable": stage.source}
     origin |= {"code": code, "packages": provenance.code_of_packages(task.identity, packages), "notes": notes}
     if stage.source:  # the record alone would mark this as a recording, until a dataset's manifest does
         _manifest_of(task, stage, result).keep(store, durable=True)

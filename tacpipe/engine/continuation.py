@@ -16,19 +16,19 @@ from tacpipe.store.location import locate
 
 
 def continued(recordings: Dataset, model: Dataset) -> Dataset:
-    """Return recordings after the stages of a model's chain that they have not been through yet.
+    """Run the remaining stages of a model's chain on recordings and return the result.
 
-    What the store has is not computed again, and what is computed goes there, as with ``tacpipe predict``. Both datasets
-    were opened. Raises `UsageError` where the recordings went through other stages, `TacpipeError` where one of them
+    Stored results are reused, and new ones are stored, as with ``tacpipe predict``. Both datasets
+    must be open. Raises `UsageError` where the recordings went through other stages, `TacpipeError` where one of them
     cannot be read.
     """
     assert recordings.path is not None and model.path is not None
     source = recordings.source
-    given = replace(source, recordings={name: source.recordings[name] for name in recordings.recordings})
-    beside = (str(recordings.path), str(model.path))
+    selected = replace(source, recordings={name: source.recordings[name] for name in recordings.recordings})
+    dataset_dirs = (str(recordings.path), str(model.path))
     store = locate(recordings.path, model.path)
     manifests = [source.content_digest, bytes_digest(model.source.content)]
     with Chosen("", 0) as chosen, store.at_work(manifests):
         mapping = ByRecording(store, Request("", None, Path()), Outcome(Path()), chosen)
-        made = mapping.replay(given, model.source, beside, str(recordings.path))
-    return Dataset(made, execution.reader(store, beside))
+        replayed = mapping.replay(selected, model.source, dataset_dirs, str(recordings.path))
+    return Dataset(replayed, execution.reader(store, dataset_dirs))

@@ -15,18 +15,18 @@ from tacpipe.store.location import locate
 from tacpipe.training import display, following
 from tacpipe.training.following import Line, Network
 
-TIMED_S = 3.0  # of batches, behind the first one, which is slower
+TIMED_S = 3.0  # Batches are timed this long, without the slower first one
 _HOUR_S = 3600.0
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """What a grid takes at most, if each model takes as long as the first and no patience ends it."""
+    """Upper estimate of a grid's duration: each model takes as long as the first, and none stops early."""
 
-    models: int  # that are missing
+    models: int  # Missing models
     at_once: int
     each_s: float  # alone
-    hours: float  # of all
+    hours: float  # Total
 
     def __str__(self) -> str:
         """Return it as a sentence."""
@@ -38,14 +38,14 @@ class Estimate:
         )
 
 
-def of(requests: Sequence[Request], jobs: int) -> Estimate | None:
-    """Return how long the missing ones of several trainings take, ``jobs`` at a time; None where it cannot be known.
+def estimate_duration(requests: Sequence[Request], jobs: int) -> Estimate | None:
+    """Return how long the missing trainings take, ``jobs`` at a time; None if it cannot be estimated.
 
-    That is where nothing is missing, where no network is trained, and where the first one fails.
+    There is no estimate if nothing is missing, if no network is trained, and if the first training fails.
     """
     with progress.showing_progress(False):
         try:
-            missing = [one for one in requests if _is_missing(one)]
+            missing = [request for request in requests if _is_missing(request)]
             each_s = _timed(missing[0]) if missing else None
         except TacpipeError:  # the grid reports it
             return None
@@ -90,7 +90,7 @@ class _Stopwatch:
     """Times batches of the first network, and ends its training."""
 
     def __init__(self) -> None:
-        self.all_s = 0.0  # of reading and of all epochs of all networks that are left
+        self.all_s = 0.0  # Reading and all epochs of the remaining networks
         self._started_s = self._begun_s = time.monotonic()
         self._first: tuple[float, float] | None = None  # time and fraction of the epoch after the first batch
         self._network, self._done = Network(1), 0
@@ -109,8 +109,10 @@ class _Stopwatch:
         if passed < 1 and now_s - since_s < TIMED_S:
             return
         epoch_s = (now_s - since_s) / (passed - before)
-        left = self._network.epochs - self._done + self._network.epochs * (self._network.count - self._network.number)
-        self.all_s = self._begun_s - self._started_s + epoch_s * left
+        remaining_epochs = (
+            self._network.epochs - self._done + self._network.epochs * (self._network.count - self._network.number)
+        )
+        self.all_s = self._begun_s - self._started_s + epoch_s * remaining_epochs
         raise _TimedError
 
     def line(self, line: Line, learning_rate: float) -> None:

@@ -52,21 +52,24 @@ class Scratch:
 def execute(
     task: Task, store: Store, sink: Store | Scratch, *, followed: bool = True
 ) -> tuple[dict[str, Any], list[str]]:
-    """Call the stage for the task; return what a record's ``result`` holds, its content put into ``sink``, and notes.
+    """Call the stage for the task, put the content into ``sink``, and return the ``result`` of a record and notes.
 
-    What it trains is ``followed`` by whoever looks, or by no one.
+    With ``followed``, the progress of a training is reported to trackers and the display.
     """
-    stage, stage_name = stage_of(task.name), registry.whole(task.name)
+    stage, stage_name = stage_of(task.name), registry.stage_name(task.name)
     params = params_of.from_json(stage, task.identity["params"])
     with _arguments(stage, task, store) as arguments, _followed(task.name, stage, arguments if followed else {}):
         try:
-            with memory.raising_shortage(), extras.named(f"Stage {stage_name}", lambda: registry.package(stage_name)):
+            with (
+                memory.raising_shortage(),
+                extras.explain_missing(f"Stage {stage_name}", lambda: registry.package(stage_name)),
+            ):
                 returned = _result(task.name, stage, stage(params, **arguments))
-                result = _stored(returned, sink, durable=stage.source)  # of batches it is here that they are read
+                result = _stored(returned, sink, durable=stage.source)  # Batches are read here
         except Exception as error:
             failures.attach(error, task.name, task.recording, (__file__, Stage.__call__.__code__.co_filename))
             raise
-    notes = [*returned.notes, *(note for one in returned.recordings.values() for note in one.notes)]
+    notes = [*returned.notes, *(note for output in returned.recordings.values() for note in output.notes)]
     return result, notes
 
 
@@ -87,7 +90,7 @@ def _stored(returned: Result, sink: Store | Scratch, *, durable: bool) -> dict[s
 
 def stage_of(name: str) -> AnyStage:
     """Return the stage of this name; ``compress.pca.fit`` is the fit of ``compress.pca``, and so with parts."""
-    stage = registry.load(registry.whole(name))
+    stage = registry.load(registry.stage_name(name))
     if name.endswith(registry.FIT):
         assert stage.fit is not None
         return stage.fit
@@ -97,8 +100,8 @@ def stage_of(name: str) -> AnyStage:
     return stage
 
 
-def differences(stored: Mapping[str, Any], made: Mapping[str, Any], name: str) -> list[str]:
-    """Return the paths of shards and files whose content is other in two results; ``name`` is that of a mapped recording."""
+def differences(stored: Mapping[str, Any], recomputed: Mapping[str, Any], name: str) -> list[str]:
+    """Return the paths of shards and files whose content differs; ``name`` is the recording of a mapped stage."""
 
     def contents(result: Mapping[str, Any]) -> dict[str, str]:
         shards = {
@@ -108,15 +111,15 @@ def differences(stored: Mapping[str, Any], made: Mapping[str, Any], name: str) -
         }
         return {**shards, **{file: value["digest"] for file, value in result["files"].items()}}
 
-    before, now = contents(stored), contents(made)
+    before, now = contents(stored), contents(recomputed)
     return sorted(path for path in {*before, *now} if before.get(path) != now.get(path))
 
 
 class _Reader:
-    """What `reader` returns; in another process it reads from the same store."""
+    """Function that `reader` returns; pickled into another process it reads from the same store."""
 
-    def __init__(self, store: Store, beside: tuple[str, ...], sizes: Mapping[str, int] | Manifest) -> None:
-        self._store, self._beside, self._sizes = store, beside, sizes
+    def __init__(self, store: Store, dataset_dirs: tuple[str, ...], sizes: Mapping[str, int] | Manifest) -> None:
+        self._store, self._dataset_dirs, self._sizes = store, dataset_dirs, sizes
 
     def __call__(self, name: str, path: str) -> bytes:
         sizes = self._sizes
@@ -125,7 +128,7 @@ class _Reader:
             return self._store.read(name, size)
         except MissingError as error:
             try:
-                content = _adopt(self._store, name, path, self._beside, size)
+                content = _adopt(self._store, name, path, self._dataset_dirs, size)
             except StorageError as unread:  # a copy may be there: the stage that made it is the other way to have it
                 try:
                     return _remake(self._store, name, path, str(error), size)
@@ -149,116 +152,120 @@ class _Reader:
 
     def __reduce__(self) -> tuple[Any, ...]:
         sizes = self._sizes if isinstance(self._sizes, Manifest) else dict(self._sizes)
-        return _reader_at, (self._store.place, self._beside, sizes)
+        return _reader_at, (self._store.place, self._dataset_dirs, sizes)
 
 
-def _reader_at(place: str, beside: tuple[str, ...], sizes: Mapping[str, int] | Manifest) -> _Reader:
-    return _Reader(opened(place), beside, sizes)
+def _reader_at(place: str, dataset_dirs: tuple[str, ...], sizes: Mapping[str, int] | Manifest) -> _Reader:
+    return _Reader(opened(place), dataset_dirs, sizes)
 
 
 def reader(
-    store: Store, beside: tuple[str, ...] = (), sizes: Mapping[str, int] | Manifest = MappingProxyType({})
+    store: Store, dataset_dirs: tuple[str, ...] = (), sizes: Mapping[str, int] | Manifest = MappingProxyType({})
 ) -> Callable[[str, str], bytes]:
-    """Return a function (digest, path within its dataset) -> content that repairs what it finds damaged.
+    """Return a function (digest, path within its dataset) -> content that repairs damaged objects.
 
-    It reads from the store; what is missing there is adopted from the directories ``beside``, or recomputed from its
+    It reads from the store; missing objects are adopted from ``dataset_dirs``, or recomputed from their
     record. ``sizes`` are those in bytes that a manifest declares, by digest, or the manifest: nothing much larger is read.
     Raises `DamagedError` where neither can be done. It can be pickled.
     """
-    return _Reader(store, beside, sizes)
+    return _Reader(store, dataset_dirs, sizes)
 
 
 def _adopt(store: Store, name: str, path: str, beside_of: tuple[str, ...], size: int | None) -> bytes | None:
-    content = adoption.beside(name, path, beside_of, size)
+    content = adoption.verified_copy(name, path, beside_of, size)
     if content is not None:
-        with contextlib.suppress(TacpipeError):  # of a store that may only be read the sound copy is as good
+        with contextlib.suppress(TacpipeError):  # A read-only store stays damaged; the intact copy is used
             store.prepare()
             store.put(content, durable=True)
     return content
 
 
-def _remake(store: Store, name: str, path: str, why: str, size: int | None = None) -> bytes:
-    other = ""
+def _remake(store: Store, name: str, path: str, problem: str, size: int | None = None) -> bytes:
+    obstacle = ""
     for identity, made_by in _makers(store, name):
         acquired = identity["stage"] == ACQUIRE
         if acquired or stage_of(identity["stage"]).source:
             raise DamagedError(
-                f"{why} It is the recording {path}, which cannot be recomputed: restore it with `tacpipe store pull`"
+                f"{problem} It is the recording {path}, which cannot be recomputed: restore it with `tacpipe store pull`"
                 f"{'' if acquired else ', or ingest it again'}."
             )
         stage = stage_of(identity["stage"])
         if stage.version != identity["version"]:
-            other = f"{identity['stage']} has version {stage.version} now, and it was made by {identity['version']}"
+            obstacle = f"{identity['stage']} has version {stage.version} now, and it was made by {identity['version']}"
             continue
         key = digest(identity)
-        if key in _remaking:  # a stage that gives what it was given: another one made that first
+        if key in _remaking:  # The stage returns its input: another stage made the object first
             continue
         _remaking.add(key)
         try:
             with store.leases.hold(key, f"{identity['stage']}, for {path}"):
-                if not store.has(name, size):  # else another process has made it again
+                if not store.has(name, size):  # Otherwise another process has recomputed it
                     execute(Task(store.place, identity["stage"], identity, run=store.run), store, store)
         except TacpipeError as error:
             if error.exit_code != FAILED:
                 raise
-            other = str(error)
+            obstacle = str(error)
             continue
         finally:
             _remaking.discard(key)
         if store.has(name, size):
             return store.read(name, size)
-        unlike = "; ".join(provenance.unlike(made_by, provenance.of(0.0)))
-        other = f"{identity['stage']} gave something else when it was run again ({unlike or 'it depends on chance'})"
-    reason = other or f"nothing in the store says how {path} was made"
+        unlike = "; ".join(provenance.unlike(made_by, provenance.describe(0.0)))
+        obstacle = f"{identity['stage']} gave something else when it was run again ({unlike or 'it depends on chance'})"
+    reason = obstacle or f"nothing in the store says how {path} was made"
     raise DamagedError(
-        f"{why} It cannot be recomputed: {reason}. Bring {path} with `tacpipe store pull`, or run the stage anew."
+        f"{problem} It cannot be recomputed: {reason}. Bring {path} with `tacpipe store pull`, or run the stage anew."
     )
 
 
 _remaking: set[str] = set()  # keys that this process makes again, one because another one lacks its input
-_known: dict[str, dict[str, list[tuple[Any, Any]]]] = {}  # store, digest, identities of what gave it and provenance
+_makers_by_object: dict[
+    str, dict[str, list[tuple[Any, Any]]]
+] = {}  # store, digest, identities of what gave it and provenance
 
 
 def _makers(store: Store, name: str) -> list[tuple[Any, Any]]:
-    """Return identity and provenance of the keys that gave an object; all records are read once for many lost objects."""
+    """Return identity and provenance of the records that name an object; all records are read once for many objects."""
     root = str(store.root)
-    if name not in _known.get(root, {}):
-        _known[root] = {}
+    if name not in _makers_by_object.get(root, {}):
+        _makers_by_object[root] = {}
         for _, record in store.records():
             if "stage" in record["identity"]:
-                for found in set(records.named(record["result"])):
-                    _known[root].setdefault(found, []).append((record["identity"], record["provenance"]))
-    return _known[root].get(name, [])
+                for object_name in set(records.digests(record["result"])):
+                    _makers_by_object[root].setdefault(object_name, []).append(
+                        (record["identity"], record["provenance"])
+                    )
+    return _makers_by_object[root].get(name, [])
 
 
 @contextmanager
 def _arguments(stage: AnyStage, task: Task, store: Store) -> Iterator[dict[str, Any]]:
     """Yield the arguments that the identity describes, by name."""
-    read = reader(store, task.beside)
+    read = reader(store, task.dataset_dirs)
     inputs = task.identity["inputs"]
-    found: dict[str, Any] = {}
+    arguments: dict[str, Any] = {}
     for name, kind in stage.arguments.items():
         if kind == "Recording":
-            found[name] = Recording(task.recording, inputs[name], read)
+            arguments[name] = Recording(task.recording, inputs[name], read)
         elif kind in ("Dataset", "Model", "Parts"):
-            store.fetch(_named(inputs[name] or {}))
-            found[name] = _dataset(inputs[name], read) if inputs[name] is not None else None
+            store.fetch(_digests(inputs[name] or {}))
+            arguments[name] = _dataset(inputs[name], read) if inputs[name] is not None else None
         elif kind == "Datasets":
-            store.fetch(name for value in inputs[name] for name in _named(value))
-            found[name] = tuple(_dataset(value, read) for value in inputs[name])
+            store.fetch(name for value in inputs[name] for name in _digests(value))
+            arguments[name] = tuple(_dataset(value, read) for value in inputs[name])
         elif kind == "Fitted":
-            found[name] = {file: read(value, file) for file, value in inputs[name].items()}
+            arguments[name] = {file: read(value, file) for file, value in inputs[name].items()}
         elif kind == "Files":
-            found[name] = {file: Path(path) for file, path in (task.files or {}).items()}
+            arguments[name] = {file: Path(path) for file, path in (task.files or {}).items()}
         elif kind in ("Trial", "Values", "RecordingName"):
-            found[name] = inputs[name]
+            arguments[name] = inputs[name]
         elif kind == "Shared":
-            found[name] = SharedFiles(store) if store.run else None
+            arguments[name] = SharedFiles(store) if store.run else None
         elif kind == "Roles":
-            found[name] = _roles(inputs[name], read)
+            arguments[name] = _roles(inputs[name], read)
         else:
-            found[name] = _begun_workspace(store, digest(task.identity))
-    yield found
+            arguments[name] = _begun_workspace(store, digest(task.identity))
+    yield arguments
     for file, path in (task.files or {}).items():
         if remembered_file_digest(path) != inputs[stage.argument("Files")][file]:
             raise StorageError(f"{path} changed while it was read. Run the same command again.")
@@ -309,30 +316,35 @@ def remove_empty_workspace(store: Store, key: str) -> None:
 
 @contextmanager
 def _followed(name: str, stage: AnyStage, arguments: Mapping[str, Any]) -> Iterator[None]:
-    """Have what the stage trains, if it has a workspace to train in, followed by whoever looks."""
+    """Report the training of a stage that has a workspace to trackers and the display while the block runs."""
     workspace = arguments.get(stage.argument("Workspace") or "")
     if workspace is None:
         yield
         return
-    with display.on_stderr(registry.whole(name), workspace) as shown, following.in_workspace(workspace, *shown):
+    with (
+        display.on_stderr(registry.stage_name(name), workspace) as displays,
+        following.in_workspace(workspace, *displays),
+    ):
         yield
 
 
 @contextmanager
 def watching(task: Task) -> Iterator[Sequence[following.Follower]]:
-    """Yield whoever looks, here, at what a task trains in another process: nobody where its stage trains nothing."""
+    """Yield the followers in this process of a training in another process; none if the stage trains nothing."""
     if stage_of(task.name).argument("Workspace") is None:
         yield ()
         return
     store = opened(task.store)
-    here = None if store.distant else workspace(store, digest(task.identity))  # else it is in the worker's own folder
-    with display.on_stderr(registry.whole(task.name), here) as shown:
-        yield (*following.trackers(), *shown)
+    local_workspace = (
+        None if store.distant else workspace(store, digest(task.identity))
+    )  # The workspace of a remote store is in the worker's folder
+    with display.on_stderr(registry.stage_name(task.name), local_workspace) as displays:
+        yield (*following.trackers(), *displays)
 
 
-def _named(value: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the digests of shards and files of a dataset, as an identity has it."""
-    yield from (shard["digest"] for one in value.get("recordings", {}).values() for shard in one["shards"].values())
+def _digests(value: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the digests of the shards and files of a dataset in an identity."""
+    yield from (shard["digest"] for entry in value.get("recordings", {}).values() for shard in entry["shards"].values())
     yield from value.get("files", {}).values()
 
 

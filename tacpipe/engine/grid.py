@@ -25,14 +25,14 @@ def folds(text: str) -> tuple[int, ...]:
     >>> folds("3"), folds("0-3"), folds("4,0-1,1")
     ((3,), (0, 1, 2, 3), (4, 0, 1))
     """
-    found: dict[int, None] = {}
+    numbers: dict[int, None] = {}
     for part in text.split(","):
         match = _RANGE.fullmatch(part.strip())
         first, last = (int(match[1]), int(match[2] or match[1])) if match else (1, 0)
         if first > last:
             raise UsageError(f"--fold is {text!r}; it must be a fold as 2, or several as 0-4 or 0,2,5.")
-        found |= dict.fromkeys(range(first, last + 1))
-    return tuple(found)
+        numbers |= dict.fromkeys(range(first, last + 1))
+    return tuple(numbers)
 
 
 def requests(request: Request, numbers: Sequence[int]) -> list[Request]:
@@ -45,30 +45,30 @@ def requests(request: Request, numbers: Sequence[int]) -> list[Request]:
             f"{len(numbers)} folds cannot be written to {request.output} alone: put {PLACE} into the path, as in "
             f"-o {request.output.with_name(f'{request.output.stem}-{PLACE}{request.output.suffix}')}."
         )
-    return [_of(request, number) for number in numbers]
+    return [_fold_request(request, number) for number in numbers]
 
 
-def _of(request: Request, number: int) -> Request:
-    def path(given: Path) -> Path:
-        return Path(str(given).replace(PLACE, str(number)))
+def _fold_request(request: Request, number: int) -> Request:
+    def path(pattern: Path) -> Path:
+        return Path(str(pattern).replace(PLACE, str(number)))
 
-    named: Mapping[str, Any] = {name: path(given) for name, given in request.named.items()}
-    datasets = [path(given) for given in request.datasets]
-    return replace(request, fold=number, output=path(request.output), datasets=datasets, **named)
+    paths: Mapping[str, Any] = {name: path(pattern) for name, pattern in request.named_paths.items()}
+    datasets = [path(pattern) for pattern in request.datasets]
+    return replace(request, fold=number, output=path(request.output), datasets=datasets, **paths)
 
 
-def run(given: Sequence[Request], jobs: int) -> Iterator[tuple[Request, Outcome | TacpipeError]]:
-    """Yield each request and what became of it as they end, ``jobs`` at a time, 0: as many as there are cores.
+def run(requests: Sequence[Request], jobs: int) -> Iterator[tuple[Request, Outcome | TacpipeError]]:
+    """Yield each request and its outcome as they end, ``jobs`` at a time; 0 means one job per core.
 
-    A request that fails keeps no other from running. Processes end with this one, as those of `Local` do.
+    A request that fails does not stop the others. Processes end with this one, as those of `Local` do.
     """
-    tasks = [(position, replace(request, jobs=1)) for position, request in enumerate(given)]
+    tasks = [(position, replace(request, jobs=1)) for position, request in enumerate(requests)]
     pool = Local(jobs, pool_from=2)
     at_once = min(pool.jobs, len(tasks))
-    with processor.shared_by(at_once), progress.bar(f"{given[0].name}, folds", len(given)) as advance:
+    with processor.shared_by(at_once), progress.bar(f"{requests[0].name}, folds", len(requests)) as advance:
         for position, became in pool.run(_run, tasks, ["tacpipe.engine.pipeline", "tacpipe.io.parquet"]):
-            advance(note=str(given[position].output))
-            yield given[position], became
+            advance(note=str(requests[position].output))
+            yield requests[position], became
 
 
 def _run(task: tuple[int, Request]) -> tuple[int, Outcome | TacpipeError]:

@@ -58,24 +58,28 @@ def chain_step(name: str, stage: AnyStage, params: Any, fitted: Mapping[str, Any
 
 
 def of_group(step: Mapping[str, Any], stage: AnyStage, entries: Mapping[str, Entry]) -> dict[str, Any]:
-    """Return what names the results of a map stage for several recordings, by all that their own keys hold."""
-    named = digest({name: of_recording(entry, stage.reads or ()) for name, entry in entries.items()})
-    return {"group": step["stage"], "step": step, "recordings": named}
+    """Return the identity of a group's results in a map stage, which covers the keys of all its recordings."""
+    recordings_digest = digest({name: of_recording(entry, stage.reads or ()) for name, entry in entries.items()})
+    return {"group": step["stage"], "step": step, "recordings": recordings_digest}
 
 
-def shard_tasks(store: Store, given: Manifest, step: Mapping[str, Any], beside: tuple[str, ...]) -> list[Task]:
-    """Return one task a recording of ``given``, excluded ones left out, for the map stage of a link of a chain."""
+def shard_tasks(store: Store, source: Manifest, step: Mapping[str, Any], dataset_dirs: tuple[str, ...]) -> list[Task]:
+    """Return one task per included recording of ``source`` for the map stage of a link of a chain."""
     stage = execution.stage_of(step["stage"])
     fitted = {name: step["fitted"] for name, kind in stage.arguments.items() if kind == "Fitted"}
     (recording,) = (name for name, kind in stage.arguments.items() if kind == "Recording")
-    named = stage.argument("RecordingName")
+    name_argument = stage.argument("RecordingName")
 
     def task(name: str, entry: Entry) -> Task:
-        inputs = {recording: of_recording(entry, stage.reads or ()), **fitted, **({named: name} if named else {})}
-        wanted = identity(step["stage"], stage.version, step["params"], inputs)
-        return Task(store.place, step["stage"], wanted, name, beside=beside)
+        inputs = {
+            recording: of_recording(entry, stage.reads or ()),
+            **fitted,
+            **({name_argument: name} if name_argument else {}),
+        }
+        task_identity = identity(step["stage"], stage.version, step["params"], inputs)
+        return Task(store.place, step["stage"], task_identity, name, dataset_dirs=dataset_dirs)
 
-    return [task(name, entry) for name, entry in sorted(given.included.items())]
+    return [task(name, entry) for name, entry in sorted(source.included.items())]
 
 
 def source_tasks(
@@ -86,7 +90,7 @@ def source_tasks(
     sources: Mapping[str, Source],
     digests: Mapping[str, Mapping[str, str]],
 ) -> list[Task]:
-    """Return one task a recording of a published source."""
+    """Return one task per recording of a published source."""
     argument, values, called = (stage.argument(kind) for kind in ("Files", "Values", "RecordingName"))
     assert argument is not None
 
@@ -96,15 +100,17 @@ def source_tasks(
             inputs[values] = dict(source.values)
         if called is not None:
             inputs[called] = recording
-        named = identity(name, stage.version, params, inputs)
-        return Task(store.place, name, named, recording, files={file: str(path) for file, path in source.files.items()})
+        task_identity = identity(name, stage.version, params, inputs)
+        return Task(
+            store.place, name, task_identity, recording, files={file: str(path) for file, path in source.files.items()}
+        )
 
     return [task(recording, source) for recording, source in sources.items()]
 
 
 def trial_tasks(store: Store, name: str, stage: AnyStage, params: Any) -> list[Task]:
-    """Return one task a recording to simulate, named ``trial-000`` and so on."""
-    (argument,) = (found for found, kind in stage.arguments.items() if kind == "Trial")
+    """Return one task per recording to simulate, named ``trial-000`` and so on."""
+    (argument,) = (name for name, kind in stage.arguments.items() if kind == "Trial")
     count = int(params.trials)
     if count > _MOST_TRIALS:
         raise UsageError(f"--trials is {count}; a dataset holds at most {_MOST_TRIALS:,} recordings.")

@@ -1,4 +1,4 @@
-"""What a command did: counts, bad recordings, and what its user should know of results that are valid."""
+"""Collect the outcome of a command: counts, bad recordings, and notes on valid results."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _FROM_RECORDS = ("stated", "code", "packages", "unlike")  # fields that `describ
 
 @dataclass
 class Outcome:
-    """What a command did."""
+    """Outcome of a command."""
 
     output: Path
     key: str = ""
@@ -29,10 +29,12 @@ class Outcome:
     bad: dict[str, str] = field(default_factory=dict)
     differs: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
-    stated: dict[str, list[str]] = field(default_factory=dict)  # note of a stage to the recordings that it is about
+    recordings_by_note: dict[str, list[str]] = field(
+        default_factory=dict
+    )  # note of a stage to the recordings that it is about
     code: dict[str, dict[str, int]] = field(default_factory=dict)  # stage to digest of its code to number of results
     packages: dict[str, dict[str, int]] = field(default_factory=dict)  # the same by plug-in package
-    unlike: list[str] = field(default_factory=list)  # in what the computers of results that differ are not the same
+    unlike: list[str] = field(default_factory=list)  # How the computers that produced differing results differ
 
     def begin(self) -> None:
         """Count nothing and restore nothing: what the store answers, or what is computed, is added from here."""
@@ -40,54 +42,57 @@ class Outcome:
         self.restore({})
 
     def add_record(self, stage: str, recording: str, record: Mapping[str, Any]) -> None:
-        """Add what the record of one result holds besides it: notes, and the code that it was computed by."""
-        made = record["provenance"]
-        for note in made.get("notes") or ():
-            self.stated.setdefault(note, []).append(recording)
-        if made.get("code"):
-            _add_counts(self.code, {stage: {made["code"]: 1}})
-        _add_counts(self.packages, {package: {code: 1} for package, code in (made.get("packages") or {}).items()})
+        """Add the notes of one record and the code that computed it."""
+        provenance_of_record = record["provenance"]
+        for note in provenance_of_record.get("notes") or ():
+            self.recordings_by_note.setdefault(note, []).append(recording)
+        if provenance_of_record.get("code"):
+            _add_counts(self.code, {stage: {provenance_of_record["code"]: 1}})
+        _add_counts(
+            self.packages,
+            {package: {code: 1} for package, code in (provenance_of_record.get("packages") or {}).items()},
+        )
 
-    def add_group(self, kept: Mapping[str, Any]) -> None:
-        """Add what `of_results` returned for a group of recordings."""
-        for note, recordings in (kept.get("notes") or {}).items():
-            self.stated.setdefault(note, []).extend(recordings)
-        _add_counts(self.code, kept.get("code") or {})
-        _add_counts(self.packages, kept.get("packages") or {})
+    def add_group(self, summary: Mapping[str, Any]) -> None:
+        """Add the summary that `of_results` returned for a group of recordings."""
+        for note, recordings in (summary.get("notes") or {}).items():
+            self.recordings_by_note.setdefault(note, []).extend(recordings)
+        _add_counts(self.code, summary.get("code") or {})
+        _add_counts(self.packages, summary.get("packages") or {})
 
-    def compare(self, stored: Mapping[str, Any], made: Mapping[str, Any], name: str) -> None:
-        """Add what differs between two records of one result; ``name`` is that of the stage or of the recording."""
-        differs = execution.differences(stored["result"], made["result"], name)
+    def compare(self, stored: Mapping[str, Any], recomputed: Mapping[str, Any], name: str) -> None:
+        """Add the differences between two records of one result; ``name`` is the stage or the recording."""
+        differs = execution.differences(stored["result"], recomputed["result"], name)
         self.differs += differs
-        unlike = provenance.unlike(stored["provenance"], made["provenance"]) if differs else []
-        self.unlike += [one for one in unlike if one not in self.unlike]
+        unlike = provenance.unlike(stored["provenance"], recomputed["provenance"]) if differs else []
+        self.unlike += [difference for difference in unlike if difference not in self.unlike]
 
     def of_results(self) -> dict[str, Any]:
         """Return what `add_record` added, as the record of a whole run keeps it."""
-        return {"code": self.code, "packages": self.packages, "notes": self.stated}
+        return {"code": self.code, "packages": self.packages, "notes": self.recordings_by_note}
 
-    def restore(self, kept: Mapping[str, Any]) -> None:
-        """Take over what `of_results` returned; nothing of an older record, which has none."""
-        self.code, self.packages = kept.get("code") or {}, kept.get("packages") or {}
-        self.stated = kept.get("notes") or {}
+    def restore(self, summary: Mapping[str, Any]) -> None:
+        """Restore the summary that `of_results` returned; older records have none."""
+        self.code, self.packages = summary.get("code") or {}, summary.get("packages") or {}
+        self.recordings_by_note = summary.get("notes") or {}
 
     def describe_differences(self) -> str:
-        """Return what differs from what is stored, and whether another computer's rounding may be why."""
-        why = f" (computed with other {'; '.join(self.unlike)}, which rounds differently)" if self.unlike else ""
-        return f"these differ from what is stored: {'; '.join(self.differs)}{why}"
+        """Describe the differences from the stored results, and whether another computer's rounding may explain them."""
+        computers = f" (computed with other {'; '.join(self.unlike)}, which rounds differently)" if self.unlike else ""
+        return f"these differ from what is stored: {'; '.join(self.differs)}{computers}"
 
     def describe_results(self) -> list[str]:
         """Return the notes of stages, and how many results were computed by other code than their stage has now."""
         count = self.ran + self.reused
-        found = []
-        for text, names in self.stated.items():
-            some = f"{len(names)} recordings ({listed(sorted(names), _NAMED)})"
-            some = f"all {count} recordings" if len(names) == count else some
-            found.append(f"{some}: {text}" if len(names) > 1 else f"{names[0]}: {text}" if names[0] else text)
+        lines = []
+        for text, names in self.recordings_by_note.items():
+            subject = f"{len(names)} recordings ({listed(sorted(names), _NAMED)})"
+            subject = f"all {count} recordings" if len(names) == count else subject
+            lines.append(f"{subject}: {text}" if len(names) > 1 else f"{names[0]}: {text}" if names[0] else text)
         stages = {name: line for name, counts in self.code.items() if (line := _other_code(name, counts))}
         packages = {name: line for name, counts in self.packages.items() if (line := _other_package(name, counts))}
         described = {package for name in stages if (package := registry.package_of_stage(name)) is not None}
-        return [*found, *stages.values(), *(line for name, line in packages.items() if name not in described)]
+        return [*lines, *stages.values(), *(line for name, line in packages.items() if name not in described)]
 
     def to_json(self) -> dict[str, Any]:
         """Return the outcome as a command prints it."""
@@ -116,17 +121,17 @@ def _other_package(package: str, counts: Mapping[str, int]) -> str:
 
 
 def _other_code(name: str, counts: Mapping[str, int]) -> str:
-    """Return the warning for a stage of which ``counts`` results were computed by each code; empty without a need."""
+    """Return the warning if results of a stage were computed by other code (``counts`` by code); else an empty string."""
     try:
         stage = execution.stage_of(name)
-    except TacpipeError:  # of a plug-in that is gone: its results stay valid
+    except TacpipeError:  # The plug-in was removed; its results stay valid
         return ""
     now = provenance.code(stage)
-    others = sum(number for code, number in counts.items() if code != now)
-    if now is None or not others:
+    outdated = sum(number for code, number in counts.items() if code != now)
+    if now is None or not outdated:
         return ""
     return (
-        f"{others} of these results were computed by other code of {name} than there is now in "
+        f"{outdated} of these results were computed by other code of {name} than there is now in "
         f"{stage.function.__module__}, under the same version {stage.version}. Raise its version if they differ, "
         f"or compute them again with --rerun."
     )

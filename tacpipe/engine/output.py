@@ -1,4 +1,4 @@
-"""What a command's output shows afterwards: a dataset with its labels, or one file of it."""
+"""Publish the output of a command: a dataset with its labels, or one file."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ class Unread:
 
 
 class Work(Protocol):
-    """Where the result of a command comes from."""
+    """Source of a command's result."""
 
     @property
     def key(self) -> str:
-        """What names the run."""
+        """Key of the run."""
 
-    def count(self, made: Manifest) -> int:
-        """Return how many results of the store the answer consists of, which gave this manifest."""
+    def count(self, manifest: Manifest) -> int:
+        """Return the number of stored results that a manifest consists of."""
 
     def recall(self, manifest_digest: str, reused: int) -> bool:
         """Take over what is known of the run before; return whether it gave the manifest of this digest."""
@@ -84,17 +84,17 @@ def settle(store: Store, request: Request, plan: replacing.Plan, work: Work) -> 
         return unread
     look = place.look()
     hit = None if request.compare or request.rerun else work.answer()
-    shown = hit is not None and place.shows(hit, look)
-    if shown and hit is not None:
+    is_shown = hit is not None and place.shows(hit, look)
+    if is_shown and hit is not None:
         place.note(look, work, hit)
-    if not (shown or request.compare):
+    if not (is_shown or request.compare):
         place.refuse(plan)
-    if shown or request.check or request.compare:
-        made = place.settled(hit or work.make())
+    if is_shown or request.check or request.compare:
+        manifest = place.settled(hit or work.make())
         if request.check:
-            place.check(made)
-        return made
-    with store.at_work([*work.reads, *place.named]):
+            place.check(manifest)
+        return manifest
+    with store.at_work([*work.reads, *place.source_manifests]):
         previous = None if request.rerun else place.previous()
         result: Manifest | None = None
         try:
@@ -114,8 +114,8 @@ def _quarantine_damaged(store: Store, manifest: Manifest) -> None:
                 pass
 
 
-def shown(store: Store, request: Request, work: Work) -> Manifest | Unread | None:
-    """Return what `settle` returns where the output shows the store's answer already, else None; nothing is changed."""
+def existing_answer(store: Store, request: Request, work: Work) -> Manifest | Unread | None:
+    """Return the result of `settle` if the output already shows the stored answer, else None; nothing is changed."""
     place = _place(store, request)
     if (unread := place.unread(work)) is not None:
         return unread
@@ -139,7 +139,7 @@ class _Place(ABC):
 
     @property
     def root(self) -> dict[str, Any] | None:
-        """What the store knows of what was last written there."""
+        """Root in the store: the last dataset that was written there."""
         return self.store.roots.get(self.path)
 
     @abstractmethod
@@ -162,7 +162,7 @@ class _Place(ABC):
         return False
 
     @property
-    def named(self) -> list[str]:
+    def source_manifests(self) -> list[str]:
         """The digests of manifests of which results may be taken over."""
         return []
 
@@ -170,53 +170,53 @@ class _Place(ABC):
         """Return the run that gave what is shown, where all of that is noted and still there."""
         return None
 
-    def published(self, work: Work, made: Manifest, previous: Previous | None = None) -> Manifest:
-        """Show ``made``, of which some was taken over from a ``previous`` run, and return the manifest that is shown now."""
-        return self.publish(made)
+    def published(self, work: Work, result: Manifest, previous: Previous | None = None) -> Manifest:
+        """Publish ``result``, which may reuse parts of a ``previous`` run, and return the published manifest."""
+        return self.publish(result)
 
     @abstractmethod
     def refuse(self, plan: replacing.Plan) -> None:
         """Raise `UsageError` if the command would replace what it must not, before it computes anything."""
 
     @abstractmethod
-    def publish(self, made: Manifest) -> Manifest:
-        """Show ``made`` and return the manifest that is shown now."""
+    def publish(self, result: Manifest) -> Manifest:
+        """Publish ``result`` and return the published manifest."""
 
-    def settled(self, made: Manifest) -> Manifest:
-        """Return the manifest that it shows after the command gave ``made``."""
-        return made
+    def settled(self, result: Manifest) -> Manifest:
+        """Return the manifest to publish for ``result``."""
+        return result
 
-    def check(self, made: Manifest) -> None:
-        """Raise `WouldChangeError` where it was made from anything else, `UsageError` where it would be refused."""
+    def check(self, result: Manifest) -> None:
+        """Raise `WouldChangeError` if the output was made from other inputs, `UsageError` if it would be refused."""
         root = self.root
-        if root is None or root["manifest"] != made.content_digest:
+        if root is None or root["manifest"] != result.content_digest:
             raise WouldChangeError(f"{self.request.output} would change: it was made from other inputs or params.")
 
 
 class _Directory(_Place):
     """The directory of a dataset."""
 
-    _linked = False  # whether it was found to hold nothing but links to objects
+    _linked = False  # True if the directory holds only links to objects
 
     def shows(self, hit: Manifest, look: Look | None) -> bool:
         root = self.root
         if root is None:
             return False
-        wanted = self.settled(hit)
-        known = root["manifest"] == wanted.content_digest and self.store.has(root["manifest"])
+        expected = self.settled(hit)
+        is_current = root["manifest"] == expected.content_digest and self.store.has(root["manifest"])
         self._linked = False
-        if not known:
+        if not is_current:
             return False
         if look is not None:
             look.begin()
-        how = directory.showing(self.store, wanted, self.path)
-        self._linked = how == "links"
-        return bool(how)
+        appearance = directory.showing(self.store, expected, self.path)
+        self._linked = appearance == "links"
+        return bool(appearance)
 
     @cached_property
     def _noted(self) -> Note | None:
         """The note on what is shown here, if that is the manifest that was noted."""
-        note, root = notes.known(self.store, self.path), self.root
+        note, root = notes.read(self.store, self.path), self.root
         if note is None or root is None or root["manifest"] != note.head.manifest:
             return None
         with suppress(OSError, TacpipeError):
@@ -248,76 +248,76 @@ class _Directory(_Place):
         return look.note(_head(work, hit), hit.contents())
 
     @property
-    def named(self) -> list[str]:
+    def source_manifests(self) -> list[str]:
         return [] if self._noted is None else [self._noted.head.manifest, *previous_of.inputs(self.store, self._noted)]
 
     def previous(self) -> Previous | None:
-        return None if self._noted is None else previous_of.found(self.store, self.path, self._noted)
+        return None if self._noted is None else previous_of.find(self.store, self.path, self._noted)
 
-    def published(self, work: Work, made: Manifest, previous: Previous | None = None) -> Manifest:
-        shown = self.publish(made, previous, work.key)
-        if made.copied or shown.pages is None:
-            return shown
-        head = _head(work, shown)
-        if previous is not None and previous.succeed(head, shown):
-            return shown
+    def published(self, work: Work, result: Manifest, previous: Previous | None = None) -> Manifest:
+        published = self.publish(result, previous, work.key)
+        if result.copied or published.pages is None:
+            return published
+        head = _head(work, published)
+        if previous is not None and previous.succeed(head, published):
+            return published
         look = Look(self.store, self.path)
         look.begin()
-        how = directory.showing(self.store, shown, self.path)
-        if how == "links":
-            look.note(head, shown.contents())
-        elif not how:  # what was there already has another content, which its size does not show
-            directory.publish(self.store, shown, self.path)
-        return shown
+        appearance = directory.showing(self.store, published, self.path)
+        if appearance == "links":
+            look.note(head, published.contents())
+        elif not appearance:  # An existing file has other content of the same size
+            directory.publish(self.store, published, self.path)
+        return published
 
     def refuse(self, plan: replacing.Plan) -> None:
         directory.check_output(self.store, self.request.output)
         if not self.request.replace:
             replacing.refuse_plan(self._occupant(), self.request.output, plan)
 
-    def settled(self, made: Manifest) -> Manifest:
-        """Return ``made`` as it is shown.
+    def settled(self, result: Manifest) -> Manifest:
+        """Return ``result`` as it is published.
 
-        Recordings have the labels that were set on them by hand, also where they were deleted or replaced in the meantime
-        and come back; ingested ones are appended to those that are there. Raises `DamagedError` if what is there cannot be
-        read.
+        Recordings keep the labels that were set by hand, even if they were deleted or replaced in the meantime and
+        return. Ingested recordings are appended to the existing ones. Raises `DamagedError` if the existing dataset
+        cannot be read.
         """
-        if not made.recorded:
-            return made
+        if not result.recorded:
+            return result
         before = replacing.occupant(self.store, self.request.output)
-        if before is not None and before.stage != made.stage:
+        if before is not None and before.stage != result.stage:
             before = None
-        returning = replacing.returning_labels(self.store, self.request.output, before, made)
+        returning = replacing.returning_labels(self.store, self.request.output, before, result)
         if before is None:
-            return _labelled(made, returning)
-        if replacing.irreplaceable(made) and not self.request.replace:
-            made = replacing.appended(before, made)
-        return _labelled(made, {**returning, **before.labels})
+            return _labelled(result, returning)
+        if replacing.irreplaceable(result) and not self.request.replace:
+            result = replacing.appended(before, result)
+        return _labelled(result, {**returning, **before.labels})
 
-    def check(self, made: Manifest) -> None:
-        self._refuse_losses(made)
-        edited = directory.edited_files(self.store, made, self.path) if made.exported else []
+    def check(self, result: Manifest) -> None:
+        self._refuse_losses(result)
+        edited = directory.edited_files(self.store, result, self.path) if result.exported else []
         if edited and not self.request.replace:
             raise replacing.edited(self.request.output, edited)
-        super().check(made)
+        super().check(result)
 
-    def publish(self, made: Manifest, previous: Previous | None = None, key: str = "") -> Manifest:
-        if not made.recorded and directory.shows(self.store, made, self.path):
-            deliver(self.store, self.path, made)
-            self.store.roots.set(self.path, made.content_digest, key=key)
-            return made
+    def publish(self, result: Manifest, previous: Previous | None = None, key: str = "") -> Manifest:
+        if not result.recorded and directory.shows(self.store, result, self.path):
+            deliver(self.store, self.path, result)
+            self.store.roots.set(self.path, result.content_digest, key=key)
+            return result
 
-        def decided() -> directory.Change:  # somebody may have labelled what is there
-            wanted = self.settled(made)
-            self._refuse_losses(wanted)
-            complete = previous is not None and previous.stands()
-            return directory.Change(wanted, whole=complete, replace=self.request.replace, key=key)
+        def decided() -> directory.Change:  # Labels may have been set in the meantime
+            settled = self.settled(result)
+            self._refuse_losses(settled)
+            complete = previous is not None and previous.is_current()
+            return directory.Change(settled, is_complete=complete, replace=self.request.replace, key=key)
 
         return directory.change(self.store, self.request.output, decided)
 
-    def _refuse_losses(self, made: Manifest) -> None:
+    def _refuse_losses(self, result: Manifest) -> None:
         if not self.request.replace:
-            replacing.refuse_losses(self._occupant(), self.request.output, made)
+            replacing.refuse_losses(self._occupant(), self.request.output, result)
 
     def _occupant(self) -> Manifest | None:
         """Return the manifest that is there; None also where both it and its root are damaged.
@@ -335,8 +335,8 @@ class _File(_Place):
 
     def shows(self, hit: Manifest, look: Look | None) -> bool:
         root = self.root
-        known = root is not None and root["manifest"] == hit.content_digest and self.path.exists()
-        return known and file_digest(self.path) == self._digest(hit)
+        is_current = root is not None and root["manifest"] == hit.content_digest and self.path.exists()
+        return is_current and file_digest(self.path) == self._digest(hit)
 
     def refuse(self, plan: replacing.Plan) -> None:
         if self.request.replace or not self.path.is_file() or self.root is not None:
@@ -346,28 +346,28 @@ class _File(_Place):
                 f"{self.request.output} is a file that tacpipe did not write. Give -o another name, or --replace."
             )
 
-    def publish(self, made: Manifest) -> Manifest:
-        wanted = self._digest(made)
+    def publish(self, result: Manifest) -> Manifest:
+        file_name = self._digest(result)
         with directory.changing(self.store, self.path), directory.writing(self.path):
-            if not self.path.exists() or file_digest(self.path) != wanted:
+            if not self.path.exists() or file_digest(self.path) != file_name:
                 directory.sweep_beside(self.path)
-                directory.place(self.store, wanted, self.path, copy=True)
-            deliver(self.store, self.path, made)
-            self.store.roots.set(self.path, made.content_digest)
-        return made
+                directory.place(self.store, file_name, self.path, copy=True)
+            deliver(self.store, self.path, result)
+            self.store.roots.set(self.path, result.content_digest)
+        return result
 
-    def _digest(self, made: Manifest) -> str:
-        """Return the digest of the file that is asked for."""
+    def _digest(self, result: Manifest) -> str:
+        """Return the digest of the requested file."""
         suffix = self.path.suffix
-        found = next((file["digest"] for name, file in made.files.items() if name.endswith(suffix)), None)
-        if found is None:
+        matching = next((file["digest"] for name, file in result.files.items() if name.endswith(suffix)), None)
+        if matching is None:
             raise UsageError(f"{self.request.name} makes no {suffix} file; give -o a directory.")
-        return str(found)
+        return str(matching)
 
 
-def _labelled(made: Manifest, labels: Mapping[str, Mapping[str, Attribute]]) -> Manifest:
-    return made.labelled(labels) if labels else made
+def _labelled(result: Manifest, labels: Mapping[str, Mapping[str, Attribute]]) -> Manifest:
+    return result.labelled(labels) if labels else result
 
 
-def _head(work: Work, made: Manifest) -> Head:
-    return Head(work.key, made.content_digest, work.count(made), made.rows)
+def _head(work: Work, result: Manifest) -> Head:
+    return Head(work.key, result.content_digest, work.count(result), result.rows)

@@ -1,4 +1,4 @@
-"""What a command does: find out what is needed, answer from the store, run the rest, publish the dataset."""
+"""Run a command: determine what is needed, answer from the store, compute the missing results, publish the dataset."""
 
 from __future__ import annotations
 
@@ -35,19 +35,19 @@ from tacpipe.trackers import tracker, tracking
 from tacpipe.trackers.tracker import Tracker
 from tacpipe.training import following
 
-_NOTHING: Entry = {"attributes": {}, "shards": {}}  # of a part that gives files alone
+_NOTHING: Entry = {"attributes": {}, "shards": {}}  # Entry of a recording whose part returns only files
 
 
 def open_dataset(path: Path | str) -> Dataset:
     """Return the dataset at ``path``, its shards read from the store (or adopted from beside the manifest)."""
-    found = manifest.find(path)
-    directory = found.directory.absolute()
-    read = execution.reader(locate(directory), (str(directory),), found.manifest)
-    return Dataset(found.manifest, read, directory=directory, opener=open_dataset)
+    located = manifest.find(path)
+    directory = located.directory.absolute()
+    read = execution.reader(locate(directory), (str(directory),), located.manifest)
+    return Dataset(located.manifest, read, directory=directory, opener=open_dataset)
 
 
 def run(request: Request) -> Outcome:
-    """Make the dataset that ``request`` asks for, doing only what was not done before."""
+    """Produce the dataset of ``request``, computing only what is not stored."""
     started = time.perf_counter()
     if request.rerun and (request.check or request.compare):
         raise UsageError("--rerun computes and stores; it does not go with --check or --recompute-and-compare.")
@@ -60,11 +60,11 @@ def run(request: Request) -> Outcome:
     with Chosen(request.executor, request.jobs) as chosen:
         work = _Run(request, store, inputs, inputs.identity(), chosen)
         outcome = work.outcome
-        with _tracked(request, trackers, outcome, store) as ended:
-            made = output.settle(store, request, inputs.plan(), work)
-            if isinstance(made, Manifest):  # else there was nothing to track
-                ended(made)
-    return _concluded(outcome, inputs, made, started)
+        with _tracked(request, trackers, outcome, store) as end_tracking:
+            result = output.settle(store, request, inputs.plan(), work)
+            if isinstance(result, Manifest):  # Otherwise there was nothing to track
+                end_tracking(result)
+    return _concluded(outcome, inputs, result, started)
 
 
 def answered(request: Request) -> Outcome | None:
@@ -73,20 +73,20 @@ def answered(request: Request) -> Outcome | None:
     It raises what `run` would raise before that. Nothing is computed, and nothing is changed.
     """
     started = time.perf_counter()
-    if request.check or request.compare or request.rerun or request.track:  # each has a business of its own
+    if request.check or request.compare or request.rerun or request.track:  # These always compute or report something
         return None
     replacing.refuse_inputs(request.output, request.reads)
     store = locate(*request.locations)
     inputs = Inputs(request, store)
     with Chosen(request.executor, request.jobs) as chosen:
         work = _Run(request, store, inputs, inputs.identity(), chosen)
-        shown = output.shown(store, request, work)
-    return None if shown is None else _concluded(work.outcome, inputs, shown, started)
+        result = output.existing_answer(store, request, work)
+    return None if result is None else _concluded(work.outcome, inputs, result, started)
 
 
-def _concluded(outcome: Outcome, inputs: Inputs, made: Manifest | Unread, started: float) -> Outcome:
+def _concluded(outcome: Outcome, inputs: Inputs, result: Manifest | Unread, started: float) -> Outcome:
     outcome.notes = [*sorted(set(inputs.notes)), *inputs.describe_unread(), *outcome.describe_results(), *outcome.notes]
-    outcome.rows = made.rows
+    outcome.rows = result.rows
     outcome.seconds = round(time.perf_counter() - started, 3)
     return outcome
 
@@ -95,15 +95,15 @@ def _concluded(outcome: Outcome, inputs: Inputs, made: Manifest | Unread, starte
 def _tracked(
     request: Request, trackers: dict[str, Tracker], outcome: Outcome, store: Store
 ) -> Iterator[Callable[[Manifest], None]]:
-    """Have what is trained in the block followed by trackers; yield what ends their run with the manifest that was made."""
+    """Have trackers follow trainings in the block; yield the function that ends their run with the resulting manifest."""
     if not trackers:
-        yield lambda made: None
+        yield lambda result: None
         return
     params = {**params_of.to_json(request.params), "stage": request.name, "fold": request.fold}
     tracked = tracking.Tracking(trackers, tracking.name_of(request.output, outcome.key), tracker.params(params))
 
-    def end(made: Manifest) -> None:
-        tracked.finish(request.output, tracking.files(made, store))
+    def end(result: Manifest) -> None:
+        tracked.finish(request.output, tracking.files(result, store))
         outcome.notes += tracked.failures if progress.is_quiet() else []
 
     try:
@@ -115,7 +115,7 @@ def _tracked(
 
 
 class _Run:
-    """What a request asks for, of the store or by running what is missing there."""
+    """Result of a request, from the store or by computing what is missing there."""
 
     def __init__(
         self, request: Request, store: Store, inputs: Inputs, identity: Mapping[str, Any], chosen: Chosen
@@ -123,17 +123,17 @@ class _Run:
         self.request, self.store, self.inputs, self.identity, self.chosen = request, store, inputs, identity, chosen
         self.stage = inputs.stage
         self.outcome = Outcome(request.output, digest(identity))
-        self.reads = [found.digest for found in inputs.used]
-        self.previous: Previous | None = None  # of which results are taken over
+        self.reads = [dataset.digest for dataset in inputs.used]
+        self.previous: Previous | None = None  # Earlier run whose unchanged results are reused
 
     @property
     def key(self) -> str:
-        """What names the run."""
+        """Key of the run."""
         return self.outcome.key
 
-    def count(self, made: Manifest) -> int:
-        """Return how many results of the store the answer consists of, which gave this manifest."""
-        return len(self.inputs.merged.included) if self.stage.part else len(made.recordings) or 1
+    def count(self, manifest_of_run: Manifest) -> int:
+        """Return the number of stored results that a manifest consists of."""
+        return len(self.inputs.merged.included) if self.stage.part else len(manifest_of_run.recordings) or 1
 
     def recall(self, manifest_digest: str, reused: int) -> bool:
         """Take over what is known of the run before; return whether it gave the manifest of this digest."""
@@ -154,68 +154,70 @@ class _Run:
         name = record["result"]["files"][manifest.NAME]["digest"]
         self.store.announce([name])
         try:
-            found = manifest.stored(self.store, name, "the stored manifest")
-            self.store.announce(page.digest for page in (found.pages.pages if found.pages is not None else ()))
-            sizes = list(found.sizes())
+            stored_manifest = manifest.stored(self.store, name, "the stored manifest")
+            self.store.announce(
+                page.digest for page in (stored_manifest.pages.pages if stored_manifest.pages is not None else ())
+            )
+            sizes = list(stored_manifest.sizes())
         except MissingError:  # the manifest, or a page of it
             return None
         self.store.announce(name for name, _ in sizes)
         if not all(self.store.has(name, size) for name, size in sizes):
             return None
         self.outcome.restore(record["provenance"])
-        self.outcome.reused = self.count(found)
-        return found
+        self.outcome.reused = self.count(stored_manifest)
+        return stored_manifest
 
     def result(self, *, rerun: bool, previous: Previous | None = None) -> Manifest:
-        """Return the manifest as the store answers it, or made and then remembered; ``rerun``: made in any case.
+        """Return the stored manifest, or compute and store it; with ``rerun`` it is always computed.
 
-        Of a ``previous`` run what did not change is taken over.
+        Unchanged results of a ``previous`` run are reused.
         """
-        made = None if rerun else self.answer()
+        result = None if rerun else self.answer()
         self.previous = previous if self.stage.mapped and self.stage.argument("Recording") else None
-        if made is None:
+        if result is None:
             self.outcome.begin()
-            made = self.make()
-            self._remember(made)
-        return made
+            result = self.make()
+            self._remember(result)
+        return result
 
     def make(self) -> Manifest:
         """Return the manifest of the result, having run what was missing."""
-        for found in self.inputs.used:
-            given = found.manifest  # one edited by hand is refused before anything is written
+        for dataset in self.inputs.used:
+            source_manifest = dataset.manifest  # one edited by hand is refused before anything is written
             if self.store.run:
-                given.keep(self.store)  # explain and gc follow a dataset to the manifests it descends from
-        made = self._make()
+                source_manifest.keep(self.store)  # explain and gc follow a dataset to the manifests it descends from
+        result = self._make()
         try:
-            manifest.check_pages(made, fresh=True)
+            manifest.check_pages(result, fresh=True)
         except (ValueError, TypeError, KeyError) as error:
             raise TacpipeError(f"{self.request.name} gave what no dataset can hold: {error}.") from None
-        return made
+        return result
 
     def _make(self) -> Manifest:
         request, stage = self.request, self.stage
-        made = Manifest(request.name, stage.version, params_of.to_json(request.params), self.inputs.lineage())
+        empty = Manifest(request.name, stage.version, params_of.to_json(request.params), self.inputs.lineage())
         if not stage.mapped:
             identity = keys.identity(request.name, stage.version, request.params, self._whole_inputs())
             if stage.part is not None:
-                files = {**self._whole(request.name, identity, counted=False)["files"], **self._parts.files}
-                return replace(made, files={**files, **self._originals()}, skipped=self._skipped)
-            result = self._whole(request.name, identity)
-            return replace(made, chain=self._chain(), recordings=result["recordings"], files=result["files"])
+                files = {**self._run_whole(request.name, identity, counted=False)["files"], **self._parts.files}
+                return replace(empty, files={**files, **self._originals()}, skipped=self._skipped)
+            result = self._run_whole(request.name, identity)
+            return replace(empty, chain=self._chain(), recordings=result["recordings"], files=result["files"])
         fitted = self._fit() if stage.fit else None
         chain: Sequence[Mapping[str, Any]] = ()
         recordings: Mapping[str, Entry] = {}
         if stage.argument("Recording"):
-            given = self.inputs.merged
+            source = self.inputs.merged
             step = keys.chain_step(request.name, stage, request.params, fitted)
-            recordings = self._by_recording.mapped(given, step, self.inputs.beside)
-            chain = [*given.chain, step]
+            recordings = self._by_recording.run_step(source, step, self.inputs.dataset_dirs)
+            chain = [*source.chain, step]
         elif tasks := self._own_tasks():
             recordings = self._by_recording.run(request.name, tasks)
         if not recordings and not self.outcome.bad:
             raise UsageError(f"{request.name} found no recording to work on.")
         return replace(
-            made,
+            empty,
             chain=chain,
             recordings=recordings,
             files=fitted or {},
@@ -224,16 +226,18 @@ class _Run:
         )
 
     def _own_tasks(self) -> list[Task]:
-        """Return one task a recording of a stage that reads no dataset: of a source, or to simulate."""
+        """Return one task per recording of a stage that reads no dataset: from a source, or to simulate."""
         request, stage = self.request, self.stage
         if stage.source:
-            found, digests = self.inputs.sources, self.inputs.source_digests
-            return keys.source_tasks(self.store, request.name, stage, request.params, found, digests)
+            sources, digests = self.inputs.sources, self.inputs.source_digests
+            return keys.source_tasks(self.store, request.name, stage, request.params, sources, digests)
         return keys.trial_tasks(self.store, request.name, stage, request.params)
 
     @property
     def _skipped(self) -> dict[str, str]:
-        carried = {name: why for found in self.inputs.datasets for name, why in found.manifest.skipped.items()}
+        carried = {
+            name: reason for dataset in self.inputs.datasets for name, reason in dataset.manifest.skipped.items()
+        }
         return {**carried, **self.outcome.bad}
 
     @property
@@ -241,34 +245,34 @@ class _Run:
         return ByRecording(self.store, self.request, self.outcome, self.chosen, self.previous)
 
     def _chain(self) -> Sequence[Mapping[str, Any]]:
-        if "model" in self.inputs.named:
+        if "model" in self.inputs.named_datasets:
             return self.inputs.model.chain
-        chains = [found.manifest.chain for found in self.inputs.datasets]
+        chains = [dataset.manifest.chain for dataset in self.inputs.datasets]
         return chains[0] if chains and all(chain == chains[0] for chain in chains) else ()
 
     # ---- stages over whole datasets
 
     @cached_property
-    def _given(self) -> Manifest:
+    def _source(self) -> Manifest:
         """The given datasets read as one, after the stages that the recordings go through first."""
-        given, first = self.inputs.merged, self.stage.first
-        wanted = first(self.request.params) if first is not None else {}
-        if not wanted:
-            return given
-        chain = list(given.chain)
-        for name, options in wanted.items():
+        source, first = self.inputs.merged, self.stage.first
+        stages = first(self.request.params) if first is not None else {}
+        if not stages:
+            return source
+        chain = list(source.chain)
+        for name, options in stages.items():
             stage = registry.load(name)
             chain.append(keys.chain_step(name, stage, given_params.build(name, stage, options=options), None))
-        behind = Manifest(self.request.name, self.stage.version, chain=chain)
-        return self._by_recording.replay(given, behind, self.inputs.beside, str(self.request.datasets[0]))
+        target = Manifest(self.request.name, self.stage.version, chain=chain)
+        return self._by_recording.replay(source, target, self.inputs.dataset_dirs, str(self.request.datasets[0]))
 
     @cached_property
     def _parts(self) -> Manifest:
-        """What the stage's part gave for each recording: tables, and files by their names in the result."""
-        given, name = self._given, f"{self.request.name}{registry.PART}"
+        """Result of the stage's part for each recording: tables, and files by their names in the result."""
+        source, name = self._source, f"{self.request.name}{registry.PART}"
         assert self.stage.part is not None
         step = keys.chain_step(name, self.stage.part, self.request.params, None)
-        tasks = keys.shard_tasks(self.store, given, step, self.inputs.beside)
+        tasks = keys.shard_tasks(self.store, source, step, self.inputs.dataset_dirs)
         if not tasks:
             raise UsageError(f"{self.request.name} found no recording to work on.")
         results = self._by_recording.results(name, tasks)
@@ -281,15 +285,15 @@ class _Run:
         folder = self.stage.originals(self.request.params) if self.stage.originals is not None else ""
         if not folder:
             return {}
-        given, found = self.inputs.merged, {}
-        read = execution.reader(self.store, self.inputs.beside, dict(given.sizes()))
-        for recording, entry in given.included.items():
+        source, originals = self.inputs.merged, {}
+        read = execution.reader(self.store, self.inputs.dataset_dirs, dict(source.sizes()))
+        for recording, entry in source.included.items():
             for stream, shard in entry["shards"].items():
                 path = shard_path(recording, stream)
                 if not self.store.has(shard["digest"], shard["bytes"]):
                     read(shard["digest"], path)  # adopts it, or computes it again
-                found[f"{folder}/{path}"] = {"digest": shard["digest"], "bytes": shard["bytes"]}
-        return found
+                originals[f"{folder}/{path}"] = {"digest": shard["digest"], "bytes": shard["bytes"]}
+        return originals
 
     def _whole_inputs(self) -> dict[str, Any]:
         return {
@@ -299,36 +303,38 @@ class _Run:
     def _whole_input(self, name: str, kind: str) -> Any:
         inputs, reads = self.inputs, self.stage.reads
         if kind == "Model" and name == "init":
-            init = inputs.named.get("init")
+            init = inputs.named_datasets.get("init")
             return keys.of_dataset(init.manifest, None, {}) if init else None
         if kind == "Model":
             return keys.of_dataset(inputs.model, None, {})
         if kind == "Datasets":
-            return [keys.of_dataset(found.manifest, reads, found.manifest.included) for found in inputs.datasets]
+            return [keys.of_dataset(dataset.manifest, reads, dataset.manifest.included) for dataset in inputs.datasets]
         if kind == "Roles":
             return self._roles(name)
         if kind == "Parts":
             return keys.of_dataset(self._parts, None, self._parts.recordings)
         if self.stage.part is not None:
-            given = self.inputs.merged if name == ORIGINALS else self._given
-            chosen = {one: entry for one, entry in given.included.items() if one in self._parts.recordings}
-            return keys.of_dataset(given, reads, chosen)
-        given = inputs.merged
+            source = self.inputs.merged if name == ORIGINALS else self._source
+            chosen = {
+                recording: entry for recording, entry in source.included.items() if recording in self._parts.recordings
+            }
+            return keys.of_dataset(source, reads, chosen)
+        source = inputs.merged
         as_given = self.stage.as_given
-        if "model" in inputs.named and not (as_given is not None and as_given(self.request.params)):
-            where = str(self.request.datasets[0])
-            given = self._by_recording.replay(given, inputs.model, inputs.beside, where)
+        if "model" in inputs.named_datasets and not (as_given is not None and as_given(self.request.params)):
+            dataset_name = str(self.request.datasets[0])
+            source = self._by_recording.replay(source, inputs.model, inputs.dataset_dirs, dataset_name)
         if name in ROLES:
-            return keys.of_dataset(given, reads, inputs.in_role(given, name, may_lack=self.stage.optional(name)))
-        if "split" in inputs.named:
-            return keys.of_dataset(given, reads, inputs.in_role(given, self.request.role or "test"))
+            return keys.of_dataset(source, reads, inputs.in_role(source, name, may_lack=self.stage.optional(name)))
+        if "split" in inputs.named_datasets:
+            return keys.of_dataset(source, reads, inputs.in_role(source, self.request.role or "test"))
         if self.request.role is not None:
             raise UsageError(f"--role {self.request.role} has no effect without --split.")
-        return keys.of_dataset(given, reads, given.included)
+        return keys.of_dataset(source, reads, source.included)
 
     def _roles(self, name: str) -> Any:
         """Return what identifies the roles of the argument ``name``, None where its option was not given."""
-        dataset = self.inputs.named.get(name)
+        dataset = self.inputs.named_datasets.get(name)
         fold = self.request.fold
         if dataset is None:
             if name == "split" and fold:
@@ -341,12 +347,12 @@ class _Run:
             raise UsageError(f"No recording of the dataset has a role in {dataset.directory}. Split this dataset.")
         return {"roles": table, "fold": fold}
 
-    def _whole(self, name: str, identity: Mapping[str, Any], *, counted: bool = True) -> Mapping[str, Any]:
+    def _run_whole(self, name: str, identity: Mapping[str, Any], *, counted: bool = True) -> Mapping[str, Any]:
         """Return the result of a key over whole datasets, from the store or by running the stage."""
         self.store.expect([digest(identity)])
         record = self.store.record(digest(identity))
-        known = record is not None and records.complete(self.store, record)
-        if record is not None and known and not self.request.compare and not self.request.rerun:
+        is_stored = record is not None and records.complete(self.store, record)
+        if record is not None and is_stored and not self.request.compare and not self.request.rerun:
             self.outcome.reused += counted
             self.outcome.add_record(name, "", record)
             result: Mapping[str, Any] = record["result"]
@@ -357,47 +363,47 @@ class _Run:
             self.store.place,
             name,
             identity,
-            beside=self.inputs.beside,
+            dataset_dirs=self.inputs.dataset_dirs,
             replace=record is not None,
             dry=self.request.compare,
             rerun=self.request.rerun,
             device=self.request.device,
             run=self.store.run,
         )
-        (done,) = self.chosen.opened().run(computing.compute, [task], [])
-        if done.record is None:
-            raise by_recording.error(done.exit_code, done.error)
-        self.outcome.add_record(name, "", done.record)
-        made: Mapping[str, Any] = done.record["result"]
-        if self.request.compare and known and record is not None:
-            self.outcome.compare(record, done.record, name)
-            made = record["result"]  # what else was made rests on what is stored
+        (computed,) = self.chosen.opened().run(computing.compute, [task], [])
+        if computed.record is None:
+            raise by_recording.error(computed.exit_code, computed.error)
+        self.outcome.add_record(name, "", computed.record)
+        result_of_task: Mapping[str, Any] = computed.record["result"]
+        if self.request.compare and is_stored and record is not None:
+            self.outcome.compare(record, computed.record, name)
+            result_of_task = record["result"]  # Everything else was computed from the stored result
         elif self.request.compare and not counted:
             raise UsageError(f"Nothing is stored of {name} to compare with. Run the command without it first.")
-        self.outcome.ran += done.made and counted
-        self.outcome.reused += counted and not done.made
-        return made
+        self.outcome.ran += computed.made and counted
+        self.outcome.reused += counted and not computed.made
+        return result_of_task
 
     def _fit(self) -> dict[str, Any]:
-        """Return the files that the stage's fit made of the training recordings, or those of ``--codec``."""
-        codec, name, fit = self.inputs.named.get("codec"), self.request.name, self.stage.fit
+        """Return the files that the stage's fit computed from the training recordings, or those of ``--codec``."""
+        codec, name, fit = self.inputs.named_datasets.get("codec"), self.request.name, self.stage.fit
         if codec is not None:
             step = codec.manifest.chain[-1] if codec.manifest.chain else {}
             if step.get("stage") != name:
                 raise UsageError(f"{codec.directory} was not made by {name}, so it holds no codec of its kind.")
             return dict(codec.manifest.files)
         assert fit is not None
-        given = self.inputs.merged
-        described = keys.of_dataset(given, fit.reads or (), self.inputs.in_role(given, "train"))
+        source = self.inputs.merged
+        described = keys.of_dataset(source, fit.reads or (), self.inputs.in_role(source, "train"))
         identity = keys.identity(
             f"{name}.fit", fit.version, self.request.params, {next(iter(fit.arguments)): described}
         )
-        return dict(self._whole(f"{name}.fit", identity, counted=False)["files"])
+        return dict(self._run_whole(f"{name}.fit", identity, counted=False)["files"])
 
-    def _remember(self, made: Manifest) -> None:
+    def _remember(self, result_manifest: Manifest) -> None:
         """Store the manifest, and the run if every recording was good: then a rerun is answered at once."""
-        stored = vars(made.keep(self.store, durable=made.recorded))
+        stored = vars(result_manifest.keep(self.store, durable=result_manifest.recorded))
         if not self.outcome.bad:
             result = {"recordings": {}, "files": {manifest.NAME: stored}}
-            made_by = {**provenance.of(0.0), **self.outcome.of_results()}
+            made_by = {**provenance.describe(0.0), **self.outcome.of_results()}
             self.store.commit(self.identity, result, made_by, replace=True)

@@ -25,11 +25,11 @@ from tacpipe.store.store import Store
 
 
 @dataclass(frozen=True)
-class Taken:
+class Reusable:
     """Results that are taken over: pages by the digest of the page that they are results of, and what records state."""
 
     pages: Mapping[str, Pages]
-    stated: Mapping[str, Any]  # as `Outcome.add_group` takes it
+    summary: Mapping[str, Any]  # Argument of `Outcome.add_group`
 
     @property
     def count(self) -> int:
@@ -46,81 +46,80 @@ class Previous:
     note: Note
     look: Look
     record: Mapping[str, Any]
-    given: Manifest  # its input
-    made: Manifest  # its result
+    source: Manifest  # its input
+    result: Manifest  # its result
 
-    def taken(self, entries: Mapping[str, Entry], step: Mapping[str, Any]) -> Taken | None:
-        """Return what is taken over of the results of a link of a chain for ``entries``; None where nothing can be."""
-        before, results = self.given.included, self.made.pages
+    def reusable(self, entries: Mapping[str, Entry], step: Mapping[str, Any]) -> Reusable | None:
+        """Return the reusable results of a link of a chain for ``entries``; None if there are none."""
+        before, results = self.source.included, self.result.pages
         if results is None or not (isinstance(entries, pages.Recordings) and isinstance(before, pages.Recordings)):
             return None
-        if not self._gave(step):
+        if not self._is_same_step(step):
             return None
         now = {page.digest for page in entries.pages.pages}
         firsts = [page.first for page in results.pages] + [""]
         places = {first: number for number, first in enumerate(firsts)}
         read = before.pages.pages
         followers = [*(page.first for page in read[1:]), ""]
-        found: dict[str, Pages] = {}
-        left = set(range(len(results)))
+        reusable: dict[str, Pages] = {}
+        replaced_pages = set(range(len(results)))
         for page, follower in zip(read, followers, strict=True):
             number = places.get(page.first)
             if page.digest not in now or number is None or number == len(results):
                 continue
-            result = results.pages[
-                number
-            ]  # with both ends and as many recordings, it holds the results of all of these
-            whole = firsts[number + 1] == follower and result.recordings == page.recordings
-            if whole and self.store.has(result.digest, result.bytes):
-                found[page.digest] = results.part(number)
-                left.discard(number)
-        others = {name for number in left for name in results.load(number).recordings}
-        count = sum(part.total("recordings") for part in found.values())
-        stated = self._stated(step["stage"], others, count)
-        return None if stated is None else Taken(found, stated)
+            # Same first names and count: the page holds the results of exactly these recordings
+            result = results.pages[number]
+            covers_page = firsts[number + 1] == follower and result.recordings == page.recordings
+            if covers_page and self.store.has(result.digest, result.bytes):
+                reusable[page.digest] = results.part(number)
+                replaced_pages.discard(number)
+        replaced_names = {name for number in replaced_pages for name in results.load(number).recordings}
+        count = sum(part.total("recordings") for part in reusable.values())
+        summary = self._summary(step["stage"], replaced_names, count)
+        return None if summary is None else Reusable(reusable, summary)
 
-    def stands(self) -> bool:
-        """Return whether the directory still shows what the run gave, with the files that were found there."""
+    def is_current(self) -> bool:
+        """Return whether the directory still shows the run's result and its files did not change."""
         root = self.store.roots.get(self.directory)
         return root is not None and root["manifest"] == self.note.head.manifest and self.look.unchanged
 
-    def succeed(self, head: Head, shown: Manifest) -> bool:
-        """Note that all of ``shown`` is in the directory now; return False where each file is to be looked at for that."""
-        before, now = pages.differing(self.made.recordings, shown.recordings)
-        gone = [shard_path(name, stream) for name, entry in before.items() for stream in entry["shards"]]
+    def succeed(self, head: Head, published: Manifest) -> bool:
+        """Note that the directory holds all of ``published`` now; return False if each file must be checked for that."""
+        before, now = pages.differing(self.result.recordings, published.recordings)
+        removed = [shard_path(name, stream) for name, entry in before.items() for stream in entry["shards"]]
         placed = [
             (shard_path(name, stream), shard["digest"], shard["bytes"])
             for name, entry in now.items()
             for stream, shard in entry["shards"].items()
         ]
-        for manifest in (self.made, shown):
+        for manifest in (self.result, published):
             for page in () if manifest.pages is None else manifest.pages.pages:
-                gone += [page.path] if manifest is self.made else []
-                placed += [(page.path, page.digest, page.bytes)] if manifest is shown else []
-        files = [(path, file["digest"], file["bytes"]) for path, file in shown.files.items()]
-        return self.look.succeed(self.note, head, [*gone, *self.made.files], [*placed, *files])
+                removed += [page.path] if manifest is self.result else []
+                placed += [(page.path, page.digest, page.bytes)] if manifest is published else []
+        files = [(path, file["digest"], file["bytes"]) for path, file in published.files.items()]
+        return self.look.succeed(self.note, head, [*removed, *self.result.files], [*placed, *files])
 
-    def _gave(self, step: Mapping[str, Any]) -> bool:
-        made = self.made
-        named = [one["manifest"] for one in made.inputs.get("datasets", ())]
+    def _is_same_step(self, step: Mapping[str, Any]) -> bool:
+        result = self.result
+        input_digests = [dataset["manifest"] for dataset in result.inputs.get("datasets", ())]
         return (
-            made.stage == self.record["identity"]["run"] == step["stage"]
-            and named == [self.given.content_digest]
-            and bool(made.chain)
-            and digest(made.chain[-1]) == digest(step)
+            result.stage == self.record["identity"]["run"] == step["stage"]
+            and input_digests == [self.source.content_digest]
+            and bool(result.chain)
+            and digest(result.chain[-1]) == digest(step)
         )
 
-    def _stated(self, stage: str, others: set[str], count: int) -> Mapping[str, Any] | None:
-        """Return what records state of results of which ``others`` are left out; None where that is not known."""
+    def _summary(self, stage: str, replaced_names: set[str], count: int) -> Mapping[str, Any] | None:
+        """Return the summary of all results except ``replaced_names``; None if it is not known."""
         provenance = self.record["provenance"]
         codes: Mapping[str, int] = (provenance.get("code") or {}).get(stage) or {}
         packages: Mapping[str, Mapping[str, int]] = provenance.get("packages") or {}
         for counts in filter(None, (codes, *packages.values())):
-            if [*counts.values()] != [len(self.made.recordings)]:  # it is unknown which results other code computed
+            if [*counts.values()] != [len(self.result.recordings)]:  # it is unknown which results other code computed
                 return None
-        left = {*others, ""}  # the last: of a stage over a whole dataset, which is asked again
-        given: Mapping[str, Sequence[str]] = provenance.get("notes") or {}
-        notes = {note: [name for name in names if name not in left] for note, names in given.items()}
+        excluded = {*replaced_names, ""}  # The empty name stands for a stage over a whole dataset, which is asked again
+        notes_of_run: Mapping[str, Sequence[str]] = provenance.get("notes") or {}
+        notes = {note: [name for name in names if name not in excluded] for note, names in notes_of_run.items()}
         return {
             "code": {stage: dict.fromkeys(codes, count)} if codes and count else {},
             "packages": {name: dict.fromkeys(counts, count) for name, counts in packages.items() if count},
@@ -134,25 +133,25 @@ def inputs(store: Store, note: Note) -> Sequence[str]:
     return [] if record is None else list(record["identity"].get("datasets", ()))
 
 
-def found(store: Store, directory: Path, note: Note) -> Previous | None:
-    """Return the run that gave what ``directory`` shows, as noted; None where that is not known, or not all is there.
+def find(store: Store, directory: Path, note: Note) -> Previous | None:
+    """Return the run whose result ``directory`` shows, as noted; None if it is unknown or incomplete.
 
-    All that it names must be announced before, and be kept from collections until what is made of it is shown.
+    Everything that it names must be announced before, and protected from collection until the new result is published.
     """
     record = None if store.distant else store.record(note.head.key)
     if record is None or "run" not in record["identity"]:
         return None
-    named, gave = record["identity"].get("datasets", ()), record["result"]["files"].get(manifest_of.NAME)
-    if len(named) != 1 or gave is None or gave["digest"] != note.head.manifest:
+    input_digests, result_file = record["identity"].get("datasets", ()), record["result"]["files"].get(manifest_of.NAME)
+    if len(input_digests) != 1 or result_file is None or result_file["digest"] != note.head.manifest:
         return None
     look = Look(store, directory)
     if not look.holds(note, listed=True):
         return None
     try:
-        made, given = manifest_of.stored(store, note.head.manifest), manifest_of.stored(store, named[0])
-        if manifest_of.find(directory).digest != note.head.manifest or given.pages is None:
+        result, source = manifest_of.stored(store, note.head.manifest), manifest_of.stored(store, input_digests[0])
+        if manifest_of.find(directory).digest != note.head.manifest or source.pages is None:
             return None
-        return Previous(store, directory, note, look, record, given, made)
+        return Previous(store, directory, note, look, record, source, result)
     except StorageError:
         raise
     except TacpipeError:

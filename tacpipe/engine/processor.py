@@ -26,19 +26,19 @@ JOBS = "TACPIPE_JOBS"  # processes of a command that is given no --jobs, or 0
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
-def here() -> dict[str, Any]:
+def describe() -> dict[str, Any]:
     """Return the processor's ``model``, its vector ``instructions``, kernels ``chosen`` by variables, and ``threads``."""
     chosen = {name: os.environ[name] for name in _CHOSEN if name in os.environ}
     return {**_processor(), "chosen": chosen, "threads": threads()}
 
 
 def threads() -> int:
-    """Return with how many threads this process computes."""
+    """Return the number of threads that this process computes with."""
     torch = sys.modules.get("torch")
     if torch is not None:
         return int(torch.get_num_threads())
-    given = (os.environ.get(name, "") for name in THREADS)
-    return next((int(text) for text in given if text.isdecimal() and int(text)), usable_cores())
+    settings = (os.environ.get(name, "") for name in THREADS)
+    return next((int(text) for text in settings if text.isdecimal() and int(text)), usable_cores())
 
 
 @contextlib.contextmanager
@@ -64,16 +64,16 @@ def each_of(processes: int) -> dict[str, str]:
 
 
 def jobs() -> int:
-    """Return how many processes a command starts that is not given a number: as `JOBS` states, else one a usable core.
+    """Return the default number of processes of a command: the value of `JOBS`, else one per usable core.
 
     Raises `UsageError` where `JOBS` is no number above 0.
     """
-    stated = os.environ.get(JOBS, "")
-    if not stated:
+    setting = os.environ.get(JOBS, "")
+    if not setting:
         return usable_cores()
-    if not stated.isdecimal() or not int(stated):
-        raise UsageError(f"{JOBS} is {stated!r}; it must be a number of processes, 1 or more.")
-    return int(stated)
+    if not setting.isdecimal() or not int(setting):
+        raise UsageError(f"{JOBS} is {setting!r}; it must be a number of processes, 1 or more.")
+    return int(setting)
 
 
 def jobs_of(commands: int) -> dict[str, str]:
@@ -90,18 +90,18 @@ def usable_cores() -> int:
 
 @functools.cache
 def _processor() -> dict[str, Any]:
-    found: dict[str, str] = {}  # of the first core
+    values: dict[str, str] = {}  # Values of the first core
     try:
         with _CPUINFO.open(encoding="utf-8", errors="replace") as lines:
             for line in lines:
                 name, _, value = line.partition(":")
                 if not value:
                     break
-                found[name.strip().lower()] = value.strip()
+                values[name.strip().lower()] = value.strip()
     except OSError:  # macOS
         pass
-    words = set(f"{found.get('flags', '')} {found.get('features', '')}".split())
+    words = set(f"{values.get('flags', '')} {values.get('features', '')}".split())
     return {
-        "model": found.get("model name") or platform.processor() or platform.machine(),
+        "model": values.get("model name") or platform.processor() or platform.machine(),
         "instructions": [name for name in _INSTRUCTIONS if name in words],
     }

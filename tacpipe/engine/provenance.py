@@ -1,4 +1,4 @@
-"""Where and with what something was made: kept beside results, no part of any key or digest."""
+"""Describe where and with which software a result was computed; stored with results, part of no key or digest."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _LIBRARIES = ("numpy", "pandas", "pyarrow", "scikit-learn", "tacpipe", "torch")
 
 
 @functools.cache
-def _here() -> dict[str, Any]:
+def _environment() -> dict[str, Any]:
     import subprocess
     from importlib.metadata import PackageNotFoundError, version
 
@@ -45,10 +45,10 @@ def _here() -> dict[str, Any]:
     }
 
 
-def of(seconds: float) -> dict[str, Any]:
-    """Return libraries, git commit, host, device, processor and worker of this process, and the ``seconds`` of something."""
-    made = {**_here(), "device": devices.kind(), "processor": processor.here(), "seconds": seconds}
-    return {**made, "worker": _worker.get()} if _worker.get() else made
+def describe(seconds: float) -> dict[str, Any]:
+    """Return libraries, git commit, host, device, processor and worker of this process, and a duration in ``seconds``."""
+    environment = {**_environment(), "device": devices.kind(), "processor": processor.describe(), "seconds": seconds}
+    return {**environment, "worker": _worker.get()} if _worker.get() else environment
 
 
 @contextlib.contextmanager
@@ -62,20 +62,20 @@ def worker(name: str) -> Iterator[None]:
 
 
 def unlike(stored: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    """Return in what two computers differ that changes how numbers round; nothing where ``stored`` does not state it.
+    """Return the differences between two computers that change rounding; empty if ``stored`` does not state them.
 
     >>> unlike({"device": "cpu", "processor": {"threads": 1}}, {"device": "cpu", "processor": {"threads": 2}})
     ['threads: 1, now 2']
     """
-    found = []
+    differences = []
     for name in ("device", "processor", "libraries"):
         before, after = stored.get(name), now.get(name)
         if isinstance(before, Mapping) and isinstance(after, Mapping):
-            there = [(part, before.get(part), after.get(part)) for part in sorted({*before, *after})]
+            parts = [(part, before.get(part), after.get(part)) for part in sorted({*before, *after})]
         else:
-            there = [(name, before, after)] if before and after else []
-        found += [f"{part}: {_text(one)}, now {_text(other)}" for part, one, other in there if one != other]
-    return found
+            parts = [(name, before, after)] if before and after else []
+        differences += [f"{part}: {_text(old)}, now {_text(new)}" for part, old, new in parts if old != new]
+    return differences
 
 
 def _text(value: Any) -> str:

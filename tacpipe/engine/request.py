@@ -1,4 +1,4 @@
-"""What a command was asked for, and the datasets, model, split and source files that it reads."""
+"""Describe the request of a command, and find the datasets, model, split and source files that it reads."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tacpipe.plugins.stage import AnyStage, Source
 from tacpipe.store.store import Store
 from tacpipe.training.devices import AUTO, Device
 
-# what options of a run may be that are no params
+# Types of the options of a run that are no params
 OPTIONS = {
     "jobs": NonNegativeInt,
     "executor": str,
@@ -39,9 +39,9 @@ PATHS = (*DATASETS, "source")
 
 @dataclass(frozen=True)
 class Request:
-    """What a command was asked to do."""
+    """Request of a command."""
 
-    name: str  # of the stage
+    name: str  # Name of the stage
     params: Any
     output: Path
     datasets: Sequence[Path] = ()
@@ -66,21 +66,21 @@ class Request:
     @property
     def reads(self) -> list[Path]:
         """All that was given to read: datasets, model, split and the like, the folder of a published source."""
-        return [*self.datasets, *self.named.values()]
+        return [*self.datasets, *self.named_paths.values()]
 
     @property
-    def named(self) -> dict[str, Path]:
-        """What was given to read by its argument's name: all but datasets."""
+    def named_paths(self) -> dict[str, Path]:
+        """Paths to read by argument name, without the datasets."""
         return {name: path for name in PATHS if (path := getattr(self, name)) is not None}
 
     @property
     def locations(self) -> list[Path]:
         """Return the places to look for the store: the output, then the datasets that are read."""
-        return [self.output, *self.datasets, *(path for name, path in self.named.items() if name in DATASETS)]
+        return [self.output, *self.datasets, *(path for name, path in self.named_paths.items() if name in DATASETS)]
 
     @property
     def single_file(self) -> bool:
-        """Whether the output is one file, such as a report, and no dataset directory."""
+        """Return whether the output is one file, such as a report, instead of a dataset directory."""
         return self.output.suffix == ".html"
 
 
@@ -91,22 +91,25 @@ class Inputs:
         self.request, self.store = request, store
         self.stage = registry.load(request.name)
         self.datasets = [manifest.find(path) for path in request.datasets]
-        self.named: dict[str, Found] = {
-            name: manifest.find(path) for name, path in request.named.items() if name in DATASETS
+        self.named_datasets: dict[str, Found] = {
+            name: manifest.find(path) for name, path in request.named_paths.items() if name in DATASETS
         }
-        self.notes: list[str] = []  # what the user should know though nothing failed
+        self.notes: list[str] = []  # Warnings for the user
         self.sources = _discover(self.stage, request)
         self.source_digests = _hash(self.sources)
 
     def identity(self) -> dict[str, Any]:
-        """Return what names the run: manifests read, params, versions. It answers a rerun without opening a shard."""
+        """Return the identity of the run: manifests, params, versions.
+
+        A rerun is answered from it without opening a shard.
+        """
         fit = self.stage.fit
         return {
             "run": self.request.name,
             "version": [self.stage.version, fit.version if fit else None],
             "params": params_of.to_json(self.request.params),
-            "datasets": [found.digest for found in self.datasets],
-            "named": {name: found.digest for name, found in self.named.items()},
+            "datasets": [dataset.digest for dataset in self.datasets],
+            "named": {name: dataset.digest for name, dataset in self.named_datasets.items()},
             "sources": self.source_digests,
             "fold": self.request.fold,
             "role": self.request.role,
@@ -131,54 +134,54 @@ class Inputs:
         )
 
     def lineage(self) -> dict[str, list[dict[str, str]]]:
-        """Return the inputs as a manifest names them."""
-        given = {"datasets": self.datasets, **{name: [found] for name, found in self.named.items()}}
+        """Return the inputs as a manifest lists them."""
+        inputs = {"datasets": self.datasets, **{name: [dataset] for name, dataset in self.named_datasets.items()}}
         return {
-            name: [{"dataset": found.manifest.digest, "manifest": found.digest} for found in several]
-            for name, several in given.items()
-            if several
+            name: [{"dataset": dataset.manifest.digest, "manifest": dataset.digest} for dataset in datasets]
+            for name, datasets in inputs.items()
+            if datasets
         }
 
     @property
     def used(self) -> list[Found]:
         """All datasets that were given."""
-        return [*self.datasets, *self.named.values()]
+        return [*self.datasets, *self.named_datasets.values()]
 
     @property
-    def beside(self) -> tuple[str, ...]:
-        """The directories of all given datasets."""
-        return tuple(str(found.directory.absolute()) for found in self.used)
+    def dataset_dirs(self) -> tuple[str, ...]:
+        """Directories of all datasets, from which shards can be adopted."""
+        return tuple(str(dataset.directory.absolute()) for dataset in self.used)
 
     @cached_property
     def merged(self) -> Manifest:
         """The given datasets read as one."""
         if not self.datasets:
             raise UsageError(f"{self.request.name} needs a dataset to read.")
-        return merging.merge([found.manifest for found in self.datasets])
+        return merging.merge([dataset.manifest for dataset in self.datasets])
 
     @property
     def model(self) -> Manifest:
         """The given model's manifest."""
-        if "model" not in self.named:
+        if "model" not in self.named_datasets:
             raise UsageError(f"{self.request.name} needs a model to read.")
-        return self.named["model"].manifest
+        return self.named_datasets["model"].manifest
 
     @cached_property
     def roles(self) -> dict[str, str]:
         """Recording to role in the fold that was asked for."""
-        split = self.named.get("split")
+        split = self.named_datasets.get("split")
         if split is None:
             raise UsageError(
                 f"{self.request.name} must know which recordings to train on: give --split, as made by `tacpipe split`."
             )
-        where = str(split.directory)
-        content = execution.reader(self.store, (where,))(roles.digest(split.manifest, where), roles.FILE)
-        return roles.in_fold(roles.read(content), self.request.fold, where)
+        split_path = str(split.directory)
+        content = execution.reader(self.store, (split_path,))(roles.digest(split.manifest, split_path), roles.FILE)
+        return roles.in_fold(roles.read(content), self.request.fold, split_path)
 
-    def in_role(self, given: Manifest, role: str, *, may_lack: bool = False) -> dict[str, Entry]:
-        """Return the recordings of ``given`` that have this role. Raises `UsageError` without any, unless ``may_lack``."""
-        chosen = {name: entry for name, entry in given.included.items() if self.roles.get(name) == role}
-        unknown = sorted(set(given.included) - set(self.roles))
+    def in_role(self, source: Manifest, role: str, *, may_lack: bool = False) -> dict[str, Entry]:
+        """Return the recordings of ``source`` that have this role. Raises `UsageError` without any, unless ``may_lack``."""
+        chosen = {name: entry for name, entry in source.included.items() if self.roles.get(name) == role}
+        unknown = sorted(set(source.included) - set(self.roles))
         if unknown:
             note = f"{len(unknown)} recordings have no role in the split and are left out, as {unknown[0]}"
             self.notes.append(f"{note}: give them one with `tacpipe split --extend`.")
@@ -197,21 +200,23 @@ def _discover(stage: AnyStage, request: Request) -> dict[str, Source]:
         raise UsageError(f"{request.name} needs a folder of recordings to read.")
     if not request.source.exists():
         raise UsageError(f"There is no {request.source} to read recordings from.")
-    found = {
-        name: one if isinstance(one, Source) else Source(one)
-        for name, one in sorted(stage.discover(request.params, request.source).items())
+    sources = {
+        name: source if isinstance(source, Source) else Source(source)
+        for name, source in sorted(stage.discover(request.params, request.source).items())
     }
-    recording_names.refuse_shared((name, next(iter(one.files.values()), request.source)) for name, one in found.items())
-    regular.expect_inside(request.source, (path for source in found.values() for path in source.files.values()))
-    return found
+    recording_names.refuse_shared(
+        (name, next(iter(source.files.values()), request.source)) for name, source in sources.items()
+    )
+    regular.expect_inside(request.source, (path for source in sources.values() for path in source.files.values()))
+    return sources
 
 
 def _hash(sources: Mapping[str, Source]) -> dict[str, dict[str, str]]:
-    """Return the digest of each file, and of values where there are; threads gain nothing on files of some 100 kB."""
+    """Return the digests of files and values by recording; threads gain nothing for files of about 100 kB."""
     return {
         name: {
-            **{file: remembered_file_digest(path) for file, path in one.files.items()},
-            **({VALUES: digest(dict(one.values))} if one.values else {}),
+            **{file: remembered_file_digest(path) for file, path in source.files.items()},
+            **({VALUES: digest(dict(source.values))} if source.values else {}),
         }
-        for name, one in sources.items()
+        for name, source in sources.items()
     }

@@ -13,7 +13,7 @@ from tacpipe.io.files import Draft, move, present
 from tacpipe.io.hashing import digest
 from tacpipe.store.store import Store
 
-_MOST_BYTES = 1 << 20  # of a sentence
+_MOST_BYTES = 1 << 20  # Longest error message
 
 
 @dataclass(frozen=True)
@@ -22,12 +22,12 @@ class SharedFiles:
 
     store: Store
 
-    def file(self, of: Any, make: Callable[[Draft], None]) -> Path:
-        """Return the file that ``make`` wrote for ``of``, a value of JSON: now, or before in any process of the run.
+    def file(self, content_key: Any, make: Callable[[Draft], None]) -> Path:
+        """Return the file that ``make`` wrote for the JSON value ``content_key``, now or earlier in any process.
 
-        Raises what ``make`` raises, and where that is a mistake in what it reads the same for each who asks.
+        Raises the errors of ``make``; an input error is stored and raised again for each caller.
         """
-        key = digest({"run": self.store.run, "of": of})
+        key = digest({"run": self.store.run, "of": content_key})
         path, failed = (self.store.draft(digest([key, part])[:32]) for part in ("made", "failed"))
         with self.store.leases.hold(key, "the recordings of a file"):
             if present(failed):

@@ -14,11 +14,11 @@ class Task:
     """One key to make: all that a worker process needs."""
 
     store: str  # its path or address
-    name: str  # of the stage
+    name: str  # Name of the stage
     identity: Mapping[str, Any]
     recording: str = ""
-    files: Mapping[str, str] | None = None  # of a published source: name to path
-    beside: tuple[str, ...] = ()  # dataset directories whose shards can be adopted
+    files: Mapping[str, str] | None = None  # Files of a published source: name to path
+    dataset_dirs: tuple[str, ...] = ()  # dataset directories whose shards can be adopted
     replace: bool = False  # the old record names objects that are gone
     dry: bool = False  # compute and compare, store nothing
     rerun: bool = False  # compute although a result is stored
@@ -28,11 +28,11 @@ class Task:
 
 @dataclass(frozen=True)
 class Done:
-    """What became of a task: a record, or what was wrong with the recording."""
+    """Outcome of a task: a record, or the error of the recording."""
 
     recording: str
     record: Mapping[str, Any] | None
     error: str = ""
     exit_code: int = 0
-    made: bool = True  # False if another process was faster
+    is_new: bool = True  # False if another process was faster
     at_fault: bool = True  # the recording is, and not the disk, a damaged input or another process

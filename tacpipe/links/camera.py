@@ -22,7 +22,7 @@ def open_camera(place: str, sensor: Sensor, name: str) -> CameraLink:
 
     Raises `DeviceError` where it is not connected, or held by another program, `MissingModuleError` without Open3D.
     """
-    with extras.named(name):
+    with extras.explain_missing(name):
         import open3d
     kind = getattr(open3d.t.io, "RealSenseSensor", None)
     if kind is None:

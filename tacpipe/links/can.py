@@ -42,7 +42,7 @@ def open_can(place: str, sensor: Sensor, name: str) -> CanLink:
     Raises `UsageError` for an address that is none, `DeviceError` for an interface that is missing, down, or not permitted.
     """
     kind, channel, bitrate = parse_place(place)
-    with extras.named(name):
+    with extras.explain_missing(name):
         import can
     if kind == "slcan":
         serial_port.refuse_missing(channel, name)

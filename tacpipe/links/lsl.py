@@ -43,7 +43,7 @@ def open_lsl(place: str, sensor: Sensor, name: str) -> LslLink:
     rig file states; `MissingModuleError` without pylsl, `UsageError` for an address that is none.
     """
     properties = _properties(place)
-    with extras.named(name):
+    with extras.explain_missing(name):
         import pylsl
     quiet(pylsl)
     outlets = _resolve(pylsl, properties)

@@ -34,7 +34,7 @@ class Port:
 
 def serial_ports() -> list[Port]:
     """Return the serial ports of this computer. Raises `MissingModuleError` without pyserial."""
-    with extras.named("A serial port"):
+    with extras.explain_missing("A serial port"):
         from serial.tools import list_ports
 
     lasting = {str(path.resolve()): str(path) for path in files.listed(BY_ID)}

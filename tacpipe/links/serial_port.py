@@ -61,7 +61,7 @@ def refused(error: OSError, place: str, name: str) -> DeviceError:
 
 
 def _open_port(place: str, baud: int, line: Line, name: str) -> serial.Serial:
-    with extras.named(name):
+    with extras.explain_missing(name):
         import serial
 
     port = serial.Serial(timeout=0, exclusive=True)

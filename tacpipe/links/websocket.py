@@ -30,7 +30,7 @@ def open_websocket(place: str, sensor: Sensor, name: str) -> WebsocketLink:
 
     Raises `DeviceError` for a host that is unknown, unreachable, refuses, or speaks something else.
     """
-    with extras.named(name):
+    with extras.explain_missing(name):
         from websockets.exceptions import WebSocketException
         from websockets.sync.client import connect
 

@@ -192,7 +192,7 @@ def main(arguments: Sequence[str], engine_for: Callable[[SessionOptions], Engine
     connection.setblocking(True)
     options = SessionOptions.from_json(_first_line(connection))
     try:
-        with extras.named("tacpipe live"):
+        with extras.explain_missing("tacpipe live"):
             engine = engine_for(options)
             publishers = publishing.open_publishers(options, engine.describe(options.settings.model))
     except TacpipeError as error:

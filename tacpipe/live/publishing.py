@@ -137,7 +137,7 @@ def publisher(address: str, about: Description) -> Publisher:
     """Return the publisher of an address. Raises `UsageError` and `DeviceError`, as `open_publishers`."""
     scheme, place = check(address)
     if scheme == "ws":
-        with extras.named("--publish ws"):
+        with extras.explain_missing("--publish ws"):
             from tacpipe.live.websocket import WebsocketPublisher
 
         return WebsocketPublisher(place, about)
@@ -161,7 +161,7 @@ class LslPublisher:
     """An outlet; LSL keeps what its readers have not fetched and drops the oldest, so nobody is waited for."""
 
     def __init__(self, place: str, about: Description) -> None:
-        with extras.named("--publish lsl"):
+        with extras.explain_missing("--publish lsl"):
             import pylsl
         lsl.quiet(pylsl)
         columns = about.columns()
@@ -190,7 +190,7 @@ class McapPublisher:
     """Writes a file that did not exist before."""
 
     def __init__(self, place: str, about: Description) -> None:
-        with extras.named("--publish mcap"):
+        with extras.explain_missing("--publish mcap"):
             from mcap.writer import Writer
 
         path = Path(place)
@@ -282,7 +282,7 @@ class UdpPublisher:
 
 
 def _msgpack() -> Callable[[Mapping[str, Any]], bytes]:
-    with extras.named("--publish udp with format=msgpack"):
+    with extras.explain_missing("--publish udp with format=msgpack"):
         import msgpack
 
     def packed(content: Mapping[str, Any]) -> bytes:

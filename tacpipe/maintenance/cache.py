@@ -113,7 +113,7 @@ def collect(store: CachedStore, *, dry_run: bool, recordings: bool, grace_days: 
     """
     for root in [] if dry_run else _gone(store, grace_days):
         folder, name = projects.place(Path(root["path"]))
-        owner = projects.known(store, folder)
+        owner = projects.identity_of(store, folder)
         there = None if owner is None else store.bucket.roots.pushed(name, owner.id)
         if there is not None and there.get("output") and there["manifest"] == root["manifest"]:
             store.bucket.roots.remove(there)

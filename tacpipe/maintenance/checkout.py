@@ -171,7 +171,7 @@ def _named(store: AnyStore, name: str) -> str:
     if not _HEX.fullmatch(name):
         folder, _ = projects.place(Path.cwd())
         try:
-            return str(pushed.find(store, name, name, projects.known(locate(), folder))["manifest"])
+            return str(pushed.find(store, name, name, projects.identity_of(locate(), folder))["manifest"])
         except UsageError as error:
             raise UsageError(
                 f"{name} is neither the digest of a manifest ({SHORTEST} or more hex digits) nor a path at which "

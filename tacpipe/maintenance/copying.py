@@ -224,7 +224,7 @@ def _named(record: Mapping[str, Any]) -> set[str]:
     identity, provenance = record["identity"], record["provenance"]
     try:
         formed = isinstance(provenance, dict) and isinstance(identity.get("stage", ""), str)
-        named = set(records.named(record["result"])) if formed else set()
+        named = set(records.digests(record["result"])) if formed else set()
     except (TypeError, KeyError, AttributeError):
         return set()
     return named if all(isinstance(name, str) for name in named) else set()

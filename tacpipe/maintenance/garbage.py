@@ -24,7 +24,7 @@ from tacpipe.io.files import readable_errors
 from tacpipe.io.hashing import DIGEST
 from tacpipe.maintenance import unnamed
 from tacpipe.store import layout, notes
-from tacpipe.store.records import named
+from tacpipe.store.records import digests
 from tacpipe.store.roots import PUSHED
 from tacpipe.store.store import MissingError, Store
 
@@ -119,7 +119,7 @@ def collect(store: Store, *, dry_run: bool, recordings: bool = False, grace_days
     """
     if not store.check():
         return Collected()
-    with store.leases.alone("gc") if not dry_run else contextlib.nullcontext(), readable_errors(store.root):
+    with store.leases.exclusive("gc") if not dry_run else contextlib.nullcontext(), readable_errors(store.root):
         if not dry_run:
             _put_back(store)
         return _collect(store, dry_run=dry_run, recordings=recordings, grace_days=grace_days)
@@ -153,7 +153,7 @@ def _collect(store: Store, *, dry_run: bool, recordings: bool, grace_days: float
             _count(collected, path)
         else:
             with contextlib.suppress(FileNotFoundError):
-                os.rename(path, store.aside(path.name))  # noqa: PTH104
+                os.rename(path, store.aside_path(path.name))  # noqa: PTH104
                 aside.append(path.name)
     if aside:
         shown = {root["manifest"] for root in store.roots.all()}
@@ -166,7 +166,7 @@ def _collect(store: Store, *, dry_run: bool, recordings: bool, grace_days: float
 def _brief(found: tuple[str, Mapping[str, Any]]) -> tuple[str, str, bool]:
     """Return the key of a record, the digests that it names, and whether it marks a recording: memory holds all records."""
     key, record = found
-    return key, " ".join(named(record["result"])), bool(record["provenance"].get("irreplaceable"))
+    return key, " ".join(digests(record["result"])), bool(record["provenance"].get("irreplaceable"))
 
 
 def _remove(store: Store, aside: list[str], needed: set[str], collected: Collected) -> None:
@@ -175,7 +175,7 @@ def _remove(store: Store, aside: list[str], needed: set[str], collected: Collect
         if name in needed:
             store.has(name)  # which puts it back
             continue
-        path = Path(store.aside(name))
+        path = Path(store.aside_path(name))
         _count(collected, path)
         path.unlink(missing_ok=True)
 

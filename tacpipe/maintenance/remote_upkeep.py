@@ -27,7 +27,7 @@ from tacpipe.maintenance.garbage import GRACE_DAYS, Collected, ancestors
 from tacpipe.maintenance.repair import Soundness
 from tacpipe.store import layout
 from tacpipe.store.backend import AT_ONCE, Entry
-from tacpipe.store.records import named
+from tacpipe.store.records import digests
 from tacpipe.store.remote import SNAPSHOTS, RemoteStore
 from tacpipe.store.store import AbsentError, MissingError
 
@@ -130,7 +130,7 @@ def collect(
     kept = set(needed.objects)
     unneeded: dict[str, set[str]] = {}  # keys of records, and what they name
     for key, record in store.records():
-        names = set(named(record["result"]))
+        names = set(digests(record["result"]))
         if names <= needed.objects:
             continue
         if record["provenance"].get("irreplaceable") and not recordings:
@@ -223,7 +223,7 @@ def _needed(store: RemoteStore) -> _Needed:
     for _, run in store.runs().values():
         needed.objects |= run.objects
         wanted += run.manifests
-        needed.objects |= {name for _, record in store.records(run.keys) for name in named(record["result"])}
+        needed.objects |= {name for _, record in store.records(run.keys) for name in digests(record["result"])}
     for root in store.roots.all():
         wanted += [str(one["manifest"]) for one in (root, *root.get("history", []))]
     damaged = store.roots.damaged()

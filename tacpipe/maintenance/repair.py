@@ -157,7 +157,7 @@ def _manifest_again(store: Store, root: dict[str, Any]) -> list[str]:
     Only at paths that this user's own roots name: another user's could name any file that is called so.
     """
     path = Path(root["path"]) / manifest_of.NAME
-    if root["kind"] == PUSHED or not path.is_file() or not store.roots.own(root):
+    if root["kind"] == PUSHED or not path.is_file() or not store.roots.is_own(root):
         return []
     try:
         manifest_of.find(path).manifest  # noqa: B018  (is it sound?)

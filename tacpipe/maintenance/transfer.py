@@ -234,7 +234,7 @@ def _wanted(path: Path, there: AnyStore) -> tuple[manifest_of.Found, str]:
         return manifest_of.Found(directory, manifest_of.find(directory).content, there), str(directory)
     folder, name = projects.place(directory)
     local_store = locate(directory)
-    root = pushed.find(there, str(path), name, projects.known(local_store, folder))
+    root = pushed.find(there, str(path), name, projects.identity_of(local_store, folder))
     if root["path"] != name:  # PROJECT:PATH
         if not paths.safe_path(root["path"]):
             raise UsageError(

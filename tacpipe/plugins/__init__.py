@@ -1,1 +1,1 @@
-"""What others extend: stages, their params, and the registry that finds plug-ins."""
+"""Define what plug-ins extend: stages, their params, and the registry that finds them."""

@@ -37,41 +37,43 @@ Kind = type[Any]
 
 def task(kind: Any) -> str | None:
     """Return the task whose architectures extend the class ``kind`` itself; None for other params."""
-    found: str | None = vars(kind).get("ARCHITECTURES") if isinstance(kind, type) else None
-    return found
+    task_name: str | None = vars(kind).get("ARCHITECTURES") if isinstance(kind, type) else None
+    return task_name
 
 
 @functools.cache
 def kinds(base: Kind) -> tuple[Kind, ...]:
     """Return the classes of the architectures that extend ``base``: the default one, tacpipe's own, those of plug-ins."""
-    found: list[Kind] = []
+    architectures: list[Kind] = []
     for name in registry.architectures(str(task(base))):
-        with contextlib.suppress(TacpipeError):  # one that cannot be loaded spoils itself alone
+        with contextlib.suppress(TacpipeError):  # An architecture that cannot be loaded does not stop the others.
             kind = load(base, name)
-            if kind not in found and not _taken(kind, found):
-                found.append(kind)
+            if kind not in architectures and not _shared_choices(kind, architectures):
+                architectures.append(kind)
     default = base.__dataclass_fields__[TAG].default
-    return tuple(sorted(found, key=lambda kind: default not in fields_of.choices(kind, TAG)))
+    return tuple(sorted(architectures, key=lambda kind: default not in fields_of.choices(kind, TAG)))
 
 
 def load(base: Kind, name: str) -> Kind:
     """Return the class of the architecture ``name``. Raises `TacpipeError` for one that does not fit ``base``."""
-    of = task(base)
-    found = registry.load_architecture(str(of), name)
-    target = registry.entry_points()[registry.MODELS][f"{of}.{name}"]
+    task_name = task(base)
+    architecture = registry.load_architecture(str(task_name), name)
+    target = registry.entry_points()[registry.MODELS][f"{task_name}.{name}"]
     misfits = {
-        f"a dataclass that extends {base.__module__}.{base.__name__}": isinstance(found, type)
-        and issubclass(found, base)
-        and dataclasses.is_dataclass(found),
+        f"a dataclass that extends {base.__module__}.{base.__name__}": isinstance(architecture, type)
+        and issubclass(architecture, base)
+        and dataclasses.is_dataclass(architecture),
     }
     if all(misfits.values()):
-        misfits[f"a dataclass whose {TAG} is a Literal with {name}"] = name in fields_of.choices(found, TAG)
-        missing = sorted(getattr(found, "__abstractmethods__", ()))
+        misfits[f"a dataclass whose {TAG} is a Literal with {name}"] = name in fields_of.choices(architecture, TAG)
+        missing = sorted(getattr(architecture, "__abstractmethods__", ()))
         misfits[f"a class with the methods {', '.join(missing)}"] = not missing
-    for wanted, fits in misfits.items():
+    for requirement, fits in misfits.items():
         if not fits:
-            raise TacpipeError(f"{target}, registered as the architecture {name} of {of}, must be {wanted}.")
-    kind: Kind = found
+            raise TacpipeError(
+                f"{target}, registered as the architecture {name} of {task_name}, must be {requirement}."
+            )
+    kind: Kind = architecture
     return kind
 
 
@@ -83,12 +85,12 @@ def title(base: Any, architecture: str) -> str:
 
 def require(base: Any, value: Any) -> None:
     """Raise the reason why an architecture that is installed as ``value`` is not among the choices, if it is not."""
-    of = task(base)
-    if of is None or not isinstance(value, str) or value not in registry.architectures(of):
+    task_name = task(base)
+    if task_name is None or not isinstance(value, str) or value not in registry.architectures(task_name):
         return
     kind = load(base, value)
-    if kind not in (known := kinds(base)):
-        choices = ", ".join(map(str, _taken(kind, known)))
+    if kind not in (choosable := kinds(base)):
+        choices = ", ".join(map(str, _shared_choices(kind, choosable)))
         raise TacpipeError(
             f"The architecture {value} of the package {plugin(kind)} has the choice {choices}, which another has too. "
             f"Rename it there."
@@ -98,12 +100,12 @@ def require(base: Any, value: Any) -> None:
 def plugin(kind: Kind) -> str | None:
     """Return name and version of the package that the architecture of a class comes from; None for tacpipe's own."""
     for base in kind.__mro__[1:]:
-        if (of := task(base)) is not None:
+        if (task_name := task(base)) is not None:
             for name in fields_of.choices(kind, TAG):
-                if name in registry.architectures(of) and (
-                    found := registry.brought_by(registry.MODELS, f"{of}.{name}")
+                if name in registry.architectures(task_name) and (
+                    package := registry.brought_by(registry.MODELS, f"{task_name}.{name}")
                 ):
-                    return str(found)
+                    return str(package)
     return None
 
 
@@ -142,7 +144,12 @@ def check_version(values: Mapping[str, Any], kind: Kind) -> None:
         )
 
 
-def _taken(kind: Kind, found: Iterable[Kind]) -> list[Any]:
-    """Return the choices of a class that one of those found has too."""
-    taken = {choice for other in found if other is not kind for choice in fields_of.choices(other, TAG)}
-    return [choice for choice in fields_of.choices(kind, TAG) if choice in taken]
+def _shared_choices(kind: Kind, architectures: Iterable[Kind]) -> list[Any]:
+    """Return the choices of a class that another of the ``architectures`` has too."""
+    other_choices = {
+        choice
+        for architecture in architectures
+        if architecture is not kind
+        for choice in fields_of.choices(architecture, TAG)
+    }
+    return [choice for choice in fields_of.choices(kind, TAG) if choice in other_choices]

@@ -1,4 +1,4 @@
-"""What a param may be beyond its type: metadata of ``Annotated``, checked where params are built and shown in help.
+"""Constrain the values of params: metadata of ``Annotated``, checked where params are built and shown in help.
 
 ``pressure: Annotated[float, Unit("count"), Range(0, 4095)] = 40.0``, or ``rate_hz: PositiveFloat = 50.0``. A choice is a
 ``Literal``. `StoredAs` names a param that was renamed.
@@ -16,15 +16,15 @@ from tacpipe.io import regular
 from tacpipe.plugins import fields
 from tacpipe.printable import plain
 
-MOST_BYTES = 1 << 20  # of a TOML file
+MOST_BYTES = 1 << 20  # Largest TOML file
 
 
 @dataclass(frozen=True)
 class Range:
-    """Numbers between two ends: ``least`` and ``most`` belong to it, ``above`` and ``below`` do not."""
+    """Numbers between two ends: ``minimum`` and ``maximum`` belong to it, ``above`` and ``below`` do not."""
 
-    least: float | None = None
-    most: float | None = None
+    minimum: float | None = None
+    maximum: float | None = None
     above: float | None = None
     below: float | None = None
 
@@ -35,8 +35,8 @@ class Range:
         [False, True, True, False]
         """
         return not (
-            (self.least is not None and value < self.least)
-            or (self.most is not None and value > self.most)
+            (self.minimum is not None and value < self.minimum)
+            or (self.maximum is not None and value > self.maximum)
             or (self.above is not None and value <= self.above)
             or (self.below is not None and value >= self.below)
         )
@@ -47,12 +47,12 @@ class Range:
         >>> Range(1).describe("a whole number"), Range(0, 1).describe("a number"), Range(above=0).describe("a number")
         ('a whole number of 1 or more', 'a number from 0 to 1', 'a number above 0')
         """
-        if self.least is not None and self.most is not None:
-            return f"{kind} from {self.least} to {self.most}"
+        if self.minimum is not None and self.maximum is not None:
+            return f"{kind} from {self.minimum} to {self.maximum}"
         ends = [
-            (self.least, "of {} or more"),
+            (self.minimum, "of {} or more"),
             (self.above, "above {}"),
-            (self.most, "at most {}"),
+            (self.maximum, "at most {}"),
             (self.below, "below {}"),
         ]
         return f"{kind} " + " and ".join(text.format(end) for end, text in ends if end is not None)
@@ -60,10 +60,10 @@ class Range:
 
 @dataclass(frozen=True)
 class CommaList:
-    """Text that is a list with commas between; each item is read as the annotation ``of`` has it."""
+    """Comma-separated text; each item is read by the annotation ``item_type``."""
 
-    of: Any = str
-    least: int = 0  # items
+    item_type: Any = str
+    min_items: int = 0
 
     def items(self, text: str) -> list[Any]:
         """Return the items of a text that is allowed; spaces around them and empty ones do not count.
@@ -71,23 +71,25 @@ class CommaList:
         >>> CommaList(int).items("1, 5,10")
         [1, 5, 10]
         """
-        return [fields.parsed(part.strip(), self.of) for part in text.split(",") if part.strip()]
+        return [fields.parsed(part.strip(), self.item_type) for part in text.split(",") if part.strip()]
 
     def allows(self, value: str) -> bool:
         """Return whether there are enough items and each is allowed."""
-        found = self.items(value)
-        return len(found) >= self.least and all(fields.fits(item, self.of) for item in found)
+        items = self.items(value)
+        return len(items) >= self.min_items and all(fields.fits(item, self.item_type) for item in items)
 
     def describe(self, kind: str) -> str:
-        """Return what the list holds."""
-        return "a comma-separated list" + ("" if self.of is str else f", each item {fields.describe(self.of)}")
+        """Return the description of the list and of its items."""
+        return "a comma-separated list" + (
+            "" if self.item_type is str else f", each item {fields.describe(self.item_type)}"
+        )
 
 
 @dataclass(frozen=True)
 class Assignments:
-    """Text that is a list of ``NAME=VALUE``; each value is read as the annotation ``of`` has it."""
+    """Text that is a list of ``NAME=VALUE``; each value is read by the annotation ``item_type``."""
 
-    of: Any
+    item_type: Any
     between: str = ","
 
     def items(self, text: str) -> Mapping[str, Any]:
@@ -97,18 +99,18 @@ class Assignments:
         {'biotac': 0.025, 'roboskin': 0.05}
         """
         pairs = [part.partition("=") for part in text.split(self.between) if part.strip()]
-        return {name.strip(): fields.parsed(value.strip(), self.of) for name, _, value in pairs}
+        return {name.strip(): fields.parsed(value.strip(), self.item_type) for name, _, value in pairs}
 
     def allows(self, value: str) -> bool:
-        """Return whether all have a name, no two the same one, and each value is allowed."""
-        found = self.items(value)
+        """Return whether all names are present and different, and each value is allowed."""
+        values = self.items(value)
         count = sum(bool(part.strip()) for part in value.split(self.between))
-        return len(found) == count and all(name and fields.fits(item, self.of) for name, item in found.items())
+        return len(values) == count and all(name and fields.fits(item, self.item_type) for name, item in values.items())
 
     def describe(self, kind: str) -> str:
-        """Return what the list holds."""
+        """Return the description of the list and of its values."""
         between = {",": "comma", ";": "semicolon"}[self.between]
-        return f"a {between}-separated list of NAME=VALUE, each value {fields.describe(self.of)}"
+        return f"a {between}-separated list of NAME=VALUE, each value {fields.describe(self.item_type)}"
 
 
 @dataclass(frozen=True)
@@ -138,7 +140,7 @@ class StoredAs:
     """
 
     name: str
-    choices: Mapping[str, str] = field(default_factory=dict)  # today's choice to that which is stored
+    choices: Mapping[str, str] = field(default_factory=dict)  # Maps the current choice to the stored one
 
 
 @dataclass(frozen=True)
@@ -150,11 +152,14 @@ class TomlFile:
         return True
 
     def describe(self, kind: str) -> str:
-        """Return what the text is."""
+        """Return the description of the text."""
         return "the path of a TOML file"
 
     def read(self, path: str) -> str:
-        """Return what the file at ``path`` holds. Raises `UsageError` where there is none or it is not TOML."""
+        """Return the content of the file at ``path`` as canonical JSON.
+
+        Raises `UsageError` if the file does not exist or is not TOML.
+        """
         import tomllib  # not at each start of a command
 
         if not path:
@@ -176,6 +181,6 @@ NonNegativeInt = Annotated[int, Range(0)]
 PositiveFloat = Annotated[float, Range(above=0)]
 NonNegativeFloat = Annotated[float, Range(0)]
 Fraction = Annotated[float, Range(0, 1)]
-Seed = Annotated[int, Range(0, 2**32 - 1)]  # what numpy, torch and scikit-learn take
-Rate = Annotated[float, Range(above=0, most=1_000_000_000), Unit("Hz")]  # stamps are whole nanoseconds
+Seed = Annotated[int, Range(0, 2**32 - 1)]  # The range that numpy, torch and scikit-learn accept
+Rate = Annotated[float, Range(above=0, maximum=1_000_000_000), Unit("Hz")]  # stamps are whole nanoseconds
 Names = Annotated[str, CommaList()]

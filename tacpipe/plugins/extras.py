@@ -35,7 +35,7 @@ TOGETHER = "all"  # the extra that brings all others: a user wants the one that 
 
 
 @contextmanager
-def named(needed_by: str, plugin: Callable[[], str | None] = lambda: None) -> Iterator[None]:
+def explain_missing(needed_by: str, plugin: Callable[[], str | None] = lambda: None) -> Iterator[None]:
     """Have a module that is missing in the block reported in one sentence that begins with ``needed_by``.
 
     ``plugin`` returns the package that ``needed_by`` comes from, if it is known. Raises `MissingModuleError`, which is an
@@ -44,10 +44,10 @@ def named(needed_by: str, plugin: Callable[[], str | None] = lambda: None) -> It
     try:
         yield
     except ImportError as error:
-        found = None if isinstance(error, MissingModuleError) else missing(error, needed_by, plugin())
-        if found is None:
+        explained = None if isinstance(error, MissingModuleError) else missing(error, needed_by, plugin())
+        if explained is None:
             raise
-        raise found from error
+        raise explained from error
 
 
 def require(needed_by: str, *modules: str) -> None:
@@ -66,7 +66,7 @@ def missing(error: ImportError, needed_by: str, plugin: str | None = None) -> Mi
     module = (error.name or "").partition(".")[0]
     if not module or module in OWN or module in sys.modules:  # a mistake in whoever imports from it
         return None
-    extra, absent = of(module), isinstance(error, ModuleNotFoundError) and not _installed(module)
+    extra, absent = extra_for(module), isinstance(error, ModuleNotFoundError) and not _installed(module)
     if extra is None:
         if not absent:
             return None
@@ -82,30 +82,32 @@ def missing(error: ImportError, needed_by: str, plugin: str | None = None) -> Mi
     )
 
 
-def of(module: str) -> str | None:
+def extra_for(module: str) -> str | None:
     """Return the extra that brings a module, None if none does, or if tacpipe is not installed."""
-    wanted = _normal(PACKAGES.get(module, module))
-    found = _distribution()
-    optional = _optional(found.requires or []) if found is not None else {}
-    return next((extra for extra, packages in optional.items() if extra != TOGETHER and wanted in packages), None)
+    package = _normal(PACKAGES.get(module, module))
+    distribution = _distribution()
+    optional = _optional(distribution.requires or []) if distribution is not None else {}
+    return next((extra for extra, packages in optional.items() if extra != TOGETHER and package in packages), None)
 
 
 def command(extra: str) -> str:
     """Return the shell command that installs an extra of tacpipe, from where this installation came from."""
-    found = _distribution()
-    source = _source(found) if found is not None else None
+    distribution = _distribution()
+    source = _source(distribution) if distribution is not None else None
     pip = _pip()
     if source is not None:
-        return " ".join([pip, "install", *_asked(source, extra)])
-    if found is not None and _from_index(found):
+        return " ".join([pip, "install", *_pip_arguments(source, extra)])
+    if distribution is not None and _from_index(distribution):
         return f"{pip} install {shlex.quote(f'{NAME}[{extra}]')}"
-    requires = (found.requires or []) if found is not None else []  # its source is gone: what the extra names is enough
+    requires = (
+        (distribution.requires or []) if distribution is not None else []
+    )  # its source is gone: what the extra names is enough
     packages = [text.partition(";")[0].strip() for text in requires if _extra(text) == extra]
-    return " ".join([pip, "install", *(shlex.quote(one) for one in packages)])
+    return " ".join([pip, "install", *(shlex.quote(package) for package in packages)])
 
 
-def _asked(source: dict[str, Any], extra: str) -> list[str]:
-    """Return what is given to ``pip install`` for an extra of what a direct URL names."""
+def _pip_arguments(source: dict[str, Any], extra: str) -> list[str]:
+    """Return the arguments of ``pip install`` for an extra of the package that a direct URL names."""
     url = str(source["url"])
     if "vcs_info" in source:
         version = source["vcs_info"]
@@ -115,26 +117,26 @@ def _asked(source: dict[str, Any], extra: str) -> list[str]:
         return [shlex.quote(f"{NAME}[{extra}] @ {url}")]
     from pathlib import Path
 
-    here = Path.cwd() == Path(place)
-    wanted = shlex.quote(f"{'.' if here else place}[{extra}]")
-    return ["-e", wanted] if source.get("dir_info", {}).get("editable") else [wanted]
+    is_working_folder = Path.cwd() == Path(place)
+    requirement = shlex.quote(f"{'.' if is_working_folder else place}[{extra}]")
+    return ["-e", requirement] if source.get("dir_info", {}).get("editable") else [requirement]
 
 
-def _source(found: Distribution) -> dict[str, Any] | None:
+def _source(distribution: Distribution) -> dict[str, Any] | None:
     """Return the direct URL that a distribution was installed from (PEP 610), None if there is none or it is gone."""
     import json
     from pathlib import Path
 
     try:
-        value: dict[str, Any] = json.loads(found.read_text("direct_url.json") or "null")
+        value: dict[str, Any] = json.loads(distribution.read_text("direct_url.json") or "null")
         place = _path(str(value["url"]))
     except (ValueError, TypeError, KeyError):
         return None
     return value if place is None or Path(place).exists() else None
 
 
-def _from_index(found: Distribution) -> bool:
-    return found.read_text("direct_url.json") is None and found.read_text("INSTALLER") is not None
+def _from_index(distribution: Distribution) -> bool:
+    return distribution.read_text("direct_url.json") is None and distribution.read_text("INSTALLER") is not None
 
 
 def _path(url: str) -> str | None:
@@ -156,11 +158,14 @@ def _pip() -> str:
 
 
 def _distribution() -> Distribution | None:
-    """Return tacpipe as it is installed; a clone's own ``egg-info`` on the path knows less."""
+    """Return the installed distribution of tacpipe, preferably the one that states where it came from."""
     from importlib.metadata import distributions
 
-    every = list(distributions(name=NAME))
-    return next((one for one in every if one.read_text("direct_url.json")), every[0] if every else None)
+    installed = list(distributions(name=NAME))
+    return next(
+        (distribution for distribution in installed if distribution.read_text("direct_url.json")),
+        installed[0] if installed else None,
+    )
 
 
 def _optional(requires: list[str]) -> dict[str, set[str]]:
@@ -170,12 +175,12 @@ def _optional(requires: list[str]) -> dict[str, set[str]]:
     ...     "torch", "scikit-learn"}
     True
     """
-    found: dict[str, set[str]] = {}
+    packages: dict[str, set[str]] = {}
     for text in requires:
         match = REQUIREMENT.match(text)
         if match:
-            found.setdefault(match[2], set()).add(_normal(match[1]))
-    return found
+            packages.setdefault(match[2], set()).add(_normal(match[1]))
+    return packages
 
 
 def _extra(text: str) -> str | None:

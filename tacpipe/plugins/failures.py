@@ -21,13 +21,13 @@ def attach(error: BaseException, stage: str, recording: str, outer: tuple[str, .
 
 
 def text(error: BaseException) -> str | None:
-    """Return what to print of an exception that a stage raised; None for any other one, and where all frames are wanted."""
-    found: dict[str, Any] | None = getattr(error, _NAME, None)
-    if found is None or os.environ.get(ALL_FRAMES):
+    """Return the message for an exception that a stage raised; None for other exceptions and if all frames are requested."""
+    failure: dict[str, Any] | None = getattr(error, _NAME, None)
+    if failure is None or os.environ.get(ALL_FRAMES):
         return None
-    where = f" on recording {found['recording']}" if found["recording"] else ""
+    place = f" on recording {failure['recording']}" if failure["recording"] else ""
     return (
-        f"The code of stage {found['stage']} raised {type(error).__name__}{where}:\n{found['frames'].rstrip()}\n"
+        f"The code of stage {failure['stage']} raised {type(error).__name__}{place}:\n{failure['frames'].rstrip()}\n"
         f"What was finished is kept in the store. Set {ALL_FRAMES}=1 to see the frames of tacpipe too."
     )
 
@@ -35,7 +35,7 @@ def text(error: BaseException) -> str | None:
 def line(error: BaseException) -> str:
     """Return in one line what was raised and where: the file and line of the innermost frame, or of the syntax error."""
     described = f"{type(error).__name__}: {error}"
-    if isinstance(error, SyntaxError):  # whose text ends with the file's name and line
+    if isinstance(error, SyntaxError):  # Its text ends with the file's name and line
         return f"{type(error).__name__}: {error.msg}, in {error.filename}, line {error.lineno}."
     frames = traceback.extract_tb(error.__traceback__)
     return f"{described}, in {frames[-1].filename}, line {frames[-1].lineno}." if frames else f"{described}."

@@ -1,4 +1,4 @@
-"""What the annotation of a dataclass's field allows: fit values to it, parse text for it, describe it in words.
+"""Fit values to the annotations of a dataclass's fields, parse text for them, and describe them in words.
 
 Annotations are ``bool``, ``int``, ``float``, ``str``, ``Literal``, another dataclass, a ``tuple`` or a union of these, and
 ``Annotated`` with a `Constraint`, of which `tacpipe.plugins.constraints` has the usual ones.
@@ -19,7 +19,7 @@ from tacpipe.printable import excerpt, plain, suggestion
 
 REFUSED = object()
 _EXPONENT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+")  # YAML 1.1 takes 1e-3 for text, and nobody else does
-_HINTS: dict[type[Any], Mapping[str, Any]] = {}  # to evaluate annotations takes milliseconds for many fields
+_HINTS: dict[type[Any], Mapping[str, Any]] = {}  # Cache: evaluating the annotations of many fields takes milliseconds
 _UNIONS = (typing.Union, types.UnionType)
 
 
@@ -37,104 +37,112 @@ class Constraint(Protocol):
 def hints(kind: type[Any]) -> Mapping[str, Any]:
     """Return the annotation of each field of a dataclass, constraints included."""
     if kind not in _HINTS:
-        found = typing.get_type_hints(kind, include_extras=True)
-        _HINTS[kind] = {field.name: found[field.name] for field in dataclasses.fields(kind)}
+        annotations = typing.get_type_hints(kind, include_extras=True)
+        _HINTS[kind] = {field.name: annotations[field.name] for field in dataclasses.fields(kind)}
     return _HINTS[kind]
 
 
-def bare(wanted: Any) -> Any:
+def bare(annotation: Any) -> Any:
     """Return an annotation without constraints, and without None where that is the only alternative.
 
     >>> bare(Annotated[int, "of 1 or more"]), bare(float | None)
     (<class 'int'>, <class 'float'>)
     """
-    if get_origin(wanted) is Annotated:
-        return bare(get_args(wanted)[0])
-    kinds = [kind for kind in get_args(wanted) if kind is not types.NoneType] if get_origin(wanted) in _UNIONS else []
-    return bare(kinds[0]) if len(kinds) == 1 else wanted
+    if get_origin(annotation) is Annotated:
+        return bare(get_args(annotation)[0])
+    kinds = (
+        [kind for kind in get_args(annotation) if kind is not types.NoneType]
+        if get_origin(annotation) in _UNIONS
+        else []
+    )
+    return bare(kinds[0]) if len(kinds) == 1 else annotation
 
 
 def choices(kind: type[Any], name: str) -> tuple[Any, ...]:
     """Return the choices of the field ``name`` of a dataclass; empty where it is not a Literal."""
-    wanted = bare(hints(kind).get(name))
-    return get_args(wanted) if get_origin(wanted) is Literal else ()
+    annotation = bare(hints(kind).get(name))
+    return get_args(annotation) if get_origin(annotation) is Literal else ()
 
 
-def constraints(wanted: Any) -> list[Constraint]:
+def constraints(annotation: Any) -> list[Constraint]:
     """Return the constraints of an annotation, also of one that None is the only alternative to."""
-    return [one for one in metadata(wanted) if isinstance(one, Constraint)]
+    return [mark for mark in metadata(annotation) if isinstance(mark, Constraint)]
 
 
-def metadata(wanted: Any) -> tuple[Any, ...]:
+def metadata(annotation: Any) -> tuple[Any, ...]:
     """Return what follows the type in ``Annotated``, also where None is the only alternative; empty for other types."""
-    kinds = [kind for kind in get_args(wanted) if kind is not types.NoneType] if get_origin(wanted) in _UNIONS else []
+    kinds = (
+        [kind for kind in get_args(annotation) if kind is not types.NoneType]
+        if get_origin(annotation) in _UNIONS
+        else []
+    )
     if len(kinds) == 1:
         return metadata(kinds[0])
-    return get_args(wanted)[1:] if get_origin(wanted) is Annotated else ()
+    return get_args(annotation)[1:] if get_origin(annotation) is Annotated else ()
 
 
-def check(value: Any, wanted: Any, name: str, where: str = "") -> Any:
-    """Return ``value`` as the annotation ``wanted`` has it, an int as a float where one is wanted.
+def check(value: Any, annotation: Any, name: str, place: str = "") -> Any:
+    """Return ``value`` in the type of ``annotation``: an int becomes a float if a float is expected.
 
-    ``name`` and ``where`` name in messages what holds the value. Raises `UsageError` where it is not allowed.
+    ``name`` and ``place`` identify the value in messages. Raises `UsageError` where it is not allowed.
     """
-    fitted = _fit(value, wanted, f"{where}, {name}" if where else name)
+    fitted = _fit(value, annotation, f"{place}, {name}" if place else name)
     if fitted is REFUSED:
-        subject = f"{where}: {name}" if where else name
-        raise UsageError(f"{subject} is {shown(value)}; it must be {describe(wanted)}.")
+        subject = f"{place}: {name}" if place else name
+        raise UsageError(f"{subject} is {format_value(value)}; it must be {describe(annotation)}.")
     return fitted
 
 
-def shown(value: Any) -> str:
-    """Return a value as a message has it: short, and a whole number as such.
+def format_value(value: Any) -> str:
+    """Format a value for a message: short, and whole floats without a decimal point.
 
-    >>> shown(-5.0), shown("x"), shown(0.5)
+    >>> format_value(-5.0), format_value("x"), format_value(0.5)
     ('-5', "'x'", '0.5')
     """
-    whole = isinstance(value, float) and value.is_integer() and abs(value) < 1e15
-    return str(int(value)) if whole else excerpt(value)
+    is_whole = isinstance(value, float) and value.is_integer() and abs(value) < 1e15
+    return str(int(value)) if is_whole else excerpt(value)
 
 
-def fits(value: Any, wanted: Any) -> bool:
-    """Return whether the annotation ``wanted`` allows ``value``."""
-    return _fit(value, wanted, "") is not REFUSED
+def fits(value: Any, annotation: Any) -> bool:
+    """Return whether ``annotation`` allows ``value``."""
+    return _fit(value, annotation, "") is not REFUSED
 
 
-def filled(kind: type[Any], values: Mapping[str, Any], where: str, noun: str = "param") -> Any:
-    """Return the dataclass ``kind`` with ``values`` over its defaults, an int as a float where one is wanted.
+def filled(kind: type[Any], values: Mapping[str, Any], place: str, noun: str = "param") -> Any:
+    """Return the dataclass ``kind`` with ``values`` over its defaults; an int becomes a float if a float is expected.
 
     Raises `UsageError` for an unknown name, a value that is not allowed, and one without a default that is missing.
     """
-    known = hints(kind)
+    annotations = hints(kind)
     fitting = {}
     for key, value in values.items():
-        if key not in known:
-            raise unknown(key, known, where, noun)
-        fitting[key] = check(value, known[key], key, where)
+        if key not in annotations:
+            raise unknown(key, annotations, place, noun)
+        fitting[key] = check(value, annotations[key], key, place)
     missing = [
         field.name
         for field in dataclasses.fields(kind)
         if field.default is field.default_factory is dataclasses.MISSING and field.name not in fitting
     ]
     if missing:
-        raise UsageError(f"{where}: {noun} {' and '.join(missing)} must be given.")
+        raise UsageError(f"{place}: {noun} {' and '.join(missing)} must be given.")
     return kind(**fitting)
 
 
-def unknown(key: Any, known: Mapping[str, Any], where: str, noun: str) -> UsageError:
-    """Return the error for a name that is not among those known."""
+def unknown(key: Any, names: Mapping[str, Any], place: str, noun: str) -> UsageError:
+    """Return the error for a key that is not among ``names``."""
     shown_key = plain(key) if isinstance(key, str) else excerpt(key)
-    names = ", ".join(known) or "none"
-    return UsageError(f"{where}: there is no {noun} {shown_key}; there are {names}.{suggestion(str(key), known)}")
+    valid = ", ".join(names) or "none"
+    return UsageError(f"{place}: there is no {noun} {shown_key}; there are {valid}.{suggestion(str(key), names)}")
 
 
-def parsed(text: str, wanted: Any) -> Any:
+def parsed(text: str, annotation: Any) -> Any:
     """Return what ``text``, of a command line or of a list, means for an annotation; the text itself if nothing.
 
     >>> parsed("3", int), parsed("3", float), parsed("3", str), parsed("x", int), parsed("3", Literal[1, 3])
     (3, 3.0, '3', 'x', 3)
     """
-    kind = bare(wanted)
+    kind = bare(annotation)
     if get_origin(kind) is Literal:
         return next((choice for choice in get_args(kind) if str(choice) == text), text)
     if kind in (int, float):
@@ -145,64 +153,73 @@ def parsed(text: str, wanted: Any) -> Any:
     return text
 
 
-def describe(wanted: Any) -> str:
+def describe(annotation: Any) -> str:
     """Return what an annotation allows, as in "it must be …".
 
     >>> describe(Literal["a", "b"]), describe(int | None), describe(tuple[float, ...])
     ('one of a, b', 'a whole number', 'a list, each item a number')
     """
-    if get_origin(wanted) is Annotated:
-        text = describe(get_args(wanted)[0])
-        for constraint in constraints(wanted):
+    if get_origin(annotation) is Annotated:
+        text = describe(get_args(annotation)[0])
+        for constraint in constraints(annotation):
             text = constraint.describe(text)
         return text
-    if get_origin(wanted) is Literal:
-        return "one of " + ", ".join(map(str, get_args(wanted)))
-    if get_origin(wanted) in _UNIONS:
-        return " or ".join(describe(kind) for kind in get_args(wanted) if kind is not types.NoneType)
-    if get_origin(wanted) is tuple:
-        return f"a list, each item {describe(get_args(wanted)[0])}"
-    if dataclasses.is_dataclass(wanted):
-        return f"a table of {', '.join(field.name for field in dataclasses.fields(wanted))}"
+    if get_origin(annotation) is Literal:
+        return "one of " + ", ".join(map(str, get_args(annotation)))
+    if get_origin(annotation) in _UNIONS:
+        return " or ".join(describe(kind) for kind in get_args(annotation) if kind is not types.NoneType)
+    if get_origin(annotation) is tuple:
+        return f"a list, each item {describe(get_args(annotation)[0])}"
+    if dataclasses.is_dataclass(annotation):
+        return f"a table of {', '.join(field.name for field in dataclasses.fields(annotation))}"
     names = {float: "a number", int: "a whole number", str: "text", bool: "true or false"}
-    return names.get(wanted, str(wanted))
+    return names.get(annotation, str(annotation))
 
 
-def _fit(value: Any, wanted: Any, where: str) -> Any:
-    """Return ``value`` as what is wanted, or `REFUSED`; a mapping fills a dataclass, which raises as `filled` does."""
-    origin = get_origin(wanted)
+def _fit(value: Any, annotation: Any, place: str) -> Any:
+    """Return ``value`` in the type of ``annotation``, else `REFUSED`.
+
+    A mapping fills a dataclass, which raises as `filled` does.
+    """
+    origin = get_origin(annotation)
     if origin is Annotated:
-        fit = _fit(value, get_args(wanted)[0], where)
-        return fit if fit is not REFUSED and all(one.allows(fit) for one in constraints(wanted)) else REFUSED
+        fit = _fit(value, get_args(annotation)[0], place)
+        return (
+            fit
+            if fit is not REFUSED and all(constraint.allows(fit) for constraint in constraints(annotation))
+            else REFUSED
+        )
     if origin in _UNIONS:
-        fits = (_fit(value, kind, where) for kind in get_args(wanted))
+        fits = (_fit(value, kind, place) for kind in get_args(annotation))
         return next((fit for fit in fits if fit is not REFUSED), REFUSED)
     if origin is Literal:  # 1, 1.0 and True are equal, and three values in a key
-        return next((one for one in get_args(wanted) if one == value and type(one) is type(value)), REFUSED)
+        return next(
+            (choice for choice in get_args(annotation) if choice == value and type(choice) is type(value)), REFUSED
+        )
     if origin is tuple:
         if not isinstance(value, list | tuple):
             return REFUSED
-        fitted = [_fit(item, get_args(wanted)[0], f"{where} {row}") for row, item in enumerate(value, start=1)]
+        fitted = [_fit(item, get_args(annotation)[0], f"{place} {row}") for row, item in enumerate(value, start=1)]
         return REFUSED if any(fit is REFUSED for fit in fitted) else tuple(fitted)
-    if dataclasses.is_dataclass(wanted):
+    if dataclasses.is_dataclass(annotation):
         if isinstance(value, Mapping):
-            return filled(typing.cast(type, wanted), value, where, "key")
-        return value if isinstance(value, typing.cast(type, wanted)) else REFUSED
-    return _fit_plain(value, wanted)
+            return filled(typing.cast(type, annotation), value, place, "key")
+        return value if isinstance(value, typing.cast(type, annotation)) else REFUSED
+    return _fit_plain(value, annotation)
 
 
-def _fit_plain(value: Any, wanted: Any) -> Any:
+def _fit_plain(value: Any, kind: Any) -> Any:
     """Return ``value`` as a bool, an int, a float, a text or None, or `REFUSED`."""
-    if wanted is float and isinstance(value, str) and _EXPONENT.fullmatch(value):
+    if kind is float and isinstance(value, str) and _EXPONENT.fullmatch(value):
         value = float(value)
-    if wanted is float and isinstance(value, int | float) and not isinstance(value, bool):
-        return float(value) + 0.0 if abs(value) <= sys.float_info.max else REFUSED  # NaN is none; -0.0 becomes 0.0
-    if wanted is str and isinstance(value, str) and not _encodes(value):
+    if kind is float and isinstance(value, int | float) and not isinstance(value, bool):
+        return float(value) + 0.0 if abs(value) <= sys.float_info.max else REFUSED  # NaN is refused; -0.0 becomes 0.0
+    if kind is str and isinstance(value, str) and not _encodes(value):
         return REFUSED
-    if wanted is types.NoneType:
+    if kind is types.NoneType:
         return value if value is None else REFUSED
-    right = isinstance(value, wanted) and (wanted is bool or not isinstance(value, bool))
-    return value if right else REFUSED
+    is_kind = isinstance(value, kind) and (kind is bool or not isinstance(value, bool))
+    return value if is_kind else REFUSED
 
 
 def _encodes(text: str) -> bool:

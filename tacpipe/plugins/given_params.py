@@ -17,21 +17,21 @@ from tacpipe.plugins.stage import AnyStage
 from tacpipe.printable import excerpt, listed
 
 
-class _Given(NamedTuple):
+class _Setting(NamedTuple):
     """A value that was given, and where."""
 
-    where: str
+    origin: str
     key: str
     value: Any
     option: bool = False
 
     @property
     def name(self) -> str:
-        return self.where if self.option else self.key
+        return self.origin if self.option else self.key
 
     @property
     def place(self) -> str:
-        return "" if self.option else self.where
+        return "" if self.option else self.origin
 
 
 def build(
@@ -51,60 +51,69 @@ def build(
     """
     early = [] if file is None else _from_file(file, block or name, required=block is not None)
     late = [_from_set(name, text) for text in sets]
-    late += [_Given(f"--{key.replace('_', '-')}", key, value, True) for key, value in (options or {}).items()]
+    late += [_Setting(f"--{key.replace('_', '-')}", key, value, True) for key, value in (options or {}).items()]
     kind = _chosen(stage, early, late, preset)
     between = [] if preset is None else _from_preset(name, stage, kind, preset)
     values: dict[str, Any] = {}
     chooses = params_of.tag(stage)
-    for given in (*early, *between, *late):
-        if given.key != chooses or given.value in params_of.choices(kind, given.key):  # others were overruled
-            values[given.key] = _checked(stage, kind, given, values)
+    for setting in (*early, *between, *late):
+        if setting.key != chooses or setting.value in params_of.choices(kind, setting.key):  # others were overruled
+            values[setting.key] = _checked(stage, kind, setting, values)
     try:
-        made = kind(**values)
+        params = kind(**values)
     except TypeError as error:
         raise UsageError(f"The params of {name} are not complete: {error}.") from error
-    if hasattr(made, "check"):
-        made.check()
-    return made
+    if hasattr(params, "check"):
+        params.check()
+    return params
 
 
-def _chosen(stage: AnyStage, early: Sequence[_Given], late: Sequence[_Given], preset: str | None) -> Kind:
+def _chosen(stage: AnyStage, early: Sequence[_Setting], late: Sequence[_Setting], preset: str | None) -> Kind:
     """Return the kind of params: that of an option, else of the preset if the file's kind does not have it."""
-    kind = _named(stage, early)
-    if any(given.key == params_of.tag(stage) for given in late):
-        return _named(stage, late)
+    kind = _kind_by_tag(stage, early)
+    if any(setting.key == params_of.tag(stage) for setting in late):
+        return _kind_by_tag(stage, late)
     if preset is None or preset in params_of.presets_of(kind):
         return kind
-    return next((other for other in params_of.kinds(stage) if preset in params_of.presets_of(other)), kind)
+    return next(
+        (alternative for alternative in params_of.kinds(stage) if preset in params_of.presets_of(alternative)), kind
+    )
 
 
-def _named(stage: AnyStage, given: Sequence[_Given]) -> Kind:
-    """Return the kind that the last tag among ``given`` names, or the default one. Raises `UsageError` for none."""
-    name, found = params_of.tag(stage), params_of.kinds(stage)[0]
-    for one in given:
-        if one.key == name:
-            architectures.require(stage.params, one.value)
-            value = fields_of.check(one.value, params_of.fields(stage)[name], one.name, one.place)
-            found = next(kind for kind in params_of.kinds(stage) if value in params_of.choices(kind, str(name)))
-    return found
+def _kind_by_tag(stage: AnyStage, settings: Sequence[_Setting]) -> Kind:
+    """Return the kind that the last tag among ``settings`` selects, or the default kind.
+
+    Raises `UsageError` for a tag that no kind has.
+    """
+    name, kind = params_of.tag(stage), params_of.kinds(stage)[0]
+    for setting in settings:
+        if setting.key == name:
+            architectures.require(stage.params, setting.value)
+            value = fields_of.check(setting.value, params_of.fields(stage)[name], setting.name, setting.place)
+            kind = next(
+                candidate for candidate in params_of.kinds(stage) if value in params_of.choices(candidate, str(name))
+            )
+    return kind
 
 
-def _checked(stage: AnyStage, kind: Kind, given: _Given, before: Mapping[str, Any]) -> Any:
-    """Return a value as the field of ``kind`` has it."""
-    known, name = fields_of.hints(kind), params_of.tag(stage)
-    if given.key not in params_of.fields(stage):
-        raise fields_of.unknown(given.key, params_of.fields(stage), given.where, "param")
-    subject = given.name if given.option else f"{given.place}: {given.key}"
+def _checked(stage: AnyStage, kind: Kind, setting: _Setting, before: Mapping[str, Any]) -> Any:
+    """Return the value of ``setting`` in the type of its field in ``kind``."""
+    annotations, name = fields_of.hints(kind), params_of.tag(stage)
+    if setting.key not in params_of.fields(stage):
+        raise fields_of.unknown(setting.key, params_of.fields(stage), setting.origin, "param")
+    subject = setting.name if setting.option else f"{setting.place}: {setting.key}"
     current = before.get(name, kind.__dataclass_fields__[name].default) if name else None
-    if given.key in known:
-        wanted = known[given.key]
-        if fields_of.fits(given.value, params_of.fields(stage)[given.key]) and not fields_of.fits(given.value, wanted):
-            rule = f"with {name} {current} it must be {fields_of.describe(wanted)}"
-            raise UsageError(f"{subject} is {fields_of.shown(given.value)}; {rule}.")
-        value = fields_of.check(given.value, wanted, given.name, given.place)
-        files = [mark for mark in fields_of.metadata(wanted) if isinstance(mark, TomlFile)]
+    if setting.key in annotations:
+        annotation = annotations[setting.key]
+        if fields_of.fits(setting.value, params_of.fields(stage)[setting.key]) and not fields_of.fits(
+            setting.value, annotation
+        ):
+            rule = f"with {name} {current} it must be {fields_of.describe(annotation)}"
+            raise UsageError(f"{subject} is {fields_of.format_value(setting.value)}; {rule}.")
+        value = fields_of.check(setting.value, annotation, setting.name, setting.place)
+        files = [mark for mark in fields_of.metadata(annotation) if isinstance(mark, TomlFile)]
         return files[0].read(value) if files else value
-    owners = params_of.having(stage, given.key)
+    owners = params_of.having(stage, setting.key)
     raise UsageError(
         f"{subject} belongs to the {name} {_or(owners)}, and the {name} is {current}. "
         f"Leave it out, or set {name} to {_or(owners)}."
@@ -115,21 +124,21 @@ def _or(names: Sequence[str]) -> str:
     return "".join(names) if len(names) < 2 else f"{', '.join(names[:-1])} or {names[-1]}"
 
 
-def _from_preset(name: str, stage: AnyStage, kind: Kind, preset: str) -> list[_Given]:
-    there = params_of.presets_of(kind)
+def _from_preset(name: str, stage: AnyStage, kind: Kind, preset: str) -> list[_Setting]:
+    presets = params_of.presets_of(kind)
     if preset not in params_of.presets(stage):
         have = f"it has {', '.join(params_of.presets(stage))}" if params_of.presets(stage) else "it has none"
         raise UsageError(f"There is no preset {preset} for {name}; {have}.")
-    if preset not in there:
+    if preset not in presets:
         choices = _or(list(map(str, params_of.choices(kind, params_of.tag(stage) or ""))))
-        have = f"it has {', '.join(there)}" if there else "it has none"
+        have = f"it has {', '.join(presets)}" if presets else "it has none"
         raise UsageError(f"There is no preset {preset} for the {params_of.tag(stage)} {choices} of {name}; {have}.")
-    return [_Given(f"preset {preset} of {name}", key, value) for key, value in there[preset].items()]
+    return [_Setting(f"preset {preset} of {name}", key, value) for key, value in presets[preset].items()]
 
 
-def _from_set(name: str, text: str) -> _Given:
+def _from_set(name: str, text: str) -> _Setting:
     key, _, value = text.partition("=")
-    return _Given(f"--set {text}", key.removeprefix(f"{name}."), _parse(value))
+    return _Setting(f"--set {text}", key.removeprefix(f"{name}."), _parse(value))
 
 
 def _parse(text: str) -> Any:
@@ -139,14 +148,14 @@ def _parse(text: str) -> Any:
         return text
 
 
-def _from_file(path: Path, block: str, *, required: bool) -> list[_Given]:
-    where = f"{path}, block {block}"
-    return [_Given(where, key, value) for key, value in _block(path, block, required=required).items()]
+def _from_file(path: Path, block: str, *, required: bool) -> list[_Setting]:
+    place = f"{path}, block {block}"
+    return [_Setting(place, key, value) for key, value in _block(path, block, required=required).items()]
 
 
 def _block(path: Path, block: str, *, required: bool) -> dict[str, Any]:
     try:
-        found = yaml_text.load(regular.content(path)) or {}
+        content = yaml_text.load(regular.content(path)) or {}
     except FileNotFoundError:
         raise UsageError(f"There is no file {path} to read params from.") from None
     except OSError as error:
@@ -156,13 +165,13 @@ def _block(path: Path, block: str, *, required: bool) -> dict[str, Any]:
     except ValueError as error:
         raise UsageError(f"{path} cannot be read: {error}.") from error
     for part in block.split("."):
-        if not isinstance(found, dict):
-            raise UsageError(f"{path}: {part} of block {block} stands in {excerpt(found)}, which is not a mapping.")
-        if part not in found:
+        if not isinstance(content, dict):
+            raise UsageError(f"{path}: {part} of block {block} stands in {excerpt(content)}, which is not a mapping.")
+        if part not in content:
             if required:
-                raise UsageError(f"{path} has no block {block}; at {part} there are {listed(found)}.")
+                raise UsageError(f"{path} has no block {block}; at {part} there are {listed(content)}.")
             return {}
-        found = found[part]
-    if not isinstance(found, dict):
-        raise UsageError(f"{path}: block {block} is {excerpt(found)}; it should be a mapping of params.")
-    return found
+        content = content[part]
+    if not isinstance(content, dict):
+        raise UsageError(f"{path}: block {block} is {excerpt(content)}; it should be a mapping of params.")
+    return content

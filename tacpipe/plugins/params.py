@@ -1,4 +1,4 @@
-"""What a stage declares as its params, and params as they are stored.
+"""Read the params that a stage declares, and convert them from and to the form that is stored.
 
 A stage has one dataclass of params, or several: a tagged union, ``Params = Small | Large``, whose classes each have the
 same first field, say ``architecture``, with choices (``Literal``) of their own. That field chooses the class, the first
@@ -45,21 +45,21 @@ def _members(union: Any) -> tuple[Kind, ...]:
 
 def tag(stage: AnyStage) -> str | None:
     """Return the name of the field that chooses among several kinds of params; None where there is one kind."""
-    several = kinds(stage)
-    if len(several) == 1:
+    alternatives = kinds(stage)
+    if len(alternatives) == 1:
         return None
-    name = _tag_name(several)
-    several_choices = [choices(kind, name) for kind in several]
-    if not all(several_choices) or len(set().union(*several_choices)) < sum(map(len, several_choices)):
+    name = _tag_name(alternatives)
+    choices_by_kind = [choices(kind, name) for kind in alternatives]
+    if not all(choices_by_kind) or len(set().union(*choices_by_kind)) < sum(map(len, choices_by_kind)):
         raise TacpipeError(
-            f"The params of {stage.function.__name__} are of {len(several)} kinds, and their first field, {name}, does "
+            f"The params of {stage.function.__name__} are of {len(alternatives)} kinds, and their first field, {name}, does "
             f"not distinguish them: it must be a Literal in each, with choices that no other has."
         )
     return name
 
 
-def _tag_name(several: Sequence[Kind]) -> str:
-    return dataclasses.fields(several[0])[0].name
+def _tag_name(alternatives: Sequence[Kind]) -> str:
+    return dataclasses.fields(alternatives[0])[0].name
 
 
 def fields(stage: AnyStage) -> dict[str, Any]:
@@ -69,18 +69,20 @@ def fields(stage: AnyStage) -> dict[str, Any]:
 
 def having(stage: AnyStage, field: str) -> list[str]:
     """Return the choices of the tag for which a param counts, empty if it always does."""
-    name, several = tag(stage), kinds(stage)
-    owners = [kind for kind in several if field in fields_of.hints(kind)]
-    if name is None or len(owners) == len(several):
+    name, alternatives = tag(stage), kinds(stage)
+    owners = [kind for kind in alternatives if field in fields_of.hints(kind)]
+    if name is None or len(owners) == len(alternatives):
         return []
     return [str(choice) for kind in owners for choice in choices(kind, name)]
 
 
 def defaults(stage: AnyStage, field: str) -> list[Any]:
-    """Return the defaults that a param has, one in each kind that has another; of the tag that of the default kind."""
-    several = kinds(stage)[:1] if field == tag(stage) else kinds(stage)
-    found = [kind.__dataclass_fields__[field] for kind in several if field in kind.__dataclass_fields__]
-    return list({repr(one.default): one.default for one in found if one.default is not dataclasses.MISSING}.values())
+    """Return the different defaults that a param has among the kinds; for the tag, the default of the default kind."""
+    owners = kinds(stage)[:1] if field == tag(stage) else kinds(stage)
+    declared = [kind.__dataclass_fields__[field] for kind in owners if field in kind.__dataclass_fields__]
+    return list(
+        {repr(item.default): item.default for item in declared if item.default is not dataclasses.MISSING}.values()
+    )
 
 
 def presets(stage: AnyStage) -> list[str]:
@@ -93,15 +95,15 @@ def panels(stage: AnyStage) -> dict[str, str]:
 
     A param of an architecture that declares none is in the panel of the architecture.
     """
-    found: dict[str, str] = {}
+    panel_of: dict[str, str] = {}
     for kind in kinds(stage):
         for owner in kind.__mro__:
             declared: Mapping[str, Sequence[str]] = vars(owner).get("PANELS", {})
             for panel, names in declared.items():
-                found |= {name: panel for name in names if name not in found}
-    if architectures.task(stage.params) is not None and architectures.TAG in found:
-        found = {**dict.fromkeys(fields(stage), found[architectures.TAG]), **found}
-    return found
+                panel_of |= {name: panel for name in names if name not in panel_of}
+    if architectures.task(stage.params) is not None and architectures.TAG in panel_of:
+        panel_of = {**dict.fromkeys(fields(stage), panel_of[architectures.TAG]), **panel_of}
+    return panel_of
 
 
 def added(default: Any) -> Any:
@@ -123,11 +125,11 @@ def to_json(params: Any) -> dict[str, Any]:
         if field.metadata.get("added") and getattr(params, field.name) == field.default
     }
     values = {name: value for name, value in dataclasses.asdict(params).items() if name not in silent}
-    found = _stored(
+    stored = _stored(
         type(params), {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
     )
     package = architectures.plugin(type(params))
-    return found if package is None else {**found, architectures.PLUGIN: package}
+    return stored if package is None else {**stored, architectures.PLUGIN: package}
 
 
 def to_input(params: Any) -> dict[str, Any]:
@@ -147,14 +149,16 @@ def from_json(stage: AnyStage, values: Mapping[str, Any]) -> Any:
     architectures.check_installed(stage.params, values, kind)
     kind = kind or kinds(stage)[0]
     architectures.check_version(values, kind)
-    known = fields_of.hints(kind)
-    gone = sorted(set(current) - set(fields(stage)))
-    if gone and stage.mapped:
+    annotations = fields_of.hints(kind)
+    removed = sorted(set(current) - set(fields(stage)))
+    if removed and stage.mapped:
         raise TacpipeError(
-            f"What is stored was computed by another version of {stage.function.__name__}, with the param {gone[0]}, which "
-            f"this version does not have. Run the stage again, or use that version."
+            f"What is stored was computed by another version of {stage.function.__name__}, with the param {removed[0]}, "
+            f"which this version does not have. Run the stage again, or use that version."
         )
-    return kind(**{k: tuple(v) if get_origin(known[k]) is tuple else v for k, v in current.items() if k in known})
+    return kind(
+        **{k: tuple(v) if get_origin(annotations[k]) is tuple else v for k, v in current.items() if k in annotations}
+    )
 
 
 def counting(stage: AnyStage, values: Mapping[str, Any]) -> dict[str, Any]:
@@ -171,47 +175,49 @@ def kind_of(stage: AnyStage, values: Mapping[str, Any]) -> Kind | None:
     return _current(kinds(stage), values)[0]
 
 
-def named(stage: str, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return stored params by today's names and choices; as they are where the ``stage`` is not installed."""
+def with_current_names(stage: str, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return stored params with current names and choices; unchanged if the ``stage`` is not installed."""
     from tacpipe.plugins import registry
 
     try:
-        found = kinds(registry.load(stage))
+        alternatives = kinds(registry.load(stage))
     except TacpipeError:
         return dict(values)
-    return _current(found, values)[1]
+    return _current(alternatives, values)[1]
 
 
-def read(union: Any, values: Mapping[str, Any], where: str) -> Any:
+def read(union: Any, values: Mapping[str, Any], place: str) -> Any:
     """Return the params, of a dataclass or of one of a ``union``, that a model's configuration holds.
 
     It may be of an older version: fields that are missing have their default, those that are gone are left out, and types
-    alone are checked, for ranges and choices may have been others. Raises `TacpipeError`, which begins with ``where``,
+    alone are checked, for ranges and choices may have been others. Raises `TacpipeError`, which begins with ``place``,
     for a value of another type and where the tag names none of the union.
     """
-    several = _members(union)
-    kind, current = _current(several, values)
+    members = _members(union)
+    kind, current = _current(members, values)
     architectures.check_installed(union, values, kind)
     if kind is None:
-        name = _tag_name(several)
-        allowed = [str(choice) for one in several for choice in choices(one, name)]
-        found = excerpt(values.get(_stored_name(several[0], name)))
-        raise TacpipeError(f"{where}: {name} is {found}; it must be one of {', '.join(allowed)}.")
+        name = _tag_name(members)
+        allowed = [str(choice) for member in members for choice in choices(member, name)]
+        tag_text = excerpt(values.get(_stored_name(members[0], name)))
+        raise TacpipeError(f"{place}: {name} is {tag_text}; it must be one of {', '.join(allowed)}.")
     architectures.warn_of_version(values, kind)
-    known = fields_of.hints(kind)
-    fitted = {name: _of_type(value, known[name], name, where) for name, value in current.items() if name in known}
+    annotations = fields_of.hints(kind)
+    fitted = {
+        name: _of_type(value, annotations[name], name, place) for name, value in current.items() if name in annotations
+    }
     return kind(**fitted)
 
 
-def _of_type(value: Any, wanted: Any, name: str, where: str) -> Any:
+def _of_type(value: Any, annotation: Any, name: str, place: str) -> Any:
     """Return ``value`` as the type of an annotation, whatever its constraints; raises `TacpipeError` for another type."""
-    kind = fields_of.bare(wanted)
+    kind = fields_of.bare(annotation)
     if get_origin(kind) is Literal:
         kind = typing.Union[tuple({type(choice) for choice in get_args(kind)})]  # noqa: UP007
-    optional = wanted if fields_of.fits(None, wanted) else kind
+    optional = annotation if fields_of.fits(None, annotation) else kind
     try:
-        return fields_of.check(value, kind if value is not None else optional, name, where)
-    except UsageError as error:  # of a file, not of a command
+        return fields_of.check(value, kind if value is not None else optional, name, place)
+    except UsageError as error:  # The mistake is in a file, not in a command
         raise TacpipeError(str(error)) from None
 
 
@@ -228,40 +234,40 @@ def _stored_name(kind: Kind, name: str) -> str:
 
 
 def _stored(kind: Kind, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return params of ``kind`` by the names and choices that are stored."""
-    found = {}
+    """Return params of ``kind`` with their stored names and choices."""
+    stored = {}
     for name, value in values.items():
         mark = _stored_as(kind, name)
-        found[mark.name] = mark.choices.get(value, value) if isinstance(value, str) else value
-    return found
+        stored[mark.name] = mark.choices.get(value, value) if isinstance(value, str) else value
+    return stored
 
 
-def _current(several: Sequence[Kind], values: Mapping[str, Any]) -> tuple[Kind | None, dict[str, Any]]:
+def _current(alternatives: Sequence[Kind], values: Mapping[str, Any]) -> tuple[Kind | None, dict[str, Any]]:
     """Return the kind that stored params are of, and these by today's names and choices; None where there is no such kind.
 
     A name that the kind does not have is that of another kind, or stays as it is.
     """
-    name = _tag_name(several) if len(several) > 1 else None
-    chosen = next((one for one in several if name is None or _tagged(one, name, values)), None)
+    name = _tag_name(alternatives) if len(alternatives) > 1 else None
+    chosen = next((kind for kind in alternatives if name is None or _tagged(kind, name, values)), None)
     upgrade = getattr(chosen, "upgrade", None)
     values = values if upgrade is None else upgrade(values)
-    today = _today(tuple(one for one in (chosen, *several) if one is not None))
-    found = {}
+    today = _today(tuple(kind for kind in (chosen, *alternatives) if kind is not None))
+    current = {}
     for stored, value in values.items():
         field, choices = today.get(stored, (stored, {}))
-        found[field] = choices.get(value, value) if isinstance(value, str) else value
-    return chosen, found
+        current[field] = choices.get(value, value) if isinstance(value, str) else value
+    return chosen, current
 
 
 @functools.cache
 def _today(order: tuple[Kind, ...]) -> Mapping[str, tuple[str, Mapping[str, str]]]:
-    """Return today's name and choices of each stored name; of two kinds that have it, those of the first."""
-    found: dict[str, tuple[str, Mapping[str, str]]] = {}
+    """Return the current name and choices of each stored name; the first kind that has the name counts."""
+    current: dict[str, tuple[str, Mapping[str, str]]] = {}
     for kind in order:
         for field in fields_of.hints(kind):
             mark = _stored_as(kind, field)
-            found.setdefault(mark.name, (field, {old: new for new, old in mark.choices.items()}))
-    return found
+            current.setdefault(mark.name, (field, {old: new for new, old in mark.choices.items()}))
+    return current
 
 
 def _tagged(kind: Kind, name: str, values: Mapping[str, Any]) -> bool:
@@ -273,15 +279,15 @@ def _tagged(kind: Kind, name: str, values: Mapping[str, Any]) -> bool:
 
 def comments(stage: AnyStage) -> dict[str, str]:
     """Return the comment behind each field of a stage's params, or in the lines above it: its help."""
-    found: dict[str, list[str]] = {}
+    texts_by_name: dict[str, list[str]] = {}
     for kind in kinds(stage):
-        own: dict[str, str] = {}
+        inherited: dict[str, str] = {}
         for owner in reversed(kind.__mro__):
-            own |= comments_of(owner) if dataclasses.is_dataclass(owner) else {}
-        for name, text in own.items():
-            if text not in found.setdefault(name, []) and text:
-                found[name].append(text)
-    return {name: "; ".join(texts) for name, texts in found.items()}
+            inherited |= comments_of(owner) if dataclasses.is_dataclass(owner) else {}
+        for name, text in inherited.items():
+            if text not in texts_by_name.setdefault(name, []) and text:
+                texts_by_name[name].append(text)
+    return {name: "; ".join(texts) for name, texts in texts_by_name.items()}
 
 
 def comments_of(kind: Kind) -> dict[str, str]:
@@ -290,40 +296,44 @@ def comments_of(kind: Kind) -> dict[str, str]:
         lines = inspect.getsource(kind).splitlines()
     except (OSError, TypeError):
         return {}
-    found: dict[str, str] = {}
+    comments: dict[str, str] = {}
     above: list[str] = []
     for line in lines:
         if match := re.match(r"\s+#\s*(.*)", line):
             above.append(match[1])
         elif match := re.match(r"\s+(\w+)\s*:[^#]*(?:#\s*(.*))?$", line):
-            found[match[1]] = match[2] or " ".join(above)
+            comments[match[1]] = match[2] or " ".join(above)
             above = []
         else:
             above = []
-    return found
+    return comments
 
 
 # ---- kinds of params
 
 
 @functools.cache
-def _fields(several: tuple[Kind, ...]) -> Mapping[str, Any]:
-    found: dict[str, list[Any]] = {}
-    for kind in several:
-        for name, wanted in fields_of.hints(kind).items():
-            if wanted not in found.setdefault(name, []):
-                found[name].append(wanted)
-    return {name: _joined(wanted) for name, wanted in found.items()}
+def _fields(alternatives: tuple[Kind, ...]) -> Mapping[str, Any]:
+    annotations: dict[str, list[Any]] = {}
+    for kind in alternatives:
+        for name, annotation in fields_of.hints(kind).items():
+            if annotation not in annotations.setdefault(name, []):
+                annotations[name].append(annotation)
+    return {name: _joined(options) for name, options in annotations.items()}
 
 
-def _joined(several: Sequence[Any]) -> Any:
-    """Return one annotation that allows what any of several does."""
-    if all(get_origin(fields_of.bare(one)) is Literal for one in several):
-        return Literal[tuple(dict.fromkeys(choice for one in several for choice in get_args(fields_of.bare(one))))]
-    return several[0] if len(several) == 1 else typing.Union[tuple(several)]  # noqa: UP007
+def _joined(annotations: Sequence[Any]) -> Any:
+    """Return an annotation that allows every value that one of ``annotations`` allows."""
+    if all(get_origin(fields_of.bare(annotation)) is Literal for annotation in annotations):
+        return Literal[
+            tuple(
+                dict.fromkeys(choice for annotation in annotations for choice in get_args(fields_of.bare(annotation)))
+            )
+        ]
+    return annotations[0] if len(annotations) == 1 else typing.Union[tuple(annotations)]  # noqa: UP007
 
 
 def presets_of(kind: Kind | None) -> Mapping[str, Mapping[str, Any]]:
     """Return the values of each preset of a kind of params, by its name."""
-    found: Mapping[str, Mapping[str, Any]] = getattr(kind, "PRESETS", {})
-    return found
+    presets: Mapping[str, Mapping[str, Any]] = getattr(kind, "PRESETS", {})
+    return presets

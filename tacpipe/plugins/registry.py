@@ -28,16 +28,16 @@ if TYPE_CHECKING:
     from tacpipe.tasks.task import Task
 
 STAGES, FORMATS, SENSORS = "tacpipe.stages", "tacpipe.formats", "tacpipe.sensors"
-TASKS = "tacpipe.tasks"  # by name: a subclass of `tacpipe.tasks.task.Task`
+TASKS = "tacpipe.tasks"  # Maps a name to a subclass of `tacpipe.tasks.task.Task`
 EXPORTS = "tacpipe.exports"
 EXECUTORS = "tacpipe.executors"
-COMMANDS = "tacpipe.commands"  # by the name of a package: the order of its commands, and the lines of its groups
+COMMANDS = "tacpipe.commands"  # Maps a package to the order of its commands and the help of its groups
 OWN = "tacpipe"  # the name of its own entry point there
 TRACKERS = "tacpipe.trackers"
 MODELS = "tacpipe.models"  # TASK.NAME: params of an architecture of a task (`tacpipe.plugins.architectures`)
-CODECS = "tacpipe.codecs"  # by the kind of a codec: its class (`tacpipe.codecs.codec.Codec`)
+CODECS = "tacpipe.codecs"  # Maps the kind of a codec to its class (`tacpipe.codecs.codec.Codec`)
 GROUPS = (STAGES, FORMATS, EXPORTS, TASKS, COMMANDS, SENSORS, EXECUTORS, TRACKERS, MODELS, CODECS)
-PREFIXES = {FORMATS: "ingest.", EXPORTS: "export.", TASKS: "train."}  # of the stages of other groups
+PREFIXES = {FORMATS: "ingest.", EXPORTS: "export.", TASKS: "train."}  # Prefixes of stage names in other groups
 FIT, PART = ".fit", ".part"  # end the names of what belongs to a stage and has a key of its own
 _used_packages: ContextVar[set[str] | None] = ContextVar("used_packages", default=None)
 
@@ -55,7 +55,7 @@ class Package(NamedTuple):
 @functools.cache
 def entry_points() -> dict[str, dict[str, str]]:
     """Return group, name and target of every entry point of tacpipe's groups."""
-    return {group: {name: target for name, (target, _) in found.items()} for group, found in installed().items()}
+    return {group: {name: target for name, (target, _) in declared.items()} for group, declared in installed().items()}
 
 
 @functools.cache
@@ -65,7 +65,7 @@ def installed() -> dict[str, dict[str, tuple[str, Path]]]:
     Reads the ``entry_points.txt`` of what is installed itself: ``importlib.metadata`` builds an object of each of them and
     takes as long as the rest of ``tacpipe --help``. The first one on the path wins, as there.
     """
-    found: dict[str, dict[str, tuple[str, Path]]] = {group: {} for group in GROUPS}
+    targets_by_group: dict[str, dict[str, tuple[str, Path]]] = {group: {} for group in GROUPS}
     for folder in dict.fromkeys(sys.path):
         for file in _entry_point_files(folder):
             try:
@@ -77,11 +77,11 @@ def installed() -> dict[str, dict[str, tuple[str, Path]]]:
             parser = ConfigParser(delimiters=("=",), interpolation=None)
             parser.optionxform = str  # type: ignore[assignment, method-assign]  # names keep their case
             parser.read_string(text)
-            for group, targets in found.items():
+            for group, targets in targets_by_group.items():
                 if parser.has_section(group):
                     for name, target in parser.items(group):
                         targets.setdefault(name, (target, file))
-    return found
+    return targets_by_group
 
 
 def brought_by(group: str, name: str) -> Package | None:
@@ -114,7 +114,7 @@ def plugin_packages() -> dict[str, Path]:
 
 def package_of_stage(name: str) -> str | None:
     """Return the name of the plug-in package that brings a stage; None for tacpipe's own stages and unknown names."""
-    name = whole(name)
+    name = stage_name(name)
     for group, prefix in (*PREFIXES.items(), (STAGES, "")):
         if name.startswith(prefix) and name.removeprefix(prefix) in entry_points()[group]:
             package = brought_by(group, name.removeprefix(prefix))
@@ -184,7 +184,7 @@ def _entry_point_files(folder: str) -> list[Path]:
     """Return where the entry points of what is installed in a folder may be."""
     pattern = "*.dist-info" if folder.endswith("-packages") else "*.egg-info"
     try:
-        return [found / "entry_points.txt" for found in listed(Path(folder or "."), pattern)]
+        return [metadata / "entry_points.txt" for metadata in listed(Path(folder or "."), pattern)]
     except PermissionError:  # nothing can be imported from there either: Python passes over such a folder too
         return []
 
@@ -220,10 +220,10 @@ def commands() -> dict[str, str]:
     return {name: lines.get(name) or summary(first[name]) for name in names}
 
 
-def whole(name: str) -> str:
+def stage_name(name: str) -> str:
     """Return the name of the stage that a fit or a part belongs to, or the name of a stage itself.
 
-    >>> whole("compress.pca.fit"), whole("export.csv.part"), whole("split")
+    >>> stage_name("compress.pca.fit"), stage_name("export.csv.part"), stage_name("split")
     ('compress.pca', 'export.csv', 'split')
     """
     return name.removesuffix(FIT).removesuffix(PART)
@@ -237,13 +237,13 @@ def load(name: str) -> AnyStage:
     target = stages().get(name)
     if target is None:
         raise UsageError(f"There is no stage {name}; there are {', '.join(stages())}.")
-    found = _import(name, target)
+    loaded = _import(name, target)
     packages = _used_packages.get()
     if packages is not None and (package := package_of_stage(name)) is not None:
         packages.add(package)
-    if not isinstance(found, Stage):
+    if not isinstance(loaded, Stage):
         raise TacpipeError(f"{target}, registered as stage {name}, is not a stage: decorate it with @stage(version=1).")
-    return found
+    return loaded
 
 
 def tasks() -> list[str]:
@@ -256,7 +256,7 @@ def load_task(name: str) -> Task:
 
     Raises `UsageError` if there is none, `TacpipeError` if it cannot be imported or is no subclass of `Task`.
     """
-    task_class = _named(TASKS, "task", name)
+    task_class = _load_plugin(TASKS, "task", name)
     try:
         task: Task = task_class()
     except TypeError as error:  # a module, an instance, or a class that lacks abstract members
@@ -278,7 +278,7 @@ def load_sensor(name: str) -> Any:
 
     Raises `UsageError` if there is none, `TacpipeError` if it cannot be imported.
     """
-    return _named(SENSORS, "sensor", name)
+    return _load_plugin(SENSORS, "sensor", name)
 
 
 def load_executor(name: str) -> Any:
@@ -286,7 +286,7 @@ def load_executor(name: str) -> Any:
 
     Raises `UsageError` if there is none, `TacpipeError` if it cannot be imported.
     """
-    return _named(EXECUTORS, "executor", name)
+    return _load_plugin(EXECUTORS, "executor", name)
 
 
 def trackers() -> dict[str, str]:
@@ -299,13 +299,13 @@ def load_tracker(name: str) -> Any:
 
     Raises `UsageError` if there is none, `TacpipeError` if it cannot be imported.
     """
-    return _named(TRACKERS, "tracker", name)
+    return _load_plugin(TRACKERS, "tracker", name)
 
 
 def architectures(task: str) -> list[str]:
     """Return the names of the architectures of a task: tacpipe's own first, then those of plug-ins."""
-    found = [name.partition(".")[2] for name in installed()[MODELS] if name.partition(".")[0] == task]
-    return sorted(found, key=lambda name: (brought_by(MODELS, f"{task}.{name}") is not None, name))
+    names = [name.partition(".")[2] for name in installed()[MODELS] if name.partition(".")[0] == task]
+    return sorted(names, key=lambda name: (brought_by(MODELS, f"{task}.{name}") is not None, name))
 
 
 def load_architecture(task: str, name: str) -> Any:
@@ -313,7 +313,7 @@ def load_architecture(task: str, name: str) -> Any:
 
     Raises `UsageError` if there is none, `TacpipeError` if it cannot be imported.
     """
-    return _named(MODELS, f"architecture of {task}", f"{task}.{name}")
+    return _load_plugin(MODELS, f"architecture of {task}", f"{task}.{name}")
 
 
 def codecs() -> list[str]:
@@ -326,15 +326,15 @@ def load_codec(kind: str) -> Any:
 
     Raises `UsageError` if there is none, `TacpipeError` if it cannot be imported.
     """
-    return _named(CODECS, "codec of kind", kind)
+    return _load_plugin(CODECS, "codec of kind", kind)
 
 
-def _named(group: str, what: str, name: Any) -> Any:
+def _load_plugin(group: str, noun: str, name: Any) -> Any:
     """Return what an entry point of a group names; ``name`` may be anything that a file holds."""
-    found = entry_points()[group]
-    target = found.get(str(name))
+    targets = entry_points()[group]
+    target = targets.get(str(name))
     if target is None:
-        raise UsageError(f"There is no {what} {plain(str(name))}; there are {', '.join(sorted(found))}.")
+        raise UsageError(f"There is no {noun} {plain(str(name))}; there are {', '.join(sorted(targets))}.")
     packages = _used_packages.get()
     if (
         packages is not None and group != MODELS
@@ -369,11 +369,18 @@ def package(name: str) -> str | None:
 
 def _package(target: str) -> str | None:
     """Return the name of the installed package whose entry point ``target`` is, if it is known."""
-    from importlib.metadata import entry_points as every
+    from importlib.metadata import entry_points as installed_points
 
-    found = (point.dist for group in GROUPS for point in every(group=group) if point.value == target)
+    distributions = (point.dist for group in GROUPS for point in installed_points(group=group) if point.value == target)
     try:
-        return next((one.metadata["Name"] for one in found if one is not None and "Name" in one.metadata), None)
+        return next(
+            (
+                distribution.metadata["Name"]
+                for distribution in distributions
+                if distribution is not None and "Name" in distribution.metadata
+            ),
+            None,
+        )
     except FileNotFoundError:  # once `importlib_metadata` was imported it answers, and raises where metadata is missing
         return None
 

@@ -1,4 +1,4 @@
-"""What a task needs of recordings, by quantity and unit: what `tacpipe train TASK --requirements` prints."""
+"""Describe what recordings must hold for a task, by quantity and unit, as `tacpipe train TASK --requirements` prints it."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from textwrap import wrap
 
-WIDTH = 110  # of the text
+WIDTH = 110  # Characters per line
 ANY = "any"
 
 
@@ -16,8 +16,8 @@ class Channels:
 
     quantity: str
     units: tuple[str, ...]  # none: any one unit
-    what: str  # how many, of which components or streams
-    without: str = ""  # what happens without them; empty: they are needed
+    description: str  # how many, of which components or streams
+    without: str = ""  # Consequence of their absence; empty: they are required
     stream: str = ""  # the stream that they are columns of, where the task looks for it by name
 
 
@@ -26,25 +26,25 @@ class Label:
     """A label of recordings that a task reads."""
 
     name: str
-    what: str
+    description: str
     without: str = ""
 
 
 @dataclass(frozen=True)
 class Requirements:
-    """What recordings must hold to train a task, and which stages prepare them."""
+    """Requirements of a task on its recordings, and the stages that prepare them."""
 
     task: str
-    stages: Sequence[str]  # whose output it takes, in order
+    stages: Sequence[str]  # Stages whose output the task reads, in order
     optional_stages: Sequence[str]
-    roles: str  # what the split must have
+    roles: str  # Roles that the split must have
     channels: Sequence[Channels]
     labels: Sequence[Label] = ()
 
     @property
     def needed(self) -> tuple[str, ...]:
         """The quantities without which a recording is refused."""
-        return tuple(one.quantity for one in self.channels if not one.without)
+        return tuple(channel.quantity for channel in self.channels if not channel.without)
 
     def to_text(self) -> str:
         """Return all of it as lines."""
@@ -53,14 +53,16 @@ class Requirements:
         lines += [f"  (optional: {stage})" for stage in self.optional_stages]
         lines += ["", "roles of the split", *_wrapped(self.roles, "  "), ""]
         lines += ["channels: found by the quantity and unit of a column, in any stream unless one is named"]
-        for one in self.channels:
-            place = f", stream {one.stream}" if one.stream else ""
-            head = f"  {one.quantity} [{' or '.join(one.units) or 'any unit'}]{place}: "
-            lines += _wrapped(f"{one.what}. {_need(one.without)}", head)
+        for channel in self.channels:
+            place = f", stream {channel.stream}" if channel.stream else ""
+            head = f"  {channel.quantity} [{' or '.join(channel.units) or 'any unit'}]{place}: "
+            lines += _wrapped(f"{channel.description}. {_need(channel.without)}", head)
         if self.labels:
             lines += ["", "labels of recordings"]
             lines += [
-                line for one in self.labels for line in _wrapped(f"{one.what}. {_need(one.without)}", f"  {one.name}: ")
+                line
+                for label in self.labels
+                for line in _wrapped(f"{label.description}. {_need(label.without)}", f"  {label.name}: ")
             ]
         lines += [
             "",

@@ -1,4 +1,4 @@
-"""What a stage is: a typed function whose signature is its declaration.
+"""Declare a stage: a typed function with a version, whose signature states what it reads.
 
 The first parameter is ``params``, a frozen dataclass or a union of several (`tacpipe.plugins.params`). Each further one
 states by its annotation what the stage reads:
@@ -46,7 +46,7 @@ ROLES = ("train", "val", "calibration", "test")
 ORIGINALS = "originals"
 Attribute = str | int | float | bool | None
 Files = Mapping[str, Path]  # name within the source, path to read
-Values = Mapping[str, Any]  # of JSON, by name
+Values = Mapping[str, Any]  # JSON values by name
 RecordingName = str
 Fitted = Mapping[str, bytes]  # file name, content
 Trial = int
@@ -57,13 +57,13 @@ Workspace = Path
 class Shared(Protocol):
     """Files that the recordings of a run share; they are removed with its end."""
 
-    def file(self, of: Any, make: Callable[[Draft], None]) -> Path:
-        """Return the file that ``make`` wrote for ``of``, a value of JSON: now, or before in any process of the run."""
+    def file(self, content_key: Any, make: Callable[[Draft], None]) -> Path:
+        """Return the file that ``make`` wrote for the JSON value ``content_key``, now or earlier in any process."""
 
 
 P = ParamSpec("P")
 R = TypeVar("R", covariant=True)
-ALL = ("*",)  # as ``reads``: every attribute
+ALL = ("*",)  # Value of ``reads`` for every attribute
 _KINDS = (
     *("Recording", "Dataset", "Datasets", "Model", "Fitted", "Parts", "RecordingName"),
     *("Files", "Values", "Shared", "Trial", "Roles", "Workspace"),
@@ -72,7 +72,7 @@ _KINDS = (
 
 @dataclass(frozen=True)
 class RecordingOutput:
-    """What a stage returns for one recording: a table, or one a stream, attributes to add, and notes for the user.
+    """Result of a stage for one recording: a table, or one table per stream, attributes to add, and notes for the user.
 
     A stream that memory need not hold is a ``pyarrow.RecordBatchReader``: its batches are stored as they come, to the bytes
     of the table that they make. What is raised on the way is an error of the recording.
@@ -93,7 +93,7 @@ class RecordingOutput:
 
 @dataclass(frozen=True)
 class Source:
-    """What ``discover`` finds of one recording: its files, and values that the stage needs besides, such as labels."""
+    """Files of one recording, as ``discover`` returns them, and other values that the stage needs, such as labels."""
 
     files: Files
     values: Values = field(default_factory=dict)
@@ -103,12 +103,12 @@ Discover = Callable[[Any, Path], Mapping[str, Mapping[str, Path] | Source]]
 # Maps params and a source to a function. That function maps the path of a file in the source to the reason why no
 # recording is read from it, "" for a file that is read in another way, as labels are.
 WhyUnread = Callable[[Any, Path], Callable[[str], str]]
-First = Callable[[Any], Mapping[str, Mapping[str, Any]]]  # of params: stages by name, each with params of its own
+First = Callable[[Any], Mapping[str, Mapping[str, Any]]]  # Maps params to stages by name, each with its own params
 
 
 @dataclass(frozen=True)
 class Result:
-    """What a stage over whole datasets returns: recordings, files or both, and notes for the user (as `RecordingOutput`).
+    """Result of a stage over whole datasets: recordings, files or both, and notes for the user (as in `RecordingOutput`).
 
     Files are taken one by one, so a mapping that makes each when it is asked for holds one in memory. Those of ``written``
     memory need not hold: each is a function that writes the file, once, to what it is given.
@@ -126,20 +126,19 @@ class Stage(Generic[P, R]):
 
     function: Callable[P, R]
     version: int
-    reads: tuple[str, ...] | None = (
-        None  # attributes that the function looks at; None: none of a Recording, all of a Dataset
-    )
+    # Attributes that the function reads; None: no attribute of a Recording, all of a Dataset
+    reads: tuple[str, ...] | None = None
     fit: AnyStage | None = None  # makes what a ``Fitted`` argument holds
     part: AnyStage | None = None  # runs on each recording; its files are files of the result, its tables are ``Parts``
     first: First | None = None  # stages that the recordings go through before, as the params ask
     originals: Callable[[Any], str] | None = None  # folder of the result for the shards that were given; empty: none
     discover: Discover | None = None
     headline: str | None = None  # the file of the result that holds its headlines, which the command prints
-    preview: Callable[[Any, Path], str] | None = None  # of a source: describes what would be read (--dry-run)
-    guess: Callable[[Path], str] | None = None  # of a source: a first layout file (--guess)
+    preview: Callable[[Any, Path], str] | None = None  # Describes what would be read of a source (--dry-run)
+    guess: Callable[[Path], str] | None = None  # Returns a first layout file for a source (--guess)
     why_unread: WhyUnread | None = None
-    requirements: Requirements | None = None  # of recordings to train a task on (--requirements)
-    # whether recordings are read as they were given, rather than behind the stages that the model was trained behind
+    requirements: Requirements | None = None  # Requirements on recordings to train a task (--requirements)
+    # Returns True if recordings are read unchanged, without the stages that precede the model's training
     as_given: Callable[[Any], bool] | None = None
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
@@ -156,19 +155,19 @@ class Stage(Generic[P, R]):
     @functools.cached_property
     def arguments(self) -> dict[str, str]:
         """The stage's arguments after ``params``, and the kind of each."""
-        found = {}
+        kinds = {}
         for name, parameter in list(inspect.signature(self.function).parameters.items())[1:]:
             kind = _text(parameter.annotation).removesuffix(" | None").rpartition(".")[2]
             if kind not in _KINDS:
                 raise TacpipeError(
                     f"Stage {self.function.__name__} annotates {name} as {kind}; known are {', '.join(_KINDS)}."
                 )
-            found[name] = kind
-        return found
+            kinds[name] = kind
+        return kinds
 
     def argument(self, kind: str) -> str | None:
         """The name of the argument of this kind, or None."""
-        return next((name for name, found in self.arguments.items() if found == kind), None)
+        return next((name for name, argument_kind in self.arguments.items() if argument_kind == kind), None)
 
     def optional(self, name: str) -> bool:
         """Return whether the argument ``name`` may be left out."""
@@ -178,27 +177,27 @@ class Stage(Generic[P, R]):
     def params(self) -> Any:
         """The dataclass of the first argument, or a union of dataclasses; `params.kinds` gives each."""
         function: Any = self.function
-        found: Any = next(iter(inspect.signature(function).parameters.values())).annotation
-        return function.__globals__[found] if isinstance(found, str) else found
+        annotation: Any = next(iter(inspect.signature(function).parameters.values())).annotation
+        return function.__globals__[annotation] if isinstance(annotation, str) else annotation
 
     @property
     def reads_model(self) -> bool:
-        """Whether the stage works with a trained model, rather than beginning with one if it is given (``init``)."""
+        """Return whether the stage works with a trained model; an optional first model (``init``) does not count."""
         return any(kind == "Model" and name != "init" for name, kind in self.arguments.items())
 
     @property
     def mapped(self) -> bool:
-        """Whether the stage works recording by recording."""
+        """Return whether the stage works recording by recording."""
         return any(kind in ("Recording", "Files", "Trial") for kind in self.arguments.values())
 
     @property
     def source(self) -> bool:
-        """Whether what the stage returns cannot be recomputed from the store."""
+        """Return whether the stage's result cannot be recomputed from the store."""
         return "Files" in self.arguments.values()
 
     @property
     def needs_split(self) -> bool:
-        """Whether the stage distinguishes training recordings from others."""
+        """Return whether the stage distinguishes training recordings from others."""
         return self.fit is not None or any(name in ROLES for name in self.arguments)
 
     @property
@@ -208,13 +207,13 @@ class Stage(Generic[P, R]):
 
     @property
     def tracked(self) -> bool:
-        """Whether trackers can follow the stage: it trains in a workspace, or its result has headlines."""
+        """Return whether trackers can follow the stage: it trains in a workspace, or its result has headlines."""
         return self.trains or self.headline is not None
 
     @property
     def trains(self) -> bool:
-        """Whether the stage, or its fit, trains networks: it has a workspace for their checkpoints."""
-        return any(one is not None and one.argument("Workspace") is not None for one in (self, self.fit))
+        """Return whether the stage or its fit trains networks: it has a workspace for their checkpoints."""
+        return any(stage is not None and stage.argument("Workspace") is not None for stage in (self, self.fit))
 
 
 AnyStage: TypeAlias = Stage[..., Any]

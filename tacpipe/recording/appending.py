@@ -61,7 +61,7 @@ def append(store: Store, output: Path, spooled: Spooled, rig: Rig, sealed: Mappi
             files[BYTES] = vars(store.put_written(copied, durable=True))
     result = {"recordings": {"": entry}, "files": files}
     identity = keys.identity(ACQUIRE, VERSION, {"rig": text["digest"]}, {"spool": spooled.folder.name})
-    provenance_entry = {**provenance.of(round(time.perf_counter() - began_s, 4)), "irreplaceable": True}
+    provenance_entry = {**provenance.describe(round(time.perf_counter() - began_s, 4)), "irreplaceable": True}
     store.commit(identity, result, provenance_entry, durable=True)
     output, rig_name = output.absolute(), f"rig-{text['digest'][:8]}.toml"
     names: list[str] = []  # the name of the recording, last

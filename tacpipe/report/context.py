@@ -137,7 +137,7 @@ def is_published(result: Dataset, sets: Collection[str]) -> bool:
 
 def _params_of_step(step: Tree) -> dict[str, Any]:
     """Return the params of a step of a chain by today's names."""
-    return params_of.named(str(step.get("stage")), step.get("params") or {})
+    return params_of.with_current_names(str(step.get("stage")), step.get("params") or {})
 
 
 def provenance_blocks(manifest: Tree) -> list[Block]:

@@ -28,7 +28,7 @@ COMMAND = re.compile(r"`([^`]+)`")
 
 def page(sections: Sequence[Section], title: str, heading: str = "") -> bytes:
     """Return the page as UTF-8; the same sections give the same bytes."""
-    with extras.named("A report"):
+    with extras.explain_missing("A report"):
         import jinja2
         from markupsafe import Markup
 

@@ -1,1 +1,1 @@
-"""What keeps the bytes: objects by digest, records by key, roots, and leases."""
+"""Store bytes: objects by digest, records by key, roots, and leases."""

@@ -23,7 +23,7 @@ SCHEMES = {
 }
 _ADDRESS = re.compile(r"([A-Za-z][A-Za-z0-9+.-]*)://(.*)", re.DOTALL)
 _PARTS = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*(/[A-Za-z0-9._ =+,-]+)*")  # a bucket, and folders in it
-_OWN = (  # where one of these is set, the client finds its credentials itself
+_OWN = (  # The client finds its credentials itself if one of these is set
     "AWS_ACCESS_KEY_ID",
     "AWS_WEB_IDENTITY_TOKEN_FILE",
     "AWS_CONTAINER_CREDENTIALS_RELATIVE_URI",
@@ -39,7 +39,7 @@ _PLAIN = {"region": "region", "endpoint_url": "endpoint"}
 
 @dataclass(frozen=True)
 class Address:
-    """Where a store lies in object storage."""
+    """Address of a store in object storage."""
 
     scheme: str
     path: str  # bucket/folder/…
@@ -51,37 +51,38 @@ class Address:
 
 @dataclass
 class Settings:
-    """What the client is given besides the address; its representation shows no credential."""
+    """Settings of the client in addition to the address; their representation shows no credential."""
 
     config: dict[str, Any] = field(default_factory=dict, repr=False)
-    provider: Any = field(default=None, repr=False)  # of credentials that change, as those of roles do
+    provider: Any = field(default=None, repr=False)  # Provides credentials that change, such as those of roles
     plaintext: bool = False  # the server is reached without TLS
-    url: str = ""  # what the client is given in place of the address
+    url: str = ""  # Replaces the address if not empty
 
 
 def parsed(text: str) -> Address | Path:
-    """Return the address that ``text`` gives, or a path; ``file:///lab/store`` is a path too.
+    """Parse an address or a path; ``file:///lab/store`` is a path too.
 
-    Raises `UsageError` for an address of another kind, and for one with credentials or options in it.
+    Raises `UsageError` for an unsupported scheme, and for an address with credentials or options.
 
     >>> parsed("/lab/store"), parsed("file:///lab/store"), str(parsed("s3://lab/store/"))
     (PosixPath('/lab/store'), PosixPath('/lab/store'), 's3://lab/store')
     """
-    found = _ADDRESS.fullmatch(text)
-    if found is None:
+    match = _ADDRESS.fullmatch(text)
+    if match is None:
         return Path(text)
-    scheme, rest = found[1].lower(), found[2]
+    scheme, location = match[1].lower(), match[2]
     if scheme == "file":
-        if not rest.startswith("/"):
+        if not location.startswith("/"):
             raise UsageError(f"{scheme}:// is followed by a path from the top, as in file:///lab/store.")
-        return Path(rest)
+        return Path(location)
     if scheme not in SCHEMES:
-        known = ", ".join(f"{one}://" for one in SCHEMES)
+        prefixes = ", ".join(f"{supported}://" for supported in SCHEMES)
         raise UsageError(
-            f"An address that begins with {scheme}:// is not supported. Give one that begins with {known} or file://, or a "
+            f"An address that begins with {scheme}:// is not supported. Give one that begins with {prefixes} "
+            f"or file://, or a "
             f"path of the file system."
         )
-    path = rest.rstrip("/")
+    path = location.rstrip("/")
     if not _PARTS.fullmatch(path) or ".." in path.split("/"):  # not shown: it may hold a password
         raise UsageError(
             f"An address of a store is {scheme}://BUCKET/FOLDER, of letters, digits and ._=+,- alone. Credentials belong in "
@@ -93,63 +94,67 @@ def parsed(text: str) -> Address | Path:
 
 
 def settings(address: Address, environment: Mapping[str, str] = os.environ) -> Settings:
-    """Return what the environment does not give the client by itself: settings of a profile, and whether TLS is used.
+    """Return the settings that the client does not take from the environment: those of a profile, and whether TLS is used.
 
-    Raises `UsageError` for a profile that is named and is not there.
+    Raises `UsageError` if the selected profile does not exist.
     """
     if address.scheme == "az":  # the client takes the account as a setting
-        account, _, within = address.path.partition("/")
-        return Settings({"account_name": account}, url=f"az://{within}")
+        account, _, container_path = address.path.partition("/")
+        return Settings({"account_name": account}, url=f"az://{container_path}")
     if address.scheme != "s3":
         return Settings()
-    found = Settings({"disable_bulk_delete": True})  # which not every server knows, and one at a time is deleted here
-    named = environment.get("AWS_PROFILE") or environment.get("AWS_DEFAULT_PROFILE") or ""
-    if named or not any(environment.get(name) for name in _OWN):
-        _fill(found, named, environment)
+    client_settings = Settings(
+        {"disable_bulk_delete": True}
+    )  # Not every server supports it, and objects are deleted singly
+    profile = environment.get("AWS_PROFILE") or environment.get("AWS_DEFAULT_PROFILE") or ""
+    if profile or not any(environment.get(name) for name in _OWN):
+        _fill(client_settings, profile, environment)
     endpoints = (environment.get(name) for name in ("AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT_URL", "AWS_ENDPOINT"))
-    endpoint = next((one for one in endpoints if one), found.config.get("endpoint", ""))
+    endpoint = next((candidate for candidate in endpoints if candidate), client_settings.config.get("endpoint", ""))
     if endpoint:
-        found.config["endpoint"] = endpoint
-    found.plaintext = endpoint.startswith("http://")
-    return found
+        client_settings.config["endpoint"] = endpoint
+    client_settings.plaintext = endpoint.startswith("http://")
+    return client_settings
 
 
-def _fill(found: Settings, named: str, environment: Mapping[str, str]) -> None:
-    """Add what the profile has; credentials of the environment come first, as they do for others."""
+def _fill(client_settings: Settings, profile_name: str, environment: Mapping[str, str]) -> None:
+    """Add the settings of the profile; credentials in the environment take precedence, as in other tools."""
     home = Path(environment.get("HOME") or "~").expanduser() / ".aws"
     files = [
         (environment.get("AWS_CONFIG_FILE") or home / "config", "profile "),
         (environment.get("AWS_SHARED_CREDENTIALS_FILE") or home / "credentials", ""),
     ]
-    name, there = named or "default", False
+    name, exists = profile_name or "default", False
     profile: dict[str, str] = {}
     for path, before in files:
         reader = configparser.RawConfigParser()
         try:
             reader.read(path, encoding="utf-8")
-        except (configparser.Error, UnicodeDecodeError):  # what it states would show a credential
+        except (configparser.Error, UnicodeDecodeError):  # The text of the error could show a credential
             raise UsageError(f"{path} is not a file of profiles: a line of it cannot be read.") from None
         for section in (name, f"{before}{name}"):
             if reader.has_section(section):
-                there = True
+                exists = True
                 profile.update(reader.items(section))
-    if named and not there:
-        raise UsageError(f"There is no profile {named} in {files[1][0]} or {files[0][0]}; AWS_PROFILE names it.")
-    found.config.update({new: profile[old] for old, new in _PLAIN.items() if profile.get(old)})
+    if profile_name and not exists:
+        raise UsageError(f"There is no profile {profile_name} in {files[1][0]} or {files[0][0]}; AWS_PROFILE names it.")
+    client_settings.config.update({new: profile[old] for old, new in _PLAIN.items() if profile.get(old)})
     region = environment.get("AWS_REGION") or environment.get("AWS_DEFAULT_REGION")
     if region:
-        found.config["region"] = region
-    if any(environment.get(one) for one in _OWN):
+        client_settings.config["region"] = region
+    if any(environment.get(variable) for variable in _OWN):
         return
     if profile.get("aws_secret_access_key"):
-        found.config.update({new: profile[old] for old, new in _STATED.items() if profile.get(old)})
-    elif there and any(one.startswith(("sso_", "role_arn", "credential_process", "source_profile")) for one in profile):
-        found.provider = _provider(name)
+        client_settings.config.update({new: profile[old] for old, new in _STATED.items() if profile.get(old)})
+    elif exists and any(
+        key.startswith(("sso_", "role_arn", "credential_process", "source_profile")) for key in profile
+    ):
+        client_settings.provider = _provider(name)
 
 
 def _provider(name: str) -> Any:
     """Return what asks boto3 for the credentials of a profile that states none itself: a role, or a single sign-on."""
-    with extras.named(f"The profile {name}, whose credentials are those of a role or a sign-on,"):
+    with extras.explain_missing(f"The profile {name}, whose credentials are those of a role or a sign-on,"):
         from boto3 import Session
         from obstore.auth.boto3 import Boto3CredentialProvider
     return Boto3CredentialProvider(Session(profile_name=name))

@@ -1,4 +1,4 @@
-"""What a store asks of the place that keeps its bytes: six verbs on names, the same for a folder and for a bucket.
+"""Define the interface of the place that keeps a store's bytes: six operations on names, for folders and buckets.
 
 A name is a path within the store, as `docs/format.md` lists them, such as ``objects/ab/ab12…``. A place that computers share
 needs no more than that one of several that create a name wins: what has to change gets another name.
@@ -16,7 +16,7 @@ AT_ONCE = 16  # requests on their way at once
 
 
 class Entry(NamedTuple):
-    """What a place states of one name."""
+    """State of one name in a place."""
 
     name: str
     bytes: int
@@ -30,7 +30,7 @@ class Backend(Protocol):
     """A place that keeps bytes by name. Every verb raises `StorageError` where the place fails, which states nothing of
     what it keeps."""
 
-    place: str  # as sentences name it
+    place: str  # Name in messages
 
     def create(self, name: str, content: bytes | Iterable[bytes]) -> bool:
         """Keep ``content``, whole or in blocks, under a name that nothing has; return False where something has it.
@@ -38,13 +38,13 @@ class Backend(Protocol):
         Of several that create one name at once one wins. Nobody ever sees a part of the content.
         """
 
-    def read(self, name: str, most: int | None = None) -> bytes:
-        """Return the content of at most ``most`` bytes.
+    def read(self, name: str, max_bytes: int | None = None) -> bytes:
+        """Return the content of at most ``max_bytes`` bytes.
 
         Raises `FileNotFoundError` where there is none, and `IrregularError` for one that is larger or is not content.
         """
 
-    def blocks(self, name: str, most: int) -> Iterator[bytes]:
+    def blocks(self, name: str, max_bytes: int) -> Iterator[bytes]:
         """Yield the content block by block; raises as `read` does."""
 
     def stat(self, name: str) -> Entry | None:
@@ -66,16 +66,16 @@ class Backend(Protocol):
         """Keep a name no longer; one that nothing has is no mistake."""
 
 
-def read_twice(files: Backend, name: str, most: int, parse: Callable[[bytes], T | None]) -> T | None:
-    """Return what ``parse`` makes of a file, which is read again where it makes nothing of the first answer.
+def read_twice(files: Backend, name: str, max_bytes: int, parse: Callable[[bytes], T | None]) -> T | None:
+    """Return the parsed content of a file, which is read again if the first answer cannot be parsed.
 
-    Returns None only where a second answer agrees with the first one: an answer may be damaged on its way. Raises
-    `StorageError` where they differ, and `FileNotFoundError` where no such file exists.
+    Returns None only if the second answer agrees with the first: an answer may be damaged on its way. Raises
+    `StorageError` if they differ, and `FileNotFoundError` where no such file exists.
     """
     answers: list[bytes | str] = []
     for _ in range(2):
         try:
-            answer: bytes | str = files.read(name, most)
+            answer: bytes | str = files.read(name, max_bytes)
         except regular.IrregularError as error:
             answer = str(error)
         parsed = parse(answer) if isinstance(answer, bytes) else None

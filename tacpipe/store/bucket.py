@@ -22,9 +22,9 @@ from tacpipe.store.addresses import Address
 from tacpipe.store.backend import Entry
 
 Result = TypeVar("Result")
-TRIES = 5  # of one request
-RETRIES = 2  # of the client, within each of these
-PAUSE_S = 0.2  # after the first; four times longer after each
+TRIES = 5  # Attempts per request
+RETRIES = 2  # Retries of the client within each attempt
+PAUSE_S = 0.2  # Pause after the first attempt; each pause is four times longer
 PART_BYTES = 8 << 20  # an object up to this size is one request
 PAGE = 1000  # names that one request lists
 _AHEAD = 4  # parts of one object on their way at once
@@ -46,24 +46,24 @@ class Bucket:
     def create(self, name: str, content: bytes | Iterable[bytes]) -> bool:
         """Do as `Backend.create`.
 
-        Blocks of more than one part are sent as such, and take a name whoever has it meanwhile; what ``content`` raises
-        ends that, and nothing of it is kept. It is iterated over again where the connection is lost, but an iterator is not.
+        Content of more than one part is uploaded in parts and replaces an object that was created meanwhile. An error of
+        ``content`` aborts the upload. After a lost connection ``content`` is iterated again, unless it is an iterator.
         """
         if isinstance(content, bytes):
             return self._create(name, content)
         blocks = iter(content)
-        begun = _part(blocks)
-        if len(begun) <= PART_BYTES:
-            return self._create(name, begun)
+        first_part = _part(blocks)
+        if len(first_part) <= PART_BYTES:
+            return self._create(name, first_part)
         if self.stat(name) is not None:
             return False
         import obstore
 
-        again: Iterable[bytes] = chain([begun], blocks)
+        remaining: Iterable[bytes] = chain([first_part], blocks)
 
         def send() -> None:
-            nonlocal again
-            sent, again = again, content
+            nonlocal remaining
+            sent, remaining = remaining, content
             obstore.put(
                 self._client, name, _parts(sent), use_multipart=True, chunk_size=PART_BYTES, max_concurrency=_AHEAD
             )
@@ -78,7 +78,7 @@ class Bucket:
 
         tries = 0
 
-        def put() -> bool | None:
+        def put_object() -> bool | None:
             nonlocal tries
             tries += 1
             try:
@@ -91,7 +91,7 @@ class Bucket:
 
         try:
             for _ in range(TRIES):
-                created = self._tried(put)
+                created = self._tried(put_object)
                 if created is not None:
                     return created
                 time.sleep(PAUSE_S)
@@ -104,28 +104,29 @@ class Bucket:
             f"what went over stays there."
         )
 
-    def read(self, name: str, most: int | None = None) -> bytes:
+    def read(self, name: str, max_bytes: int | None = None) -> bytes:
         """Do as `Backend.read`."""
-        return b"".join(self._blocks(name, most))
+        return b"".join(self._blocks(name, max_bytes))
 
-    def blocks(self, name: str, most: int) -> Iterator[bytes]:
+    def blocks(self, name: str, max_bytes: int) -> Iterator[bytes]:
         """Do as `Backend.blocks`: parts of a large object are fetched ahead of the one that is used."""
-        return self._blocks(name, most)
+        return self._blocks(name, max_bytes)
 
-    def _blocks(self, name: str, most: int | None) -> Iterator[bytes]:
+    def _blocks(self, name: str, max_bytes: int | None) -> Iterator[bytes]:
         import obstore
 
         def begin() -> tuple[bytes, int]:
-            found = obstore.get(self._client, name)
-            size = int(found.meta["size"])
-            return bytes(found.bytes()) if size <= PART_BYTES else b"", size
+            response = obstore.get(self._client, name)
+            size = int(response.meta["size"])
+            return bytes(response.bytes()) if size <= PART_BYTES else b"", size
 
         first, size = self._tried(begin)
-        if most is not None and size > most:
+        if max_bytes is not None and size > max_bytes:
             raise regular.IrregularError(
-                f"{self.place}/{name} has {size:,} bytes, and should have {most:,} at most. It is damaged or was made up."
+                f"{self.place}/{name} has {size:,} bytes, and should have {max_bytes:,} at most. It is damaged "
+                f"or was made up."
             )
-        if most is None:
+        if max_bytes is None:
             memory.require(size, f"{self.place}/{name}", error=StorageError)
         if size <= PART_BYTES:
             yield first
@@ -149,10 +150,10 @@ class Bucket:
         import obstore
 
         try:
-            found = self._tried(lambda: obstore.head(self._client, name))
+            head = self._tried(lambda: obstore.head(self._client, name))
         except FileNotFoundError:
             return None
-        return Entry(name, found["size"], found["last_modified"].timestamp())
+        return Entry(name, head["size"], head["last_modified"].timestamp())
 
     def list(self, folder: str) -> Iterator[Entry]:
         """Do as `Backend.list`; what has another form than a store's names is listed too."""
@@ -181,11 +182,11 @@ class Bucket:
         """Do as `Backend.move`: a copy, which the server makes, and then a deletion."""
         import obstore
 
-        there = self.stat(name)
-        if there is None:
+        entry = self.stat(name)
+        if entry is None:
             return False
         try:
-            if there.bytes > _COPY_BYTES:
+            if entry.bytes > _COPY_BYTES:
                 self.create(to, self._blocks(name, None))
             else:
                 self._tried(lambda: obstore.copy(self._client, name, to))
@@ -202,16 +203,16 @@ class Bucket:
             self._tried(lambda: obstore.delete(self._client, name))
 
     def _tried(self, request: Callable[[], Result], tries: int = 0) -> Result:
-        """Return what a request gives, repeated where the connection or the server fails. Raises `StorageError`."""
+        """Return the result of a request, repeated if the connection or the server fails. Raises `StorageError`."""
         import obstore
         from obstore.exceptions import BaseError
 
         pause_s = PAUSE_S
-        for left in reversed(range(tries or TRIES)):
+        for remaining_tries in reversed(range(tries or TRIES)):
             try:
                 return request()
             except obstore.exceptions.GenericError as error:
-                if left == 0 or not _may_pass(error):
+                if remaining_tries == 0 or not _may_pass(error):
                     raise self._sentence(error) from None  # its own text may hold what nobody may read
             except FileNotFoundError as error:
                 if any(mark in str(error) for mark in _NO_BUCKET):
@@ -262,15 +263,15 @@ def _may_pass(error: Exception) -> bool:
 
 
 def _part(blocks: Iterator[bytes]) -> bytes:
-    """Return what ``blocks`` give up to a little more than one part, or all they give."""
-    found: list[bytes] = []
+    """Return the next ``blocks`` joined, up to a little more than one part."""
+    parts: list[bytes] = []
     size = 0
     for block in blocks:
-        found.append(block)
+        parts.append(block)
         size += len(block)
         if size > PART_BYTES:
             break
-    return found[0] if len(found) == 1 else b"".join(found)
+    return parts[0] if len(parts) == 1 else b"".join(parts)
 
 
 def _parts(blocks: Iterable[bytes]) -> Iterator[bytes]:
@@ -282,21 +283,23 @@ def _parts(blocks: Iterable[bytes]) -> Iterator[bytes]:
 
 def _connected(address: Address) -> Any:
     """Return obstore's client of an address, with the credentials that the environment or a profile gives."""
-    with extras.named(f"A store at {address.scheme}://"):
+    with extras.explain_missing(f"A store at {address.scheme}://"):
         from obstore.exceptions import BaseError
         from obstore.store import from_url
 
-    given = addresses.settings(address)
-    options: dict[str, Any] = {"timeout": "120s", "connect_timeout": "5s", "allow_http": given.plaintext}
+    client_settings = addresses.settings(address)
+    options: dict[str, Any] = {"timeout": "120s", "connect_timeout": "5s", "allow_http": client_settings.plaintext}
     retries: dict[str, Any] = {
         "max_retries": RETRIES,
         "retry_timeout": timedelta(seconds=60),
         "backoff": {"init_backoff": timedelta(milliseconds=100), "max_backoff": timedelta(seconds=2), "base": 2},
     }
-    more: dict[str, Any] = {} if given.provider is None else {"credential_provider": given.provider}
-    more |= {"config": given.config, "client_options": options, "retry_config": retries}
+    arguments: dict[str, Any] = (
+        {} if client_settings.provider is None else {"credential_provider": client_settings.provider}
+    )
+    arguments |= {"config": client_settings.config, "client_options": options, "retry_config": retries}
     try:
-        return from_url(given.url or str(address), **more)
+        return from_url(client_settings.url or str(address), **arguments)
     except (BaseError, ValueError, TypeError):  # its text may hold a credential
         raise UsageError(
             f"The settings for {address} cannot be used. Look at the variables {_VARIABLES[address.scheme]} and the profile."

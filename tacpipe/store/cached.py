@@ -27,8 +27,8 @@ from tacpipe.store.store import AbsentError, MissingError, Object, Store
 
 VARIABLE = "TACPIPE_CACHE"
 _LOOKS = 100  # pushes of one name that may come first
-_buckets: dict[tuple[int, Path], Bucket] = {}  # of this process: a client outlives the tasks that use it
-_stores: set[tuple[int, Path]] = set()  # of these, the ones that are known to hold a store
+_buckets: dict[tuple[int, Path], Bucket] = {}  # Buckets of this process: a client outlives the tasks that use it
+_stores: set[tuple[int, Path]] = set()  # Buckets that hold a store
 
 
 def folder(address: Address) -> Path:
@@ -36,16 +36,16 @@ def folder(address: Address) -> Path:
 
     Its name holds a digest of the address and of the server: the same address at another one is another store.
     """
-    named = os.environ.get(VARIABLE)
-    above = Path(named).expanduser() if named else _of_user() / "tacpipe"
+    cache = os.environ.get(VARIABLE)
+    above = Path(cache).expanduser() if cache else _of_user() / "tacpipe"
     endpoint = addresses.settings(address).config.get("endpoint", "")
-    shown = "-".join([address.scheme, *address.path.split("/")])[:80].replace(" ", "_")
-    return above.absolute() / f"{shown}-{digest([str(address), endpoint])[:12]}"
+    label = "-".join([address.scheme, *address.path.split("/")])[:80].replace(" ", "_")
+    return above.absolute() / f"{label}-{digest([str(address), endpoint])[:12]}"
 
 
 def _of_user() -> Path:
-    named = os.environ.get("XDG_CACHE_HOME", "")
-    return Path(named) if Path(named).is_absolute() else Path("~/.cache").expanduser()
+    cache = os.environ.get("XDG_CACHE_HOME", "")
+    return Path(cache) if Path(cache).is_absolute() else Path("~/.cache").expanduser()
 
 
 class CachedStore(Store):
@@ -59,15 +59,15 @@ class CachedStore(Store):
         self.address = address
         self._remote: RemoteStore | None = None
         self._is_prepared = False  # the folder
-        self._work: ExitStack | None = None  # what ends with the run that was begun here
-        self._is_announced = False  # in the bucket
+        self._work: ExitStack | None = None  # Closed at the end of the run that began here
+        self._is_announced = False  # True once the run is announced in the bucket
         self._reads: list[str] = []
         self._forget()
 
     def _forget(self) -> None:
-        self._asked: set[str] = set()  # objects that are looked for next
-        self._there: dict[str, int | None] = {}  # bytes of objects in the bucket, None for those that it has not
-        self._made: set[str] = set()  # objects that were put here, and did not go to the bucket yet
+        self._requested: set[str] = set()  # objects that are looked for next
+        self._bucket_sizes: dict[str, int | None] = {}  # bytes of objects in the bucket, None for those that it has not
+        self._not_uploaded: set[str] = set()  # objects that were put here, and did not go to the bucket yet
         self._no_record: set[str] = set()  # keys without a record there
 
     @property
@@ -112,10 +112,10 @@ class CachedStore(Store):
             self._work, self._is_announced = None, False
 
     def announce(self, names: Iterable[str]) -> None:
-        """Do as `Store.announce`. The bucket is asked for all of them as soon as one is looked for and is not here."""
-        several = list(names)
-        self._asked.update(several)
-        super().announce(several)
+        """Do as `Store.announce`. The bucket is asked for all of them as soon as one is needed and missing here."""
+        announced = list(names)
+        self._requested.update(announced)
+        super().announce(announced)
 
     def _announce(self, names: Collection[str], *, manifests: Collection[str] = (), keys: Collection[str] = ()) -> None:
         """Announce to collections in the bucket, where a run was begun here: a worker's is announced by who began it."""
@@ -128,16 +128,16 @@ class CachedStore(Store):
         self.bucket.announce(names, manifests=manifests, keys=keys)
 
     def expect(self, keys: Iterable[str]) -> None:
-        """Bring the records of ``keys`` that are not here, and announce that the others are made."""
+        """Fetch the missing records of ``keys`` from the bucket, and announce the keys that will be computed."""
         unknown = [key for key in keys if key not in self._no_record and not present(self.record_path(key))]
         if not unknown:
             return
         self._announce((), keys=unknown)
-        there = self.bucket.present(unknown)
-        self._no_record.update(set(unknown) - there)
-        for _, record in self.bucket.records(there):
+        stored_keys = self.bucket.present(unknown)
+        self._no_record.update(set(unknown) - stored_keys)
+        for _, record in self.bucket.records(stored_keys):
             self._keep_record(record)
-            self._asked.update(records.named(record["result"]))
+            self._requested.update(records.digests(record["result"]))
 
     def seek(self, key: str) -> None:
         """Bring the record of a key that is not here, or note that there is none."""
@@ -155,18 +155,18 @@ class CachedStore(Store):
         """Return whether an object of this digest (and size in bytes) is here or in the bucket."""
         if self._lies(name, size):
             return True
-        if name not in self._there:
-            self._look({*self._asked, name})
-        there = self._there[name]
-        return there is not None and size in (None, there)
+        if name not in self._bucket_sizes:
+            self._look({*self._requested, name})
+        stored_bytes = self._bucket_sizes[name]
+        return stored_bytes is not None and size in (None, stored_bytes)
 
     def _look(self, names: Iterable[str]) -> None:
-        """Ask the bucket, once for all, which of some objects it has."""
-        wanted = [name for name in names if name not in self._there and not present(self.object_path(name))]
-        self._asked.clear()
-        self._announce(wanted)
-        found = self.bucket.sizes(wanted)
-        self._there.update({name: found.get(name) for name in wanted})
+        """Ask the bucket once which of these objects it has."""
+        unknown = [name for name in names if name not in self._bucket_sizes and not present(self.object_path(name))]
+        self._requested.clear()
+        self._announce(unknown)
+        sizes = self.bucket.sizes(unknown)
+        self._bucket_sizes.update({name: sizes.get(name) for name in unknown})
 
     def fetch(self, names: Iterable[str]) -> None:
         """Bring objects that are not here, several at once; what cannot be brought is reported by who reads it."""
@@ -196,12 +196,12 @@ class CachedStore(Store):
                 self.write_file(self.object_path(name), self.bucket.blocks(name, size), mode=0o444)
                 return
             except AbsentError:
-                self._there[name] = None
+                self._bucket_sizes[name] = None
                 raise
             except MissingError:
                 if last:
-                    self._there[name] = None
-                    with contextlib.suppress(StorageError):  # where it may only be read
+                    self._bucket_sizes[name] = None
+                    with contextlib.suppress(StorageError):  # The store may be read-only
                         self.bucket.quarantine(name)
                     raise
 
@@ -220,18 +220,18 @@ class CachedStore(Store):
         yield from super().blocks(name, size)
 
     def put(self, content: bytes, *, durable: bool = False) -> Object:
-        """Do as `Store.put`; it goes to the bucket with the record or the dataset that names it."""
+        """Do as `Store.put`; the object is uploaded with the record or the dataset that names it."""
         self.prepare()
-        made = super().put(content, durable=durable)
-        self._made.add(made.digest)
-        return made
+        stored = super().put(content, durable=durable)
+        self._not_uploaded.add(stored.digest)
+        return stored
 
     def put_written(self, write: Callable[[Draft], object], *, durable: bool = False) -> Object:
-        """Do as `Store.put_written`; it goes to the bucket as what is put."""
+        """Do as `Store.put_written`; the object is uploaded as in `put`."""
         self.prepare()
-        made = super().put_written(write, durable=durable)
-        self._made.add(made.digest)
-        return made
+        stored = super().put_written(write, durable=durable)
+        self._not_uploaded.add(stored.digest)
+        return stored
 
     def send(self, names: Iterable[str]) -> None:
         """Have the bucket hold objects; those that it lacks are sent. Raises `MissingError` for one that is not here."""
@@ -253,9 +253,9 @@ class CachedStore(Store):
             for name, _ in zip(
                 names, threads.map_in_threads(send, names, AT_ONCE if len(names) > 1 else 1), strict=True
             ):
-                self._there[name] = os.lstat(self.object_path(name)).st_size
+                self._bucket_sizes[name] = os.lstat(self.object_path(name)).st_size
                 advance()
-        self._made.difference_update(names)
+        self._not_uploaded.difference_update(names)
 
     def _bar(self, description: str, total: int) -> contextlib.AbstractContextManager[Callable[..., None]]:
         """Do as `progress.bar`, but in a task: there is one for all of these."""
@@ -286,11 +286,11 @@ class CachedStore(Store):
         replace: bool = False,
         durable: bool = False,
     ) -> dict[str, Any]:
-        """Do as `Store.commit`, in the bucket, which has the objects that were put here before it has the record."""
+        """Do as `Store.commit` in the bucket; the objects that the record names are uploaded first."""
         self._begin()
-        self._upload([name for name in dict.fromkeys(records.named(result)) if name in self._made])
-        kept = self.bucket.commit(identity, result, provenance, replace=replace)
-        return self._keep_record(kept, durable=durable)
+        self._upload([name for name in dict.fromkeys(records.digests(result)) if name in self._not_uploaded])
+        committed = self.bucket.commit(identity, result, provenance, replace=replace)
+        return self._keep_record(committed, durable=durable)
 
     def _begin(self) -> None:
         """Begin the store in the bucket where there is none."""
@@ -329,7 +329,7 @@ class CachedStore(Store):
         before: str = "",
         lasting: bool = False,
     ) -> None:
-        """Have the bucket keep ``manifest`` and all that it ``needs``, as the dataset ``name`` of a project.
+        """Keep ``manifest`` and everything that it ``needs`` in the bucket, as the dataset ``name`` of a project.
 
         ``needs`` gives names and bytes of objects for the digest of a manifest that lies here, nothing for another one;
         ``before`` is the manifest that this computer last knew under that name: what the bucket's own newest version needs
@@ -340,13 +340,15 @@ class CachedStore(Store):
         if root is not None and root["manifest"] == manifest:
             return
         with self.at_work([manifest]):
-            wanted, known = needs(manifest), needs(before) if before else {}
-            self._announce(wanted.keys() - known.keys(), manifests=[before] if known else [])
+            needed, previously_needed = needs(manifest), needs(before) if before else {}
+            self._announce(needed.keys() - previously_needed.keys(), manifests=[before] if previously_needed else [])
             root = roots.pushed(name, project["id"])
             if root is None or root["manifest"] != before:
-                known = {}
-                self._announce(wanted.keys())
-            self._complete({one: size for one, size in wanted.items() if one not in known})
+                previously_needed = {}
+                self._announce(needed.keys())
+            self._complete(
+                {object_name: size for object_name, size in needed.items() if object_name not in previously_needed}
+            )
             for _ in range(_LOOKS):
                 if roots.push(name, project, manifest, root, lasting=lasting, output=True):
                     return
@@ -354,16 +356,16 @@ class CachedStore(Store):
         raise TacpipeError(f"{name} is written to {self.place} by others all the time. Run the same command again.")
 
     def _complete(self, sizes: Mapping[str, int]) -> None:
-        """Have the bucket hold objects that are announced. Raises `MissingError` for one that is neither there nor here.
+        """Upload announced objects that the bucket lacks. Raises `MissingError` for one that is missing here too.
 
-        They are looked for also if they were sent: a collection may have come between that and the announcement.
+        Objects that were sent before are checked too: a collection may have run before the announcement.
         """
-        found = self.bucket.sizes(sizes)
-        absent = [name for name in sizes if found.get(name) != sizes[name]]
+        sizes_in_bucket = self.bucket.sizes(sizes)
+        absent = [name for name in sizes if sizes_in_bucket.get(name) != sizes[name]]
         for name in absent:
             if not self._lies(name):
                 raise AbsentError(f"Object {name[:12]} is neither in {self.place} nor in {self.root}.")
-            if name in found:  # of another size, so it is damaged
+            if name in sizes_in_bucket:  # The size differs, so it is damaged
                 self.bucket.quarantine(name)
         self._upload(absent)
 

@@ -42,19 +42,19 @@ class Directory:
         with readable_errors(self._root):
             return write_whole(str(path), content, self._draft(), mode=mode, exclusive=exclusive)
 
-    def read(self, name: str, most: int | None = None) -> bytes:
+    def read(self, name: str, max_bytes: int | None = None) -> bytes:
         """Do as `Backend.read`."""
         try:
-            return regular.content(self.path(name), most, follow=False)
+            return regular.content(self.path(name), max_bytes, follow=False)
         except FileNotFoundError:
             raise
         except OSError as error:
             raise unread(self.path(name), error) from error
 
-    def blocks(self, name: str, most: int) -> Iterator[bytes]:
+    def blocks(self, name: str, max_bytes: int) -> Iterator[bytes]:
         """Do as `Backend.blocks`."""
         try:
-            yield from regular.blocks(self.path(name), most, follow=False)
+            yield from regular.blocks(self.path(name), max_bytes, follow=False)
         except FileNotFoundError:
             raise
         except OSError as error:
@@ -64,20 +64,20 @@ class Directory:
         """Do as `Backend.stat`."""
         path = self.path(name)
         try:
-            found = os.lstat(path)  # called once a shard: os is 5 times faster than pathlib
+            status = os.lstat(path)  # Called once per shard: os is 5 times faster than pathlib
         except FileNotFoundError:
             return None
         except OSError as error:
             raise sentence(self.place, error) from error
-        regular.require(path, found.st_mode)
-        return Entry(name, found.st_size, found.st_mtime)
+        regular.require(path, status.st_mode)
+        return Entry(name, status.st_size, status.st_mtime)
 
     def list(self, folder: str) -> Iterator[Entry]:
         """Do as `Backend.list`; ``folder`` is one of those of the layout."""
         for path in layout.entries(self._root, folder):
             with contextlib.suppress(FileNotFoundError), readable_errors(self._root):
-                found = path.lstat()
-                yield Entry(str(path.relative_to(self._root)), found.st_size, found.st_mtime)
+                status = path.lstat()
+                yield Entry(str(path.relative_to(self._root)), status.st_size, status.st_mtime)
 
     def move(self, name: str, to: str) -> bool:
         """Do as `Backend.move`: within a folder of the file system a name changes at once."""

@@ -31,7 +31,7 @@ ASIDE = "gc-"  # begins the name in ``tmp/`` of an object that a collection has 
 SHELF = re.compile(r"[0-9a-f]{2}")  # folders within objects/ and records/: how the names in them begin
 _DIGEST = r"[0-9a-f]{64}"
 _RANDOM = r"[0-9a-f]{32}"
-_FORMS = {  # of the path within each folder
+_FORMS = {  # Pattern of the paths within each folder
     "objects": re.compile(r"(?P<shelf>[0-9a-f]{2})/(?P=shelf)[0-9a-f]{62}"),
     "records": re.compile(r"(?P<shelf>[0-9a-f]{2})/(?P=shelf)[0-9a-f]{62}\.json"),
     "roots": re.compile(rf"{_DIGEST}\.json"),
@@ -66,20 +66,20 @@ def record_name(key: str) -> str:
 
 
 def check(root: Path) -> bool:
-    """Return whether there is a store at ``root``; False where there is nothing yet, and a store may be begun.
+    """Return whether ``root`` holds a store; False if it is empty or missing, so that a store can be created.
 
-    Raises `UsageError` for a folder that holds something else, for a store of another format, and for one whose folders are
+    Raises `UsageError` for a folder with other content, for a store of another format, and for one whose folders are
     symbolic links. Nothing is changed.
     """
     with readable_errors(root):
-        found = _mark(root)
-        if found is None and not _may_begin(root):
-            found = _mark(root)  # another process may have begun the store between the two looks
-            if found is None:
+        mark = _mark(root)
+        if mark is None and not _may_begin(root):
+            mark = _mark(root)  # another process may have begun the store between the two looks
+            if mark is None:
                 raise UsageError(_not_a_store(root))
-        if found not in (None, FORMAT):
+        if mark not in (None, FORMAT):
             raise UsageError(
-                f"The store {root} has format {plain(found) or 'unknown'}; this tacpipe reads format {FORMAT}. Install "
+                f"The store {root} has format {plain(mark) or 'unknown'}; this tacpipe reads format {FORMAT}. Install "
                 f"the tacpipe that wrote it, or name another store in TACPIPE_STORE."
             )
         for name in _FORMS:
@@ -88,7 +88,7 @@ def check(root: Path) -> bool:
                     f"{root / name} is a symbolic link, and none is followed within a store. To keep a store on another "
                     f"disk, move the whole of {root} there and make that a link, or name it in TACPIPE_STORE."
                 )
-    return found is not None
+    return mark is not None
 
 
 def refuse_within(output: Path) -> None:
@@ -106,15 +106,15 @@ def entries(root: Path, name: str) -> Iterator[Path]:
 
     What vanishes meanwhile is left out. Raises `StorageError` for a folder that cannot be listed.
     """
-    return (path for path, ours in _found(root, name) if ours)
+    return (path for path, ours in _contents(root, name) if ours)
 
 
 def foreign(root: Path) -> list[str]:
-    """Return the paths within the store of all that is not of its form, sorted; symbolic links are among it."""
-    found = [path for name in _FORMS for path, ours in _found(root, name) if not ours]
+    """Return the sorted paths within the store that do not belong to it, symbolic links included."""
+    paths = [path for name in _FORMS for path, ours in _contents(root, name) if not ours]
     expected = {MARK, PROJECT, *_FORMS, *_BESIDE}
-    found += [Path(entry.path) for entry in _scan(root, root) if entry.name not in expected]
-    return sorted(str(path.relative_to(root)) for path in found)
+    paths += [Path(entry.path) for entry in _scan(root, root) if entry.name not in expected]
+    return sorted(str(path.relative_to(root)) for path in paths)
 
 
 def is_linked(root: str, path: str | Path) -> bool:
@@ -132,8 +132,8 @@ def _is_link(path: str | Path) -> bool:
         return False
 
 
-def _found(root: Path, name: str) -> Iterator[tuple[Path, bool]]:
-    """Yield what lies in a folder of the store, and whether it is of the store's form; shelves are gone into."""
+def _contents(root: Path, name: str) -> Iterator[tuple[Path, bool]]:
+    """Yield the paths in a folder of the store and its shelves, and whether each belongs to the store."""
     folder = root / name
     if folder.is_symlink():
         yield folder, False
@@ -154,8 +154,8 @@ def _found(root: Path, name: str) -> Iterator[tuple[Path, bool]]:
 def _scan(root: Path, folder: Path) -> list[os.DirEntry[str]]:
     with readable_errors(root):
         try:
-            with os.scandir(folder) as found:
-                return sorted(found, key=lambda entry: entry.name)
+            with os.scandir(folder) as entries:
+                return sorted(entries, key=lambda entry: entry.name)
         except (FileNotFoundError, NotADirectoryError):
             return []
 
@@ -185,16 +185,16 @@ def _may_begin(root: Path) -> bool:
             continue
         if entry.name not in _FORMS or not entry.is_dir(follow_symlinks=False):
             return False
-        if any(not (ours and entry.name in _BEGUN) for _, ours in _everything(root, entry.name)):
+        if any(not (ours and entry.name in _BEGUN) for _, ours in _all_entries(root, entry.name)):
             return False
     return True
 
 
-def _everything(root: Path, name: str) -> Iterator[tuple[Path, bool]]:
-    """Do as `_found`; empty shelves count as something too."""
+def _all_entries(root: Path, name: str) -> Iterator[tuple[Path, bool]]:
+    """Do as `_contents`, but yield shelves, which may be empty, instead of their content."""
     if name in _SHELVED:
         return ((Path(entry.path), False) for entry in _scan(root, root / name))
-    return _found(root, name)
+    return _contents(root, name)
 
 
 def _not_a_store(root: Path) -> str:

@@ -57,20 +57,20 @@ class Leases:
         self.folder = folder
 
     @contextlib.contextmanager
-    def hold(self, key: str, what: str = "", timeout_s: float | None = None) -> Iterator[None]:
-        """Hold the key alone while in the block, so that two processes do not make ``what`` both.
+    def hold(self, key: str, work: str = "", timeout_s: float | None = None) -> Iterator[None]:
+        """Hold the key exclusively in the block, so that two processes do not both compute ``work``.
 
-        The kernel frees the lease of a process that dies. Who is waited for is reported on stderr. Raises `LockedError`
-        after ``timeout_s``.
+        The kernel frees the lease of a process that dies. The holder that is waited for is reported on stderr. Raises
+        `LockedError` after ``timeout_s``.
         """
         path = self.folder / f"{key}.lock"
         handle = _try_lock(path)
         if handle is None:
-            handle = _wait(path, what or f"key {key[:12]}", _timeout_s() if timeout_s is None else timeout_s)
+            handle = _wait(path, work or f"key {key[:12]}", _timeout_s() if timeout_s is None else timeout_s)
         try:
-            with contextlib.suppress(OSError):  # who waits likes to know for whom; no more rests on it
+            with contextlib.suppress(OSError):  # The note only informs processes that wait
                 os.ftruncate(handle, 0)
-                os.pwrite(handle, note(what=what), 0)
+                os.pwrite(handle, note(what=work), 0)
             yield
         finally:
             _release(path, handle)
@@ -92,27 +92,27 @@ class Leases:
             _release(path, handle)
 
     def runs(self) -> list[Run]:
-        """Return the running processes with what they announced so far; forget dead ones.
+        """Return the running processes with their announcements; remove the leases of dead ones.
 
-        A run that began and stated nothing yet has made no use of anything yet.
+        A run without announcements uses nothing yet.
         """
-        found = []
+        running = []
         for path in self._files():
             if not path.name.startswith("run-"):
                 continue
             try:
                 handle = _try_lock(path, create=False)
                 if handle is None:
-                    found.append(_parsed(path))
+                    running.append(_parsed(path))
                     continue
                 if not _has_locks(handle) and _seems_alive(path):
-                    found.append(_parsed(path))
+                    running.append(_parsed(path))
                 else:
                     path.unlink(missing_ok=True)
                 os.close(handle)
             except FileNotFoundError:
                 continue
-        return found
+        return running
 
     def sweep(self) -> None:
         """Remove the files that killed processes left; their locks went with them."""
@@ -128,22 +128,22 @@ class Leases:
         return layout.entries(self.folder.parent, self.folder.name)
 
     @contextlib.contextmanager
-    def alone(self, what: str) -> Iterator[None]:
-        """Do ``what`` in the block while nobody else does. Raises `LockedError` at once if somebody does."""
-        path = self.folder / f"{what}.lock"
+    def exclusive(self, work: str) -> Iterator[None]:
+        """Do ``work`` exclusively in the block. Raises `LockedError` at once if another process does it."""
+        path = self.folder / f"{work}.lock"
         handle = _try_lock(path)
         if handle is None:
-            raise LockedError(f"{_holder(path)} is at work on `tacpipe store {what}` already. Wait for it.")
+            raise LockedError(f"{_holder(path)} is at work on `tacpipe store {work}` already. Wait for it.")
         try:
             with contextlib.suppress(OSError):
-                os.pwrite(handle, note(what=what), 0)
+                os.pwrite(handle, note(what=work), 0)
             yield
         finally:
             _release(path, handle)
 
 
 class Announcing:
-    """Where the processes of one run state which objects they use, before they look whether these are there.
+    """File in which the processes of a run announce the objects that they use, before they check for them.
 
     Whoever collects garbage moves objects away first and reads the announcements then: so of the two one sees the other.
     """
@@ -170,7 +170,7 @@ class Announcing:
     def close(self) -> None:
         """Announce nothing more."""
         if self._handle >= 0:
-            with contextlib.suppress(OSError):  # what was announced is needed no more
+            with contextlib.suppress(OSError):  # The announcements are no longer needed
                 os.close(self._handle)
             self._handle = -1
 
@@ -187,19 +187,25 @@ def _parsed(path: Path) -> Run:
 
 
 def parsed(path: Path, content: bytes) -> Run:
-    """Return the run that a lease describes: a line on who holds it, and a line for each digest that is used."""
-    first, _, rest = content.decode("latin-1").partition("\n")
+    """Parse a lease: one line that describes its holder, and one line per digest that is used."""
+    first, _, digests = content.decode("latin-1").partition("\n")
     try:
-        stated = json.loads(first)
+        holder = json.loads(first)
     except ValueError:
-        stated = {}  # it is being written
-    return Run(path, stated if isinstance(stated, dict) else {}, set(rest.split()))
+        holder = {}  # The lease is being written
+    return Run(path, holder if isinstance(holder, dict) else {}, set(digests.split()))
 
 
-def note(**more: Any) -> bytes:
-    """Return what a lease states of who holds it, as one line of JSON."""
+def note(**extra: Any) -> bytes:
+    """Return the description of a lease's holder as one line of JSON."""
     command = shlex.join(["tacpipe", *sys.argv[1:]])
-    value = {"host": platform.node(), "pid": os.getpid(), "command": command[:500], "since_s": int(time.time()), **more}
+    value = {
+        "host": platform.node(),
+        "pid": os.getpid(),
+        "command": command[:500],
+        "since_s": int(time.time()),
+        **extra,
+    }
     return json.dumps(value).encode()
 
 
@@ -211,20 +217,20 @@ def _timeout_s() -> float:
         raise TacpipeError(f"TACPIPE_LOCK_TIMEOUT_S is {text!r}; it should be a number of seconds.") from None
 
 
-def _wait(path: Path, what: str, timeout_s: float) -> int:
-    """Return the handle once the lock is free; state on stderr who is waited for."""
+def _wait(path: Path, work: str, timeout_s: float) -> int:
+    """Wait until the lock is free and return its handle; report the holder on stderr."""
     began_s = time.monotonic()
     reported = False
     while True:
         waited_s = time.monotonic() - began_s
         if waited_s >= timeout_s:
             raise LockedError(
-                f"{_holder(path)} has held {what} for over {timeout_s:g} s. Wait for it or stop it; "
+                f"{_holder(path)} has held {work} for over {timeout_s:g} s. Wait for it or stop it; "
                 f"TACPIPE_LOCK_TIMEOUT_S sets how long to wait."
             )
         if not reported and waited_s >= REPORT_AFTER_S:
             reported = True
-            progress.report(f"waiting for {_holder(path, 'another process')}, which is at work on {what}.")
+            progress.report(f"waiting for {_holder(path, 'another process')}, which is at work on {work}.")
         time.sleep(_POLL_S)
         handle = _try_lock(path)
         if handle is not None:
@@ -234,7 +240,7 @@ def _wait(path: Path, what: str, timeout_s: float) -> int:
 def _holder(path: Path, unknown: str = "Another process") -> str:
     """Return in words who holds a lease, and whether it is stopped."""
     note = None
-    with contextlib.suppress(OSError, TacpipeError):  # who it is helps to know, and nothing rests on it
+    with contextlib.suppress(OSError, TacpipeError):  # The name of the holder only informs the user
         note = read_json(path)
     if not note or "pid" not in note:
         return unknown
@@ -260,7 +266,7 @@ def _seems_alive(path: Path) -> bool:
             os.kill(note["pid"], 0)
         except ProcessLookupError:
             return False
-        except PermissionError:  # of another user
+        except PermissionError:  # The process belongs to another user
             return True
         return True
     return time.time() - path.stat().st_mtime < _UNKNOWN_S

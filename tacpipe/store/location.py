@@ -1,4 +1,4 @@
-"""Which store a command uses, and the project that it works in."""
+"""Locate the store and the project of a command."""
 
 from __future__ import annotations
 
@@ -27,24 +27,24 @@ MARKS = (
 
 def opened(place: str, run: str = "") -> Store:
     """Return the store at a path or an address, as `Store.place` names it; ``run`` is as `Store` has it."""
-    found = addresses.parsed(place)
-    if isinstance(found, Path):
-        return Store(found, run)
-    from tacpipe.store.cached import CachedStore  # of a bucket alone: others need not load it
+    address = addresses.parsed(place)
+    if isinstance(address, Path):
+        return Store(address, run)
+    from tacpipe.store.cached import CachedStore  # Only buckets need it
 
-    return CachedStore(found, run)
+    return CachedStore(address, run)
 
 
 def locate(*datasets: Path) -> Store:
     """Return the store for a command that reads or writes ``datasets``, the output first.
 
-    It is named by ``TACPIPE_STORE``, else it lies in `project`. The name may be an address: the folder in front of the
-    bucket is then used as a store is. Raises `UsageError` where something else lies there, as `layout.check` does, for an
+    ``TACPIPE_STORE`` names it, else it lies in `project`. With an address, the cache folder of the bucket is used as a
+    store. Raises `UsageError` where something else lies there, as `layout.check` does, for an
     address that is not one of a bucket, and for a store of another user that ``TACPIPE_STORE`` does not name.
     """
-    named = os.environ.get("TACPIPE_STORE")
-    if named:
-        place = addresses.parsed(named)
+    setting = os.environ.get("TACPIPE_STORE")
+    if setting:
+        place = addresses.parsed(setting)
         store = opened(str(place.absolute() if isinstance(place, Path) else place))
     else:
         store = Store(project(*datasets) / BESIDE_NAME)
@@ -134,7 +134,7 @@ def _marks(path: Path) -> bool:
     """
     try:
         return present(path)
-    except ValueError:  # of a path that nothing can have
+    except ValueError:  # The path is invalid
         return False
     except OSError as error:
         if error.errno in (errno.ENAMETOOLONG, errno.ELOOP):

@@ -23,15 +23,15 @@ from tacpipe.store.store import Store
 FORMAT = 2
 _HEAD_BYTES = 1 << 20  # the longest first line that is read
 _ROW = 48  # bytes: a digest of 32, the size of the object, and its inode
-State = list[int]  # of a folder: what the system states of it
-Row = tuple[str, int, int]  # of an object: digest, size in bytes, inode
+State = list[int]  # State of a folder: device, inode, and times of change
+Row = tuple[str, int, int]  # Object: digest, size in bytes, inode
 
 
 @dataclass(frozen=True)
 class Head:
-    """What a note states of a dataset: all of its objects in the store, and nothing but links to them in its directory."""
+    """Note on a dataset whose objects are all in the store, and whose directory holds only links to them."""
 
-    key: str  # of the run that gave the dataset
+    key: str  # Key of the run that computed the dataset
     manifest: str  # digest
     reused: int  # results of that run
     rows: int
@@ -47,27 +47,27 @@ class Note:
     head: Head
     shelves: Mapping[str, tuple[State | None, int, int, str]]  # state, first row, rows, digest of these rows
     file: Path
-    body: int  # where in the file the rows begin
+    body: int  # Offset of the rows in the file
 
     def rows(self, shelf: str) -> list[Row] | None:
         """Return the objects that were noted on a shelf; None where the note is damaged."""
         content = self.content(shelf)
         if content is None:
             return None
-        found = []
+        rows = []
         for at in range(0, len(content), _ROW):
             size, inode = content[at + 32 : at + 40], content[at + 40 : at + _ROW]
-            found.append((content[at : at + 32].hex(), int.from_bytes(size, "little"), int.from_bytes(inode, "little")))
-        return found
+            rows.append((content[at : at + 32].hex(), int.from_bytes(size, "little"), int.from_bytes(inode, "little")))
+        return rows
 
     def content(self, shelf: str) -> bytes | None:
         """Return the rows of a shelf as they are kept; None where the note is damaged."""
-        _, begin, count, wanted = self.shelves.get(shelf, (None, 0, 0, hashlib.sha256().hexdigest()))
+        _, begin, count, expected_digest = self.shelves.get(shelf, (None, 0, 0, hashlib.sha256().hexdigest()))
         content = b""
         with contextlib.suppress(OSError, TacpipeError), regular.opened(self.file, follow=False) as reading:
             reading.seek(self.body + begin * _ROW)
             content = reading.read(count * _ROW)
-        return content if hashlib.sha256(content).hexdigest() == wanted else None
+        return content if hashlib.sha256(content).hexdigest() == expected_digest else None
 
 
 def encoded(rows: Iterable[Row]) -> bytes:
@@ -78,7 +78,7 @@ def encoded(rows: Iterable[Row]) -> bytes:
     return b"".join(parts)
 
 
-def known(store: Store, directory: Path) -> Note | None:
+def read(store: Store, directory: Path) -> Note | None:
     """Return the note on a directory; None where there is none, or none that can be read."""
     file = _file(store, directory)
     with contextlib.suppress(OSError, TacpipeError, ValueError, TypeError, KeyError, RecursionError):
@@ -86,7 +86,7 @@ def known(store: Store, directory: Path) -> Note | None:
             first = reading.readline(_HEAD_BYTES)
         head: dict[str, Any] = json.loads(first)
         if head.pop("check") == digest(head) and head.pop("format") == FORMAT:
-            shelves = {shelf: tuple(found) for shelf, found in head.pop("shelves").items()}
+            shelves = {shelf: tuple(values) for shelf, values in head.pop("shelves").items()}
             return Note(Head(**head), shelves, file, len(first))
     return None
 
@@ -112,19 +112,19 @@ def write(store: Store, directory: Path, head: Head, shelves: Mapping[str, tuple
 
 def forget(store: Store, names: Iterable[str]) -> None:
     """Remove the notes on directories that no root of these names has."""
-    kept = set(names)
+    retained = set(names)
     for path in layout.entries(store.root, layout.PRESENCE):
-        if path.name not in kept:
+        if path.name not in retained:
             path.unlink(missing_ok=True)
 
 
 def shelved(rows: Iterable[Row]) -> Iterator[tuple[str, list[Row]]]:
-    """Yield each shelf that objects lie on, with these, in the order of shelves."""
-    found: dict[str, list[Row]] = {}
+    """Yield each shelf with its objects, in the order of shelves."""
+    shelves: dict[str, list[Row]] = {}
     for row in rows:
-        found.setdefault(row[0][:2], []).append(row)
-    yield from sorted(found.items())
+        shelves.setdefault(row[0][:2], []).append(row)
+    yield from sorted(shelves.items())
 
 
 def _file(store: Store, directory: Path) -> Path:
-    return store.root / layout.PRESENCE / name_of(*store.roots.named(directory))
+    return store.root / layout.PRESENCE / name_of(*store.roots.kind_and_name(directory))

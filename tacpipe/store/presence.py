@@ -1,4 +1,4 @@
-"""What a look at each file of a large dataset found, and the state of the folders then: while they stay as they were, the
+"""Remember that all files of a large dataset were present, and the state of the folders: while they are unchanged, the
 files are there, and none of them is looked at.
 
 A folder changes its time whenever a name in it comes, goes or is given to another file. Where it changed so shortly before
@@ -29,7 +29,7 @@ from tacpipe.store.store import Store
 BOOT = Path("/proc/sys/kernel/random/boot_id")  # a file system is repaired between two starts of a computer
 _MOST_CHANGED = 32  # shelves that are looked at again by each command before the note is written anew
 _SAMPLE = 16  # files of which both ways to learn the inode are compared
-_MANIFEST = "manifest.json"  # in the directory, and no link: whoever relies on a note hashes it
+_MANIFEST = "manifest.json"  # A copy instead of a link, so its content is hashed whenever a note is used
 
 
 class Look:
@@ -38,7 +38,7 @@ class Look:
     def __init__(self, store: Store, directory: Path) -> None:
         self._store, self._directory = store, directory
         self._begun_ns = time.monotonic_ns()
-        self._shelves, self._here = _states(store), _state(directory)
+        self._shelves, self._directory_state = _states(store), _state(directory)
 
     @cached_property
     def inodes(self) -> Mapping[str, int]:
@@ -51,10 +51,10 @@ class Look:
 
     @property
     def unchanged(self) -> bool:
-        """Whether the names in the directory are those of the files that it had as the look began."""
+        """Return whether the directory has the same names and files as at the start of the look."""
         with contextlib.suppress(OSError, TacpipeError):
-            if self._settled()(self._here) is not None:
-                return _state(self._directory) == self._here
+            if self._settled()(self._directory_state) is not None:
+                return _state(self._directory) == self._directory_state
         return _inodes(self._directory) == self.inodes
 
     def holds(self, note: Note, *, listed: bool = False) -> bool:
@@ -65,28 +65,28 @@ class Look:
         where that saves the next look something. False where it is not known: then each file is to be looked at.
         """
         head = note.head
-        if not head.boot or head.boot != _boot() or self._here is None:
+        if not head.boot or head.boot != _boot() or self._directory_state is None:
             return False
-        same = head.directory == self._here
+        same = head.directory == self._directory_state
         if listed:
             self.begin()
-            same = same and _state(self._directory) == self._here
-        if not same and _listing(self._here, self.inodes) != head.listing:
+            same = same and _state(self._directory) == self._directory_state
+        if not same and _listing(self._directory_state, self.inodes) != head.listing:
             return False
         changed = self._changed(note)
         if not all(self._lie(note.rows(shelf)) for shelf in changed):
             return False
-        if not listed and (head.directory != self._here or len(changed) > _MOST_CHANGED):
+        if not listed and (head.directory != self._directory_state or len(changed) > _MOST_CHANGED):
             self._renew(note, changed)
         return True
 
     def note(self, head: Head, contents: Iterable[tuple[str, str, int]]) -> bool:
-        """Note that a look at each file found all of a dataset there; return False where that would not be safe.
+        """Note that all files of a dataset were present; return False if that would not be safe.
 
         ``contents`` are path in the directory, digest and size in bytes of each shard and file: links to the objects.
         """
-        boot, here, inodes = _boot(), self._here, self.inodes
-        if not boot or here is None:
+        boot, directory_state, inodes = _boot(), self._directory_state, self.inodes
+        if not boot or directory_state is None:
             return False
         with contextlib.suppress(OSError, TacpipeError, KeyError):
             rows = [(name, size, inodes[path]) for path, name, size in contents]
@@ -95,36 +95,37 @@ class Look:
             if _inodes(self._directory) != inodes or not self._alike(rows):
                 return False
             shelves = {
-                shelf: (settled(self._shelves[shelf]), notes.encoded(some)) for shelf, some in notes.shelved(rows)
+                shelf: (settled(self._shelves[shelf]), notes.encoded(shelf_rows))
+                for shelf, shelf_rows in notes.shelved(rows)
             }
-            listing = _listing(here, inodes)
+            listing = _listing(directory_state, inodes)
             notes.write(
                 self._store,
                 self._directory,
-                replace(head, boot=boot, directory=settled(here), listing=listing),
+                replace(head, boot=boot, directory=settled(directory_state), listing=listing),
                 shelves,
             )
             return True
         return False
 
     def succeed(self, note: Note, head: Head, before: Iterable[str], now: Iterable[tuple[str, str, int]]) -> bool:
-        """Note what is there after a dataset was changed whose note held when the look began; False where it is not safe.
+        """Update the note after a change of the dataset; return False if that is not safe. The old note must have held.
 
         ``before`` are the paths of what the dataset named then and does not name now, or otherwise, and ``now`` path, digest
         and size of what it names now in their place. Objects that it named stay in the note until all are looked at again.
         """
-        here = _state(self._directory)
-        if here is None:
+        directory_state = _state(self._directory)
+        if directory_state is None:
             return False
         with contextlib.suppress(OSError, TacpipeError, KeyError):
-            wanted = dict(self.inodes)
+            expected = dict(self.inodes)
             for path in before:
-                wanted.pop(path, None)
+                expected.pop(path, None)
             placed = [*now]
             new = [self._stored(name) for _, name, _ in placed]
-            wanted |= {path: row[2] for (path, _, _), row in zip(placed, new, strict=True)}
-            found = _inodes(self._directory)
-            if any(found.get(path) != inode for path, inode in wanted.items()):
+            expected |= {path: row[2] for (path, _, _), row in zip(placed, new, strict=True)}
+            inodes = _inodes(self._directory)
+            if any(inodes.get(path) != inode for path, inode in expected.items()):
                 return False
             added = dict(notes.shelved({*new, self._stored(head.manifest)}))
             settled = self._settled()
@@ -133,9 +134,12 @@ class Look:
                 state, content = self._shelves[shelf], note.content(shelf)
                 if content is None:
                     return False
-                known = shelf in note.shelves and note.shelves[shelf][0] == state
-                shelves[shelf] = state if known else settled(state), content + notes.encoded(added.get(shelf, ()))
-            listing = _listing(here, found)
+                is_unchanged = shelf in note.shelves and note.shelves[shelf][0] == state
+                shelves[shelf] = (
+                    state if is_unchanged else settled(state),
+                    content + notes.encoded(added.get(shelf, ())),
+                )
+            listing = _listing(directory_state, inodes)
             notes.write(
                 self._store, self._directory, replace(head, boot=_boot(), directory=None, listing=listing), shelves
             )
@@ -146,10 +150,10 @@ class Look:
         """Note the states that folders have now, where they can be noted; all that was noted was found there."""
         with contextlib.suppress(OSError, TacpipeError):
             settled = self._settled()
-            here = settled(self._here) or note.head.directory
+            directory_state = settled(self._directory_state) or note.head.directory
             states = {shelf: settled(self._shelves[shelf]) for shelf in changed}
             gained = sum(state is not None for state in states.values()) > _MOST_CHANGED
-            if here == note.head.directory and not gained:
+            if directory_state == note.head.directory and not gained:
                 return
             shelves = {}
             for shelf, (state, *_) in note.shelves.items():
@@ -157,17 +161,21 @@ class Look:
                 if content is None:
                     return
                 shelves[shelf] = states.get(shelf, state), content
-            notes.write(self._store, self._directory, replace(note.head, directory=here), shelves)
+            notes.write(self._store, self._directory, replace(note.head, directory=directory_state), shelves)
 
     def _changed(self, note: Note) -> set[str]:
         return {shelf for shelf, (state, *_) in note.shelves.items() if state is None or state != self._shelves[shelf]}
 
     def _stored(self, name: str) -> Row:
         """Return digest, size and inode of an object. Raises `KeyError` where it is not a file next to the directory."""
-        found = os.lstat(f"{self._store.root}/objects/{name[:2]}/{name}")
-        if not stat.S_ISREG(found.st_mode) or self._here is None or found.st_dev != self._here[0]:
+        status = os.lstat(f"{self._store.root}/objects/{name[:2]}/{name}")
+        if (
+            not stat.S_ISREG(status.st_mode)
+            or self._directory_state is None
+            or status.st_dev != self._directory_state[0]
+        ):
             raise KeyError(name)
-        return name, found.st_size, found.st_ino
+        return name, status.st_size, status.st_ino
 
     def _lie(self, rows: Iterable[Row] | None) -> bool:
         """Return whether objects lie where they should, the very files that were noted."""
@@ -204,17 +212,17 @@ class Look:
 
 
 def _inodes(directory: Path) -> dict[str, int]:
-    with contextlib.suppress(OSError), os.scandir(directory) as found:
-        return {one.name: one.inode() for one in found if one.name != _MANIFEST}
+    with contextlib.suppress(OSError), os.scandir(directory) as entries:
+        return {entry.name: entry.inode() for entry in entries if entry.name != _MANIFEST}
     return {}
 
 
 def _listing(state: State, inodes: Mapping[str, int]) -> str:
     """Return the digest of the names in a directory, on a device, and of their inodes."""
     names = sorted(inodes)
-    found = hashlib.sha256("\0".join([str(state[0]), *names]).encode(errors="surrogateescape"))
-    found.update(array("Q", [inodes[name] for name in names]).tobytes())
-    return found.hexdigest()
+    hasher = hashlib.sha256("\0".join([str(state[0]), *names]).encode(errors="surrogateescape"))
+    hasher.update(array("Q", [inodes[name] for name in names]).tobytes())
+    return hasher.hexdigest()
 
 
 def _states(store: Store) -> dict[str, State | None]:
@@ -222,14 +230,14 @@ def _states(store: Store) -> dict[str, State | None]:
 
 
 def _state(folder: Path | str) -> State | None:
-    """Return what changes with a folder's names, None where there is no folder."""
+    """Return the state of a folder, which changes with its names; None if it does not exist."""
     try:
-        found = os.lstat(folder)
+        status = os.lstat(folder)
     except OSError:
         return None
-    if not stat.S_ISDIR(found.st_mode):
+    if not stat.S_ISDIR(status.st_mode):
         return None
-    return [found.st_dev, found.st_ino, found.st_mtime_ns, found.st_ctime_ns]
+    return [status.st_dev, status.st_ino, status.st_mtime_ns, status.st_ctime_ns]
 
 
 def _boot() -> str:

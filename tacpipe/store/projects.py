@@ -20,7 +20,7 @@ from tacpipe.printable import plain
 from tacpipe.store.location import project, project_folder
 from tacpipe.store.store import Store
 
-FOLDER = "projects"  # within the store
+FOLDER = "projects"  # Folder of the store
 VARIABLE = "TACPIPE_PROJECT"
 _FILE_BYTES = 1 << 16  # the largest identity that is read
 _NAME_LETTERS = 60
@@ -28,7 +28,7 @@ _NAME_LETTERS = 60
 
 @dataclass(frozen=True)
 class Project:
-    """What distinguishes a project from all others, and what people call it: its folder's name."""
+    """Unique identity of a project, and its name for people: the name of its folder."""
 
     id: str  # hex digits
     name: str
@@ -40,27 +40,27 @@ def place(directory: Path) -> tuple[Path, str]:
     Where nothing marks a project, the folder is the working directory, and that above a dataset outside of it. A dataset in
     the folder itself has the folder's name.
     """
-    here = Path(os.path.abspath(directory))  # noqa: PTH100  (a name holds no ".." and follows no link)
-    folder = project(here)
-    if project_folder(here) is None and folder not in here.parents:
-        folder = here.parent
-    return folder, str(here.relative_to(folder)) if folder in here.parents else here.name or "dataset"
+    path = Path(os.path.abspath(directory))  # noqa: PTH100  (a name holds no ".." and follows no link)
+    folder = project(path)
+    if project_folder(path) is None and folder not in path.parents:
+        folder = path.parent
+    return folder, str(path.relative_to(folder)) if folder in path.parents else path.name or "dataset"
 
 
-def named() -> Project | None:
-    """Return the project that the environment names, the same wherever it does; None where it names none.
+def from_environment() -> Project | None:
+    """Return the project that the environment names, identical on every computer; None if it names none.
 
-    Raises `UsageError` for a name that none can have.
+    Raises `UsageError` for an invalid name.
 
     >>> os.environ["TACPIPE_PROJECT"] = "slip detection"
-    >>> named().name, named() == named()
+    >>> from_environment().name, from_environment() == from_environment()
     ('slip detection', True)
     >>> del os.environ["TACPIPE_PROJECT"]
     """
     name = os.environ.get(VARIABLE, "")
     if not name:
         return None
-    if _shown(name) != name or name != name.strip():
+    if _printable(name) != name or name != name.strip():
         raise UsageError(
             f"{VARIABLE} is {plain(name, 80)!r}; the name of a project has {_NAME_LETTERS} printable letters at most, no "
             f"colon, and no space at its ends."
@@ -68,12 +68,14 @@ def named() -> Project | None:
     return Project(digest(["named project", name])[:32], name)
 
 
-def known(store: Store, folder: Path) -> Project | None:
-    """Return the identity of the project in ``folder``, None where it has pushed nothing yet and `named` gives none.
+def identity_of(store: Store, folder: Path) -> Project | None:
+    """Return the identity of the project in ``folder``, or None.
+
+    It has one once it pushed something, or if `from_environment` gives one.
 
     Raises `DamagedError` for one that is damaged: under a new one it would be another project.
     """
-    if (project := named()) is not None:
+    if (project := from_environment()) is not None:
         return project
     file = _file(store, folder)
     try:
@@ -97,9 +99,9 @@ def identify(store: Store, folder: Path, *, writable: bool = True) -> Project:
 
     In a store that is not ``writable`` it is derived from the computer and the paths.
     """
-    found = known(store, folder)
-    if found is not None:
-        return found
+    existing = identity_of(store, folder)
+    if existing is not None:
+        return existing
     try:
         store.prepare()
         _write(store, folder, Project(new_id(), _name(folder)), exclusive=True)
@@ -108,9 +110,9 @@ def identify(store: Store, folder: Path, *, writable: bool = True) -> Project:
             raise
         derived = digest([platform.node(), str(store.root.absolute()), str(folder)])[:32]
         return Project(derived, _name(folder))
-    made = known(store, folder)  # the first to write it wins
-    assert made is not None
-    return made
+    written = identity_of(store, folder)  # the first to write it wins
+    assert written is not None
+    return written
 
 
 def new_id() -> str:
@@ -123,17 +125,17 @@ def join(store: Store, folder: Path, project: Project) -> None:
 
     Raises `UsageError` where the environment names another one.
     """
-    given = named()
-    if given is not None and given != project:
+    configured = from_environment()
+    if configured is not None and configured != project:
         raise UsageError(
-            f"{VARIABLE} names the project {given.name}, so --project {project.name} has no effect. Unset one."
+            f"{VARIABLE} names the project {configured.name}, so --project {project.name} has no effect. Unset one."
         )
     store.prepare()
     _write(store, folder, project, exclusive=False)
 
 
 def _write(store: Store, folder: Path, project: Project, *, exclusive: bool) -> None:
-    kind, name = store.roots.named(folder)
+    kind, name = store.roots.kind_and_name(folder)
     value = {"kind": kind, "folder": name, **asdict(project)}
     file = _file(store, folder)
     text = json.dumps({**value, "check": digest(value)}, sort_keys=True)
@@ -142,7 +144,7 @@ def _write(store: Store, folder: Path, project: Project, *, exclusive: bool) -> 
 
 
 def _file(store: Store, folder: Path) -> Path:
-    return store.root / FOLDER / f"{digest(['project', *store.roots.named(folder)])}.json"
+    return store.root / FOLDER / f"{digest(['project', *store.roots.kind_and_name(folder)])}.json"
 
 
 def _name(folder: Path) -> str:
@@ -151,8 +153,8 @@ def _name(folder: Path) -> str:
     >>> _name(Path("/lab/slip detection")), _name(Path("/lab/a:b")), _name(Path("/"))
     ('slip detection', 'a-b', 'project')
     """
-    return _shown(folder.name) or "project"
+    return _printable(folder.name) or "project"
 
 
-def _shown(name: str) -> str:
+def _printable(name: str) -> str:
     return "".join("-" if letter == ":" or not letter.isprintable() else letter for letter in name)[:_NAME_LETTERS]

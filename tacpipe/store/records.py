@@ -13,27 +13,27 @@ from tacpipe.store.store import Store
 
 
 def complete(store: Store, record: Mapping[str, Any]) -> bool:
-    """Return whether every object that the record names is in the store, whole; they are announced first."""
-    store.announce(named(record["result"]))
-    return all(store.has(one["digest"], one["bytes"]) for one in _objects(record["result"]))
+    """Return whether the store has every object of the record in its full size; announces them first."""
+    store.announce(digests(record["result"]))
+    return all(store.has(content["digest"], content["bytes"]) for content in _objects(record["result"]))
 
 
-def named(result: Mapping[str, Any]) -> Iterator[str]:
+def digests(result: Mapping[str, Any]) -> Iterator[str]:
     """Yield the digests of all shards and files of a record's ``result`` (or of a manifest)."""
-    return (one["digest"] for one in _objects(result))
+    return (content["digest"] for content in _objects(result))
 
 
 def naming(store: Store, name: str, written_s: float) -> Iterator[dict[str, Any]]:
-    """Yield the records in which the digest ``name`` stands, first those that were written nearest to ``written_s``.
+    """Yield the records that contain the digest ``name``, those written closest to ``written_s`` first.
 
-    A record is written just before what it names is shown, so who looks for one reads few of them.
+    A record is written just before its result is published, so few records are read.
     """
-    apart = {}
+    distance_s = {}
     with readable_errors(store.root, reading=True):
         for path in layout.entries(store.root, "records"):
             with contextlib.suppress(FileNotFoundError):
-                apart[path] = abs(path.lstat().st_mtime - written_s)
-    for path in sorted(apart, key=lambda path: (apart[path], path)):
+                distance_s[path] = abs(path.lstat().st_mtime - written_s)
+    for path in sorted(distance_s, key=lambda path: (distance_s[path], path)):
         with contextlib.suppress(FileNotFoundError, regular.IrregularError), readable_errors(store.root, reading=True):
             if name.encode() not in regular.content(path, regular.JSON_BYTES, follow=False):
                 continue

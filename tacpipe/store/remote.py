@@ -26,12 +26,12 @@ from tacpipe.store import layout, leases
 from tacpipe.store.backend import AT_ONCE, Backend, Entry, read_twice
 from tacpipe.store.leases import LEASE_BYTES, Run
 from tacpipe.store.remote_roots import RemoteRoots
-from tacpipe.store.store import AbsentError, MissingError, Object, most, record_content, sound
+from tacpipe.store.store import AbsentError, MissingError, Object, read_limit, record_content, sound
 
-SNAPSHOTS = "snapshots"  # which records belong to which manifest, so that a pull need not read all
+SNAPSHOTS = "snapshots"  # Keys of the records of each manifest, so that a pull reads only these
 _LISTED = 12  # looks that cost as much as a list of 1,000 names, on S3
 _PAGE = 1000  # names that a list gives for one request
-_TRIES = 10  # to replace a record, of several who do
+_TRIES = 10  # Attempts to replace a record that others replace too
 
 
 class RemoteStore:
@@ -56,14 +56,15 @@ class RemoteStore:
         try:
             if read_twice(self.files, layout.MARK, regular.BLOCK_BYTES, _parse_format) is not None:
                 return True
-            found = self.files.read(layout.MARK, regular.BLOCK_BYTES).strip().decode(errors="replace")
+            format_text = self.files.read(layout.MARK, regular.BLOCK_BYTES).strip().decode(errors="replace")
         except FileNotFoundError:
             return False
         except regular.IrregularError as error:
             raise UsageError(f"{self.place} is not a store: {error}") from None
-        if found != layout.FORMAT:
+        if format_text != layout.FORMAT:
             raise UsageError(
-                f"The store {self.place} has format {plain(found) or 'unknown'}; this tacpipe reads format {layout.FORMAT}."
+                f"The store {self.place} has format {plain(format_text) or 'unknown'}; this tacpipe reads "
+                f"format {layout.FORMAT}."
             )
         return True
 
@@ -105,71 +106,73 @@ class RemoteStore:
                     f"what was there already. Run the same command again."
                 )
         finally:
-            with contextlib.suppress(TacpipeError):  # what stays is removed by a later collection
+            with contextlib.suppress(TacpipeError):  # A later collection removes the remaining files
                 for name in self._leases:
                     self.files.delete(name)
             self._leases, self._announced = [], set()
 
     def announce(self, names: Iterable[str], *, manifests: Iterable[str] = (), keys: Iterable[str] = ()) -> None:
-        """Announce objects to collections; whoever reuses one does so before looking whether it is there.
+        """Announce objects to collections; an object is announced before its presence is checked.
 
-        Of ``manifests`` all is announced that they name, and of ``keys`` what their records name as soon as these are there.
+        ``manifests`` announce all that they name, and ``keys`` all that their records name once these exist.
         """
         new = sorted(set(names) - self._announced)
-        several, made = sorted({*manifests} - {*self._manifests}), sorted(set(keys) - self._announced)
-        if not (new or several or made):
+        new_manifests, new_keys = sorted({*manifests} - {*self._manifests}), sorted(set(keys) - self._announced)
+        if not (new or new_manifests or new_keys):
             return
         name = f"leases/run-{uuid.uuid4().hex}.lock"
         self._leases.append(name)
-        stated = leases.note(manifests=[*self._manifests, *several], **({"keys": made} if made else {}))
-        self.files.create(name, b"\n".join([stated, *(one.encode() for one in new)]))
-        self._announced.update(new, made)
+        header = leases.note(manifests=[*self._manifests, *new_manifests], **({"keys": new_keys} if new_keys else {}))
+        self.files.create(name, b"\n".join([header, *(object_name.encode() for object_name in new)]))
+        self._announced.update(new, new_keys)
 
     def runs(self) -> dict[str, tuple[Entry, Run]]:
-        """Return what is announced now, by its name, with what the place states of it."""
-        found = {}
+        """Return the current announcements by name, each with its entry in the place."""
+        runs = {}
         for entry in self.files.list("leases"):
-            with contextlib.suppress(FileNotFoundError):  # it is over
+            with contextlib.suppress(FileNotFoundError):  # The run has ended
                 content = self.files.read(entry.name, LEASE_BYTES)
-                found[entry.name] = entry, leases.parsed(Path(entry.name), content)
-        return found
+                runs[entry.name] = entry, leases.parsed(Path(entry.name), content)
+        return runs
 
-    def exclusively(self, key: str, what: str) -> contextlib.AbstractContextManager[None]:
-        """Do nothing: here of two that do the same one finds out when it creates a name."""
+    def exclusively(self, key: str, work: str) -> contextlib.AbstractContextManager[None]:
+        """Do nothing: of two processes that do the same work, the second fails to create the name."""
         return contextlib.nullcontext()
 
     # ---- objects
 
     def sizes(self, names: Collection[str]) -> dict[str, int]:
         """Return the bytes of those objects that are there."""
-        found = self._looked("objects", {layout.object_name(name): name for name in names})
-        return {name: entry.bytes for name, entry in found.items()}
+        entries = self._entries_at("objects", {layout.object_name(name): name for name in names})
+        return {name: entry.bytes for name, entry in entries.items()}
 
     def present(self, keys: Iterable[str]) -> set[str]:
         """Return those keys that have a record, sound or not."""
-        return set(self._looked("records", {layout.record_name(key): key for key in keys}))
+        return set(self._entries_at("records", {layout.record_name(key): key for key in keys}))
 
-    def _looked(self, folder: str, wanted: Mapping[str, str]) -> dict[str, Entry]:
-        """Return what the place states of those names (values) that lie at a path (keys) of a folder.
+    def _entries_at(self, folder: str, names_by_path: Mapping[str, str]) -> dict[str, Entry]:
+        """Return the entries of the names (values) whose paths (keys) exist in a folder.
 
-        The folder is listed for as long as that costs no more than a look at each; the rest is looked at.
+        The folder is listed as long as that costs no more than single requests; the remaining paths are requested.
         """
-        found: dict[str, Entry] = {}
-        left = dict(wanted)
-        if len(left) > _LISTED:
+        entries_by_name: dict[str, Entry] = {}
+        remaining = dict(names_by_path)
+        if len(remaining) > _LISTED:
             listing = self.files.list(folder)
-            budget = _PAGE * (len(left) // _LISTED)
+            budget = _PAGE * (len(remaining) // _LISTED)
             for entry in itertools.islice(listing, budget):
-                name = left.pop(entry.name, None)
+                name = remaining.pop(entry.name, None)
                 if name is not None:
-                    found[name] = entry
+                    entries_by_name[name] = entry
                 budget -= 1
-                if not left:
-                    return found
-            if budget > 0:  # that was all
-                return found
-        entries = threads.map_in_threads(self.files.stat, left, AT_ONCE)
-        return found | {left[path]: entry for path, entry in zip(left, entries, strict=True) if entry is not None}
+                if not remaining:
+                    return entries_by_name
+            if budget > 0:  # The listing is complete
+                return entries_by_name
+        entries = threads.map_in_threads(self.files.stat, remaining, AT_ONCE)
+        return entries_by_name | {
+            remaining[path]: entry for path, entry in zip(remaining, entries, strict=True) if entry is not None
+        }
 
     def has(self, name: str, size: int | None = None) -> bool:
         """Return whether an object of this digest (and size in bytes) is there; its bytes are not looked at."""
@@ -209,9 +212,9 @@ class RemoteStore:
     def blocks(self, name: str, size: int | None = None) -> Iterator[bytes]:
         """Yield the content of an object block by block. Raises as `read` does, where it is damaged after the last block."""
         hashed = hashlib.sha256()
-        limit = sys.maxsize if size is None else most(size)
+        limit = sys.maxsize if size is None else read_limit(size)
         try:
-            for block in self._found(name, limit):
+            for block in self._stored_blocks(name, limit):
                 hashed.update(block)
                 yield block
         except regular.IrregularError as error:
@@ -222,8 +225,8 @@ class RemoteStore:
                 f"replaces it."
             )
 
-    def _found(self, name: str, limit: int) -> Iterator[bytes]:
-        """Yield what is kept as an object, or was moved aside by a collection that runs or was killed."""
+    def _stored_blocks(self, name: str, limit: int) -> Iterator[bytes]:
+        """Yield the content of an object, also of one that a running or killed collection moved aside."""
         try:
             yield from self.files.blocks(layout.object_name(name), limit)
             return
@@ -233,7 +236,7 @@ class RemoteStore:
             with contextlib.suppress(FileNotFoundError):
                 yield from self.files.blocks(entry.name, limit)
                 return
-        try:  # it was put back in between
+        try:  # It may have been put back meanwhile
             yield from self.files.blocks(layout.object_name(name), limit)
         except FileNotFoundError:
             raise AbsentError(f"Object {name[:12]} is not in the store {self.place}.") from None
@@ -266,18 +269,18 @@ class RemoteStore:
         *,
         replace: bool = False,
     ) -> dict[str, Any]:
-        """Record that ``identity`` gave ``result`` and return the record that holds: the first to finish wins.
+        """Record that ``identity`` gave ``result`` and return the valid record: the first to finish wins.
 
-        A damaged one is replaced, and with ``replace`` any that was there; else that one holds.
+        An existing record stays valid unless it is damaged or ``replace`` is set.
         """
         key = digest(identity)
         record, content = record_content(identity, result, provenance)
         for _ in range(_TRIES):
             if self.files.create(layout.record_name(key), content):
                 return record
-            there = None if replace else self.record(key)
-            if there is not None:
-                return there
+            existing = None if replace else self.record(key)
+            if existing is not None:
+                return existing
             self.files.delete(layout.record_name(key))
         raise TacpipeError(
             f"Others replace the record {key[:12]} in {self.place} all the time. Run the same command again."
@@ -302,11 +305,11 @@ class RemoteStore:
         return self.records(self.noted(manifest) or None)
 
     def _keys(self, name: str) -> list[str]:
-        """Return the keys that a snapshot notes, none where it is damaged: records save work, no result rests on them."""
+        """Return the keys in a snapshot; none if it is damaged: records save work, but no result depends on them."""
         with contextlib.suppress(FileNotFoundError, ValueError, RecursionError, regular.IrregularError):
-            found = json.loads(self.files.read(name, regular.JSON_BYTES))
-            if isinstance(found, list):
-                return [key for key in found if isinstance(key, str) and DIGEST.fullmatch(key)]
+            keys = json.loads(self.files.read(name, regular.JSON_BYTES))
+            if isinstance(keys, list):
+                return [key for key in keys if isinstance(key, str) and DIGEST.fullmatch(key)]
         return []
 
     def records(self, keys: Iterable[str] | None = None) -> Iterator[tuple[str, dict[str, Any]]]:

@@ -14,8 +14,8 @@ from tacpipe.io import threads
 from tacpipe.store.backend import AT_ONCE, Backend, read_twice
 from tacpipe.store.roots import PUSHED, ROOT_BYTES, Root, decoded, encoded, name_of, project_id, succeeding
 
-_OUTPUT = "output"  # whether a command wrote it, which worked on the bucket as its own store
-_NUMBER = "number"  # of the version that a root was read from; it is not kept
+_OUTPUT = "output"  # Marks a root that a command wrote with the bucket as its store
+_NUMBER = "number"  # Version that a root was read from; it is not stored
 _VERSION = re.compile(r"roots/([0-9a-f]{64})(?:/([0-9]{8}))?\.json")
 
 
@@ -41,15 +41,16 @@ class RemoteRoots:
         return None
 
     def pushed(self, name: str, project: str = "") -> Root | None:
-        """Return what the project of this id pushed as ``name``, or None.
+        """Return the root that a project pushed as ``name``, or None.
 
-        Raises `DamagedError` where nobody knows any more what it was.
+        Raises `DamagedError` if its newest version is damaged.
         """
-        wanted = name_of(PUSHED, name, project)
-        for one, root in self._read(wanted):
+        digest_of_name = name_of(PUSHED, name, project)
+        for root_name, root in self._read(digest_of_name):
             if root is None:
                 raise DamagedError(
-                    f"The newest file in {self.files.place}/roots/{one} is damaged: it was read twice, with the same bytes. "
+                    f"The newest file in {self.files.place}/roots/{root_name} is damaged: it was read twice, "
+                    f"with the same bytes. "
                     f"Delete it, and the one before it counts."
                 )
             return root
@@ -65,22 +66,24 @@ class RemoteRoots:
         lasting: bool,
         output: bool = False,
     ) -> bool:
-        """Note that a project pushed ``manifest`` as its dataset ``name``, after ``before``, as `pushed` gave it.
+        """Note that a project pushed ``manifest`` as its dataset ``name``, after ``before``, which `pushed` returned.
 
-        What was pushed stays in the history until it is forgotten. The ``output`` of a command is no such snapshot: the next
-        output takes its place, unless it is ``lasting``. Returns False where another push came first, and nothing was noted.
+        Pushed versions stay in the history until they are forgotten. The ``output`` of a command is no snapshot: the next
+        output replaces it, unless it is ``lasting``. Returns False without a change if another push came first.
         """
-        kept = before is not None and not before.get(_OUTPUT)  # as a snapshot
+        is_snapshot = before is not None and not before.get(_OUTPUT)  # True for a snapshot
         same = before is not None and before["manifest"] == manifest and before.get("project") == project
-        if same and (output or kept):
+        if same and (output or is_snapshot):
             return True
         root = {"path": name, "kind": PUSHED, "project": dict(project)}
         number = before.get(_NUMBER, 0) if before is not None and _name(before) == _name(root) else 0
         succeeded = succeeding(before, manifest, lasting=lasting)
-        if before is not None and not kept and not lasting:
-            succeeded["history"] = [one for one in succeeded["history"] if one["manifest"] != before["manifest"]]
-        stated = {_OUTPUT: True} if output else {}
-        return self._succeed({**root, **succeeded, **stated, _NUMBER: number})
+        if before is not None and not is_snapshot and not lasting:
+            succeeded["history"] = [
+                version for version in succeeded["history"] if version["manifest"] != before["manifest"]
+            ]
+        flags = {_OUTPUT: True} if output else {}
+        return self._succeed({**root, **succeeded, **flags, _NUMBER: number})
 
     def write(self, root: Root) -> None:
         """Have ``root`` succeed its last version, as `all` gave it. Raises `TacpipeError` where another one came first."""
@@ -109,9 +112,9 @@ class RemoteRoots:
             self.files.delete(_version(name, number - 2))
         return True
 
-    def _read(self, wanted: str = "") -> Iterator[tuple[str, Root | None]]:
-        """Yield the name of each root, or of the one that is ``wanted``, and its newest version; None for a damaged one."""
-        newest = {name: found[-1] for name, found in self._versions(wanted).items()}
+    def _read(self, only: str = "") -> Iterator[tuple[str, Root | None]]:
+        """Yield the name of each root, or of ``only`` one, and its newest version; None for a damaged one."""
+        newest = {name: versions[-1] for name, versions in self._versions(only).items()}
         return zip(newest, threads.map_in_threads(self._at, newest.values(), AT_ONCE), strict=True)
 
     def _at(self, version: tuple[int, str]) -> Root | None:
@@ -121,16 +124,16 @@ class RemoteRoots:
             return None if root is None else {**root, _NUMBER: number}
         return None
 
-    def _versions(self, wanted: str = "") -> dict[str, list[tuple[int, str]]]:
-        """Return number and file of the versions of each root, the newest last; a root of a folder that was copied is 0."""
-        found: dict[str, list[tuple[int, str]]] = {}
-        entries = list(self.files.list(f"roots/{wanted}" if wanted else "roots"))
-        copied = self.files.stat(f"roots/{wanted}.json") if wanted and not entries else None
+    def _versions(self, only: str = "") -> dict[str, list[tuple[int, str]]]:
+        """Return number and file of the versions of each root, the newest last; roots of a copied folder have number 0."""
+        versions: dict[str, list[tuple[int, str]]] = {}
+        entries = list(self.files.list(f"roots/{only}" if only else "roots"))
+        copied = self.files.stat(f"roots/{only}.json") if only and not entries else None
         for entry in [*entries, *([copied] if copied else [])]:
             match = _VERSION.fullmatch(entry.name)
             if match is not None:
-                found.setdefault(match[1], []).append((int(match[2] or 0), entry.name))
-        return {name: sorted(found[name]) for name in sorted(found)}
+                versions.setdefault(match[1], []).append((int(match[2] or 0), entry.name))
+        return {name: sorted(versions[name]) for name in sorted(versions)}
 
 
 def _parse(content: bytes) -> Root | None:

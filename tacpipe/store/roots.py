@@ -35,22 +35,22 @@ class Roots:
         self.store = store
 
     def set(self, path: Path, manifest: str, *, durable: bool = False, lasting: bool = False, key: str = "") -> None:
-        """Note that ``path`` now holds ``manifest``, which the run of ``key`` gave; the one before goes into the history.
+        """Note that ``path`` now holds ``manifest``, the result of the run ``key``; the previous one goes into the history.
 
-        That one is ``lasting`` where it held recordings or labels that are not in the new one: `gc` then keeps it.
+        The previous one is ``lasting`` if it held recordings or labels that the new one lacks: `gc` then keeps it.
         """
-        kind, name = self.named(path)
-        known = self.get(path)
-        if known is None or known["manifest"] != manifest:
-            pushed = {"pushed": known["pushed"]} if known and "pushed" in known else {}
-            stated = {**pushed, **({"key": key} if key else {})}
-            self.write({"path": name, "kind": kind, **succeeding(known, manifest, lasting=lasting), **stated})
+        kind, name = self.kind_and_name(path)
+        current = self.get(path)
+        if current is None or current["manifest"] != manifest:
+            pushed = {"pushed": current["pushed"]} if current and "pushed" in current else {}
+            extra = {**pushed, **({"key": key} if key else {})}
+            self.write({"path": name, "kind": kind, **succeeding(current, manifest, lasting=lasting), **extra})
         if durable:
             self.store.sync(self._file(kind, name))
 
     def get(self, path: Path) -> Root | None:
         """Return the root of ``path``, or None; its ``path`` is where the dataset lies now."""
-        return self.at(self._file(*self.named(path)))
+        return self.at(self._file(*self.kind_and_name(path)))
 
     def push(self, name: str, project: Mapping[str, str], manifest: str, before: Root | None, *, lasting: bool) -> bool:
         """Note that a project (``id`` and ``name``) pushed ``manifest`` as its dataset ``name``, after ``before``.
@@ -69,16 +69,16 @@ class Roots:
         return self.at(self._file(PUSHED, name, project))
 
     def note_pushed(self, path: Path, manifest: str) -> None:
-        """Note that ``manifest`` of ``path`` went to another store; a path without a root has nothing to note it in."""
+        """Note that ``manifest`` of ``path`` was pushed to another store; do nothing for a path without a root."""
         root = self.get(path)
         if root is not None:
-            earlier = [one for one in root.get("pushed", []) if one != manifest]
+            earlier = [pushed for pushed in root.get("pushed", []) if pushed != manifest]
             self.write({**root, "pushed": [manifest, *earlier][:PUSHES]})
 
     def all(self) -> list[Root]:
         """Return all roots. Damaged ones are quarantined: the next run of their stage writes them anew."""
-        found = (self.at(path) for path in self.store.listed("roots", "*.json"))
-        return [root for root in found if root is not None]
+        roots = (self.at(path) for path in self.store.listed("roots", "*.json"))
+        return [root for root in roots if root is not None]
 
     def remove(self, root: Root) -> None:
         """Remove a root, as `all` gave it, whatever its file is called."""
@@ -95,7 +95,7 @@ class Roots:
         self.store.write_file(self._file(kind, name, project_id(root)), encoded({**root, "path": name, "kind": kind}))
 
     def at(self, file: Path) -> Root | None:
-        """Return the root that lies in ``file``; None if none does, and a damaged one is quarantined."""
+        """Return the root in ``file``; None if the file does not exist or is damaged, in which case it is quarantined."""
         try:
             with readable_errors(self.store.root, reading=True):
                 value = regular.json_value(file, ROOT_BYTES)
@@ -108,8 +108,8 @@ class Roots:
             if DIGEST.fullmatch(file.stem):  # another name is not one of ours
                 self.store.quarantine(file)
             return None
-        beside = root["kind"] == BESIDE
-        return {**root, "path": str(self.store.root.parent / root["path"])} if beside else root
+        is_relative = root["kind"] == BESIDE
+        return {**root, "path": str(self.store.root.parent / root["path"])} if is_relative else root
 
     def damaged(self) -> list[str]:
         """Return the names of roots that were damaged and not written anew: nobody knows which datasets they represented."""
@@ -118,10 +118,10 @@ class Roots:
 
     def is_of(self, name: str, path: Path) -> bool:
         """Return whether the root of this name represents the dataset at ``path``."""
-        return self._file(*self.named(path)).stem == name
+        return self._file(*self.kind_and_name(path)).stem == name
 
-    def own(self, root: Root) -> bool:
-        """Return whether this user wrote a root: in a shared store another one's may name any path."""
+    def is_own(self, root: Root) -> bool:
+        """Return whether this user wrote a root: in a shared store, roots of other users may name any path."""
         kind, name = root["kind"], str(root["path"])
         if kind == BESIDE and Path(name).is_absolute():
             name = os.path.relpath(name, self.store.root.parent)
@@ -131,11 +131,11 @@ class Roots:
         except FileNotFoundError:
             return False
 
-    def named(self, path: Path) -> tuple[str, str]:
-        """Return kind and name of a root: relative where the dataset lies next to its store, so that both can move."""
-        beside = self.store.root.parent
-        if self.store.root.name == BESIDE_NAME and path.is_relative_to(beside):
-            return BESIDE, str(path.relative_to(beside))
+    def kind_and_name(self, path: Path) -> tuple[str, str]:
+        """Return kind and name of a root: a relative path if the dataset lies next to its store, so that both can move."""
+        parent = self.store.root.parent
+        if self.store.root.name == BESIDE_NAME and path.is_relative_to(parent):
+            return BESIDE, str(path.relative_to(parent))
         return ABSOLUTE, str(path)
 
     def _file(self, kind: str, name: str, project: str = "") -> Path:
@@ -143,9 +143,9 @@ class Roots:
 
 
 def name_of(kind: str, name: str, project: str = "") -> str:
-    """Return the digest under which a root is kept."""
-    named: Any = name if kind == ABSOLUTE else [kind, project, name] if project else [kind, name]
-    return digest(named)
+    """Return the digest that names the file of a root."""
+    parts: Any = name if kind == ABSOLUTE else [kind, project, name] if project else [kind, name]
+    return digest(parts)
 
 
 def encoded(root: Mapping[str, Any]) -> bytes:
@@ -158,7 +158,7 @@ def decoded(value: Any) -> Root | None:
     """Return the root that a JSON value holds, None for one that is damaged."""
     root: Root = dict(value) if isinstance(value, dict) else {}
     check = root.pop("check", None)
-    if check is None and "kind" not in root and isinstance(root.get("path"), str):  # as they were once written
+    if check is None and "kind" not in root and isinstance(root.get("path"), str):  # Roots of version 0.1
         root["kind"] = ABSOLUTE if Path(root["path"]).is_absolute() else PUSHED
         return root if _formed(root) else None
     return root if check is not None and check == digest(root) and _formed(root) else None
@@ -169,37 +169,43 @@ def project_id(root: Mapping[str, Any]) -> str:
     return str(root.get("project", {}).get("id", ""))
 
 
-def succeeding(known: Root | None, manifest: str, *, lasting: bool) -> Root:
-    """Return what a root states of ``manifest`` and of those before it, the newest of which is that of ``known``."""
-    history = [] if known is None else _history(known, manifest, lasting=lasting)
-    previous = None if known is None else known["manifest"]
+def succeeding(current: Root | None, manifest: str, *, lasting: bool) -> Root:
+    """Return the fields of a root for ``manifest`` and its history, which begins with the manifest of ``current``."""
+    history = [] if current is None else _history(current, manifest, lasting=lasting)
+    previous = None if current is None else current["manifest"]
     return {"manifest": manifest, "previous": previous, "written_s": int(time.time()), "history": history}
 
 
 def _formed(root: Root) -> bool:
-    """Return whether the values of a root are of the types that one has: another program may have written it."""
+    """Return whether the values of a root have the right types: another program may have written it."""
     project, history = root.get("project", {"id": "", "name": ""}), root.get("history", [])
-    if not (isinstance(project, dict) and isinstance(history, list) and all(isinstance(one, dict) for one in history)):
+    if not (
+        isinstance(project, dict)
+        and isinstance(history, list)
+        and all(isinstance(version, dict) for version in history)
+    ):
         return False
     texts = [root.get("path"), *(project.get(key) for key in ("id", "name"))]
-    texts += [one.get("manifest") for one in (root, *history)]
-    times = [one.get("written_s", 0) for one in (root, *history)] + [root.get("missing_since_s", 0)]
+    texts += [version.get("manifest") for version in (root, *history)]
+    times = [version.get("written_s", 0) for version in (root, *history)] + [root.get("missing_since_s", 0)]
     return (
         all(isinstance(text, str) and "\0" not in text for text in texts)
         and all(isinstance(time_s, int) and 0 <= time_s < _LATEST_S for time_s in times)
-        and all(isinstance(one.get("lasting"), bool) for one in history)
+        and all(isinstance(version.get("lasting"), bool) for version in history)
         and isinstance(root.get("previous"), str | None)
         and root.get("kind") in (BESIDE, ABSOLUTE, PUSHED)
     )
 
 
-def _history(known: Root, manifest: str, *, lasting: bool) -> list[dict[str, Any]]:
-    """Return what a path held before it held ``manifest``, newest first: all that is lasting, and `HISTORY` others."""
-    newest = {"manifest": known["manifest"], "written_s": known.get("written_s", 0), "lasting": lasting}
-    older = [one for one in known.get("history", []) if one["manifest"] not in (manifest, newest["manifest"])]
-    kept, room = [], HISTORY
-    for one in [newest, *older]:
-        room -= not one["lasting"]
-        if one["lasting"] or room >= 0:
-            kept.append(one)
-    return kept
+def _history(current: Root, manifest: str, *, lasting: bool) -> list[dict[str, Any]]:
+    """Return the versions before ``manifest``, newest first: all lasting ones and `HISTORY` others."""
+    newest = {"manifest": current["manifest"], "written_s": current.get("written_s", 0), "lasting": lasting}
+    older = [
+        version for version in current.get("history", []) if version["manifest"] not in (manifest, newest["manifest"])
+    ]
+    retained, room = [], HISTORY
+    for version in [newest, *older]:
+        room -= not version["lasting"]
+        if version["lasting"] or room >= 0:
+            retained.append(version)
+    return retained

@@ -34,7 +34,7 @@ class AbsentError(MissingError):
 
 @dataclass(frozen=True)
 class Object:
-    """What a manifest states of stored content."""
+    """Digest and size of stored content."""
 
     digest: str
     bytes: int
@@ -47,7 +47,7 @@ class Store:
     """
 
     at_once = 1  # objects that a transfer reads or writes at once
-    distant = False  # whether it is kept elsewhere, and this folder lies in front of that
+    distant = False  # True for the local cache of a remote store
 
     def __init__(self, root: Path | str, run: str = "") -> None:
         self.root = Path(root)
@@ -93,7 +93,7 @@ class Store:
     @contextlib.contextmanager
     def at_work(self, manifests: Iterable[str] = ()) -> Iterator[None]:
         """Announce to `gc` while in the block what is read (``manifests`` and all they name), put and reused."""
-        if self._run is not None:  # within a larger piece of work, which has its lease
+        if self._run is not None:  # The surrounding work holds the lease
             self._run.announce(manifests)
             yield
             return
@@ -117,9 +117,9 @@ class Store:
         if self._run is not None:
             self._run.close()
 
-    def exclusively(self, key: str, what: str) -> contextlib.AbstractContextManager[None]:
+    def exclusively(self, key: str, work: str) -> contextlib.AbstractContextManager[None]:
         """Hold the lease of ``key`` within the block, as `Leases.hold` does."""
-        return self.leases.hold(key, what)
+        return self.leases.hold(key, work)
 
     @property
     def run(self) -> str:
@@ -151,18 +151,20 @@ class Store:
 
     def _lies(self, name: str, size: int | None = None) -> bool:
         try:
-            found = self.files.stat(layout.object_name(name))
+            entry = self.files.stat(layout.object_name(name))
         except regular.IrregularError:
             self.quarantine(self.object_path(name))
             return self._put_back(name)
-        if found is None:
+        if entry is None:
             return self._put_back(name)
-        return size is None or found.bytes == size
+        return size is None or entry.bytes == size
 
     def sizes(self, names: Iterable[str]) -> dict[str, int]:
-        """Return the bytes of those objects that are there."""
-        there = (name for name in names if self._lies(name))
-        return {name: entry.bytes for name in there if (entry := self.files.stat(layout.object_name(name))) is not None}
+        """Return the sizes in bytes of the objects that are stored."""
+        stored = (name for name in names if self._lies(name))
+        return {
+            name: entry.bytes for name in stored if (entry := self.files.stat(layout.object_name(name))) is not None
+        }
 
     def room(self) -> int | None:
         """Return how many bytes the disk has left, None where that is not known."""
@@ -172,21 +174,20 @@ class Store:
     def put(self, content: bytes, *, durable: bool = False) -> Object:
         """Store ``content`` and return its digest and size.
 
-        An object that is there already is kept, after a look at its size: a damaged one is found on reading. What cannot
-        be recomputed is ``durable``: the folders above it are synced too, and a copy that is there already is read and
-        replaced if it is damaged.
+        An existing object of the same size is kept; damage is detected on reading. Content that cannot be recomputed is
+        ``durable``: the folders above it are synced too, and an existing copy is read and replaced if it is damaged.
         """
         name = bytes_digest(content)
         path = self.object_path(name)
         self.announce([name])
-        there = False
+        is_stored = False
         with contextlib.suppress(MissingError):
             if durable:
                 self._read(name, len(content))
-            there = self._lies(name, len(content))
-        if not there:
+            is_stored = self._lies(name, len(content))
+        if not is_stored:
             self.write_file(path, content, mode=0o444)
-        if durable:  # whoever put it there
+        if durable:  # Also if another process stored it
             self.sync(path)
         return Object(name, len(content))
 
@@ -235,7 +236,7 @@ class Store:
 
     def _read(self, name: str, size: int | None = None) -> bytes:
         try:
-            content = self.files.read(layout.object_name(name), None if size is None else most(size))
+            content = self.files.read(layout.object_name(name), None if size is None else read_limit(size))
         except FileNotFoundError:
             if self._put_back(name):
                 return self._read(name, size)
@@ -251,7 +252,7 @@ class Store:
         hashed = hashlib.sha256()
         try:
             self._lies(name)  # puts back what a collection moved aside
-            for block in self.files.blocks(layout.object_name(name), sys.maxsize if size is None else most(size)):
+            for block in self.files.blocks(layout.object_name(name), sys.maxsize if size is None else read_limit(size)):
                 hashed.update(block)
                 yield block
         except FileNotFoundError:
@@ -272,8 +273,8 @@ class Store:
 
     def _damaged(self, name: str) -> MissingError:
         moved = self.quarantine(self.object_path(name))
-        where = f"is now in {self._root}/quarantine" if moved else "cannot be moved out of the way"
-        return MissingError(f"Object {name[:12]} was damaged and {where}.")
+        outcome = f"is now in {self._root}/quarantine" if moved else "cannot be moved out of the way"
+        return MissingError(f"Object {name[:12]} was damaged and {outcome}.")
 
     def quarantine(self, path: str | Path) -> bool:
         """Move a damaged file out of the way, for whoever wants to know why; return False where nothing may be moved."""
@@ -294,8 +295,8 @@ class Store:
         """Return whether an object of this digest was damaged, lies in quarantine, and was not recomputed."""
         return bool(self.listed("quarantine", f"{name}.*")) and not self.has(name)
 
-    def aside(self, name: str) -> str:
-        """Return where a collection keeps an object between its first look at what is needed and its second."""
+    def aside_path(self, name: str) -> str:
+        """Return the path at which a collection keeps an object between its first and its second check."""
         return f"{self._root}/tmp/{layout.ASIDE}{name}"
 
     def _put_back(self, name: str) -> bool:
@@ -307,9 +308,9 @@ class Store:
             return False
         try:
             return self.files.move(f"tmp/{layout.ASIDE}{name}", layout.object_name(name))
-        except StorageError:  # of a store that may only be read, whether or not anything is aside
+        except StorageError:  # The store may be read-only
             with readable_errors(self.root):
-                if present(self.aside(name)):
+                if present(self.aside_path(name)):
                     raise
             return False
 
@@ -319,12 +320,12 @@ class Store:
             sync_folders(os.path.dirname(path), self._root)  # noqa: PTH120
 
     def listed(self, *patterns: str) -> list[Path]:
-        """Return the paths in the store that match a pattern a level. Raises `TacpipeError` for folders it cannot list."""
-        found = [self.root]
+        """Return the paths that match one pattern per level. Raises `TacpipeError` for folders it cannot list."""
+        paths = [self.root]
         with readable_errors(self.root):
             for pattern in patterns:
-                found = [path for folder in found for path in listed(folder, pattern)]
-        return found
+                paths = [path for folder in paths for path in listed(folder, pattern)]
+        return paths
 
     def write_file(
         self, path: Path | str, content: bytes | Iterable[bytes], *, mode: int = 0o666, exclusive: bool = False
@@ -377,19 +378,19 @@ class Store:
         replace: bool = False,
         durable: bool = False,
     ) -> dict[str, Any]:
-        """Record that ``identity`` gave ``result`` and return the record that holds: the first to finish wins.
+        """Record that ``identity`` gave ``result`` and return the valid record: the first to finish wins.
 
-        ``replace`` is for results whose old record names objects that are gone.
+        ``replace`` is for results whose old record names missing objects.
         """
         key = digest(identity)
         record, content = record_content(identity, result, provenance)
         path = self.record_path(key)
-        for _ in range(2):  # a second time if the record that was there turns out to be damaged
+        for _ in range(2):  # A second attempt, in case the existing record is damaged
             if self.write_file(path, content, exclusive=not replace):
                 break
-            there = self.record(key)
-            if there is not None:
-                record = there
+            existing = self.record(key)
+            if existing is not None:
+                record = existing
                 break
         if durable:
             self.sync(path)
@@ -424,14 +425,14 @@ def record_content(
 
 
 def sound(record: dict[str, Any], key: str) -> bool:
-    """Return whether a record is the key's own, and all of it is as it was written (older ones have no check)."""
+    """Return whether a record belongs to the key and is unchanged since it was written (old ones have no check)."""
     identity, result = canonical(record["identity"]), canonical(record["result"])  # once: a store has many records
     body = b'{"identity":%b,"result":%b}' % (identity, result)
-    whole = set(record) <= {"identity", "result", "digest", "provenance", "check"}
-    whole = whole and ("check" not in record or record["check"] == digest(record["provenance"]))
-    return whole and bytes_digest(identity) == key and bytes_digest(body) == record["digest"]
+    is_valid = set(record) <= {"identity", "result", "digest", "provenance", "check"}
+    is_valid = is_valid and ("check" not in record or record["check"] == digest(record["provenance"]))
+    return is_valid and bytes_digest(identity) == key and bytes_digest(body) == record["digest"]
 
 
-def most(size: int) -> int:
-    """Return how many bytes of an object of this declared size are read: a small one that has grown is quarantined."""
+def read_limit(size: int) -> int:
+    """Return how many bytes of an object of this declared size are read: a small one that grew is quarantined."""
     return max(size, memory.AT_HAND)

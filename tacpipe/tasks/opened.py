@@ -65,7 +65,7 @@ def _command(step: Mapping[str, Any]) -> str:
 
     usual = params.to_input(params.from_json(registry.load(step["stage"]), {}))
     words = [step["stage"].replace(".", " ")]
-    for name, value in params.named(step["stage"], step["params"]).items():
+    for name, value in params.with_current_names(step["stage"], step["params"]).items():
         if usual.get(name) != value:
             option = name.replace("_", "-")
             words.append(f"--{'' if value else 'no-'}{option}" if isinstance(value, bool) else f"--{option} {value}")

@@ -35,7 +35,7 @@ def open_trackers(options: Sequence[str]) -> dict[str, Tracker]:
     trackers = {}
     for text in options:
         name, _, place = text.partition(":")
-        with extras.named(f"The tracker {name}"):
+        with extras.explain_missing(f"The tracker {name}"):
             trackers[text] = registry.load_tracker(name)(place)
     return trackers
 

@@ -64,7 +64,7 @@ def draw(contents: Contents, path: Path) -> None:
     lines = panels(contents)
     if not lines and not contents.taxels:
         raise UsageError(f"Recording {contents.name} has no stream with times, so there is nothing to plot.")
-    with extras.named("A picture"):
+    with extras.explain_missing("A picture"):
         import matplotlib
     with matplotlib.rc_context({"svg.hashsalt": "recording", "font.size": 9, "axes.titlesize": 9, "text.color": TEXT}):
         figure = _over_time(contents, lines) if lines else _at_once(contents)

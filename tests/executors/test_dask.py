@@ -65,8 +65,8 @@ def test_a_worker_with_other_versions_is_refused_in_one_sentence(
     lab: Apart, scheduler: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     lab.run("simulate toy -o data/rec --jobs 1")
-    versions = agreement.here
-    monkeypatch.setattr(agreement, "here", lambda stage: {**versions(stage), "numpy": "0.1"})
+    versions = agreement.local_versions
+    monkeypatch.setattr(agreement, "local_versions", lambda stage: {**versions(stage), "numpy": "0.1"})
     ran = lab.inside(f"scale data/rec -o data/out --executor {scheduler}")
     assert ran.code == 2
     assert "(here 0.1)" in ran.err

@@ -77,9 +77,9 @@ for package in (tacpipe, tacpipe_stages):
         try:
             importlib.import_module(module.name)
         except ModuleNotFoundError as error:
-            if extras.of(error.name) is None:
+            if extras.extra_for(error.name) is None:
                 raise
-            lacking.setdefault(extras.of(error.name), []).append(module.name)
+            lacking.setdefault(extras.extra_for(error.name), []).append(module.name)
 for extra, modules in lacking.items():
     print(f"  {len(modules)} modules need the extra {extra}")
 assert not lacking or sys.argv[1] != "all", lacking

@@ -217,7 +217,7 @@ class Trials:
 def call(command: str) -> Ran:
     """Run a command as the program does."""
     hashing._remembered.clear()  # A new process has nothing in memory.
-    execution._known.clear()
+    execution._makers_by_object.clear()
     out, err = io.StringIO(), io.StringIO()
     sys.argv = ["tacpipe", *shlex.split(command)]
     signal.alarm(LIMIT_S)

@@ -601,7 +601,7 @@ def test_results_are_sent_while_others_are_computed_and_objects_still_come_befor
         if not name.startswith("records/"):
             return create(name, content)
         assert isinstance(content, bytes)
-        for wanted in records.named(json.loads(content)["result"]):
+        for wanted in records.digests(json.loads(content)["result"]):
             assert files.stat(f"objects/{wanted[:2]}/{wanted}") is not None, name
         with lock:
             under_way[0] += 1
@@ -634,7 +634,7 @@ def test_what_another_computer_made_meanwhile_is_not_computed_where_many_are_loo
         if identity.get("stage") in tasks:
             tasks[identity["stage"]].append(Task(computers.address, identity["stage"], identity))
     computers.enter("second")
-    done = list(computing.compute.each(tasks["simulate.toy"]))
+    done = list(computing.compute.compute_all(tasks["simulate.toy"]))
     assert len(done) == 12 and not any(one.made for one in done)
 
 

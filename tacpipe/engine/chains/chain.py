@@ -14,7 +14,7 @@ from tacpipe.errors import UsageError
 from tacpipe.io import regular, yaml_text
 from tacpipe.printable import excerpt, listed, plain
 
-PARAMS = "params.yaml"  # whose values every text may use
+PARAMS = "params.yaml"  # Its values can be used in every text
 _OUTPUTS = ("outs", "metrics", "plots")
 _SHOWN = 8  # names of stages that an error lists
 
@@ -54,7 +54,7 @@ _EXPECTED = {
 class ChainStage:
     """One stage of a chain: its commands in their order, and the paths that it reads and writes."""
 
-    name: str  # with what follows ``@`` where it is one of several
+    name: str  # Full name, with the part after ``@`` in a group
     commands: Sequence[str]
     reads: Sequence[str]
     writes: Sequence[str]
@@ -74,12 +74,12 @@ class Chain:
     after: Mapping[str, frozenset[str]]
 
 
-def load(file: Path, wanted: Sequence[str] = ()) -> Chain:
+def load(file: Path, names: Sequence[str] = ()) -> Chain:
     """Return the stages of a file of the format of ``dvc.yaml``, in their order.
 
-    ``wanted`` are names of stages, or of groups of them (``train`` for every ``train@…``): then it is these and all that
-    they depend on. Raises `UsageError` for a file that is not such a one, for what DVC knows and this does not, for names
-    that are not in it, and where stages depend on each other in a circle.
+    ``names`` are stages or groups of stages (``train`` for every ``train@…``); with them, only these and the stages that
+    they depend on are returned. Raises `UsageError` for a file that is no such chain, for parts of DVC's format that are
+    not supported, for unknown names, and for stages that depend on each other in a circle.
     """
     by_name: dict[str, ChainStage] = {}
     for stage in _stages(file):
@@ -91,7 +91,7 @@ def load(file: Path, wanted: Sequence[str] = ()) -> Chain:
         ordered = list(TopologicalSorter(after).static_order())
     except CycleError as error:
         raise UsageError(f"{file}: these stages depend on each other: {' -> '.join(error.args[1])}.") from None
-    needed = _needed(by_name, after, wanted, file)
+    needed = _needed(by_name, after, names, file)
     return Chain([by_name[name] for name in ordered if name in needed], after)
 
 
@@ -112,8 +112,8 @@ def _stages(file: Path) -> Iterator[ChainStage]:
                 if key not in definition:
                     raise UsageError(f"{place}: foreach and do belong together, and it has no {key}.")
             _check(definition["do"], _STAGE, f"{place}, do")
-        for key, given, known in template.several(definition, values, place):
-            yield _stage(f"{name}@{key}" if key else name, given, known, file, place)
+        for key, stage_definition, stage_values in template.expand(definition, values, place):
+            yield _stage(f"{name}@{key}" if key else name, stage_definition, stage_values, file, place)
 
 
 def _check(content: Mapping[str, Any], schema: Mapping[str, Any], place: str) -> None:
@@ -143,32 +143,32 @@ def _fits(value: Any, schema: Any) -> bool:
     return all(key in schema and _fits(item, schema[key]) for key, item in value.items())
 
 
-def _stage(name: str, given: Mapping[str, Any], values: template.Values, file: Path, where: str) -> ChainStage:
-    values = _values(file, given.get("vars", []), values, where)
-    used = {key: given[key] for key in ("cmd", "deps", "params", *_OUTPUTS, "wdir") if key in given}
-    made = template.filled(used, values, where)
-    commands = made["cmd"] if isinstance(given.get("cmd"), list) else [made.get("cmd")]
+def _stage(name: str, definition: Mapping[str, Any], values: template.Values, file: Path, place: str) -> ChainStage:
+    values = _values(file, definition.get("vars", []), values, place)
+    used = {key: definition[key] for key in ("cmd", "deps", "params", *_OUTPUTS, "wdir") if key in definition}
+    resolved = template.filled(used, values, place)
+    commands = resolved["cmd"] if isinstance(definition.get("cmd"), list) else [resolved.get("cmd")]
     if not commands or not all(isinstance(command, str) for command in commands):
-        raise UsageError(f"{where}: its cmd is {excerpt(made.get('cmd'))}; it must be {_EXPECTED['cmd']}.")
-    if posixpath.normpath(made.get("wdir", ".")) != ".":
+        raise UsageError(f"{place}: its cmd is {excerpt(resolved.get('cmd'))}; it must be {_EXPECTED['cmd']}.")
+    if posixpath.normpath(resolved.get("wdir", ".")) != ".":
         raise UsageError(
-            f"{where}: it has the wdir {excerpt(made['wdir'])}, which `tacpipe run` does not know. Write the paths "
+            f"{place}: it has the wdir {excerpt(resolved['wdir'])}, which `tacpipe run` does not know. Write the paths "
             f"relative to {file.name}, or run it with `dvc repro`."
         )
     folder = file.parent.absolute().as_posix()
     files = [
-        entry for entry in made.get("params", []) if isinstance(entry, Mapping)
+        entry for entry in resolved.get("params", []) if isinstance(entry, Mapping)
     ]  # params files other than params.yaml
-    reads = _paths([*made.get("deps", []), *files], folder, where)
-    writes = [path for kind in _OUTPUTS for path in dict.fromkeys(_paths(made.get(kind, []), folder, where))]
+    reads = _paths([*resolved.get("deps", []), *files], folder, place)
+    writes = [path for kind in _OUTPUTS for path in dict.fromkeys(_paths(resolved.get(kind, []), folder, place))]
     for path in writes:
         if path == "." or _is_within(folder, path):
-            raise UsageError(f"{where}: it writes {plain(path)}, the folder of {file.name}. Name what it writes there.")
+            raise UsageError(f"{place}: it writes {plain(path)}, the folder of {file.name}. Name what it writes there.")
         if path in reads or writes.count(path) > 1:
             raise UsageError(
-                f"{where}: it has {plain(path)} twice. Name a path once, under deps, outs, metrics or plots."
+                f"{place}: it has {plain(path)} twice. Name a path once, under deps, outs, metrics or plots."
             )
-    return ChainStage(name, [command.strip() for command in commands], reads, writes, given.get("frozen", False))
+    return ChainStage(name, [command.strip() for command in commands], reads, writes, definition.get("frozen", False))
 
 
 def _paths(entries: Sequence[Any], folder: str, place: str) -> list[str]:
@@ -190,23 +190,23 @@ def _is_within(path: str, folder: str) -> bool:
 def _values(file: Path, entries: Sequence[Any], before: template.Values, place: str) -> template.Values:
     """Return the values that texts may use: those of ``before``, and over them those of ``vars``."""
     values = dict(before)
-    for one in entries:
-        if isinstance(one, str) and one.endswith((".yaml", ".yml")):
-            one = _mapping(file.with_name(one))
-        if not isinstance(one, Mapping):
-            raise UsageError(f"{place}: vars has {excerpt(one)}; `tacpipe run` reads mappings and YAML files there.")
-        values = _merged(values, one)
+    for entry in entries:
+        if isinstance(entry, str) and entry.endswith((".yaml", ".yml")):
+            entry = _mapping(file.with_name(entry))
+        if not isinstance(entry, Mapping):
+            raise UsageError(f"{place}: vars has {excerpt(entry)}; `tacpipe run` reads mappings and YAML files there.")
+        values = _merged(values, entry)
     return values
 
 
 def _merged(before: template.Values, over: template.Values) -> dict[str, Any]:
-    both = {
+    merged = {
         key: _merged(before[key], value)
         if isinstance(value, Mapping) and isinstance(before.get(key), Mapping)
         else value
         for key, value in over.items()
     }
-    return {**before, **both}
+    return {**before, **merged}
 
 
 def _mapping(file: Path, *, missing: bool = False) -> Mapping[str, Any]:
@@ -227,15 +227,15 @@ def _mapping(file: Path, *, missing: bool = False) -> Mapping[str, Any]:
 
 
 def _dependencies(stages: Sequence[ChainStage], file: Path) -> dict[str, frozenset[str]]:
-    """Return the names of the stages that each stage reads an output of: a path, or what lies within one."""
+    """Return, for each stage, the names of the stages whose outputs it reads, or reads something within."""
     writers: dict[str, str] = {}
-    within: dict[str, set[str]] = {}  # folder to the stages that write below it
+    writers_below: dict[str, set[str]] = {}  # Maps a folder to the stages that write below it
     for stage in stages:
         for path in stage.writes:
             if writers.setdefault(path, stage.name) != stage.name:
                 raise UsageError(f"{file}: the stages {writers[path]} and {stage.name} both write {plain(path)}.")
             for folder in _above(path):
-                within.setdefault(folder, set()).add(stage.name)
+                writers_below.setdefault(folder, set()).add(stage.name)
     for path, name in writers.items():
         for folder in _above(path):
             if folder in writers:
@@ -244,9 +244,11 @@ def _dependencies(stages: Sequence[ChainStage], file: Path) -> dict[str, frozens
                 )
     after = {}
     for stage in stages:
-        found = {writers[one] for path in stage.reads for one in (path, *_above(path)) if one in writers}
-        found |= {name for path in stage.reads for name in within.get(path, ())}
-        after[stage.name] = frozenset(found - {stage.name})
+        providers = {
+            writers[location] for path in stage.reads for location in (path, *_above(path)) if location in writers
+        }
+        providers |= {name for path in stage.reads for name in writers_below.get(path, ())}
+        after[stage.name] = frozenset(providers - {stage.name})
     return after
 
 
@@ -257,20 +259,20 @@ def _above(path: str) -> Iterator[str]:
 
 
 def _needed(
-    stages: Mapping[str, ChainStage], after: Mapping[str, frozenset[str]], wanted: Sequence[str], file: Path
+    stages: Mapping[str, ChainStage], after: Mapping[str, frozenset[str]], names: Sequence[str], file: Path
 ) -> set[str]:
-    if not wanted:
+    if not names:
         return set(stages)
-    found: set[str] = set()
-    for name in wanted:
+    needed: set[str] = set()
+    for name in names:
         chosen = {stage.name for stage in stages.values() if name in (stage.name, stage.group)}
         if not chosen:
             groups = dict.fromkeys(stage.group for stage in stages.values())
             raise UsageError(f"{file} has no stage {plain(name)}; it has {listed(groups, _SHOWN)}.")
-        found |= chosen
-    waiting = list(found)
+        needed |= chosen
+    waiting = list(needed)
     while waiting:
-        new = after[waiting.pop()] - found
-        found |= new
+        new = after[waiting.pop()] - needed
+        needed |= new
         waiting += new
-    return found
+    return needed

@@ -15,82 +15,81 @@ _PART = re.compile(r"[^.\[\]]+")
 Values = Mapping[str, Any]
 
 
-def filled(value: Any, values: Values, where: str) -> Any:
-    """Return ``value``, each ``${name}`` in its texts replaced; a text that is one such name alone becomes its value.
+def filled(value: Any, values: Values, place: str) -> Any:
+    """Return ``value`` with each ``${name}`` in its texts replaced; a text that is only such a name becomes its value.
 
-    ``where`` names the place in errors. Raises `UsageError` for a name that has no value, and for a list or a mapping within
-    a text.
+    Errors state ``place``. Raises `UsageError` for a name that has no value, and for a list or a mapping within a text.
 
     >>> filled(["${a.b[1]}", "x-${a.c}"], {"a": {"b": [1, 2], "c": True}}, "dvc.yaml")
     [2, 'x-true']
     """
     if isinstance(value, Mapping):
-        return {filled(key, values, where): filled(one, values, where) for key, one in value.items()}
+        return {filled(key, values, place): filled(item, values, place) for key, item in value.items()}
     if isinstance(value, list):
-        return [filled(one, values, where) for one in value]
+        return [filled(item, values, place) for item in value]
     if not isinstance(value, str):
         return value
-    whole = _FIELD.fullmatch(value)
-    if whole is not None:
-        return _value(whole["name"], values, where)
-    text = _FIELD.sub(lambda found: _within(found["name"], values, where), value)
+    single = _FIELD.fullmatch(value)
+    if single is not None:
+        return _value(single["name"], values, place)
+    text = _FIELD.sub(lambda match: _as_text(match["name"], values, place), value)
     return text.replace(r"\${", "${")
 
 
-def several(definition: Mapping[str, Any], values: Values, where: str) -> Iterator[tuple[str, Any, Values]]:
-    """Yield the stages that a definition describes: what follows ``@`` in the name of each, its template and its values.
+def expand(definition: Mapping[str, Any], values: Values, place: str) -> Iterator[tuple[str, Any, Values]]:
+    """Yield the stages of a definition: the part of each name after ``@``, the template and its values.
 
-    One without ``foreach`` and ``matrix`` describes one stage, whose name has no such part. Raises `UsageError` where
+    A definition without ``foreach`` and ``matrix`` is one stage, with an empty part. Raises `UsageError` where
     ``foreach`` is not a list or mapping, or ``matrix`` not a mapping of lists.
     """
     if "foreach" in definition:
-        for key, given in _each(filled(definition["foreach"], values, where), where):
-            yield key, definition.get("do"), {**values, **given}
+        for key, stage_values in _foreach_items(filled(definition["foreach"], values, place), place):
+            yield key, definition.get("do"), {**values, **stage_values}
     elif "matrix" in definition:
         template = {name: value for name, value in definition.items() if name != "matrix"}
-        for key, item in _combinations(filled(definition["matrix"], values, where), where):
+        for key, item in _combinations(filled(definition["matrix"], values, place), place):
             yield key, template, {**values, "item": item, "key": key}
     else:
         yield "", definition, values
 
 
-def _each(items: Any, where: str) -> Iterator[tuple[str, Values]]:
+def _foreach_items(items: Any, place: str) -> Iterator[tuple[str, Values]]:
     if isinstance(items, Mapping):
         yield from ((_text(key), {"key": _text(key), "item": item}) for key, item in items.items())
     elif isinstance(items, list):
         nested = any(isinstance(item, Mapping | list) for item in items)
         yield from ((_text(number if nested else item), {"item": item}) for number, item in enumerate(items))
     else:
-        raise UsageError(f"{where}: foreach is {excerpt(items)}; it must be a list or a mapping.")
+        raise UsageError(f"{place}: foreach is {excerpt(items)}; it must be a list or a mapping.")
 
 
-def _combinations(axes: Any, where: str) -> Iterator[tuple[str, Values]]:
+def _combinations(axes: Any, place: str) -> Iterator[tuple[str, Values]]:
     if not isinstance(axes, Mapping) or not all(isinstance(items, list) for items in axes.values()):
-        raise UsageError(f"{where}: matrix is {excerpt(axes)}; it must be a mapping of lists.")
+        raise UsageError(f"{place}: matrix is {excerpt(axes)}; it must be a mapping of lists.")
     for chosen in product(*(enumerate(items) for items in axes.values())):
-        named = dict(zip(axes, chosen, strict=True))
+        choice = dict(zip(axes, chosen, strict=True))
         parts = [
             f"{axis}{number}" if isinstance(item, Mapping | list) else _text(item)
-            for axis, (number, item) in named.items()
+            for axis, (number, item) in choice.items()
         ]
-        yield "-".join(parts), {axis: item for axis, (_, item) in named.items()}
+        yield "-".join(parts), {axis: item for axis, (_, item) in choice.items()}
 
 
-def _within(name: str, values: Values, where: str) -> str:
-    value = _value(name, values, where)
+def _as_text(name: str, values: Values, place: str) -> str:
+    value = _value(name, values, place)
     if isinstance(value, Mapping | list):
-        raise UsageError(f"{where}: ${{{name}}} is {excerpt(value)}, which `tacpipe run` does not put into a text.")
+        raise UsageError(f"{place}: ${{{name}}} is {excerpt(value)}, which `tacpipe run` does not put into a text.")
     return _text(value)
 
 
-def _value(name: str, values: Values, where: str) -> Any:
-    found: Any = values
+def _value(name: str, values: Values, place: str) -> Any:
+    value: Any = values
     for part in _PART.findall(name):
         try:
-            found = found[int(part)] if isinstance(found, Sequence) and not isinstance(found, str) else found[part]
+            value = value[int(part)] if isinstance(value, Sequence) and not isinstance(value, str) else value[part]
         except (LookupError, TypeError, ValueError):
-            raise UsageError(f"{where}: ${{{name}}} has no value; give it one in params.yaml or under vars.") from None
-    return found
+            raise UsageError(f"{place}: ${{{name}}} has no value; give it one in params.yaml or under vars.") from None
+    return value
 
 
 def _text(value: Any) -> str:

@@ -1,1 +1,1 @@
-"""Where work is computed: by this computer, or by workers that an executor's plug-in reaches."""
+"""Run tasks on this computer, or on workers that an executor's plug-in reaches."""

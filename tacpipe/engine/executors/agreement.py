@@ -1,4 +1,4 @@
-"""Whether a worker would compute what this process would: the versions of Python, libraries and the stage's own code."""
+"""Compare a worker with this process: versions of Python, libraries and the stage's code."""
 
 from __future__ import annotations
 
@@ -9,30 +9,30 @@ from tacpipe.engine import provenance
 from tacpipe.plugins import registry
 
 
-def here(stage: str) -> dict[str, Any]:
-    """Return what must be alike for ``stage`` (a name as a task has it) to be computed here or there.
+def local_versions(stage: str) -> dict[str, Any]:
+    """Return the versions that must agree for a task of ``stage`` to be computed by another process.
 
     Raises `UsageError` where there is no such stage.
     """
-    found = registry.load(registry.whole(stage))
-    made = provenance.of(0.0)
-    python = ".".join(made["python"].split(".")[:2])
-    code = provenance.code(found)
+    stage_object = registry.load(registry.stage_name(stage))
+    environment = provenance.describe(0.0)
+    python = ".".join(environment["python"].split(".")[:2])
+    code = provenance.code(stage_object)
     return {
         "Python": python,
-        **made["libraries"],
-        f"stage {registry.whole(stage)}": f"version {found.version}{f', code {code[:12]}' if code else ''}",
+        **environment["libraries"],
+        f"stage {registry.stage_name(stage)}": f"version {stage_object.version}{f', code {code[:12]}' if code else ''}",
     }
 
 
-def unlike(wanted: Mapping[str, Any], found: Mapping[str, Any]) -> list[str]:
-    """Return in what a worker differs from what is ``wanted``.
+def unlike(local: Mapping[str, Any], worker: Mapping[str, Any]) -> list[str]:
+    """Return the differences between a ``worker`` and this process, in words.
 
     >>> unlike({"Python": "3.11", "numpy": "2.1", "torch": "2.13"}, {"Python": "3.11", "numpy": "1.26"})
     ['numpy 1.26 (here 2.1)', 'no torch (here 2.13)']
     """
     return [
-        f"{name} {found[name]} (here {value})" if name in found else f"no {name} (here {value})"
-        for name, value in wanted.items()
-        if found.get(name) != value
+        f"{name} {worker[name]} (here {value})" if name in worker else f"no {name} (here {value})"
+        for name, value in local.items()
+        if worker.get(name) != value
     ]

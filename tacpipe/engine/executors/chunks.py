@@ -12,21 +12,21 @@ Done = TypeVar("Done")
 _A_WORKER = 8  # how often a worker comes back for more: progress against overhead
 
 
-def of(tasks: Sequence[Task], workers: int, most: int | None = None) -> list[Sequence[Task]]:
-    """Return the tasks in chunks of the same size, some for each worker, and none of more than ``most`` tasks.
+def divide(tasks: Sequence[Task], workers: int, max_size: int | None = None) -> list[Sequence[Task]]:
+    """Divide the tasks into chunks of the same size, several per worker, of at most ``max_size`` tasks.
 
-    >>> of("abcdefg", 1, 3), [len(one) for one in of(range(64), 2)]
+    >>> divide("abcdefg", 1, 3), [len(chunk) for chunk in divide(range(64), 2)]
     (['a', 'b', 'c', 'd', 'e', 'f', 'g'], [4, 4, 4, 4, 4, 4, 4, 4, 4, 4, 4, 4, 4, 4, 4, 4])
     """
     size = max(1, len(tasks) // (workers * _A_WORKER))
-    size = size if most is None else min(size, most)
+    size = size if max_size is None else min(size, max_size)
     return [tasks[start : start + size] for start in range(0, len(tasks), size)]
 
 
-def each(compute: Callable[[Task], Done], tasks: Sequence[Task]) -> Iterator[Done]:
-    """Yield ``compute(task)`` of each task; ``compute.each(tasks)`` where it has that, which may do several at once."""
-    several: Callable[[Sequence[Task]], Iterator[Done]] | None = getattr(compute, "each", None)
-    return map(compute, tasks) if several is None else several(tasks)
+def compute_each(compute: Callable[[Task], Done], tasks: Sequence[Task]) -> Iterator[Done]:
+    """Yield ``compute(task)`` for each task, or ``compute.compute_all(tasks)``, which may overlap tasks, if it exists."""
+    batch_compute: Callable[[Sequence[Task]], Iterator[Done]] | None = getattr(compute, "compute_all", None)
+    return map(compute, tasks) if batch_compute is None else batch_compute(tasks)
 
 
 def computed(compute: Callable[[Task], Done], chunk: Sequence[Task]) -> list[Done] | Exception:
@@ -36,7 +36,7 @@ def computed(compute: Callable[[Task], Done], chunk: Sequence[Task]) -> list[Don
     """
     try:
         with memory.raising_shortage():
-            return list(each(compute, chunk))
+            return list(compute_each(compute, chunk))
     except Exception as error:
         import pickle
         import traceback

@@ -55,8 +55,8 @@ def connected(address: str, jobs: int) -> Iterator[Dask]:
     without Dask.
     """
     if not address:
-        with _started(jobs or processor.jobs()) as found:
-            yield found
+        with _started(jobs or processor.jobs()) as workers:
+            yield workers
         return
     if not _is_here(address):
         raise UsageError(
@@ -73,7 +73,7 @@ def encrypted(address: str, jobs: int) -> Iterator[Dask]:
     """Yield the workers of the scheduler at ``address``, reached with TLS; raises as `connected`."""
     if not address:
         raise UsageError("The executor tls needs the address of a scheduler: give tls://HOST:PORT.")
-    with extras.named("The executor tls"):
+    with extras.explain_missing("The executor tls"):
         from distributed import Security
 
     try:
@@ -107,21 +107,23 @@ class Dask:
         """
         if not tasks:
             return
-        wanted = agreement.here(tasks[0].name)
+        versions = agreement.local_versions(tasks[0].name)
         workers = max(len(self._workers()), self._expected)
-        given = [[_absolute(task) for task in chunk] for chunk in chunks.of(tasks, workers, _MOST)]
-        what = f"{len(tasks)} tasks were given to {workers} workers"
+        task_chunks = [[_absolute(task) for task in chunk] for chunk in chunks.divide(tasks, workers, _MOST)]
+        summary = f"{len(tasks)} tasks were given to {workers} workers"
         with (
             self._followed(tasks) as topic,
-            termination.reporting(f"tacpipe: interrupted; {what}: those that wait are cancelled, those at work end."),
+            termination.reporting(
+                f"tacpipe: interrupted; {summary}: those that wait are cancelled, those at work end."
+            ),
         ):
-            futures = [self.client.submit(_work, wanted, compute, chunk, topic, pure=False) for chunk in given]
+            futures = [self.client.submit(_work, versions, compute, chunk, topic, pure=False) for chunk in task_chunks]
             store = opened(tasks[0].store, tasks[0].run)
             try:
-                for done in self._results(futures, tasks[0].name):
-                    if done.record is not None:  # a worker announces it too, until that worker ends
-                        store.announce(records.named(done.record["result"]))
-                    yield done
+                for result in self._results(futures, tasks[0].name):
+                    if result.record is not None:  # a worker announces it too, until that worker ends
+                        store.announce(records.digests(result.record["result"]))
+                    yield result
             finally:
                 store.close()
                 with contextlib.suppress(Exception):  # the scheduler forgets them in any case when the client goes
@@ -129,7 +131,7 @@ class Dask:
 
     @contextlib.contextmanager
     def _followed(self, tasks: Sequence[Task]) -> Iterator[str]:
-        """Have what a task trains in a worker followed here; yield the topic of its messages, empty where nobody looks.
+        """Follow the training of a task in a worker; yield the topic of its messages, empty without followers.
 
         Followers are called in a thread of their own: the client's own thread must not wait for a tracker's server.
         """
@@ -139,26 +141,26 @@ class Dask:
                 yield ""
                 return
             topic = f"tacpipe-{uuid.uuid4().hex}"
-            came: Queue[following.Message | None] = Queue()
-            thread = threading.Thread(target=_passed_on, args=(came, followers), daemon=True)
+            messages: Queue[following.Message | None] = Queue()
+            thread = threading.Thread(target=_passed_on, args=(messages, followers), daemon=True)
             thread.start()
-            self.client.subscribe_topic(topic, lambda event: came.put(event[1]))  # type: ignore[no-untyped-call]
+            self.client.subscribe_topic(topic, lambda event: messages.put(event[1]))  # type: ignore[no-untyped-call]
             try:
                 yield topic
             finally:
                 with contextlib.suppress(Exception):  # the scheduler may be gone
                     self.client.unsubscribe_topic(topic)  # type: ignore[no-untyped-call]
-                came.put(None)
+                messages.put(None)
                 thread.join()
 
     def _workers(self) -> Mapping[str, Any]:
-        found: Mapping[str, Any] = self.client.scheduler_info(n_workers=-1)["workers"]
-        if not found:
+        workers: Mapping[str, Any] = self.client.scheduler_info(n_workers=-1)["workers"]
+        if not workers:
             raise TacpipeError(
                 f"The scheduler at {self._scheduler} has no worker. Start some, as with `dask worker "
                 f"{self._scheduler} --nthreads 1`."
             )
-        return found
+        return workers
 
     def _results(self, futures: Sequence[Future[Any]], stage: str) -> Iterator[Done]:
         from concurrent.futures import CancelledError
@@ -170,10 +172,10 @@ class Dask:
             for future in as_completed(futures, loop=self.client.loop):  # type: ignore[no-untyped-call]
                 if future.status == "error":
                     raise future.exception()
-                made = future.result()
-                if isinstance(made, Exception):
-                    raise made
-                yield from made
+                results = future.result()
+                if isinstance(results, Exception):
+                    raise results
+                yield from results
                 future.release()
         except KilledWorker as error:
             raise TacpipeError(
@@ -193,7 +195,7 @@ class Dask:
 @contextlib.contextmanager
 def _started(workers: int) -> Iterator[Dask]:
     """Yield workers of this computer, each a process of one thread, that end with the block or with this process."""
-    with extras.named("The executor dask"):
+    with extras.explain_missing("The executor dask"):
         import cryptography  # noqa: F401  (TLS of one command's own: other users of this computer reach its port)
         import dask
         from distributed import Client, LocalCluster, Security
@@ -232,7 +234,7 @@ def _client(address: str) -> Iterator[Client]:
     host, _, port = address.partition("://")[2].rpartition(":")
     if not host or not (port.isascii() and port.isdigit() and 0 < int(port) < 65536):
         raise UsageError(f"{address} is not the address of a scheduler; it needs host and port, as localhost:8786.")
-    with extras.named("The executor dask"):
+    with extras.explain_missing("The executor dask"):
         from distributed import Client
 
     with quiet():
@@ -250,14 +252,14 @@ def _client(address: str) -> Iterator[Client]:
 def quiet() -> Iterator[None]:
     """Have Dask log nothing in the block: a worker or scheduler that is gone is a sentence of ours."""
     loggers = [logging.getLogger(name) for name in ("asyncio", "tornado.application", *_dask_loggers())]
-    before = [one.level for one in loggers]
-    for one in loggers:
-        one.setLevel(logging.CRITICAL + 1)
+    before = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.CRITICAL + 1)
     try:
         yield
     finally:
-        for one, level in zip(loggers, before, strict=True):
-            one.setLevel(level)
+        for logger, level in zip(loggers, before, strict=True):
+            logger.setLevel(level)
 
 
 def _dask_loggers() -> list[str]:
@@ -284,43 +286,43 @@ def _absolute(task: Task) -> Task:
     return replace(task, files={name: str(Path(path).absolute()) for name, path in task.files.items()})
 
 
-def _passed_on(came: Queue[following.Message | None], followers: Sequence[following.Follower]) -> None:
+def _passed_on(messages: Queue[following.Message | None], followers: Sequence[following.Follower]) -> None:
     """Call followers with what comes, until None does."""
     receiver = following.Receiver(followers)
-    while (message := came.get()) is not None:
+    while (message := messages.get()) is not None:
         receiver.take(message)
     receiver.close()
 
 
 # ---- in a worker
 
-_alone = threading.Lock()  # tasks are computed one at a time in a process, whatever number of threads it was given
-_leases: dict[str, str] = {}  # of this worker, by the lease of the run that they are for
+_one_at_a_time = threading.Lock()  # A process computes one task at a time, whatever its number of threads
+_leases: dict[str, str] = {}  # Leases of this worker, by the lease of the run that they belong to
 
 
 def _work(
-    wanted: Mapping[str, Any], compute: Callable[[Task], Done], tasks: Sequence[Task], topic: str
+    versions: Mapping[str, Any], compute: Callable[[Task], Done], tasks: Sequence[Task], topic: str
 ) -> list[Done] | Exception:
-    """Return ``compute`` of each task, or what kept this worker from it; what it trains is followed by a topic's readers."""
+    """Return ``compute`` of each task, or the error that prevented it; trainings are followed by a topic's readers."""
     from distributed import get_worker
 
     worker = get_worker()
     name = str(worker.name)
     senders = [following.Sender(functools.partial(worker.log_event, topic))] if topic else []
-    with _alone, progress.showing_progress(False), provenance.worker(name), following.tracked(senders):
+    with _one_at_a_time, progress.showing_progress(False), provenance.worker(name), following.tracked(senders):
         try:
-            _check(name, wanted, tasks[0])
+            _check(name, versions, tasks[0])
             lease = _lease(tasks[0])
         except TacpipeError as error:
             return error
         return chunks.computed(compute, [replace(task, run=lease) for task in tasks])
 
 
-def _check(name: str, wanted: Mapping[str, Any], task: Task) -> None:
-    other = agreement.unlike(wanted, agreement.here(task.name))
-    if other:
+def _check(name: str, versions: Mapping[str, Any], task: Task) -> None:
+    differences = agreement.unlike(versions, agreement.local_versions(task.name))
+    if differences:
         raise UsageError(
-            f"Worker {name} would not compute what this computer does: {'; '.join(other)}. Install the same there."
+            f"Worker {name} would not compute what this computer does: {'; '.join(differences)}. Install the same there."
         )
     store = opened(task.store)
     if store.distant:  # reached by its address, with this worker's own credentials
@@ -350,18 +352,18 @@ def _lease(task: Task) -> str:
         return ""
     if not task.run or task.run in _leases:
         return _leases.get(task.run, "")
-    begun: Queue[str] = Queue()
-    threading.Thread(target=_keep, args=(Store(task.store), task.run, begun), daemon=True).start()
-    _leases[task.run] = begun.get()
+    lease_paths: Queue[str] = Queue()
+    threading.Thread(target=_keep, args=(Store(task.store), task.run, lease_paths), daemon=True).start()
+    _leases[task.run] = lease_paths.get()
     return _leases[task.run]
 
 
-def _keep(store: Store, run: str, begun: Queue[str]) -> None:
-    """Hold a lease until a run has ended; put its path into ``begun``."""
-    ended = threading.Event()
+def _keep(store: Store, run: str, lease_paths: Queue[str]) -> None:
+    """Hold a lease until a run has ended; put the path of the lease into ``lease_paths``."""
+    run_ended = threading.Event()
     with store.leases.running() as announcing:
-        begun.put(announcing.path)
+        lease_paths.put(announcing.path)
         while _at_work(run):
-            ended.wait(_POLL_S)
-        with _alone:
+            run_ended.wait(_POLL_S)
+        with _one_at_a_time:
             del _leases[run]

@@ -14,7 +14,7 @@ LOCAL = "local"
 
 
 class Executor(Protocol):
-    """What an executor's plug-in gives: something that computes tasks.
+    """Interface of an executor's plug-in, which computes tasks.
 
     The plug-in's entry point names a function ``connected(address, jobs)`` that returns a context manager of it:
     ``address`` is what was given behind the executor's name (``host:port`` of ``dask://host:port``, or empty), ``jobs``
@@ -34,9 +34,9 @@ class Executor(Protocol):
 class Chosen:
     """The executor that a command names, used within a block; it is opened for the first work."""
 
-    def __init__(self, given: str, jobs: int) -> None:
+    def __init__(self, executor: str, jobs: int) -> None:
         """Take an executor as ``NAME`` or ``NAME://ADDRESS``; empty: `VARIABLE`, or `LOCAL`. Raises `UsageError`."""
-        name, _, self._address = (given or os.environ.get(VARIABLE, "") or LOCAL).partition("://")
+        name, _, self._address = (executor or os.environ.get(VARIABLE, "") or LOCAL).partition("://")
         self._jobs = jobs
         self._connect = registry.load_executor(name)
         self._stack = ExitStack()
@@ -51,6 +51,6 @@ class Chosen:
     def opened(self) -> Executor:
         """Return the executor, connected."""
         if self._open is None:
-            found: AbstractContextManager[Executor] = self._connect(self._address, self._jobs)
-            self._open = self._stack.enter_context(found)
+            connection: AbstractContextManager[Executor] = self._connect(self._address, self._jobs)
+            self._open = self._stack.enter_context(connection)
         return self._open

@@ -15,25 +15,25 @@ if TYPE_CHECKING:
 
 
 def context(preload: Sequence[str]) -> ForkServerContext:
-    """Return what starts processes, having begun the one that forks them, which imports the modules ``preload``.
+    """Start the fork server, which imports the modules ``preload``, and return the context that starts processes.
 
-    It is begun once in a process, with the modules of the first call. It and those that it forks never hear of Ctrl-C, which
-    is this process's to answer, until they unblock SIGINT. A module that is not there is left out.
+    A process starts one server, with the modules of the first call. SIGINT is blocked in the server and in the processes
+    that it forks, because this process handles Ctrl-C. Modules that do not exist are skipped.
     """
     import multiprocessing
     import signal
     from multiprocessing import forkserver, resource_tracker
 
-    memory.require_library("pyarrow")  # which each of them loads
-    found = multiprocessing.get_context("forkserver")
-    found.set_forkserver_preload(list(preload))
-    resource_tracker.ensure_running()  # which lets signals through that were held back
+    memory.require_library("pyarrow")  # Each process loads it
+    server = multiprocessing.get_context("forkserver")
+    server.set_forkserver_preload(list(preload))
+    resource_tracker.ensure_running()  # It unblocks signals, so it starts before they are blocked
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         forkserver.ensure_running()
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
-    return found
+    return server
 
 
 @contextlib.contextmanager

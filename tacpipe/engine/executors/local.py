@@ -34,8 +34,8 @@ class Local:
         Raises `TacpipeError` if a worker dies (out of memory, killed); what the others finished is in the store by then.
         """
         jobs = min(self.jobs, len(tasks))
-        alone = jobs <= 1 or len(tasks) < self._pool_from
-        return chunks.each(compute, tasks) if alone else _run(compute, tasks, jobs, preload)
+        in_this_process = jobs <= 1 or len(tasks) < self._pool_from
+        return chunks.compute_each(compute, tasks) if in_this_process else _run(compute, tasks, jobs, preload)
 
 
 @contextlib.contextmanager
@@ -49,24 +49,24 @@ def connected(address: str, jobs: int) -> Iterator[Local]:
 def _run(compute: Callable[[Task], Done], tasks: Sequence[Task], jobs: int, preload: Sequence[str]) -> Iterator[Done]:
     from multiprocessing.connection import wait  # 10 ms that a hit does not pay
 
-    left = chunks.of(tasks, jobs)
+    pending = chunks.divide(tasks, jobs)
     workers: dict[Connection, Connection] = {}
     try:
         _start(jobs, preload, workers)
         busy: list[Connection] = []
         idle = list(workers)
-        while left or busy:
-            while left and idle:
-                _give(idle[-1], compute, left.pop(0))
+        while pending or busy:
+            while pending and idle:
+                _give(idle[-1], compute, pending.pop(0))
                 busy.append(idle.pop())
             ready = wait(busy)
-            for worker in [one for one in busy if one in ready]:
+            for worker in [connection for connection in busy if connection in ready]:
                 busy.remove(worker)
-                yield from _taken(worker)
+                yield from _receive(worker)
                 idle.append(worker)
     finally:
         for worker, life in workers.items():
-            life.close()  # which ends the worker, whatever it is doing: nothing is ever half written
+            life.close()  # Ends the worker at any point: files are never left half written
             worker.close()
 
 
@@ -101,12 +101,12 @@ def _give(worker: Connection, compute: Callable[[Task], Done], chunk: Sequence[T
         worker.send((compute, chunk))
 
 
-def _taken(worker: Connection) -> list[Any]:
+def _receive(worker: Connection) -> list[Any]:
     with _death_told():
-        made: list[Any] | Exception = worker.recv()
-    if isinstance(made, Exception):
-        raise made
-    return made
+        results: list[Any] | Exception = worker.recv()
+    if isinstance(results, Exception):
+        raise results
+    return results
 
 
 @contextlib.contextmanager

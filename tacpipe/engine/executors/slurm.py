@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from dask_jobqueue import SLURMCluster
     from distributed import Client, Security
 
-JOBS = 4  # that are submitted unless --jobs gives another number
-CORES, MEMORY = 1, "4 GiB"  # that a job requests where Dask's configuration states nothing
+JOBS = 4  # Number of jobs without --jobs
+CORES, MEMORY = 1, "4 GiB"  # Resources of a job unless Dask's configuration states them
 SECTION = "jobqueue.slurm"
 _THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")  # each 1 in Dask's workers unless it is set
 _POLL_S = 0.5
@@ -42,7 +42,7 @@ def connected(address: str, jobs: int) -> Iterator[dask_workers.Dask]:
     `TacpipeError` where jobs cannot be submitted or all of them end before one has started work, and
     `MissingModuleError` without dask-jobqueue.
     """
-    with extras.named("The executor slurm"), _interrupts():
+    with extras.explain_missing("The executor slurm"), _interrupts():
         import dask_jobqueue  # noqa: F401, I001  (first: what else is missing comes with it; it adds to Dask's configuration)
         import cryptography  # noqa: F401  (of the certificates)
         import dask
@@ -71,9 +71,9 @@ def _interrupts() -> Iterator[None]:
 
 
 def _shared(config: Any) -> Path:
-    """Return a folder that jobs see too, for certificates and for what they print: the home's, or the configured one."""
-    given = config.get(f"{SECTION}.shared-temp-directory")
-    folder = Path(given).expanduser() if given else Path.home() / ".cache/tacpipe"
+    """Return the shared folder for certificates and output of jobs: the configured one, or one in the home directory."""
+    configured = config.get(f"{SECTION}.shared-temp-directory")
+    folder = Path(configured).expanduser() if configured else Path.home() / ".cache/tacpipe"
     folder.mkdir(parents=True, exist_ok=True)
     return folder
 
@@ -82,12 +82,12 @@ def _certified(folder: Path) -> Security:
     """Return a new certificate and its key, in files that only their owner reads."""
     from distributed import Security
 
-    made = Security.temporary()  # type: ignore[no-untyped-call]
+    temporary = Security.temporary()  # type: ignore[no-untyped-call]
     files = {}
     for field in ("tls_ca_file", "tls_client_key"):
         path = folder / field
         path.touch(mode=0o600)
-        path.write_text(getattr(made, field))
+        path.write_text(getattr(temporary, field))
         files[field] = str(path)
     certificate, key = files.values()
     roles = {
@@ -104,8 +104,8 @@ def _submitted(address: str, jobs: int, security: Security, folder: Path, config
     from dask_jobqueue import SLURMCluster
 
     def configured(name: str, default: Any) -> Any:
-        found = config.get(f"{SECTION}.{name}")
-        return default if found is None else found
+        value = config.get(f"{SECTION}.{name}")
+        return default if value is None else value
 
     cores = configured("cores", CORES)
     cluster = SLURMCluster(
@@ -130,7 +130,7 @@ def _submitted(address: str, jobs: int, security: Security, folder: Path, config
 
     numbers: Sequence[str] = ()
     try:
-        while len(cluster.worker_spec) < jobs:  # as `scale` does, which drops what sbatch answers
+        while len(cluster.worker_spec) < jobs:  # Like `scale`, which discards the answer of sbatch
             cluster.worker_spec.update(cluster.new_worker_spec())
         try:
             cluster.sync(submit)
@@ -144,10 +144,10 @@ def _submitted(address: str, jobs: int, security: Security, folder: Path, config
         numbers = _numbers(cluster)
         yield cluster
     finally:
-        if numbers:  # at once: `close` asks worker by worker, and a command that is interrupted ends within a second
+        if numbers:  # `close` asks each worker, too slow for an interrupted command, which must end within a second
             subprocess.run(["scancel", *numbers], check=False, capture_output=True)
         with contextlib.suppress(Exception):
-            cluster.close(timeout=None if numbers else 1.0)  # without a worker it waits 10 s
+            cluster.close(timeout=None if numbers else 1.0)  # The default timeout without a worker is 10 s
 
 
 def _numbers(cluster: SLURMCluster) -> list[str]:
@@ -167,24 +167,24 @@ def _reason(text: str) -> str:
 
 def _wait(client: Client, numbers: Sequence[str], folder: Path) -> None:
     """Return when one job has begun to work. Raises `TacpipeError` where all have ended before."""
-    began_s, shown = time.monotonic(), False
+    began_s, is_noted = time.monotonic(), False
     while not client.scheduler_info(n_workers=-1)["workers"]:
         if not _waiting(numbers):
             raise TacpipeError(
                 f"No job began to work: {', '.join(numbers)} ended at once. {_printed(folder)} Jobs need Python and tacpipe "
                 f"where this computer has them, and a way to reach it."
             )
-        if not shown and time.monotonic() - began_s > _SHOWN_S:
-            shown = True
+        if not is_noted and time.monotonic() - began_s > _SHOWN_S:
+            is_noted = True
             terminal.note(f"tacpipe: waiting for Slurm to start one of the jobs {', '.join(numbers)}")
         time.sleep(_POLL_S)
 
 
 def _waiting(numbers: Sequence[str]) -> bool:
-    """Return whether one of the jobs waits or runs, as far as Slurm answers."""
+    """Return whether one of the jobs waits or runs; True if Slurm does not answer."""
     command = ["squeue", "--noheader", "--format=%T", "--jobs", ",".join(numbers)]
-    asked = subprocess.run(command, check=False, capture_output=True, text=True)
-    return asked.returncode != 0 or bool(asked.stdout.strip())
+    queue = subprocess.run(command, check=False, capture_output=True, text=True)
+    return queue.returncode != 0 or bool(queue.stdout.strip())
 
 
 def _printed(folder: Path) -> str:

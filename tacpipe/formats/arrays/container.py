@@ -117,7 +117,7 @@ class ArrayContainer:
 
 def open_hdf5(path: Path) -> ArrayContainer:
     """Return the container of an HDF5 file. Raises `MissingModuleError` without h5py."""
-    with extras.named("Reading HDF5"):
+    with extras.explain_missing("Reading HDF5"):
         from tacpipe.formats.arrays import hdf5
     return ArrayContainer(path, lambda: hdf5.open_hdf5(path))
 

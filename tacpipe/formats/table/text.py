@@ -357,7 +357,7 @@ class Workbook:
     @contextlib.contextmanager
     def _rows(self) -> Iterator[Iterator[tuple[int, tuple[Any, ...]]]]:
         """Yield the number and the cells of each row that holds some, below the lines to skip."""
-        with extras.named("Reading .xlsx"):
+        with extras.explain_missing("Reading .xlsx"):
             import openpyxl
         try:
             with regular.failing(self.path), regular.opened(self.path) as file:

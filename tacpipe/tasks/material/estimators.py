@@ -85,7 +85,7 @@ class Fitted:
 
 def packed(fitted: Mapping[str, Fitted], params: Estimator) -> bytes:
     """Return fitted estimators by sensor as the bytes of a file. Raises `TacpipeError` for what cannot be read back."""
-    with extras.named(f"The architecture {params.architecture}"):
+    with extras.explain_missing(f"The architecture {params.architecture}"):
         from skops.io import dumps, get_untrusted_types
         from skops.io.exceptions import UnsupportedTypeException
     try:
@@ -108,7 +108,7 @@ def unpacked(content: bytes, name: str, params: Estimator) -> dict[str, Fitted]:
 
     Raises `TacpipeError` where it is not such a file, and where it has types that the architecture does not trust.
     """
-    with extras.named(f"The architecture {params.architecture}"):
+    with extras.explain_missing(f"The architecture {params.architecture}"):
         from skops.io import get_untrusted_types, loads
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as file:

@@ -168,7 +168,7 @@ def evaluate(model: Mapping[str, bytes], recordings: Dataset) -> Result:
     table = predictions_table(
         evaluated, classifier, {name: shard_attributes.get("session") for name, shard_attributes in attributes.items()}
     )
-    return Result({PREDICTIONS: RecordingOutput(table, origin.together(attributes.values()))}, files)
+    return Result({PREDICTIONS: RecordingOutput(table, origin.combined(attributes.values()))}, files)
 
 
 def _read(classifier: Classifier, recordings: Dataset, advance: Callable[..., None]) -> dict[str, Slides]:

@@ -43,7 +43,7 @@ Dropout = Annotated[float, Range(0, below=1)]
 # the paper's text; its code has no header for BioTac, and a dropout that PyTorch ignores in an LSTM of one layer
 _PAPER_TEXT: Mapping[str, object] = {"epochs": 2000, "dropout": 0.2, "headers": "other=mlp"}
 _ALIGNED_RECONSTRUCTION = 0.05  # weight in networks that are aligned to a frozen one: that of the published script
-HeldOut = Annotated[str, Assignments(Annotated[str, CommaList(least=1)], between=";")]
+HeldOut = Annotated[str, Assignments(Annotated[str, CommaList(min_items=1)], between=";")]
 
 
 @dataclass(frozen=True)

@@ -140,7 +140,7 @@ def _evaluated(
     if predictor.quantiles is not None:
         files[COVERAGE] = quantiles.coverage(predictor.quantiles, grasps, predicted, ~in_training, is_known)
     streams[GRASPS] = _about(grasps, in_training, is_known)
-    attributes = origin.together(shard.attributes for shard in recordings.recordings.values())
+    attributes = origin.combined(shard.attributes for shard in recordings.recordings.values())
     return Result({PREDICTIONS: RecordingOutput(streams, attributes)}, files)
 
 

@@ -34,7 +34,7 @@ Presets = Mapping[str, Mapping[str, object]]
 Panels = Mapping[str, Sequence[str]]
 Dropout = Annotated[float, Range(0, below=1)]
 Draws = Annotated[int, Range(1, 100_000)]
-Targets = Annotated[str, CommaList(Literal["pdc_th", "pdc_mf", "e_th", "e_mf"], least=1)]
+Targets = Annotated[str, CommaList(Literal["pdc_th", "pdc_mf", "e_th", "e_mf"], min_items=1)]
 
 
 @dataclass(frozen=True)

@@ -50,7 +50,7 @@ class Result(context.Result):
     def architecture(self) -> str:
         """The kind of model."""
         stored = self.config.get("architecture", self.given.get("architecture", ""))
-        return str(params_of.named(self.STAGE, {"architecture": stored})["architecture"])
+        return str(params_of.with_current_names(self.STAGE, {"architecture": stored})["architecture"])
 
     @property
     def split(self) -> str:
