@@ -150,9 +150,9 @@ def test_a_failing_object_is_listed_apart_and_the_rest_is_verified(full: Lab) ->
 
 def opening(store: Store, folder: Path) -> dict[str, Callable[[], Any]]:
     """Return every function of the store and of its maintenance that opens a file there, called on one that is there."""
-    objects = sorted(store.root.glob("objects/*/*"))
+    paths = sorted(store.root.glob("objects/*/*"))
     key = next(store.root.glob("records/*/*.json")).stem
-    name = next(path.name for path in objects if path.read_bytes()[:2] == b"{\n")
+    name = next(path.name for path in paths if path.read_bytes()[:2] == b"{\n")
     (root,) = (root for root in store.roots.all() if root["path"].endswith("data/s"))
     return {
         "read": lambda: store.read(name),
@@ -169,7 +169,7 @@ def opening(store: Store, folder: Path) -> dict[str, Callable[[], Any]]:
         "checkout.known": lambda: checkout.known(store),
         "garbage.live": lambda: garbage.live(store),
         "pushed.lasting": lambda: pushed.lasting(store, root["manifest"]),
-        "unnamed.kept": lambda: unnamed.kept(store, objects, ()),
+        "unnamed.kept": lambda: unnamed.kept(store, [path.name for path in paths], ()),
         "manifest.find": lambda: manifest.find(folder / "data/s"),
         "adoption.beside": lambda: adoption.verified_copy("ab" * 32, "manifest.json", (str(folder / "data/s"),)),
         "leases.runs": lambda: store.leases.runs(),

@@ -308,7 +308,7 @@ def test_recompute_and_compare_names_what_differs(lab: Lab, monkeypatch: pytest.
             {"model": "Zen 9", "instructions": ["sve"]},
             r"instructions: .*, now sve; model: .*9",
         ),
-        (provenance, "_here", {"libraries": {"numpy": "0.1"}}, r"numpy: [\d.]+, now 0\.1;"),
+        (provenance, "_environment", {"libraries": {"numpy": "0.1"}}, r"numpy: [\d.]+, now 0\.1;"),
     ],
     ids=["threads", "processor", "libraries"],
 )

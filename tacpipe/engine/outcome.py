@@ -13,7 +13,7 @@ from tacpipe.plugins import registry
 from tacpipe.printable import listed
 
 _NAMED = 5  # recordings that a note names
-_FROM_RECORDS = ("stated", "code", "packages", "unlike")  # fields that `describe_results` puts into words
+_FROM_RECORDS = ("recordings_by_note", "code", "packages", "unlike")  # fields that `describe_results` puts into words
 
 
 @dataclass

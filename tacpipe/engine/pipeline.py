@@ -380,8 +380,8 @@ class _Run:
             result_of_task = record["result"]  # Everything else was computed from the stored result
         elif self.request.compare and not counted:
             raise UsageError(f"Nothing is stored of {name} to compare with. Run the command without it first.")
-        self.outcome.ran += computed.made and counted
-        self.outcome.reused += counted and not computed.made
+        self.outcome.ran += computed.is_new and counted
+        self.outcome.reused += counted and not computed.is_new
         return result_of_task
 
     def _fit(self) -> dict[str, Any]:

@@ -139,22 +139,22 @@ def _collect(store: Store, *, dry_run: bool, recordings: bool, grace_days: float
             continue
         unneeded.append(key)
     kept |= needed.objects
-    objects = [path.name for path in layout.entries(store.root, "objects") if path.name not in kept]
-    unknown = (Path(store.object_path(name)) for name in objects)
-    named_by = {} if recordings else unnamed.kept(store, unknown, needed.manifests)
+    objects = [name for name in layout.names(store.root, "objects") if name not in kept]
+    named_by = {} if recordings else unnamed.kept(store, objects, needed.manifests)
     kept = kept.union(named_by, *named_by.values())
-    collected.records = sum(_remove_record(Path(store.record_path(key)), dry_run=dry_run) for key in unneeded)
+    collected.records = sum(_remove_record(store.record_path(key), dry_run=dry_run) for key in unneeded)
     collected.kept_recordings = len(kept - needed.objects - needed.replaced - needed.pages - set(named_by))
     aside = []
-    for path in (Path(store.object_path(name)) for name in objects if name not in kept):
+    for name in (name for name in objects if name not in kept):
+        path = store.object_path(name)
         if _young(path):
             continue
         if dry_run:
             _count(collected, path)
         else:
             with contextlib.suppress(FileNotFoundError):
-                os.rename(path, store.aside_path(path.name))  # noqa: PTH104
-                aside.append(path.name)
+                os.rename(path, store.aside_path(name))  # noqa: PTH104
+                aside.append(name)
     if aside:
         shown = {root["manifest"] for root in store.roots.all()}
         aside.sort(key=lambda name: name not in shown)  # no manifest is there that names what is gone
@@ -175,9 +175,9 @@ def _remove(store: Store, aside: list[str], needed: set[str], collected: Collect
         if name in needed:
             store.has(name)  # which puts it back
             continue
-        path = Path(store.aside_path(name))
+        path = store.aside_path(name)
         _count(collected, path)
-        path.unlink(missing_ok=True)
+        Path(path).unlink(missing_ok=True)
 
 
 def _put_back(store: Store) -> None:
@@ -187,24 +187,24 @@ def _put_back(store: Store) -> None:
             path.unlink(missing_ok=True)
 
 
-def _count(collected: Collected, path: Path) -> None:
+def _count(collected: Collected, path: str) -> None:
     with contextlib.suppress(FileNotFoundError):  # put back by who needs it, or removed by another collection
-        collected.bytes += path.stat().st_size
+        collected.bytes += os.stat(path).st_size  # noqa: PTH116
         collected.objects += 1
 
 
-def _young(path: Path) -> bool:
+def _young(path: str) -> bool:
     """Return whether a file was written just now, by a clock that may have been set since."""
     with contextlib.suppress(FileNotFoundError):
-        return abs(time.time() - path.stat().st_mtime) < _YOUNG_S
+        return abs(time.time() - os.stat(path).st_mtime) < _YOUNG_S  # noqa: PTH116
     return True
 
 
-def _remove_record(path: Path, *, dry_run: bool) -> bool:
+def _remove_record(path: str, *, dry_run: bool) -> bool:
     if _young(path):
         return False
     if not dry_run:
-        path.unlink(missing_ok=True)
+        Path(path).unlink(missing_ok=True)
     return True
 
 

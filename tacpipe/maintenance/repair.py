@@ -82,10 +82,10 @@ def verify(store: Store) -> Soundness:
     if not store.check():
         return Soundness(there=False)
     found = Soundness(foreign=layout.foreign(store.root))
-    for path in layout.entries(store.root, "objects"):
-        found.objects += _read(store.read, path.name, found)
-    for path in layout.entries(store.root, "records"):
-        found.records += _read(store.read_record, path.stem, found)
+    for name in layout.names(store.root, "objects"):
+        found.objects += _read(store.read, name, found)
+    for key in layout.names(store.root, "records"):
+        found.records += _read(store.read_record, key, found)
     store.roots.all()
     found.damaged += [f"root {name}" for name in store.roots.damaged()]
     missing = set(_wanted(store, found)) - set(found.damaged)

@@ -35,7 +35,7 @@ class _Candidate:
     objects: set[str]
 
 
-def kept(store: Store, objects: Iterable[Path], known: Iterable[Manifest]) -> dict[str, set[str]]:
+def kept(store: Store, objects: Iterable[str], known: Iterable[Manifest]) -> dict[str, set[str]]:
     """Return the digests of those manifests and pages among ``objects`` that must be kept, with those of all that they name.
 
     Those are the ones with recordings or labels that are neither in a ``known`` manifest nor in another one that is kept. An
@@ -44,7 +44,7 @@ def kept(store: Store, objects: Iterable[Path], known: Iterable[Manifest]) -> di
     covered = {one for manifest in known for one, _ in replacing.possessions(manifest)}
     names: dict[str, set[str]] = {}
     candidates: dict[bool, list[_Candidate]] = {True: [], False: []}  # by whether it is a page
-    for name, content in _candidates(objects):
+    for name, content in _beginning(store, objects, (_BEGINS, pages.BEGINS)):
         if bytes_digest(content) != name:
             names[name] = digests(content)
             continue
@@ -94,20 +94,15 @@ def digests(content: bytes) -> set[str]:
 
 def named_by_pages(store: Store, names: Collection[str]) -> set[str]:
     """Return the digests in those objects of these names that are pages of a manifest."""
-    paths = (Path(store.object_path(name)) for name in names)
-    return {one for _, content in _beginning(paths, (pages.BEGINS,)) for one in digests(content)}
+    return {one for _, content in _beginning(store, names, (pages.BEGINS,)) for one in digests(content)}
 
 
-def _candidates(objects: Iterable[Path]) -> Iterator[tuple[str, bytes]]:
-    """Yield digest and content of the objects that begin as a manifest or a page does."""
-    return _beginning(objects, (_BEGINS, pages.BEGINS))
-
-
-def _beginning(objects: Iterable[Path], marks: tuple[bytes, ...]) -> Iterator[tuple[str, bytes]]:
-    """Yield digest and content of the objects that begin with a mark."""
-    for path in objects:
-        with contextlib.suppress(FileNotFoundError, regular.IrregularError), readable_errors(path, reading=True):
+def _beginning(store: Store, names: Iterable[str], marks: tuple[bytes, ...]) -> Iterator[tuple[str, bytes]]:
+    """Yield name and content of the objects of these names that begin with a mark."""
+    for name in names:
+        path = store.object_path(name)
+        with contextlib.suppress(FileNotFoundError, regular.IrregularError), readable_errors(Path(path), reading=True):
             with regular.opened(path, follow=False) as file:
                 if not file.read(max(map(len, marks))).startswith(marks):
                     continue
-            yield path.name, regular.content(path, regular.JSON_BYTES, follow=False)
+            yield name, regular.content(path, regular.JSON_BYTES, follow=False)

@@ -45,6 +45,7 @@ _FORMS = {  # Pattern of the paths within each folder
     PRESENCE: re.compile(_DIGEST),
 }
 _SHELVED = ("objects", "records")
+_NAME_LENGTHS = {"objects": 64, "records": 69}  # characters: a digest, and ".json" after that of a record
 _HOLD_FOLDERS = ("checkpoints", SPOOL, KEPT)  # their entries are folders, those of others files
 _BEGUN = ("tmp", "leases", "checkpoints", SPOOL)  # may hold something before there is a mark
 _BESIDE = frozenset({".gitignore", ".gitkeep", "lost+found"})  # no reason to refuse a folder that is to become a store
@@ -106,15 +107,20 @@ def entries(root: Path, name: str) -> Iterator[Path]:
 
     What vanishes meanwhile is left out. Raises `StorageError` for a folder that cannot be listed.
     """
-    return (path for path, ours in _contents(root, name) if ours)
+    return (Path(path) for path, ours in _contents(root, name) if ours)
+
+
+def names(root: Path, folder: str) -> Iterator[str]:
+    """Yield the names of the files in ``objects`` or ``records``, which are digests, sorted. Raises as `entries` does."""
+    return (path[-_NAME_LENGTHS[folder] :][:64] for path, ours in _contents(root, folder) if ours)
 
 
 def foreign(root: Path) -> list[str]:
     """Return the sorted paths within the store that do not belong to it, symbolic links included."""
     paths = [path for name in _FORMS for path, ours in _contents(root, name) if not ours]
     expected = {MARK, PROJECT, *_FORMS, *_BESIDE}
-    paths += [Path(entry.path) for entry in _scan(root, root) if entry.name not in expected]
-    return sorted(str(path.relative_to(root)) for path in paths)
+    paths += [entry.path for entry in _scan(root, root) if entry.name not in expected]
+    return sorted(str(Path(path).relative_to(root)) for path in paths)
 
 
 def is_linked(root: str, path: str | Path) -> bool:
@@ -132,26 +138,25 @@ def _is_link(path: str | Path) -> bool:
         return False
 
 
-def _contents(root: Path, name: str) -> Iterator[tuple[Path, bool]]:
+def _contents(root: Path, name: str) -> Iterator[tuple[str, bool]]:
     """Yield the paths in a folder of the store and its shelves, and whether each belongs to the store."""
     folder = root / name
     if folder.is_symlink():
-        yield folder, False
+        yield str(folder), False
         return
     for entry in _scan(root, folder):
-        path = Path(entry.path)
         if name not in _SHELVED:
             is_kind = entry.is_dir if name in _HOLD_FOLDERS else entry.is_file
-            yield path, is_kind(follow_symlinks=False) and _FORMS[name].fullmatch(entry.name) is not None
+            yield entry.path, is_kind(follow_symlinks=False) and _FORMS[name].fullmatch(entry.name) is not None
         elif SHELF.fullmatch(entry.name) and entry.is_dir(follow_symlinks=False):
-            for inner in _scan(root, path):
+            for inner in _scan(root, entry.path):
                 form = _FORMS[name].fullmatch(f"{entry.name}/{inner.name}")
-                yield Path(inner.path), inner.is_file(follow_symlinks=False) and form is not None
+                yield inner.path, inner.is_file(follow_symlinks=False) and form is not None
         else:
-            yield path, False
+            yield entry.path, False
 
 
-def _scan(root: Path, folder: Path) -> list[os.DirEntry[str]]:
+def _scan(root: Path, folder: Path | str) -> list[os.DirEntry[str]]:
     with readable_errors(root):
         try:
             with os.scandir(folder) as entries:
@@ -190,10 +195,10 @@ def _may_begin(root: Path) -> bool:
     return True
 
 
-def _all_entries(root: Path, name: str) -> Iterator[tuple[Path, bool]]:
+def _all_entries(root: Path, name: str) -> Iterator[tuple[str, bool]]:
     """Do as `_contents`, but yield shelves, which may be empty, instead of their content."""
     if name in _SHELVED:
-        return ((Path(entry.path), False) for entry in _scan(root, root / name))
+        return ((entry.path, False) for entry in _scan(root, root / name))
     return _contents(root, name)
 
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import json
 import os
+import re
 import shutil
 import sys
 import time
@@ -22,6 +24,9 @@ from tacpipe.store import layout
 from tacpipe.store.directory import Directory
 from tacpipe.store.leases import Announcing, Leases
 from tacpipe.store.roots import Roots
+
+_RECORD = re.compile(rb'\{"check":"(?P<check>[0-9a-f]{64})","digest":"(?P<digest>[0-9a-f]{64})","identity":')
+_parse_at = json.JSONDecoder().raw_decode  # maps a text and a start to the value there and its end
 
 
 class MissingError(DamagedError):
@@ -357,8 +362,10 @@ class Store:
         path = self.record_path(key)
         try:
             with readable_errors(self.root, reading=True):
-                record: dict[str, Any] = regular.json_value(path)
-            if sound(record, key):
+                content = regular.content(path, regular.JSON_BYTES, follow=False)
+                regular.expect_parsed(path, len(content))
+            record = parse_record(content, key)
+            if record is not None:
                 return record
         except FileNotFoundError:
             raise AbsentError(f"Record {key[:12]} is not in the store {self._root}.") from None
@@ -409,10 +416,10 @@ class Store:
 
     def records(self) -> Iterator[tuple[str, dict[str, Any]]]:
         """Yield every key and its record."""
-        for path in layout.entries(self.root, "records"):
-            record = self.record(path.stem)
+        for key in layout.names(self.root, "records"):
+            record = self.record(key)
             if record is not None:
-                yield path.stem, record
+                yield key, record
 
 
 def record_content(
@@ -422,6 +429,42 @@ def record_content(
     body = {"identity": identity, "result": result}
     record = {**body, "digest": digest(body), "provenance": provenance, "check": digest(provenance)}
     return record, canonical(record)
+
+
+def parse_record(content: bytes, key: str) -> dict[str, Any] | None:
+    """Return the record of ``key`` that JSON holds, None where it is damaged. Raises `ValueError` where it is not JSON.
+
+    The digests of canonical JSON, as `record_content` returns it, are those of its parts: nothing is encoded again.
+    """
+    begins = _RECORD.match(content)
+    if begins is None:  # written by an earlier version
+        record: dict[str, Any] = json.loads(content)
+        return record if sound(record, key) else None
+    text = content.decode("ascii")
+    identity, identity_end = _parse_at(text, begins.end())
+    provenance_start = _after(text, identity_end, ',"provenance":')
+    provenance, provenance_end = _parse_at(text, provenance_start)
+    result_start = _after(text, provenance_end, ',"result":')
+    result, result_end = _parse_at(text, result_start)
+    if text[result_end:] != "}":
+        return None
+    check, digest_of_body = begins["check"].decode(), begins["digest"].decode()
+    identity_text = content[begins.end() : identity_end]
+    body = b'{"identity":%b,"result":%b}' % (identity_text, content[result_start:result_end])
+    if (
+        bytes_digest(identity_text) != key
+        or bytes_digest(body) != digest_of_body
+        or bytes_digest(content[provenance_start:provenance_end]) != check
+    ):
+        return None
+    return {"identity": identity, "result": result, "digest": digest_of_body, "provenance": provenance, "check": check}
+
+
+def _after(text: str, start: int, words: str) -> int:
+    """Return where ``text`` continues after ``words``, which must stand at ``start``. Raises `ValueError`."""
+    if not text.startswith(words, start):
+        raise ValueError(f"{words} is missing")
+    return start + len(words)
 
 
 def sound(record: dict[str, Any], key: str) -> bool:

@@ -635,7 +635,7 @@ def test_what_another_computer_made_meanwhile_is_not_computed_where_many_are_loo
             tasks[identity["stage"]].append(Task(computers.address, identity["stage"], identity))
     computers.enter("second")
     done = list(computing.compute.compute_all(tasks["simulate.toy"]))
-    assert len(done) == 12 and not any(one.made for one in done)
+    assert len(done) == 12 and not any(task.is_new for task in done)
 
 
 def test_a_result_that_cannot_be_sent_ends_the_command_and_the_others_are_kept(
