@@ -19,7 +19,7 @@ from tacpipe.plugins.stage import ROLES, Attribute
 from tacpipe.printable import listed, plain, suggestion
 
 SCHEMES = ("random", "kfold", "blocked", "leave-one-out", "authors")
-SHARES = (0.2, 0.25, 0.3, 0.35, 0.4, 0.5, 0.6)  # Shares of validation recordings that errors suggest
+SHARES = (0.2, 0.25, 0.3, 0.35, 0.4, 0.5, 0.6)  # Fractions of validation recordings that errors suggest
 _NAMED = 12  # attributes that an error names
 UNUSED = "unused"  # role of those that a few-shot split takes out of training
 Attributes = Mapping[str, Attribute]

@@ -26,7 +26,7 @@ Answer = Mapping[str, Entry] | pages.Pages  # results of a group of recordings
 
 
 @dataclass(frozen=True)
-class _Group:
+class _RecordingGroup:
     """A group of recordings: what its key is the digest of, and the recordings."""
 
     identity: Mapping[str, Any]
@@ -51,7 +51,7 @@ class ByRecording:
         in pages.
         """
         entries, name, stage = source.included, step["stage"], execution.stage_of(step["stage"])
-        answered: list[Answer | _Group] = []
+        answered: list[Answer | _RecordingGroup] = []
         missing: list[Task] = []
         stored: dict[str, Mapping[str, Any]] = {}  # Records of groups that are incomplete
         reusable = None if self.previous is None else self.previous.reusable(entries, step)
@@ -76,7 +76,7 @@ class ByRecording:
                 answered.append(reusable_pages[group.page])
                 continue
             group_entries = group.entries()
-            pending = _Group(keys.of_group(step, stage, group_entries), group_entries)
+            pending = _RecordingGroup(keys.of_group(step, stage, group_entries), group_entries)
             group_results = None if self.request.compare or self._reruns(name) else self._of_group(pending)
             if group_results is None:
                 tasks = keys.shard_tasks(self.store, replace(source, recordings=group_entries), step, dataset_dirs)
@@ -92,7 +92,7 @@ class ByRecording:
 
         def parts() -> Iterator[Answer]:
             for answer_or_pending in answered:
-                if not isinstance(answer_or_pending, _Group):
+                if not isinstance(answer_or_pending, _RecordingGroup):
                     yield answer_or_pending
                     continue
                 records_of = {
@@ -105,7 +105,7 @@ class ByRecording:
             return pages.Recordings(pages.Pages.joined(part for part in parts() if isinstance(part, pages.Pages)))
         return {name: entry for part in parts() if isinstance(part, Mapping) for name, entry in part.items()}
 
-    def _of_group(self, group: _Group) -> Mapping[str, Entry] | None:
+    def _of_group(self, group: _RecordingGroup) -> Mapping[str, Entry] | None:
         """Return the entries in the record of a group; None if there is no record or an object is missing."""
         record = self.store.record(digest(group.identity))
         if record is None or not records.complete(self.store, record):
@@ -168,7 +168,7 @@ class ByRecording:
         return complete
 
     def _remember_group(
-        self, name: str, group: _Group, records_by_name: Mapping[str, Mapping[str, Any]]
+        self, name: str, group: _RecordingGroup, records_by_name: Mapping[str, Mapping[str, Any]]
     ) -> dict[str, Entry]:
         """Return the entries of a group's recordings, and store them under the key of the group if the group is complete."""
         result = {recording: record["result"]["recordings"][""] for recording, record in records_by_name.items()}

@@ -117,7 +117,7 @@ class Previous:
         for counts in filter(None, (codes, *packages.values())):
             if [*counts.values()] != [len(self.result.recordings)]:  # it is unknown which results other code computed
                 return None
-        excluded = {*replaced_names, ""}  # The empty name stands for a stage over a whole dataset, which is asked again
+        excluded = {*replaced_names, ""}  # The empty name is a stage over a whole dataset, which runs again
         notes_of_run: Mapping[str, Sequence[str]] = provenance.get("notes") or {}
         notes = {note: [name for name in names if name not in excluded] for note, names in notes_of_run.items()}
         return {

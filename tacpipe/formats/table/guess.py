@@ -30,7 +30,7 @@ VOCABULARY = (  # help for the person who replaces a "?"
 
 
 @dataclass(frozen=True)
-class _Group:
+class _FileGroup:
     stream: str
     pattern: str
     paths: tuple[Path, ...]
@@ -74,13 +74,13 @@ def guess_layout(folder: Path) -> str:
     return "\n\n".join(["\n".join(head), *parts]) + "\n"
 
 
-def _group_files(folder: Path, data: Sequence[Path]) -> tuple[list[_Group], list[_Group], dict[str, str]]:
+def _group_files(folder: Path, data: Sequence[Path]) -> tuple[list[_FileGroup], list[_FileGroup], dict[str, str]]:
     """Return the groups of files that are streams, the groups that hold labels, and by path why others cannot be read."""
     by_template: dict[str, list[Path]] = {}
     for path in sorted(data):
         by_template.setdefault(_template(path), []).append(path)
-    streams: list[_Group] = []
-    labels: list[_Group] = []
+    streams: list[_FileGroup] = []
+    labels: list[_FileGroup] = []
     damaged: dict[str, str] = {}
     used: set[str] = set()
     for paths in itertools.chain.from_iterable(map(_by_file_name, by_template.values())):
@@ -92,7 +92,7 @@ def _group_files(folder: Path, data: Sequence[Path]) -> tuple[list[_Group], list
             damaged |= {path.as_posix(): str(error).rstrip(".") for path in paths}
             continue
         shared = len(paths) == 1 < len(data) and _is_labels(sample)
-        group = _Group(_stream_name(paths, used), pattern.generalize(paths), tuple(paths), sample)
+        group = _FileGroup(_stream_name(paths, used), pattern.generalize(paths), tuple(paths), sample)
         single = sample.text is not None and sample.text.header and len(sample.text.rows) == 1 and len(paths) > 1
         if shared or single:
             labels.append(group)
@@ -101,7 +101,7 @@ def _group_files(folder: Path, data: Sequence[Path]) -> tuple[list[_Group], list
     return streams, labels, damaged
 
 
-def _by_length(group: _Group) -> list[_Group]:
+def _by_length(group: _FileGroup) -> list[_FileGroup]:
     """Return one stream per length of the arrays in a file; files without arrays are one stream."""
     by_length: dict[int, list[str]] = {}
     for name, array in group.first.arrays.items():
@@ -117,11 +117,11 @@ def _by_length(group: _Group) -> list[_Group]:
     return groups
 
 
-def _with_stamps(groups: Sequence[_Group]) -> tuple[list[_Group], list[_Group]]:
+def _with_stamps(groups: Sequence[_FileGroup]) -> tuple[list[_FileGroup], list[_FileGroup]]:
     """Return the streams and the groups of stamp files; a stream without stamps gets the stamp file of its length."""
     clocks = [group for group in groups if len(group.first.names) == 1 and _is_clock(group)]
-    used: list[_Group] = []
-    streams: list[_Group] = []
+    used: list[_FileGroup] = []
+    streams: list[_FileGroup] = []
     for group in groups:
         if group in clocks:
             continue
@@ -140,7 +140,7 @@ def _with_stamps(groups: Sequence[_Group]) -> tuple[list[_Group], list[_Group]]:
     return [*streams, *(clock for clock in clocks if clock not in used)], used
 
 
-def _is_clock(group: _Group) -> bool:
+def _is_clock(group: _FileGroup) -> bool:
     """Return whether a file of one column has a name of stamps, and values that rise or are text."""
     stem = group.paths[0].name.partition(".")[0]
     match = column_names.TIME_NAME.fullmatch(stem) or column_names.TIME_ENDING.fullmatch(stem)
@@ -158,7 +158,7 @@ def _stream_name(paths: Sequence[Path], used: set[str]) -> str:
     return name
 
 
-def _label_files(folder: Path, paths: Sequence[Path], streams: Sequence[_Group]) -> dict[str, list[Path]]:
+def _label_files(folder: Path, paths: Sequence[Path], streams: Sequence[_FileGroup]) -> dict[str, list[Path]]:
     """Return YAML and JSON files of labels by pattern: one file per recording, or one file for all recordings."""
     by_template: dict[str, list[Path]] = {}
     for path in paths:
@@ -212,7 +212,7 @@ def _is_labels(sample: FileSample) -> bool:
     return texts and file_sample.time_column(sample) is None and 0 < len(sample.text.rows) < SAMPLE_LINES - 1
 
 
-def _labels_text(group: _Group) -> str:
+def _labels_text(group: _FileGroup) -> str:
     """Return the text of a ``[[labels]]`` entry."""
     lines = ["[[labels]]", f"file = {quoted(group.pattern if len(group.paths) > 1 else group.paths[0].as_posix())}"]
     if len(group.paths) == 1:
@@ -223,7 +223,7 @@ def _labels_text(group: _Group) -> str:
     return "\n".join(lines)
 
 
-def _stream_text(group: _Group) -> str:
+def _stream_text(group: _FileGroup) -> str:
     """Return the text of a ``[streams.NAME]`` entry."""
     sample = group.first
     time = None if group.stamps else file_sample.time_column(sample)
